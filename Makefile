@@ -1,0 +1,30 @@
+# Set-up is part of every target: a virtual environment is made and filled on the first run.
+PYTHON ?= python3
+VENV ?= .venv
+BIN = $(VENV)/bin
+
+.PHONY: demo test lint types tests clean
+
+demo: $(VENV)/.all  ## mark, attack and read a mesh: make demo [MESH=file]
+	$(BIN)/jaxmark demo $(MESH) --output demo-output
+
+test: lint types tests  ## everything that must hold
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.dev
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+tests: $(VENV)/.dev
+	$(BIN)/python -m pytest -q -n auto
+
+$(VENV)/.%: pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --editable '.[$*]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) demo-output build dist

@@ -1,0 +1,30 @@
+"""jaxmark: differentiable spectral filtering of polygonal meshes, and the watermarking built on it."""
+
+from jaxmark import attacks as attacks
+from jaxmark import bands as bands
+from jaxmark import carriers as carriers
+from jaxmark import chebyshev as chebyshev
+from jaxmark import detectors as detectors
+from jaxmark import distortion as distortion
+from jaxmark import evidence as evidence
+from jaxmark import laplacian as laplacian
+from jaxmark import schemes as schemes
+from jaxmark import spectrum as spectrum
+from jaxmark import watermark as watermark
+from jaxmark.attacks import attack as attack
+from jaxmark.distortion import compare as compare
+from jaxmark.errors import JaxmarkError as JaxmarkError
+from jaxmark.files import load_mesh as load_mesh
+from jaxmark.files import save_mesh as save_mesh
+from jaxmark.keys import Key as Key
+from jaxmark.keys import load_key as load_key
+from jaxmark.keys import new_key as new_key
+from jaxmark.keys import save_key as save_key
+from jaxmark.marking import Detection as Detection
+from jaxmark.marking import EmbedInfo as EmbedInfo
+from jaxmark.marking import detect as detect
+from jaxmark.marking import embed as embed
+from jaxmark.marking import reader as reader
+from jaxmark.mesh import Mesh as Mesh
+from jaxmark.mesh import make_mesh as make_mesh
+from jaxmark.record import Record as Record

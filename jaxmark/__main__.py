@@ -1,0 +1,5 @@
+"""`python -m jaxmark`."""
+
+from jaxmark.cli import main
+
+main()

@@ -1,0 +1,102 @@
+"""What a carrier is, and the one that modulates components of the host by keyed sequences."""
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+Displacement = Float[Array, "vertices 3"]
+Strength = float | Float[Array, ""] | Float[Array, " bands"] | Float[Array, "bands 3"]
+
+
+@runtime_checkable
+class Carrier(Protocol):
+    """A linear map from k bits to a displacement [N, 3]; a pytree whose methods can be traced.
+
+    `beta` is the embedding strength: one number, one per band `[bands]`, or one per band and coordinate `[bands, 3]`.
+    """
+
+    def displacement(self, bits: Float[Array, " bits"], beta: Strength = 1.0) -> Displacement:
+        """The displacement that carries `bits` (±1, or any real amplitudes), linear in `bits` and in `beta`."""
+        ...
+
+    def adjoint(self, residual: Displacement, beta: Strength = 1.0) -> Float[Array, " bits"]:
+        """The D-adjoint: ⟨displacement(a), r⟩_D summed over coordinates equals a · adjoint(r)."""
+        ...
+
+    def gram(self, beta: Strength = 1.0) -> Float[Array, "bits bits"]:
+        """D inner products of the bits' displacements: adjoint(displacement(e_j)), column by column."""
+        ...
+
+    def claim(
+        self, residual: Displacement, bits: Float[Array, " bits"]
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Score S of a claimed codeword, and the norm ‖a‖ with S = Σ s·a over the keyed signs s (a is key-free)."""
+        ...
+
+
+@runtime_checkable
+class Components(Protocol):
+    """Directions [N] per band and coordinate, in which a carrier writes: fixed by the original, free of the key."""
+
+    @property
+    def gram(self) -> Float[Array, "3 bands bands"]:
+        """D inner products of the components, per coordinate."""
+        ...
+
+    def synthesise(self, amplitudes: Float[Array, "bands 3"]) -> Displacement:
+        """Σ_j amplitude_jc · component_jc for each coordinate c."""
+        ...
+
+    def analyse(self, residual: Displacement) -> Float[Array, "bands 3"]:
+        """⟨residual_c, component_jc⟩_D: the D-adjoint of `synthesise`."""
+        ...
+
+
+class ModulatedCarrier(NamedTuple):
+    """w = Σ_i bit_i Σ_j β_j p_j^(i) x_j: the bits modulate components x_j of the host by sequences p (Sohn et al., 2.2).
+
+    With polynomial bands as components it is the paper's scheme, with eigenspaces Ohbuchi's.
+    """
+
+    components: Components
+    sequences: Int[Array | np.ndarray, "bits bands 3"] | Int[Array | np.ndarray, "bits bands 1"]
+
+    def displacement(self, bits: Float[Array, " bits"], beta: Strength = 1.0) -> Displacement:
+        """See `Carrier`."""
+        return self.components.synthesise(_per_band(beta, bits) * self._modulate(bits))
+
+    def adjoint(self, residual: Displacement, beta: Strength = 1.0) -> Float[Array, " bits"]:
+        """See `Carrier`."""
+        found = _per_band(beta, residual) * self.components.analyse(residual)
+        return jnp.einsum("kjc,jc->k", self._sequences(residual), found)
+
+    def gram(self, beta: Strength = 1.0) -> Float[Array, "bits bits"]:
+        """See `Carrier`."""
+        products = self.components.gram
+        weighted = _per_band(beta, products) * self._sequences(products)
+        return jnp.einsum("ajc,cjl,blc->ab", weighted, products, weighted)
+
+    def claim(
+        self, residual: Displacement, bits: Float[Array, " bits"]
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """See `Carrier`; one sign per band and coordinate, or per band where coordinates share their sequences."""
+        found = self.components.analyse(residual)
+        if self.sequences.shape[-1] == 1:
+            found = found.sum(axis=1, keepdims=True)
+        terms = jnp.tensordot(bits, jnp.asarray(self.sequences).astype(bits.dtype), 1) * found
+        return terms.sum(), jnp.sqrt((terms**2).sum())
+
+    def _modulate(self, bits: Float[Array, " bits"]) -> Float[Array, "bands 3"]:
+        return jnp.tensordot(bits, self._sequences(bits), 1)
+
+    def _sequences(self, like: Array) -> Float[Array, "bits bands 3"]:
+        signs = jnp.asarray(self.sequences).astype(like.dtype)
+        return jnp.broadcast_to(signs, (*signs.shape[:2], 3))
+
+
+def _per_band(beta: Strength, like: Array) -> Array:
+    """β in the dtype of `like`, shaped to broadcast against `[bands, 3]`."""
+    strength = jnp.asarray(beta).astype(like.dtype)
+    return strength[:, None] if strength.ndim == 1 else strength

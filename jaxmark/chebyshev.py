@@ -1,0 +1,238 @@
+"""Polynomials of the Laplacian by the three-term recurrence, and their derivatives in O(N) memory.
+
+With Δ̃ = Δ - I, whose spectrum lies in [-1, 1], T_k(Δ̃)x obeys T_k = 2Δ̃T_{k-1} - T_{k-2} (Sohn et al., Method 2; the
+paper's start t_0 = 0, T_0 = 0 is an erratum for t_0 = 1, T_0 = I). All functions here take signals `[N]` or `[N, C]`,
+keep the dtype of the signal, and cost `degree` products with Δ.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.laplacian import Laplacian
+
+Signal = Float[Array | np.ndarray, "vertices *columns"]
+
+
+def filter(
+    operator: Laplacian,
+    coefficients: Float[Array | np.ndarray, "terms *filters"],
+    x: Signal,
+    *,
+    derivative: Literal["recompute", "scan"] = "recompute",
+) -> Float[Array, "vertices *columns"]:
+    """f(Δ)x for the Chebyshev series f(λ) = Σ_k c_k T_k(λ - 1), as one `lax.scan`.
+
+    Args:
+        operator: the Laplacian, of N vertices.
+        coefficients: `[degree + 1]`, or `[degree + 1, C]` for one filter per column of `x`.
+        x: `[N]` or `[N, C]`.
+        derivative: `"recompute"` (default) has O(N) memory in reverse mode at any degree: by the self-adjointness of
+            Δ, x̄ = D f(Δ) D⁻¹ȳ is another filter, and c̄_k = Σ ȳ·T_k(Δ̃)x recomputes the recurrence. It has no forward
+            mode and no derivative with respect to the operator. `"scan"` is differentiated by JAX as it stands: forward
+            mode, derivatives with respect to edge weights and degrees, and in reverse mode O(degree · N) memory.
+
+    Returns:
+        f(Δ)x, in the shape and dtype of `x`.
+
+    Raises:
+        JaxmarkError: if shapes do not fit, or the operator is differentiated under `"recompute"`.
+    """
+    x = jnp.asarray(x)
+    _check_signal("filter", operator, x)
+    c = jnp.asarray(coefficients).astype(x.dtype)
+    if c.ndim not in (1, 2) or len(c) == 0 or (c.ndim == 2 and c.shape[1:] != x.shape[1:]):
+        raise JaxmarkError(
+            f"filter needs coefficients [degree + 1] or [degree + 1, C] for a signal {x.shape}, got {c.shape}."
+        )
+    match derivative:
+        case "recompute":
+            return _filter_recompute(operator, c, x)
+        case "scan":
+            return _filter_scan(operator, c, x)
+    raise JaxmarkError(f"derivative must be 'recompute' or 'scan', got {derivative!r}.")
+
+
+@jax.jit
+def band_components(
+    operator: Laplacian, coefficients: Float[Array | np.ndarray, "bands terms"], x: Signal
+) -> Float[Array, "bands vertices *columns"]:
+    """All band components f_j(Δ)x in one pass of `degree` products; O(bands · N) memory.
+
+    Args:
+        operator: the Laplacian, of N vertices.
+        coefficients: one Chebyshev series per row, `[bands, degree + 1]`.
+        x: `[N]` or `[N, C]`.
+
+    Returns:
+        `[bands, N]` or `[bands, N, C]`.
+    """
+    _check_signal("band_components", operator, x)
+    c = _check_bands(coefficients).astype(x.dtype)
+
+    def add(total: Array, t: Array, _: Array, c_k: Array) -> tuple[Array, None]:
+        return total + jnp.multiply.outer(c_k, t), None
+
+    return _scan_terms(operator, x, c.T, add, jnp.multiply.outer(c[:, 0], x))[0]
+
+
+@partial(jax.jit, static_argnames="degree")
+def cross_moments(operator: Laplacian, u: Signal, x: Signal, *, degree: int) -> Float[Array, "terms *columns"]:
+    """⟨u, T_k(Δ̃)x⟩_D for k = 0 … degree, column by column.
+
+    Every correlation with a band needs only these: ⟨u, f_j(Δ)x⟩_D = Σ_k C_jk ⟨u, T_k x⟩_D. With them, weak bands are
+    small differences of large numbers: in float32 a band is lost where ‖f_j x‖ is below about 1e-6 ‖x‖.
+    """
+    _check_signal("cross_moments", operator, x)
+    return _projections(operator, _weighted(operator, u), x, degree)
+
+
+@partial(jax.jit, static_argnames="degree")
+def moments(operator: Laplacian, x: Signal, *, degree: int) -> Float[Array, "moments *columns"]:
+    """m_k = ⟨x, T_k(Δ̃)x⟩_D for k = 0 … 2·degree from only `degree` products, column by column.
+
+    By T_{j+k} + T_{|j-k|} = 2T_jT_k: m_2k = 2⟨T_k x, T_k x⟩_D - m_0 and m_{2k-1} = 2⟨T_k x, T_{k-1} x⟩_D - m_1.
+    """
+    _check_signal("moments", operator, x)
+
+    def products(_: None, t: Array, before: Array, __: Array) -> tuple[None, tuple[Array, Array]]:
+        return None, (operator.inner(t, before), operator.inner(t, t))
+
+    _, (odd, even) = _scan_terms(operator, x, jnp.zeros(degree + 1, x.dtype), products, None)
+    m0 = operator.inner(x, x)[None]
+    if degree == 0:
+        return m0
+    pairs = jnp.stack([2 * odd - odd[0], 2 * even - m0], axis=1)
+    return jnp.concatenate([m0, pairs.reshape(2 * degree, *x.shape[1:])])
+
+
+@partial(jax.jit, static_argnames="method")
+def gram(
+    operator: Laplacian,
+    coefficients: Float[Array | np.ndarray, "bands terms"],
+    x: Signal,
+    *,
+    method: Literal["bands", "moments"] = "bands",
+) -> Float[Array, "*columns bands bands"]:
+    """Gram matrix ⟨f_i(Δ)x, f_j(Δ)x⟩_D of the band components, one per column.
+
+    Args:
+        operator: the Laplacian, of N vertices.
+        coefficients: one Chebyshev series per row, `[bands, degree + 1]`.
+        x: `[N]` or `[N, C]`.
+        method: `"bands"` forms the components, O(bands · N) memory, accurate for weak bands; `"moments"` needs O(N)
+            memory, and ⟨T_j x, T_k x⟩_D = (m_{j+k} + m_{|j-k|})/2, but entries below about eps · ‖x‖² are rounding
+            noise: use it in float64, or where no band is weak.
+
+    Returns:
+        `[bands, bands]`, or `[C, bands, bands]` for `[N, C]`.
+    """
+    _check_signal("gram", operator, x)
+    c = _check_bands(coefficients).astype(x.dtype)
+    match method:
+        case "bands":
+            y = band_components(operator, c, x)
+            return jnp.einsum("v,iv...,jv...->...ij", jnp.asarray(operator.degree).astype(x.dtype), y, y)
+        case "moments":
+            terms = c.shape[1]
+            m = moments(operator, x, degree=terms - 1)
+            j, k = np.indices((terms, terms))
+            return jnp.einsum("ij,jk...,lk->...il", c, (m[j + k] + m[np.abs(j - k)]) / 2, c)
+    raise JaxmarkError(f"gram(method=...) must be 'bands' or 'moments', got {method!r}.")
+
+
+def _scan_terms(
+    operator: Laplacian,
+    x: Array,
+    data: Array,
+    step: Callable[[Any, Array, Array, Array], tuple[Any, Any]],
+    start: Any,
+) -> tuple[Any, Any]:
+    """Run `step(carry, T_k x, T_{k-1} x, data[k])` over k = 1 … len(data) - 1; T_0 x = x is the caller's."""
+
+    def body(state: tuple[Array, Array, Any], inputs: tuple[Array, Array]) -> tuple[tuple[Array, Array, Any], Any]:
+        before, current, carry = state
+        factor, datum = inputs
+        following = factor * (operator.apply(current) - current) - before
+        carry, output = step(carry, following, current, datum)
+        return (current, following, carry), output
+
+    # T_1 = Δ̃T_0 is the recurrence with factor 1 and T_{-1} = 0.
+    factors = jnp.full(len(data) - 1, 2, x.dtype).at[:1].set(1)
+    (_, _, carry), outputs = jax.lax.scan(body, (jnp.zeros_like(x), x, start), (factors, data[1:]))
+    return carry, outputs
+
+
+@jax.jit
+def _filter_scan(operator: Laplacian, coefficients: Array, x: Array) -> Array:
+    def add(total: Array, t: Array, _: Array, c_k: Array) -> tuple[Array, None]:
+        return total + c_k * t, None
+
+    return _scan_terms(operator, x, coefficients, add, coefficients[0] * x)[0]
+
+
+@partial(jax.jit, static_argnums=3)
+def _projections(operator: Laplacian, u: Array, x: Array, degree: int) -> Array:
+    """Σ_v u_v (T_k(Δ̃)x)_v for k = 0 … degree, column by column."""
+
+    def project(_: None, t: Array, __: Array, ___: Array) -> tuple[None, Array]:
+        return None, jnp.sum(u * t, axis=0)
+
+    _, rest = _scan_terms(operator, x, jnp.zeros(degree + 1, x.dtype), project, None)
+    return jnp.concatenate([jnp.sum(u * x, axis=0)[None], rest])
+
+
+@jax.custom_vjp
+def _filter_recompute(operator: Laplacian, coefficients: Array, x: Array) -> Array:
+    return _filter_scan(operator, coefficients, x)
+
+
+def _filter_forward(operator: Any, coefficients: Any, x: Any) -> tuple[Array, tuple[Laplacian, Array, Array]]:
+    if any(leaf.perturbed for leaf in operator):
+        raise JaxmarkError(
+            "filter has no derivative with respect to the operator's weights in O(N) memory;"
+            " call it with derivative='scan' for one in O(degree · N)."
+        )
+    plain = Laplacian(*(leaf.value for leaf in operator))
+    return _filter_scan(plain, coefficients.value, x.value), (plain, coefficients.value, x.value)
+
+
+def _filter_reverse(residuals: tuple[Laplacian, Array, Array], cotangent: Any) -> tuple[None, Array, Array]:
+    operator, coefficients, x = residuals
+    if isinstance(cotangent, jax.custom_derivatives.SymbolicZero):
+        return None, jnp.zeros_like(coefficients), jnp.zeros_like(x)
+    # An isolated vertex is its own block of Δ, so any positive mass serves there.
+    mass = jnp.asarray(operator.degree).astype(x.dtype).reshape(-1, *[1] * (x.ndim - 1))
+    mass = jnp.where(mass > 0, mass, 1)
+    x_bar = mass * _filter_recompute(operator, coefficients, cotangent / mass)
+    c_bar = _projections(operator, cotangent, x, len(coefficients) - 1)
+    return None, c_bar if coefficients.ndim == x.ndim else c_bar.sum(axis=1), x_bar
+
+
+_filter_recompute.defvjp(_filter_forward, _filter_reverse, symbolic_zeros=True)
+
+
+def _weighted(operator: Laplacian, u: Array | np.ndarray) -> Array:
+    return jnp.asarray(operator.degree).astype(u.dtype).reshape(-1, *[1] * (u.ndim - 1)) * u
+
+
+def _check_signal(name: str, operator: Laplacian, x: Array | np.ndarray) -> None:
+    if x.ndim not in (1, 2) or x.shape[0] != operator.degree.shape[0]:
+        raise JaxmarkError(
+            f"{name} needs a signal [N] or [N, C] with N = {operator.degree.shape[0]} vertices, got {x.shape}."
+        )
+    if not jnp.issubdtype(x.dtype, jnp.floating):
+        raise JaxmarkError(f"{name} needs a floating-point signal, got {x.dtype}.")
+
+
+def _check_bands(coefficients: Array | np.ndarray) -> Array:
+    c = jnp.asarray(coefficients)
+    if c.ndim != 2 or c.shape[1] == 0:
+        raise JaxmarkError(f"Band coefficients must be [bands, degree + 1], got {c.shape}.")
+    return c

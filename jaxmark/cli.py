@@ -1,0 +1,317 @@
+"""The command line: files in, files and one answer out.
+
+Exit status 0: done, or detected. 1: `detect` found nothing. 2: refused, with one sentence on standard error and no output
+file. With --json, standard output holds exactly one JSON object.
+"""
+
+import json
+import math
+import os
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from jaxmark import distortion
+from jaxmark.attacks import ATTACKS, attack
+from jaxmark.errors import JaxmarkError
+from jaxmark.files import load_mesh, save_mesh
+from jaxmark.files.atomic import write_atomically
+from jaxmark.keys import commitment, load_key, new_key, save_key
+from jaxmark.marking import DEFAULT_BITS, detect, embed
+from jaxmark.record import Record
+from jaxmark.schemes import SCHEMES
+
+_RECORD_SUFFIX = ".jaxmark.json"
+
+
+class _Hexadecimal(click.ParamType):
+    """A message as hexadecimal digits."""
+
+    name = "hex"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> bytes:
+        """Bytes of the digits."""
+        if isinstance(value, bytes):
+            return value
+        try:
+            message = bytes.fromhex(value)
+        except ValueError:
+            message = b""
+        if not message:
+            self.fail(f"{value!r} is not a message: give an even number of hexadecimal digits, e.g. c0ffee42.", param, ctx)
+        return message
+
+
+_MESH = click.Path(path_type=Path)
+_KEY = click.option("--key", "key_file", type=_MESH, required=True, help="Key file, from `jaxmark keygen`.")
+_JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
+
+
+@click.group(
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Exit status: 0 done or detected, 1 nothing detected, 2 refused.",
+)
+@click.version_option(package_name="jaxmark", prog_name="jaxmark")
+def cli() -> None:
+    """Hide a keyed message in the vertex positions of a mesh, and read it again from a suspect.
+
+    \b
+    A first round:
+      jaxmark keygen owner.key
+      jaxmark embed model.ply marked.ply --key owner.key --message 0123456789abcdef
+      jaxmark attack marked.ply suspect.ply noise 0.001
+      jaxmark detect suspect.ply --original model.ply --key owner.key
+
+    Meshes are OBJ, PLY, OFF, STL or GLB. Keep the key secret, and keep the original: detection needs both.
+    """  # noqa: D301
+
+
+@cli.command()
+@click.argument("keyfile", type=_MESH)
+@_JSON
+def keygen(keyfile: Path, as_json: bool) -> None:
+    """Make a key of 256 random bits in a new file that only you can read.
+
+    The file is never overwritten, and there is no copy: without it a mark can be neither read nor proven.
+    """
+    key = new_key()
+    save_key(key, keyfile)
+    _answer(as_json, {"key_file": str(keyfile), "commitment": commitment(key)}, f"key → {keyfile}")
+
+
+@cli.command(name="embed")
+@click.argument("original", type=_MESH)
+@click.argument("marked", type=_MESH)
+@_KEY
+@click.option("--message", type=_Hexadecimal(), required=True, help="Hexadecimal digits; 16 of them are 64 bits.")
+@click.option(
+    "--budget",
+    type=float,
+    default=8e-4,
+    show_default=True,
+    help="RMS displacement of the vertices, relative to the diagonal of the bounding box.",
+)
+@click.option("--scheme", type=click.Choice(list(SCHEMES)), default="host", show_default=True, help="What carries the bits.")
+@click.option("--record", "record_file", type=_MESH, help=f"Where the record goes.  [default: MARKED{_RECORD_SUFFIX}]")
+@_JSON
+def embed_command(
+    original: Path,
+    marked: Path,
+    key_file: Path,
+    message: bytes,
+    budget: float,
+    scheme: str,
+    record_file: Path | None,
+    as_json: bool,
+) -> None:
+    """Mark ORIGINAL and write MARKED, of the same format.
+
+    Only positions change (and normals, where the file has them); materials, colours, groups and comments stay byte by byte.
+    A record goes beside MARKED: it holds no secret, and with it nothing about the mark needs remembering.
+    """
+    record_file = record_file or marked.with_name(marked.name + _RECORD_SUFFIX)
+    _distinct(original=original, marked=marked, key=key_file, record=record_file)
+    key = load_key(key_file)
+    mesh = load_mesh(original)
+    result, info = embed(mesh, message, key, budget=budget, scheme=scheme)
+    with _replacing(marked) as draft:
+        save_mesh(result, draft, like=original)
+        # What counts is the file: its numbers are rounded.
+        written = load_mesh(draft)
+        if detect(written, original=mesh, key=key, record=info.record).message != message:
+            raise JaxmarkError(
+                f"Rounded to the numbers of {marked.suffix.upper()[1:]}, the mark no longer reads; use a larger budget,"
+                " or a file with more digits."
+            )
+        write_atomically(record_file, info.record.to_json().encode())
+    change = distortion.compare(mesh, written)
+    answer = {
+        "rms": change.rms,
+        "max": change.max,
+        "bits": info.record.bits,
+        "scheme": info.record.scheme,
+        "record": str(record_file),
+        "marked": str(marked),
+    }
+    _answer(
+        as_json,
+        answer,
+        f"{info.record.bits} bits → {marked}, RMS {change.rms:.3g} and max {change.max:.3g} of the diagonal;"
+        f" record → {record_file}",
+    )
+
+
+@cli.command(name="detect")
+@click.argument("suspect", type=_MESH)
+@click.option("--original", type=_MESH, required=True, help="The unmarked mesh.")
+@_KEY
+@click.option("--bits", type=int, help=f"Payload, a multiple of 8.  [default: the record's, else {DEFAULT_BITS}]")
+@click.option("--message", type=_Hexadecimal(), help="A message claimed to be there: proves it even where it cannot be read.")
+@click.option("--record", "record_file", type=_MESH, help="The mark's record: gives scheme and payload, binds key and original.")
+@click.option("--scheme", type=click.Choice(list(SCHEMES)), help="Without a record: what carries the bits.  [default: host]")
+@click.option("--alpha", type=float, default=1e-6, show_default=True, help="Largest false-positive probability that counts.")
+@_JSON
+def detect_command(
+    suspect: Path,
+    original: Path,
+    key_file: Path,
+    bits: int | None,
+    message: bytes | None,
+    record_file: Path | None,
+    scheme: str | None,
+    alpha: float,
+    as_json: bool,
+) -> None:
+    """Look for a mark in SUSPECT, which must share the original's vertex and face order.
+
+    Exit status 0 if the false-positive probability is at most --alpha, else 1. It holds for any suspect made without the
+    key, as long as key, original and a claimed message were fixed before the suspect was seen.
+    """
+    if not 0 < alpha < 1:
+        raise JaxmarkError(f"--alpha is a probability and must be in (0, 1), got {alpha:g}.")
+    record = None if record_file is None else Record.load(record_file)
+    if record is not None and scheme not in (None, record.scheme):
+        raise JaxmarkError(f"--scheme {scheme} contradicts the record, which says {record.scheme}.")
+    key = load_key(key_file)
+    found = detect(
+        load_mesh(suspect),
+        original=load_mesh(original),
+        key=key,
+        bits=bits,
+        message=message,
+        record=record,
+        scheme=scheme or "host",
+    )
+    detected = found.detected(alpha)
+    answer = {
+        "detected": detected,
+        "log10_p": found.log10_p,
+        "message": None if found.message is None else found.message.hex(),
+        "scores": [float(score) for score in found.scores],
+        "coverage": found.coverage,
+    }
+    read = f"message {answer['message']}" if found.message is not None else "no message could be read"
+    _answer(
+        as_json,
+        answer,
+        f"{'detected' if detected else 'nothing detected'}: {read}; false-positive probability at most"
+        f" 10^{found.log10_p:.1f} (--alpha {alpha:g})",
+    )
+    sys.exit(0 if detected else 1)
+
+
+_KINDS = "; ".join(f"{name}: {entry.unit}" for name, entry in ATTACKS.items())
+
+
+@cli.command(name="attack", epilog=f"Unit of STRENGTH. {_KINDS}.")
+@click.argument("source", metavar="IN", type=_MESH)
+@click.argument("target", metavar="OUT", type=_MESH)
+@click.argument("kind", type=click.Choice(list(ATTACKS)))
+@click.argument("strength", type=float)
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of the attack's randomness.")
+@_JSON
+def attack_command(source: Path, target: Path, kind: str, strength: float, seed: int, as_json: bool) -> None:
+    """Put a mesh through an attack, to see what a mark survives."""
+    _distinct(IN=source, OUT=target)
+    mesh = load_mesh(source)
+    with _replacing(target) as draft:
+        save_mesh(attack(mesh, kind, strength, seed=seed), draft, like=source)
+        change = distortion.compare(mesh, load_mesh(draft))
+    answer = {"kind": kind, "strength": strength, "seed": seed, "rms": change.rms, "max": change.max}
+    _answer(as_json, answer, f"{kind} {strength:g} → {target}, RMS {change.rms:.3g} of the diagonal")
+
+
+@cli.command()
+@click.argument("original", type=_MESH)
+@click.argument("distorted", type=_MESH)
+@_JSON
+def compare(original: Path, distorted: Path, as_json: bool) -> None:
+    """Measure how far DISTORTED was moved from ORIGINAL, relative to the diagonal of the bounding box."""
+    change = distortion.compare(load_mesh(original), load_mesh(distorted))
+    _answer(as_json, change._asdict(), f"RMS {change.rms:.6g}, max {change.max:.6g} of the diagonal")
+
+
+@cli.command()
+@click.argument("mesh", type=_MESH, required=False)
+@click.option("--output", type=_MESH, default=Path("demo-output"), show_default=True, help="Folder for what it leaves.")
+@_JSON
+def demo(mesh: Path | None, output: Path, as_json: bool) -> None:
+    """Mark a mesh, attack it, read it again, and leave tables and pictures. Without MESH, on a sample.
+
+    Needs the extra `plot`, and `attacks` for the sample.
+    """
+    from jaxmark.demo import run_demo
+
+    rows = run_demo(mesh, output, lambda line: click.echo(line, err=as_json))
+    if as_json:
+        _answer(True, {"output": str(output), "rows": [row._asdict() for row in rows]}, "")
+
+
+def main() -> None:
+    """Run the command line; refused input ends with status 2 and one sentence."""
+    try:
+        cli(standalone_mode=False)
+    except click.exceptions.Exit as end:
+        sys.exit(end.exit_code)
+    except click.Abort:
+        _refuse("Interrupted.")
+    except click.ClickException as error:
+        _refuse(error.format_message())
+    except JaxmarkError as error:
+        _refuse(str(error))
+    except BrokenPipeError:
+        # The reader of our output has gone; nothing is left to tell it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(2)
+    except OSError as error:
+        _refuse(f"{error.filename or 'A file'} cannot be used: {error.strerror}.")
+
+
+def _refuse(sentence: str) -> None:
+    click.echo(f"jaxmark: {' '.join(sentence.split())}", err=True)
+    sys.exit(2)
+
+
+def _answer(as_json: bool, answer: Mapping[str, Any], text: str) -> None:
+    if as_json:
+        click.echo(json.dumps({name: _finite(value) for name, value in answer.items()}, allow_nan=False))
+    else:
+        click.echo(text)
+
+
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _distinct(**files: Path) -> None:
+    """Refuse to write over an input: two names for one file."""
+    seen: dict[Path, str] = {}
+    for name, path in files.items():
+        other = seen.setdefault(path.resolve(), name)
+        if other != name:
+            raise JaxmarkError(f"{other} and {name} are the same file, {path}; give another name.")
+
+
+class _replacing:  # noqa: N801 (used as a function)
+    """A draft beside a file, of the same suffix, that takes its place if all goes well and vanishes if not."""
+
+    def __init__(self, target: Path) -> None:
+        self._target = target
+
+    def __enter__(self) -> Path:
+        folder = self._target.parent
+        if not folder.is_dir():
+            raise JaxmarkError(f"The folder {folder} does not exist.")
+        self._folder = tempfile.TemporaryDirectory(prefix=".jaxmark-", dir=folder)
+        return Path(self._folder.name) / self._target.name
+
+    def __exit__(self, kind: Any, *_: object) -> None:
+        try:
+            if kind is None:
+                os.replace(Path(self._folder.name) / self._target.name, self._target)
+        finally:
+            self._folder.cleanup()

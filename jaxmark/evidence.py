@@ -1,0 +1,68 @@
+"""What a score proves: probabilities of false detection that hold for any suspect independent of the key.
+
+All results are log10 of an upper bound on the probability, at most 0, and at least -77: a 256-bit key supports no claim
+below 2⁻²⁵⁶.
+"""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+FLOOR = -77.0
+
+
+def log10_p_claimed(score: ArrayLike, norm: ArrayLike) -> float:
+    """log10 of P(S ≥ score) for a codeword that was claimed beforehand (Hoeffding 1963, Theorem 2).
+
+    For S = Σ s·a over keyed independent signs s, P(S ≥ t‖a‖) ≤ exp(-t²/2). This holds for any suspect, provided that
+    the suspect, and with it a, is independent of the signs; that weights, masks and pose never depend on the key or
+    the score; and that key, original and message were fixed before the suspect was seen.
+
+    Args:
+        score: S, the plain linear correlation of the claimed codeword.
+        norm: ‖a‖, of the very vector that the signs multiply.
+
+    Returns:
+        A finite number in [-77, 0]; 0 for a score that is not positive, or a residual without anything in it.
+    """
+    s, a = float(np.asarray(score, np.float64)), float(np.asarray(norm, np.float64))
+    if not (s > 0 and a > 0 and math.isfinite(s) and math.isfinite(a)):
+        return 0.0
+    return max(FLOOR, -((s / a) ** 2) / 2 / math.log(10))
+
+
+def log10_p_tag(bits: int) -> float:
+    """log10 of the probability that a message read from an unmarked suspect passes a keyed tag of so many bits.
+
+    The tag's subkey is independent of everything that chose the message, so it is 2^-bits for the one candidate tried.
+    """
+    return max(FLOOR, -bits * math.log10(2))
+
+
+def correlation_bound(
+    sequences: Float[Array, "bits bands"],
+    attack: Float[Array, " bands"],
+    coherence: Float[Array, ""] | float,
+    beta: Float[Array, ""] | float,
+) -> Float[Array, " bits"]:
+    """The paper's bound (3): a lower bound on |W_i| of the plain correlation, completed by what it leaves out.
+
+    For unit components with |⟨x_i, x_j⟩_D| ≤ ε, n bands, k bits of strength β, and an attack Σ_j a_j x_j inside the span of the
+    components, |W_i| ≥ βn - |Σ_j p_j a_j| - ε(n - 1)(βkn + Σ_j |a_j|). The paper omits β and the other bits. At the ε of
+    real meshes under its own kernel (about 0.9) the bound is negative and says nothing: compute it, do not lean on it.
+
+    Args:
+        sequences: ±1, `[k, n]`, mutually orthogonal.
+        attack: the attack's amplitudes a_j, `[n]`.
+        coherence: ε.
+        beta: strength β ≥ 0.
+
+    Returns:
+        The bound for each bit, `[k]`; negative values are vacuous.
+    """
+    k, n = sequences.shape
+    spread = beta * k * n + jnp.abs(attack).sum()
+    return beta * n - jnp.abs(sequences @ attack) - coherence * (n - 1) * spread

@@ -1,0 +1,36 @@
+"""Optional dependencies: what is missing names the extra that brings it."""
+
+import importlib
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+from jaxmark.errors import JaxmarkError
+
+
+def require(module: str, extra: str) -> ModuleType:
+    """Import an optional dependency.
+
+    Raises:
+        JaxmarkError: if it is not installed, naming the extra.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise JaxmarkError(f"{_missing(module, extra)} ({error})") from None
+
+
+def package_folder(module: str, extra: str) -> Path:
+    """Where an optional package lies, without importing it.
+
+    Raises:
+        JaxmarkError: if it is not installed, naming the extra.
+    """
+    spec = importlib.util.find_spec(module)
+    if spec is None or spec.origin is None:
+        raise JaxmarkError(_missing(module, extra))
+    return Path(spec.origin).parent
+
+
+def _missing(module: str, extra: str) -> str:
+    return f"{module.partition('.')[0]} is needed for this; install it with: pip install 'jaxmark[{extra}]'"

@@ -1,0 +1,123 @@
+"""Mesh files in and out: OBJ, PLY, OFF, STL and GLB."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.files import glb, obj, off, ply, stl
+from jaxmark.files.atomic import write_atomically
+from jaxmark.files.source import Source
+from jaxmark.mesh import Mesh, host_mesh, make_mesh
+
+__all__ = ["load_mesh", "save_mesh", "write_atomically"]
+
+_FORMATS: dict[str, Callable[[bytes], Source]] = {
+    ".obj": obj.parse,
+    ".ply": ply.parse,
+    ".off": off.parse,
+    ".stl": stl.parse,
+    ".glb": glb.parse,
+}
+# A displacement is kept well enough if it is this many times the spacing of the file's numbers.
+_STEPS = 10
+
+
+def load_mesh(path: str | os.PathLike) -> Mesh:
+    """Read a mesh; the suffix says how.
+
+    Vertices are the file's own, in its order: none merged, none dropped, isolated ones kept. An STL file gives three
+    for each facet. A GLB file gives the local coordinates of its one mesh; transformations of nodes are not applied.
+    Polygons are split into triangles (v0, v1, v2), (v0, v2, v3), … for computing only.
+
+    Args:
+        path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary) or GLB file.
+
+    Returns:
+        NumPy arrays: float64 vertices in the file's units, int64 faces.
+
+    Raises:
+        JaxmarkError: if the file is missing, of another kind, malformed, or holds no valid mesh (see `make_mesh`).
+    """
+    return _read(path)[1]
+
+
+def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | None = None) -> None:
+    """Write a mesh; the file appears whole or not at all.
+
+    Args:
+        mesh: what to write.
+        path: where to; the suffix says how. It may be the same file as `like`.
+        like: the file that the mesh was loaded from. Only the numbers of vertices that moved change, their normals
+            follow, and everything else stays byte for byte. Without it a new file is written: exact in OBJ and OFF,
+            in single precision in PLY, STL and GLB.
+
+    Raises:
+        JaxmarkError: if `path` has another suffix than `like`, the mesh has other faces or another number of
+            vertices, the file cannot be read or written, or its numbers are too coarse for what changed: their
+            spacing exceeds a tenth of the root mean square displacement of the vertices.
+    """
+    mesh = host_mesh(mesh)
+    parse = _parser(path)
+    if like is None:
+        from jaxmark.files.fresh import fresh  # trimesh takes long to import, and reading does without
+
+        write_atomically(path, fresh(mesh, Path(path).suffix.lower(), parse))
+        return
+    if Path(path).suffix.lower() != Path(like).suffix.lower():
+        raise JaxmarkError(
+            f"{os.fspath(path)} must have the same suffix as {os.fspath(like)}, whose bytes it takes over."
+        )
+    source, before = _read(like)
+    if len(mesh.vertices) != len(before.vertices) or not np.array_equal(mesh.faces, before.faces):
+        raise JaxmarkError(
+            f"The mesh ({len(mesh.vertices)} vertices, {len(mesh.faces)} faces) does not have the vertices and faces"
+            f" of {os.fspath(like)} ({len(before.vertices)} vertices, {len(before.faces)} faces)."
+        )
+    write_atomically(path, _patched(source, np.asarray(mesh.vertices), os.fspath(like)))
+
+
+def _parser(path: str | os.PathLike) -> Callable[[bytes], Source]:
+    """How files with this suffix are read."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in _FORMATS:
+        known = ", ".join(known[1:].upper() for known in _FORMATS)
+        raise JaxmarkError(f"{os.fspath(path)}: '{suffix}' is no suffix of a known mesh format ({known}).")
+    return _FORMATS[suffix]
+
+
+def _read(path: str | os.PathLike) -> tuple[Source, Mesh]:
+    """A file as its source and as a validated mesh."""
+    parse = _parser(path)
+    try:
+        data = Path(path).read_bytes()
+    except (OSError, ValueError) as error:  # ValueError for a NUL in the name
+        raise JaxmarkError(f"Cannot read {os.fspath(path)}: {getattr(error, 'strerror', None) or error}.") from error
+    try:
+        source = parse(data)
+        return source, make_mesh(source.positions, source.faces)
+    except JaxmarkError as error:
+        raise JaxmarkError(f"{os.fspath(path)}: {error}") from error
+
+
+def _patched(source: Source, positions: np.ndarray, name: str) -> bytes:
+    """The source's bytes with new positions, unless its numbers are too coarse for the difference."""
+    with np.errstate(all="ignore"):
+        moved = np.abs(positions - source.positions)
+        largest = moved.max()
+        if largest == 0:
+            return source.data
+        rms = float(largest * np.sqrt(np.square(moved / largest).sum(axis=1).mean()))  # scaled: squares may overflow
+    try:
+        spacing = source.coordinates.spacing(positions)
+        if not spacing <= rms / _STEPS:
+            raise JaxmarkError(
+                f"The mesh differs from the file by {rms:.3g} (root mean square over the vertices, in file units),"
+                f" but the file's numbers are {spacing:.3g} apart, more than a tenth of that;"
+                f" {source.coordinates.advice(rms / _STEPS)}."
+            )
+        return source.patch(positions)
+    except JaxmarkError as error:
+        raise JaxmarkError(f"{name}: {error}") from error

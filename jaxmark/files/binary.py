@@ -1,0 +1,80 @@
+"""Numbers in binary files: found by byte offset and written in the file's own type."""
+
+import numpy as np
+from jaxtyping import Float64, Int64, Shaped
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.files.source import Edits, Overlay, changed
+
+
+def gather(data: bytes, offsets: Int64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.ndarray, "..."]:
+    """The numbers of this type at these byte offsets, which must lie inside the data."""
+    raw = np.frombuffer(data, np.uint8)
+    rows = np.empty((*offsets.shape, dtype.itemsize), np.uint8)
+    for byte in range(dtype.itemsize):
+        rows[..., byte] = raw[offsets + byte]
+    return rows.view(dtype)[..., 0]
+
+
+def encode(values: Float64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.ndarray, "..."]:
+    """Finite numbers in this type, rounded to nearest.
+
+    Raises:
+        JaxmarkError: if one is beyond the type's range.
+    """
+    if dtype.kind == "f":
+        with np.errstate(over="ignore", under="ignore"):
+            coded = values.astype(dtype)
+        fits = np.isfinite(coded)
+    else:
+        limits = np.iinfo(dtype)
+        rounded = np.rint(values)
+        fits = (rounded >= limits.min) & (rounded <= limits.max)
+        coded = np.where(fits, rounded, 0).astype(dtype)
+    if not fits.all():
+        raise JaxmarkError(f"The number {values[~fits][0]:g} is beyond the range of the file's {dtype.name} numbers.")
+    return coded
+
+
+class BinaryNumbers:
+    """Triples of binary numbers; see `Numbers`."""
+
+    values: Float64[np.ndarray, "rows 3"]
+
+    def __init__(self, data: bytes, offsets: Int64[np.ndarray, "rows 3"], types: tuple[np.dtype, ...]) -> None:
+        """Read the numbers at these byte offsets, which must lie inside the data; one type for each column."""
+        self._offsets = offsets
+        self._types = types
+        with np.errstate(invalid="ignore"):  # signalling NaNs
+            columns = [gather(data, offsets[:, axis], types[axis]).astype(np.float64) for axis in range(3)]
+        self.values = np.stack(columns, axis=1)
+
+    def edits(self, values: Float64[np.ndarray, "rows 3"]) -> list[Edits | Overlay]:
+        """The bytes of all numbers that changed.
+
+        Raises:
+            JaxmarkError: if a number is beyond the type's range.
+        """
+        moved = changed(self.values, values)
+        overlays: list[Edits | Overlay] = []
+        for axis, dtype in enumerate(self._types):
+            rows = np.flatnonzero(moved[:, axis])
+            coded = encode(values[rows, axis], dtype)
+            overlays.append(Overlay(self._offsets[rows, axis], coded.view(np.uint8).reshape(-1, dtype.itemsize)))
+        return overlays
+
+    def spacing(self, values: Float64[np.ndarray, "rows 3"]) -> float:
+        """The distance from the largest number of each axis to the next, or 1 for integers; the largest of the three.
+
+        Raises:
+            JaxmarkError: if a number is beyond the type's range.
+        """
+        largest = np.abs(values).max(axis=0, initial=0.0)
+        coded = [encode(largest[axis : axis + 1], dtype) for axis, dtype in enumerate(self._types)]
+        return max(float(np.spacing(top[0])) if top.dtype.kind == "f" else 1.0 for top in coded)
+
+    def advice(self, step: float) -> str:
+        """Which type would do."""
+        if any(dtype.kind != "f" for dtype in self._types):
+            return "declare its coordinates as float or double instead of integers"
+        return "centre the mesh on the origin, or use a format with doubles such as PLY with double properties or OBJ"

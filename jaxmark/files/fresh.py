@@ -1,0 +1,57 @@
+"""Mesh files written from nothing, without a source to patch."""
+
+from collections.abc import Callable
+
+import numpy as np
+import trimesh
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.files.source import Source
+from jaxmark.mesh import Mesh
+
+# Part of the diagonal: marks move vertices by about ten times that or more.
+_COARSE = 1e-5
+
+
+def fresh(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> bytes:
+    """The bytes of a new file, read back as a check.
+
+    Args:
+        mesh: a validated mesh on the host.
+        suffix: the format, such as `.obj`.
+        parse: how files of this format are read.
+
+    Raises:
+        JaxmarkError: if the format cannot hold the mesh: single precision would move a coordinate by more than 1e-5
+            of the diagonal of the bounding box, as it does far from the origin.
+    """
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if suffix in (".obj", ".off"):
+        data = _text(vertices, faces, suffix)
+    else:
+        with np.errstate(all="ignore"):
+            data = bytes(trimesh.Trimesh(vertices, faces, process=False).export(file_type=suffix[1:]))  # type: ignore[arg-type]
+            if suffix == ".stl":
+                vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
+            exact, vertices = vertices, vertices.astype(np.float32).astype(np.float64)
+            error = np.abs(exact - vertices).max()
+            if not error <= _COARSE * np.linalg.norm(np.ptp(exact, axis=0)):
+                raise JaxmarkError(
+                    f"The single precision numbers of {suffix[1:].upper()} files would move vertices by {error:.3g},"
+                    " too far for this mesh; centre it on the origin, or use OBJ or OFF, which are written exactly."
+                )
+    back = parse(data)
+    if not (np.array_equal(back.positions, vertices) and np.array_equal(back.faces, faces)):
+        raise JaxmarkError(f"The mesh does not survive being written as {suffix}; use another format.")
+    return data
+
+
+def _text(vertices: np.ndarray, faces: np.ndarray, suffix: str) -> bytes:
+    """OBJ or OFF with the shortest digits that give exactly the same float64; trimesh has fixed decimals only."""
+    obj = suffix == ".obj"
+    head = [] if obj else ["OFF", f"{len(vertices)} {len(faces)} 0"]
+    point = "v {!r} {!r} {!r}" if obj else "{!r} {!r} {!r}"
+    face = "f {} {} {}" if obj else "3 {} {} {}"
+    points = [point.format(*row) for row in vertices.tolist()]
+    triangles = [face.format(*row) for row in (faces + obj).tolist()]
+    return "\n".join([*head, *points, *triangles, ""]).encode()

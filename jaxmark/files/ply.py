@@ -1,0 +1,260 @@
+"""PLY: text, binary little endian and binary big endian."""
+
+import re
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int64
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.files.binary import BinaryNumbers, gather
+from jaxmark.files.normals import Transported
+from jaxmark.files.source import Source, fan, ranges
+from jaxmark.files.text import Text, TextNumbers, unix
+
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+class _Property(NamedTuple):
+    type: np.dtype
+    length: np.dtype | None  # the type of a list's length; None for a scalar
+
+
+@dataclass
+class _Element:
+    name: str
+    rows: int
+    properties: dict[str, _Property] = field(default_factory=dict)
+
+
+class _Column(NamedTuple):
+    """Where the items of a property stand in each row, in the body's units, and how many there are."""
+
+    starts: Int64[np.ndarray, " rows"]
+    sizes: Int64[np.ndarray, " rows"]
+
+
+class _Tokens:
+    """A text body; its units are tokens, from 0 to `end`."""
+
+    def __init__(self, data: bytes, start: int) -> None:
+        self._text = Text(data, b" " * start + unix(data)[start:])
+        self.end = len(self._text)
+
+    def width(self, dtype: np.dtype) -> int:
+        return 1
+
+    def integers(self, at: Int64[np.ndarray, " items"], dtype: np.dtype) -> Int64[np.ndarray, " items"]:
+        return self._text.ints(self._text.starts[at], self._text.ends[at])
+
+    def integer(self, at: int, dtype: np.dtype) -> int:
+        token = self._text.token(at)
+        return int(token) if token.isdigit() and len(token) < 18 else int(self.integers(np.array([at]), dtype)[0])
+
+    def triples(self, at: Int64[np.ndarray, "rows 3"], types: tuple[np.dtype, ...]) -> TextNumbers:
+        return TextNumbers(self._text, at, whole=any(dtype.kind != "f" for dtype in types))
+
+
+class _Bytes:
+    """A binary body, read in the same way; its units are the bytes of the file."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self.end = len(data)
+
+    def width(self, dtype: np.dtype) -> int:
+        return dtype.itemsize
+
+    def integers(self, at: Int64[np.ndarray, " items"], dtype: np.dtype) -> Int64[np.ndarray, " items"]:
+        return gather(self._data, at, dtype).astype(np.int64)
+
+    def integer(self, at: int, dtype: np.dtype) -> int:
+        order = "big" if dtype.str[0] == ">" else "little"
+        return int.from_bytes(self._data[at : at + dtype.itemsize], order, signed=dtype.kind == "i")
+
+    def triples(self, at: Int64[np.ndarray, "rows 3"], types: tuple[np.dtype, ...]) -> BinaryNumbers:
+        return BinaryNumbers(self._data, at, types)
+
+
+_Body = _Tokens | _Bytes
+
+
+def parse(data: bytes) -> Source:
+    """Read the positions, the faces and, if they are floats, the normals `nx ny nz`, in any order of the elements.
+
+    Raises:
+        JaxmarkError: if the header or the body cannot be read, the file ends too early, or the faces are strips.
+    """
+    order, elements, start = _header(data)
+    names = [element.name for element in elements]
+    for name in ("vertex", "face"):
+        if names.count(name) > 1:
+            raise JaxmarkError(f"The header declares the element {name} more than once.")
+    if "tristrips" in names:
+        raise JaxmarkError("Triangle strips (the element tristrips) are not supported; save the file with faces.")
+    body: _Body = _Tokens(data, start) if order == "=" else _Bytes(data)
+    at = 0 if order == "=" else start
+    columns: dict[str, dict[str, _Column]] = {}
+    for element in elements:
+        columns[element.name], at = _locate(body, element, at)
+
+    declared = {element.name: element.properties for element in elements}
+    coordinates = _triples(body, declared, columns, ("x", "y", "z"))
+    if coordinates is None:
+        raise JaxmarkError("The header declares no element vertex with the numbers x, y and z.")
+    faces = np.zeros((0, 3), np.int64)
+    name = next((name for name in ("vertex_indices", "vertex_index") if name in declared.get("face", {})), None)
+    if name is not None:
+        faces = _faces(body, declared["face"][name], columns["face"][name])
+    elif columns.get("face"):
+        raise JaxmarkError("The element face has no list vertex_indices or vertex_index.")
+    normals = _triples(body, declared, columns, ("nx", "ny", "nz"))
+    if normals is None or any(declared["vertex"][axis].type.kind != "f" for axis in ("nx", "ny", "nz")):
+        return Source(data, coordinates, faces)
+    outside = (faces < 0) | (faces >= len(coordinates.values))  # refused by make_mesh, which says it better
+    return Source(data, coordinates, faces, Transported(normals, np.where(outside, -1, faces)))
+
+
+def _header(data: bytes) -> tuple[str, list[_Element], int]:
+    """The byte order, the elements, and the offset of the body."""
+    begin = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
+    if begin is None:
+        raise JaxmarkError("line 1: a PLY file begins with a line that says ply.")
+    end = re.compile(rb"(?<=[\r\n])end_header[ \t]*\r??" + begin[1]).search(data)
+    if end is None:
+        raise JaxmarkError(f"byte {len(data)}: the file ends inside the header, before end_header.")
+    order = None
+    elements: list[_Element] = []
+    for number, line in enumerate(data[begin.end() : end.start()].decode("latin-1").split(begin[1].decode()), 2):
+        try:
+            match line.split():
+                case [] | ["comment" | "obj_info", *_]:
+                    pass
+                case ["format", name, *_]:
+                    order = _ORDERS[name]
+                case ["element", name, rows]:
+                    elements.append(_Element(name, int(rows)))
+                    if not 0 <= int(rows) < 2**62:
+                        raise ValueError
+                case ["property", "list", count, type_, name] if name not in elements[-1].properties:
+                    elements[-1].properties[name] = _Property(_type(type_, order), _type(count, order))
+                    if _type(count, order).kind == "f":
+                        raise ValueError
+                case ["property", type_, name] if name not in elements[-1].properties:
+                    elements[-1].properties[name] = _Property(_type(type_, order), None)
+                case _:
+                    raise ValueError
+        except (KeyError, IndexError, ValueError):
+            raise JaxmarkError(f"line {number}: {line[:60]!a} does not belong in a PLY header here.") from None
+    if order is None:
+        raise JaxmarkError("The header declares no format.")
+    return order, elements, end.end()
+
+
+def _type(name: str, order: str | None) -> np.dtype:
+    if order is None:  # the format comes first
+        raise ValueError
+    return np.dtype(order + _TYPES[name])
+
+
+def _locate(body: _Body, element: _Element, at: int) -> tuple[dict[str, _Column], int]:
+    """Where every property of an element stands, and where the next element begins."""
+    properties = element.properties
+    empty = np.zeros(0, np.int64)
+    if element.rows == 0 or not properties:
+        return {name: _Column(empty, empty) for name in properties}, at
+    # Nearly always all rows look like the first one.
+    offsets, sizes, counts = [], [], []
+    end = at
+    for name, kind in properties.items():
+        size = 1
+        if kind.length is not None:
+            size = _size(body, element, name, 0, end)
+            counts.append((end - at, kind.length, size))
+            end += body.width(kind.length)
+        offsets.append(end - at)
+        sizes.append(size)
+        end += size * body.width(kind.type)
+    width = end - at
+    if at + element.rows * width <= body.end:
+        rows = at + width * np.arange(element.rows)
+        if all((body.integers(rows + offset, kind) == size).all() for offset, kind, size in counts):
+            columns = [
+                _Column(rows + offset, np.full(len(rows), size)) for offset, size in zip(offsets, sizes, strict=True)
+            ]
+            return dict(zip(properties, columns, strict=True)), at + element.rows * width
+    elif not counts:
+        raise _ended(element, max(0, body.end - at) // width)
+    return _locate_one_by_one(body, element, at)
+
+
+def _locate_one_by_one(body: _Body, element: _Element, at: int) -> tuple[dict[str, _Column], int]:
+    """The same where rows differ."""
+    starts: dict[str, list[int]] = {name: [] for name in element.properties}
+    sizes: dict[str, list[int]] = {name: [] for name in element.properties}
+    for row in range(element.rows):
+        for name, kind in element.properties.items():
+            size = 1
+            if kind.length is not None:
+                size = _size(body, element, name, row, at)
+                at += body.width(kind.length)
+            starts[name].append(at)
+            sizes[name].append(size)
+            at += size * body.width(kind.type)
+        if at > body.end:
+            raise _ended(element, row)
+    return {
+        name: _Column(np.array(starts[name], np.int64), np.array(sizes[name], np.int64)) for name in element.properties
+    }, at
+
+
+def _size(body: _Body, element: _Element, name: str, row: int, at: int) -> int:
+    """The length of a list."""
+    count = element.properties[name].length
+    if count is None or at + body.width(count) > body.end:
+        raise _ended(element, row)
+    size = body.integer(at, count)
+    if size < 0:
+        raise JaxmarkError(f"Row {row} (zero-based) of the element {element.name}: the list {name} has length {size}.")
+    return size
+
+
+def _ended(element: _Element, row: int) -> JaxmarkError:
+    return JaxmarkError(
+        f"The file ends in row {row} (zero-based) of the element {element.name}, which has {element.rows} rows."
+    )
+
+
+def _triples(
+    body: _Body,
+    declared: dict[str, dict[str, _Property]],
+    columns: dict[str, dict[str, _Column]],
+    names: tuple[str, str, str],
+) -> TextNumbers | BinaryNumbers | None:
+    """Three scalar properties of the vertices, or None if they are not declared."""
+    kinds = [declared.get("vertex", {}).get(name) for name in names]
+    types = tuple(kind.type for kind in kinds if kind is not None and kind.length is None)
+    if len(types) < 3:
+        return None
+    return body.triples(np.stack([columns["vertex"][name].starts for name in names], axis=1), types)
+
+
+def _faces(body: _Body, kind: _Property, column: _Column) -> Int64[np.ndarray, "faces 3"]:
+    """The fanned triangles of a list of indices."""
+    if kind.length is None or kind.type.kind == "f":
+        raise JaxmarkError("The indices of the element face must be a list of integers.")
+    short = np.flatnonzero(column.sizes < 3)
+    if len(short):
+        raise JaxmarkError(
+            f"Row {short[0]} (zero-based) of the element face has {column.sizes[short[0]]} corners; it needs at least"
+            " three."
+        )
+    item = ranges(np.zeros_like(column.sizes), column.sizes)
+    index = body.integers(np.repeat(column.starts, column.sizes) + item * body.width(kind.type), kind.type)
+    return index[fan(column.sizes)]

@@ -1,0 +1,64 @@
+"""STL, binary and text: a triangle soup with three vertices of its own for every facet."""
+
+import re
+import struct
+
+import numpy as np
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.files.binary import BinaryNumbers
+from jaxmark.files.normals import PerFace
+from jaxmark.files.source import Source
+from jaxmark.files.text import Text, TextNumbers, blank, unix
+
+_FLOAT = (np.dtype("<f4"),) * 3
+_VERTEX = (b"vertex", None, None, None)
+_FACET = (b"facet", b"normal", None, None, None, b"outer", b"loop", *_VERTEX * 3, b"endloop", b"endfacet")
+
+
+def parse(data: bytes) -> Source:
+    """Read a binary STL, known by its size, or else a text one.
+
+    Raises:
+        JaxmarkError: if the size fits no binary file and the text cannot be read; it names the line.
+    """
+    # Binary files may begin with "solid" as well, but a text of just this size is no accident to plan for.
+    facets = struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 0
+    if len(data) == 84 + 50 * facets and len(data) >= 84:
+        return _binary(data, facets)
+    if re.match(rb"\s*solid\b", data, re.IGNORECASE):
+        return _text(data)
+    if len(data) < 84:
+        raise JaxmarkError(f"byte {len(data)}: the file ends inside the header of a binary STL, which has 84 bytes.")
+    raise JaxmarkError(
+        f"byte 80: a binary STL with {facets} facets has {84 + 50 * facets} bytes, but the file has {len(data)}."
+    )
+
+
+def _binary(data: bytes, facets: int) -> Source:
+    start = 84 + 50 * np.arange(facets)[:, None]
+    vertices = (start + np.arange(12, 48, 4)).reshape(-1, 3)
+    normals = PerFace(BinaryNumbers(data, start + np.arange(0, 12, 4), _FLOAT))
+    return Source(data, BinaryNumbers(data, vertices, _FLOAT), np.arange(3 * facets).reshape(-1, 3), normals)
+
+
+def _text(data: bytes) -> Source:
+    # Names may hold any words, so the lines that begin and end a solid are not read at all.
+    text = Text(data, blank(rb"(?i)(?<!\S)(?:end)?solid(?!\S)[^\n\r]*", unix(data)))
+    facets = len(text) // len(_FACET)
+    tokens = np.arange(facets * len(_FACET)).reshape(facets, len(_FACET))
+    for column, word in enumerate(_FACET):
+        if word is None:
+            continue
+        starts, ends = text.starts[tokens[:, column]], text.ends[tokens[:, column]]
+        wrong = ends - starts != len(word)
+        for index, char in enumerate(word):
+            wrong |= text.buffer[np.minimum(starts + index, len(text.buffer) - 1)] | 0x20 != char
+        if wrong.any():
+            bad = int(np.argmax(wrong))
+            raise text.error(starts[bad], f"'{word.decode()}' is expected in facet {bad} (zero-based)")
+    if facets * len(_FACET) != len(text):
+        raise text.error(text.starts[-1], f"the file ends inside facet {facets} (zero-based)")
+    vertices = tokens[:, [8, 9, 10, 12, 13, 14, 16, 17, 18]].reshape(-1, 3)
+    normals = PerFace(TextNumbers(text, tokens[:, 2:5]))
+    return Source(data, TextNumbers(text, vertices), np.arange(3 * facets).reshape(-1, 3), normals)

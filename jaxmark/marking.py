@@ -1,0 +1,211 @@
+"""Marking meshes: messages and keys in, meshes and evidence out."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float64
+
+from jaxmark import distortion
+from jaxmark.carriers import Carrier
+from jaxmark.detectors import Detector, decorrelate
+from jaxmark.errors import JaxmarkError
+from jaxmark.evidence import log10_p_claimed, log10_p_tag
+from jaxmark.keys import Key, commitment
+from jaxmark.laplacian import centre
+from jaxmark.mesh import Mesh
+from jaxmark.message import TAG_BITS, code_length, decode, encode
+from jaxmark.original import Original, displaced, prepare, residual
+from jaxmark.record import Record
+from jaxmark.schemes import Scheme, get_scheme, parameters_of
+
+DEFAULT_BITS = 64
+
+
+class EmbedInfo(NamedTuple):
+    """What was done to a mesh."""
+
+    rms: float  # displacement of the welded vertices, unweighted, over the bounding-box diagonal
+    max: float  # the largest such displacement
+    beta: float  # strength: the factor on the carrier's unit displacement, in diagonals
+    record: Record
+
+
+class Detection(NamedTuple):
+    """What was found in a suspect."""
+
+    message: bytes | None  # the message read, None unless its keyed tag fits
+    log10_p: float  # log10 of a bound on the false-positive probability, in [-77, 0]
+    scores: Float64[np.ndarray, " bits"]  # soft values of the payload's bits, ±1 on average
+    coverage: float  # share of the original's points that the suspect gave evidence for
+
+    def detected(self, alpha: float = 1e-6) -> bool:
+        """Whether the false-positive probability is at most `alpha`."""
+        return self.log10_p <= math.log10(alpha)
+
+
+def embed(
+    mesh: Mesh, message: bytes, key: bytes, *, budget: float = 8e-4, scheme: str | Scheme = "host"
+) -> tuple[Mesh, EmbedInfo]:
+    """Hide a message in the vertex positions of a mesh.
+
+    The mark is read back before the mesh is returned: a mesh that does not carry it is refused, not marked in vain.
+
+    Args:
+        mesh: the original. Vertices at exactly the same position move together; a vertex that no face uses stays.
+        message: any bytes, at least one.
+        key: 32 bytes, from `new_key`.
+        budget: RMS displacement of the welded vertices, unweighted, relative to the diagonal of the axis-aligned
+            bounding box of the vertices that faces use: 0.0008 is 0.08 % of it. It is met exactly.
+        scheme: a name (`"host"`, `"eigen"`) or an object of `jaxmark.schemes`.
+
+    Returns:
+        The marked mesh (float64 vertices, same faces) and what was done to it.
+
+    Raises:
+        JaxmarkError: if the mesh, key, budget or payload is unusable, or the mesh cannot carry so many bits.
+    """
+    if not (isinstance(budget, int | float) and 0 < budget < 1):
+        raise JaxmarkError(f"The budget is relative to the bounding-box diagonal and must be in (0, 1), got {budget}.")
+    key = Key(bytes(key))
+    scheme = get_scheme(scheme)
+    bits = 8 * len(message)
+    original = prepare(mesh)
+    codeword = encode(message, key, original.geometry)
+    carrier = scheme.carrier(original, key, len(codeword))
+    unit = np.asarray(carrier.displacement(jnp.asarray(codeword, original.signal.dtype)), np.float64)
+    size = distortion.rms(unit)
+    if not (np.isfinite(size) and size > 0):
+        raise JaxmarkError(
+            f"The {len(original.signal)} points of this mesh leave the scheme {scheme.name!r} nothing to write in."
+        )
+    beta = float(budget / size)
+    marked = displaced(original, beta * unit)
+    written = residual(original, marked)
+    found = _read(original, carrier, decorrelate, key, written, None)
+    if found.message != message:
+        wrong = int(np.sum((found.scores > 0) != (codeword[:bits] > 0)))
+        raise JaxmarkError(
+            f"This mesh ({len(original.signal)} points) cannot carry {bits} bits with the scheme {scheme.name!r}: even"
+            f" unattacked they do not read back ({wrong} payload bits wrong). Use a shorter message or a finer mesh."
+        )
+    record = Record(
+        scheme=scheme.name,
+        bits=bits,
+        beta=beta,
+        original=original.geometry.hex(),
+        key=commitment(key),
+        parameters=parameters_of(scheme),
+    )
+    return marked, EmbedInfo(float(distortion.rms(written)), float(distortion.maximum(written)), beta, record)
+
+
+def detect(
+    suspect: Mesh,
+    *,
+    original: Mesh,
+    key: bytes,
+    bits: int | None = None,
+    message: bytes | None = None,
+    record: Record | None = None,
+    scheme: str | Scheme = "host",
+    detector: Detector = decorrelate,
+) -> Detection:
+    """Read a mark from a suspect, and say what the reading proves.
+
+    Without `message`, the message read counts only if its keyed 32-bit tag fits: log10_p is then log10 2⁻³² = -9.6,
+    else 0. With `message`, log10_p is Hoeffding's bound for that message (see `evidence.log10_p_claimed`), which can
+    prove a mark whose message no longer reads. Both hold for any suspect independent of the key, provided that key,
+    original and claimed message were fixed before the suspect was seen.
+
+    Args:
+        suspect: a mesh with the original's connectivity.
+        original: the unmarked mesh.
+        key: 32 bytes.
+        bits: payload, a multiple of 8; by default the record's, else the claimed message's, else 64.
+        message: the message that is claimed to be there.
+        record: of the mark; fixes scheme and payload, and binds to original and key.
+        scheme: as embedded, where there is no record.
+        detector: see `jaxmark.detectors`.
+
+    Returns:
+        What was found; a suspect identical to the original gives log10_p = 0.
+
+    Raises:
+        JaxmarkError: if the suspect has another connectivity, the record is for another original or key, or the
+            payloads of record, bits and message disagree.
+    """
+    if bits is None and record is None and message is not None:
+        bits = 8 * len(message)
+    read = reader(original=original, key=key, bits=bits, record=record, scheme=scheme, detector=detector)
+    return read(suspect, message)
+
+
+def reader(
+    *,
+    original: Mesh,
+    key: bytes,
+    bits: int | None = None,
+    record: Record | None = None,
+    scheme: str | Scheme = "host",
+    detector: Detector = decorrelate,
+) -> Callable[..., Detection]:
+    """`detect` for many suspects of one original: prepares the carrier once.
+
+    Args:
+        original: the unmarked mesh.
+        key: 32 bytes.
+        bits: payload, a multiple of 8; by default the record's, else 64.
+        record: as for `detect`.
+        scheme: as for `detect`.
+        detector: as for `detect`.
+
+    Returns:
+        A function `read(suspect, message=None) -> Detection`.
+
+    Raises:
+        JaxmarkError: as `detect` does, here or when a suspect is read.
+    """
+    key = Key(bytes(key))
+    ready = prepare(original)
+    if record is not None:
+        if record.original != ready.geometry.hex():
+            raise JaxmarkError("The original is not the mesh that the record was made for (its geometry differs).")
+        if record.key != commitment(key):
+            raise JaxmarkError("The key is not the one that the record commits to.")
+        if bits not in (None, record.bits):
+            raise JaxmarkError(f"The payload is {record.bits} bits by the record, not {bits}.")
+        scheme, bits = get_scheme(record.scheme, record.parameters), record.bits
+    payload = DEFAULT_BITS if bits is None else bits
+    carrier = get_scheme(scheme).carrier(ready, key, code_length(payload))
+
+    def read(suspect: Mesh, message: bytes | None = None) -> Detection:
+        if message is not None and 8 * len(message) != payload:
+            raise JaxmarkError(f"The claimed message has {8 * len(message)} bits, but the payload is {payload} bits.")
+        return _read(ready, carrier, detector, key, residual(ready, suspect), message)
+
+    return read
+
+
+def _read(
+    original: Original,
+    carrier: Carrier,
+    detector: Detector,
+    key: bytes,
+    difference: Float64[np.ndarray, "points 3"],
+    message: bytes | None,
+) -> Detection:
+    """Detection on a residual in diagonals."""
+    # Centred in float64, so that a suspect that was moved far away leaves no rounding errors behind.
+    traced = jnp.asarray(centre(original.operator, difference), original.signal.dtype)
+    soft = np.asarray(detector(carrier, traced, 1.0), np.float64)
+    read = decode(soft, key, original.geometry)
+    if message is not None:
+        claimed = jnp.asarray(encode(message, key, original.geometry), original.signal.dtype)
+        log10_p = log10_p_claimed(*carrier.claim(traced, claimed))
+    else:
+        log10_p = 0.0 if read is None else log10_p_tag(TAG_BITS)
+    size = np.sqrt(np.mean(soft**2))
+    return Detection(read, log10_p, soft[:-TAG_BITS] / (size or 1.0), 1.0)

@@ -1,0 +1,152 @@
+"""Triangle meshes as arrays, checked once on the host.
+
+A `Mesh` is plain data: it goes through `jit`, `vmap` and `grad`. Everything in this module except the type itself
+runs on the host with NumPy, keeps float64, and says what is wrong before anything is traced.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float, Float64, Int, Int64
+from numpy.typing import ArrayLike
+
+from jaxmark.errors import JaxmarkError
+
+
+class Mesh(NamedTuple):
+    """A triangle mesh.
+
+    Build one with `make_mesh` or `load_mesh`, which validate; the type itself checks nothing, because transformed
+    code rebuilds it with tracers.
+    """
+
+    vertices: Float[Array | np.ndarray, "vertices 3"]  # in the file's own units and order
+    faces: Int[Array | np.ndarray, "faces 3"]  # zero-based indices into `vertices`
+
+
+class Weld(NamedTuple):
+    """Which vertices are copies of one point (UV seams, triangle soup) and so must move together."""
+
+    index: Int64[np.ndarray, " vertices"]  # vertex → point, numbered by first occurrence
+    first: Int64[np.ndarray, " points"]  # point → its first vertex
+
+
+def make_mesh(vertices: ArrayLike, faces: ArrayLike) -> Mesh:
+    """Validate arrays and make a `Mesh` of them, on the host.
+
+    Args:
+        vertices: `[N, 3]` finite numbers; kept in float64.
+        faces: `[F, 3]` integers, zero-based, each in `[0, N)`. Degenerate faces, duplicate vertices, isolated
+            vertices, boundaries and non-manifold edges are all accepted.
+
+    Returns:
+        A mesh of NumPy arrays: float64 vertices, int64 faces.
+
+    Raises:
+        JaxmarkError: if a shape is wrong, there is no vertex or no face, a coordinate is not finite, an index is
+            not an integer or out of range.
+    """
+    points = np.asarray(vertices)
+    triangles = np.asarray(faces)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise JaxmarkError(f"vertices must be an array [N, 3], got shape {points.shape}.")
+    if triangles.size == 0:
+        raise JaxmarkError("The mesh has no faces; a point cloud has no graph to filter on.")
+    if triangles.ndim != 2 or triangles.shape[1] != 3:
+        raise JaxmarkError(f"faces must be an array [F, 3], got shape {triangles.shape}; split polygons first.")
+    if not np.issubdtype(triangles.dtype, np.integer):
+        raise JaxmarkError(f"faces must be integers, got {triangles.dtype}.")
+    if np.iscomplexobj(points) or not np.issubdtype(points.dtype, np.number):
+        raise JaxmarkError(f"vertices must be real numbers, got {points.dtype}.")
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        bad = int(np.argmin(finite))
+        raise JaxmarkError(
+            f"Vertex {bad} (zero-based) has a coordinate that is not a finite number: {points[bad].tolist()};"
+            " mend or remove it."
+        )
+    outside = ((triangles < 0) | (triangles >= len(points))).any(axis=1)
+    if outside.any():
+        bad = int(np.argmax(outside))
+        raise JaxmarkError(
+            f"Face {bad} (zero-based) refers to vertices {triangles[bad].tolist()}, but the mesh has"
+            f" {len(points)} vertices, numbered from 0."
+        )
+    return Mesh(points, np.ascontiguousarray(triangles, dtype=np.int64))
+
+
+def host_mesh(mesh: Mesh) -> Mesh:
+    """The mesh as validated NumPy arrays, whatever arrays it held (see `make_mesh` for what is raised)."""
+    return make_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def weld(vertices: Float64[np.ndarray, "vertices 3"]) -> Weld:
+    """Find vertices at exactly the same position (-0.0 equals 0.0); points are numbered by first occurrence.
+
+    Args:
+        vertices: `[N, 3]` finite positions.
+
+    Returns:
+        The map in both directions; `vertices[weld.first]` are the distinct points.
+    """
+    canonical = vertices + 0.0  # turns -0.0 into 0.0
+    _, first, inverse = np.unique(canonical, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return Weld(rank[inverse.reshape(-1)].astype(np.int64), first[order].astype(np.int64))
+
+
+def welded_mesh(mesh: Mesh, welded: Weld) -> Mesh:
+    """The mesh of the distinct points: same faces, referring to points instead of vertices."""
+    return Mesh(np.asarray(mesh.vertices)[welded.first], welded.index[np.asarray(mesh.faces)])
+
+
+def edges(faces: Int[np.ndarray, "faces 3"]) -> Int64[np.ndarray, "edges 2"]:
+    """The undirected edges of the faces, each once, as `[E, 2]` with the smaller index first, sorted.
+
+    An edge used by one face, two, or more counts once; sides of degenerate faces that join a vertex to itself do
+    not count.
+    """
+    return _count_sides(faces)[0]
+
+
+def diagonal(mesh: Mesh) -> float:
+    """Length of the diagonal of the axis-aligned box of the vertices that faces use, in the mesh's units.
+
+    All distortions are given relative to it.
+
+    Raises:
+        JaxmarkError: if it is zero: all those vertices coincide.
+    """
+    used = np.asarray(mesh.vertices, np.float64)[np.unique(np.asarray(mesh.faces))]
+    length = float(np.linalg.norm(np.ptp(used, axis=0)))
+    if not 0.0 < length < np.inf:
+        raise JaxmarkError(f"The bounding box of the mesh has a diagonal of {length:g}; it must be positive and finite.")
+    return length
+
+
+def boundary_vertices(faces: Int[np.ndarray, "faces 3"]) -> Int64[np.ndarray, " boundary"]:
+    """Vertices on an edge that only one face uses, ascending."""
+    pairs, count = _count_sides(faces)
+    return np.unique(pairs[count == 1])
+
+
+def same_connectivity(first: Mesh, second: Mesh) -> bool:
+    """Whether two meshes have equally many vertices and the very same faces, index by index."""
+    return len(first.vertices) == len(second.vertices) and np.array_equal(
+        np.asarray(first.faces), np.asarray(second.faces)
+    )
+
+
+def _count_sides(
+    faces: Int[np.ndarray, "faces 3"],
+) -> tuple[Int64[np.ndarray, "edges 2"], Int64[np.ndarray, " edges"]]:
+    """The undirected edges, and how many faces have each as a side."""
+    pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64), axis=1)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    # One integer per pair sorts many times faster than rows do.
+    base = np.int64(pairs.max(initial=0) + 1)
+    codes, count = np.unique(pairs[:, 0] * base + pairs[:, 1], return_counts=True)
+    return np.stack([codes // base, codes % base], axis=1), count

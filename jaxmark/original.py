@@ -1,0 +1,73 @@
+"""An original made ready for filtering, and suspects seen from it. Host side: float64 in, the computing dtype out."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float64
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.keys import geometry_hash
+from jaxmark.laplacian import Laplacian, centre, make_laplacian
+from jaxmark.mesh import Mesh, Weld, diagonal, host_mesh, same_connectivity, weld, welded_mesh
+
+
+class Original(NamedTuple):
+    """What embedding and detection need of an original; lengths are in units of its bounding-box diagonal."""
+
+    mesh: Mesh  # as in its file
+    weld: Weld
+    diagonal: float  # in the file's units
+    geometry: bytes  # hash of the canonical geometry
+    operator: Laplacian  # on the welded points
+    signal: Float[Array, "points 3"]  # welded points, centred per component, in diagonals
+
+
+def prepare(mesh: Mesh) -> Original:
+    """Weld, hash, centre and scale a mesh, and build its operator.
+
+    Computes in float32, or in float64 where jax has it enabled.
+
+    Raises:
+        JaxmarkError: see `make_mesh` and `diagonal`.
+    """
+    mesh = host_mesh(mesh)
+    welded = weld(mesh.vertices)
+    points = welded_mesh(mesh, welded)
+    length = diagonal(mesh)
+    operator = make_laplacian(points)
+    dtype = jax.dtypes.canonicalize_dtype(np.float64)
+    signal = jnp.asarray(centre(operator, points.vertices / length), dtype)
+    traced = Laplacian(
+        jnp.asarray(operator.edges), jnp.asarray(operator.weights, dtype), jnp.asarray(operator.degree, dtype)
+    )
+    return Original(mesh, welded, length, geometry_hash(mesh), traced, signal)
+
+
+def displaced(original: Original, displacement: Float64[np.ndarray, "points 3"]) -> Mesh:
+    """The original with its welded points moved (in diagonals); copies of a point move together."""
+    moved = original.mesh.vertices + original.diagonal * displacement[original.weld.index]
+    return Mesh(moved, original.mesh.faces)
+
+
+def residual(original: Original, suspect: Mesh) -> Float64[np.ndarray, "points 3"]:
+    """How far a suspect's points lie from the original's, in diagonals; copies of a point are averaged.
+
+    The original's weld decides, not the suspect's own positions: quantisation makes vertices coincide.
+
+    Raises:
+        JaxmarkError: if the suspect does not share the original's connectivity, index by index.
+    """
+    suspect = host_mesh(suspect)
+    if not same_connectivity(suspect, original.mesh):
+        raise JaxmarkError(
+            f"The suspect ({len(suspect.vertices)} vertices, {len(suspect.faces)} triangles) does not share the"
+            f" connectivity of the original ({len(original.mesh.vertices)} vertices, {len(original.mesh.faces)}"
+            " triangles), in the same vertex and face order; this version compares vertex by vertex."
+        )
+    difference = (suspect.vertices - original.mesh.vertices) / original.diagonal
+    count = len(original.weld.first)
+    copies = np.bincount(original.weld.index, minlength=count)
+    sums = [np.bincount(original.weld.index, column, count) for column in difference.T]
+    return np.stack(sums, axis=1) / copies[:, None]

@@ -1,0 +1,71 @@
+"""Mutually orthogonal sequences of signs: how several bits share the same bands (Sohn et al., section 2.2).
+
+The paper asks for k orthogonal sequences of any length n. There are none at odd length beyond one, and three or more need
+a length that is a multiple of 4: they are rows of a Hadamard matrix.
+"""
+
+import numpy as np
+from jaxtyping import Int8
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.keys import permutation, signs
+
+
+def orthogonal_sequences(key: bytes, geometry: bytes, count: int, length: int) -> Int8[np.ndarray, "count length"]:
+    """Keyed ±1 sequences, mutually orthogonal: rows of a Hadamard matrix, chosen, permuted and signed by the key.
+
+    The signs of the columns (label `signs`) are independent of which rows and columns were chosen (labels `rows`,
+    `columns`): a false-positive probability may rest on them alone.
+
+    Args:
+        key: 32 bytes.
+        geometry: `geometry_hash` of the original.
+        count: how many, at most `length`.
+        length: 1, 2 or a multiple of 4 that `hadamard` can construct.
+
+    Returns:
+        `[count, length]` with values -1 and 1.
+
+    Raises:
+        JaxmarkError: if there are not so many of that length, or `hadamard` refuses the length.
+    """
+    matrix = hadamard(length)
+    if not 0 < count <= length:
+        raise JaxmarkError(f"There are {length} mutually orthogonal sequences of length {length}, not {count}.")
+    rows = permutation(key, geometry, "rows", length)[:count]
+    columns = permutation(key, geometry, "columns", length)
+    return matrix[rows][:, columns] * signs(key, geometry, "signs", length)
+
+
+def hadamard(order: int) -> Int8[np.ndarray, "order order"]:
+    """A matrix of ±1 with orthogonal rows, by Sylvester's doubling of Paley's first construction.
+
+    Raises:
+        JaxmarkError: if no such matrix exists (order 3, or above 2 no multiple of 4), or these constructions miss it.
+    """
+    if order < 1 or (order > 2 and order % 4):
+        raise JaxmarkError(f"No {order} mutually orthogonal ±1 sequences of length {order} exist; use a multiple of 4.")
+    if order == 1:
+        return np.ones((1, 1), np.int8)
+    if _is_prime(order - 1) and (order - 1) % 4 == 3:
+        return _paley(order - 1)
+    half = None if order % 8 and order > 4 else hadamard(order // 2)
+    if half is None:
+        raise JaxmarkError(f"No construction here for {order} orthogonal sequences; use a power of two, or 12, 20, 24 ….")
+    return np.block([[half, half], [half, -half]]).astype(np.int8)
+
+
+def _paley(q: int) -> Int8[np.ndarray, "order order"]:
+    """Order q + 1 for a prime q ≡ 3 (mod 4), from the quadratic residues modulo q."""
+    residue = np.full(q, -1, np.int8)
+    residue[np.arange(1, q, dtype=np.int64) ** 2 % q] = 1
+    residue[0] = 0
+    skew = np.zeros((q + 1, q + 1), np.int8)
+    skew[0, 1:] = 1
+    skew[1:, 0] = -1
+    skew[1:, 1:] = residue[np.subtract.outer(np.arange(q), np.arange(q)) % q]
+    return skew + np.eye(q + 1, dtype=np.int8)
+
+
+def _is_prime(n: int) -> bool:
+    return n > 1 and all(n % d for d in range(2, int(n**0.5) + 1))

@@ -1,0 +1,122 @@
+"""The spectrum itself: eigenvectors, and a signal's spectral measure. Host-side reference, in float64.
+
+Filters never need it; the eigenvector scheme, the tests and the reports do.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from scipy import linalg, sparse
+from scipy.sparse import csgraph
+from scipy.sparse import linalg as sparse_linalg
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.laplacian import Laplacian, sparse_matrices
+
+# Below this many vertices a dense decomposition is faster than it is to iterate, and finds every eigenvalue.
+_DENSE_LIMIT = 2500
+
+
+class Eigenpairs(NamedTuple):
+    """The lowest eigenpairs of Δ on the vertices that have edges, ascending."""
+
+    values: Float64[np.ndarray, " pairs"]  # in [0, 2]
+    vectors: Float64[np.ndarray, "vertices pairs"]  # D-orthonormal; 0 at isolated vertices
+    space: Int64[np.ndarray, " pairs"]  # index of the first pair with the same eigenvalue: one eigenspace
+
+
+class Quadrature(NamedTuple):
+    """Nodes and weights with ⟨x, f(Δ)x⟩_D = Σ_i weight_i f(node_i) for polynomials f of degree < 2 · nodes."""
+
+    nodes: Float64[np.ndarray, " nodes"]
+    weights: Float64[np.ndarray, " nodes"]
+
+
+def eigenpairs(operator: Laplacian, count: int | None = None, *, tolerance: float = 1e-7) -> Eigenpairs:
+    """Eigenpairs of Δ above its null space: D-orthonormal, so that x = Σ_i ⟨x, φ_i⟩_D φ_i for centred x.
+
+    Dense (`eigh`) up to 2,500 vertices, by shift-and-invert Lanczos (`eigsh`) from a fixed start beyond.
+
+    Args:
+        operator: the Laplacian, of N vertices.
+        count: how many of the lowest; fewer come back where there are not as many. None for all.
+        tolerance: eigenvalues closer than this are one eigenspace, in which no basis is preferred: only its projection
+            means anything. (An eigenspace cut by `count` keeps the part that was computed.)
+
+    Returns:
+        The pairs with eigenvalue above the null space (one null vector per connected component is left out).
+
+    Raises:
+        JaxmarkError: if `count` is below 1, or so many pairs of a large mesh are asked for that iterating is hopeless.
+    """
+    if count is not None and count < 1:
+        raise JaxmarkError(f"eigenpairs(count=...) must be at least 1, got {count}.")
+    stiffness, mass = sparse_matrices(operator)
+    degree = mass.diagonal()
+    linked = np.flatnonzero(degree > 0)
+    root = np.sqrt(degree[linked])
+    scaled = sparse.csr_array(sparse.diags_array(1 / root) @ stiffness[linked][:, linked] @ sparse.diags_array(1 / root))
+    size = len(linked)
+    null = csgraph.connected_components(scaled, directed=False)[0]
+    wanted = size - null if count is None else min(count, size - null)
+    if size <= _DENSE_LIMIT:
+        values, vectors = linalg.eigh(scaled.toarray(), subset_by_index=(null, null + wanted - 1)) if wanted else (
+            np.zeros(0),
+            np.zeros((size, 0)),
+        )
+    elif 3 * (wanted + null) > size:
+        raise JaxmarkError(
+            f"{wanted + null} eigenvectors ({null} components) of a mesh of {size} vertices are too many to iterate for;"
+            " ask for fewer, or use polynomial bands."
+        )
+    else:
+        # A fixed start keeps the result repeatable; a shift just below 0 keeps the factorised matrix definite.
+        start = np.cos(np.arange(size, dtype=np.float64))
+        values, vectors = sparse_linalg.eigsh(sparse.csc_array(scaled), wanted + null, sigma=-1e-2, v0=start)
+        order = np.argsort(values)[null:]
+        values, vectors = values[order], vectors[:, order]
+    full = np.zeros((len(degree), len(values)))
+    full[linked] = vectors / root[:, None]
+    fresh = np.diff(values, prepend=-np.inf) > tolerance
+    space = np.maximum.accumulate(np.where(fresh, np.arange(len(values)), 0))
+    return Eigenpairs(values, full, space.astype(np.int64))
+
+
+def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: int) -> Quadrature:
+    """Gauss quadrature of the spectral measure of a signal, by Lanczos with full reorthogonalisation.
+
+    Reference: Golub, Meurant, "Matrices, Moments and Quadrature with Applications", 2010, ch. 6.
+
+    Args:
+        operator: the Laplacian, of N vertices.
+        x: one signal `[N]`, best centred.
+        steps: the number of nodes; fewer come back where the signal lies in a smaller invariant space.
+
+    Returns:
+        Nodes in [0, 2] and non-negative weights that sum to ⟨x, x⟩_D.
+    """
+    stiffness, mass = sparse_matrices(operator)
+    degree = mass.diagonal()
+    root = np.sqrt(degree)
+    inverse = np.where(degree > 0, 1 / np.where(degree > 0, root, 1), 0)
+    scaled = sparse.diags_array(inverse) @ stiffness @ sparse.diags_array(inverse)
+    vector = root * x
+    norm = float(np.linalg.norm(vector))
+    if norm == 0:
+        return Quadrature(np.zeros(0), np.zeros(0))
+    basis = [vector / norm]
+    alphas: list[float] = []
+    betas: list[float] = []
+    for _ in range(min(steps, len(x))):
+        following = scaled @ basis[-1]
+        alphas.append(float(following @ basis[-1]))
+        for _ in range(2):  # twice is enough (Kahan, Parlett)
+            for q in basis:
+                following = following - (q @ following) * q
+        betas.append(float(np.linalg.norm(following)))
+        if betas[-1] < 1e-12:
+            break
+        basis.append(following / betas[-1])
+    nodes, vectors = linalg.eigh_tridiagonal(alphas, betas[: len(alphas) - 1])
+    return Quadrature(nodes, norm**2 * vectors[0] ** 2)

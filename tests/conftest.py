@@ -1,0 +1,68 @@
+"""Shapes and types of every public function are checked while tests run; dtypes are never promoted silently."""
+
+from collections.abc import Iterator
+
+import jax
+import jaxtyping
+import numpy as np
+import pytest
+from jaxtyping import install_import_hook
+
+import tests.typecheck  # noqa: F401 (the hook looks it up by name)
+
+with install_import_hook("jaxmark", "tests.typecheck.check"):
+    import jaxmark as jm
+
+from jaxmark.mesh import Mesh, make_mesh
+from tests.samples import bumpy_sphere
+
+
+@pytest.fixture(autouse=True)
+def _strict_promotion() -> Iterator[None]:
+    with jax.numpy_dtype_promotion("strict"):
+        yield
+
+
+@pytest.fixture(params=["float32", "float64"])
+def dtype(request: pytest.FixtureRequest) -> Iterator[np.dtype]:
+    """Both precisions; in float64 with jax's 64-bit mode on."""
+    with jax.enable_x64(request.param == "float64"):
+        yield np.dtype(request.param)
+
+
+@pytest.fixture
+def x64() -> Iterator[None]:
+    """Run the test with jax's 64-bit mode on."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """Run the test as a user would, without type checks, to see the library's own refusals."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(scope="session")
+def sphere() -> Mesh:
+    """An irregular closed surface of 642 vertices."""
+    return bumpy_sphere(3)
+
+
+@pytest.fixture(scope="session")
+def key() -> jm.Key:
+    """A fixed key."""
+    return jm.Key(bytes(range(32)))
+
+
+@pytest.fixture(scope="session")
+def hard_graph() -> Mesh:
+    """Two components, a boundary, an edge with three faces, a degenerate face and two isolated vertices."""
+    vertices = [
+        *([0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.3], [0.5, 0.5, 1], [9, 9, 9]),
+        *([5, 0, 0], [6, 0.2, 0], [5, 1, 0.1], [5.4, 0.4, 0.8], [-7, 0, 0]),
+    ]
+    faces = [[0, 1, 2], [1, 2, 3], [1, 2, 4], [6, 7, 8], [7, 8, 9], [8, 6, 9], [3, 3, 4]]
+    return make_mesh(np.array(vertices, float), np.array(faces))

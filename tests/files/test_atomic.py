@@ -1,0 +1,65 @@
+import os
+from pathlib import Path
+
+import pytest
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.files.atomic import write_atomically
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such permissions")
+@pytest.mark.parametrize(("mode", "expected"), [(None, 0o640), (0o600, 0o600), (0o666, 0o666)])
+def test_permissions(tmp_path: Path, mode: int | None, expected: int) -> None:
+    old = os.umask(0o027)
+    try:
+        write_atomically(tmp_path / "file", b"data", mode=mode)
+    finally:
+        os.umask(old)
+    assert (tmp_path / "file").stat().st_mode & 0o777 == expected
+
+
+def test_a_file_is_replaced_and_nothing_else_left(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"before")
+    write_atomically(tmp_path / "file", b"after")
+    assert (tmp_path / "file").read_bytes() == b"after"
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("function", ["fsync", "replace"])
+def test_failure_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, function: str) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / "file").write_bytes(b"before")
+    monkeypatch.setattr(os, function, fail)
+    with pytest.raises(JaxmarkError, match=r"file: No space left on device\."):
+        write_atomically(tmp_path / "file", b"after")
+    assert (tmp_path / "file").read_bytes() == b"before"
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_interruption_leaves_no_temporary_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(tmp_path / "file", b"after")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("absent/file", "the folder .*absent does not exist"), (".", "not an ordinary file"), ("a\0b", "NUL")],
+)
+def test_impossible_places(tmp_path: Path, name: str, message: str) -> None:
+    with pytest.raises(JaxmarkError, match=message):
+        write_atomically(tmp_path / name, b"data")
+
+
+def test_a_symbolic_link_stays_one(tmp_path: Path) -> None:
+    (tmp_path / "real").write_bytes(b"before")
+    (tmp_path / "link").symlink_to("real")
+    write_atomically(tmp_path / "link", b"after")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real").read_bytes() == b"after"

@@ -1,0 +1,166 @@
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.files import load_mesh, save_mesh
+from tests.files.helpers import loaded, noisy, patched, shifted, turned, written
+
+ASCII = (
+    b"ply\r\nformat ascii 1.0\r\ncomment by hand, caf\xe9\r\nobj_info x 1\r\n"
+    b"element vertex 4\r\nproperty uchar red\r\nproperty float z\r\nproperty float y\r\nproperty float32 x\r\n"
+    b"property float quality\r\n"
+    b"element face 2\r\nproperty uchar flags\r\nproperty list uchar int vertex_index\r\n"
+    b"property list uchar float texcoord\r\nend_header\r\n"
+    b"255 0.50 0.25  0.125 7.5\r\n0 0.00 0.00 1.00 1\r\n0 0.00 1.00 1.00 2\r\n9 0.00 1.00 0.00 3\r\n"
+    b"1 3 0 1 2 2 0.5 0.5\r\n2 4 0 1 2 3 0"
+)
+
+
+def binary(order: str, coordinate: str, quads: bool) -> tuple[bytes, list[int]]:
+    """A file with the faces before the vertices, and the byte offsets of each vertex's z, y and x."""
+    name = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    kind = {"f": "float", "d": "float64"}[coordinate]
+    header = (
+        f"ply\nformat {name} 1.0\nelement face 2\nproperty list uint8 uint vertex_indices\nproperty short group\n"
+        f"property list ushort char tags\nelement vertex 4\nproperty {kind} z\nproperty uchar red\nproperty {kind} y\n"
+        f"property {kind} x\nproperty int custom\nelement other 1\nproperty double w\nend_header\n"
+    )
+    data = header.encode()
+    for face in [[0, 1, 2], [0, 1, 2, 3] if quads else [0, 2, 3]]:
+        data += struct.pack(f"{order}B{len(face)}IhH2b", len(face), *face, -5, 2, -1, 1)
+    offsets = []
+    for x, y, z in [(0.5, 0.25, 0.125), (1, 0, 0), (1, 1, 0), (0, 1, 0)]:
+        offsets.append(len(data))
+        data += struct.pack(f"{order}{coordinate}B2{coordinate}i", z, 200, y, x, -7)
+    return data + struct.pack(order + "d", 3.25) + b"tail", offsets
+
+
+VERTICES = [[0.5, 0.25, 0.125], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+
+
+def test_text_with_everything(tmp_path: Path) -> None:
+    mesh = loaded(tmp_path, "a.ply", ASCII)
+    np.testing.assert_array_equal(mesh.vertices, [[0.125, 0.25, 0.5], *VERTICES[1:]])
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2], [0, 1, 2], [0, 2, 3]])
+
+
+def test_text_changes_only_moved_digits(tmp_path: Path) -> None:
+    source = written(tmp_path, "a.ply", ASCII)
+    data = patched(source, shifted(load_mesh(source), 0, [0.5, 0, -1]))
+    assert data == ASCII.replace(b"0.50 0.25  0.125", b"-0.500 0.25  0.625")
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("coordinate", ["f", "d"])
+@pytest.mark.parametrize("quads", [False, True])
+def test_binary(tmp_path: Path, order: str, coordinate: str, quads: bool) -> None:
+    data, offsets = binary(order, coordinate, quads)
+    source = written(tmp_path, "b.ply", data)
+    mesh = load_mesh(source)
+    np.testing.assert_array_equal(mesh.vertices, VERTICES)
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2], [0, 1, 2], [0, 2, 3]] if quads else [[0, 1, 2], [0, 2, 3]])
+    expected = bytearray(data)
+    size = struct.calcsize(coordinate)
+    struct.pack_into(order + coordinate, expected, offsets[2], 0.375)
+    struct.pack_into(order + coordinate, expected, offsets[2] + 2 * size + 1, -9.5)
+    assert patched(source, shifted(mesh, 2, [-10.5, 0, 0.375])) == bytes(expected)
+
+
+def test_normals_turn_and_custom_properties_stay(tmp_path: Path) -> None:
+    header = b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n" + b"".join(
+        b"property float %s\n" % name for name in (b"nx", b"ny", b"nz", b"s", b"x", b"y", b"z")
+    )
+    header += b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = [(0, -1, 0, 5, 0, 0, 0), (0, -2, 0, 6, 1, 0, 0), (0, 0, 0, 7, 0, 0, 1)]
+    face = struct.pack("<B3i", 3, 0, 1, 2)
+    source = written(tmp_path, "n.ply", header + b"".join(struct.pack("<7f", *row) for row in rows) + face)
+    data = patched(source, turned(load_mesh(source)))
+    assert data[: len(header)] == header
+    assert data[-len(face) :] == face
+    got = np.frombuffer(data[len(header) : -len(face)], "<f4").reshape(3, 7)
+    expected = [(1, 0, 0, 5, 0, 0, 0), (2, 0, 0, 6, 0, 1, 0), (0, 0, 0, 7, 0, 0, 1)]
+    np.testing.assert_allclose(got, expected, atol=1e-7)
+
+
+def test_spacing_of_single_precision_far_from_the_origin(tmp_path: Path) -> None:
+    data, offsets = binary("<", "f", False)
+    far = bytearray(data)
+    struct.pack_into("<f", far, offsets[0], 4096.0)  # there the next number is 2**-11 away
+    source = written(tmp_path, "far.ply", bytes(far))
+    save_mesh(noisy(load_mesh(source), 0.01), tmp_path / "out.ply", like=source)
+    with pytest.raises(JaxmarkError, match=r"0\.000488 apart.*centre the mesh"):
+        save_mesh(noisy(load_mesh(source), 0.001), tmp_path / "out.ply", like=source)
+
+
+def test_integer_coordinates(tmp_path: Path) -> None:
+    header = b"ply\nformat ascii 1.0\nelement vertex 3\nproperty int x\nproperty int y\nproperty int z\n"
+    header += b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    source = written(tmp_path, "i.ply", header + b"0 0 0\n100 0 0\n0 100 0\n3 0 1 2\n")
+    assert patched(source, shifted(load_mesh(source), 1, [0, 41.7, 0])).endswith(
+        b"\n0 0 0\n100 42 0\n0 100 0\n3 0 1 2\n"
+    )
+    with pytest.raises(JaxmarkError, match="float or double"):
+        patched(source, noisy(load_mesh(source), 0.1))
+    body = struct.pack("<9bB3i", 0, 0, 0, 100, 0, 0, 0, 100, 0, 3, 0, 1, 2)
+    packed = header.replace(b"ascii", b"binary_little_endian").replace(b"int ", b"char ", 3) + body
+    source = written(tmp_path, "c.ply", packed)
+    assert load_mesh(source).vertices[1, 0] == 100
+    with pytest.raises(JaxmarkError, match="beyond the range"):
+        patched(source, shifted(load_mesh(source), 1, [50, 0, 0]))
+
+
+def test_lists_of_vertices(tmp_path: Path) -> None:
+    data = (
+        b"ply\nformat ascii 1.0\nelement vertex 3\nproperty list uchar int tags\nproperty double x\nproperty double y\n"
+        b"property double z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        b"0 0 0 0\n2 8 8 1.5 0 0\n1 5 0 1 0\n3 0 1 2\n"
+    )
+    np.testing.assert_array_equal(loaded(tmp_path, "l.ply", data).vertices, [[0, 0, 0], [1.5, 0, 0], [0, 1, 0]])
+
+
+HEAD = b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+FACE = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+BODY = b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"plyx", "line 1"),
+        (HEAD, "inside the header"),
+        (HEAD.replace(b"float y", b"floaty y") + FACE + BODY, "line 5: .property floaty y. does"),
+        (HEAD.replace(b"float y", b"float x") + FACE + BODY, "line 5"),
+        (HEAD.replace(b"ascii", b"utf8") + FACE + BODY, "line 2.*utf8"),
+        (HEAD.replace(b"format ascii 1.0\n", b"") + FACE + BODY, "line 3|no format"),
+        (HEAD.replace(b"vertex 3", b"vertex -3") + FACE + BODY, "line 3"),
+        (HEAD.replace(b"vertex 3", b"vertex 999999999999999") + FACE + BODY, "ends in row 4 .*vertex"),
+        (HEAD.replace(b"float z", b"float w") + FACE + BODY, "x, y and z"),
+        (HEAD + FACE.replace(b"uchar int", b"uchar float") + BODY, "integers"),
+        (HEAD + FACE.replace(b"uchar int", b"float int") + BODY, "line 8"),
+        (HEAD + FACE.replace(b"_indices", b"s") + BODY, "vertex_indices"),
+        (HEAD + HEAD[21:] + FACE + BODY, "more than once"),
+        (HEAD + FACE + BODY.replace(b"3 0 1 2", b"3 0 1"), "ends in row 0 .*face"),
+        (HEAD + FACE + BODY.replace(b"3 0 1 2", b"2 0 1"), "three"),
+        (HEAD + FACE + BODY.replace(b"3 0 1 2", b"-3 0 1"), "length -3"),
+        (HEAD + FACE + BODY.replace(b"3 0 1 2", b"3 0 1 5"), r"Face 0 .*\[0, 1, 5\]"),
+        (HEAD + FACE + BODY.replace(b"1 0 0", b"1 o 0"), "line 11: 'o'"),
+        (
+            HEAD + b"element tristrips 1\nproperty list int int vertex_indices\nend_header\n0 0 0 1 0 0 0 1 0 0",
+            "strips",
+        ),
+        (HEAD + b"end_header\n" + BODY, "no faces"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, data: bytes, message: str) -> None:
+    with pytest.raises(JaxmarkError, match=rf"bad\.ply: .*({message})"):
+        loaded(tmp_path, "bad.ply", data)
+
+
+def test_every_truncation_of_a_binary_file_is_refused(tmp_path: Path) -> None:
+    data, _ = binary("<", "f", True)
+    for length in range(len(data) - len(b"tail")):
+        with pytest.raises(JaxmarkError):
+            loaded(tmp_path, "short.ply", data[:length])

@@ -1,0 +1,45 @@
+"""Meshes made on the spot."""
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from jaxmark.mesh import Mesh, make_mesh
+
+
+def bumpy_sphere(level: int, seed: int = 0) -> Mesh:
+    """A closed surface of irregular triangles, with bumps, and a little roughness so that no band is empty.
+
+    10 · 4^level + 2 vertices. Random points on a sphere, joined by their convex hull: unlike a subdivided icosahedron, its
+    graph has no symmetry, and so no repeated eigenvalues.
+    """
+    count = 10 * 4**level + 2
+    random = np.random.default_rng(seed)
+    # A spiral spreads points evenly, a shake makes them irregular.
+    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    height = 1 - (2 * np.arange(count) + 1) / count
+    ring = np.sqrt(1 - height**2)
+    points = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1)
+    points += 0.5 / np.sqrt(count) * random.normal(size=points.shape)
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    faces = ConvexHull(points).simplices.astype(np.int64)
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    bumps = np.sin(points @ (2 * random.normal(size=(3, 6))) + random.uniform(0, 6, 6)).sum(axis=1)
+    radius = 1 + 0.05 * bumps + 0.01 * random.normal(size=count)
+    return make_mesh(points * radius[:, None] * [1.0, 0.8, 1.3], faces)
+
+
+def exact_sheet(size: int) -> Mesh:
+    """A rough sheet of size² vertices whose coordinates are the same to the last bit on every machine."""
+    i, j = np.divmod(np.arange(size * size), size)
+    z = (7919 * i * i + 104729 * j + 31 * i * j) % 97
+    vertices = np.stack([i + (13 * j % 7) / 32, j + (11 * i % 5) / 32, z / 128], axis=1)
+    corner = (i * size + j).reshape(size, size)[:-1, :-1].ravel()
+    faces = np.concatenate(
+        [
+            np.stack([corner, corner + size, corner + 1], 1),
+            np.stack([corner + 1, corner + size, corner + size + 1], 1),
+        ]
+    )
+    return make_mesh(vertices, faces)

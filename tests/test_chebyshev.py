@@ -1,0 +1,188 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jax.test_util import check_grads
+
+from jaxmark import chebyshev
+from jaxmark.bands import scaling
+from jaxmark.errors import JaxmarkError
+from jaxmark.laplacian import Laplacian, make_laplacian
+from jaxmark.mesh import Mesh, make_mesh
+from tests.dense import chebyshev_matrices, tolerance
+from tests.samples import bumpy_sphere
+
+DEGREE = 9
+
+
+@pytest.fixture(scope="module")
+def graph() -> Mesh:
+    """Small enough for dense algebra, with everything that is hard in a graph."""
+    small = bumpy_sphere(0)
+    vertices = np.vstack([small.vertices, small.vertices[:4] + 5, [[9.0, 9, 9]]])
+    extra = np.array([[12, 13, 14], [13, 14, 15], [0, 1, 5]])
+    return make_mesh(vertices, np.vstack([small.faces[:-2], extra]))
+
+
+@pytest.fixture(scope="module")
+def operator(graph: Mesh) -> Laplacian:
+    return make_laplacian(graph, "inverse-length")
+
+
+@pytest.fixture(scope="module")
+def polynomials(operator: Laplacian) -> np.ndarray:
+    return chebyshev_matrices(operator, 2 * DEGREE)
+
+
+def random_array(*shape: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=shape)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, DEGREE])
+@pytest.mark.parametrize("derivative", ["recompute", "scan"])
+@pytest.mark.parametrize(("columns", "per_column"), [((), False), ((3,), False), ((3,), True)])
+def test_filter_is_the_polynomial_of_the_dense_matrix(
+    operator, polynomials, degree, derivative, columns, per_column, dtype
+):
+    c = random_array(degree + 1, *(columns if per_column else ())).astype(dtype)
+    x = random_array(len(operator.degree), *columns, seed=1).astype(dtype)
+    subscripts = "kc,kuv,vc->uc" if per_column else "k,kuv,v...->u..."
+    expected = np.einsum(subscripts, c, polynomials[: degree + 1], x)
+    y = chebyshev.filter(operator, c, jnp.asarray(x), derivative=derivative)
+    assert y.dtype == dtype
+    np.testing.assert_allclose(y, expected, atol=tolerance(dtype, 10))
+
+
+def test_band_components_moments_and_grams(operator, polynomials, dtype):
+    bands = random_array(4, DEGREE + 1).astype(dtype)
+    x, u = random_array(2, len(operator.degree), 3, seed=1).astype(dtype)
+    exact = np.einsum("jk,kuv,vc->juc", bands, polynomials[: DEGREE + 1], x)
+    close = {"atol": tolerance(dtype, 100), "rtol": tolerance(dtype, 10)}
+    np.testing.assert_allclose(chebyshev.band_components(operator, bands, jnp.asarray(x)), exact, **close)
+
+    cross = np.einsum("v,vc,kvu,uc->kc", operator.degree, u, polynomials[: DEGREE + 1], x)
+    np.testing.assert_allclose(
+        chebyshev.cross_moments(operator, jnp.asarray(u), jnp.asarray(x), degree=DEGREE), cross, **close
+    )
+    moments = np.einsum("v,vc,kvu,uc->kc", operator.degree, x, polynomials, x)
+    np.testing.assert_allclose(chebyshev.moments(operator, jnp.asarray(x), degree=DEGREE), moments, **close)
+    assert chebyshev.moments(operator, jnp.asarray(x), degree=0).shape == (1, 3)
+
+    gram = np.einsum("v,ivc,jvc->cij", operator.degree, exact, exact)
+    for method in ("bands", "moments"):
+        np.testing.assert_allclose(chebyshev.gram(operator, bands, jnp.asarray(x), method=method), gram, **close)
+        single = chebyshev.gram(operator, bands, jnp.asarray(x[:, 0]), method=method)
+        np.testing.assert_allclose(single, gram[0], **close)
+
+
+@pytest.mark.parametrize("derivative", ["recompute", "scan"])
+@pytest.mark.parametrize("per_column", [False, True])
+def test_reverse_mode_agrees_with_dense_jacobians(operator, polynomials, derivative, per_column, x64):
+    c = jnp.asarray(random_array(DEGREE + 1, *([3] if per_column else [])))
+    x = jnp.asarray(random_array(len(operator.degree), 3, seed=1))
+    y_bar = jnp.asarray(random_array(len(operator.degree), 3, seed=2))
+    _, pull = jax.vjp(lambda c, x: chebyshev.filter(operator, c, x, derivative=derivative), c, x)
+    c_bar, x_bar = pull(y_bar)
+    terms = polynomials[: DEGREE + 1]
+    per_column_c = c if per_column else jnp.broadcast_to(c[:, None], (DEGREE + 1, 3))
+    np.testing.assert_allclose(x_bar, np.einsum("kc,kuv,uc->vc", per_column_c, terms, y_bar), atol=1e-10)
+    expected = np.einsum("uc,kuv,vc->kc", y_bar, terms, x)
+    np.testing.assert_allclose(c_bar, expected if per_column else expected.sum(1), atol=1e-10)
+
+
+def test_derivatives_by_transformation(operator, x64):
+    c = jnp.asarray(random_array(DEGREE + 1))
+    x = jnp.asarray(random_array(5, len(operator.degree), seed=1))
+
+    def loss(c, x):
+        return jnp.sum(jnp.sin(chebyshev.filter(operator, c, x)))
+
+    check_grads(loss, (c, x[0]), order=2, modes=["rev"])
+    check_grads(jax.jit(loss), (c, x[0]), order=1, modes=["rev"])
+    mapped = jax.vmap(jax.grad(loss, (0, 1)), (None, 0))(c, x)
+    for one, row in zip(zip(*mapped, strict=True), x, strict=True):
+        for got, expected in zip(one, jax.grad(loss, (0, 1))(c, row), strict=True):
+            np.testing.assert_allclose(got, expected, atol=1e-12)
+
+    def scanned(c, x, weights):
+        return jnp.sum(jnp.sin(chebyshev.filter(operator._replace(weights=weights), c, x, derivative="scan")))
+
+    check_grads(scanned, (c, x[0], jnp.asarray(operator.weights)), order=1, modes=["fwd", "rev"])
+
+
+def test_derivative_of_weights_is_refused_by_name(operator, x64):
+    x = jnp.asarray(random_array(len(operator.degree)))
+    with pytest.raises(JaxmarkError, match="derivative='scan'"):
+        jax.grad(lambda w: chebyshev.filter(operator._replace(weights=w), np.ones(3), x).sum())(
+            jnp.asarray(operator.weights)
+        )
+
+
+def test_memory_does_not_grow_with_the_degree():
+    operator = jax.tree.map(jnp.asarray, make_laplacian(bumpy_sphere(4)))
+    x = jnp.ones((len(operator.degree), 3), jnp.float32)
+
+    def scratch(degree: int, derivative: str) -> int:
+        def loss(c, x):
+            return jnp.sum(chebyshev.filter(operator, c, x, derivative=derivative) ** 2)
+
+        compiled = jax.jit(jax.value_and_grad(loss, (0, 1))).lower(jnp.ones(degree + 1, jnp.float32), x).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    assert scratch(256, "recompute") < 1.1 * scratch(32, "recompute")
+    assert scratch(256, "scan") > 4 * scratch(32, "scan")  # what the rule is for
+
+
+def test_moments_in_float32_lose_weak_bands_and_components_do_not(sphere):
+    """Why `gram` has two methods, and which is the default."""
+    operator = make_laplacian(sphere)
+    family = scaling(48, damping="jackson")
+    x = sphere.vertices - operator.degree @ sphere.vertices / operator.degree.sum()
+    with jax.enable_x64(True):
+        exact = np.asarray(chebyshev.gram(operator, family, jnp.asarray(x)))
+        by_moments = np.asarray(chebyshev.gram(operator, family, jnp.asarray(x), method="moments"))
+    np.testing.assert_allclose(by_moments, exact, atol=1e-11 * exact.max())
+    weak = np.argmin(np.diagonal(exact[0]))
+    assert exact[0, weak, weak] < 1e-6 * exact[0].max()
+    single = np.asarray(chebyshev.gram(operator, family, jnp.asarray(x, jnp.float32)))
+    lost = np.asarray(chebyshev.gram(operator, family, jnp.asarray(x, jnp.float32), method="moments"))
+    by_components = abs(single[0, weak, weak] / exact[0, weak, weak] - 1)
+    assert by_components < 0.05
+    assert abs(lost[0, weak, weak] / exact[0, weak, weak] - 1) > 10 * by_components
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**31))
+def test_linearity_pose_and_vertex_order(seed):
+    random = np.random.default_rng(seed)
+    mesh = bumpy_sphere(1)
+    c = random.normal(size=6)
+    with jax.enable_x64(True):
+        operator = make_laplacian(mesh)
+        x, y = (jnp.asarray(random.normal(size=mesh.vertices.shape)) for _ in range(2))
+        a, b = random.normal(size=2)
+        out = chebyshev.filter(operator, c, x)
+        both = chebyshev.filter(operator, c, a * x + b * y)
+        np.testing.assert_allclose(both, a * out + b * chebyshev.filter(operator, c, y), atol=1e-10)
+        turn, _ = np.linalg.qr(random.normal(size=(3, 3)))
+        np.testing.assert_allclose(chebyshev.filter(operator, c, x @ turn), out @ turn, atol=1e-10)
+        order = random.permutation(len(x))
+        rank = np.argsort(order)
+        shuffled = make_laplacian(make_mesh(mesh.vertices[order], rank[mesh.faces]))
+        np.testing.assert_allclose(chebyshev.filter(shuffled, c, x[order]), out[order], atol=1e-10)
+
+
+def test_refusals(operator, unchecked):
+    size = len(operator.degree)
+    x = jnp.ones((size, 3), jnp.float32)
+    for call, sentence in [
+        (lambda: chebyshev.filter(operator, np.ones(3), x[1:]), f"N = {size}"),
+        (lambda: chebyshev.filter(operator, np.ones((3, 2)), x), "coefficients"),
+        (lambda: chebyshev.filter(operator, np.ones(0), x), "coefficients"),
+        (lambda: chebyshev.filter(operator, np.ones(3), x.astype(int)), "floating"),
+        (lambda: chebyshev.band_components(operator, np.ones((2, 0)), x), r"\[bands, degree \+ 1\]"),
+    ]:
+        with pytest.raises(JaxmarkError, match=sentence):
+            call()

@@ -1,0 +1,218 @@
+"""The command line's contract, on files made on the spot."""
+
+import json
+import re
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import jaxmark as jm
+from jaxmark import cli
+from tests.samples import bumpy_sphere
+
+pytestmark = pytest.mark.usefixtures("unchecked")
+MESSAGE = "0123456789abcdef"
+
+
+class Workshop:
+    """A folder with an original and a key, and the command line run inside."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
+        self.folder, self._monkeypatch, self._capfd = folder, monkeypatch, capfd
+        monkeypatch.chdir(folder)
+        trimesh.Trimesh(*bumpy_sphere(3), process=False).export(folder / "model.ply")
+        jm.save_key(jm.Key(bytes(range(32))), folder / "owner.key")
+
+    def __call__(self, *arguments: object) -> tuple[int, str, str]:
+        self._monkeypatch.setattr(sys, "argv", ["jaxmark", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+            sys.exit(0)
+        out, err = self._capfd.readouterr()
+        return int(end.value.code or 0), out, err
+
+    def json(self, *arguments: object, status: int = 0) -> dict:
+        code, out, err = self(*arguments, "--json")
+        assert code == status, err
+
+        def refuse(constant: str):
+            raise AssertionError(f"{constant} is not strict JSON")
+
+        assert out.count("\n") == 1
+        return json.loads(out, parse_constant=refuse)
+
+    def refused(self, *arguments: object) -> str:
+        before = {path: path.read_bytes() for path in self.folder.rglob("*") if path.is_file()}
+        code, out, err = self(*arguments)
+        assert code == 2
+        assert out == ""
+        assert re.fullmatch(r"jaxmark: [^\n]+\n", err), err
+        assert "Traceback" not in err
+        assert {path: path.read_bytes() for path in self.folder.rglob("*") if path.is_file()} == before
+        return err
+
+    def embed(self, *more: object) -> dict:
+        return self.json("embed", "model.ply", "marked.ply", "--key", "owner.key", "--message", MESSAGE, *more)
+
+
+@pytest.fixture
+def workshop(tmp_path, monkeypatch, capfd) -> Workshop:
+    return Workshop(tmp_path, monkeypatch, capfd)
+
+
+DETECT = ("--original", "model.ply", "--key", "owner.key")
+
+
+@pytest.mark.parametrize("scheme", ["host", "eigen"])
+def test_the_main_job(workshop: Workshop, scheme):
+    told = workshop.embed("--scheme", scheme)
+    assert told["bits"] == 64
+    assert told["scheme"] == scheme
+    assert told["record"] == "marked.ply.jaxmark.json"
+    assert told["rms"] == pytest.approx(8e-4, rel=1e-3)
+    before, after = (trimesh.load(name, process=False) for name in ("model.ply", "marked.ply"))
+    shift = np.linalg.norm(after.vertices - before.vertices, axis=1) / np.linalg.norm(np.ptp(before.vertices, axis=0))
+    assert told["rms"] == pytest.approx(np.sqrt(np.mean(shift**2)), rel=1e-6)
+    assert told["max"] == pytest.approx(shift.max(), rel=1e-6)
+
+    attacked = workshop.json("attack", "marked.ply", "suspect.ply", "noise", "0.0005", "--seed", "3")
+    assert attacked["rms"] > 0
+    for options in (["--record", told["record"]], ["--scheme", scheme]):
+        found = workshop.json("detect", "suspect.ply", *DETECT, *options)
+        assert found["detected"] is True
+        assert found["message"] == MESSAGE
+        assert len(found["scores"]) == 64
+        assert found["coverage"] == 1.0
+        assert found["log10_p"] <= -6
+    claimed = workshop.json("detect", "suspect.ply", *DETECT, "--scheme", scheme, "--message", MESSAGE)
+    assert claimed["detected"] is True
+    compared = workshop.json("compare", "model.ply", "marked.ply")
+    assert compared == {"rms": told["rms"], "max": told["max"]}
+
+
+def test_nothing_found_is_status_1(workshop: Workshop):
+    workshop.embed()
+    workshop.json("keygen", "other.key")
+    for suspect, key, options in [
+        ("model.ply", "owner.key", []),
+        ("marked.ply", "other.key", []),
+        ("marked.ply", "owner.key", ["--bits", "32"]),
+        ("marked.ply", "owner.key", ["--alpha", "1e-30"]),
+        ("marked.ply", "owner.key", ["--message", "fedcba9876543210"]),
+    ]:
+        found = workshop.json("detect", suspect, "--original", "model.ply", "--key", key, *options, status=1)
+        assert found["detected"] is False
+        assert found["log10_p"] <= 0
+    assert workshop.json("detect", "model.ply", *DETECT, status=1)["log10_p"] == 0
+    code, out, _ = workshop("detect", "model.ply", *DETECT)
+    assert code == 1
+    assert "nothing detected" in out
+
+
+def test_refusals_are_one_sentence_and_leave_nothing(workshop: Workshop):
+    workshop.embed()
+    Path("broken.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\n")
+    Path("notes.txt").write_text("x")
+    Path("bad.key").write_text("not a key")
+    record = json.loads(Path("marked.ply.jaxmark.json").read_text())
+    Path("other.json").write_text(json.dumps({**record, "original": "00"}))
+    mark = ("--key", "owner.key", "--message", MESSAGE)
+    for arguments, sentence in [
+        (("keygen", "owner.key"), "never overwritten"),
+        (("embed", "absent.ply", "out.ply", *mark), "absent.ply"),
+        (("embed", "broken.ply", "out.ply", *mark), "broken.ply"),
+        (("embed", "notes.txt", "out.txt", *mark), "notes.txt"),
+        (("embed", "model.ply", "out.obj", *mark), "suffix|format"),
+        (("embed", "model.ply", "model.ply", *mark), "same file"),
+        (("embed", "model.ply", "no/where.ply", *mark), "folder no"),
+        (("embed", "model.ply", "out.ply", *mark, "--record", "no/where.json"), "no"),
+        (("embed", "model.ply", "out.ply", *mark, "--budget", "1e-9"), "."),
+        (("embed", "model.ply", "out.ply", *mark, "--budget", "nan"), "budget"),
+        (("embed", "model.ply", "out.ply", *mark, "--scheme", "magic"), "magic"),
+        (("embed", "model.ply", "out.ply", "--key", "owner.key", "--message", "xyz"), "hexadecimal"),
+        (("embed", "model.ply", "out.ply", "--key", "owner.key", "--message", "00" * 60), "at most 352"),
+        (("embed", "model.ply", "out.ply", "--key", "bad.key", "--message", MESSAGE), "no key file"),
+        (("embed", "model.ply", "out.ply", "--message", MESSAGE), "--key"),
+        (("detect", "marked.ply", "--original", "marked.ply", "--key", "owner.key", "--record", record_name()), "record"),
+        (("detect", "marked.ply", *DETECT, "--record", "other.json"), "record"),
+        (("detect", "marked.ply", *DETECT, "--record", "notes.txt"), "not a record"),
+        (("detect", "marked.ply", *DETECT, "--alpha", "2"), "alpha"),
+        (("detect", "marked.ply", *DETECT, "--bits", "7"), "multiple of 8"),
+        (("detect", "marked.ply", *DETECT, "--record", record_name(), "--scheme", "eigen"), "contradicts"),
+        (("attack", "model.ply", "out.ply", "melting", "1"), "melting"),
+        (("attack", "model.ply", "out.ply", "smoothing", "1.5"), "whole number"),
+        (("attack", "model.ply", "out.ply", "noise", "x"), "'x'"),
+        (("nonsense",), "nonsense"),
+    ]:
+        assert re.search(sentence, workshop.refused(*arguments))
+
+
+def record_name() -> str:
+    return "marked.ply.jaxmark.json"
+
+
+def test_other_connectivity_is_refused_by_name(workshop: Workshop):
+    trimesh.Trimesh(*bumpy_sphere(2), process=False).export("small.ply")
+    assert "does not share" in workshop.refused("detect", "small.ply", *DETECT)
+    assert "does not share" in workshop.refused("compare", "model.ply", "small.ply")
+
+
+def test_key_files_are_private_and_keys_never_shown(workshop: Workshop):
+    told = workshop.json("keygen", "new.key")
+    path = Path("new.key")
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    secret = path.read_text().strip()
+    assert len(secret) == 64
+    assert secret not in json.dumps(told)
+    workshop.embed()
+    owner = Path("owner.key").read_text().strip()
+    for arguments in (("embed", "model.ply", "m2.ply", "--key", "owner.key", "--message", MESSAGE), ("detect", "marked.ply", *DETECT)):
+        _, out, err = workshop(*arguments)
+        assert owner not in out + err
+    assert owner not in Path("marked.ply.jaxmark.json").read_text()
+
+
+def test_help_teaches_and_units_are_stated(workshop: Workshop):
+    for command in ([], ["keygen"], ["embed"], ["detect"], ["attack"], ["compare"], ["demo"]):
+        code, out, _ = workshop(*command, "--help")
+        assert code == 0
+        assert len(out.splitlines()) > 5
+    assert "bits per coordinate" in workshop("attack", "--help")[1]
+    code, out, _ = workshop("--version")
+    assert code == 0
+    assert re.search(r"\d+\.\d+", out)
+
+
+def test_module_and_script_are_the_same_program(tmp_path):
+    module = subprocess.run(
+        [sys.executable, "-m", "jaxmark", "detect", "a.ply", "--original", "b.ply", "--key", "k"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert module.returncode == 2
+    assert module.stdout == ""
+    assert module.stderr.startswith("jaxmark: ")
+    assert module.stderr.count("\n") == 1
+
+
+def test_an_interrupted_write_leaves_no_output(workshop: Workshop, monkeypatch):
+    monkeypatch.setattr("jaxmark.cli.write_atomically", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
+    assert "No space left" in workshop.refused("embed", "model.ply", "out.ply", "--key", "owner.key", "--message", MESSAGE)
+
+
+def test_demo_leaves_tables_and_pictures(workshop: Workshop):
+    told = workshop.json("demo", "model.ply", "--output", "shown")
+    assert {row["scheme"] for row in told["rows"]} == {"host", "eigen"}
+    unattacked = [row for row in told["rows"] if row["attack"] == "none"]
+    assert all(row["message_read"] for row in unattacked)
+    assert any(not row["message_read"] for row in told["rows"])  # losses are printed as losses
+    names = {path.name for path in Path("shown").iterdir()}
+    assert {"table.md", "mark.png", "attacked.png", "marked-host.ply", "marked-host.ply.jaxmark.json"} <= names
+    for picture in ("mark.png", "attacked.png"):
+        assert Path("shown", picture).read_bytes().startswith(b"\x89PNG")

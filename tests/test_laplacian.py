@@ -1,0 +1,124 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.laplacian import Laplacian, centre, make_laplacian, sparse_matrices
+from jaxmark.mesh import Mesh, edges, make_mesh
+from tests.dense import laplacian_matrix, tolerance
+
+WEIGHTINGS = ["valence", "inverse-length", "cotangent"]
+
+
+@pytest.mark.parametrize("weights", WEIGHTINGS)
+@pytest.mark.parametrize("columns", [(), (3,)])
+def test_apply_is_the_dense_matrix(hard_graph: Mesh, weights, columns, dtype):
+    operator = make_laplacian(hard_graph, weights)
+    x = np.random.default_rng(0).normal(size=(len(hard_graph.vertices), *columns)).astype(dtype)
+    y = operator.apply(jnp.asarray(x))
+    assert y.dtype == dtype
+    np.testing.assert_allclose(y, laplacian_matrix(operator) @ x, atol=tolerance(dtype))
+
+
+@pytest.mark.parametrize("weights", WEIGHTINGS)
+def test_spectrum_lies_in_0_2_and_each_component_is_in_the_null_space(hard_graph: Mesh, weights):
+    values = np.linalg.eigvals(laplacian_matrix(make_laplacian(hard_graph, weights)))
+    assert np.abs(values.imag).max() < 1e-12
+    assert values.real.min() > -1e-12
+    assert values.real.max() < 2 + 1e-12
+    assert np.sum(np.abs(values) < 1e-12) == 4  # two components and two isolated vertices
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31), st.sampled_from(WEIGHTINGS))
+def test_self_adjoint_in_the_inner_product(seed, weights):
+    random = np.random.default_rng(seed)
+    mesh = make_mesh(random.normal(size=(12, 3)), random.integers(0, 12, (20, 3)))
+    operator = make_laplacian(mesh, weights)
+    x, y = jnp.asarray(random.normal(size=(2, 12)), jnp.float32)
+    assert operator.inner(operator.apply(x), y) == pytest.approx(float(operator.inner(x, operator.apply(y))), abs=1e-3)
+
+
+def test_the_papers_mass_is_not_self_adjoint(hard_graph: Mesh):
+    """Erratum: with D = diag(1/d), as printed, Lemma 3.1 fails."""
+    operator = make_laplacian(hard_graph)
+    delta = laplacian_matrix(operator)
+    linked = operator.degree > 0
+    right = np.diag(operator.degree) @ delta
+    printed = np.diag(np.where(linked, 1 / np.where(linked, operator.degree, 1), 0)) @ delta
+    np.testing.assert_allclose(right, right.T, atol=1e-12)
+    assert np.abs(printed - printed.T).max() > 0.1
+
+
+def test_inner_is_weighted_by_row_sums(hard_graph: Mesh, dtype):
+    operator = make_laplacian(hard_graph, "inverse-length")
+    x, y = np.random.default_rng(1).normal(size=(2, len(hard_graph.vertices), 3)).astype(dtype)
+    expected = np.einsum("v,vc,vc->c", operator.degree, x, y)
+    np.testing.assert_allclose(operator.inner(jnp.asarray(x), jnp.asarray(y)), expected, rtol=tolerance(dtype, 10))
+
+
+def test_cotangents_agree_with_angles(sphere: Mesh):
+    operator = make_laplacian(sphere, "cotangent")
+    angles = trimesh.Trimesh(*sphere, process=False).face_angles
+    expected = {tuple(edge): 0.0 for edge in operator.edges}
+    for face, corners in zip(sphere.faces, angles, strict=True):
+        for k in range(3):
+            expected[tuple(sorted((face[(k + 1) % 3], face[(k + 2) % 3])))] += 0.5 / np.tan(corners[k])
+    values = np.array(list(expected.values()))
+    np.testing.assert_allclose(operator.weights, np.maximum(values, 1e-6 * values.max()), rtol=1e-9)
+
+
+def test_array_weights_and_their_refusal(sphere: Mesh):
+    count = len(edges(sphere.faces))
+    given_weights = np.random.default_rng(2).uniform(size=count)
+    np.testing.assert_array_equal(make_laplacian(sphere, given_weights).weights, given_weights)
+    for bad, sentence in [(np.ones(3), "one value for each"), (-np.ones(count), "not negative"), ("cot", "must be")]:
+        with pytest.raises(JaxmarkError, match=sentence):
+            make_laplacian(sphere, bad)
+    with pytest.raises(JaxmarkError, match="length zero"):
+        make_laplacian(make_mesh(np.zeros((3, 3)), np.array([[0, 1, 2]])), "inverse-length")
+
+
+def test_centring_removes_the_position_of_every_piece(hard_graph: Mesh):
+    operator = make_laplacian(hard_graph, "inverse-length")
+    centred = centre(operator, hard_graph.vertices)
+    pieces = [[0, 1, 2, 3, 4], [6, 7, 8, 9]]
+    shifted = hard_graph.vertices + 1e6
+    shifted[pieces[1]] += 3e5
+    for piece in pieces:
+        np.testing.assert_allclose(operator.degree[piece] @ centred[piece], 0, atol=1e-12)
+    np.testing.assert_array_equal(centred[[5, 10]], 0)
+    np.testing.assert_allclose(centre(operator, shifted), centred, atol=1e-9)
+
+
+def test_sparse_matrices(hard_graph: Mesh):
+    operator = make_laplacian(hard_graph, "inverse-length")
+    stiffness, mass = sparse_matrices(operator)
+    np.testing.assert_allclose(stiffness.toarray(), mass.toarray() @ laplacian_matrix(operator), atol=1e-12)
+
+
+def test_transformations(hard_graph: Mesh, x64):
+    operator = make_laplacian(hard_graph)
+    matrix = laplacian_matrix(operator)
+    batch = jnp.asarray(np.random.default_rng(3).normal(size=(4, len(matrix), 3)))
+    np.testing.assert_allclose(jax.jit(Laplacian.apply)(operator, batch[0]), matrix @ batch[0], atol=1e-12)
+    mapped = jax.vmap(Laplacian.apply, (None, 0))(operator, batch)
+    np.testing.assert_allclose(mapped, np.einsum("uv,bvc->buc", matrix, batch), atol=1e-12)
+    np.testing.assert_allclose(jax.jacobian(operator.apply)(batch[0, :, 0]), matrix, atol=1e-12)
+    gradient = jax.vmap(jax.grad(lambda x: jnp.sum(operator.apply(x) ** 2)))(batch)
+    np.testing.assert_allclose(gradient, np.einsum("uv,bvc->buc", 2 * matrix.T @ matrix, batch), atol=1e-12)
+
+
+def test_gradients_of_weights_are_finite_at_isolated_vertices(hard_graph: Mesh, x64):
+    operator = make_laplacian(hard_graph)
+    x = jnp.asarray(hard_graph.vertices)
+
+    def loss(weights, degree):
+        return jnp.sum(operator._replace(weights=weights, degree=degree).apply(x) ** 2)
+
+    for gradient in jax.grad(loss, (0, 1))(jnp.asarray(operator.weights), jnp.asarray(operator.degree)):
+        assert np.isfinite(gradient).all()

@@ -1,0 +1,216 @@
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import jaxmark as jm
+from jaxmark import distortion
+from jaxmark.mesh import Mesh, make_mesh
+from jaxmark.schemes import EigenScheme, HostScheme
+from tests.samples import bumpy_sphere, exact_sheet
+
+MESSAGE = bytes.fromhex("0123456789abcdef")
+SCHEMES = ["host", "eigen"]
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_round_trip_within_the_budget(sphere: Mesh, key: jm.Key, scheme, dtype):
+    marked, info = jm.embed(sphere, MESSAGE, key, budget=5e-4, scheme=scheme)
+    length = np.linalg.norm(np.ptp(sphere.vertices, axis=0))
+    shift = np.linalg.norm(marked.vertices - sphere.vertices, axis=1) / length
+    assert np.sqrt(np.mean(shift**2)) == pytest.approx(5e-4, rel=1e-9)
+    assert info.rms == pytest.approx(5e-4, rel=1e-9)
+    assert info.max == pytest.approx(shift.max(), rel=1e-9)
+    found = jm.detect(marked, original=sphere, key=key, scheme=scheme)
+    assert found.message == MESSAGE
+    assert found.detected()
+    assert found.coverage == 1.0
+    bits = 2.0 * np.unpackbits(np.frombuffer(MESSAGE, np.uint8)) - 1
+    np.testing.assert_allclose(found.scores, bits, atol=0.05)
+    claimed = jm.detect(marked, original=sphere, key=key, scheme=scheme, message=MESSAGE)
+    assert claimed.log10_p < -6
+    assert jm.detect(marked, original=sphere, key=key, scheme=scheme, message=b"somebody").log10_p > -6
+    assert jm.detect(marked, original=sphere, key=jm.new_key(), scheme=scheme, message=MESSAGE).log10_p > -6
+
+
+def test_precisions_read_each_other(sphere: Mesh, key: jm.Key):
+    marked, _ = jm.embed(sphere, MESSAGE, key)
+    with jax.enable_x64(True):
+        assert jm.detect(marked, original=sphere, key=key).message == MESSAGE
+        doubly, _ = jm.embed(sphere, MESSAGE, key)
+    assert jm.detect(doubly, original=sphere, key=key).message == MESSAGE
+    np.testing.assert_allclose(doubly.vertices, marked.vertices, atol=1e-5)
+
+
+def test_golden_displacement(key: jm.Key):
+    """Held within a tolerance, for ever: the same mark on the same mesh."""
+    mesh = exact_sheet(20)
+    marked, _ = jm.embed(mesh, b"\xc0\xff\xee", key, scheme=HostScheme(bands=64))
+    shift = 1e3 * (marked.vertices - mesh.vertices)[[0, 50, 100, 150]]
+    golden = np.array(
+        [
+            [-5.139426, -58.997624, 32.969155],
+            [0.070945, 4.86657, 0.558546],
+            [-15.130427, -1.194579, -23.586549],
+            [-2.915168, 0.746319, 2.512086],
+        ]
+    )
+    np.testing.assert_allclose(shift, golden, atol=0.1)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_mark_far_from_the_origin_and_at_any_scale(key: jm.Key, scheme):
+    sphere = bumpy_sphere(3)
+    for factor, offset in ((1e-20, 0.0), (1e20, 0.0), (1.0, 1e6)):
+        mesh = make_mesh(factor * sphere.vertices + offset, sphere.faces)
+        marked, info = jm.embed(mesh, MESSAGE, key, scheme=scheme)
+        assert info.rms == pytest.approx(8e-4, rel=1e-6)
+        assert jm.detect(marked, original=mesh, key=key, scheme=scheme).message == MESSAGE
+
+
+def test_copies_move_together_and_isolated_vertices_stay(sphere: Mesh, key: jm.Key):
+    soup = make_mesh(
+        np.vstack([sphere.vertices[sphere.faces].reshape(-1, 3), [[7.0, 7, 7]]]),
+        np.arange(3 * len(sphere.faces)).reshape(-1, 3),
+    )
+    marked, info = jm.embed(soup, MESSAGE, key)
+    np.testing.assert_array_equal(marked.vertices[-1], [7, 7, 7])
+    points: dict[tuple, tuple] = {}
+    for before, after in zip(soup.vertices, marked.vertices, strict=True):
+        assert points.setdefault(tuple(before), tuple(after)) == tuple(after)
+    assert len(points) == len(sphere.vertices) + 1
+    assert len(set(points.values())) == len(points)
+    shift = np.array(list(points.values())) - np.array(list(points))
+    length = np.linalg.norm(np.ptp(sphere.vertices, axis=0))
+    assert np.sqrt((shift**2).sum(1).mean()) / length == pytest.approx(info.rms, rel=1e-9)
+    # Copies that an attack moved apart are averaged: each corner of the soup gets noise of its own.
+    noise = 5e-4 * length * np.random.default_rng(0).uniform(-1, 1, soup.vertices.shape)
+    assert jm.detect(marked._replace(vertices=marked.vertices + noise), original=soup, key=key).message == MESSAGE
+
+
+def test_a_suspect_is_not_welded_by_its_own_positions(sphere: Mesh, key: jm.Key):
+    """Coarse quantisation makes vertices coincide; the original's weld map decides."""
+    marked, _ = jm.embed(sphere, b"\x5a", key, budget=5e-3)
+    coarse = jm.attack(marked, "quantisation", 5, seed=0)
+    assert len(np.unique(coarse.vertices, axis=0)) < len(sphere.vertices)
+    assert jm.detect(coarse, original=sphere, key=key, bits=8, message=b"\x5a").detected()
+
+
+def test_moving_the_suspect_changes_nothing(sphere: Mesh, key: jm.Key):
+    marked, _ = jm.embed(sphere, MESSAGE, key)
+    moved = marked._replace(vertices=marked.vertices + [3.0, -2.0, 1.0])
+    assert jm.detect(moved, original=sphere, key=key).message == MESSAGE
+
+
+def test_an_unmoved_suspect_is_no_evidence(sphere: Mesh, key: jm.Key):
+    for message in (None, MESSAGE):
+        found = jm.detect(sphere, original=sphere, key=key, message=message)
+        assert found.log10_p == 0.0
+        assert found.message is None
+        np.testing.assert_array_equal(found.scores, 0)
+
+
+def test_hard_graph_is_marked(key: jm.Key):
+    """Several components, a boundary, an edge with three faces, degenerate and duplicate faces, isolated vertices."""
+    a, b = bumpy_sphere(3), bumpy_sphere(2, seed=1)
+    vertices = np.vstack([a.vertices, b.vertices + 4, [[0.0, 0, 0], [1, 1, 1]]])
+    faces = np.vstack([a.faces[:-30], a.faces[:2], [[0, 0, 1], [5, 5, 5], [3, 77, 200]], b.faces + len(a.vertices)])
+    mesh = make_mesh(vertices, faces)
+    for scheme in SCHEMES:
+        marked, _ = jm.embed(mesh, MESSAGE, key, scheme=scheme)
+        assert jm.detect(marked, original=mesh, key=key, scheme=scheme).message == MESSAGE
+
+
+def test_record_binds_and_remembers(sphere: Mesh, key: jm.Key, tmp_path):
+    scheme = HostScheme(bands=64, damping="lanczos")
+    marked, info = jm.embed(sphere, b"record", key, scheme=scheme)
+    path = tmp_path / "record.json"
+    path.write_text(info.record.to_json())
+    assert key.hex() not in path.read_text()
+    assert b"record".hex() not in path.read_text()
+    record = jm.Record.load(path)
+    assert record == info.record
+    assert jm.detect(marked, original=sphere, key=key, record=record).message == b"record"
+    for change, sentence in [
+        ({"key": jm.new_key()}, "key is not the one"),
+        ({"original": marked}, "not the mesh that the record"),
+        ({"bits": 64}, "48 bits by the record"),
+        ({"message": b"longer than that"}, "payload is 48"),
+    ]:
+        with pytest.raises(jm.JaxmarkError, match=sentence):
+            jm.detect(marked, **{"original": sphere, "key": key, "record": record, **change})
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        "not json",
+        '{"format": "jaxmark-record", "version": 99}',
+        '{"format": "jaxmark-record", "version": 1, "scheme": 3}',
+    ],
+)
+def test_damaged_records_are_refused(tmp_path, text):
+    path = tmp_path / "record.json"
+    path.write_text(text)
+    with pytest.raises(jm.JaxmarkError, match="record"):
+        jm.Record.load(path)
+    with pytest.raises(jm.JaxmarkError, match="cannot be read"):
+        jm.Record.load(tmp_path / "absent")
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_refusals(sphere: Mesh, key: jm.Key):
+    tiny = make_mesh(np.vstack([np.eye(3), [[0, 0, 0]]]), np.array([[0, 1, 2], [0, 1, 3], [1, 2, 3], [2, 0, 3]]))
+    nan = sphere._replace(vertices=np.where(sphere.vertices > 1, np.nan, sphere.vertices))
+    for mesh, message, options, sentence in [
+        (tiny, MESSAGE, {}, r"\(4 points\) cannot carry 64 bits"),
+        (nan, MESSAGE, {}, "not a finite number"),
+        (sphere, b"", {}, "empty"),
+        (sphere, MESSAGE, {"budget": 0}, "budget"),
+        (sphere, MESSAGE, {"budget": float("nan")}, "budget"),
+        (sphere, MESSAGE, {"scheme": "magic"}, "host, eigen"),
+        (sphere, bytes(60), {}, "at most 352 bits"),
+        (sphere._replace(vertices=0 * sphere.vertices), MESSAGE, {}, "diagonal"),
+    ]:
+        with pytest.raises(jm.JaxmarkError, match=sentence):
+            jm.embed(mesh, message, key, **options)
+    with pytest.raises(jm.JaxmarkError, match="32 bytes"):
+        jm.embed(sphere, MESSAGE, b"short")
+    other = bumpy_sphere(2)
+    for suspect in (other, sphere._replace(faces=sphere.faces[::-1])):
+        with pytest.raises(jm.JaxmarkError, match="does not share"):
+            jm.detect(suspect, original=sphere, key=key)
+    with pytest.raises(jm.JaxmarkError, match="multiple of 8"):
+        jm.detect(sphere, original=sphere, key=key, bits=7)
+
+
+def test_schemes_are_data():
+    for scheme in (HostScheme(), EigenScheme(pairs=10)):
+        again = jm.schemes.get_scheme(scheme.name, dataclasses.asdict(scheme))
+        assert again == scheme
+    for parameters in ({"bands": "many"}, {"colour": 1}):
+        with pytest.raises(jm.JaxmarkError, match="takes the parameters bands"):
+            jm.schemes.get_scheme("host", parameters)
+
+
+def test_compare(sphere: Mesh):
+    moved = sphere._replace(vertices=sphere.vertices.copy())
+    moved.vertices[3] += [0.3, 0.4, 0]
+    length = np.linalg.norm(np.ptp(sphere.vertices, axis=0))
+    found = jm.compare(sphere, moved)
+    assert found.max == pytest.approx(0.5 / length)
+    assert found.rms == pytest.approx(0.5 / length / np.sqrt(len(sphere.vertices)))
+
+
+def test_distortions_have_finite_gradients_at_zero(dtype):
+    zero = jax.numpy.zeros((5, 3), dtype)
+    for metric in (distortion.rms, distortion.maximum):
+        np.testing.assert_array_equal(jax.grad(lambda d, m=metric: m(d))(zero), 0)
+        one = zero.at[2, 1].set(3.0)
+        assert metric(one).dtype == dtype
+    assert float(distortion.maximum(one)) == 3.0
+    assert float(distortion.rms(one)) == pytest.approx(3 / np.sqrt(5))

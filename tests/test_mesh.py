@@ -1,0 +1,79 @@
+import jax
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.mesh import Mesh, boundary_vertices, diagonal, edges, make_mesh, weld, welded_mesh
+
+TRIANGLE = np.array([[0, 1, 2]])
+CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "sentence"),
+    [
+        (CORNERS[:, :2], TRIANGLE, r"\[N, 3\]"),
+        (CORNERS, np.zeros((0, 3), int), "no faces"),
+        (CORNERS, TRIANGLE.astype(float), "integers"),
+        (CORNERS, np.array([[0, 1]]), "split polygons"),
+        (CORNERS, np.array([[0, 1, 3]]), r"Face 0 .*\[0, 1, 3\]"),
+        (CORNERS, np.array([[0, 1, -1]]), "Face 0"),
+        (np.where([[0], [1], [0]], np.nan, CORNERS), TRIANGLE, "Vertex 1 .*finite"),
+        (np.where([[0], [0], [1]], np.inf, CORNERS), TRIANGLE, "Vertex 2 .*finite"),
+        (CORNERS.astype(complex), TRIANGLE, "real"),
+    ],
+)
+def test_refuses_by_name(vertices, faces, sentence):
+    with pytest.raises(JaxmarkError, match=sentence):
+        make_mesh(vertices, faces)
+
+
+def test_is_a_pytree(sphere: Mesh):
+    doubled = jax.tree.map(lambda leaf: leaf * 2, sphere)
+    assert isinstance(doubled, Mesh)
+    np.testing.assert_array_equal(doubled.vertices, 2 * sphere.vertices)
+
+
+@given(st.lists(st.sampled_from([-1.0, -0.0, 0.0, 1.0, 1 + 1e-16, 1 + 1e-15]), min_size=3, max_size=30))
+def test_weld_groups_equal_positions_by_first_occurrence(numbers):
+    vertices = np.array(numbers[: len(numbers) // 3 * 3]).reshape(-1, 3)
+    found = weld(vertices)
+    first_seen: dict[tuple, int] = {}
+    for vertex, point in zip(vertices, found.index, strict=True):
+        assert first_seen.setdefault(tuple(vertex), len(first_seen)) == point
+    np.testing.assert_array_equal(vertices[found.first][found.index], vertices)
+
+
+def test_edges_are_those_of_trimesh(sphere: Mesh):
+    ours = edges(sphere.faces)
+    theirs = np.unique(np.sort(trimesh.Trimesh(*sphere, process=False).edges_unique, axis=1), axis=0)
+    np.testing.assert_array_equal(ours, theirs)
+
+
+def test_degenerate_sides_are_no_edges():
+    np.testing.assert_array_equal(edges(np.array([[0, 0, 1], [2, 2, 2]])), [[0, 1]])
+
+
+def test_boundary_vertices(sphere: Mesh, hard_graph: Mesh):
+    assert boundary_vertices(sphere.faces).size == 0
+    open_faces = sphere.faces[1:]
+    np.testing.assert_array_equal(boundary_vertices(open_faces), np.unique(sphere.faces[0]))
+    # The sides of the three faces around the edge 1-2, and the rim of the second component.
+    np.testing.assert_array_equal(boundary_vertices(hard_graph.faces), [0, 1, 2, 3, 4, 6, 7, 9])
+
+
+def test_diagonal_ignores_unused_vertices():
+    mesh = make_mesh(np.vstack([CORNERS, [[100.0, 0, 0]]]), TRIANGLE)
+    assert diagonal(mesh) == pytest.approx(np.sqrt(2))
+    with pytest.raises(JaxmarkError, match="diagonal of 0"):
+        diagonal(make_mesh(np.ones((3, 3)), TRIANGLE))
+
+
+def test_welded_mesh_keeps_positions_of_faces():
+    soup = make_mesh(np.vstack([CORNERS, CORNERS[[1, 2]], [[1.0, 1, 0]]]), np.array([[0, 1, 2], [4, 3, 5]]))
+    points = welded_mesh(soup, weld(soup.vertices))
+    assert len(points.vertices) == 4
+    np.testing.assert_array_equal(points.vertices[points.faces], soup.vertices[soup.faces])

@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+import trimesh
+
+from jaxmark import spectrum
+from jaxmark.errors import JaxmarkError
+from jaxmark.laplacian import centre, make_laplacian
+from jaxmark.mesh import Mesh, make_mesh
+from jaxmark.spectrum import eigenpairs, quadrature
+from tests.dense import laplacian_matrix
+
+
+@pytest.mark.parametrize("weights", ["valence", "inverse-length"])
+def test_eigenpairs_of_a_hard_graph(hard_graph: Mesh, weights):
+    operator = make_laplacian(hard_graph, weights)
+    pairs = eigenpairs(operator)
+    delta, mass = laplacian_matrix(operator), np.diag(operator.degree)
+    assert len(pairs.values) == 7  # 9 linked vertices in two components
+    np.testing.assert_allclose(delta @ pairs.vectors, pairs.vectors * pairs.values, atol=1e-12)
+    np.testing.assert_allclose(pairs.vectors.T @ mass @ pairs.vectors, np.eye(7), atol=1e-12)
+    assert (np.diff(pairs.values) >= 0).all()
+    np.testing.assert_array_equal(pairs.vectors[[5, 10]], 0)
+    # Complete on centred signals.
+    x = centre(operator, hard_graph.vertices)
+    np.testing.assert_allclose(pairs.vectors @ (pairs.vectors.T @ mass @ x), x, atol=1e-12)
+
+
+def test_iterated_pairs_are_the_dense_ones(sphere: Mesh, monkeypatch):
+    operator = make_laplacian(sphere, "inverse-length")  # by valence, this graph has repeated eigenvalues
+    dense = eigenpairs(operator, 20)
+    monkeypatch.setattr(spectrum, "_DENSE_LIMIT", 0)
+    iterated = eigenpairs(operator, 20)
+    np.testing.assert_allclose(iterated.values, dense.values, atol=1e-10)
+    overlap = dense.vectors.T @ (operator.degree[:, None] * iterated.vectors)
+    np.testing.assert_allclose(np.abs(np.diagonal(overlap)), 1, atol=1e-6)
+    with pytest.raises(JaxmarkError, match="too many to iterate"):
+        eigenpairs(operator, 300)
+
+
+def test_repeated_eigenvalues_are_one_space():
+    """The icosahedron's graph: eigenvalues 1 - 1/√5 (3 times), 6/5 (5 times), 1 + 1/√5 (3 times)."""
+    ball = trimesh.creation.icosahedron()
+    pairs = eigenpairs(make_laplacian(make_mesh(ball.vertices, ball.faces)))
+    np.testing.assert_allclose(pairs.values, [1 - 5**-0.5] * 3 + [1.2] * 5 + [1 + 5**-0.5] * 3, atol=1e-12)
+    np.testing.assert_array_equal(pairs.space, [0] * 3 + [3] * 5 + [8] * 3)
+
+
+def test_quadrature_is_exact_for_polynomials(hard_graph: Mesh):
+    operator = make_laplacian(hard_graph, "inverse-length")
+    x = centre(operator, hard_graph.vertices)[:, 0]
+    delta = laplacian_matrix(operator)
+    for steps in (1, 3, 50):
+        found = quadrature(operator, x, steps)
+        for power in range(min(2 * steps, 12)):
+            exact = x @ (operator.degree * (np.linalg.matrix_power(delta, power) @ x))
+            assert found.weights @ found.nodes**power == pytest.approx(exact, rel=1e-9)
+    assert quadrature(operator, 0 * x, 3).nodes.size == 0
+
+
+def test_refuses_no_pairs(sphere: Mesh):
+    with pytest.raises(JaxmarkError, match="at least 1"):
+        eigenpairs(make_laplacian(sphere), 0)
