@@ -1,10 +1,11 @@
 """How cleanly each family of bands separates a mesh: python benchmarks/families.py MESH [--bands 64].
 
-One row per family: largest overshoot of a response, median leakage of the bands that hold energy, and coherence of the unit components
-of x, y and z (the paper's Condition 3 wants it near 0).
+One row per family: largest overshoot of a response, median leakage of the bands that hold energy, and coherence of the
+unit components of x, y and z (the paper's Condition 3 wants it near 0).
 """
 
 import argparse
+from typing import Literal
 
 import numpy as np
 
@@ -13,7 +14,12 @@ from jaxmark.bands import report, scaling
 from jaxmark.laplacian import centre, make_laplacian
 from jaxmark.mesh import weld, welded_mesh
 
-FAMILIES = [("printed", "none"), ("halved", "none"), ("halved", "lanczos"), ("halved", "jackson")]
+FAMILIES: list[tuple[Literal["halved", "printed"], Literal["none", "jackson", "lanczos"]]] = [
+    ("printed", "none"),
+    ("halved", "none"),
+    ("halved", "lanczos"),
+    ("halved", "jackson"),
+]
 
 
 def main() -> None:

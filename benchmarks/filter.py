@@ -1,7 +1,7 @@
 """One filter against SciPy, same work, one run: python benchmarks/filter.py MESH [--degree 64] [--repeat 5].
 
-Three float32 columns through a Chebyshev series: SciPy's CSR product in a Python loop, ours, and ours with both gradients. Medians
-over the repeats, and ratios.
+Three float32 columns through a Chebyshev series: SciPy's CSR product in a Python loop, ours, and ours with both
+gradients. Medians over the repeats, and ratios.
 """
 
 import argparse

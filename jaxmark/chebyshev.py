@@ -17,16 +17,16 @@ from jaxtyping import Array, Float
 from jaxmark.errors import JaxmarkError
 from jaxmark.laplacian import Laplacian
 
-Signal = Float[Array | np.ndarray, "vertices *columns"]
+Signal = Float[Array | np.ndarray, " vertices *columns"]
 
 
 def filter(
     operator: Laplacian,
-    coefficients: Float[Array | np.ndarray, "terms *filters"],
+    coefficients: Float[Array | np.ndarray, " terms *filters"],
     x: Signal,
     *,
     derivative: Literal["recompute", "scan"] = "recompute",
-) -> Float[Array, "vertices *columns"]:
+) -> Float[Array, " vertices *columns"]:
     """f(Δ)x for the Chebyshev series f(λ) = Σ_k c_k T_k(λ - 1), as one `lax.scan`.
 
     Args:
@@ -73,6 +73,7 @@ def band_components(
     Returns:
         `[bands, N]` or `[bands, N, C]`.
     """
+    x = jnp.asarray(x)
     _check_signal("band_components", operator, x)
     c = _check_bands(coefficients).astype(x.dtype)
 
@@ -83,22 +84,23 @@ def band_components(
 
 
 @partial(jax.jit, static_argnames="degree")
-def cross_moments(operator: Laplacian, u: Signal, x: Signal, *, degree: int) -> Float[Array, "terms *columns"]:
+def cross_moments(operator: Laplacian, u: Signal, x: Signal, *, degree: int) -> Float[Array, " terms *columns"]:
     """⟨u, T_k(Δ̃)x⟩_D for k = 0 … degree, column by column.
 
     Every correlation with a band needs only these: ⟨u, f_j(Δ)x⟩_D = Σ_k C_jk ⟨u, T_k x⟩_D. With them, weak bands are
     small differences of large numbers: in float32 a band is lost where ‖f_j x‖ is below about 1e-6 ‖x‖.
     """
     _check_signal("cross_moments", operator, x)
-    return _projections(operator, _weighted(operator, u), x, degree)
+    return _projections(operator, _weighted(operator, u), jnp.asarray(x), degree)
 
 
 @partial(jax.jit, static_argnames="degree")
-def moments(operator: Laplacian, x: Signal, *, degree: int) -> Float[Array, "moments *columns"]:
+def moments(operator: Laplacian, x: Signal, *, degree: int) -> Float[Array, " moments *columns"]:
     """m_k = ⟨x, T_k(Δ̃)x⟩_D for k = 0 … 2·degree from only `degree` products, column by column.
 
     By T_{j+k} + T_{|j-k|} = 2T_jT_k: m_2k = 2⟨T_k x, T_k x⟩_D - m_0 and m_{2k-1} = 2⟨T_k x, T_{k-1} x⟩_D - m_1.
     """
+    x = jnp.asarray(x)
     _check_signal("moments", operator, x)
 
     def products(_: None, t: Array, before: Array, __: Array) -> tuple[None, tuple[Array, Array]]:

@@ -1,7 +1,7 @@
 """The command line: files in, files and one answer out.
 
-Exit status 0: done, or detected. 1: `detect` found nothing. 2: refused, with one sentence on standard error and no output
-file. With --json, standard output holds exactly one JSON object.
+Exit status 0: done, or detected. 1: `detect` found nothing. 2: refused, with one sentence on standard error and no
+output file. With --json, standard output holds exactly one JSON object.
 """
 
 import json
@@ -42,7 +42,9 @@ class _Hexadecimal(click.ParamType):
         except ValueError:
             message = b""
         if not message:
-            self.fail(f"{value!r} is not a message: give an even number of hexadecimal digits, e.g. c0ffee42.", param, ctx)
+            self.fail(
+                f"{value!r} is not a message: give an even number of hexadecimal digits, e.g. c0ffee42.", param, ctx
+            )
         return message
 
 
@@ -95,7 +97,9 @@ def keygen(keyfile: Path, as_json: bool) -> None:
     show_default=True,
     help="RMS displacement of the vertices, relative to the diagonal of the bounding box.",
 )
-@click.option("--scheme", type=click.Choice(list(SCHEMES)), default="host", show_default=True, help="What carries the bits.")
+@click.option(
+    "--scheme", type=click.Choice(list(SCHEMES)), default="host", show_default=True, help="What carries the bits."
+)
 @click.option("--record", "record_file", type=_MESH, help=f"Where the record goes.  [default: MARKED{_RECORD_SUFFIX}]")
 @_JSON
 def embed_command(
@@ -110,8 +114,8 @@ def embed_command(
 ) -> None:
     """Mark ORIGINAL and write MARKED, of the same format.
 
-    Only positions change (and normals, where the file has them); materials, colours, groups and comments stay byte by byte.
-    A record goes beside MARKED: it holds no secret, and with it nothing about the mark needs remembering.
+    Only positions change (and normals, where the file has them); materials, colours, groups and comments stay byte by
+    byte. A record goes beside MARKED: it holds no secret, and with it nothing about the mark needs remembering.
     """
     record_file = record_file or marked.with_name(marked.name + _RECORD_SUFFIX)
     _distinct(original=original, marked=marked, key=key_file, record=record_file)
@@ -150,10 +154,18 @@ def embed_command(
 @click.option("--original", type=_MESH, required=True, help="The unmarked mesh.")
 @_KEY
 @click.option("--bits", type=int, help=f"Payload, a multiple of 8.  [default: the record's, else {DEFAULT_BITS}]")
-@click.option("--message", type=_Hexadecimal(), help="A message claimed to be there: proves it even where it cannot be read.")
-@click.option("--record", "record_file", type=_MESH, help="The mark's record: gives scheme and payload, binds key and original.")
-@click.option("--scheme", type=click.Choice(list(SCHEMES)), help="Without a record: what carries the bits.  [default: host]")
-@click.option("--alpha", type=float, default=1e-6, show_default=True, help="Largest false-positive probability that counts.")
+@click.option(
+    "--message", type=_Hexadecimal(), help="A message claimed to be there: proves it even where it cannot be read."
+)
+@click.option(
+    "--record", "record_file", type=_MESH, help="The mark's record: gives scheme and payload, binds key and original."
+)
+@click.option(
+    "--scheme", type=click.Choice(list(SCHEMES)), help="Without a record: what carries the bits.  [default: host]"
+)
+@click.option(
+    "--alpha", type=float, default=1e-6, show_default=True, help="Largest false-positive probability that counts."
+)
 @_JSON
 def detect_command(
     suspect: Path,
@@ -168,8 +180,8 @@ def detect_command(
 ) -> None:
     """Look for a mark in SUSPECT, which must share the original's vertex and face order.
 
-    Exit status 0 if the false-positive probability is at most --alpha, else 1. It holds for any suspect made without the
-    key, as long as key, original and a claimed message were fixed before the suspect was seen.
+    Exit status 0 if the false-positive probability is at most --alpha, else 1. It holds for any suspect made without
+    the key, as long as key, original and a claimed message were fixed before the suspect was seen.
     """
     if not 0 < alpha < 1:
         raise JaxmarkError(f"--alpha is a probability and must be in (0, 1), got {alpha:g}.")
@@ -212,7 +224,9 @@ _KINDS = "; ".join(f"{name}: {entry.unit}" for name, entry in ATTACKS.items())
 @click.argument("target", metavar="OUT", type=_MESH)
 @click.argument("kind", type=click.Choice(list(ATTACKS)))
 @click.argument("strength", type=float)
-@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of the attack's randomness.")
+@click.option(
+    "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of the attack's randomness."
+)
 @_JSON
 def attack_command(source: Path, target: Path, kind: str, strength: float, seed: int, as_json: bool) -> None:
     """Put a mesh through an attack, to see what a mark survives."""
@@ -312,6 +326,6 @@ class _replacing:  # noqa: N801 (used as a function)
     def __exit__(self, kind: Any, *_: object) -> None:
         try:
             if kind is None:
-                os.replace(Path(self._folder.name) / self._target.name, self._target)
+                (Path(self._folder.name) / self._target.name).replace(self._target)
         finally:
             self._folder.cleanup()

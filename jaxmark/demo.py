@@ -61,8 +61,8 @@ def run_demo(
 ) -> list[Row]:
     """Mark a mesh with a fresh key and message, attack it, and read it again, by each scheme.
 
-    Leaves in the folder `output`: the marked mesh of each scheme with its record, the table `table.md`, and the pictures
-    `mark.png` and `attacked.png`. The key is thrown away.
+    Leaves in the folder `output`: the marked mesh of each scheme with its record, the table `table.md`, and the
+    pictures `mark.png` and `attacked.png`. The key is thrown away.
 
     Args:
         source: a mesh file, or None for `sample_mesh`.
@@ -140,7 +140,7 @@ def _line(row: Row) -> str:
 
 def _table(rows: list[Row]) -> str:
     head = (
-        "| scheme | attack | attack RMS / diagonal | wrong bits of 64 | message | log10 p | log10 p, message claimed |\n"
+        "| scheme | attack | attack RMS / diagonal | wrong bits of 64 | message | log10 p | log10 p, claimed |\n"
         "|---|---|---|---|---|---|---|\n"
     )
     lines = (

@@ -50,9 +50,10 @@ def correlation_bound(
 ) -> Float[Array, " bits"]:
     """The paper's bound (3): a lower bound on |W_i| of the plain correlation, completed by what it leaves out.
 
-    For unit components with |⟨x_i, x_j⟩_D| ≤ ε, n bands, k bits of strength β, and an attack Σ_j a_j x_j inside the span of the
-    components, |W_i| ≥ βn - |Σ_j p_j a_j| - ε(n - 1)(βkn + Σ_j |a_j|). The paper omits β and the other bits. At the ε of
-    real meshes under its own kernel (about 0.9) the bound is negative and says nothing: compute it, do not lean on it.
+    For unit components with |⟨x_i, x_j⟩_D| ≤ ε, n bands, k bits of strength β, and an attack Σ_j a_j x_j inside the
+    span of the components, |W_i| ≥ βn - |Σ_j p_j a_j| - ε(n - 1)(βkn + Σ_j |a_j|). The paper omits β and the other
+    bits. At the ε of real meshes under its own kernel (about 0.9) the bound is negative and says nothing: compute it,
+    do not lean on it.
 
     Args:
         sequences: ±1, `[k, n]`, mutually orthogonal.

@@ -89,7 +89,7 @@ def geometry_hash(mesh: Mesh) -> bytes:
     vertices = np.asarray(mesh.vertices, np.float64)
     welded = weld(vertices)
     points = vertices[welded.first] + 0.0
-    faces = welded.index[np.asarray(mesh.faces)]
+    faces = welded.point[np.asarray(mesh.faces)]
     state = hashlib.sha256(b"jaxmark/1/geometry")
     state.update(np.array([len(points), len(faces)], "<i8").tobytes())
     state.update(points.astype("<f8").tobytes())

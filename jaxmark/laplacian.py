@@ -32,7 +32,7 @@ class Laplacian(NamedTuple):
     degree: Float[Array | np.ndarray, " vertices"]  # D: the weights' row sums, 0 where isolated
 
     @jax.jit
-    def apply(self, x: Float[Array, "vertices *columns"]) -> Float[Array, "vertices *columns"]:
+    def apply(self, x: Float[Array, " vertices *columns"]) -> Float[Array, " vertices *columns"]:
         """Δx for one signal `[N]` or several `[N, C]`: two segment-sums over the edges, in the dtype of `x`."""
         tail, head = self.edges[:, 0], self.edges[:, 1]
         weights = _column(self.weights, x)
@@ -45,8 +45,8 @@ class Laplacian(NamedTuple):
 
     @jax.jit
     def inner(
-        self, x: Float[Array, "vertices *columns"], y: Float[Array, "vertices *columns"]
-    ) -> Float[Array, "*columns"]:
+        self, x: Float[Array, " vertices *columns"], y: Float[Array, " vertices *columns"]
+    ) -> Float[Array, " *columns"]:
         """⟨x, y⟩_D = Σ_v D_v x_v y_v, column by column: a scalar for `[N]`, `[C]` for `[N, C]`."""
         return jnp.sum(_column(self.degree, x) * x * y, axis=0)
 
@@ -78,7 +78,9 @@ def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence") -> La
             case "cotangent":
                 values = _cotangents(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces), pairs)
             case _:
-                raise JaxmarkError(f"weights must be 'valence', 'inverse-length', 'cotangent' or an array, got {weights!r}.")
+                raise JaxmarkError(
+                    f"weights must be 'valence', 'inverse-length', 'cotangent' or an array, got {weights!r}."
+                )
     else:
         values = np.asarray(weights, np.float64)
         if values.shape != (len(pairs),):
@@ -89,13 +91,16 @@ def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence") -> La
     return Laplacian(pairs.astype(np.int32), values, degree)
 
 
-def centre(operator: Laplacian, x: Float64[np.ndarray, "vertices columns"]) -> Float64[np.ndarray, "vertices columns"]:
+def centre(
+    operator: Laplacian, x: Float[Array | np.ndarray, "vertices columns"]
+) -> Float64[np.ndarray, "vertices columns"]:
     """Subtract from each connected component its D-weighted mean, on the host in float64.
 
     What is left has no part in the null space of Δ: a filtered signal then does not depend on where the object, or any
     piece of it, stands. Do this before casting to float32, or large offsets eat the digits. An isolated vertex
     becomes 0.
     """
+    x = np.asarray(x, np.float64)
     degree = np.asarray(operator.degree, np.float64)
     size = len(degree)
     tail, head = np.asarray(operator.edges).T

@@ -86,10 +86,9 @@ def embed(
     written = residual(original, marked)
     found = _read(original, carrier, decorrelate, key, written, None)
     if found.message != message:
-        wrong = int(np.sum((found.scores > 0) != (codeword[:bits] > 0)))
         raise JaxmarkError(
-            f"This mesh ({len(original.signal)} points) cannot carry {bits} bits with the scheme {scheme.name!r}: even"
-            f" unattacked they do not read back ({wrong} payload bits wrong). Use a shorter message or a finer mesh."
+            f"This mesh ({len(original.signal)} points) cannot carry {bits} bits with the scheme {scheme.name!r}: they"
+            " do not read back, even unattacked. Use a shorter message, or a finer or less regular mesh."
         )
     record = Record(
         scheme=scheme.name,

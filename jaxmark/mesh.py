@@ -7,7 +7,7 @@ runs on the host with NumPy, keeps float64, and says what is wrong before anythi
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int, Int64
+from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 
 from jaxmark.errors import JaxmarkError
@@ -27,7 +27,7 @@ class Mesh(NamedTuple):
 class Weld(NamedTuple):
     """Which vertices are copies of one point (UV seams, triangle soup) and so must move together."""
 
-    index: Int64[np.ndarray, " vertices"]  # vertex → point, numbered by first occurrence
+    point: Int64[np.ndarray, " vertices"]  # vertex → point, numbered by first occurrence
     first: Int64[np.ndarray, " points"]  # point → its first vertex
 
 
@@ -81,7 +81,7 @@ def host_mesh(mesh: Mesh) -> Mesh:
     return make_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
-def weld(vertices: Float64[np.ndarray, "vertices 3"]) -> Weld:
+def weld(vertices: Float[Array | np.ndarray, "vertices 3"]) -> Weld:
     """Find vertices at exactly the same position (-0.0 equals 0.0); points are numbered by first occurrence.
 
     Args:
@@ -90,7 +90,7 @@ def weld(vertices: Float64[np.ndarray, "vertices 3"]) -> Weld:
     Returns:
         The map in both directions; `vertices[weld.first]` are the distinct points.
     """
-    canonical = vertices + 0.0  # turns -0.0 into 0.0
+    canonical = np.asarray(vertices, np.float64) + 0.0  # turns -0.0 into 0.0
     _, first, inverse = np.unique(canonical, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty_like(order)
@@ -100,10 +100,10 @@ def weld(vertices: Float64[np.ndarray, "vertices 3"]) -> Weld:
 
 def welded_mesh(mesh: Mesh, welded: Weld) -> Mesh:
     """The mesh of the distinct points: same faces, referring to points instead of vertices."""
-    return Mesh(np.asarray(mesh.vertices)[welded.first], welded.index[np.asarray(mesh.faces)])
+    return Mesh(np.asarray(mesh.vertices)[welded.first], welded.point[np.asarray(mesh.faces)])
 
 
-def edges(faces: Int[np.ndarray, "faces 3"]) -> Int64[np.ndarray, "edges 2"]:
+def edges(faces: Int[Array | np.ndarray, "faces 3"]) -> Int64[np.ndarray, "edges 2"]:
     """The undirected edges of the faces, each once, as `[E, 2]` with the smaller index first, sorted.
 
     An edge used by one face, two, or more counts once; sides of degenerate faces that join a vertex to itself do
@@ -123,11 +123,13 @@ def diagonal(mesh: Mesh) -> float:
     used = np.asarray(mesh.vertices, np.float64)[np.unique(np.asarray(mesh.faces))]
     length = float(np.linalg.norm(np.ptp(used, axis=0)))
     if not 0.0 < length < np.inf:
-        raise JaxmarkError(f"The bounding box of the mesh has a diagonal of {length:g}; it must be positive and finite.")
+        raise JaxmarkError(
+            f"The bounding box of the mesh has a diagonal of {length:g}; it must be positive and finite."
+        )
     return length
 
 
-def boundary_vertices(faces: Int[np.ndarray, "faces 3"]) -> Int64[np.ndarray, " boundary"]:
+def boundary_vertices(faces: Int[Array | np.ndarray, "faces 3"]) -> Int64[np.ndarray, " boundary"]:
     """Vertices on an edge that only one face uses, ascending."""
     pairs, count = _count_sides(faces)
     return np.unique(pairs[count == 1])
@@ -141,9 +143,10 @@ def same_connectivity(first: Mesh, second: Mesh) -> bool:
 
 
 def _count_sides(
-    faces: Int[np.ndarray, "faces 3"],
+    faces: Int[Array | np.ndarray, "faces 3"],
 ) -> tuple[Int64[np.ndarray, "edges 2"], Int64[np.ndarray, " edges"]]:
     """The undirected edges, and how many faces have each as a side."""
+    faces = np.asarray(faces)
     pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64), axis=1)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     # One integer per pair sorts many times faster than rows do.

@@ -47,7 +47,7 @@ def prepare(mesh: Mesh) -> Original:
 
 def displaced(original: Original, displacement: Float64[np.ndarray, "points 3"]) -> Mesh:
     """The original with its welded points moved (in diagonals); copies of a point move together."""
-    moved = original.mesh.vertices + original.diagonal * displacement[original.weld.index]
+    moved = original.mesh.vertices + original.diagonal * displacement[original.weld.point]
     return Mesh(moved, original.mesh.faces)
 
 
@@ -68,6 +68,6 @@ def residual(original: Original, suspect: Mesh) -> Float64[np.ndarray, "points 3
         )
     difference = (suspect.vertices - original.mesh.vertices) / original.diagonal
     count = len(original.weld.first)
-    copies = np.bincount(original.weld.index, minlength=count)
-    sums = [np.bincount(original.weld.index, column, count) for column in difference.T]
+    copies = np.bincount(original.weld.point, minlength=count)
+    sums = [np.bincount(original.weld.point, column, count) for column in difference.T]
     return np.stack(sums, axis=1) / copies[:, None]

@@ -58,18 +58,16 @@ def save_views(
 
 def _rotation(elevation: float, azimuth: float) -> np.ndarray:
     around = np.array([[np.cos(azimuth), 0, -np.sin(azimuth)], [0, 1, 0], [np.sin(azimuth), 0, np.cos(azimuth)]])
-    down = np.array(
-        [[1, 0, 0], [0, np.cos(elevation), -np.sin(elevation)], [0, np.sin(elevation), np.cos(elevation)]]
-    )
+    down = np.array([[1, 0, 0], [0, np.cos(elevation), -np.sin(elevation)], [0, np.sin(elevation), np.cos(elevation)]])
     return down @ around
 
 
-def _draw(axes, view: View, turn: np.ndarray):  # noqa: ANN001, ANN202 (matplotlib's types are optional)
+def _draw(axes, view: View, turn: np.ndarray):
     """Painter's algorithm: faces from back to front, lit from above the eye."""
     from matplotlib.collections import PolyCollection
 
     mesh = host_mesh(view.mesh)
-    corners = (mesh.vertices @ turn.T)[mesh.faces]
+    corners = (np.asarray(mesh.vertices) @ turn.T)[np.asarray(mesh.faces)]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
@@ -87,7 +85,7 @@ def _draw(axes, view: View, turn: np.ndarray):  # noqa: ANN001, ANN202 (matplotl
         values = np.asarray(view.values, np.float64)
         mappable = ScalarMappable(Normalize(0.0, max(float(values.max()), 1e-300)), cmap="cividis")
         colours = brightness * mappable.to_rgba(values[mesh.faces].mean(axis=1))[:, :3]
-    faces = PolyCollection(corners[order][:, :, :2], facecolors=colours[order], edgecolors="face", linewidths=0.2)
+    faces = PolyCollection(list(corners[order][:, :, :2]), facecolors=colours[order], edgecolors="face", linewidths=0.2)
     axes.add_collection(faces)
     axes.set_aspect("equal")
     axes.autoscale_view()

@@ -51,7 +51,15 @@ class Record:
             raise JaxmarkError(
                 f"The record {path} is of version {data.get('version')}; this jaxmark reads version {SCHEME_VERSION}."
             )
-        types = {"scheme": str, "bits": int, "beta": float, "original": str, "key": str, "parameters": dict, "version": int}
+        types = {
+            "scheme": str,
+            "bits": int,
+            "beta": float,
+            "original": str,
+            "key": str,
+            "parameters": dict,
+            "version": int,
+        }
         if data.keys() != types.keys() or any(type(data[name]) is not kind for name, kind in types.items()):
             raise JaxmarkError(f"The record {path} is damaged: its fields are not those of a record.")
         return cls(**data)

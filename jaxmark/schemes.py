@@ -22,10 +22,7 @@ from jaxmark.spectrum import eigenpairs
 class Scheme(Protocol):
     """Anything that makes a carrier from an original, a key and a number of bits."""
 
-    @property
-    def name(self) -> str:
-        """What records and the command line call it."""
-        ...
+    name: ClassVar[str]  # what records and the command line call it
 
     def carrier(self, original: Original, key: bytes, code_bits: int) -> Carrier:
         """The carrier of so many bits on this original under this key."""

@@ -1,7 +1,7 @@
 """Mutually orthogonal sequences of signs: how several bits share the same bands (Sohn et al., section 2.2).
 
-The paper asks for k orthogonal sequences of any length n. There are none at odd length beyond one, and three or more need
-a length that is a multiple of 4: they are rows of a Hadamard matrix.
+The paper asks for k orthogonal sequences of any length n. There are none at odd length beyond one, and three or more
+need a length that is a multiple of 4: they are rows of a Hadamard matrix.
 """
 
 import numpy as np
@@ -51,7 +51,9 @@ def hadamard(order: int) -> Int8[np.ndarray, "order order"]:
         return _paley(order - 1)
     half = None if order % 8 and order > 4 else hadamard(order // 2)
     if half is None:
-        raise JaxmarkError(f"No construction here for {order} orthogonal sequences; use a power of two, or 12, 20, 24 ….")
+        raise JaxmarkError(
+            f"No construction here for {order} orthogonal sequences; use a power of two, or 12, 20, 24 …."
+        )
     return np.block([[half, half], [half, -half]]).astype(np.int8)
 
 

@@ -14,7 +14,7 @@ from jaxmark.detectors import Detector, decorrelate
 def embed(
     x: Float[Array, "vertices 3"], bits: Float[Array, " bits"], carrier: Carrier, beta: Strength
 ) -> Float[Array, "vertices 3"]:
-    """x + displacement(bits, β): the marked coordinates (Sohn et al., 2.2.1).
+    """Marked coordinates x + displacement(bits, β) (Sohn et al., 2.2.1).
 
     Args:
         x: the original's coordinates `[N, 3]`.

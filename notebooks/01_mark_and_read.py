@@ -13,8 +13,8 @@ marked, info = jm.embed(mesh, b"jaxmark!", key, budget=8e-4)
 print(f"{len(mesh.vertices)} vertices moved by RMS {info.rms:.4%} of the diagonal, at most {info.max:.4%}")
 
 # %% [markdown]
-# A reader prepares the original once, and reads as many suspects as you like. The unmarked mesh, and the right suspect under a
-# wrong key, must give nothing.
+# A reader prepares the original once, and reads as many suspects as you like. The unmarked mesh, and the right suspect
+# under a wrong key, must give nothing.
 
 # %%
 read = jm.reader(original=mesh, key=key)

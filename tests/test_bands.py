@@ -67,10 +67,12 @@ def test_damping_factors_by_their_closed_forms():
         (
             "jackson",
             lambda k: (
-                (bands - k + 1) * np.cos(np.pi * k / (bands + 1))
-                + np.sin(np.pi * k / (bands + 1)) / np.tan(np.pi / (bands + 1))
-            )
-            / (bands + 1),
+                (
+                    (bands - k + 1) * np.cos(np.pi * k / (bands + 1))
+                    + np.sin(np.pi * k / (bands + 1)) / np.tan(np.pi / (bands + 1))
+                )
+                / (bands + 1)
+            ),
         ),
     ]:
         ratio = np.where(solid, scaling(bands, damping=damping) / np.where(solid, plain, 1), np.nan)

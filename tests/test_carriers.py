@@ -131,7 +131,9 @@ def test_differentiable_with_respect_to_host_bits_and_strength(operator, signal,
     def loss(signal, bits, beta):
         return jnp.sum(jnp.sin(make_carrier("host", operator, signal, key).displacement(bits, beta)))
 
-    check_grads(jax.jit(loss), (jnp.asarray(signal), jnp.ones(BITS), jnp.full(BANDS, 0.3)), order=1, modes=["rev"], eps=1e-7)
+    check_grads(
+        jax.jit(loss), (jnp.asarray(signal), jnp.ones(BITS), jnp.full(BANDS, 0.3)), order=1, modes=["rev"], eps=1e-7
+    )
 
 
 def test_vmap_over_messages(operator, signal, key: jm.Key, x64):

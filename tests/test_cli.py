@@ -31,8 +31,7 @@ class Workshop:
     def __call__(self, *arguments: object) -> tuple[int, str, str]:
         self._monkeypatch.setattr(sys, "argv", ["jaxmark", *map(str, arguments)])
         with pytest.raises(SystemExit) as end:
-            cli.main()
-            sys.exit(0)
+            sys.exit(cli.main())
         out, err = self._capfd.readouterr()
         return int(end.value.code or 0), out, err
 
@@ -138,7 +137,10 @@ def test_refusals_are_one_sentence_and_leave_nothing(workshop: Workshop):
         (("embed", "model.ply", "out.ply", "--key", "owner.key", "--message", "00" * 60), "at most 352"),
         (("embed", "model.ply", "out.ply", "--key", "bad.key", "--message", MESSAGE), "no key file"),
         (("embed", "model.ply", "out.ply", "--message", MESSAGE), "--key"),
-        (("detect", "marked.ply", "--original", "marked.ply", "--key", "owner.key", "--record", record_name()), "record"),
+        (
+            ("detect", "marked.ply", "--original", "marked.ply", "--key", "owner.key", "--record", record_name()),
+            "record",
+        ),
         (("detect", "marked.ply", *DETECT, "--record", "other.json"), "record"),
         (("detect", "marked.ply", *DETECT, "--record", "notes.txt"), "not a record"),
         (("detect", "marked.ply", *DETECT, "--alpha", "2"), "alpha"),
@@ -171,7 +173,10 @@ def test_key_files_are_private_and_keys_never_shown(workshop: Workshop):
     assert secret not in json.dumps(told)
     workshop.embed()
     owner = Path("owner.key").read_text().strip()
-    for arguments in (("embed", "model.ply", "m2.ply", "--key", "owner.key", "--message", MESSAGE), ("detect", "marked.ply", *DETECT)):
+    for arguments in (
+        ("embed", "model.ply", "m2.ply", "--key", "owner.key", "--message", MESSAGE),
+        ("detect", "marked.ply", *DETECT),
+    ):
         _, out, err = workshop(*arguments)
         assert owner not in out + err
     assert owner not in Path("marked.ply.jaxmark.json").read_text()
@@ -203,7 +208,9 @@ def test_module_and_script_are_the_same_program(tmp_path):
 
 def test_an_interrupted_write_leaves_no_output(workshop: Workshop, monkeypatch):
     monkeypatch.setattr("jaxmark.cli.write_atomically", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
-    assert "No space left" in workshop.refused("embed", "model.ply", "out.ply", "--key", "owner.key", "--message", MESSAGE)
+    assert "No space left" in workshop.refused(
+        "embed", "model.ply", "out.ply", "--key", "owner.key", "--message", MESSAGE
+    )
 
 
 def test_demo_leaves_tables_and_pictures(workshop: Workshop):

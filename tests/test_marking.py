@@ -99,7 +99,7 @@ def test_a_suspect_is_not_welded_by_its_own_positions(sphere: Mesh, key: jm.Key)
 
 def test_moving_the_suspect_changes_nothing(sphere: Mesh, key: jm.Key):
     marked, _ = jm.embed(sphere, MESSAGE, key)
-    moved = marked._replace(vertices=marked.vertices + [3.0, -2.0, 1.0])
+    moved = marked._replace(vertices=marked.vertices + np.array([3.0, -2.0, 1.0]))
     assert jm.detect(moved, original=sphere, key=key).message == MESSAGE
 
 

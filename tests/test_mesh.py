@@ -42,9 +42,9 @@ def test_weld_groups_equal_positions_by_first_occurrence(numbers):
     vertices = np.array(numbers[: len(numbers) // 3 * 3]).reshape(-1, 3)
     found = weld(vertices)
     first_seen: dict[tuple, int] = {}
-    for vertex, point in zip(vertices, found.index, strict=True):
+    for vertex, point in zip(vertices, found.point, strict=True):
         assert first_seen.setdefault(tuple(vertex), len(first_seen)) == point
-    np.testing.assert_array_equal(vertices[found.first][found.index], vertices)
+    np.testing.assert_array_equal(vertices[found.first][found.point], vertices)
 
 
 def test_edges_are_those_of_trimesh(sphere: Mesh):

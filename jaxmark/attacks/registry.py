@@ -59,4 +59,4 @@ def attack(mesh: Mesh, kind: str, strength: float, *, seed: int) -> Mesh:
     # What the attack left alone stays exactly where it was.
     still = moved == np.asarray(start, np.float64)
     vertices = np.where(still, points.vertices, centre + length * moved)
-    return Mesh(vertices[welded.index], mesh.faces)
+    return Mesh(vertices[welded.point], mesh.faces)

@@ -18,20 +18,18 @@ class Carrier(Protocol):
     """
 
     def displacement(self, bits: Float[Array, " bits"], beta: Strength = 1.0) -> Displacement:
-        """The displacement that carries `bits` (±1, or any real amplitudes), linear in `bits` and in `beta`."""
+        """Move the vertices so that they carry `bits` (±1, or any real amplitudes): linear in `bits` and in `beta`."""
         ...
 
     def adjoint(self, residual: Displacement, beta: Strength = 1.0) -> Float[Array, " bits"]:
-        """The D-adjoint: ⟨displacement(a), r⟩_D summed over coordinates equals a · adjoint(r)."""
+        """Apply the D-adjoint: ⟨displacement(a), r⟩_D, summed over coordinates, is the dot product of a and this."""
         ...
 
     def gram(self, beta: Strength = 1.0) -> Float[Array, "bits bits"]:
         """D inner products of the bits' displacements: adjoint(displacement(e_j)), column by column."""
         ...
 
-    def claim(
-        self, residual: Displacement, bits: Float[Array, " bits"]
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def claim(self, residual: Displacement, bits: Float[Array, " bits"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Score S of a claimed codeword, and the norm ‖a‖ with S = Σ s·a over the keyed signs s (a is key-free)."""
         ...
 
@@ -55,7 +53,7 @@ class Components(Protocol):
 
 
 class ModulatedCarrier(NamedTuple):
-    """w = Σ_i bit_i Σ_j β_j p_j^(i) x_j: the bits modulate components x_j of the host by sequences p (Sohn et al., 2.2).
+    """Bits on components x_j of the host by sequences p: w = Σ_i bit_i Σ_j β_j p_j^(i) x_j (Sohn et al., 2.2).
 
     With polynomial bands as components it is the paper's scheme, with eigenspaces Ohbuchi's.
     """
@@ -78,9 +76,7 @@ class ModulatedCarrier(NamedTuple):
         weighted = _per_band(beta, products) * self._sequences(products)
         return jnp.einsum("ajc,cjl,blc->ab", weighted, products, weighted)
 
-    def claim(
-        self, residual: Displacement, bits: Float[Array, " bits"]
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def claim(self, residual: Displacement, bits: Float[Array, " bits"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """See `Carrier`; one sign per band and coordinate, or per band where coordinates share their sequences."""
         found = self.components.analyse(residual)
         if self.sequences.shape[-1] == 1:

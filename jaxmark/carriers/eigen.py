@@ -2,8 +2,8 @@
 
 Ohbuchi, Takahashi, Miyazawa, Mukaiyama, "Watermarking 3D polygonal meshes in the mesh spectral domain", 2001, add ±β to
 spectral coefficients. The paper's special case x_j = ⟨x, φ_j⟩_D φ_j, at unit norm, is that scheme with each
-eigenvector's arbitrary sign fixed by the host. Repeated eigenvalues have no preferred eigenvectors: the host's projection on the
-whole eigenspace stands for them.
+eigenvector's arbitrary sign fixed by the host. Repeated eigenvalues have no preferred eigenvectors: the host's
+projection on the whole eigenspace stands for them.
 """
 
 from typing import NamedTuple
@@ -41,9 +41,7 @@ class Eigenspaces(NamedTuple):
         return jax.ops.segment_sum(found, self.space, len(self.space))
 
 
-def eigenspaces(
-    operator: Laplacian, signal: Float[Array | np.ndarray, "vertices 3"], pairs: Eigenpairs
-) -> Eigenspaces:
+def eigenspaces(operator: Laplacian, signal: Float[Array | np.ndarray, "vertices 3"], pairs: Eigenpairs) -> Eigenspaces:
     """Prepare projections on eigenspaces as components.
 
     Args:

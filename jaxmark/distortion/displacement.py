@@ -17,7 +17,7 @@ def rms(displacement: Float[Array | np.ndarray, "vertices 3"]) -> Float[Array | 
 
 
 def maximum(displacement: Float[Array | np.ndarray, "vertices 3"]) -> Float[Array | np.ndarray, ""]:
-    """max over vertices of |d_v|, in the units of `displacement`; gradient 0 where all is 0."""
+    """Largest |d_v| over the vertices, in the units of `displacement`; gradient 0 where all is 0."""
     xp = np if isinstance(displacement, np.ndarray) else jnp
     largest = xp.max(xp.sum(displacement**2, axis=-1))
     return xp.where(largest > 0, xp.sqrt(xp.where(largest > 0, largest, 1)), 0)

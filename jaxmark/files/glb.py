@@ -39,8 +39,10 @@ def parse(data: bytes) -> Source:
     for primitive in primitives:
         index = _triangles(file, primitive.data, points.rows(primitive.position))
         faces.append(index + points.first_row(primitive.position))
-        known = primitive.normal is not None and normals.rows(primitive.normal) == points.rows(primitive.position)
-        corners.append(index + normals.first_row(primitive.normal) if known else np.full_like(index, -1))
+        if primitive.normal is None or normals.rows(primitive.normal) != points.rows(primitive.position):
+            corners.append(np.full_like(index, -1))
+        else:
+            corners.append(index + normals.first_row(primitive.normal))
     types = (_FLOAT,) * 3
     turned = None
     if normals.indices:

@@ -83,5 +83,5 @@ def _triples(
 def _absolute(
     index: Int64[np.ndarray, " corners"], before: Int64[np.ndarray, " corners"]
 ) -> Int64[np.ndarray, " corners"]:
-    """Zero-based indices from OBJ's, which count from 1 or, if negative, back from the line; 0 becomes -1."""
-    return np.where(index < 0, np.where(index + before < 0, -1, index + before), index - 1)
+    """Zero-based indices from those that count from 1 or, if negative, back from the line; negative if outside."""
+    return np.where(index < 0, index + before, index - 1)

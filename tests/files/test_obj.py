@@ -169,4 +169,4 @@ def test_digits_beyond_doubles_are_not_invented(tmp_path: Path) -> None:
     data = b"v 0.062389490071134229288 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
     source = written(tmp_path, "long.obj", data)
     moved = shifted(load_mesh(source), 0, [0.5, 0, 0])
-    assert loaded(tmp_path, "again.obj", patched(source, moved)).vertices[0, 0] == moved.vertices[0, 0]
+    assert patched(source, moved).startswith(b"v 0.5623894900711343 0 0\n")
