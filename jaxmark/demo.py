@@ -29,7 +29,7 @@ _ATTACKS = (
 )
 _PICTURED = ("noise", 0.005)
 _SCHEMES = ("host", "eigen")
-_EXAGGERATION = 30
+_EXAGGERATION = 10
 
 
 class Row(NamedTuple):
