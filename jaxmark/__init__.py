@@ -10,6 +10,7 @@ from jaxmark import evidence as evidence
 from jaxmark import laplacian as laplacian
 from jaxmark import schemes as schemes
 from jaxmark import spectrum as spectrum
+from jaxmark import tuning as tuning
 from jaxmark import watermark as watermark
 from jaxmark.attacks import attack as attack
 from jaxmark.distortion import compare as compare

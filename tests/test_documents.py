@@ -1,0 +1,61 @@
+"""What the documents say is run."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import trimesh
+
+import jaxmark as jm
+from jaxmark import cli
+from tests.samples import bumpy_sphere
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    trimesh.Trimesh(*bumpy_sphere(3), process=False).export("model.ply")
+    return tmp_path
+
+
+def test_python_blocks_of_the_readme_run(folder: Path, unchecked, capsys):
+    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    assert len(blocks) >= 2
+    names: dict = {}
+    for block in blocks:
+        exec(compile(block, "README.md", "exec"), names)
+    assert names["found"].message == bytes.fromhex("0123456789abcdef")
+    assert "0123456789abcdef" in capsys.readouterr().out
+    assert (names["scores"] > 0).tolist() == [True, False, False, True]
+    assert names["gradient"].shape == names["x"].shape
+
+
+def test_shell_lines_of_the_readme_run(folder: Path, unchecked, monkeypatch, capsys):
+    lines = re.findall(r"^    (jaxmark .*)$", README, re.MULTILINE)
+    assert len(lines) >= 5
+    for line in lines:
+        monkeypatch.setattr(sys, "argv", shlex.split(line))
+        with pytest.raises(SystemExit) as end:
+            sys.exit(cli.main())
+        assert end.value.code in (0, None), (line, capsys.readouterr())
+
+
+def test_make_targets_of_the_readme_exist():
+    targets = set(re.findall(r"^    make (\w+)", README, re.MULTILINE))
+    assert targets == {"demo", "test"}
+    for target in targets:
+        subprocess.run(["make", "-n", target], cwd=ROOT, check=True, capture_output=True)
+
+
+def test_payloads_of_the_readme_are_carried():
+    mesh, key = bumpy_sphere(4), jm.Key(bytes(32))
+    for scheme, bits in (("host", 192), ("eigen", 160)):
+        assert re.search(rf"\b{bits} bits \(`{scheme}`\)", README)
+        marked, _ = jm.embed(mesh, bytes(range(bits // 8)), key, scheme=scheme)
+        assert jm.detect(marked, original=mesh, key=key, scheme=scheme, bits=bits).detected()
