@@ -23,9 +23,10 @@ from jaxmark.keys import new_key as new_key
 from jaxmark.keys import save_key as save_key
 from jaxmark.marking import Detection as Detection
 from jaxmark.marking import EmbedInfo as EmbedInfo
+from jaxmark.marking import Marker as Marker
 from jaxmark.marking import detect as detect
 from jaxmark.marking import embed as embed
-from jaxmark.marking import reader as reader
+from jaxmark.marking import make_marker as make_marker
 from jaxmark.mesh import Mesh as Mesh
 from jaxmark.mesh import make_mesh as make_mesh
 from jaxmark.record import Record as Record

@@ -21,7 +21,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
 from jaxmark.files.atomic import write_atomically
 from jaxmark.keys import commitment, load_key, new_key, save_key
-from jaxmark.marking import DEFAULT_BITS, detect, embed
+from jaxmark.marking import DEFAULT_BITS, detect, make_marker
 from jaxmark.record import Record
 from jaxmark.schemes import SCHEMES
 
@@ -121,12 +121,13 @@ def embed_command(
     _distinct(original=original, marked=marked, key=key_file, record=record_file)
     key = load_key(key_file)
     mesh = load_mesh(original)
-    result, info = embed(mesh, message, key, budget=budget, scheme=scheme)
+    marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
+    result, info = marker.embed(message, budget)
     with _replacing(marked) as draft:
         save_mesh(result, draft, like=original)
         # What counts is the file: its numbers are rounded.
         written = load_mesh(draft)
-        if detect(written, original=mesh, key=key, record=info.record).message != message:
+        if marker.detect(written).message != message:
             raise JaxmarkError(
                 f"Rounded to the numbers of {marked.suffix.upper()[1:]}, the mark no longer reads; use a larger budget,"
                 " or a file with more digits."

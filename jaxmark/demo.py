@@ -14,7 +14,7 @@ from jaxmark.extras import package_folder, require
 from jaxmark.files import load_mesh, save_mesh
 from jaxmark.files.atomic import write_atomically
 from jaxmark.keys import new_key
-from jaxmark.marking import embed, reader
+from jaxmark.marking import Marker, make_marker
 from jaxmark.mesh import Mesh, diagonal
 from jaxmark.plot import View, save_views
 
@@ -90,7 +90,8 @@ def run_demo(
     rows: list[Row] = []
     for scheme in _SCHEMES:
         try:
-            marked, info = embed(mesh, message, key, scheme=scheme)
+            marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
+            marked, info = marker.embed(message)
         except JaxmarkError as error:
             say(f"{scheme}: refused. {error}")
             continue
@@ -99,7 +100,7 @@ def run_demo(
         write_atomically(f"{target}.jaxmark.json", info.record.to_json().encode())
         say(f"{scheme}: marked, RMS {info.rms:.6f}, max {info.max:.6f} → {target}")
         marked = load_mesh(target)
-        rows += _attacked(mesh, marked, message, key, scheme)
+        rows += _attacked(marker, marked, message)
         for row in rows[-len(_ATTACKS) - 1 :]:
             say("  " + _line(row))
         if scheme == _SCHEMES[0]:
@@ -113,14 +114,13 @@ def run_demo(
     return rows
 
 
-def _attacked(mesh: Mesh, marked: Mesh, message: bytes, key: bytes, scheme: str) -> Iterator[Row]:
+def _attacked(marker: Marker, marked: Mesh, message: bytes) -> Iterator[Row]:
     sent = np.unpackbits(np.frombuffer(message, np.uint8)) > 0
-    read = reader(original=mesh, key=key, scheme=scheme)
     for kind, strength in (("none", 0.0), *_ATTACKS):
         suspect = marked if kind == "none" else attack(marked, kind, strength, seed=0)
-        blind, claimed = read(suspect), read(suspect, message)
+        blind, claimed = marker.detect(suspect), marker.detect(suspect, message)
         yield Row(
-            scheme,
+            marker.scheme.name,
             kind if kind == "none" else f"{kind} {strength:g}",
             distortion.compare(marked, suspect).rms,
             int(np.sum((blind.scores > 0) != sent)),

@@ -1,7 +1,6 @@
 """Marking meshes: messages and keys in, meshes and evidence out."""
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -46,6 +45,116 @@ class Detection(NamedTuple):
         return self.log10_p <= math.log10(alpha)
 
 
+class Marker(NamedTuple):
+    """Key, payload and scheme on one original: marks it, and reads any number of suspects, preparing only once.
+
+    Make one with `make_marker`.
+    """
+
+    original: Original
+    key: Key
+    bits: int  # payload
+    scheme: Scheme
+    carrier: Carrier
+    detector: Detector
+
+    def embed(self, message: bytes, budget: float = 8e-4) -> tuple[Mesh, EmbedInfo]:
+        """Hide a message of just the payload's size in the original; see `embed`."""
+        if not 0 < budget < 1:
+            raise JaxmarkError(
+                f"The budget is relative to the bounding-box diagonal and must be in (0, 1), got {budget}."
+            )
+        self._check_size(message)
+        original, dtype = self.original, self.original.signal.dtype
+        codeword = jnp.asarray(encode(message, self.key, original.geometry), dtype)
+        unit = np.asarray(self.carrier.displacement(codeword), np.float64)
+        size = float(distortion.rms(unit))
+        if not (math.isfinite(size) and size > 0):
+            raise JaxmarkError(
+                f"The {len(unit)} points of this mesh leave the scheme {self.scheme.name!r} nothing to write in."
+            )
+        beta = budget / size
+        marked = displaced(original, beta * unit)
+        if self.detect(marked).message != message:
+            raise JaxmarkError(
+                f"This mesh ({len(unit)} points) cannot carry {self.bits} bits with the scheme {self.scheme.name!r}: they"
+                " do not read back, even unattacked. Use a shorter message, or a finer or less regular mesh."
+            )
+        written = residual(original, marked)
+        record = Record(
+            scheme=self.scheme.name,
+            bits=self.bits,
+            beta=beta,
+            original=original.geometry.hex(),
+            key=commitment(self.key),
+            parameters=parameters_of(self.scheme),
+        )
+        return marked, EmbedInfo(float(distortion.rms(written)), float(distortion.maximum(written)), beta, record)
+
+    def detect(self, suspect: Mesh, message: bytes | None = None) -> Detection:
+        """Read a suspect, with a claimed message or without; see `detect`."""
+        original, dtype = self.original, self.original.signal.dtype
+        if message is not None:
+            self._check_size(message)
+        # Centred in float64, so that a suspect that was moved far away leaves no rounding errors behind.
+        difference = jnp.asarray(centre(original.operator, residual(original, suspect)), dtype)
+        soft = np.asarray(self.detector(self.carrier, difference, 1.0), np.float64)
+        read = decode(soft, self.key, original.geometry)
+        if message is not None:
+            claimed = jnp.asarray(encode(message, self.key, original.geometry), dtype)
+            log10_p = log10_p_claimed(*self.carrier.claim(difference, claimed))
+        else:
+            log10_p = 0.0 if read is None else log10_p_tag(TAG_BITS)
+        size = np.sqrt(np.mean(soft**2))
+        return Detection(read, log10_p, soft[:-TAG_BITS] / (size or 1.0), 1.0)
+
+    def _check_size(self, message: bytes) -> None:
+        if 8 * len(message) != self.bits:
+            raise JaxmarkError(f"The message has {8 * len(message)} bits, but the payload is {self.bits} bits.")
+
+
+def make_marker(
+    original: Mesh,
+    key: bytes,
+    *,
+    bits: int | None = None,
+    record: Record | None = None,
+    scheme: str | Scheme = "host",
+    detector: Detector = decorrelate,
+) -> Marker:
+    """Prepare an original for marking, or for reading many suspects.
+
+    Args:
+        original: the unmarked mesh. Vertices at exactly the same position move together; a vertex that no face uses
+            stays.
+        key: 32 bytes, from `new_key`.
+        bits: payload, a multiple of 8; by default the record's, else 64.
+        record: of an earlier mark; fixes scheme and payload, and binds to original and key.
+        scheme: a name (`"host"`, `"eigen"`) or an object of `jaxmark.schemes`, where there is no record.
+        detector: see `jaxmark.detectors`.
+
+    Returns:
+        The marker.
+
+    Raises:
+        JaxmarkError: if the mesh, key or payload is unusable, or the record is for another original, key or payload.
+    """
+    key = Key(bytes(key))
+    ready = prepare(original)
+    if record is not None:
+        if record.original != ready.geometry.hex():
+            raise JaxmarkError("The original is not the mesh that the record was made for (its geometry differs).")
+        if record.key != commitment(key):
+            raise JaxmarkError("The key is not the one that the record commits to.")
+        if bits not in (None, record.bits):
+            raise JaxmarkError(f"The payload is {record.bits} bits by the record, not {bits}.")
+        scheme, bits = get_scheme(record.scheme, record.parameters), record.bits
+    scheme = get_scheme(scheme)
+    payload = DEFAULT_BITS if bits is None else bits
+    carrier = scheme.carrier(ready, key, code_length(payload))
+    return Marker(ready, key, payload, scheme, carrier, detector)
+
+
 def embed(
     mesh: Mesh, message: bytes, key: bytes, *, budget: float = 8e-4, scheme: str | Scheme = "host"
 ) -> tuple[Mesh, EmbedInfo]:
@@ -54,12 +163,12 @@ def embed(
     The mark is read back before the mesh is returned: a mesh that does not carry it is refused, not marked in vain.
 
     Args:
-        mesh: the original. Vertices at exactly the same position move together; a vertex that no face uses stays.
+        mesh: the original.
         message: any bytes, at least one.
         key: 32 bytes, from `new_key`.
         budget: RMS displacement of the welded vertices, unweighted, relative to the diagonal of the axis-aligned
             bounding box of the vertices that faces use: 0.0008 is 0.08 % of it. It is met exactly.
-        scheme: a name (`"host"`, `"eigen"`) or an object of `jaxmark.schemes`.
+        scheme: see `make_marker`.
 
     Returns:
         The marked mesh (float64 vertices, same faces) and what was done to it.
@@ -67,38 +176,7 @@ def embed(
     Raises:
         JaxmarkError: if the mesh, key, budget or payload is unusable, or the mesh cannot carry so many bits.
     """
-    if not (isinstance(budget, int | float) and 0 < budget < 1):
-        raise JaxmarkError(f"The budget is relative to the bounding-box diagonal and must be in (0, 1), got {budget}.")
-    key = Key(bytes(key))
-    scheme = get_scheme(scheme)
-    bits = 8 * len(message)
-    original = prepare(mesh)
-    codeword = encode(message, key, original.geometry)
-    carrier = scheme.carrier(original, key, len(codeword))
-    unit = np.asarray(carrier.displacement(jnp.asarray(codeword, original.signal.dtype)), np.float64)
-    size = distortion.rms(unit)
-    if not (np.isfinite(size) and size > 0):
-        raise JaxmarkError(
-            f"The {len(original.signal)} points of this mesh leave the scheme {scheme.name!r} nothing to write in."
-        )
-    beta = float(budget / size)
-    marked = displaced(original, beta * unit)
-    written = residual(original, marked)
-    found = _read(original, carrier, decorrelate, key, written, None)
-    if found.message != message:
-        raise JaxmarkError(
-            f"This mesh ({len(original.signal)} points) cannot carry {bits} bits with the scheme {scheme.name!r}: they"
-            " do not read back, even unattacked. Use a shorter message, or a finer or less regular mesh."
-        )
-    record = Record(
-        scheme=scheme.name,
-        bits=bits,
-        beta=beta,
-        original=original.geometry.hex(),
-        key=commitment(key),
-        parameters=parameters_of(scheme),
-    )
-    return marked, EmbedInfo(float(distortion.rms(written)), float(distortion.maximum(written)), beta, record)
+    return make_marker(mesh, key, bits=8 * len(message), scheme=scheme).embed(message, budget)
 
 
 def detect(
@@ -125,7 +203,7 @@ def detect(
         key: 32 bytes.
         bits: payload, a multiple of 8; by default the record's, else the claimed message's, else 64.
         message: the message that is claimed to be there.
-        record: of the mark; fixes scheme and payload, and binds to original and key.
+        record: see `make_marker`.
         scheme: as embedded, where there is no record.
         detector: see `jaxmark.detectors`.
 
@@ -133,78 +211,10 @@ def detect(
         What was found; a suspect identical to the original gives log10_p = 0.
 
     Raises:
-        JaxmarkError: if the suspect has another connectivity, the record is for another original or key, or the
-            payloads of record, bits and message disagree.
+        JaxmarkError: as `make_marker`; also if the suspect has another connectivity, or the claimed message another
+            size than the payload.
     """
     if bits is None and record is None and message is not None:
         bits = 8 * len(message)
-    read = reader(original=original, key=key, bits=bits, record=record, scheme=scheme, detector=detector)
-    return read(suspect, message)
-
-
-def reader(
-    *,
-    original: Mesh,
-    key: bytes,
-    bits: int | None = None,
-    record: Record | None = None,
-    scheme: str | Scheme = "host",
-    detector: Detector = decorrelate,
-) -> Callable[..., Detection]:
-    """`detect` for many suspects of one original: prepares the carrier once.
-
-    Args:
-        original: the unmarked mesh.
-        key: 32 bytes.
-        bits: payload, a multiple of 8; by default the record's, else 64.
-        record: as for `detect`.
-        scheme: as for `detect`.
-        detector: as for `detect`.
-
-    Returns:
-        A function `read(suspect, message=None) -> Detection`.
-
-    Raises:
-        JaxmarkError: as `detect` does, here or when a suspect is read.
-    """
-    key = Key(bytes(key))
-    ready = prepare(original)
-    if record is not None:
-        if record.original != ready.geometry.hex():
-            raise JaxmarkError("The original is not the mesh that the record was made for (its geometry differs).")
-        if record.key != commitment(key):
-            raise JaxmarkError("The key is not the one that the record commits to.")
-        if bits not in (None, record.bits):
-            raise JaxmarkError(f"The payload is {record.bits} bits by the record, not {bits}.")
-        scheme, bits = get_scheme(record.scheme, record.parameters), record.bits
-    payload = DEFAULT_BITS if bits is None else bits
-    carrier = get_scheme(scheme).carrier(ready, key, code_length(payload))
-
-    def read(suspect: Mesh, message: bytes | None = None) -> Detection:
-        if message is not None and 8 * len(message) != payload:
-            raise JaxmarkError(f"The claimed message has {8 * len(message)} bits, but the payload is {payload} bits.")
-        return _read(ready, carrier, detector, key, residual(ready, suspect), message)
-
-    return read
-
-
-def _read(
-    original: Original,
-    carrier: Carrier,
-    detector: Detector,
-    key: bytes,
-    difference: Float64[np.ndarray, "points 3"],
-    message: bytes | None,
-) -> Detection:
-    """Detection on a residual in diagonals."""
-    # Centred in float64, so that a suspect that was moved far away leaves no rounding errors behind.
-    traced = jnp.asarray(centre(original.operator, difference), original.signal.dtype)
-    soft = np.asarray(detector(carrier, traced, 1.0), np.float64)
-    read = decode(soft, key, original.geometry)
-    if message is not None:
-        claimed = jnp.asarray(encode(message, key, original.geometry), original.signal.dtype)
-        log10_p = log10_p_claimed(*carrier.claim(traced, claimed))
-    else:
-        log10_p = 0.0 if read is None else log10_p_tag(TAG_BITS)
-    size = np.sqrt(np.mean(soft**2))
-    return Detection(read, log10_p, soft[:-TAG_BITS] / (size or 1.0), 1.0)
+    marker = make_marker(original, key, bits=bits, record=record, scheme=scheme, detector=detector)
+    return marker.detect(suspect, message)

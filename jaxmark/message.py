@@ -10,13 +10,7 @@ TAG_BITS = 32
 
 
 def encode(message: bytes, key: bytes, geometry: bytes) -> Float64[np.ndarray, " code"]:
-    """The codeword: the message's bits, most significant first, then its keyed tag; a set bit is +1, a clear one -1.
-
-    Raises:
-        JaxmarkError: if the message is empty.
-    """
-    if not message:
-        raise JaxmarkError("The message is empty; it needs at least one byte.")
+    """The codeword: the message's bits, most significant first, then its keyed tag; a set bit is +1, a clear one -1."""
     tag = derive(key, geometry, "tag", TAG_BITS // 8, message)
     return 2.0 * np.unpackbits(np.frombuffer(message + tag, np.uint8)) - 1.0
 

@@ -11,7 +11,7 @@ from scipy import stats
 import jaxmark as jm
 from jaxmark.carriers import ModulatedCarrier
 from jaxmark.evidence import FLOOR, log10_p_claimed, log10_p_tag
-from jaxmark.marking import reader
+from jaxmark.marking import make_marker
 from jaxmark.message import TAG_BITS, code_length, decode, encode
 from jaxmark.original import prepare, residual
 from jaxmark.schemes import HostScheme
@@ -102,7 +102,7 @@ def test_wrong_keys_and_other_suspects_read_nothing(sphere):
     marked, _ = jm.embed(sphere, b"original", jm.new_key())
     for suspect in (marked, jm.attack(sphere, "noise", 0.003, seed=2), sphere):
         for seed in range(5):
-            found = reader(original=sphere, key=jm.Key(bytes([seed] * 32)))(suspect)
+            found = make_marker(sphere, jm.Key(bytes([seed] * 32))).detect(suspect)
             assert found.message is None
             assert found.log10_p == 0.0
             assert not found.detected()

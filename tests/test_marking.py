@@ -136,7 +136,7 @@ def test_record_binds_and_remembers(sphere: Mesh, key: jm.Key, tmp_path):
         ({"key": jm.new_key()}, "key is not the one"),
         ({"original": marked}, "not the mesh that the record"),
         ({"bits": 64}, "48 bits by the record"),
-        ({"message": b"longer than that"}, "payload is 48"),
+        ({"message": b"longer than that"}, "the payload is 48"),
     ]:
         with pytest.raises(jm.JaxmarkError, match=sentence):
             jm.detect(marked, **{"original": sphere, "key": key, "record": record, **change})
@@ -169,7 +169,7 @@ def test_refusals(sphere: Mesh, key: jm.Key):
     for mesh, message, options, sentence in [
         (tiny, MESSAGE, {}, r"\(4 points\) cannot carry 64 bits"),
         (nan, MESSAGE, {}, "not a finite number"),
-        (sphere, b"", {}, "empty"),
+        (sphere, b"", {}, "positive multiple of 8 bits, got 0"),
         (sphere, MESSAGE, {"budget": 0}, "budget"),
         (sphere, MESSAGE, {"budget": float("nan")}, "budget"),
         (sphere, MESSAGE, {"scheme": "magic"}, "host, eigen"),
