@@ -61,9 +61,7 @@ class Marker(NamedTuple):
     def embed(self, message: bytes, budget: float = 8e-4) -> tuple[Mesh, EmbedInfo]:
         """Hide a message of just the payload's size in the original; see `embed`."""
         if not 0 < budget < 1:
-            raise JaxmarkError(
-                f"The budget is relative to the bounding-box diagonal and must be in (0, 1), got {budget}."
-            )
+            raise JaxmarkError(f"The budget is relative to the bounding box's diagonal and in (0, 1), got {budget}.")
         self._check_size(message)
         original, dtype = self.original, self.original.signal.dtype
         codeword = jnp.asarray(encode(message, self.key, original.geometry), dtype)
