@@ -75,8 +75,8 @@ class Marker(NamedTuple):
         marked = displaced(original, beta * unit)
         if self.detect(marked).message != message:
             raise JaxmarkError(
-                f"This mesh ({len(unit)} points) cannot carry {self.bits} bits with the scheme {self.scheme.name!r}: they"
-                " do not read back, even unattacked. Use a shorter message, or a finer or less regular mesh."
+                f"This mesh ({len(unit)} points) cannot carry {self.bits} bits with the scheme {self.scheme.name!r}:"
+                " they do not read back, even unattacked. Use a shorter message, or a finer or less regular mesh."
             )
         written = residual(original, marked)
         record = Record(
