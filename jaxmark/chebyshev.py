@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.laplacian import Laplacian
+from jaxmark.laplacian import Laplacian, per_row
 
 Signal = Float[Array | np.ndarray, " vertices *columns"]
 
@@ -88,17 +88,23 @@ def cross_moments(operator: Laplacian, u: Signal, x: Signal, *, degree: int) -> 
     """⟨u, T_k(Δ̃)x⟩_D for k = 0 … degree, column by column.
 
     Every correlation with a band needs only these: ⟨u, f_j(Δ)x⟩_D = Σ_k C_jk ⟨u, T_k x⟩_D. With them, weak bands are
-    small differences of large numbers: in float32 a band is lost where ‖f_j x‖ is below about 1e-6 ‖x‖.
+    small differences of large numbers: in float32 a band is lost where ‖f_j x‖ is below about 1e-6 ‖x‖. Reverse mode
+    takes O(N) memory, two filters; there is no forward mode and no derivative with respect to the operator.
     """
+    x = jnp.asarray(x)
+    u = jnp.asarray(u).astype(x.dtype)
     _check_signal("cross_moments", operator, x)
-    return _projections(operator, _weighted(operator, u), jnp.asarray(x), degree)
+    if u.shape != x.shape:
+        raise JaxmarkError(f"cross_moments needs two signals of one shape, got {u.shape} and {x.shape}.")
+    return _projections(operator, per_row(operator.degree, u) * u, x, degree)
 
 
 @partial(jax.jit, static_argnames="degree")
 def moments(operator: Laplacian, x: Signal, *, degree: int) -> Float[Array, " moments *columns"]:
     """m_k = ⟨x, T_k(Δ̃)x⟩_D for k = 0 … 2·degree from only `degree` products, column by column.
 
-    By T_{j+k} + T_{|j-k|} = 2T_jT_k: m_2k = 2⟨T_k x, T_k x⟩_D - m_0 and m_{2k-1} = 2⟨T_k x, T_{k-1} x⟩_D - m_1.
+    By T_{j+k} + T_{|j-k|} = 2T_jT_k: m_2k = 2⟨T_k x, T_k x⟩_D - m_0 and m_{2k-1} = 2⟨T_k x, T_{k-1} x⟩_D - m_1. Reverse
+    mode stores the recurrence, O(degree · N) memory.
     """
     x = jnp.asarray(x)
     _check_signal("moments", operator, x)
@@ -179,10 +185,38 @@ def _filter_scan(operator: Laplacian, coefficients: Array, x: Array) -> Array:
     return _scan_terms(operator, x, coefficients, add, coefficients[0] * x)[0]
 
 
-@partial(jax.jit, static_argnums=3)
+@jax.custom_vjp
+def _filter_recompute(operator: Laplacian, coefficients: Array, x: Array) -> Array:
+    return _filter_scan(operator, coefficients, x)
+
+
+def _filter_forward(operator: Any, coefficients: Any, x: Any) -> tuple[Array, tuple[Laplacian, Array, Array]]:
+    inputs = (
+        _fixed(operator, "filter", "; call it with derivative='scan' for one in O(degree · N)"),
+        coefficients.value,
+        x.value,
+    )
+    return _filter_scan(*inputs), inputs
+
+
+def _filter_reverse(inputs: tuple[Laplacian, Array, Array], cotangent: Any) -> tuple[None, Array, Array]:
+    operator, coefficients, x = inputs
+    y_bar = _instantiate(cotangent)
+    c_bar: Any = _projections(operator, y_bar, x, len(coefficients) - 1)
+    return None, c_bar if coefficients.ndim == x.ndim else c_bar.sum(axis=1), _adjoint(operator, coefficients, y_bar)
+
+
+_filter_recompute.defvjp(_filter_forward, _filter_reverse, symbolic_zeros=True)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(3,))
 def _projections(operator: Laplacian, u: Array, x: Array, degree: int) -> Array:
     """Σ_v u_v (T_k(Δ̃)x)_v for k = 0 … degree, column by column."""
+    return _projections_scan(operator, u, x, degree)
 
+
+@partial(jax.jit, static_argnums=3)
+def _projections_scan(operator: Laplacian, u: Array, x: Array, degree: int) -> Array:
     def project(_: None, t: Array, __: Array, ___: Array) -> tuple[None, Array]:
         return None, jnp.sum(u * t, axis=0)
 
@@ -190,38 +224,42 @@ def _projections(operator: Laplacian, u: Array, x: Array, degree: int) -> Array:
     return jnp.concatenate([jnp.sum(u * x, axis=0)[None], rest])
 
 
-@jax.custom_vjp
-def _filter_recompute(operator: Laplacian, coefficients: Array, x: Array) -> Array:
-    return _filter_scan(operator, coefficients, x)
+def _projections_forward(operator: Any, u: Any, x: Any, degree: int) -> tuple[Array, tuple[Laplacian, Array, Array]]:
+    inputs = (_fixed(operator, "cross_moments", ""), u.value, x.value)
+    return _projections_scan(*inputs, degree), inputs
 
 
-def _filter_forward(operator: Any, coefficients: Any, x: Any) -> tuple[Array, tuple[Laplacian, Array, Array]]:
+def _projections_reverse(
+    degree: int, inputs: tuple[Laplacian, Array, Array], cotangent: Any
+) -> tuple[None, Array, Array]:
+    """The cotangents of the moments are the coefficients of two filters."""
+    operator, u, x = inputs
+    m_bar = _instantiate(cotangent)
+    return None, _filter_recompute(operator, m_bar, x), _adjoint(operator, m_bar, u)
+
+
+_projections.defvjp(_projections_forward, _projections_reverse, symbolic_zeros=True)
+
+
+def _adjoint(operator: Laplacian, coefficients: Array, y: Array) -> Array:
+    """f(Δ)ᵀy = D f(Δ) D⁻¹y, by the self-adjointness of Δ."""
+    mass = per_row(operator.degree, y)
+    mass = jnp.where(mass > 0, mass, 1)  # an isolated vertex is its own block of Δ, so any positive mass serves
+    return mass * _filter_recompute(operator, coefficients, y / mass)
+
+
+def _fixed(operator: Any, name: str, remedy: str) -> Laplacian:
+    """The operator as it came into a rule, once it is known that it is not differentiated."""
     if any(leaf.perturbed for leaf in operator):
-        raise JaxmarkError(
-            "filter has no derivative with respect to the operator's weights in O(N) memory;"
-            " call it with derivative='scan' for one in O(degree · N)."
-        )
-    plain = Laplacian(*(leaf.value for leaf in operator))
-    return _filter_scan(plain, coefficients.value, x.value), (plain, coefficients.value, x.value)
+        raise JaxmarkError(f"{name} has no derivative with respect to the operator's weights in O(N) memory{remedy}.")
+    return Laplacian(*(leaf.value for leaf in operator))
 
 
-def _filter_reverse(residuals: tuple[Laplacian, Array, Array], cotangent: Any) -> tuple[None, Array, Array]:
-    operator, coefficients, x = residuals
+def _instantiate(cotangent: Any) -> Array:
+    """A cotangent as an array, also where JAX knows it to be zero."""
     if isinstance(cotangent, jax.custom_derivatives.SymbolicZero):
-        return None, jnp.zeros_like(coefficients), jnp.zeros_like(x)
-    # An isolated vertex is its own block of Δ, so any positive mass serves there.
-    mass = jnp.asarray(operator.degree).astype(x.dtype).reshape(-1, *[1] * (x.ndim - 1))
-    mass = jnp.where(mass > 0, mass, 1)
-    x_bar = mass * _filter_recompute(operator, coefficients, cotangent / mass)
-    c_bar = _projections(operator, cotangent, x, len(coefficients) - 1)
-    return None, c_bar if coefficients.ndim == x.ndim else c_bar.sum(axis=1), x_bar
-
-
-_filter_recompute.defvjp(_filter_forward, _filter_reverse, symbolic_zeros=True)
-
-
-def _weighted(operator: Laplacian, u: Array | np.ndarray) -> Array:
-    return jnp.asarray(operator.degree).astype(u.dtype).reshape(-1, *[1] * (u.ndim - 1)) * u
+        return jnp.zeros(cotangent.shape, cotangent.dtype)  # pyright: ignore[reportArgumentType]
+    return jnp.asarray(cotangent)  # it may come as NumPy's
 
 
 def _check_signal(name: str, operator: Laplacian, x: Array | np.ndarray) -> None:

@@ -118,21 +118,22 @@ def embed_command(
     byte. A record goes beside MARKED: it holds no secret, and with it nothing about the mark needs remembering.
     """
     record_file = record_file or marked.with_name(marked.name + _RECORD_SUFFIX)
+    _check_outputs(original, marked)
     _distinct(original=original, marked=marked, key=key_file, record=record_file)
     key = load_key(key_file)
     mesh = load_mesh(original)
     marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
     result, info = marker.embed(message, budget)
-    with _replacing(marked) as draft:
+    with _replacing(marked) as draft, _replacing(record_file) as record_draft:
         save_mesh(result, draft, like=original)
         # What counts is the file: its numbers are rounded.
         written = load_mesh(draft)
         if marker.detect(written).message != message:
             raise JaxmarkError(
-                f"Rounded to the numbers of {marked.suffix.upper()[1:]}, the mark no longer reads; use a larger budget,"
-                " or a file with more digits."
+                f"Rounded to the numbers of {original}, the mark no longer reads; use a larger budget, or a file with"
+                " more digits."
             )
-        write_atomically(record_file, info.record.to_json().encode())
+        write_atomically(record_draft, info.record.to_json().encode())
     change = distortion.compare(mesh, written)
     answer = {
         "rms": change.rms,
@@ -184,8 +185,6 @@ def detect_command(
     Exit status 0 if the false-positive probability is at most --alpha, else 1. It holds for any suspect made without
     the key, as long as key, original and a claimed message were fixed before the suspect was seen.
     """
-    if not 0 < alpha < 1:
-        raise JaxmarkError(f"--alpha is a probability and must be in (0, 1), got {alpha:g}.")
     record = None if record_file is None else Record.load(record_file)
     if record is not None and scheme not in (None, record.scheme):
         raise JaxmarkError(f"--scheme {scheme} contradicts the record, which says {record.scheme}.")
@@ -231,6 +230,7 @@ _KINDS = "; ".join(f"{name}: {entry.unit}" for name, entry in ATTACKS.items())
 @_JSON
 def attack_command(source: Path, target: Path, kind: str, strength: float, seed: int, as_json: bool) -> None:
     """Put a mesh through an attack, to see what a mark survives."""
+    _check_outputs(source, target)
     _distinct(IN=source, OUT=target)
     mesh = load_mesh(source)
     with _replacing(target) as draft:
@@ -278,12 +278,10 @@ def main() -> None:
         _refuse(error.format_message())
     except JaxmarkError as error:
         _refuse(str(error))
-    except BrokenPipeError:
-        # The reader of our output has gone; nothing is left to tell it.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(2)
     except OSError as error:
-        _refuse(f"{error.filename or 'A file'} cannot be used: {error.strerror}.")
+        _refuse(f"{error.filename or 'A file'} cannot be used: {error.strerror or error}.")
+    except Exception as error:  # status 1 would say "nothing detected"
+        _refuse(f"Unexpected {type(error).__name__}: {error}. Please report it, with the command and the files.")
 
 
 def _refuse(sentence: str) -> None:
@@ -292,21 +290,34 @@ def _refuse(sentence: str) -> None:
 
 
 def _answer(as_json: bool, answer: Mapping[str, Any], text: str) -> None:
-    if as_json:
-        click.echo(json.dumps({name: _finite(value) for name, value in answer.items()}, allow_nan=False))
-    else:
-        click.echo(text)
+    try:
+        click.echo(json.dumps(_finite(answer), allow_nan=False) if as_json else text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of our output has gone: what was done is done, and the exit status still tells.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _finite(value: Any) -> Any:
+    """The value with null for numbers that JSON does not have."""
+    if isinstance(value, Mapping):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _check_outputs(source: Path, target: Path) -> None:
+    """Refuse an output that cannot take over the source's bytes, before any work is done."""
+    if source.suffix.lower() != target.suffix.lower():
+        raise JaxmarkError(f"{target} must have the suffix of {source}, whose bytes it takes over.")
 
 
 def _distinct(**files: Path) -> None:
     """Refuse to write over an input: two names for one file."""
-    seen: dict[Path, str] = {}
+    seen: dict[str, str] = {}
     for name, path in files.items():
-        other = seen.setdefault(path.resolve(), name)
+        other = seen.setdefault(os.path.realpath(path), name)
         if other != name:
             raise JaxmarkError(f"{other} and {name} are the same file, {path}; give another name.")
 
@@ -321,6 +332,8 @@ class _replacing:  # noqa: N801 (used as a function)
         folder = self._target.parent
         if not folder.is_dir():
             raise JaxmarkError(f"The folder {folder} does not exist.")
+        if self._target.is_dir():
+            raise JaxmarkError(f"{self._target} is a folder; name a file.")
         self._folder = tempfile.TemporaryDirectory(prefix=".jaxmark-", dir=folder)
         return Path(self._folder.name) / self._target.name
 

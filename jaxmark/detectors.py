@@ -24,12 +24,11 @@ def decorrelate(carrier: Carrier, residual: Displacement, beta: Strength = 1.0) 
     """Least-squares amplitudes of the bits: the correlations, with the bits' interference solved out.
 
     With the embedding's β they are ±1 where nothing was attacked. Directions that the carrier does not span within
-    rounding are held at zero by a ridge of 16 · bits · eps of the mean energy per bit.
+    rounding are held at zero by a ridge of 16 eps times the energy of all bits.
     """
     products = carrier.gram(beta)
-    bits = len(products)
-    ridge = 16 * bits * jnp.finfo(products.dtype).eps * jnp.trace(products) / bits
+    ridge = 16 * jnp.finfo(products.dtype).eps * jnp.trace(products)
     # A carrier without energy must give zeros, not the quotient of two.
     ridge = jnp.where(ridge > 0, ridge, 1)
-    factor = jsl.cho_factor(products + ridge * jnp.eye(bits, dtype=products.dtype), lower=True)
+    factor = jsl.cho_factor(products + ridge * jnp.eye(len(products), dtype=products.dtype), lower=True)
     return jsl.cho_solve(factor, carrier.adjoint(residual, beta))

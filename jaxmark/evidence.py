@@ -18,8 +18,9 @@ def log10_p_claimed(score: ArrayLike, norm: ArrayLike) -> float:
     """log10 of P(S ≥ score) for a codeword that was claimed beforehand (Hoeffding 1963, Theorem 2).
 
     For S = Σ s·a over keyed independent signs s, P(S ≥ t‖a‖) ≤ exp(-t²/2). This holds for any suspect, provided that
-    the suspect, and with it a, is independent of the signs; that weights, masks and pose never depend on the key or
-    the score; and that key, original and message were fixed before the suspect was seen.
+    the suspect, and with it a, is independent of the signs (a mesh marked under the same key is not); that weights,
+    masks and pose never depend on the key or the score; and that key, original and message were fixed before the
+    suspect was seen.
 
     Args:
         score: S, the plain linear correlation of the claimed codeword.

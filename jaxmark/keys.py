@@ -50,7 +50,7 @@ def save_key(key: bytes, path: str | os.PathLike[str]) -> None:
     Raises:
         JaxmarkError: if the file exists (a key is never overwritten) or cannot be written.
     """
-    secret = Key(bytes(key))
+    secret = Key(key)
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError:
@@ -99,7 +99,7 @@ def geometry_hash(mesh: Mesh) -> bytes:
 
 def derive(key: bytes, geometry: bytes, label: str, size: int, data: bytes = b"") -> bytes:
     """`size` bytes of SHAKE-256(key ‖ geometry hash ‖ "jaxmark/1/label" ‖ 0 ‖ data): a keyed hash with a label."""
-    state = hashlib.shake_256(Key(bytes(key)) + geometry + f"jaxmark/{SCHEME_VERSION}/{label}".encode() + b"\0" + data)
+    state = hashlib.shake_256(Key(key) + geometry + f"jaxmark/{SCHEME_VERSION}/{label}".encode() + b"\0" + data)
     return state.digest(size)
 
 

@@ -33,12 +33,18 @@ class Laplacian(NamedTuple):
 
     @jax.jit
     def apply(self, x: Float[Array, " vertices *columns"]) -> Float[Array, " vertices *columns"]:
-        """Δx for one signal `[N]` or several `[N, C]`: two segment-sums over the edges, in the dtype of `x`."""
+        """Δx for one signal `[N]` or several `[N, C]`: two segment-sums over the edges, in the dtype of `x`.
+
+        Raises:
+            JaxmarkError: if `x` is not floating.
+        """
+        if not jnp.issubdtype(x.dtype, jnp.floating):
+            raise JaxmarkError(f"Laplacian.apply needs a floating-point signal, got {x.dtype}.")
         tail, head = self.edges[:, 0], self.edges[:, 1]
-        weights = _column(self.weights, x)
+        weights = per_row(self.weights, x)
         size = self.degree.shape[0]
         total = jax.ops.segment_sum(weights * x[head], tail, size) + jax.ops.segment_sum(weights * x[tail], head, size)
-        degree = _column(self.degree, x)
+        degree = per_row(self.degree, x)
         # Select before dividing, so that isolated vertices keep finite gradients.
         linked = degree > 0
         return jnp.where(linked, x - total / jnp.where(linked, degree, 1), 0)
@@ -47,8 +53,14 @@ class Laplacian(NamedTuple):
     def inner(
         self, x: Float[Array, " vertices *columns"], y: Float[Array, " vertices *columns"]
     ) -> Float[Array, " *columns"]:
-        """⟨x, y⟩_D = Σ_v D_v x_v y_v, column by column: a scalar for `[N]`, `[C]` for `[N, C]`."""
-        return jnp.sum(_column(self.degree, x) * x * y, axis=0)
+        """⟨x, y⟩_D = Σ_v D_v x_v y_v, column by column: a scalar for `[N]`, `[C]` for `[N, C]`.
+
+        Raises:
+            JaxmarkError: if the shapes differ.
+        """
+        if x.shape != y.shape:
+            raise JaxmarkError(f"Laplacian.inner needs two signals of one shape, got {x.shape} and {y.shape}.")
+        return jnp.sum(per_row(self.degree, x) * x * y, axis=0)
 
 
 def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence") -> Laplacian:
@@ -91,6 +103,11 @@ def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence") -> La
     return Laplacian(pairs.astype(np.int32), values, degree)
 
 
+def per_row(values: Num[Array | np.ndarray, " rows"], x: Array | np.ndarray) -> Array:
+    """Values per row, such as D, in the dtype of `x` and shaped to broadcast against its columns."""
+    return jnp.asarray(values).astype(x.dtype).reshape(-1, *[1] * (x.ndim - 1))
+
+
 def centre(
     operator: Laplacian, x: Float[Array | np.ndarray, "vertices columns"]
 ) -> Float64[np.ndarray, "vertices columns"]:
@@ -103,7 +120,8 @@ def centre(
     x = np.asarray(x, np.float64)
     degree = np.asarray(operator.degree, np.float64)
     size = len(degree)
-    tail, head = np.asarray(operator.edges).T
+    # An edge of weight zero joins nothing.
+    tail, head = np.asarray(operator.edges)[np.asarray(operator.weights) > 0].T
     graph = sparse.coo_array((np.ones(len(tail)), (tail, head)), shape=(size, size))
     count, component = csgraph.connected_components(graph, directed=False)
     mass = np.where(degree > 0, degree, 1.0)
@@ -122,12 +140,9 @@ def sparse_matrices(operator: Laplacian) -> tuple[sparse.csr_array, sparse.dia_a
     weights = np.asarray(operator.weights, np.float64)
     adjacency = sparse.coo_array((weights, (tail, head)), shape=(len(degree), len(degree)))
     mass = sparse.diags_array(degree)
-    return sparse.csr_array(mass - adjacency - adjacency.T), mass
-
-
-def _column(values: Num[Array | np.ndarray, " rows"], x: Array) -> Array:
-    """Per-row values in the dtype of `x`, shaped to broadcast against its columns."""
-    return jnp.asarray(values).astype(x.dtype).reshape(-1, *[1] * (x.ndim - 1))
+    stiffness = sparse.csr_array(mass - adjacency - adjacency.T)
+    stiffness.eliminate_zeros()
+    return stiffness, mass
 
 
 def _inverse_lengths(vertices: np.ndarray, pairs: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Marking meshes: messages and keys in, meshes and evidence out."""
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ DEFAULT_BITS = 64
 class EmbedInfo(NamedTuple):
     """What was done to a mesh."""
 
-    rms: float  # displacement of the welded vertices, unweighted, over the bounding-box diagonal
+    rms: float  # displacement of the welded vertices that faces use, unweighted, over the bounding-box diagonal
     max: float  # the largest such displacement
     beta: float  # strength: the factor on the carrier's unit displacement, in diagonals
     record: Record
@@ -41,11 +42,18 @@ class Detection(NamedTuple):
     coverage: float  # share of the original's points that the suspect gave evidence for
 
     def detected(self, alpha: float = 1e-6) -> bool:
-        """Whether the false-positive probability is at most `alpha`."""
+        """Whether the false-positive probability is at most `alpha`.
+
+        Raises:
+            JaxmarkError: if `alpha` is not in (0, 1).
+        """
+        if not 0 < alpha < 1:
+            raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
         return self.log10_p <= math.log10(alpha)
 
 
-class Marker(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Marker:
     """Key, payload and scheme on one original: marks it, and reads any number of suspects, preparing only once.
 
     Make one with `make_marker`.
@@ -63,22 +71,27 @@ class Marker(NamedTuple):
         if not 0 < budget < 1:
             raise JaxmarkError(f"The budget is relative to the bounding box's diagonal and in (0, 1), got {budget}.")
         self._check_size(message)
-        original, dtype = self.original, self.original.signal.dtype
-        codeword = jnp.asarray(encode(message, self.key, original.geometry), dtype)
+        original = self.original
+        codeword = jnp.asarray(encode(message, self.key, original.geometry), original.signal.dtype)
         unit = np.asarray(self.carrier.displacement(codeword), np.float64)
-        size = float(distortion.rms(unit))
+        size = float(distortion.rms(unit[original.used]))
         if not (math.isfinite(size) and size > 0):
             raise JaxmarkError(
                 f"The {len(unit)} points of this mesh leave the scheme {self.scheme.name!r} nothing to write in."
             )
-        beta = budget / size
+        beta = float(budget) / size
         marked = displaced(original, beta * unit)
+        written = residual(original, marked)[original.used]
+        rms = float(distortion.rms(written))
+        if abs(rms - budget) > 0.01 * budget:
+            raise JaxmarkError(
+                f"A budget of {budget:g} is lost in the rounding of this mesh's coordinates; use a larger one."
+            )
         if self.detect(marked).message != message:
             raise JaxmarkError(
                 f"This mesh ({len(unit)} points) cannot carry {self.bits} bits with the scheme {self.scheme.name!r}:"
                 " they do not read back, even unattacked. Use a shorter message, or a finer or less regular mesh."
             )
-        written = residual(original, marked)
         record = Record(
             scheme=self.scheme.name,
             bits=self.bits,
@@ -87,26 +100,33 @@ class Marker(NamedTuple):
             key=commitment(self.key),
             parameters=parameters_of(self.scheme),
         )
-        return marked, EmbedInfo(float(distortion.rms(written)), float(distortion.maximum(written)), beta, record)
+        return marked, EmbedInfo(rms, float(distortion.maximum(written)), beta, record)
 
     def detect(self, suspect: Mesh, message: bytes | None = None) -> Detection:
         """Read a suspect, with a claimed message or without; see `detect`."""
         original, dtype = self.original, self.original.signal.dtype
         if message is not None:
             self._check_size(message)
-        # Centred in float64, so that a suspect that was moved far away leaves no rounding errors behind.
-        difference = jnp.asarray(centre(original.operator, residual(original, suspect)), dtype)
+        # Scaled and centred in float64: nothing overflows in float32, and a suspect that was moved far away leaves no
+        # rounding errors behind.
+        moved = residual(original, suspect)
+        moved /= np.abs(moved).max() or 1.0
+        difference = jnp.asarray(centre(original.operator, moved), dtype)
         soft = np.asarray(self.detector(self.carrier, difference, 1.0), np.float64)
         read = decode(soft, self.key, original.geometry)
         if message is not None:
             claimed = jnp.asarray(encode(message, self.key, original.geometry), dtype)
-            log10_p = log10_p_claimed(*self.carrier.claim(difference, claimed))
+            score, norm = self.carrier.claim(difference, claimed)
+            # Another message that reads refutes the claim, however much the two have in common.
+            log10_p = log10_p_claimed(score, norm) if read in (None, message) else 0.0
         else:
             log10_p = 0.0 if read is None else log10_p_tag(TAG_BITS)
         size = np.sqrt(np.mean(soft**2))
         return Detection(read, log10_p, soft[:-TAG_BITS] / (size or 1.0), 1.0)
 
     def _check_size(self, message: bytes) -> None:
+        if not isinstance(message, bytes):
+            raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
         if 8 * len(message) != self.bits:
             raise JaxmarkError(f"The message has {8 * len(message)} bits, but the payload is {self.bits} bits.")
 
@@ -128,7 +148,7 @@ def make_marker(
         key: 32 bytes, from `new_key`.
         bits: payload, a multiple of 8; by default the record's, else 64.
         record: of an earlier mark; fixes scheme and payload, and binds to original and key.
-        scheme: a name (`"host"`, `"eigen"`) or an object of `jaxmark.schemes`, where there is no record.
+        scheme: a name (`"host"`, `"eigen"`), which a record overrides; or an object of `jaxmark.schemes`.
         detector: see `jaxmark.detectors`.
 
     Returns:
@@ -137,7 +157,7 @@ def make_marker(
     Raises:
         JaxmarkError: if the mesh, key or payload is unusable, or the record is for another original, key or payload.
     """
-    key = Key(bytes(key))
+    key = Key(key)
     ready = prepare(original)
     if record is not None:
         if record.original != ready.geometry.hex():
@@ -146,7 +166,13 @@ def make_marker(
             raise JaxmarkError("The key is not the one that the record commits to.")
         if bits not in (None, record.bits):
             raise JaxmarkError(f"The payload is {record.bits} bits by the record, not {bits}.")
-        scheme, bits = get_scheme(record.scheme, record.parameters), record.bits
+        bits = record.bits
+        if isinstance(scheme, str):
+            scheme = get_scheme(record.scheme, record.parameters)
+        elif (scheme.name, parameters_of(scheme)) != (record.scheme, record.parameters):
+            raise JaxmarkError(
+                f"The record is of the scheme {record.scheme!r} with {dict(record.parameters)}, not {scheme}."
+            )
     scheme = get_scheme(scheme)
     payload = DEFAULT_BITS if bits is None else bits
     carrier = scheme.carrier(ready, key, code_length(payload))
@@ -164,8 +190,8 @@ def embed(
         mesh: the original.
         message: any bytes, at least one.
         key: 32 bytes, from `new_key`.
-        budget: RMS displacement of the welded vertices, unweighted, relative to the diagonal of the axis-aligned
-            bounding box of the vertices that faces use: 0.0008 is 0.08 % of it. It is met exactly.
+        budget: RMS displacement of the welded vertices that faces use, unweighted, relative to the diagonal of their
+            axis-aligned bounding box: 0.0008 is 0.08 % of it. It is met exactly.
         scheme: see `make_marker`.
 
     Returns:
@@ -174,6 +200,8 @@ def embed(
     Raises:
         JaxmarkError: if the mesh, key, budget or payload is unusable, or the mesh cannot carry so many bits.
     """
+    if not isinstance(message, bytes):
+        raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
     return make_marker(mesh, key, bits=8 * len(message), scheme=scheme).embed(message, budget)
 
 
@@ -192,8 +220,10 @@ def detect(
 
     Without `message`, the message read counts only if its keyed 32-bit tag fits: log10_p is then log10 2⁻³² = -9.6,
     else 0. With `message`, log10_p is Hoeffding's bound for that message (see `evidence.log10_p_claimed`), which can
-    prove a mark whose message no longer reads. Both hold for any suspect independent of the key, provided that key,
-    original and claimed message were fixed before the suspect was seen.
+    prove a mark whose message no longer reads; a claim is refuted (0) where another message reads. Both hold for any
+    suspect independent of the key, provided that key, original and claimed message were fixed before the suspect was
+    seen. A mesh marked under the same key is not independent of it: once its message no longer reads, a claim that has
+    many bits in common with it may pass.
 
     Args:
         suspect: a mesh with the original's connectivity.
@@ -212,7 +242,7 @@ def detect(
         JaxmarkError: as `make_marker`; also if the suspect has another connectivity, or the claimed message another
             size than the payload.
     """
-    if bits is None and record is None and message is not None:
+    if bits is None and record is None and isinstance(message, bytes):
         bits = 8 * len(message)
     marker = make_marker(original, key, bits=bits, record=record, scheme=scheme, detector=detector)
     return marker.detect(suspect, message)

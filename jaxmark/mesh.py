@@ -4,10 +4,11 @@ A `Mesh` is plain data: it goes through `jit`, `vmap` and `grad`. Everything in 
 runs on the host with NumPy, keeps float64, and says what is wrong before anything is traced.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float, Int, Int64
+from jaxtyping import Array, Bool, Float, Int, Int64
 from numpy.typing import ArrayLike
 
 from jaxmark.errors import JaxmarkError
@@ -120,8 +121,8 @@ def diagonal(mesh: Mesh) -> float:
     Raises:
         JaxmarkError: if it is zero: all those vertices coincide.
     """
-    used = np.asarray(mesh.vertices, np.float64)[np.unique(np.asarray(mesh.faces))]
-    length = float(np.linalg.norm(np.ptp(used, axis=0)))
+    used = np.asarray(mesh.vertices, np.float64)[used_vertices(mesh)]
+    length = math.hypot(*np.ptp(used, axis=0))
     if not 0.0 < length < np.inf:
         raise JaxmarkError(
             f"The bounding box of the mesh has a diagonal of {length:g}; it must be positive and finite."
@@ -133,6 +134,13 @@ def boundary_vertices(faces: Int[Array | np.ndarray, "faces 3"]) -> Int64[np.nda
     """Vertices on an edge that only one face uses, ascending."""
     pairs, count = _count_sides(faces)
     return np.unique(pairs[count == 1])
+
+
+def used_vertices(mesh: Mesh) -> Bool[np.ndarray, " vertices"]:
+    """Which vertices faces use; the others are no part of the surface."""
+    used = np.zeros(len(mesh.vertices), bool)
+    used[np.asarray(mesh.faces)] = True
+    return used
 
 
 def same_connectivity(first: Mesh, second: Mesh) -> bool:

@@ -1,23 +1,25 @@
 """An original made ready for filtering, and suspects seen from it. Host side: float64 in, the computing dtype out."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64
+from jaxtyping import Array, Bool, Float, Float64
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import geometry_hash
 from jaxmark.laplacian import Laplacian, centre, make_laplacian
-from jaxmark.mesh import Mesh, Weld, diagonal, host_mesh, same_connectivity, weld, welded_mesh
+from jaxmark.mesh import Mesh, Weld, diagonal, host_mesh, same_connectivity, used_vertices, weld, welded_mesh
 
 
-class Original(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Original:
     """What embedding and detection need of an original; lengths are in units of its bounding-box diagonal."""
 
     mesh: Mesh  # as in its file
     weld: Weld
+    used: Bool[np.ndarray, " points"]  # which points faces use
     diagonal: float  # in the file's units
     geometry: bytes  # hash of the canonical geometry
     operator: Laplacian  # on the welded points
@@ -42,32 +44,39 @@ def prepare(mesh: Mesh) -> Original:
     traced = Laplacian(
         jnp.asarray(operator.edges), jnp.asarray(operator.weights, dtype), jnp.asarray(operator.degree, dtype)
     )
-    return Original(mesh, welded, length, geometry_hash(mesh), traced, signal)
+    return Original(mesh, welded, used_vertices(points), length, geometry_hash(mesh), traced, signal)
 
 
-def displaced(original: Original, displacement: Float64[np.ndarray, "points 3"]) -> Mesh:
+def displaced(original: Original, shift: Float64[np.ndarray, "points 3"]) -> Mesh:
     """The original with its welded points moved (in diagonals); copies of a point move together."""
-    moved = original.mesh.vertices + original.diagonal * displacement[original.weld.point]
+    moved = original.mesh.vertices + original.diagonal * shift[original.weld.point]
     return Mesh(moved, original.mesh.faces)
 
 
 def residual(original: Original, suspect: Mesh) -> Float64[np.ndarray, "points 3"]:
-    """How far a suspect's points lie from the original's, in diagonals; copies of a point are averaged.
+    """How far a suspect's points lie from the original's; see `displacement`."""
+    return displacement(original.mesh, suspect, original.weld, original.diagonal)
 
-    The original's weld decides, not the suspect's own positions: quantisation makes vertices coincide.
+
+def displacement(mesh: Mesh, suspect: Mesh, welded: Weld, length: float) -> Float64[np.ndarray, "points 3"]:
+    """How far a suspect's points lie from a mesh's, over `length`; copies of a point are averaged.
+
+    The mesh's weld decides, not the suspect's own positions: quantisation makes vertices coincide. A point that no face
+    uses is no part of the surface: wherever it went, it counts as unmoved.
 
     Raises:
-        JaxmarkError: if the suspect does not share the original's connectivity, index by index.
+        JaxmarkError: if the suspect does not share the mesh's connectivity, index by index.
     """
     suspect = host_mesh(suspect)
-    if not same_connectivity(suspect, original.mesh):
+    if not same_connectivity(suspect, mesh):
         raise JaxmarkError(
             f"The suspect ({len(suspect.vertices)} vertices, {len(suspect.faces)} triangles) does not share the"
-            f" connectivity of the original ({len(original.mesh.vertices)} vertices, {len(original.mesh.faces)}"
-            " triangles), in the same vertex and face order; this version compares vertex by vertex."
+            f" connectivity of the original ({len(mesh.vertices)} vertices, {len(mesh.faces)} triangles), in the same"
+            " vertex and face order; this version compares vertex by vertex."
         )
-    difference = (suspect.vertices - original.mesh.vertices) / original.diagonal
-    count = len(original.weld.first)
-    copies = np.bincount(original.weld.point, minlength=count)
-    sums = [np.bincount(original.weld.point, column, count) for column in difference.T]
-    return np.stack(sums, axis=1) / copies[:, None]
+    difference = (np.asarray(suspect.vertices) - np.asarray(mesh.vertices)) / length
+    difference[~used_vertices(mesh)] = 0
+    count = len(welded.first)
+    copies = np.bincount(welded.point[used_vertices(mesh)], minlength=count)
+    sums = [np.bincount(welded.point, column, count) for column in difference.T]
+    return np.stack(sums, axis=1) / np.maximum(copies, 1)[:, None]

@@ -13,6 +13,7 @@ from jaxmark.bands import scaling
 from jaxmark.carriers import Carrier, ModulatedCarrier, eigenspaces, host_bands
 from jaxmark.carriers.carrier import Components
 from jaxmark.errors import JaxmarkError
+from jaxmark.message import TAG_BITS
 from jaxmark.original import Original
 from jaxmark.sequences import orthogonal_sequences
 from jaxmark.spectrum import eigenpairs
@@ -20,9 +21,10 @@ from jaxmark.spectrum import eigenpairs
 
 @runtime_checkable
 class Scheme(Protocol):
-    """Anything that makes a carrier from an original, a key and a number of bits."""
+    """A dataclass that makes a carrier from an original, a key and a number of bits; a record stores its fields."""
 
     name: ClassVar[str]  # what records and the command line call it
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     def carrier(self, original: Original, key: bytes, code_bits: int) -> Carrier:
         """The carrier of so many bits on this original under this key."""
@@ -35,6 +37,7 @@ class HostScheme:
 
     The defaults are its working form: Jackson-damped bands at unit norm. `kernel="printed", damping="none",
     unit_norm=False` is the form the paper prints, in which the components of natural meshes are nearly collinear.
+    There is a Hadamard matrix of order 3 · bands for `bands` a power of two from 4 on, and some others.
     """
 
     name: ClassVar[str] = "host"
@@ -47,12 +50,15 @@ class HostScheme:
         """See `Scheme`."""
         family = scaling(self.bands, kernel=self.kernel, damping=self.damping)
         components = host_bands(original.operator, original.signal, family, unit_norm=self.unit_norm)
-        return _modulated(components, self.bands, original, key, code_bits)
+        return _modulated(self.name, components, self.bands, original, key, code_bits)
 
 
 @dataclass(frozen=True)
 class EigenScheme:
-    """Ohbuchi's scheme: the lowest eigenpairs of the Laplacian, each of pairs x 3 coordinates with a keyed sign."""
+    """Ohbuchi's scheme: the lowest eigenpairs of the Laplacian, each of pairs x 3 coordinates with a keyed sign.
+
+    `pairs` as `HostScheme.bands`.
+    """
 
     name: ClassVar[str] = "eigen"
     pairs: int = 64
@@ -61,7 +67,7 @@ class EigenScheme:
         """See `Scheme`."""
         pairs = eigenpairs(original.operator, self.pairs)
         components = eigenspaces(original.operator, original.signal, pairs)
-        return _modulated(components, self.pairs, original, key, code_bits)
+        return _modulated(self.name, components, self.pairs, original, key, code_bits)
 
 
 SCHEMES: Mapping[str, type[HostScheme] | type[EigenScheme]] = {
@@ -88,19 +94,19 @@ def get_scheme(scheme: str | Scheme, parameters: Mapping[str, Any] | None = None
 
 def parameters_of(scheme: Scheme) -> dict[str, Any]:
     """The fields of a scheme, as a record stores them."""
-    return asdict(scheme)  # type: ignore[call-overload]
+    return asdict(scheme)
 
 
-def _modulated(components: Components, bands: int, original: Original, key: bytes, code_bits: int) -> ModulatedCarrier:
+def _modulated(
+    name: str, components: Components, bands: int, original: Original, key: bytes, code_bits: int
+) -> ModulatedCarrier:
     """One keyed sequence per bit over all pairs of a band and a coordinate."""
     slots = 3 * bands
     if code_bits > slots:
-        from jaxmark.message import TAG_BITS
-
         raise JaxmarkError(
-            f"This scheme has {slots} places for bits and the tag takes {TAG_BITS}: the payload is at most"
-            f" {(slots - TAG_BITS) // 8 * 8} bits."
+            f"The scheme {name!r} has {slots} places for bits, of which the tag takes {TAG_BITS}: the payload is at"
+            f" most {max(0, slots - TAG_BITS) // 8 * 8} bits."
         )
-    sequences = orthogonal_sequences(key, original.geometry, code_bits, slots).reshape(code_bits, bands, 3)
+    sequences = orthogonal_sequences(key, original.geometry, code_bits, slots, label=name).reshape(code_bits, bands, 3)
     used = components.gram.shape[-1]  # a small mesh has fewer eigenvectors than the layout has places for
     return ModulatedCarrier(components, np.ascontiguousarray(sequences[:, :used]))

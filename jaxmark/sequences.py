@@ -11,17 +11,20 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.keys import permutation, signs
 
 
-def orthogonal_sequences(key: bytes, geometry: bytes, count: int, length: int) -> Int8[np.ndarray, "count length"]:
+def orthogonal_sequences(
+    key: bytes, geometry: bytes, count: int, length: int, *, label: str = "sequences"
+) -> Int8[np.ndarray, "count length"]:
     """Keyed ±1 sequences, mutually orthogonal: rows of a Hadamard matrix, chosen, permuted and signed by the key.
 
-    The signs of the columns (label `signs`) are independent of which rows and columns were chosen (labels `rows`,
-    `columns`): a false-positive probability may rest on them alone.
+    The signs of the columns are independent of which rows and columns were chosen: a false-positive probability may
+    rest on them alone. Sequences of another label or length share nothing with these.
 
     Args:
         key: 32 bytes.
         geometry: `geometry_hash` of the original.
         count: how many, at most `length`.
         length: 1, 2 or a multiple of 4 that `hadamard` can construct.
+        label: what they are for; the keyed choices have the labels `label/length/rows`, `…/columns` and `…/signs`.
 
     Returns:
         `[count, length]` with values -1 and 1.
@@ -32,9 +35,9 @@ def orthogonal_sequences(key: bytes, geometry: bytes, count: int, length: int) -
     matrix = hadamard(length)
     if not 0 < count <= length:
         raise JaxmarkError(f"There are {length} mutually orthogonal sequences of length {length}, not {count}.")
-    rows = permutation(key, geometry, "rows", length)[:count]
-    columns = permutation(key, geometry, "columns", length)
-    return matrix[rows][:, columns] * signs(key, geometry, "signs", length)
+    rows = permutation(key, geometry, f"{label}/{length}/rows", length)[:count]
+    columns = permutation(key, geometry, f"{label}/{length}/columns", length)
+    return matrix[rows][:, columns] * signs(key, geometry, f"{label}/{length}/signs", length)
 
 
 def hadamard(order: int) -> Int8[np.ndarray, "order order"]:
@@ -45,16 +48,21 @@ def hadamard(order: int) -> Int8[np.ndarray, "order order"]:
     """
     if order < 1 or (order > 2 and order % 4):
         raise JaxmarkError(f"No {order} mutually orthogonal ±1 sequences of length {order} exist; use a multiple of 4.")
+    matrix = _construct(order)
+    if matrix is None:
+        raise JaxmarkError(
+            f"No construction here for {order} mutually orthogonal sequences; use a power of two, or three times one."
+        )
+    return matrix
+
+
+def _construct(order: int) -> Int8[np.ndarray, "order order"] | None:
     if order == 1:
         return np.ones((1, 1), np.int8)
-    if _is_prime(order - 1) and (order - 1) % 4 == 3:
+    if order % 4 == 0 and _is_prime(order - 1):
         return _paley(order - 1)
-    half = None if order % 8 and order > 4 else hadamard(order // 2)
-    if half is None:
-        raise JaxmarkError(
-            f"No construction here for {order} orthogonal sequences; use a power of two, or 12, 20, 24 …."
-        )
-    return np.block([[half, half], [half, -half]]).astype(np.int8)
+    half = _construct(order // 2) if order % 2 == 0 else None
+    return None if half is None else np.block([[half, half], [half, -half]]).astype(np.int8)
 
 
 def _paley(q: int) -> Int8[np.ndarray, "order order"]:

@@ -40,9 +40,9 @@ def eigenpairs(operator: Laplacian, count: int | None = None, *, tolerance: floa
 
     Args:
         operator: the Laplacian, of N vertices.
-        count: how many of the lowest; fewer come back where there are not as many. None for all.
+        count: how many of the lowest, at most. None for all.
         tolerance: eigenvalues closer than this are one eigenspace, in which no basis is preferred: only its projection
-            means anything. (An eigenspace cut by `count` keeps the part that was computed.)
+            means anything. An eigenspace that `count` would cut is left out.
 
     Returns:
         The pairs with eigenvalue above the null space (one null vector per connected component is left out).
@@ -61,7 +61,8 @@ def eigenpairs(operator: Laplacian, count: int | None = None, *, tolerance: floa
     )
     size = len(linked)
     null, component = csgraph.connected_components(scaled, directed=False)
-    wanted = size - null if count is None else min(count, size - null)
+    # One more than asked for tells whether the last eigenspace is whole.
+    wanted = size - null if count is None else min(count + 1, size - null)
     if wanted == 0:
         values, vectors = np.zeros(0), np.zeros((size, 0))
     elif size <= _DENSE_LIMIT:
@@ -73,11 +74,12 @@ def eigenpairs(operator: Laplacian, count: int | None = None, *, tolerance: floa
         )
     else:
         values, vectors = _lowest(scaled, root, component, wanted)
-    full = np.zeros((len(degree), len(values)))
-    full[linked] = vectors / root[:, None]
     fresh = np.diff(values, prepend=-np.inf) > tolerance
-    space = np.maximum.accumulate(np.where(fresh, np.arange(len(values)), 0))
-    return Eigenpairs(values, full, space.astype(np.int64))
+    space = np.maximum.accumulate(np.where(fresh, np.arange(len(values)), 0)).astype(np.int64)
+    kept = len(values) if count is None or len(values) <= count else int(space[count])
+    full = np.zeros((len(degree), kept))
+    full[linked] = vectors[:, :kept] / root[:, None]
+    return Eigenpairs(values[:kept], full, space[:kept])
 
 
 def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: int) -> Quadrature:

@@ -29,7 +29,12 @@ def rate(channels: Channels, beta: Float[Array, " bands"]) -> Float[Array, " att
 
 
 def tune(
-    channels: Channels, cost: Float[Array, " bands"], budget: float, *, sharpness: float = 100.0, steps: int = 500
+    channels: Channels,
+    cost: Float[Array, " bands"],
+    budget: float | Float[Array, ""],
+    *,
+    sharpness: float = 100.0,
+    steps: int = 500,
 ) -> Float[Array, " bands"]:
     """Strengths per band that maximise the worst attack's `rate` under Σ_j cost_j β_j² = budget².
 
@@ -55,7 +60,7 @@ def tune(
             f"tune needs gain and noise [attacks, bands] and dimensions and cost [bands], got {channels.gain.shape},"
             f" {channels.noise.shape}, {channels.dimensions.shape} and {cost.shape}."
         )
-    if not budget > 0:
+    if isinstance(budget, float | int) and not budget > 0:
         raise JaxmarkError(f"tune needs a positive budget, got {budget}.")
     return _tune(channels, cost, jnp.asarray(budget, cost.dtype), jnp.asarray(sharpness, cost.dtype), steps)
 
@@ -65,19 +70,26 @@ def _tune(channels: Channels, cost: Array, budget: Array, sharpness: Array, step
     jaxopt = _import_jaxopt()
 
     equal = jnp.full_like(cost, 1 / len(cost))
-    scale = sharpness / _rate(channels, budget**2 * equal / cost).mean()
+    # A band's share of the budget buys this much β².
+    scaled = channels._replace(gain=channels.gain * budget / jnp.sqrt(cost))
+    weight = sharpness / _rate(scaled, equal).mean()
 
-    def loss(shares: Array) -> Array:
-        return jax.nn.logsumexp(-scale * _rate(channels, budget**2 * shares / cost)) / sharpness
+    # jaxopt differentiates its solution with respect to arguments, not to what a closure holds.
+    def loss(shares: Array, scaled: Channels, weight: Array, sharpness: Array) -> Array:
+        return jax.nn.logsumexp(-weight * _rate(scaled, shares)) / sharpness
 
     solver = jaxopt.ProjectedGradient(
-        fun=loss, projection=lambda x, _: jaxopt.projection.projection_simplex(x), maxiter=steps, tol=1e-7
+        fun=loss,
+        projection=lambda x, _: jaxopt.projection.projection_simplex(x),
+        maxiter=steps,
+        tol=1e-7,
+        acceleration=False,  # accelerated steps leave the simplex, where a rate has no meaning
     )
     with jax.numpy_dtype_promotion("standard"):  # jaxopt mixes integers into its floats
-        shares = solver.run(equal, hyperparams_proj=None).params
-    # The root's slope at an empty band is infinite: select before it.
-    filled = shares > 0
-    return jnp.where(filled, budget * jnp.sqrt(jnp.where(filled, shares, 1) / cost), 0)
+        shares = solver.run(equal, None, scaled, weight, sharpness).params
+    # The root's slope at an empty band is infinite: select before it. NaN is not empty, and stays.
+    empty = shares <= 0
+    return jnp.where(empty, 0, budget * jnp.sqrt(jnp.where(empty, 1, shares) / cost))
 
 
 def _rate(channels: Channels, power: Array) -> Array:

@@ -57,6 +57,9 @@ def test_quantisation_rounds_to_its_grid(cap: Mesh, bits, x64):
     v = cap.vertices.copy()
     v[:, 2] = 4.0  # a flat axis
     rounded = np.asarray(quantisation(Mesh(jnp.asarray(v), cap.faces), bits).vertices)
+    used = np.unique(cap.faces)
+    np.testing.assert_array_equal(np.delete(rounded, used, axis=0), np.delete(v, used, axis=0))
+    v, rounded = v[used], rounded[used]
     step = np.ptp(v, axis=0) / 2**bits
     np.testing.assert_array_equal(rounded[:, 2], 4.0)
     cells = (rounded[:, :2] - v[:, :2].min(axis=0)) / step[:2]
@@ -93,6 +96,25 @@ def test_host_function_keeps_copies_together_and_digits_far_away(cap: Mesh):
     np.testing.assert_array_equal(jm.attack(soup, "noise", 0, seed=0).vertices, soup.vertices)
 
 
+def test_a_stray_vertex_changes_nothing(cap: Mesh):
+    stray = make_mesh(np.vstack([cap.vertices, [[1e9, 0, 0]]]), cap.faces)
+    for kind, strength in (("noise", 0.01), ("smoothing", 3), ("quantisation", 8)):
+        alone, beside = (jm.attack(mesh, kind, strength, seed=0).vertices for mesh in (cap, stray))
+        np.testing.assert_array_equal(beside[-1], stray.vertices[-1])
+        if kind != "noise":  # whose draws depend on the number of vertices
+            np.testing.assert_allclose(beside[:-1], alone, atol=1e-6)
+        assert np.abs(beside[:-1] - cap.vertices).max() < 0.05
+
+
+def test_repeated_smoothing_is_compiled_once(cap: Mesh):
+    jm.attack(cap, "smoothing", 5, seed=0)
+    with jax.log_compiles(True), pytest.MonkeyPatch.context() as patch:
+        compiled: list = []
+        patch.setattr("jax._src.interpreters.pxla.logger.log", lambda *arguments: compiled.append(arguments))
+        jm.attack(cap, "smoothing", 5, seed=1)
+    assert not compiled
+
+
 def test_registry_states_units():
     assert all(entry.unit for entry in ATTACKS.values())
 
@@ -104,6 +126,7 @@ def test_refusals(cap: Mesh):
         ("noise", -1, "not negative"),
         ("noise", float("nan"), "must be a number"),
         ("smoothing", 2.5, "whole number"),
+        ("smoothing", 1e300, "to 100000"),
         ("quantisation", 0, "1 to 32"),
     ]:
         with pytest.raises(jm.JaxmarkError, match=sentence):

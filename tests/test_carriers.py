@@ -117,6 +117,30 @@ def test_claim_is_a_sum_over_keyed_signs(kind, operator, signal, key: jm.Key, x6
     assert np.linalg.norm(terms) == pytest.approx(float(norm))
 
 
+def test_a_claim_does_not_depend_on_the_size_of_the_residual(operator, signal, key: jm.Key):
+    """In float32, squares underflow long before sums do."""
+    carrier = make_carrier("host", operator, jnp.asarray(signal, jnp.float32), key)
+    residual = np.random.default_rng(7).normal(size=signal.shape)
+    ratios = []
+    for size in (1.0, 1e-15, 1e-21, 1e-25, 1e15):
+        score, norm = carrier.claim(jnp.asarray(size * residual, jnp.float32), jnp.ones(BITS, jnp.float32))
+        ratios.append(float(score) / float(norm))
+    np.testing.assert_allclose(ratios, ratios[0], rtol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["host", "eigen"])
+def test_the_hosts_dtype_is_kept(kind, operator, signal, key: jm.Key, x64):
+    carrier = make_carrier(kind, operator, jnp.asarray(signal, jnp.float32), key)
+    bits, residual, beta = np.ones(BITS), np.ones(signal.shape), np.full(BANDS, 0.5)
+    outputs = (
+        carrier.displacement(jnp.asarray(bits), beta),
+        carrier.adjoint(jnp.asarray(residual), beta),
+        carrier.gram(beta),
+        *carrier.claim(jnp.asarray(residual), jnp.asarray(bits)),
+    )
+    assert {output.dtype for output in outputs} == {np.dtype("float32")}
+
+
 def test_sequences_shared_by_coordinates_have_one_sign_a_band(operator, signal, key: jm.Key, x64):
     carrier = make_carrier("host", operator, jnp.asarray(signal), key, shared=True)
     residual = jnp.asarray(np.random.default_rng(3).normal(size=signal.shape))

@@ -106,6 +106,13 @@ def test_derivatives_by_transformation(operator, x64):
         for got, expected in zip(one, jax.grad(loss, (0, 1))(c, row), strict=True):
             np.testing.assert_allclose(got, expected, atol=1e-12)
 
+    def projected(u, x):
+        return jnp.sum(jnp.sin(0.01 * chebyshev.cross_moments(operator, u, x, degree=DEGREE)))
+
+    check_grads(projected, (x[1], x[0]), order=2, modes=["rev"])
+    columns = jnp.asarray(random_array(2, len(operator.degree), 3, seed=3))
+    check_grads(jax.jit(projected), tuple(columns), order=1, modes=["rev"])
+
     def scanned(c, x, weights):
         return jnp.sum(jnp.sin(chebyshev.filter(operator._replace(weights=weights), c, x, derivative="scan")))
 
@@ -131,6 +138,14 @@ def test_memory_does_not_grow_with_the_degree():
         compiled = jax.jit(jax.value_and_grad(loss, (0, 1))).lower(jnp.ones(degree + 1, jnp.float32), x).compile()
         return compiled.memory_analysis().temp_size_in_bytes
 
+    def scratch_of_moments(degree: int) -> int:
+        def loss(u, x):
+            return jnp.sum(chebyshev.cross_moments(operator, u, x, degree=degree) ** 2)
+
+        compiled = jax.jit(jax.value_and_grad(loss, (0, 1))).lower(x, x).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    assert scratch_of_moments(256) < 1.1 * scratch_of_moments(32)
     assert scratch(256, "recompute") < 1.1 * scratch(32, "recompute")
     assert scratch(256, "scan") > 4 * scratch(32, "scan")  # what the rule is for
 

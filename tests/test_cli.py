@@ -117,6 +117,8 @@ def test_refusals_are_one_sentence_and_leave_nothing(workshop: Workshop):
     workshop.embed()
     Path("broken.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\n")
     Path("notes.txt").write_text("x")
+    Path("folder.ply").mkdir()
+    Path("loop.ply").symlink_to("loop.ply")
     Path("bad.key").write_text("not a key")
     record = json.loads(Path("marked.ply.jaxmark.json").read_text())
     Path("other.json").write_text(json.dumps({**record, "original": "00"}))
@@ -126,11 +128,14 @@ def test_refusals_are_one_sentence_and_leave_nothing(workshop: Workshop):
         (("embed", "absent.ply", "out.ply", *mark), "absent.ply"),
         (("embed", "broken.ply", "out.ply", *mark), "broken.ply"),
         (("embed", "notes.txt", "out.txt", *mark), "notes.txt"),
-        (("embed", "model.ply", "out.obj", *mark), "suffix|format"),
+        (("embed", "model.ply", "out.obj", *mark), "^jaxmark: out.obj must have the suffix of model.ply"),
+        (("embed", "model.ply", "folder.ply", *mark), "folder.ply is a folder"),
+        (("embed", "loop.ply", "out.ply", *mark), "loop.ply"),
+        (("attack", "model.ply", "out.off", "noise", "1"), "^jaxmark: out.off must have the suffix of model.ply"),
         (("embed", "model.ply", "model.ply", *mark), "same file"),
         (("embed", "model.ply", "no/where.ply", *mark), "folder no"),
         (("embed", "model.ply", "out.ply", *mark, "--record", "no/where.json"), "no"),
-        (("embed", "model.ply", "out.ply", *mark, "--budget", "1e-9"), "."),
+        (("embed", "model.ply", "out.ply", *mark, "--budget", "1e-9"), "numbers are .* apart"),
         (("embed", "model.ply", "out.ply", *mark, "--budget", "nan"), "budget"),
         (("embed", "model.ply", "out.ply", *mark, "--scheme", "magic"), "magic"),
         (("embed", "model.ply", "out.ply", "--key", "owner.key", "--message", "xyz"), "hexadecimal"),
@@ -204,6 +209,13 @@ def test_module_and_script_are_the_same_program(tmp_path):
     assert module.stdout == ""
     assert module.stderr.startswith("jaxmark: ")
     assert module.stderr.count("\n") == 1
+
+
+def test_a_closed_pipe_does_not_change_the_status(workshop: Workshop):
+    workshop.embed()
+    for suspect, status in (("marked.ply", 0), ("model.ply", 1)):
+        command = f"{sys.executable} -m jaxmark detect {suspect} {' '.join(DETECT)} | head -c0; exit ${{PIPESTATUS[0]}}"
+        assert subprocess.run(["bash", "-c", command], capture_output=True, check=False).returncode == status
 
 
 def test_an_interrupted_write_leaves_no_output(workshop: Workshop, monkeypatch):

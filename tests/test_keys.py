@@ -25,7 +25,7 @@ def test_golden(key: jm.Key):
     assert "".join("+" if s > 0 else "-" for s in signs(key, geometry, "signs", 24)) == "----+--+---+-+-+++-+---+"
     assert permutation(key, geometry, "rows", 12).tolist() == [4, 6, 8, 10, 11, 7, 1, 9, 5, 2, 0, 3]
     rows = ["".join("+" if s > 0 else "-" for s in row) for row in orthogonal_sequences(key, geometry, 3, 12)]
-    assert rows == ["-----+--++++", "+--+-----+--", "-+++---+-+++"]
+    assert rows == ["+++-++-+---+", "--+-----+--+", "+-+++--++-+-"]
     code = encode(bytes.fromhex("c0ffee"), key, geometry)
     assert np.packbits(code > 0).tobytes().hex() == "c0ffee550c609b"
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from jaxmark.errors import JaxmarkError
 from jaxmark.laplacian import Laplacian, centre, make_laplacian, sparse_matrices
 from jaxmark.mesh import Mesh, edges, make_mesh
+from jaxmark.spectrum import eigenpairs
 from tests.dense import laplacian_matrix, tolerance
 
 WEIGHTINGS = ["valence", "inverse-length", "cotangent"]
@@ -93,6 +94,25 @@ def test_centring_removes_the_position_of_every_piece(hard_graph: Mesh):
         np.testing.assert_allclose(operator.degree[piece] @ centred[piece], 0, atol=1e-12)
     np.testing.assert_array_equal(centred[[5, 10]], 0)
     np.testing.assert_allclose(centre(operator, shifted), centred, atol=1e-9)
+
+
+def test_an_edge_of_weight_zero_joins_nothing():
+    mesh = make_mesh(np.random.default_rng(4).normal(size=(6, 3)), np.array([[0, 1, 2], [3, 4, 5], [2, 3, 3]]))
+    weights = np.array([0.0 if {*edge} == {2, 3} else 1.0 for edge in edges(mesh.faces)])
+    operator = make_laplacian(mesh, weights)
+    centred = centre(operator, mesh.vertices)
+    for piece in ([0, 1, 2], [3, 4, 5]):
+        np.testing.assert_allclose(operator.degree[piece] @ centred[piece], 0, atol=1e-12)
+    assert len(eigenpairs(operator).values) == 4
+
+
+def test_shapes_and_types_are_checked(hard_graph: Mesh, unchecked):
+    operator = make_laplacian(hard_graph)
+    x = jnp.ones((len(hard_graph.vertices), 3))
+    with pytest.raises(JaxmarkError, match="one shape"):
+        operator.inner(x, x[:, :1])
+    with pytest.raises(JaxmarkError, match="floating-point"):
+        operator.apply(x.astype(int))
 
 
 def test_sparse_matrices(hard_graph: Mesh):

@@ -1,6 +1,7 @@
 import subprocess
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -55,6 +56,30 @@ def test_several_attacks_against_another_solver(x64):
     )
     assert float(rate(channels, beta).min()) == pytest.approx(best.x[-1], rel=0.02)
     assert float(rate(channels, beta).min()) > 1.01 * bits(4.0 / 8 / cost).min()
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_channels_of_all_sizes(seed):
+    """The budget is spent, and never worse than equally, however far the channels lie apart; in float32."""
+    random = np.random.default_rng(seed)
+    gain, noise = random.uniform(0, 1, (4, 12)) ** 3, 10 ** random.uniform(-4, 0, (4, 12))
+    channels = Channels(*(jnp.asarray(a, jnp.float32) for a in (gain, noise, random.integers(1, 200, 12))))
+    cost = jnp.asarray(10 ** random.uniform(-2, 0, 12), jnp.float32)
+    beta = tune(channels, cost, 0.1)
+    assert float(jnp.sum(cost * beta**2)) == pytest.approx(0.01, rel=1e-4)
+    assert float(rate(channels, beta).min()) > float(rate(channels, 0.1 / jnp.sqrt(12 * cost)).min())
+
+
+def test_differentiable_with_respect_to_the_budget(x64):
+    """Implicitly, through the solution: at the optimum, more budget buys the rate that finite differences say."""
+    channels, cost = random_channels(3, 6, seed=2)
+
+    def worst(budget):
+        return rate(channels, tune(channels, jnp.asarray(cost), budget, sharpness=20.0, steps=20000)).mean()
+
+    with jax.numpy_dtype_promotion("standard"):  # jaxopt's own derivative mixes integers into floats
+        slope = jax.grad(worst)(2.0)
+    assert float(slope) == pytest.approx(float(worst(2.01) - worst(1.99)) / 0.02, rel=0.02)
 
 
 def test_jaxopt_is_imported_late_and_without_its_warning():

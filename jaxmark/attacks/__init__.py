@@ -1,4 +1,8 @@
-"""Attacks: what may happen to a marked mesh. `ATTACKS` lists them by the names the command line uses."""
+"""Attacks: what may happen to a marked mesh. `ATTACKS` lists them by the names the command line uses.
+
+Under `jit`, `vmap` and `grad`, close over the faces: graphs are prepared on the host. Vertices that no face uses are no
+part of the surface: they neither move nor count.
+"""
 
 from jaxmark.attacks.noise import uniform_noise as uniform_noise
 from jaxmark.attacks.quantisation import quantisation as quantisation

@@ -2,18 +2,19 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.mesh import Mesh
+from jaxmark.mesh import Mesh, used_vertices
 
 
 def quantisation(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
     """Round each coordinate to a uniform grid of steps (max - min)/2^R along each axis.
 
     Args:
-        mesh: any mesh.
-        strength: R, bits per coordinate, a number in [1, 32].
+        mesh: any mesh, its faces concrete.
+        strength: R, bits per coordinate, a number in [1, 32]; static.
         key: not used; attacks share one signature.
 
     Returns:
@@ -25,8 +26,11 @@ def quantisation(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -
     if not 1 <= strength <= 32:
         raise JaxmarkError(f"Quantisation takes 1 to 32 bits per coordinate, got {strength}.")
     vertices = jnp.asarray(mesh.vertices)
-    low = vertices.min(axis=0)
-    step = (vertices.max(axis=0) - low) / 2**strength
+    used = used_vertices(mesh)
+    surface = vertices[np.flatnonzero(used)]
+    low = surface.min(axis=0)
+    step = (surface.max(axis=0) - low) / float(2**strength)
     # A flat axis has nothing to round.
-    rounded = jnp.where(step > 0, low + step * jnp.round((vertices - low) / jnp.where(step > 0, step, 1)), vertices)
+    rounds = used[:, None] & (step > 0)
+    rounded = jnp.where(rounds, low + step * jnp.round((vertices - low) / jnp.where(step > 0, step, 1)), vertices)
     return Mesh(vertices + jax.lax.stop_gradient(rounded - vertices), mesh.faces)

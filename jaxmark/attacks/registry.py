@@ -11,7 +11,7 @@ from jaxmark.attacks.noise import uniform_noise
 from jaxmark.attacks.quantisation import quantisation
 from jaxmark.attacks.smoothing import laplacian_smoothing
 from jaxmark.errors import JaxmarkError
-from jaxmark.mesh import Mesh, diagonal, host_mesh, weld, welded_mesh
+from jaxmark.mesh import Mesh, diagonal, host_mesh, used_vertices, weld, welded_mesh
 
 
 class Attack(NamedTuple):
@@ -51,7 +51,7 @@ def attack(mesh: Mesh, kind: str, strength: float, *, seed: int) -> Mesh:
     welded = weld(mesh.vertices)
     points = welded_mesh(mesh, welded)
     # Near the origin and at unit size, float32 keeps its digits.
-    centre, length = points.vertices.mean(axis=0), diagonal(mesh)
+    centre, length = points.vertices[used_vertices(points)].mean(axis=0), diagonal(mesh)
     dtype = jax.dtypes.canonicalize_dtype(np.float64)
     start = jnp.asarray((points.vertices - centre) / length, dtype)
     attacked = ATTACKS[kind].apply(Mesh(start, points.faces), strength, jax.random.key(seed))

@@ -5,9 +5,12 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 Displacement = Float[Array, "vertices 3"]
-Strength = float | Float[Array, ""] | Float[Array, " bands"] | Float[Array, "bands 3"]
+Strength = (
+    float | Float[Array | np.ndarray, ""] | Float[Array | np.ndarray, " bands"] | Float[Array | np.ndarray, "bands 3"]
+)
 
 
 @runtime_checkable
@@ -55,7 +58,8 @@ class Components(Protocol):
 class ModulatedCarrier(NamedTuple):
     """Bits on components x_j of the host by sequences p: w = Σ_i bit_i Σ_j β_j p_j^(i) x_j (Sohn et al., 2.2).
 
-    With polynomial bands as components it is the paper's scheme, with eigenspaces Ohbuchi's.
+    With polynomial bands as components it is the paper's scheme, with eigenspaces Ohbuchi's. It computes in the dtype
+    of the components. Polynomial bands have no forward mode (see `jaxmark.chebyshev.filter`).
     """
 
     components: Components
@@ -63,36 +67,39 @@ class ModulatedCarrier(NamedTuple):
 
     def displacement(self, bits: Float[Array, " bits"], beta: Strength = 1.0) -> Displacement:
         """See `Carrier`."""
-        return self.components.synthesise(_per_band(beta, bits) * self._modulate(bits))
+        amplitudes = jnp.tensordot(self._as_real(bits), self._sequences, 1)
+        return self.components.synthesise(self._per_band(beta) * amplitudes)
 
     def adjoint(self, residual: Displacement, beta: Strength = 1.0) -> Float[Array, " bits"]:
         """See `Carrier`."""
-        found = _per_band(beta, residual) * self.components.analyse(residual)
-        return jnp.einsum("kjc,jc->k", self._sequences(residual), found)
+        found = self._per_band(beta) * self.components.analyse(self._as_real(residual))
+        return jnp.einsum("kjc,jc->k", self._sequences, found)
 
     def gram(self, beta: Strength = 1.0) -> Float[Array, "bits bits"]:
         """See `Carrier`."""
-        products = self.components.gram
-        weighted = _per_band(beta, products) * self._sequences(products)
-        return jnp.einsum("ajc,cjl,blc->ab", weighted, products, weighted)
+        weighted = self._per_band(beta) * self._sequences
+        return jnp.einsum("ajc,cjl,blc->ab", weighted, self.components.gram, weighted)
 
     def claim(self, residual: Displacement, bits: Float[Array, " bits"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """See `Carrier`; one sign per band and coordinate, or per band where coordinates share their sequences."""
-        found = self.components.analyse(residual)
+        found = self.components.analyse(self._as_real(residual))
         if self.sequences.shape[-1] == 1:
             found = found.sum(axis=1, keepdims=True)
-        terms = jnp.tensordot(bits, jnp.asarray(self.sequences).astype(bits.dtype), 1) * found
-        return terms.sum(), jnp.sqrt((terms**2).sum())
+        terms = jnp.tensordot(self._as_real(bits), self._as_real(self.sequences), 1) * found
+        # Squares of tiny terms underflow where their sum does not: S/‖a‖ must not depend on the residual's size.
+        peak = jnp.max(jnp.abs(terms))
+        return terms.sum(), peak * jnp.linalg.norm(terms / jnp.where(peak > 0, peak, 1))
 
-    def _modulate(self, bits: Float[Array, " bits"]) -> Float[Array, "bands 3"]:
-        return jnp.tensordot(bits, self._sequences(bits), 1)
-
-    def _sequences(self, like: Array) -> Float[Array, "bits bands 3"]:
-        signs = jnp.asarray(self.sequences).astype(like.dtype)
+    @property
+    def _sequences(self) -> Float[Array, "bits bands 3"]:
+        signs = self._as_real(self.sequences)
         return jnp.broadcast_to(signs, (*signs.shape[:2], 3))
 
+    def _per_band(self, beta: Strength) -> Array:
+        """β shaped to broadcast against `[bands, 3]`."""
+        strength = self._as_real(beta)
+        return strength[:, None] if strength.ndim == 1 else strength
 
-def _per_band(beta: Strength, like: Array) -> Array:
-    """β in the dtype of `like`, shaped to broadcast against `[bands, 3]`."""
-    strength = jnp.asarray(beta).astype(like.dtype)
-    return strength[:, None] if strength.ndim == 1 else strength
+    def _as_real(self, values: ArrayLike) -> Array:
+        """Anything in the dtype of the host."""
+        return jnp.asarray(values).astype(self.components.gram.dtype)

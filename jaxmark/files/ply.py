@@ -184,7 +184,7 @@ def _locate(body: _Body, element: _Element, at: int) -> tuple[dict[str, _Column]
     width = end - at
     if at + element.rows * width <= body.end:
         rows = at + width * np.arange(element.rows)
-        if all((body.integers(rows + offset, kind) == size).all() for offset, kind, size in counts):
+        if _all_alike(body, rows, counts):
             columns = [
                 _Column(rows + offset, np.full(len(rows), size)) for offset, size in zip(offsets, sizes, strict=True)
             ]
@@ -192,6 +192,14 @@ def _locate(body: _Body, element: _Element, at: int) -> tuple[dict[str, _Column]
     elif not counts:
         raise _ended(element, max(0, body.end - at) // width)
     return _locate_one_by_one(body, element, at)
+
+
+def _all_alike(body: _Body, rows: Int64[np.ndarray, " rows"], counts: list[tuple[int, np.dtype, int]]) -> bool:
+    """Whether the lists of all rows are as long as the first row's, at these offsets."""
+    try:
+        return all(bool((body.integers(rows + offset, kind) == size).all()) for offset, kind, size in counts)
+    except JaxmarkError:  # something else stands there
+        return False
 
 
 def _locate_one_by_one(body: _Body, element: _Element, at: int) -> tuple[dict[str, _Column], int]:

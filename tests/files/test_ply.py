@@ -164,3 +164,18 @@ def test_every_truncation_of_a_binary_file_is_refused(tmp_path: Path) -> None:
     for length in range(len(data) - len(b"tail")):
         with pytest.raises(JaxmarkError):
             loaded(tmp_path, "short.ply", data[:length])
+
+
+def test_rows_of_different_length_with_fractions(tmp_path: Path) -> None:
+    """A triangle before quads, and a number with a fraction behind each list."""
+    path = tmp_path / "mixed.ply"
+    path.write_bytes(
+        b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        b"element face 3\nproperty list uchar int vertex_indices\nproperty float q\nend_header\n"
+        b"5 0 0.5\n1 5 0\n0 1 5.25\n0 6 1\n3 0 1 2 .9\n4 0 1 2 3 .9\n3 1 2 3 .8\n"
+    )
+    mesh = load_mesh(path)
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2], [0, 1, 2], [0, 2, 3], [1, 2, 3]])
+    path.write_bytes(path.read_bytes().replace(b"4 0 1 2 3 .9", b".4 0 1 2 3 .9"))
+    with pytest.raises(JaxmarkError, match=r"'\.4' is not a whole number"):
+        load_mesh(path)
