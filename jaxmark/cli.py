@@ -9,7 +9,8 @@ import math
 import os
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +23,8 @@ from jaxmark.files import load_mesh, save_mesh
 from jaxmark.files.atomic import write_atomically
 from jaxmark.keys import commitment, load_key, new_key, save_key
 from jaxmark.marking import DEFAULT_BITS, detect, make_marker
-from jaxmark.record import Record
+from jaxmark.record import RECORD_SUFFIX, Record
 from jaxmark.schemes import SCHEMES
-
-_RECORD_SUFFIX = ".jaxmark.json"
 
 
 class _Hexadecimal(click.ParamType):
@@ -100,7 +99,7 @@ def keygen(keyfile: Path, as_json: bool) -> None:
 @click.option(
     "--scheme", type=click.Choice(list(SCHEMES)), default="host", show_default=True, help="What carries the bits."
 )
-@click.option("--record", "record_file", type=_MESH, help=f"Where the record goes.  [default: MARKED{_RECORD_SUFFIX}]")
+@click.option("--record", "record_file", type=_MESH, help=f"Where the record goes.  [default: MARKED{RECORD_SUFFIX}]")
 @_JSON
 def embed_command(
     original: Path,
@@ -117,7 +116,7 @@ def embed_command(
     Only positions change (and normals, where the file has them); materials, colours, groups and comments stay byte by
     byte. A record goes beside MARKED: it holds no secret, and with it nothing about the mark needs remembering.
     """
-    record_file = record_file or marked.with_name(marked.name + _RECORD_SUFFIX)
+    record_file = record_file or marked.with_name(marked.name + RECORD_SUFFIX)
     _check_outputs(original, marked)
     _distinct(original=original, marked=marked, key=key_file, record=record_file)
     key = load_key(key_file)
@@ -322,24 +321,14 @@ def _distinct(**files: Path) -> None:
             raise JaxmarkError(f"{other} and {name} are the same file, {path}; give another name.")
 
 
-class _replacing:  # noqa: N801 (used as a function)
-    """A draft beside a file, of the same suffix, that takes its place if all goes well and vanishes if not."""
-
-    def __init__(self, target: Path) -> None:
-        self._target = target
-
-    def __enter__(self) -> Path:
-        folder = self._target.parent
-        if not folder.is_dir():
-            raise JaxmarkError(f"The folder {folder} does not exist.")
-        if self._target.is_dir():
-            raise JaxmarkError(f"{self._target} is a folder; name a file.")
-        self._folder = tempfile.TemporaryDirectory(prefix=".jaxmark-", dir=folder)
-        return Path(self._folder.name) / self._target.name
-
-    def __exit__(self, kind: Any, *_: object) -> None:
-        try:
-            if kind is None:
-                (Path(self._folder.name) / self._target.name).replace(self._target)
-        finally:
-            self._folder.cleanup()
+@contextmanager
+def _replacing(target: Path) -> Iterator[Path]:
+    """A draft beside a file, of the same name, that takes its place if all goes well and vanishes if not."""
+    if not target.parent.is_dir():
+        raise JaxmarkError(f"The folder {target.parent} does not exist.")
+    if target.is_dir():
+        raise JaxmarkError(f"{target} is a folder; name a file.")
+    with tempfile.TemporaryDirectory(prefix=".jaxmark-", dir=target.parent) as folder:
+        draft = Path(folder) / target.name
+        yield draft
+        draft.replace(target)

@@ -17,6 +17,7 @@ from jaxmark.keys import new_key
 from jaxmark.marking import Marker, make_marker
 from jaxmark.mesh import Mesh, diagonal
 from jaxmark.plot import View, save_views
+from jaxmark.record import RECORD_SUFFIX
 
 _ATTACKS = (
     ("noise", 0.001),
@@ -97,7 +98,7 @@ def run_demo(
             continue
         target = folder / f"marked-{scheme}{source.suffix}"
         save_mesh(marked, target, like=source)
-        write_atomically(f"{target}.jaxmark.json", info.record.to_json().encode())
+        write_atomically(f"{target}{RECORD_SUFFIX}", info.record.to_json().encode())
         say(f"{scheme}: marked, RMS {info.rms:.6f}, max {info.max:.6f} → {target}")
         marked = load_mesh(target)
         rows += _attacked(marker, marked, message)

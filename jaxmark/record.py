@@ -14,6 +14,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.keys import SCHEME_VERSION
 
 _FORMAT = "jaxmark-record"
+RECORD_SUFFIX = ".jaxmark.json"  # behind the name of the marked file
 
 
 @dataclass(frozen=True)

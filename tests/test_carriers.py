@@ -12,7 +12,7 @@ from jaxmark.carriers import Carrier, ModulatedCarrier, eigenspaces, host_bands
 from jaxmark.laplacian import Laplacian, centre, make_laplacian
 from jaxmark.sequences import orthogonal_sequences
 from jaxmark.spectrum import eigenpairs
-from tests.dense import chebyshev_matrices, tolerance
+from tests.dense import chebyshev_matrices
 from tests.samples import bumpy_sphere
 
 BANDS = 16
@@ -71,22 +71,19 @@ def test_against_dense_algebra(kind, beta, shared, operator, signal, key: jm.Key
     columns = np.einsum("kjc,jc,jvc->kvc", np.broadcast_to(carrier.sequences, (BITS, BANDS, 3)), full, parts)
     amplitudes = random.normal(size=BITS)
     residual = random.normal(size=signal.shape)
-    # Scaling weak bands to unit norm scales their rounding errors too.
-    host_norm = np.sqrt(np.einsum("v,vc->c", operator.degree, signal**2))
-    plain = dense_components("as printed", operator, signal)
-    weakest = (np.sqrt(np.einsum("v,jvc->jc", operator.degree, plain**2)) / host_norm).min()
-    amplified = 1 / weakest if kind == "host" else 1
-    close = {"rtol": tolerance(dtype), "atol": tolerance(dtype, 0.1 * amplified + 10)}
+
+    def check(actual, expected):
+        """Relative to the whole: in float32, scaling weak bands to unit norm scales their rounding errors too."""
+        error = np.linalg.norm(np.asarray(actual, np.float64) - expected) / np.linalg.norm(expected)
+        assert error < (1e-9 if dtype == np.float64 else 5e-3 if kind == "host" else 1e-5)
 
     beta_array = jnp.asarray(strength, dtype)
     displacement = carrier.displacement(jnp.asarray(amplitudes, dtype), beta_array)
     assert displacement.dtype == dtype
-    np.testing.assert_allclose(displacement, np.einsum("k,kvc->vc", amplitudes, columns), **close)
+    check(displacement, np.einsum("k,kvc->vc", amplitudes, columns))
     adjoint = carrier.adjoint(jnp.asarray(residual, dtype), beta_array)
-    np.testing.assert_allclose(adjoint, np.einsum("kvc,v,vc->k", columns, operator.degree, residual), **close)
-    np.testing.assert_allclose(
-        carrier.gram(beta_array), np.einsum("avc,v,bvc->ab", columns, operator.degree, columns), **close
-    )
+    check(adjoint, np.einsum("kvc,v,vc->k", columns, operator.degree, residual))
+    check(carrier.gram(beta_array), np.einsum("avc,v,bvc->ab", columns, operator.degree, columns))
 
 
 @pytest.mark.parametrize("kind", ["host", "as printed", "eigen"])
