@@ -104,19 +104,20 @@ def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: 
     norm = float(np.linalg.norm(vector))
     if norm == 0:
         return Quadrature(np.zeros(0), np.zeros(0))
-    basis = [vector / norm]
+    steps = min(steps, len(x))
+    basis = np.zeros((steps + 1, len(x)))
+    basis[0] = vector / norm
     alphas: list[float] = []
     betas: list[float] = []
-    for _ in range(min(steps, len(x))):
-        following = scaled @ basis[-1]
-        alphas.append(float(following @ basis[-1]))
+    for k in range(steps):
+        following = scaled @ basis[k]
+        alphas.append(float(following @ basis[k]))
         for _ in range(2):  # twice is enough (Kahan, Parlett)
-            for q in basis:
-                following = following - (q @ following) * q
+            following -= basis[: k + 1].T @ (basis[: k + 1] @ following)
         betas.append(float(np.linalg.norm(following)))
         if betas[-1] < 1e-12:
             break
-        basis.append(following / betas[-1])
+        basis[k + 1] = following / betas[-1]
     nodes, vectors = linalg.eigh_tridiagonal(alphas, betas[: len(alphas) - 1])
     return Quadrature(nodes, norm**2 * vectors[0] ** 2)
 
