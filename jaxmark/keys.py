@@ -58,7 +58,6 @@ def save_key(key: bytes, path: str | os.PathLike[str]) -> None:
     except OSError as error:
         raise JaxmarkError(f"The key file {path} cannot be written: {error.strerror}.") from None
     with os.fdopen(descriptor, "w") as file:
-        os.fchmod(descriptor, 0o600)  # whatever the umask
         file.write(secret.hex() + "\n")
 
 
