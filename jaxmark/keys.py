@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Int8, Int64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.mesh import Mesh, weld
+from jaxmark.mesh import Mesh, weld, welded_mesh
 
 SCHEME_VERSION = 1
 KEY_BYTES = 32
@@ -85,13 +85,16 @@ def geometry_hash(mesh: Mesh) -> bytes:
     Canonical are the welded points in order of first occurrence, as little-endian float64 with -0.0 as 0.0, and the
     triangles that refer to them, as little-endian int64.
     """
-    vertices = np.asarray(mesh.vertices, np.float64)
-    welded = weld(vertices)
-    points = vertices[welded.first] + 0.0
-    faces = welded.point[np.asarray(mesh.faces)]
+    return points_hash(welded_mesh(mesh, weld(mesh.vertices)))
+
+
+def points_hash(points: Mesh) -> bytes:
+    """`geometry_hash` of a mesh that has been welded already."""
+    vertices = np.asarray(points.vertices, np.float64) + 0.0  # turns -0.0 into 0.0
+    faces = np.asarray(points.faces)
     state = hashlib.sha256(b"jaxmark/1/geometry")
-    state.update(np.array([len(points), len(faces)], "<i8").tobytes())
-    state.update(points.astype("<f8").tobytes())
+    state.update(np.array([len(vertices), len(faces)], "<i8").tobytes())
+    state.update(vertices.astype("<f8").tobytes())
     state.update(faces.astype("<i8").tobytes())
     return state.digest()
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.keys import geometry_hash
+from jaxmark.keys import points_hash
 from jaxmark.laplacian import Laplacian, centre, make_laplacian
 from jaxmark.mesh import Mesh, Weld, diagonal, host_mesh, same_connectivity, used_vertices, weld, welded_mesh
 
@@ -44,7 +44,7 @@ def prepare(mesh: Mesh) -> Original:
     traced = Laplacian(
         jnp.asarray(operator.edges), jnp.asarray(operator.weights, dtype), jnp.asarray(operator.degree, dtype)
     )
-    return Original(mesh, welded, used_vertices(points), length, geometry_hash(mesh), traced, signal)
+    return Original(mesh, welded, used_vertices(points), length, points_hash(points), traced, signal)
 
 
 def displaced(original: Original, shift: Float64[np.ndarray, "points 3"]) -> Mesh:
@@ -75,8 +75,9 @@ def displacement(mesh: Mesh, suspect: Mesh, welded: Weld, length: float) -> Floa
             " vertex and face order; this version compares vertex by vertex."
         )
     difference = (np.asarray(suspect.vertices) - np.asarray(mesh.vertices)) / length
-    difference[~used_vertices(mesh)] = 0
+    used = used_vertices(mesh)
+    difference[~used] = 0
     count = len(welded.first)
-    copies = np.bincount(welded.point[used_vertices(mesh)], minlength=count)
+    copies = np.bincount(welded.point[used], minlength=count)
     sums = [np.bincount(welded.point, column, count) for column in difference.T]
     return np.stack(sums, axis=1) / np.maximum(copies, 1)[:, None]

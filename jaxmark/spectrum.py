@@ -77,7 +77,7 @@ def eigenpairs(operator: Laplacian, count: int | None = None, *, tolerance: floa
     fresh = np.diff(values, prepend=-np.inf) > tolerance
     space = np.maximum.accumulate(np.where(fresh, np.arange(len(values)), 0)).astype(np.int64)
     kept = len(values) if count is None or len(values) <= count else int(space[count])
-    full = np.zeros((len(degree), kept))
+    full = np.zeros((len(operator.degree), kept))
     full[linked] = vectors[:, :kept] / root[:, None]
     return Eigenpairs(values[:kept], full, space[:kept])
 
@@ -95,17 +95,13 @@ def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: 
     Returns:
         Nodes in [0, 2] and non-negative weights that sum to ⟨x, x⟩_D.
     """
-    stiffness, mass = sparse_matrices(operator)
-    degree = mass.diagonal()
-    root = np.sqrt(degree)
-    inverse = np.where(degree > 0, 1 / np.where(degree > 0, root, 1), 0)
-    scaled = sparse.diags_array(inverse) @ stiffness @ sparse.diags_array(inverse)
-    vector = root * x
+    linked, root, scaled = _symmetric(operator)
+    vector = root * x[linked]
     norm = float(np.linalg.norm(vector))
     if norm == 0:
         return Quadrature(np.zeros(0), np.zeros(0))
-    steps = min(steps, len(x))
-    basis = np.zeros((steps + 1, len(x)))
+    steps = min(steps, len(vector))
+    basis = np.zeros((steps + 1, len(vector)))
     basis[0] = vector / norm
     alphas: list[float] = []
     betas: list[float] = []
@@ -120,6 +116,16 @@ def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: 
         basis[k + 1] = following / betas[-1]
     nodes, vectors = linalg.eigh_tridiagonal(alphas, betas[: len(alphas) - 1])
     return Quadrature(nodes, norm**2 * vectors[0] ** 2)
+
+
+def _symmetric(operator: Laplacian) -> tuple[Int64[np.ndarray, " linked"], np.ndarray, sparse.csc_array]:
+    """Δ made symmetric, D^-1/2 (D - W) D^-1/2, on the vertices that have edges; which these are, and √D on them."""
+    stiffness, mass = sparse_matrices(operator)
+    degree = mass.diagonal()
+    linked = np.flatnonzero(degree > 0)
+    root = np.sqrt(degree[linked])
+    inverse = sparse.diags_array(1 / root)
+    return linked, root, sparse.csc_array(inverse @ stiffness[linked][:, linked] @ inverse)
 
 
 def _lowest(
