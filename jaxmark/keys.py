@@ -100,9 +100,9 @@ def points_hash(points: Mesh) -> bytes:
 
 
 def derive(key: bytes, geometry: bytes, label: str, size: int, data: bytes = b"") -> bytes:
-    """`size` bytes of SHAKE-256(key ‖ geometry hash ‖ "jaxmark/1/label" ‖ 0 ‖ data): a keyed hash with a label."""
-    state = hashlib.shake_256(Key(key) + geometry + f"jaxmark/{SCHEME_VERSION}/{label}".encode() + b"\0" + data)
-    return state.digest(size)
+    """`size` bytes of SHAKE-256(key ‖ geometry hash ‖ "jaxmark/1/label"), with ‖ 0 ‖ data behind if there are data."""
+    message = Key(key) + geometry + f"jaxmark/{SCHEME_VERSION}/{label}".encode()
+    return hashlib.shake_256(message + b"\0" + data if data else message).digest(size)
 
 
 def commitment(key: bytes) -> str:
