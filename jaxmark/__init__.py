@@ -24,6 +24,7 @@ from jaxmark.keys import save_key as save_key
 from jaxmark.marking import Detection as Detection
 from jaxmark.marking import EmbedInfo as EmbedInfo
 from jaxmark.marking import Marker as Marker
+from jaxmark.marking import capacity as capacity
 from jaxmark.marking import detect as detect
 from jaxmark.marking import embed as embed
 from jaxmark.marking import make_marker as make_marker

@@ -59,6 +59,16 @@ def filter(
     raise JaxmarkError(f"derivative must be 'recompute' or 'scan', got {derivative!r}.")
 
 
+def transpose(
+    operator: Laplacian, coefficients: Float[Array | np.ndarray, " terms *filters"], y: Signal
+) -> Float[Array, " vertices *columns"]:
+    """f(Δ)ᵀy = D f(Δ) D⁻¹y, by the self-adjointness of Δ: the plain adjoint of `filter`, with its arguments."""
+    y = jnp.asarray(y)
+    mass = per_row(operator.degree, y)
+    mass = jnp.where(mass > 0, mass, 1)  # an isolated vertex is its own block of Δ, so any positive mass serves
+    return mass * filter(operator, coefficients, y / mass)
+
+
 @jax.jit
 def band_components(
     operator: Laplacian, coefficients: Float[Array | np.ndarray, "bands terms"], x: Signal
@@ -203,7 +213,7 @@ def _filter_reverse(inputs: tuple[Laplacian, Array, Array], cotangent: Any) -> t
     operator, coefficients, x = inputs
     y_bar = _instantiate(cotangent)
     c_bar: Any = _projections(operator, y_bar, x, len(coefficients) - 1)
-    return None, c_bar if coefficients.ndim == x.ndim else c_bar.sum(axis=1), _adjoint(operator, coefficients, y_bar)
+    return None, c_bar if coefficients.ndim == x.ndim else c_bar.sum(axis=1), transpose(operator, coefficients, y_bar)
 
 
 _filter_recompute.defvjp(_filter_forward, _filter_reverse, symbolic_zeros=True)
@@ -235,17 +245,10 @@ def _projections_reverse(
     """The cotangents of the moments are the coefficients of two filters."""
     operator, u, x = inputs
     m_bar = _instantiate(cotangent)
-    return None, _filter_recompute(operator, m_bar, x), _adjoint(operator, m_bar, u)
+    return None, _filter_recompute(operator, m_bar, x), transpose(operator, m_bar, u)
 
 
 _projections.defvjp(_projections_forward, _projections_reverse, symbolic_zeros=True)
-
-
-def _adjoint(operator: Laplacian, coefficients: Array, y: Array) -> Array:
-    """f(Δ)ᵀy = D f(Δ) D⁻¹y, by the self-adjointness of Δ."""
-    mass = per_row(operator.degree, y)
-    mass = jnp.where(mass > 0, mass, 1)  # an isolated vertex is its own block of Δ, so any positive mass serves
-    return mass * _filter_recompute(operator, coefficients, y / mass)
 
 
 def _fixed(operator: Any, name: str, remedy: str) -> Laplacian:

@@ -22,9 +22,9 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
 from jaxmark.files.atomic import write_atomically
 from jaxmark.keys import commitment, load_key, new_key, save_key
-from jaxmark.marking import DEFAULT_BITS, detect, make_marker
+from jaxmark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity, detect, make_marker
 from jaxmark.record import RECORD_SUFFIX, Record
-from jaxmark.schemes import SCHEMES
+from jaxmark.schemes import DEFAULT_SCHEME, SCHEMES
 
 
 class _Hexadecimal(click.ParamType):
@@ -50,6 +50,13 @@ class _Hexadecimal(click.ParamType):
 _MESH = click.Path(path_type=Path)
 _KEY = click.option("--key", "key_file", type=_MESH, required=True, help="Key file, from `jaxmark keygen`.")
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
+_BUDGET = click.option(
+    "--budget",
+    type=float,
+    default=8e-4,
+    show_default=True,
+    help="RMS displacement of the vertices, relative to the diagonal of the bounding box.",
+)
 
 
 @click.group(
@@ -89,15 +96,20 @@ def keygen(keyfile: Path, as_json: bool) -> None:
 @click.argument("marked", type=_MESH)
 @_KEY
 @click.option("--message", type=_Hexadecimal(), required=True, help="Hexadecimal digits; 16 of them are 64 bits.")
+@_BUDGET
 @click.option(
-    "--budget",
+    "--noise",
     type=float,
-    default=8e-4,
+    default=NOISE,
     show_default=True,
-    help="RMS displacement of the vertices, relative to the diagonal of the bounding box.",
+    help="Noise that the message must survive with half of the vertices lost (see `jaxmark capacity`).",
 )
 @click.option(
-    "--scheme", type=click.Choice(list(SCHEMES)), default="host", show_default=True, help="What carries the bits."
+    "--scheme",
+    type=click.Choice(list(SCHEMES)),
+    default=DEFAULT_SCHEME,
+    show_default=True,
+    help="What carries the bits.",
 )
 @click.option("--record", "record_file", type=_MESH, help=f"Where the record goes.  [default: MARKED{RECORD_SUFFIX}]")
 @_JSON
@@ -107,6 +119,7 @@ def embed_command(
     key_file: Path,
     message: bytes,
     budget: float,
+    noise: float,
     scheme: str,
     record_file: Path | None,
     as_json: bool,
@@ -122,7 +135,7 @@ def embed_command(
     key = load_key(key_file)
     mesh = load_mesh(original)
     marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
-    result, info = marker.embed(message, budget)
+    result, info = marker.embed(message, budget, noise=noise)
     with _replacing(marked) as draft, _replacing(record_file) as record_draft:
         save_mesh(result, draft, like=original)
         # What counts is the file: its numbers are rounded.
@@ -162,7 +175,9 @@ def embed_command(
     "--record", "record_file", type=_MESH, help="The mark's record: gives scheme and payload, binds key and original."
 )
 @click.option(
-    "--scheme", type=click.Choice(list(SCHEMES)), help="Without a record: what carries the bits.  [default: host]"
+    "--scheme",
+    type=click.Choice(list(SCHEMES)),
+    help=f"Without a record: what carries the bits.  [default: {DEFAULT_SCHEME}]",
 )
 @click.option(
     "--alpha", type=float, default=1e-6, show_default=True, help="Largest false-positive probability that counts."
@@ -195,12 +210,13 @@ def detect_command(
         bits=bits,
         message=message,
         record=record,
-        scheme=scheme or "host",
+        scheme=scheme or DEFAULT_SCHEME,
     )
     detected = found.detected(alpha)
     answer = {
         "detected": detected,
         "log10_p": found.log10_p,
+        "log10_p_fitted": found.log10_p_fitted,
         "message": None if found.message is None else found.message.hex(),
         "scores": [float(score) for score in found.scores],
         "coverage": found.coverage,
@@ -247,6 +263,25 @@ def compare(original: Path, distorted: Path, as_json: bool) -> None:
     """Measure how far DISTORTED was moved from ORIGINAL, relative to the diagonal of the bounding box."""
     change = distortion.compare(load_mesh(original), load_mesh(distorted))
     _answer(as_json, change._asdict(), f"RMS {change.rms:.6g}, max {change.max:.6g} of the diagonal")
+
+
+@cli.command(name="capacity")
+@click.argument("mesh", type=_MESH)
+@_BUDGET
+@click.option(
+    "--noise",
+    type=float,
+    default=NOISE,
+    show_default=True,
+    help="Half width of uniform noise, relative to the mean distance of the vertices to their centre.",
+)
+@click.option("--coverage", type=float, default=COVERAGE, show_default=True, help="Share of the vertices that is left.")
+@_JSON
+def capacity_command(mesh: Path, budget: float, noise: float, coverage: float, as_json: bool) -> None:
+    """Say how many bits MESH carries by the keyed scheme, so that they read in noise and with vertices lost."""
+    bits = capacity(load_mesh(mesh), budget, noise=noise, coverage=coverage)
+    answer = {"bits": bits, "budget": budget, "noise": noise, "coverage": coverage}
+    _answer(as_json, answer, f"{bits} bits at a budget of {budget:g}, noise {noise:g}, coverage {coverage:g}")
 
 
 @cli.command()

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
+from scipy import stats
 
 FLOOR = -77.0
 
@@ -29,18 +30,57 @@ def log10_p_claimed(score: ArrayLike, norm: ArrayLike) -> float:
     Returns:
         A finite number in [-77, 0]; 0 for a score that is not positive, or a residual without anything in it.
     """
+    return _bounded(_log10_tail(score, norm))
+
+
+def log10_p_read(score: ArrayLike, norm: ArrayLike, bits: int) -> float:
+    """log10 of the probability that a codeword read, of 2^bits possible ones, scores so high: their union bound.
+
+    Args:
+        score: S, the plain linear correlation of the codeword that was read.
+        norm: ‖a‖, of the very vector that the signs multiply.
+        bits: payload, without the tag, which the message determines.
+    """
+    return _bounded(bits * math.log10(2) + _log10_tail(score, norm))
+
+
+def log10_p_tag(bits: int, candidates: int) -> float:
+    """log10 of the probability that one of so many messages tried passes a keyed tag of so many bits.
+
+    The tag's subkey is independent of everything that chose the messages, so it is 2^-bits for each.
+    """
+    return _bounded(math.log10(candidates) - bits * math.log10(2))
+
+
+def any_of(*log10_p: float) -> float:
+    """log10 of the probability that the best of several proofs is as good as it is (Bonferroni)."""
+    return _bounded(min(log10_p) + math.log10(len(log10_p)))
+
+
+def log10_p_fitted(score: ArrayLike, norm: ArrayLike, bits: int = 0) -> float:
+    """log10 of the probability if S were Gaussian with standard deviation ‖a‖: near the truth, but no bound.
+
+    Args:
+        score: S.
+        norm: ‖a‖.
+        bits: payload where the message was read, 0 where it was claimed.
+    """
+    s, a = float(np.asarray(score, np.float64)), float(np.asarray(norm, np.float64))
+    if not (a > 0 and math.isfinite(s) and math.isfinite(a)):
+        return 0.0
+    return min(0.0, float(stats.norm.logsf(s / a)) / math.log(10) + bits * math.log10(2))
+
+
+def _log10_tail(score: ArrayLike, norm: ArrayLike) -> float:
+    """log10 of exp(-S²/2‖a‖²), 0 where there is nothing to go by."""
     s, a = float(np.asarray(score, np.float64)), float(np.asarray(norm, np.float64))
     if not (s > 0 and a > 0 and math.isfinite(s) and math.isfinite(a)):
         return 0.0
-    return max(FLOOR, -((s / a) ** 2) / 2 / math.log(10))
+    return -((s / a) ** 2) / 2 / math.log(10)
 
 
-def log10_p_tag(bits: int) -> float:
-    """log10 of the probability that a message read from an unmarked suspect passes a keyed tag of so many bits.
-
-    The tag's subkey is independent of everything that chose the message, so it is 2^-bits for the one candidate tried.
-    """
-    return max(FLOOR, -bits * math.log10(2))
+def _bounded(log10_p: float) -> float:
+    return min(0.0, max(FLOOR, log10_p))
 
 
 def correlation_bound(

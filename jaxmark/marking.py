@@ -7,21 +7,25 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
+from numpy.typing import ArrayLike
 
-from jaxmark import distortion
+from jaxmark import distortion, evidence
+from jaxmark.alignment import align
+from jaxmark.capacity import Capacity, Conditions
 from jaxmark.carriers import Carrier
-from jaxmark.detectors import Detector, decorrelate
+from jaxmark.detectors import Detector
 from jaxmark.errors import JaxmarkError
-from jaxmark.evidence import log10_p_claimed, log10_p_tag
 from jaxmark.keys import Key, commitment
-from jaxmark.laplacian import centre
 from jaxmark.mesh import Mesh
-from jaxmark.message import TAG_BITS, code_length, decode, encode
+from jaxmark.message import CANDIDATES, TAG_BITS, code_length, decode, encode
+from jaxmark.observation import Observation, observe
 from jaxmark.original import Original, displaced, prepare, residual
 from jaxmark.record import Record
-from jaxmark.schemes import Scheme, get_scheme, parameters_of
+from jaxmark.schemes import DEFAULT_SCHEME, KeyedScheme, Scheme, get_scheme, parameters_of
 
 DEFAULT_BITS = 64
+NOISE = 0.005  # the strongest of the SMI 2010 protocol
+COVERAGE = 0.5
 
 
 class EmbedInfo(NamedTuple):
@@ -38,7 +42,8 @@ class Detection(NamedTuple):
 
     message: bytes | None  # the message read, None unless its keyed tag fits
     log10_p: float  # log10 of a bound on the false-positive probability, in [-77, 0]
-    scores: Float64[np.ndarray, " bits"]  # soft values of the payload's bits, ±1 on average
+    log10_p_fitted: float  # the same if the score were Gaussian: an estimate, which decides nothing
+    scores: Float64[np.ndarray, " code"]  # soft values of the code bits, of root mean square 1
     coverage: float  # share of the original's points that the suspect gave evidence for
 
     def detected(self, alpha: float = 1e-6) -> bool:
@@ -64,16 +69,52 @@ class Marker:
     bits: int  # payload
     scheme: Scheme
     carrier: Carrier
+    code: int  # how many code bits are carried
     detector: Detector
 
-    def embed(self, message: bytes, budget: float = 8e-4) -> tuple[Mesh, EmbedInfo]:
+    def embed(self, message: bytes, budget: float = 8e-4, *, noise: float = NOISE) -> tuple[Mesh, EmbedInfo]:
         """Hide a message of just the payload's size in the original; see `embed`."""
+        self._check_size(message)
+        if isinstance(self.scheme, KeyedScheme):
+            self._check_capacity(self.scheme, Conditions(budget, noise, COVERAGE))
+        marked, info = self.write(encode(message, self.key, self.original.geometry, self.code), budget)
+        if self.detect(marked).message != message:
+            raise JaxmarkError(
+                f"This mesh ({int(self.original.used.sum())} points) cannot carry {self.bits} bits with the scheme"
+                f" {self.scheme.name!r}: they do not read back, even unattacked. Use a shorter message, or a finer or"
+                " less regular mesh."
+            )
+        return marked, info
+
+    def detect(self, suspect: Mesh, message: bytes | None = None, weights: ArrayLike | None = None) -> Detection:
+        """Read a suspect, with a claimed message or without; see `detect`."""
+        if message is not None:
+            self._check_size(message)
+        seen = self.observe(suspect, weights)
+        soft = self.soft_values(seen)
+        found = decode(soft, self.bits, self.key, self.original.geometry)
+        log10_p = fitted = 0.0
+        # Another message that reads refutes the claim, however much the two have in common.
+        if (chosen := message or found) is not None and found in (None, chosen):
+            codeword = encode(chosen, self.key, self.original.geometry, self.code)
+            score, norm = self.carrier.claim(seen, jnp.asarray(codeword, seen.residual.dtype))
+            if message is not None:
+                log10_p = evidence.log10_p_claimed(score, norm)
+            else:
+                log10_p = evidence.any_of(
+                    evidence.log10_p_tag(TAG_BITS, CANDIDATES), evidence.log10_p_read(score, norm, self.bits)
+                )
+            fitted = evidence.log10_p_fitted(score, norm, 0 if message is not None else self.bits)
+        size = np.sqrt(np.mean(soft**2)) or 1.0
+        coverage = float(np.mean(np.asarray(seen.weights)[self.original.used] > 0))
+        return Detection(found, log10_p, fitted, soft / size, coverage)
+
+    def write(self, amplitudes: Float64[np.ndarray, " code"], budget: float) -> tuple[Mesh, EmbedInfo]:
+        """Displace the original by the carrier of any amplitudes, scaled to the budget exactly."""
         if not 0 < budget < 1:
             raise JaxmarkError(f"The budget is relative to the bounding box's diagonal and in (0, 1), got {budget}.")
-        self._check_size(message)
         original = self.original
-        codeword = jnp.asarray(encode(message, self.key, original.geometry), original.signal.dtype)
-        unit = np.asarray(self.carrier.displacement(codeword), np.float64)
+        unit = np.asarray(self.carrier.displacement(jnp.asarray(amplitudes, original.signal.dtype)), np.float64)
         size = float(distortion.rms(unit[original.used]))
         if not (math.isfinite(size) and size > 0):
             raise JaxmarkError(
@@ -87,11 +128,6 @@ class Marker:
             raise JaxmarkError(
                 f"A budget of {budget:g} is lost in the rounding of this mesh's coordinates; use a larger one."
             )
-        if self.detect(marked).message != message:
-            raise JaxmarkError(
-                f"This mesh ({len(unit)} points) cannot carry {self.bits} bits with the scheme {self.scheme.name!r}:"
-                " they do not read back, even unattacked. Use a shorter message, or a finer or less regular mesh."
-            )
         record = Record(
             scheme=self.scheme.name,
             bits=self.bits,
@@ -102,27 +138,36 @@ class Marker:
         )
         return marked, EmbedInfo(rms, float(distortion.maximum(written)), beta, record)
 
-    def detect(self, suspect: Mesh, message: bytes | None = None) -> Detection:
-        """Read a suspect, with a claimed message or without; see `detect`."""
+    def observe(self, suspect: Mesh, weights: ArrayLike | None = None) -> Observation:
+        """What a suspect shows of each point's displacement, in diagonals; free of the key."""
         original, dtype = self.original, self.original.signal.dtype
-        if message is not None:
-            self._check_size(message)
-        # Scaled and centred in float64: nothing overflows in float32, and a suspect that was moved far away leaves no
-        # rounding errors behind.
-        moved = residual(original, suspect)
-        moved /= np.abs(moved).max() or 1.0
-        difference = jnp.asarray(centre(original.operator, moved), dtype)
-        soft = np.asarray(self.detector(self.carrier, difference, 1.0), np.float64)
-        read = decode(soft, self.key, original.geometry)
-        if message is not None:
-            claimed = jnp.asarray(encode(message, self.key, original.geometry), dtype)
-            score, norm = self.carrier.claim(difference, claimed)
-            # Another message that reads refutes the claim, however much the two have in common.
-            log10_p = log10_p_claimed(score, norm) if read in (None, message) else 0.0
-        else:
-            log10_p = 0.0 if read is None else log10_p_tag(TAG_BITS)
-        size = np.sqrt(np.mean(soft**2))
-        return Detection(read, log10_p, soft[:-TAG_BITS] / (size or 1.0), 1.0)
+        moved, agreeing = align(original, suspect)
+        if weights is not None:
+            agreeing = agreeing * self._per_point(weights)
+        return observe(jnp.asarray(moved, dtype), jnp.asarray(agreeing, dtype))
+
+    def soft_values(self, seen: Observation) -> Float64[np.ndarray, " code"]:
+        """One soft value per code bit."""
+        return np.asarray(self.detector(self.carrier, seen, 1.0), np.float64)
+
+    def _per_point(self, weights: ArrayLike) -> Float64[np.ndarray, " points"]:
+        """Weights of vertices as weights of points; a point's copies are averaged."""
+        given, point = np.asarray(weights, np.float64), self.original.weld.point
+        if given.shape != point.shape or not (np.isfinite(given) & (given >= 0)).all():
+            raise JaxmarkError(f"weights must be {len(point)} finite numbers, not negative, one for each vertex.")
+        return np.bincount(point, given) / np.bincount(point)
+
+    def _check_capacity(self, scheme: KeyedScheme, conditions: Conditions) -> None:
+        room = Capacity(self.original, scheme)
+        least = room.least_budget(self.bits, conditions)
+        if least <= conditions.budget:
+            return
+        most = room.bits(conditions)
+        mend = "Use a shorter message" + (f", or a budget of at least {least:.2g}" if math.isfinite(least) else "")
+        raise JaxmarkError(
+            f"This mesh ({int(self.original.used.sum())} points) carries at most {most} bits at a budget of"
+            f" {conditions.budget:g}, with noise of {conditions.noise:g} and half of it lost, not {self.bits}. {mend}."
+        )
 
     def _check_size(self, message: bytes) -> None:
         if not isinstance(message, bytes):
@@ -137,8 +182,8 @@ def make_marker(
     *,
     bits: int | None = None,
     record: Record | None = None,
-    scheme: str | Scheme = "host",
-    detector: Detector = decorrelate,
+    scheme: str | Scheme = DEFAULT_SCHEME,
+    detector: Detector | None = None,
 ) -> Marker:
     """Prepare an original for marking, or for reading many suspects.
 
@@ -148,8 +193,8 @@ def make_marker(
         key: 32 bytes, from `new_key`.
         bits: payload, a multiple of 8; by default the record's, else 64.
         record: of an earlier mark; fixes scheme and payload, and binds to original and key.
-        scheme: a name (`"host"`, `"eigen"`), which a record overrides; or an object of `jaxmark.schemes`.
-        detector: see `jaxmark.detectors`.
+        scheme: a name (`"keyed"`, `"host"`, `"eigen"`), which a record overrides; or an object of `jaxmark.schemes`.
+        detector: see `jaxmark.detectors`; by default the scheme's own.
 
     Returns:
         The marker.
@@ -175,12 +220,19 @@ def make_marker(
             )
     scheme = get_scheme(scheme)
     payload = DEFAULT_BITS if bits is None else bits
-    carrier = scheme.carrier(ready, key, code_length(payload))
-    return Marker(ready, key, payload, scheme, carrier, detector)
+    code = code_length(payload, scheme.places(ready, payload))
+    carrier = scheme.carrier(ready, key, payload, code)
+    return Marker(ready, key, payload, scheme, carrier, code, detector or scheme.detector)
 
 
 def embed(
-    mesh: Mesh, message: bytes, key: bytes, *, budget: float = 8e-4, scheme: str | Scheme = "host"
+    mesh: Mesh,
+    message: bytes,
+    key: bytes,
+    *,
+    budget: float = 8e-4,
+    noise: float = NOISE,
+    scheme: str | Scheme = DEFAULT_SCHEME,
 ) -> tuple[Mesh, EmbedInfo]:
     """Hide a message in the vertex positions of a mesh.
 
@@ -192,17 +244,52 @@ def embed(
         key: 32 bytes, from `new_key`.
         budget: RMS displacement of the welded vertices that faces use, unweighted, relative to the diagonal of their
             axis-aligned bounding box: 0.0008 is 0.08 % of it. It is met exactly.
+        noise: which the message must survive when half of the vertices are lost, see `capacity`; 0 asks only that there
+            are dimensions enough. For the keyed scheme only.
         scheme: see `make_marker`.
 
     Returns:
         The marked mesh (float64 vertices, same faces) and what was done to it.
 
     Raises:
-        JaxmarkError: if the mesh, key, budget or payload is unusable, or the mesh cannot carry so many bits.
+        JaxmarkError: if the mesh, key, budget or payload is unusable, or the mesh cannot carry so many bits; the
+            sentence then has the largest payload, and the least budget if there is one.
     """
     if not isinstance(message, bytes):
         raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
-    return make_marker(mesh, key, bits=8 * len(message), scheme=scheme).embed(message, budget)
+    return make_marker(mesh, key, bits=8 * len(message), scheme=scheme).embed(message, budget, noise=noise)
+
+
+def capacity(
+    mesh: Mesh,
+    budget: float = 8e-4,
+    *,
+    noise: float = NOISE,
+    coverage: float = COVERAGE,
+    scheme: KeyedScheme | None = None,
+) -> int:
+    """How many bits a mesh carries by the keyed scheme, by what is left after projection: energy and dimensions.
+
+    Args:
+        mesh: the original.
+        budget: see `embed`.
+        noise: half width of uniform noise on each coordinate, relative to the mean distance of the vertices to their
+            centre; by default the strongest of the SMI 2010 protocol (Wang et al.), 0.5 %.
+        coverage: share of the vertices that may be left.
+        scheme: by default `KeyedScheme()`.
+
+    Returns:
+        The largest payload in bits, a multiple of 8; 0 if not even 8.
+
+    Raises:
+        JaxmarkError: if the mesh is unusable or a number out of range.
+    """
+    if not (0 < budget < 1 and 0 <= noise < math.inf and 0 < coverage <= 1):
+        raise JaxmarkError(
+            f"capacity needs a budget in (0, 1), a noise of at least 0 and a coverage in (0, 1], got {budget:g},"
+            f" {noise:g} and {coverage:g}."
+        )
+    return Capacity(prepare(mesh), scheme or KeyedScheme()).bits(Conditions(budget, noise, coverage))
 
 
 def detect(
@@ -213,17 +300,21 @@ def detect(
     bits: int | None = None,
     message: bytes | None = None,
     record: Record | None = None,
-    scheme: str | Scheme = "host",
-    detector: Detector = decorrelate,
+    scheme: str | Scheme = DEFAULT_SCHEME,
+    detector: Detector | None = None,
+    weights: ArrayLike | None = None,
 ) -> Detection:
     """Read a mark from a suspect, and say what the reading proves.
 
-    Without `message`, the message read counts only if its keyed 32-bit tag fits: log10_p is then log10 2⁻³² = -9.6,
-    else 0. With `message`, log10_p is Hoeffding's bound for that message (see `evidence.log10_p_claimed`), which can
-    prove a mark whose message no longer reads; a claim is refuted (0) where another message reads. Both hold for any
-    suspect independent of the key, provided that key, original and claimed message were fixed before the suspect was
-    seen. A mesh marked under the same key is not independent of it: once its message no longer reads, a claim that has
-    many bits in common with it may pass.
+    The suspect is brought back by the best affine map first; points that are far off are masked. Without `message`, the
+    message read counts only if its keyed tag fits; two proofs are then tried and paid for: the tag, and the union bound
+    over all messages. With `message`, log10_p is Hoeffding's bound for that message (see `evidence.log10_p_claimed`),
+    which can prove a mark whose message no longer reads; a claim is refuted (0) where another message reads.
+
+    Both hold for any suspect independent of the key, provided that key, original and claimed message were fixed before
+    the suspect was seen; that weights depend on suspect and original only; and that the score is the plain correlation
+    of the codeword, which joint decoding may choose but does not enter. A mesh marked under the same key is not
+    independent of it: once its message no longer reads, a claim that has many bits in common with it may pass.
 
     Args:
         suspect: a mesh with the original's connectivity.
@@ -233,7 +324,8 @@ def detect(
         message: the message that is claimed to be there.
         record: see `make_marker`.
         scheme: as embedded, where there is no record.
-        detector: see `jaxmark.detectors`.
+        detector: see `make_marker`.
+        weights: for each vertex of the suspect how far it may be trusted, 0 not at all; free of the key.
 
     Returns:
         What was found; a suspect identical to the original gives log10_p = 0.
@@ -245,4 +337,4 @@ def detect(
     if bits is None and record is None and isinstance(message, bytes):
         bits = 8 * len(message)
     marker = make_marker(original, key, bits=bits, record=record, scheme=scheme, detector=detector)
-    return marker.detect(suspect, message)
+    return marker.detect(suspect, message, weights)

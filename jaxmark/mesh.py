@@ -8,7 +8,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Int64
+from jaxtyping import Array, Bool, Float, Float64, Int, Int64
 from numpy.typing import ArrayLike
 
 from jaxmark.errors import JaxmarkError
@@ -128,6 +128,16 @@ def diagonal(mesh: Mesh) -> float:
             f"The bounding box of the mesh has a diagonal of {length:g}; it must be positive and finite."
         )
     return length
+
+
+def vertex_normals(mesh: Mesh) -> Float64[np.ndarray, "vertices 3"]:
+    """Unit normals, the area-weighted means of the faces'; zero where they cancel or there is no area."""
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    area = np.cross(b - a, c - a)
+    normals = np.stack([np.bincount(faces.ravel(), np.repeat(column, 3), len(vertices)) for column in area.T], axis=1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
 
 
 def boundary_vertices(faces: Int[Array | np.ndarray, "faces 3"]) -> Int64[np.ndarray, " boundary"]:

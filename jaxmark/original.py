@@ -23,7 +23,8 @@ class Original:
     diagonal: float  # in the file's units
     geometry: bytes  # hash of the canonical geometry
     operator: Laplacian  # on the welded points
-    signal: Float[Array, "points 3"]  # welded points, centred per component, in diagonals
+    positions: Float64[np.ndarray, "points 3"]  # welded points, centred as a whole, in diagonals
+    signal: Float[Array, "points 3"]  # the same, centred per component
 
 
 def prepare(mesh: Mesh) -> Original:
@@ -40,11 +41,15 @@ def prepare(mesh: Mesh) -> Original:
     length = diagonal(mesh)
     operator = make_laplacian(points)
     dtype = jax.dtypes.canonicalize_dtype(np.float64)
-    signal = jnp.asarray(centre(operator, points.vertices / length), dtype)
+    used = used_vertices(points)
+    positions = np.asarray(points.vertices, np.float64)
+    positions = (positions - positions[used].mean(axis=0)) / length
+    positions[~used] = 0
+    signal = jnp.asarray(centre(operator, positions), dtype)
     traced = Laplacian(
         jnp.asarray(operator.edges), jnp.asarray(operator.weights, dtype), jnp.asarray(operator.degree, dtype)
     )
-    return Original(mesh, welded, used_vertices(points), length, points_hash(points), traced, signal)
+    return Original(mesh, welded, used, length, points_hash(points), traced, positions, signal)
 
 
 def displaced(original: Original, shift: Float64[np.ndarray, "points 3"]) -> Mesh:

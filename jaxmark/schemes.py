@@ -3,32 +3,125 @@
 A scheme's fields go into the record of a mark, so a mark made with other fields stays readable.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxmark.bands import scaling
-from jaxmark.carriers import Carrier, ModulatedCarrier, eigenspaces, host_bands
+from jaxmark.carriers import Carrier, KeyedCarrier, ModulatedCarrier, eigenspaces, host_bands, make_chips
 from jaxmark.carriers.carrier import Components
+from jaxmark.detectors import Detector, decorrelate, joint
 from jaxmark.errors import JaxmarkError
+from jaxmark.mesh import Mesh, vertex_normals
 from jaxmark.message import TAG_BITS
 from jaxmark.original import Original
+from jaxmark.reception import make_host
 from jaxmark.sequences import orthogonal_sequences
 from jaxmark.spectrum import eigenpairs
 
 
 @runtime_checkable
 class Scheme(Protocol):
-    """A dataclass that makes a carrier from an original, a key and a number of bits; a record stores its fields."""
+    """A dataclass that makes a carrier from an original, a key and a payload; a record stores its fields."""
 
     name: ClassVar[str]  # what records and the command line call it
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
-    def carrier(self, original: Original, key: bytes, code_bits: int) -> Carrier:
-        """The carrier of so many bits on this original under this key."""
+    @property
+    def detector(self) -> Detector:
+        """What reads its carriers."""
         ...
+
+    def places(self, original: Original, bits: int) -> int:
+        """How many code bits there are places for."""
+        ...
+
+    def carrier(self, original: Original, key: bytes, bits: int, code_bits: int) -> Carrier:
+        """The carrier of so many code bits for a payload on this original under this key."""
+        ...
+
+
+class Layout(NamedTuple):
+    """What a keyed carrier writes in, and what its receiver projects off."""
+
+    passing: int  # bands, from the lowest
+    scales: int  # diffusion scales of the host
+    degree: int  # of the polynomials of the position
+
+
+@dataclass(frozen=True)
+class KeyedScheme:
+    """Keyed chips in a pass band of low frequencies; the host's part is projected off when reading.
+
+    The pass band is as narrow as the payload allows, for the eye and for smoothing: 1,024 dimensions and 12 for each
+    bit of message and tag, but at most what lies below λ = 0.44 unless the payload needs it. Dimensions are counted as
+    on a regular triangle mesh, √3/2π · λ for each coordinate of each vertex. The nuisance that is projected off has at
+    most a sixth of them, apart from affine maps.
+    """
+
+    name: ClassVar[str] = "keyed"
+    bands: int = 64  # Jackson-damped scaling functions over the whole spectrum, of which the lowest pass
+    direction: Literal["coordinates", "normals"] = "coordinates"
+
+    @property
+    def detector(self) -> Detector:
+        """See `Scheme`."""
+        return joint
+
+    def places(self, original: Original, bits: int) -> int:
+        """See `Scheme`."""
+        return int(self._dimensions(original, self._passing(original, bits)))
+
+    def layout(self, original: Original, bits: int) -> Layout:
+        """Pass band and nuisance for a payload, free of the key."""
+        passing = self._passing(original, bits)
+        columns = self._dimensions(original, passing) / self._channels
+        # Affine maps are 4 columns; each scale has one for each coordinate.
+        scales = min(9, max(0, int(columns / 3 - 4) // 3))
+        degree = 1
+        while degree < 8 and math.comb(degree + 4, 3) + 3 * scales <= columns / 6:
+            degree += 1
+        return Layout(passing, scales, degree)
+
+    def carrier(self, original: Original, key: bytes, bits: int, code_bits: int) -> KeyedCarrier:
+        """See `Scheme`."""
+        layout, dtype = self.layout(original, bits), original.signal.dtype
+        host = make_host(
+            original.operator,
+            original.signal,
+            jnp.asarray(original.positions, dtype),
+            scaling(self.bands, damping="jackson")[: layout.passing],
+            scales=layout.scales,
+            degree=layout.degree,
+        )
+        chips = make_chips(key, original.geometry, original.used, code_bits, channels=self._channels)
+        if self.direction == "coordinates":
+            return KeyedCarrier(host, chips)
+        normals = vertex_normals(Mesh(original.positions, original.weld.point[np.asarray(original.mesh.faces)]))
+        return KeyedCarrier(host, chips, jnp.asarray(normals, dtype))
+
+    @property
+    def _channels(self) -> int:
+        return 3 if self.direction == "coordinates" else 1
+
+    def _passing(self, original: Original, bits: int) -> int:
+        """How many bands the mark is written in: six at least, for narrower bands leak too much."""
+        information = bits + TAG_BITS
+        usual = self._dimensions(original, round(self.bands * 0.31))
+        wanted = max(min(1024 + 12 * information, usual), 6 * information)
+        passing = min(6, self.bands)
+        while passing < self.bands and self._dimensions(original, passing) < wanted:
+            passing += 1
+        return passing
+
+    def _dimensions(self, original: Original, passing: int) -> float:
+        edge = 1 - math.cos(math.pi * passing / self.bands)
+        share = min(1.0, math.sqrt(3) / (2 * math.pi) * edge)
+        return self._channels * share * int(original.used.sum())
 
 
 @dataclass(frozen=True)
@@ -46,7 +139,16 @@ class HostScheme:
     damping: Literal["none", "jackson", "lanczos"] = "jackson"
     unit_norm: bool = True
 
-    def carrier(self, original: Original, key: bytes, code_bits: int) -> Carrier:
+    @property
+    def detector(self) -> Detector:
+        """See `Scheme`."""
+        return decorrelate
+
+    def places(self, original: Original, bits: int) -> int:
+        """See `Scheme`."""
+        return 3 * self.bands
+
+    def carrier(self, original: Original, key: bytes, bits: int, code_bits: int) -> Carrier:
         """See `Scheme`."""
         family = scaling(self.bands, kernel=self.kernel, damping=self.damping)
         components = host_bands(original.operator, original.signal, family, unit_norm=self.unit_norm)
@@ -63,16 +165,26 @@ class EigenScheme:
     name: ClassVar[str] = "eigen"
     pairs: int = 64
 
-    def carrier(self, original: Original, key: bytes, code_bits: int) -> Carrier:
+    @property
+    def detector(self) -> Detector:
+        """See `Scheme`."""
+        return decorrelate
+
+    def places(self, original: Original, bits: int) -> int:
+        """See `Scheme`."""
+        return 3 * self.pairs
+
+    def carrier(self, original: Original, key: bytes, bits: int, code_bits: int) -> Carrier:
         """See `Scheme`."""
         pairs = eigenpairs(original.operator, self.pairs)
         components = eigenspaces(original.operator, original.signal, pairs)
         return _modulated(self.name, components, self.pairs, original, key, code_bits)
 
 
-SCHEMES: Mapping[str, type[HostScheme] | type[EigenScheme]] = {
-    scheme.name: scheme for scheme in (HostScheme, EigenScheme)
+SCHEMES: Mapping[str, type[KeyedScheme] | type[HostScheme] | type[EigenScheme]] = {
+    scheme.name: scheme for scheme in (KeyedScheme, HostScheme, EigenScheme)
 }
+DEFAULT_SCHEME = KeyedScheme.name
 
 
 def get_scheme(scheme: str | Scheme, parameters: Mapping[str, Any] | None = None) -> Scheme:
@@ -102,11 +214,6 @@ def _modulated(
 ) -> ModulatedCarrier:
     """One keyed sequence per bit over all pairs of a band and a coordinate."""
     slots = 3 * bands
-    if code_bits > slots:
-        raise JaxmarkError(
-            f"The scheme {name!r} has {slots} places for bits, of which the tag takes {TAG_BITS}: the payload is at"
-            f" most {max(0, slots - TAG_BITS) // 8 * 8} bits."
-        )
     sequences = orthogonal_sequences(key, original.geometry, code_bits, slots, label=name).reshape(code_bits, bands, 3)
     used = components.gram.shape[-1]  # a small mesh has fewer eigenvectors than the layout has places for
     return ModulatedCarrier(components, np.ascontiguousarray(sequences[:, :used]))

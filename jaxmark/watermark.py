@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from jaxmark.carriers import Carrier
 from jaxmark.carriers.carrier import Strength
 from jaxmark.detectors import Detector, decorrelate
+from jaxmark.observation import observe
 
 
 def embed(
@@ -35,6 +36,9 @@ def detect(
     carrier: Carrier,
     detector: Detector = decorrelate,
     beta: Strength = 1.0,
+    *,
+    weights: Float[Array, " vertices"] | None = None,
+    normals: Float[Array, "vertices 3"] | None = None,
 ) -> Float[Array, " bits"]:
     """Soft values of the bits in a suspect, given the original; their signs are the bits (Sohn et al., 2.2.2).
 
@@ -44,8 +48,10 @@ def detect(
         carrier: the one that was embedded with.
         detector: see `jaxmark.detectors`.
         beta: the strengths' profile over the bands, as embedded; a common factor only rescales the result.
+        weights: relative inverse variance of each vertex `[N]`, 0 where nothing is known; by default all alike.
+        normals: unit vectors `[N, 3]`, if only the component along them is known; by default all three are.
 
     Returns:
         `[k]` soft values.
     """
-    return detector(carrier, suspect - x, beta)
+    return detector(carrier, observe(suspect - x, weights, normals), beta)

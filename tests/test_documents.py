@@ -20,7 +20,7 @@ README = (ROOT / "README.md").read_text()
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    trimesh.Trimesh(*bumpy_sphere(3), process=False).export("model.ply")
+    trimesh.Trimesh(*bumpy_sphere(4), process=False).export("model.ply")
     return tmp_path
 
 

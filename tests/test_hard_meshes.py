@@ -23,7 +23,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
 
 @pytest.mark.skipif(not FILES, reason="shared meshes hard/ are absent (set JAXMARK_MESHES)")
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
-@pytest.mark.parametrize("scheme", ["host", "eigen"])
+@pytest.mark.parametrize("scheme", ["keyed", "host", "eigen"])
 def test_marked_and_read_back_or_refused(path: Path, scheme, tmp_path, monkeypatch, capfd, unchecked):
     jm.save_key(jm.Key(bytes(range(32))), tmp_path / "key")
     marked = tmp_path / f"marked{path.suffix}"

@@ -7,11 +7,12 @@ import pytest
 import jaxmark as jm
 from jaxmark import distortion
 from jaxmark.mesh import Mesh, make_mesh
+from jaxmark.message import encode
 from jaxmark.schemes import EigenScheme, HostScheme
 from tests.samples import bumpy_sphere, exact_sheet
 
 MESSAGE = bytes.fromhex("0123456789abcdef")
-SCHEMES = ["host", "eigen"]
+SCHEMES = ["keyed", "host", "eigen"]
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -26,8 +27,8 @@ def test_round_trip_within_the_budget(sphere: Mesh, key: jm.Key, scheme, dtype):
     assert found.message == MESSAGE
     assert found.detected()
     assert found.coverage == 1.0
-    bits = 2.0 * np.unpackbits(np.frombuffer(MESSAGE, np.uint8)) - 1
-    np.testing.assert_allclose(found.scores, bits, atol=0.05)
+    code = encode(MESSAGE, key, jm.keys.geometry_hash(sphere), len(found.scores))
+    assert np.mean(found.scores * code) > 0.9
     claimed = jm.detect(marked, original=sphere, key=key, scheme=scheme, message=MESSAGE)
     assert claimed.log10_p < -6
     assert jm.detect(marked, original=sphere, key=key, scheme=scheme, message=b"somebody").log10_p > -6
@@ -59,7 +60,7 @@ def test_golden_displacement(key: jm.Key):
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_mark_far_from_the_origin_and_at_any_scale(key: jm.Key, scheme):
-    sphere = bumpy_sphere(3)
+    sphere = bumpy_sphere(4)
     for factor, offset in ((1e-20, 0.0), (1e20, 0.0), (1.0, 1e6)):
         mesh = make_mesh(factor * sphere.vertices + offset, sphere.faces)
         marked, info = jm.embed(mesh, MESSAGE, key, scheme=scheme)
@@ -111,7 +112,7 @@ def test_an_unmoved_suspect_is_no_evidence(sphere: Mesh, key: jm.Key):
 
 def test_hard_graph_is_marked(key: jm.Key):
     """Several components, a boundary, an edge with three faces, degenerate and duplicate faces, isolated vertices."""
-    a, b = bumpy_sphere(3), bumpy_sphere(2, seed=1)
+    a, b = bumpy_sphere(4), bumpy_sphere(2, seed=1)
     vertices = np.vstack([a.vertices, b.vertices + 4, [[0.0, 0, 0], [1, 1, 1]]])
     faces = np.vstack([a.faces[:-30], a.faces[:2], [[0, 0, 1], [5, 5, 5], [3, 77, 200]], b.faces + len(a.vertices)])
     mesh = make_mesh(vertices, faces)
@@ -126,11 +127,11 @@ def test_vertices_that_no_face_uses_neither_move_nor_count(sphere: Mesh, key: jm
     marked, info = jm.embed(mesh, MESSAGE, key)
     length = np.linalg.norm(np.ptp(sphere.vertices, axis=0))
     shift = np.linalg.norm(marked.vertices - mesh.vertices, axis=1) / length
-    np.testing.assert_array_equal(shift[642:], 0)
-    assert np.sqrt(np.mean(shift[:642] ** 2)) == pytest.approx(8e-4, rel=1e-6)
+    np.testing.assert_array_equal(shift[2562:], 0)
+    assert np.sqrt(np.mean(shift[:2562] ** 2)) == pytest.approx(8e-4, rel=1e-6)
     assert info.rms == pytest.approx(8e-4, rel=1e-9)
     assert jm.compare(mesh, marked).rms == pytest.approx(8e-4, rel=1e-9)
-    thrown = marked._replace(vertices=np.where(np.arange(len(shift))[:, None] < 642, marked.vertices, 1e200))
+    thrown = marked._replace(vertices=np.where(np.arange(len(shift))[:, None] < 2562, marked.vertices, 1e200))
     assert jm.detect(thrown, original=mesh, key=key).message == MESSAGE
 
 

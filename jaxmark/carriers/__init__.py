@@ -6,3 +6,6 @@ from jaxmark.carriers.eigen import Eigenspaces as Eigenspaces
 from jaxmark.carriers.eigen import eigenspaces as eigenspaces
 from jaxmark.carriers.host import HostBands as HostBands
 from jaxmark.carriers.host import host_bands as host_bands
+from jaxmark.carriers.keyed import Chips as Chips
+from jaxmark.carriers.keyed import KeyedCarrier as KeyedCarrier
+from jaxmark.carriers.keyed import make_chips as make_chips

@@ -7,6 +7,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
+from jaxmark.observation import Observation
+
 Displacement = Float[Array, "vertices 3"]
 Strength = (
     float | Float[Array | np.ndarray, ""] | Float[Array | np.ndarray, " bands"] | Float[Array | np.ndarray, "bands 3"]
@@ -32,7 +34,7 @@ class Carrier(Protocol):
         """D inner products of the bits' displacements: adjoint(displacement(e_j)), column by column."""
         ...
 
-    def claim(self, residual: Displacement, bits: Float[Array, " bits"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def claim(self, seen: Observation, bits: Float[Array, " bits"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Score S of a claimed codeword, and the norm ‖a‖ with S = Σ s·a over the keyed signs s (a is key-free)."""
         ...
 
@@ -80,9 +82,9 @@ class ModulatedCarrier(NamedTuple):
         weighted = self._per_band(beta) * self._sequences
         return jnp.einsum("ajc,cjl,blc->ab", weighted, self.components.gram, weighted)
 
-    def claim(self, residual: Displacement, bits: Float[Array, " bits"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def claim(self, seen: Observation, bits: Float[Array, " bits"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """See `Carrier`; one sign per band and coordinate, or per band where coordinates share their sequences."""
-        found = self.components.analyse(self._as_real(residual))
+        found = self.components.analyse(self._as_real(seen.weigh(seen.residual)))
         if self.sequences.shape[-1] == 1:
             found = found.sum(axis=1, keepdims=True)
         terms = jnp.tensordot(self._as_real(bits), self._as_real(self.sequences), 1) * found

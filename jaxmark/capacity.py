@@ -1,0 +1,126 @@
+"""How many bits a mesh carries: room for them in the pass band, and energy for them in noise."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import optimize, stats
+
+from jaxmark.carriers import KeyedCarrier
+from jaxmark.errors import JaxmarkError
+from jaxmark.keys import KEY_BYTES
+from jaxmark.message import TAG_BITS, code_length
+from jaxmark.observation import observe
+from jaxmark.original import Original
+from jaxmark.reception import clean, receive
+from jaxmark.schemes import KeyedScheme, Layout
+
+# The whole chain, code and tag and interference, stays within this of the least energy that any code needs.
+GAP_DECIBEL = 2.5
+
+
+class Room(NamedTuple):
+    """What the projection leaves of a carrier's mark."""
+
+    dimensions: float  # equivalent number of equally strong ones
+    energy: float  # share of the mark's
+
+
+def room(carrier: KeyedCarrier, original: Original) -> Room:
+    """Measure a carrier by one probe of random signs in place of the keyed ones."""
+    host = carrier.host
+    moving = jnp.asarray(original.used, host.signal.dtype)
+    shape = carrier.shape(1.0)
+    signs = jax.random.rademacher(jax.random.key(2), carrier.chips.signs.shape, host.signal.dtype) * moving[:, None]
+    probe = carrier.shaped(signs, shape)
+    received = receive(host, observe(jnp.zeros_like(host.signal), moving))
+    kept = clean(host, received.seen, received.factor, probe)
+    again = carrier.match(kept, shape) * moving[:, None]
+    energy = jnp.sum(probe * kept)
+    spread = jnp.sum(again**2)
+    return Room(
+        float(energy**2 / jnp.where(spread > 0, spread, 1)),
+        float(energy / jnp.maximum(jnp.sum(probe**2), jnp.finfo(probe.dtype).tiny)),
+    )
+
+
+def least_energy(bits: int, error: float = 1e-3) -> float:
+    """E/N0 that any code needs for so many bits at a message error rate in white noise.
+
+    The converse 2^-bits = Q(√(2E/N0) + Q⁻¹(1 - error)) of Polyanskiy, Poor, Verdú, "Minimum energy to send k bits
+    through the Gaussian channel with and without feedback", IEEE Trans. Inf. Theory 57, 2011, Theorem 2.
+    """
+
+    def excess(root: float) -> float:
+        return float(stats.norm.logsf(root + stats.norm.ppf(error))) + bits * math.log(2)
+
+    root = optimize.root_scalar(excess, bracket=(0.0, 10.0 + 4.0 * math.sqrt(bits))).root
+    return root**2 / 2
+
+
+def needed_energy(bits: int) -> float:
+    """E/N0 with which the whole chain reads so many bits, but for one message in a thousand."""
+    return 10 ** (GAP_DECIBEL / 10) * least_energy(bits)
+
+
+def needed_dimensions(bits: int) -> float:
+    """Dimensions that must be left for a payload: to prove its message without a tag, and to tell its code bits apart.
+
+    Without noise the squared score over its squared norm is about the number of dimensions n, so that the union bound
+    2^bits exp(-n/2) is at most 1e-6 for n = 1.39 bits + 28; two for each bit and the tag's are the code's.
+    """
+    return max(2 * math.log(2) * bits + 28, 2.0 * (bits + TAG_BITS))
+
+
+class Conditions(NamedTuple):
+    """Under which a message must still read."""
+
+    budget: float  # RMS displacement over the diagonal
+    noise: float  # half width of uniform noise over the mean distance of the vertices to their centre
+    coverage: float  # share of the vertices that are left
+
+
+class Capacity:
+    """How many bits an original carries by the keyed scheme; measures each layout once."""
+
+    def __init__(self, original: Original, scheme: KeyedScheme) -> None:
+        self._original, self._scheme = original, scheme
+        self._rooms: dict[Layout, Room] = {}
+
+    def least_budget(self, bits: int, conditions: Conditions) -> float:
+        """With which budget so many bits are carried; infinite where the dimensions do not suffice.
+
+        Uniform noise on three coordinates has the RMS displacement ν = noise · radius, and E/N0 = 3N (budget/ν)² / 2
+        for N vertices, times what coverage and projection leave.
+        """
+        original, scheme = self._original, self._scheme
+        try:
+            code = code_length(bits, scheme.places(original, bits))
+        except JaxmarkError:
+            return math.inf
+        layout = scheme.layout(original, bits)
+        if layout not in self._rooms:
+            self._rooms[layout] = room(scheme.carrier(original, bytes(KEY_BYTES), bits, code), original)
+        left = self._rooms[layout]
+        if conditions.coverage * left.dimensions < needed_dimensions(bits):
+            return math.inf
+        vertices = conditions.coverage * left.energy * int(original.used.sum())
+        points = original.positions[original.used]
+        radius = float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean())
+        return conditions.noise * radius * math.sqrt(needed_energy(bits) / (1.5 * vertices))
+
+    def bits(self, conditions: Conditions) -> int:
+        """The largest payload, a multiple of 8 bits; 0 if not even 8."""
+
+        def fits(size: int) -> bool:
+            return self.least_budget(8 * size, conditions) <= conditions.budget
+
+        least, most = 0, 1
+        while fits(most):
+            least, most = most, 2 * most
+        while most - least > 1:
+            middle = (least + most) // 2
+            least, most = (middle, most) if fits(middle) else (least, middle)
+        return 8 * least

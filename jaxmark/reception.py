@@ -1,0 +1,169 @@
+"""What a receiver learns of a suspect without the key: the host's part taken off, the rest weighed band by band.
+
+Whatever acts on the *host* as a spectral filter, an affine map or a smooth warp leaves a residual in the span of a few
+diffusion scales of the host and polynomials of the position. Projecting that nuisance off leaves the mark and noise.
+How much of the mark each band still holds is seen from what the attack did to the host there.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmark.bands import diffusion
+from jaxmark.chebyshev import band_components
+from jaxmark.laplacian import Laplacian, per_row
+from jaxmark.observation import Observation
+
+
+class Host(NamedTuple):
+    """An original as the receiver sees it; free of the key."""
+
+    operator: Laplacian
+    signal: Float[Array, "vertices 3"]  # centred per component
+    coefficients: Float[Array, "bands terms"]  # of the bands that the mark is written in
+    nuisance: Float[Array, "vertices columns"]  # nearly orthonormal, for each coordinate
+
+
+class Reception(NamedTuple):
+    """A suspect as the receiver sees it; free of the key."""
+
+    residual: Float[Array, "vertices 3"]  # weighed, and free of nuisance
+    gain: Float[Array, " bands"]  # what the attack left of the host, and so of the mark
+    power: Float[Array, " bands"]  # residual energy per dimension, relative to the largest
+    seen: Observation
+    factor: Float[Array, "unknowns unknowns"]  # Cholesky factor of the nuisance as it is seen
+
+
+def make_host(
+    operator: Laplacian,
+    signal: Float[Array, "vertices 3"],
+    positions: Float[Array, "vertices 3"],
+    coefficients: Float[Array | np.ndarray, "bands terms"],
+    *,
+    scales: int,
+    degree: int,
+) -> Host:
+    """Prepare what the receiver projects off; can be traced and differentiated with respect to signal and positions.
+
+    Args:
+        operator: the Laplacian, of N vertices.
+        signal: the host's coordinates, centred per component.
+        positions: the host's coordinates.
+        coefficients: the bands that the mark is written in.
+        scales: how many diffusion scales of each coordinate are nuisance, from one smoothing step on.
+        degree: total degree of the polynomials of the position that are nuisance, at least 1 (affine maps).
+    """
+    coefficients = jnp.asarray(coefficients).astype(signal.dtype)
+    columns = [_polynomials(positions, degree)]
+    if scales:
+        scaled = band_components(operator, diffusion(scales, coefficients.shape[1]), signal)
+        columns.append(jnp.moveaxis(scaled, 0, 1).reshape(len(signal), -1))
+    raw = jnp.concatenate(columns, axis=1)
+    # Only the span matters, so the change to a good basis is not differentiated. What depends on the columns before it
+    # is rounding noise and is dropped.
+    size = jax.lax.stop_gradient(jnp.linalg.norm(raw, axis=0))
+    raw = raw / jnp.where(size > 0, size, 1)
+    triangle = jnp.linalg.qr(jax.lax.stop_gradient(raw), mode="r")
+    pivot = jnp.abs(jnp.diagonal(triangle))
+    sound = pivot > 10 * jnp.finfo(raw.dtype).eps
+    square = jnp.where(sound[:, None], triangle[: len(pivot)], jnp.eye(len(pivot), dtype=raw.dtype))
+    change = jsl.solve_triangular(square, jnp.diag(sound.astype(raw.dtype)))
+    return Host(operator, signal, coefficients, raw @ change)
+
+
+def receive(host: Host, seen: Observation) -> Reception:
+    """Project the nuisance off a residual, and measure gain and power of each band.
+
+    Args:
+        host: from `make_host`.
+        seen: the suspect's residual, in the units of the host.
+    """
+    # Points that are far off once the nuisance is gone were edited, or lost: they count for less.
+    strange = _robust(clean(host, seen, _factor(host, seen), seen.residual), seen.weights)
+    seen = seen._replace(weights=seen.weights * strange)
+    factor = _factor(host, seen)
+    # Twice, because the ridge leaves a little of a large nuisance behind.
+    once = seen.residual - _explained(host, seen, factor, seen.residual)
+    residual = clean(host, seen, factor, once)
+    # A reference that is as strong in every direction as in any other.
+    probe = jax.random.rademacher(jax.random.key(0), residual.shape, residual.dtype)
+    bands = _energies(host, residual)
+    reference = _energies(host, clean(host, seen, factor, probe))
+    tiny = 1e-6
+    power = (bands + tiny * bands.sum()) / (reference + tiny * reference.sum() + jnp.finfo(bands.dtype).tiny)
+    largest = power.max()
+    power = jnp.where(largest > 0, power / jnp.where(largest > 0, largest, 1), 1)
+
+    # Where nothing is seen, the host is taken to have moved as the nuisance says: a hole would leak into every band.
+    filled = residual + _explained(host, seen, factor, seen.residual)
+    moved = band_components(host.operator, host.coefficients, filled)
+    still = band_components(host.operator, host.coefficients, host.signal)
+    mass = per_row(host.operator.degree, residual)
+    change = jnp.sum(mass * moved * still, axis=(1, 2))
+    whole = jnp.sum(mass * still**2, axis=(1, 2))
+    gain = 1 + jnp.where(whole > 0, change / jnp.where(whole > 0, whole, 1), 0)
+    return Reception(residual, jnp.clip(gain, 0, 2), power, seen, factor)
+
+
+def _robust(residual: Float[Array, "vertices 3"], weights: Float[Array, " vertices"]) -> Float[Array, " vertices"]:
+    """Huber's weights, on the squared length: 1 up to four times the median, which Gaussian noise rarely exceeds."""
+    square = jnp.sum(residual**2, axis=1)
+    limit = 4 * jnp.nanmedian(jnp.where(weights > 0, square, jnp.nan))
+    return jnp.where(square > limit, limit / jnp.where(square > limit, square, 1), 1)
+
+
+def _factor(host: Host, seen: Observation) -> Float[Array, "unknowns unknowns"]:
+    """Cholesky factor of the nuisance's normal equations, with a ridge for what looks alike where it is seen."""
+    columns = _seen_columns(host, seen)
+    products = columns.T @ (seen.weights[:, None] * columns)
+    ridge = jnp.finfo(products.dtype).eps * (jnp.trace(products) + 1)
+    return jnp.linalg.cholesky(products + ridge * jnp.eye(len(products), dtype=products.dtype))
+
+
+def clean(
+    host: Host, seen: Observation, factor: Float[Array, "unknowns unknowns"], x: Float[Array, "vertices 3"]
+) -> Float[Array, "vertices 3"]:
+    """ΩPx: a displacement without its nuisance, weighed; symmetric in the plain inner product."""
+    return seen.weigh(x - _explained(host, seen, factor, x))
+
+
+def _explained(host: Host, seen: Observation, factor: Array, x: Array) -> Array:
+    """The nuisance that fits a displacement best, where and as it is seen."""
+    columns = _seen_columns(host, seen)
+    fitted = jsl.cho_solve((factor, True), columns.T @ (seen.weights[:, None] * seen.channels(x)))
+    if seen.normals is None:
+        return host.nuisance @ fitted
+    return host.nuisance @ fitted.reshape(-1, 3)
+
+
+def _seen_columns(host: Host, seen: Observation) -> Float[Array, "vertices unknowns"]:
+    """The nuisance as it shows: once for all coordinates, or each column along each coordinate by the normals."""
+    if seen.normals is None:
+        return host.nuisance
+    return (host.nuisance[:, :, None] * seen.normals[:, None, :]).reshape(len(host.nuisance), -1)
+
+
+def _energies(host: Host, x: Array) -> Float[Array, " bands"]:
+    return jnp.sum(band_components(host.operator, host.coefficients, x) ** 2, axis=(1, 2))
+
+
+def _polynomials(positions: Float[Array, "vertices 3"], degree: int) -> Float[Array, "vertices columns"]:
+    """Products of Chebyshev polynomials of the position in its box, up to a total degree."""
+    low, high = jax.lax.stop_gradient((positions.min(axis=0), positions.max(axis=0)))
+    inside = (2 * positions - (high + low)) / jnp.where(high > low, high - low, 1)
+    powers = [jnp.ones_like(inside), inside]
+    while len(powers) <= degree:
+        powers.append(2 * inside * powers[-1] - powers[-2])
+    return jnp.stack(
+        [
+            powers[i][:, 0] * powers[j][:, 1] * powers[k][:, 2]
+            for i in range(degree + 1)
+            for j in range(degree + 1 - i)
+            for k in range(degree + 1 - i - j)
+        ],
+        axis=1,
+    )
