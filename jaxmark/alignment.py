@@ -14,6 +14,7 @@ from jaxmark.original import Original, residual
 _FAR = 0.005
 _OFF = 10.0
 _ROUNDS = 10
+_ROUNDING = 1e-12  # of sums over all points; a smaller residual is none
 
 
 def align(original: Original, suspect: Mesh) -> tuple[Float64[np.ndarray, "points 3"], Float64[np.ndarray, " points"]]:
@@ -37,6 +38,8 @@ def align(original: Original, suspect: Mesh) -> tuple[Float64[np.ndarray, "point
     x, y = x[sound], x[sound] + moved[sound]
     fits = [_fit(x, y, agreeing) for agreeing in (np.ones(len(x), bool), _agreeing(spread[sound]))]
     error, agreeing = min(fits, key=lambda fit: np.quantile(np.linalg.norm(fit[0], axis=1), 0.6))
+    if np.abs(error).max() < _ROUNDING:
+        error = np.zeros_like(error)
     displacement, weights = np.zeros(moved.shape), np.zeros(len(moved))
     displacement[sound] = np.where(agreeing[:, None], error, 0)
     weights[sound] = agreeing

@@ -11,7 +11,7 @@ from scipy import optimize, stats
 from jaxmark.carriers import KeyedCarrier
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import KEY_BYTES
-from jaxmark.message import TAG_BITS, code_length
+from jaxmark.message import TAG_BITS
 from jaxmark.observation import observe
 from jaxmark.original import Original
 from jaxmark.reception import clean, receive
@@ -97,7 +97,7 @@ class Capacity:
         """
         original, scheme = self._original, self._scheme
         try:
-            code = code_length(bits, scheme.places(original, bits))
+            code = scheme.code_length(original, bits)
         except JaxmarkError:
             return math.inf
         layout = scheme.layout(original, bits)

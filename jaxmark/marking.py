@@ -17,7 +17,7 @@ from jaxmark.detectors import Detector
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import Key, commitment
 from jaxmark.mesh import Mesh
-from jaxmark.message import CANDIDATES, TAG_BITS, code_length, decode, encode
+from jaxmark.message import CANDIDATES, TAG_BITS, decode, encode
 from jaxmark.observation import Observation, observe
 from jaxmark.original import Original, displaced, prepare, residual
 from jaxmark.record import Record
@@ -75,6 +75,10 @@ class Marker:
     def embed(self, message: bytes, budget: float = 8e-4, *, noise: float = NOISE) -> tuple[Mesh, EmbedInfo]:
         """Hide a message of just the payload's size in the original; see `embed`."""
         self._check_size(message)
+        if not 0 < budget < 1:
+            raise JaxmarkError(f"The budget is relative to the bounding box's diagonal and in (0, 1), got {budget}.")
+        if not 0 <= noise < math.inf:
+            raise JaxmarkError(f"The noise to survive is a number of at least 0, got {noise}.")
         if isinstance(self.scheme, KeyedScheme):
             self._check_capacity(self.scheme, Conditions(budget, noise, COVERAGE))
         marked, info = self.write(encode(message, self.key, self.original.geometry, self.code), budget)
@@ -111,8 +115,6 @@ class Marker:
 
     def write(self, amplitudes: Float64[np.ndarray, " code"], budget: float) -> tuple[Mesh, EmbedInfo]:
         """Displace the original by the carrier of any amplitudes, scaled to the budget exactly."""
-        if not 0 < budget < 1:
-            raise JaxmarkError(f"The budget is relative to the bounding box's diagonal and in (0, 1), got {budget}.")
         original = self.original
         unit = np.asarray(self.carrier.displacement(jnp.asarray(amplitudes, original.signal.dtype)), np.float64)
         size = float(distortion.rms(unit[original.used]))
@@ -220,7 +222,7 @@ def make_marker(
             )
     scheme = get_scheme(scheme)
     payload = DEFAULT_BITS if bits is None else bits
-    code = code_length(payload, scheme.places(ready, payload))
+    code = scheme.code_length(ready, payload)
     carrier = scheme.carrier(ready, key, payload, code)
     return Marker(ready, key, payload, scheme, carrier, code, detector or scheme.detector)
 

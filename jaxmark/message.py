@@ -13,16 +13,15 @@ from jaxmark.keys import derive
 
 TAG_BITS = 28
 CANDIDATES = 32
-# More code bits than this for each bit of information gain less than 0.1 dB more, and take time.
-_SPREAD = 12
 
 
-def code_length(bits: int, places: int) -> int:
+def code_length(bits: int, places: int, spread: int) -> int:
     """How many code bits carry a payload of so many bits: the largest power of two that fits and is of use.
 
     Args:
         bits: payload, a positive multiple of 8.
         places: how many code bits the carrier has places for.
+        spread: how many code bits for each bit of message and tag are of use.
 
     Raises:
         JaxmarkError: if the payload is no positive multiple of 8, or too large for the places.
@@ -30,11 +29,11 @@ def code_length(bits: int, places: int) -> int:
     if bits <= 0 or bits % 8:
         raise JaxmarkError(f"The payload must be a positive multiple of 8 bits, got {bits}.")
     information = bits + TAG_BITS
-    length = 1 << (max(1, min(places, _SPREAD * information)).bit_length() - 1)
+    length = 1 << (max(1, min(places, spread * information)).bit_length() - 1)
     if information > length:
         raise JaxmarkError(
-            f"{bits} bits and a tag of {TAG_BITS} do not fit into {places} places: the payload is at most"
-            f" {max(0, length - TAG_BITS) // 8 * 8} bits."
+            f"{bits} bits and a tag of {TAG_BITS} do not fit: this mesh and scheme have {places} places, and the"
+            f" payload is at most {max(0, length - TAG_BITS) // 8 * 8} bits."
         )
     return length
 

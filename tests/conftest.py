@@ -47,8 +47,8 @@ def unchecked() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def sphere() -> Mesh:
-    """An irregular closed surface of 2562 vertices."""
-    return bumpy_sphere(4)
+    """An irregular closed surface of 642 vertices."""
+    return bumpy_sphere(3)
 
 
 @pytest.fixture(scope="session")

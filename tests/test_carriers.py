@@ -10,6 +10,7 @@ import jaxmark as jm
 from jaxmark.bands import scaling
 from jaxmark.carriers import Carrier, ModulatedCarrier, eigenspaces, host_bands
 from jaxmark.laplacian import Laplacian, centre, make_laplacian
+from jaxmark.observation import observe
 from jaxmark.sequences import orthogonal_sequences
 from jaxmark.spectrum import eigenpairs
 from tests.dense import chebyshev_matrices
@@ -101,13 +102,13 @@ def test_claim_is_a_sum_over_keyed_signs(kind, operator, signal, key: jm.Key, x6
     carrier = make_carrier(kind, operator, jnp.asarray(signal), key)
     random = np.random.default_rng(2)
     residual, bits = jnp.asarray(random.normal(size=signal.shape)), jnp.asarray(random.choice([-1.0, 1.0], BITS))
-    score, norm = carrier.claim(residual, bits)
+    score, norm = carrier.claim(observe(residual), bits)
     assert float(score) == pytest.approx(float(bits @ carrier.adjoint(residual)))
     terms = []
     for band, coordinate in np.ndindex(BANDS, 3):
         turned = np.array(carrier.sequences)
         turned[:, band, coordinate] *= -1
-        other, same = carrier._replace(sequences=turned).claim(residual, bits)
+        other, same = carrier._replace(sequences=turned).claim(observe(residual), bits)
         terms.append(float(score - other) / 2)
         assert float(same) == pytest.approx(float(norm))
     assert sum(terms) == pytest.approx(float(score))
@@ -120,7 +121,7 @@ def test_a_claim_does_not_depend_on_the_size_of_the_residual(operator, signal, k
     residual = np.random.default_rng(7).normal(size=signal.shape)
     ratios = []
     for size in (1.0, 1e-15, 1e-21, 1e-25, 1e15):
-        score, norm = carrier.claim(jnp.asarray(size * residual, jnp.float32), jnp.ones(BITS, jnp.float32))
+        score, norm = carrier.claim(observe(jnp.asarray(size * residual, jnp.float32)), jnp.ones(BITS, jnp.float32))
         ratios.append(float(score) / float(norm))
     np.testing.assert_allclose(ratios, ratios[0], rtol=1e-3)
 
@@ -133,7 +134,7 @@ def test_the_hosts_dtype_is_kept(kind, operator, signal, key: jm.Key, x64):
         carrier.displacement(jnp.asarray(bits), beta),
         carrier.adjoint(jnp.asarray(residual), beta),
         carrier.gram(beta),
-        *carrier.claim(jnp.asarray(residual), jnp.asarray(bits)),
+        *carrier.claim(observe(jnp.asarray(residual)), jnp.asarray(bits)),
     )
     assert {output.dtype for output in outputs} == {np.dtype("float32")}
 
@@ -142,7 +143,7 @@ def test_sequences_shared_by_coordinates_have_one_sign_a_band(operator, signal, 
     carrier = make_carrier("host", operator, jnp.asarray(signal), key, shared=True)
     residual = jnp.asarray(np.random.default_rng(3).normal(size=signal.shape))
     bits = jnp.ones(BITS)
-    score, norm = carrier.claim(residual, bits)
+    score, norm = carrier.claim(observe(residual), bits)
     terms = np.einsum("kj,jc->j", carrier.sequences[:, :, 0], carrier.components.analyse(residual))
     assert float(score) == pytest.approx(terms.sum())
     assert float(norm) == pytest.approx(np.linalg.norm(terms))

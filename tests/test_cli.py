@@ -25,7 +25,7 @@ class Workshop:
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
         self.folder, self._monkeypatch, self._capfd = folder, monkeypatch, capfd
         monkeypatch.chdir(folder)
-        trimesh.Trimesh(*bumpy_sphere(3), process=False).export(folder / "model.ply")
+        trimesh.Trimesh(*bumpy_sphere(4), process=False).export(folder / "model.ply")
         jm.save_key(jm.Key(bytes(range(32))), folder / "owner.key")
 
     def __call__(self, *arguments: object) -> tuple[int, str, str]:
@@ -67,7 +67,7 @@ def workshop(tmp_path, monkeypatch, capfd) -> Workshop:
 DETECT = ("--original", "model.ply", "--key", "owner.key")
 
 
-@pytest.mark.parametrize("scheme", ["host", "eigen"])
+@pytest.mark.parametrize("scheme", ["keyed", "host", "eigen"])
 def test_the_main_job(workshop: Workshop, scheme):
     told = workshop.embed("--scheme", scheme)
     assert told["bits"] == 64
@@ -85,9 +85,10 @@ def test_the_main_job(workshop: Workshop, scheme):
         found = workshop.json("detect", "suspect.ply", *DETECT, *options)
         assert found["detected"] is True
         assert found["message"] == MESSAGE
-        assert len(found["scores"]) == 64
+        assert len(found["scores"]) >= 92
         assert found["coverage"] == 1.0
         assert found["log10_p"] <= -6
+        assert found["log10_p_fitted"] <= found["log10_p"] or scheme != "keyed"
     claimed = workshop.json("detect", "suspect.ply", *DETECT, "--scheme", scheme, "--message", MESSAGE)
     assert claimed["detected"] is True
     compared = workshop.json("compare", "model.ply", "marked.ply")
@@ -101,7 +102,7 @@ def test_nothing_found_is_status_1(workshop: Workshop):
         ("model.ply", "owner.key", []),
         ("marked.ply", "other.key", []),
         ("marked.ply", "owner.key", ["--bits", "32"]),
-        ("marked.ply", "owner.key", ["--alpha", "1e-30"]),
+        ("marked.ply", "owner.key", ["--alpha", "1e-80"]),
         ("marked.ply", "owner.key", ["--message", "fedcba9876543210"]),
     ]:
         found = workshop.json("detect", suspect, "--original", "model.ply", "--key", key, *options, status=1)
@@ -135,11 +136,14 @@ def test_refusals_are_one_sentence_and_leave_nothing(workshop: Workshop):
         (("embed", "model.ply", "model.ply", *mark), "same file"),
         (("embed", "model.ply", "no/where.ply", *mark), "folder no"),
         (("embed", "model.ply", "out.ply", *mark, "--record", "no/where.json"), "no"),
-        (("embed", "model.ply", "out.ply", *mark, "--budget", "1e-9"), "numbers are .* apart"),
+        (("embed", "model.ply", "out.ply", *mark, "--budget", "1e-9", "--noise", "0"), "numbers are .* apart"),
         (("embed", "model.ply", "out.ply", *mark, "--budget", "nan"), "budget"),
         (("embed", "model.ply", "out.ply", *mark, "--scheme", "magic"), "magic"),
         (("embed", "model.ply", "out.ply", "--key", "owner.key", "--message", "xyz"), "hexadecimal"),
-        (("embed", "model.ply", "out.ply", "--key", "owner.key", "--message", "00" * 60), "at most 352"),
+        (("embed", "model.ply", "out.ply", *mark, "--budget", "2e-4"), "at most .* bits .*budget of at least 0.000"),
+        (("embed", "model.ply", "out.ply", *mark, "--noise", "-1"), "noise"),
+        (("embed", "model.ply", "out.ply", "--key", "owner.key", "--message", "00" * 600), "at most"),
+        (("capacity", "model.ply", "--coverage", "2"), "coverage"),
         (("embed", "model.ply", "out.ply", "--key", "bad.key", "--message", MESSAGE), "no key file"),
         (("embed", "model.ply", "out.ply", "--message", MESSAGE), "--key"),
         (
@@ -188,7 +192,7 @@ def test_key_files_are_private_and_keys_never_shown(workshop: Workshop):
 
 
 def test_help_teaches_and_units_are_stated(workshop: Workshop):
-    for command in ([], ["keygen"], ["embed"], ["detect"], ["attack"], ["compare"], ["demo"]):
+    for command in ([], ["keygen"], ["embed"], ["detect"], ["attack"], ["compare"], ["capacity"], ["demo"]):
         code, out, _ = workshop(*command, "--help")
         assert code == 0
         assert len(out.splitlines()) > 5
@@ -227,11 +231,11 @@ def test_an_interrupted_write_leaves_no_output(workshop: Workshop, monkeypatch):
 
 def test_demo_leaves_tables_and_pictures(workshop: Workshop):
     told = workshop.json("demo", "model.ply", "--output", "shown")
-    assert {row["scheme"] for row in told["rows"]} == {"host", "eigen"}
+    assert {row["scheme"] for row in told["rows"]} == {"keyed", "host", "eigen"}
     unattacked = [row for row in told["rows"] if row["attack"] == "none"]
     assert all(row["message_read"] for row in unattacked)
     assert any(not row["message_read"] for row in told["rows"])  # losses are printed as losses
     names = {path.name for path in Path("shown").iterdir()}
-    assert {"table.md", "mark.png", "attacked.png", "marked-host.ply", "marked-host.ply.jaxmark.json"} <= names
+    assert {"table.md", "mark.png", "attacked.png", "marked-keyed.ply", "marked-keyed.ply.jaxmark.json"} <= names
     for picture in ("mark.png", "attacked.png"):
         assert Path("shown", picture).read_bytes().startswith(b"\x89PNG")

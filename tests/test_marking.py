@@ -15,6 +15,12 @@ MESSAGE = bytes.fromhex("0123456789abcdef")
 SCHEMES = ["keyed", "host", "eigen"]
 
 
+@pytest.fixture(scope="module")
+def sphere() -> Mesh:
+    """2562 vertices: enough for 64 bits by each scheme."""
+    return bumpy_sphere(4)
+
+
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_round_trip_within_the_budget(sphere: Mesh, key: jm.Key, scheme, dtype):
     marked, info = jm.embed(sphere, MESSAGE, key, budget=5e-4, scheme=scheme)
@@ -28,7 +34,7 @@ def test_round_trip_within_the_budget(sphere: Mesh, key: jm.Key, scheme, dtype):
     assert found.detected()
     assert found.coverage == 1.0
     code = encode(MESSAGE, key, jm.keys.geometry_hash(sphere), len(found.scores))
-    assert np.mean(found.scores * code) > 0.9
+    assert np.mean(found.scores * code) > 0.85
     claimed = jm.detect(marked, original=sphere, key=key, scheme=scheme, message=MESSAGE)
     assert claimed.log10_p < -6
     assert jm.detect(marked, original=sphere, key=key, scheme=scheme, message=b"somebody").log10_p > -6
@@ -143,14 +149,13 @@ def test_a_claim_is_refuted_by_another_message(sphere: Mesh, key: jm.Key):
     assert found.message == MESSAGE
 
 
-def test_huge_coordinates_are_no_evidence(sphere: Mesh, key: jm.Key):
+def test_a_vertex_thrown_away_is_masked(sphere: Mesh, key: jm.Key):
     marked, _ = jm.embed(sphere, MESSAGE, key)
     thrown = marked._replace(vertices=marked.vertices.copy())
     thrown.vertices[7, 1] = 1e60
-    for message in (None, MESSAGE):
-        found = jm.detect(thrown, original=sphere, key=key, message=message)
-        assert np.isfinite(found.scores).all()
-        assert not found.detected()
+    found = jm.detect(thrown, original=sphere, key=key)
+    assert found.message == MESSAGE
+    assert found.coverage == pytest.approx(1 - 1 / len(sphere.vertices))
 
 
 def test_record_binds_and_remembers(sphere: Mesh, key: jm.Key, tmp_path):
@@ -199,15 +204,19 @@ def test_refusals(sphere: Mesh, key: jm.Key):
     tiny = make_mesh(np.vstack([np.eye(3), [[0, 0, 0]]]), np.array([[0, 1, 2], [0, 1, 3], [1, 2, 3], [2, 0, 3]]))
     nan = sphere._replace(vertices=np.where(sphere.vertices > 1, np.nan, sphere.vertices))
     for mesh, message, options, sentence in [
-        (tiny, MESSAGE, {}, r"\(4 points\) cannot carry 64 bits"),
+        (tiny, MESSAGE, {}, "payload is at most 0 bits"),
+        (bumpy_sphere(2), MESSAGE, {}, r"\(162 points\) carries at most 8 bits"),
+        (bumpy_sphere(2), MESSAGE, {"scheme": "eigen"}, r"\(162 points\) cannot carry 64 bits"),
         (nan, MESSAGE, {}, "not a finite number"),
         (sphere, b"", {}, "positive multiple of 8 bits, got 0"),
         (sphere, MESSAGE, {"budget": 0}, "budget"),
         (sphere, MESSAGE, {"budget": float("nan")}, "budget"),
-        (sphere, MESSAGE, {"budget": 1e-300}, "lost in the rounding"),
+        (sphere, MESSAGE, {"budget": 1e-300, "noise": 0}, "lost in the rounding"),
         (sphere, "text", {}, "A message is bytes, got str"),
-        (sphere, MESSAGE, {"scheme": "magic"}, "host, eigen"),
-        (sphere, bytes(60), {}, "at most 352 bits"),
+        (sphere, MESSAGE, {"scheme": "magic"}, "keyed, host, eigen"),
+        (sphere, bytes(60), {"scheme": "host"}, "at most 224 bits"),
+        (sphere, MESSAGE, {"noise": -1.0}, "noise"),
+        (sphere, MESSAGE, {"budget": 1e-4}, "budget of at least 0.000"),
         (sphere._replace(vertices=0 * sphere.vertices), MESSAGE, {}, "diagonal"),
     ]:
         with pytest.raises(jm.JaxmarkError, match=sentence):
