@@ -31,3 +31,8 @@ from jaxmark.marking import make_marker as make_marker
 from jaxmark.mesh import Mesh as Mesh
 from jaxmark.mesh import make_mesh as make_mesh
 from jaxmark.record import Record as Record
+from jaxmark.tardos import Accusation as Accusation
+from jaxmark.tracing import Tracer as Tracer
+from jaxmark.tracing import fingerprint as fingerprint
+from jaxmark.tracing import identify as identify
+from jaxmark.tracing import make_tracer as make_tracer

@@ -1,7 +1,7 @@
 """The command line: files in, files and one answer out.
 
-Exit status 0: done, or detected. 1: `detect` found nothing. 2: refused, with one sentence on standard error and no
-output file. With --json, standard output holds exactly one JSON object.
+Exit status 0: done, or detected. 1: `detect` found nothing, `identify` nobody. 2: refused, with one sentence on
+standard error and no output file. With --json, standard output holds exactly one JSON object.
 """
 
 import json
@@ -25,6 +25,7 @@ from jaxmark.keys import commitment, load_key, new_key, save_key
 from jaxmark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity, detect, make_marker
 from jaxmark.record import RECORD_SUFFIX, Record
 from jaxmark.schemes import DEFAULT_SCHEME, SCHEMES
+from jaxmark.tracing import identify, make_tracer
 
 
 class _Hexadecimal(click.ParamType):
@@ -50,6 +51,9 @@ class _Hexadecimal(click.ParamType):
 _MESH = click.Path(path_type=Path)
 _KEY = click.option("--key", "key_file", type=_MESH, required=True, help="Key file, from `jaxmark keygen`.")
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
+_ALPHA = click.option(
+    "--alpha", type=float, default=1e-6, show_default=True, help="Largest false-positive probability that counts."
+)
 _BUDGET = click.option(
     "--budget",
     type=float,
@@ -95,7 +99,8 @@ def keygen(keyfile: Path, as_json: bool) -> None:
 @click.argument("original", type=_MESH)
 @click.argument("marked", type=_MESH)
 @_KEY
-@click.option("--message", type=_Hexadecimal(), required=True, help="Hexadecimal digits; 16 of them are 64 bits.")
+@click.option("--message", type=_Hexadecimal(), help="Hexadecimal digits; 16 of them are 64 bits.")
+@click.option("--recipient", help="Instead of a message: whose copy it is, for `jaxmark identify`.")
 @_BUDGET
 @click.option(
     "--noise",
@@ -117,7 +122,8 @@ def embed_command(
     original: Path,
     marked: Path,
     key_file: Path,
-    message: bytes,
+    message: bytes | None,
+    recipient: str | None,
     budget: float,
     noise: float,
     scheme: str,
@@ -134,13 +140,23 @@ def embed_command(
     _distinct(original=original, marked=marked, key=key_file, record=record_file)
     key = load_key(key_file)
     mesh = load_mesh(original)
-    marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
-    result, info = marker.embed(message, budget, noise=noise)
+    if (message is None) == (recipient is None):
+        raise JaxmarkError("Give either --message or --recipient.")
+    if message is not None:
+        marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
+        result, info = marker.embed(message, budget, noise=noise)
+        said, reads = f"{info.record.bits} bits", lambda mesh: marker.detect(mesh).message == message
+    elif recipient is not None:
+        if scheme != DEFAULT_SCHEME:
+            raise JaxmarkError(f"Fingerprints are carried by the scheme {DEFAULT_SCHEME!r}, not {scheme!r}.")
+        tracer = make_tracer(mesh, key)
+        result, info = tracer.fingerprint(recipient, budget)
+        said, reads = f"fingerprint of {recipient}", lambda mesh: tracer.finds(mesh, recipient)
     with _replacing(marked) as draft, _replacing(record_file) as record_draft:
         save_mesh(result, draft, like=original)
         # What counts is the file: its numbers are rounded.
         written = load_mesh(draft)
-        if marker.detect(written).message != message:
+        if not reads(written):
             raise JaxmarkError(
                 f"Rounded to the numbers of {original}, the mark no longer reads; use a larger budget, or a file with"
                 " more digits."
@@ -152,14 +168,14 @@ def embed_command(
         "max": change.max,
         "bits": info.record.bits,
         "scheme": info.record.scheme,
+        "content": info.record.content,
         "record": str(record_file),
         "marked": str(marked),
     }
     _answer(
         as_json,
         answer,
-        f"{info.record.bits} bits → {marked}, RMS {change.rms:.3g} and max {change.max:.3g} of the diagonal;"
-        f" record → {record_file}",
+        f"{said} → {marked}, RMS {change.rms:.3g} and max {change.max:.3g} of the diagonal; record → {record_file}",
     )
 
 
@@ -179,9 +195,7 @@ def embed_command(
     type=click.Choice(list(SCHEMES)),
     help=f"Without a record: what carries the bits.  [default: {DEFAULT_SCHEME}]",
 )
-@click.option(
-    "--alpha", type=float, default=1e-6, show_default=True, help="Largest false-positive probability that counts."
-)
+@_ALPHA
 @_JSON
 def detect_command(
     suspect: Path,
@@ -229,6 +243,52 @@ def detect_command(
         f" 10^{found.log10_p:.1f} (--alpha {alpha:g})",
     )
     sys.exit(0 if detected else 1)
+
+
+@cli.command(name="identify")
+@click.argument("suspect", type=_MESH)
+@click.option("--original", type=_MESH, required=True, help="The unmarked mesh.")
+@_KEY
+@click.option("--recipients", type=_MESH, required=True, help="Text file: who was given a copy, one identifier a line.")
+@click.option("--record", "record_file", type=_MESH, help="The record of a copy: binds key and original.")
+@click.option("--top", type=click.IntRange(1), default=10, show_default=True, help="How many to print.")
+@_ALPHA
+@_JSON
+def identify_command(
+    suspect: Path,
+    original: Path,
+    key_file: Path,
+    recipients: Path,
+    record_file: Path | None,
+    top: int,
+    alpha: float,
+    as_json: bool,
+) -> None:
+    """Say whose copies SUSPECT was made of.
+
+    Exit status 0 if somebody is accused: if the probability that any innocent recipient scores so high is at most
+    --alpha; else 1.
+    """
+    if not 0 < alpha < 1:
+        raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
+    try:
+        names = [line for line in recipients.read_text(encoding="utf-8").splitlines() if line]
+    except UnicodeDecodeError:
+        raise JaxmarkError(f"{recipients} is no text in UTF-8; give one identifier a line.") from None
+    if not names:
+        raise JaxmarkError(f"{recipients} names nobody; give one identifier a line.")
+    record = None if record_file is None else Record.load(record_file)
+    key = load_key(key_file)
+    found = identify(load_mesh(suspect), names, original=load_mesh(original), key=key, record=record, top=top)
+    accused = [one for one in found if one.log10_p <= math.log10(alpha)]
+    answer = {
+        "accused": [one.recipient for one in accused],
+        "ranking": [one._asdict() for one in found],
+        "recipients": len(names),
+    }
+    lines = [f"{one.recipient}: score {one.score:.1f}, probability at most 10^{one.log10_p:.1f}" for one in accused]
+    _answer(as_json, answer, "\n".join(lines) or f"nobody of {len(names)} is accused (--alpha {alpha:g})")
+    sys.exit(0 if accused else 1)
 
 
 _KINDS = "; ".join(f"{name}: {entry.unit}" for name, entry in ATTACKS.items())

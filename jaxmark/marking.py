@@ -207,10 +207,7 @@ def make_marker(
     key = Key(key)
     ready = prepare(original)
     if record is not None:
-        if record.original != ready.geometry.hex():
-            raise JaxmarkError("The original is not the mesh that the record was made for (its geometry differs).")
-        if record.key != commitment(key):
-            raise JaxmarkError("The key is not the one that the record commits to.")
+        record.check("message", ready.geometry, key)
         if bits not in (None, record.bits):
             raise JaxmarkError(f"The payload is {record.bits} bits by the record, not {bits}.")
         bits = record.bits

@@ -8,12 +8,13 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.keys import SCHEME_VERSION
+from jaxmark.keys import SCHEME_VERSION, commitment
 
 _FORMAT = "jaxmark-record"
+_READERS = {"message": "detect", "fingerprint": "identify"}
 RECORD_SUFFIX = ".jaxmark.json"  # behind the name of the marked file
 
 
@@ -22,16 +23,30 @@ class Record:
     """A mark's record; JSON in a file."""
 
     scheme: str
-    bits: int  # payload, without the tag
+    bits: int  # payload, without the tag; of a fingerprint its slots
     beta: float  # strength, relative to the bounding-box diagonal: the common factor of the carrier's displacement
     original: str  # hash of the original's canonical geometry, hexadecimal
     key: str  # commitment to the key, hexadecimal
     parameters: Mapping[str, Any] = field(default_factory=dict)  # of the scheme
+    content: Literal["message", "fingerprint"] = "message"
     version: int = SCHEME_VERSION
 
     def to_json(self) -> str:
         """The record as JSON text."""
         return json.dumps({"format": _FORMAT, **asdict(self)}, indent=2) + "\n"
+
+    def check(self, content: Literal["message", "fingerprint"], geometry: bytes, key: bytes) -> None:
+        """Refuse what the record is not for.
+
+        Raises:
+            JaxmarkError: if it is of other content, another original or another key.
+        """
+        if self.content != content:
+            raise JaxmarkError(f"The record is of a {self.content}; {_READERS[self.content]} reads it.")
+        if self.original != geometry.hex():
+            raise JaxmarkError("The original is not the mesh that the record was made for (its geometry differs).")
+        if self.key != commitment(key):
+            raise JaxmarkError("The key is not the one that the record commits to.")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "Record":
@@ -59,8 +74,11 @@ class Record:
             "original": str,
             "key": str,
             "parameters": dict,
+            "content": str,
             "version": int,
         }
         if data.keys() != types.keys() or any(type(data[name]) is not kind for name, kind in types.items()):
             raise JaxmarkError(f"The record {path} is damaged: its fields are not those of a record.")
+        if data["content"] not in _READERS:
+            raise JaxmarkError(f"The record {path} is of a {data['content']}, which this jaxmark does not know.")
         return cls(**data)

@@ -74,7 +74,11 @@ class KeyedScheme:
 
     def code_length(self, original: Original, bits: int) -> int:
         """See `Scheme`; beyond 12 code bits a bit, the code gains less than 0.1 dB."""
-        return code_length(bits, int(self._dimensions(original, self._passing(original, bits))), 12)
+        return code_length(bits, self.dimensions(original, bits), 12)
+
+    def dimensions(self, original: Original, bits: int) -> int:
+        """How many dimensions the pass band for a payload has, as they are counted here."""
+        return int(self._dimensions(original, self._passing(original, bits)))
 
     def layout(self, original: Original, bits: int) -> Layout:
         """Pass band and nuisance for a payload, free of the key."""

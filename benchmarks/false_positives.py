@@ -1,0 +1,139 @@
+"""How often a claimed message is "detected" where there is no mark: nominal probabilities against counted ones.
+
+For many keys and hard suspects, through `Marker.observe`, `Carrier.claim` and `evidence.log10_p_claimed`, which
+`jaxmark.detect` calls. Every rate must not exceed its level (Clopper-Pearson, one-sided, 99.9 %), for each suspect, and
+the rate over all must be at least a thirtieth of it from 1e-1 to 1e-3: a bound that never fires proves nothing. As a
+control, the same checks of a bound with the exponent doubled must fail. Exit status 1 if a check does not end so.
+
+    python benchmarks/false_positives.py [--keys N] [--mesh FILE]
+"""
+
+import argparse
+import math
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from scipy import stats
+
+import jaxmark as jm
+from jaxmark.carriers import KeyedCarrier, make_chips
+from jaxmark.evidence import log10_p_claimed
+from jaxmark.mesh import Mesh
+from jaxmark.message import encode
+from jaxmark.observation import Observation
+
+LEVELS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
+MESSAGE = b"m"
+BATCH = 500
+
+
+def sample() -> Mesh:
+    """A rough sphere of 162 points."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    return jm.make_mesh(ball.vertices * (1 + 0.05 * np.random.default_rng(0).normal(size=(162, 1))), ball.faces)
+
+
+def suspects(marker: jm.Marker) -> dict[str, Observation]:
+    """What `detect` sees of meshes that know nothing of the keys tried."""
+    mesh, random = marker.original.mesh, np.random.default_rng(1)
+    vertices, size = mesh.vertices, marker.original.diagonal
+
+    def marked(seed: int, budget: float = 8e-4) -> Mesh:
+        other = jm.make_marker(mesh, jm.Key(bytes([seed] * 32)), bits=marker.bits, scheme=marker.scheme)
+        return other.write(encode(MESSAGE, other.key, other.original.geometry, other.code), budget)[0]
+
+    half = (vertices[:, 0] > np.median(vertices[:, 0]))[:, None]
+    spike = np.zeros_like(vertices)
+    spike[7, 1] = 0.004 * size
+    two = np.zeros_like(vertices)
+    two[[3, 50], [0, 2]] = 0.004 * size
+    meshes = {
+        "noise": jm.attack(mesh, "noise", 0.005, seed=1),
+        "smoothed": jm.attack(mesh, "smoothing", 5, seed=0),
+        "smoothed, noised": jm.attack(jm.attack(mesh, "smoothing", 5, seed=0), "noise", 0.01, seed=2),
+        "quantised": jm.attack(mesh, "quantisation", 6, seed=0),
+        "other shape": mesh._replace(vertices=vertices * (1 + 0.1 * random.normal(size=(len(vertices), 1)))),
+        "marked under another key": marked(200),
+        "marked under two other keys": mesh._replace(vertices=(marked(201).vertices + marked(202).vertices) / 2),
+        "marked strongly, noised": jm.attack(marked(203, 8e-3), "noise", 0.005, seed=3),
+        "half lost": mesh._replace(vertices=vertices + half * size * random.normal(size=vertices.shape)),
+        "one vertex moved": mesh._replace(vertices=vertices + spike),
+        "two vertices moved": mesh._replace(vertices=vertices + two),
+        "moved along one axis": mesh._replace(
+            vertices=vertices + 1e-3 * size * np.sin(9 * vertices[:, [1]]) * [0, 0, 1]
+        ),
+        "heavy tails": mesh._replace(vertices=vertices + 1e-4 * size * random.standard_cauchy(vertices.shape)),
+        "affine": mesh._replace(vertices=vertices @ np.diag([1, 1.1, 0.9]) + 3),
+        "sign of the position": mesh._replace(vertices=vertices + 1e-3 * size * np.sign(vertices)),
+    }
+    return {name: marker.observe(suspect) for name, suspect in meshes.items()}
+
+
+def log10_p(marker: jm.Marker, seen: dict[str, Observation], keys: int) -> tuple[np.ndarray, np.ndarray]:
+    """Scores and norms `[keys, suspects]` of the claimed message under fresh keys."""
+    original, carrier = marker.original, marker.carrier
+    assert isinstance(carrier, KeyedCarrier)
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen.values())
+
+    @jax.jit
+    def claims(chips, codewords):
+        def claim(one, chip, codeword):
+            return carrier._replace(chips=chip).claim(one, codeword)
+
+        return jax.lax.map(lambda one: jax.vmap(lambda chip, word: claim(one, chip, word))(chips, codewords), stacked)
+
+    found = []
+    for start in range(0, keys, BATCH):
+        chips, words = [], []
+        for seed in range(start, start + BATCH):
+            key = jm.Key(seed.to_bytes(32, "little"))
+            chips.append(make_chips(key, original.geometry, original.used, marker.code))
+            words.append(encode(MESSAGE, key, original.geometry, marker.code))
+        batch = jax.tree.map(lambda *leaves: np.stack(leaves), *chips)
+        found.append([np.asarray(part).T for part in claims(batch, jnp.asarray(np.array(words), jnp.float32))])
+    scores, norms = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return scores, norms
+
+
+def holds(values: np.ndarray, names: list[str], report: bool) -> bool:
+    """Whether no suspect exceeds a level, and all together come within a thirtieth of it."""
+    sound = True
+    for level in LEVELS:
+        hits = np.sum(values <= math.log10(level), axis=0)
+        lower = [stats.beta.ppf(1e-3, hit, len(values) - hit + 1) if hit else 0.0 for hit in hits]
+        total, pairs = int(hits.sum()), values.size
+        low = stats.beta.ppf(0.025, total, pairs - total + 1) if total else 0.0
+        high = stats.beta.ppf(0.975, total + 1, pairs - total)
+        worst = int(np.argmax(hits))
+        sound &= max(lower) <= level and (level < 1e-3 or total >= level * pairs / 30)
+        if report:
+            print(
+                f"{level:7.0e} {total:8d} of {pairs}: {total / pairs:.2e} [{low:.2e}, {high:.2e}], nominal /"
+                f" {level * pairs / max(total, 1):5.1f}; most for {names[worst]!r}: {hits[worst] / len(values):.2e}"
+            )
+    return bool(sound)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--keys", type=int, default=70_000, help="multiple of 500")
+    parser.add_argument("--mesh", help="by default a rough sphere of 162 points")
+    arguments = parser.parse_args()
+    mesh = jm.load_mesh(arguments.mesh) if arguments.mesh else sample()
+    marker = jm.make_marker(mesh, jm.Key(bytes([255] * 32)), bits=8 * len(MESSAGE))
+    seen = suspects(marker)
+    scores, norms = log10_p(marker, seen, arguments.keys)
+    values = np.vectorize(log10_p_claimed)(scores, norms)
+    names = list(seen)
+    print("nominal   counted, with 95 % interval")
+    passed = holds(values, names, report=True)
+    control = holds(2 * values, names, report=False)
+    print(f"the bound {'holds' if passed else 'FAILS'}; with its exponent doubled it {'holds' if control else 'fails'}")
+    sys.exit(0 if passed and not control else 1)
+
+
+if __name__ == "__main__":
+    main()
