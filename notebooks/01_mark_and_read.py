@@ -22,7 +22,7 @@ suspects = {
     "marked": marked,
     "noise 0.1 %": jm.attack(marked, "noise", 0.001, seed=0),
     "quantised to 9 bits": jm.attack(marked, "quantisation", 9, seed=0),
-    "smoothed 10 times": jm.attack(marked, "smoothing", 10, seed=0),
+    "smoothed 50 times": jm.attack(marked, "smoothing", 50, seed=0),
     "unmarked": mesh,
 }
 for name, suspect in suspects.items():

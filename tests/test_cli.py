@@ -95,6 +95,41 @@ def test_the_main_job(workshop: Workshop, scheme):
     assert compared == {"rms": told["rms"], "max": told["max"]}
 
 
+def test_capacity_is_what_embed_takes(workshop: Workshop):
+    bits = workshop.json("capacity", "model.ply")["bits"]
+    assert 64 <= bits < 1000
+    for size, status in ((bits, 0), (bits + 8, 2)):
+        code, _, err = workshop(
+            "embed", "model.ply", "full.ply", "--key", "owner.key", "--message", "5a" * (size // 8), "--json"
+        )
+        assert code == status, err
+    assert f"at most {bits} bits" in err
+    assert workshop.json("capacity", "model.ply", "--budget", "0.0004")["bits"] < bits
+    assert workshop.json("capacity", "model.ply", "--noise", "0.01")["bits"] < bits
+
+
+def test_copies_are_traced(workshop: Workshop):
+    Path("names.txt").write_text("alice\nbob\n\ncarol\n")
+    told = workshop.json("embed", "model.ply", "copy.ply", "--key", "owner.key", "--recipient", "bob")
+    assert told["content"] == "fingerprint"
+    who = ("--original", "model.ply", "--key", "owner.key", "--recipients", "names.txt")
+    found = workshop.json("identify", "copy.ply", *who, "--record", told["record"])
+    assert found["accused"] == ["bob"]
+    assert found["recipients"] == 3
+    assert found["ranking"][0]["recipient"] == "bob"
+    assert workshop.json("identify", "model.ply", *who, status=1)["accused"] == []
+    Path("nobody.txt").write_text("\n")
+    for arguments, sentence in [
+        (("identify", "copy.ply", *who[:-1], "nobody.txt"), "names nobody"),
+        (("identify", "copy.ply", *who, "--alpha", "0"), "alpha"),
+        (("identify", "copy.ply", *who[:-1], "absent.txt"), "absent.txt"),
+        (("detect", "copy.ply", *DETECT, "--record", told["record"]), "identify reads it"),
+        (("embed", "model.ply", "o.ply", "--key", "owner.key"), "either --message or --recipient"),
+        (("embed", "model.ply", "o.ply", "--key", "owner.key", "--recipient", "x", "--scheme", "host"), "keyed"),
+    ]:
+        assert re.search(sentence, workshop.refused(*arguments))
+
+
 def test_nothing_found_is_status_1(workshop: Workshop):
     workshop.embed()
     workshop.json("keygen", "other.key")
@@ -192,7 +227,17 @@ def test_key_files_are_private_and_keys_never_shown(workshop: Workshop):
 
 
 def test_help_teaches_and_units_are_stated(workshop: Workshop):
-    for command in ([], ["keygen"], ["embed"], ["detect"], ["attack"], ["compare"], ["capacity"], ["demo"]):
+    for command in (
+        [],
+        ["keygen"],
+        ["embed"],
+        ["detect"],
+        ["attack"],
+        ["compare"],
+        ["capacity"],
+        ["identify"],
+        ["demo"],
+    ):
         code, out, _ = workshop(*command, "--help")
         assert code == 0
         assert len(out.splitlines()) > 5

@@ -21,6 +21,7 @@ README = (ROOT / "README.md").read_text()
 def folder(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     trimesh.Trimesh(*bumpy_sphere(4), process=False).export("model.ply")
+    Path("names.txt").write_text("alice\nbob\n")
     return tmp_path
 
 
@@ -33,12 +34,13 @@ def test_python_blocks_of_the_readme_run(folder: Path, unchecked, capsys):
     assert names["found"].message == bytes.fromhex("0123456789abcdef")
     assert "0123456789abcdef" in capsys.readouterr().out
     assert (names["scores"] > 0).tolist() == [True, False, False, True]
+    assert sorted(one.recipient for one in names["accused"] if one.log10_p < -6) == ["alice", "bob"]
     assert names["gradient"].shape == names["x"].shape
 
 
 def test_shell_lines_of_the_readme_run(folder: Path, unchecked, monkeypatch, capsys):
     lines = re.findall(r"^    (jaxmark .*)$", README, re.MULTILINE)
-    assert len(lines) >= 5
+    assert len(lines) >= 8
     for line in lines:
         monkeypatch.setattr(sys, "argv", shlex.split(line))
         with pytest.raises(SystemExit) as end:
@@ -55,7 +57,7 @@ def test_make_targets_of_the_readme_exist():
 
 def test_payloads_of_the_readme_are_carried():
     mesh, key = bumpy_sphere(4), jm.Key(bytes(32))
-    for scheme, bits in (("host", 192), ("eigen", 160)):
+    for scheme, bits in (("host", 192), ("eigen", 96)):
         assert re.search(rf"\b{bits} bits \(`{scheme}`\)", README)
         marked, _ = jm.embed(mesh, bytes(range(bits // 8)), key, scheme=scheme)
         assert jm.detect(marked, original=mesh, key=key, scheme=scheme, bits=bits).detected()
