@@ -110,7 +110,12 @@ class KeyedScheme:
 
     @property
     def _channels(self) -> int:
-        return 3 if self.direction == "coordinates" else 1
+        match self.direction:
+            case "coordinates":
+                return 3
+            case "normals":
+                return 1
+        raise JaxmarkError(f"direction must be 'coordinates' or 'normals', got {self.direction!r}.")
 
     def _passing(self, original: Original, bits: int) -> int:
         """How many bands the mark is written in: six at least, for narrower bands leak too much."""
