@@ -8,9 +8,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
-import numpy as np
 from jax.scipy.sparse.linalg import cg
-from jax.scipy.special import erf
 from jaxtyping import Array, Float
 
 from jaxmark.carriers import Carrier, KeyedCarrier
@@ -25,6 +23,7 @@ Detector = Callable[[Carrier, Observation, Strength], Float[Array, " bits"]]
 # Joint decoding stops here: what remains to be gained is below the noise of the soft values.
 _STEPS = 12
 _TOLERANCE = 1e-2
+_BALANCE = (0.02, 1e3)  # least and largest noise, relative to the energy of a bit, that is believed
 
 
 def correlate(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Array, " bits"]:
@@ -55,7 +54,7 @@ def joint(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Ar
 
     The nuisance is projected off and each band weighed by its power (`jaxmark.reception`); there the mark is modelled
     as the carrier with each band at the gain that the host has. The balance between interference of bits and noise is
-    found from how far the matched filter's values spread about two points.
+    found from the energy before and after matching.
 
     Args:
         carrier: a `KeyedCarrier`.
@@ -83,24 +82,33 @@ def joint(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Ar
         dull = transpose(host.operator, whitening, white)
         return carrier.correlate(clean(host, seen, received.factor, dull), model)
 
-    matched = backward(filter(host.operator, whitening, received.residual))
-    probe = jax.random.rademacher(jax.random.key(1), matched.shape, matched.dtype)
-    response = backward(forward(probe))
-    # The trace of the bits' Gram matrix and of its square, as a probe of random signs estimates them.
-    count = len(matched)
-    energy = probe @ response / count
-    energy = jnp.where(energy > 0, energy, 1)
-    interference = jnp.maximum(response @ response / count / energy**2 - 1, 0)
-    noise = jnp.maximum(1 / _signal_to_noise(matched) - interference, 0.02)
-    ridge = jax.lax.stop_gradient(noise * energy)
+    def white(x: Array) -> Array:
+        return filter(host.operator, whitening, x)
+
+    observed = white(received.residual)
+    matched = backward(observed)
+    # What one bit of unit amplitude, and noise of the residual's spectrum and unit strength, contribute to the energy
+    # before and after matching, as probes of random signs estimate it.
+    key_bits, key_noise = jax.random.split(jax.random.key(1))
+    bits = jax.random.rademacher(key_bits, matched.shape, matched.dtype)
+    signs = jax.random.rademacher(key_noise, observed.shape, observed.dtype)
+    coloured = filter(host.operator, host.coefficients.T @ jnp.sqrt(received.power), signs)
+    response, noise = backward(forward(bits)), white(clean(host, seen, received.factor, coloured))
+    ridge = _noise_to_signal(
+        jnp.stack([jnp.sum(observed**2), jnp.sum(matched**2)]),
+        jnp.stack([bits @ response, jnp.sum(response**2)]),
+        jnp.stack([jnp.sum(noise**2), jnp.sum(backward(noise) ** 2)]),
+    )
+    energy = bits @ response / len(bits)
+    ridge = jax.lax.stop_gradient(jnp.where(energy > 0, energy * jnp.clip(ridge / energy, *_BALANCE), 1))
     return cg(lambda bits: backward(forward(bits)) + ridge * bits, matched, tol=_TOLERANCE, maxiter=_STEPS)[0]
 
 
-def _signal_to_noise(values: Float[Array, " bits"]) -> Float[Array, ""]:
-    """a²/σ² of values ±a with Gaussian noise σ, from the ratio of their first absolute and second moments."""
-    grid = jnp.asarray(np.geomspace(1e-2, 1e3, 101), values.dtype)
-    root = jnp.sqrt(grid / 2)
-    folded = jnp.sqrt(2 / np.pi) * jnp.exp(-grid / 2) + jnp.sqrt(grid) * erf(root)
-    second = jnp.mean(values**2)
-    found = jnp.mean(jnp.abs(values)) ** 2 / jnp.where(second > 0, second, 1)
-    return jnp.interp(found, folded**2 / (1 + grid), grid)
+def _noise_to_signal(
+    energy: Float[Array, " 2"], of_signal: Float[Array, " 2"], of_noise: Float[Array, " 2"]
+) -> Float[Array, ""]:
+    """σ²/A² where energy = A² of_signal + σ² of_noise, two equations; infinite if A² is not positive."""
+    determinant = of_signal[1] * of_noise[0] - of_signal[0] * of_noise[1]
+    signal = (energy[1] * of_noise[0] - energy[0] * of_noise[1]) * jnp.sign(determinant)
+    noise = (energy[0] * of_signal[1] - energy[1] * of_signal[0]) * jnp.sign(determinant)
+    return jnp.where(signal > 0, jnp.maximum(noise, 0) / jnp.where(signal > 0, signal, 1), jnp.inf)

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from jaxmark import distortion, evidence
 from jaxmark.alignment import align
-from jaxmark.capacity import Capacity, Conditions
 from jaxmark.carriers import Carrier
 from jaxmark.detectors import Detector
 from jaxmark.errors import JaxmarkError
@@ -20,6 +19,7 @@ from jaxmark.mesh import Mesh
 from jaxmark.message import CANDIDATES, TAG_BITS, decode, encode
 from jaxmark.observation import Observation, observe
 from jaxmark.original import Original, displaced, prepare, residual
+from jaxmark.payload import Capacity, Conditions
 from jaxmark.record import Record
 from jaxmark.schemes import DEFAULT_SCHEME, KeyedScheme, Scheme, get_scheme, parameters_of
 
@@ -75,8 +75,7 @@ class Marker:
     def embed(self, message: bytes, budget: float = 8e-4, *, noise: float = NOISE) -> tuple[Mesh, EmbedInfo]:
         """Hide a message of just the payload's size in the original; see `embed`."""
         self._check_size(message)
-        if not 0 < budget < 1:
-            raise JaxmarkError(f"The budget is relative to the bounding box's diagonal and in (0, 1), got {budget}.")
+        _check_budget(budget)
         if not 0 <= noise < math.inf:
             raise JaxmarkError(f"The noise to survive is a number of at least 0, got {noise}.")
         if isinstance(self.scheme, KeyedScheme):
@@ -115,6 +114,7 @@ class Marker:
 
     def write(self, amplitudes: Float64[np.ndarray, " code"], budget: float) -> tuple[Mesh, EmbedInfo]:
         """Displace the original by the carrier of any amplitudes, scaled to the budget exactly."""
+        _check_budget(budget)
         original = self.original
         unit = np.asarray(self.carrier.displacement(jnp.asarray(amplitudes, original.signal.dtype)), np.float64)
         size = float(distortion.rms(unit[original.used]))
@@ -176,6 +176,11 @@ class Marker:
             raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
         if 8 * len(message) != self.bits:
             raise JaxmarkError(f"The message has {8 * len(message)} bits, but the payload is {self.bits} bits.")
+
+
+def _check_budget(budget: float) -> None:
+    if not 0 < budget < 1:
+        raise JaxmarkError(f"The budget is relative to the bounding box's diagonal and in (0, 1), got {budget}.")
 
 
 def make_marker(

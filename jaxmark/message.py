@@ -12,7 +12,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.keys import derive
 
 TAG_BITS = 28
-CANDIDATES = 32
+CANDIDATES = 64
 
 
 def code_length(bits: int, places: int, spread: int) -> int:

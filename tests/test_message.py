@@ -30,7 +30,7 @@ def test_codeword_is_the_message_and_its_tag(key: jm.Key):
 def test_the_codeword_never_changes(key: jm.Key):
     """If this fails, marks in the world no longer read."""
     code = encode(MESSAGE, key, b"", 128)
-    assert np.packbits(code < 0).tobytes().hex() == "GOLDEN"
+    assert np.packbits(code < 0).tobytes().hex() == "cc4fac95d43c9934045a203be3d6ea65"
 
 
 @pytest.mark.parametrize(("size", "length"), [(1, 64), (8, 128), (8, 1024), (32, 2048), (128, 2048)])
@@ -75,25 +75,32 @@ def test_nothing_seen_gives_nothing(key: jm.Key):
     assert decode(np.zeros(1024), 64, key, b"") is None
 
 
-@pytest.mark.parametrize("candidates", [1, CANDIDATES])
-def test_chance_passes_as_often_as_the_tag_says(key: jm.Key, monkeypatch: pytest.MonkeyPatch, candidates: int):
-    """With a tag of 8 bits, random soft values pass at most candidates · 2^-8 of the time, and not far less often.
+@pytest.mark.parametrize(("candidates", "trials"), [(8, 1000), (CANDIDATES, 500)])
+def test_chance_passes_as_often_as_the_tag_says(
+    key: jm.Key, monkeypatch: pytest.MonkeyPatch, candidates: int, trials: int
+):
+    """With a tag of 8 bits, random soft values pass with probability 1 - (1 - 2^-8)^candidates ≤ candidates · 2^-8.
 
-    All candidates are distinct messages with tags of their own, but for those that differ in their tags only, of which
-    at most one can pass: the exact rate is below 1 - (1 - 2^-8)^candidates.
+    As a control, half or twice as many would be noticed.
     """
     monkeypatch.setattr("jaxmark.message.TAG_BITS", 8)
     random = np.random.default_rng(7)
-    trials = 4000 if candidates == 1 else 1000
-    passed = sum(decode(random.normal(size=64), 24, key, b"", candidates) is not None for _ in range(trials))
-    assert stats.binomtest(passed, trials, candidates / 256, alternative="greater").pvalue > 1e-3
-    assert stats.binomtest(passed, trials, candidates / 256 / 2, alternative="less").pvalue > 1e-3
-    assert stats.binomtest(passed, trials, candidates / 256 / 4).pvalue < 1e-3
+    passed = sum(decode(random.normal(size=32), 8, key, b"", candidates) is not None for _ in range(trials))
+    exact = 1 - (1 - 2**-8) ** candidates
+
+    def plausible(count: int) -> bool:
+        above = stats.binomtest(count, trials, candidates / 256, alternative="greater").pvalue
+        below = stats.binomtest(count, trials, exact, alternative="less").pvalue
+        return bool(min(above, below) > 2e-3)
+
+    assert plausible(passed)
+    assert not plausible(round(exact / 2 * trials))
+    assert not plausible(round(2 * candidates / 256 * trials))
 
 
 def test_chance_does_not_pass_the_whole_tag(key: jm.Key):
     random = np.random.default_rng(8)
-    assert all(decode(random.normal(size=128), 64, key, b"") is None for _ in range(100))
+    assert all(decode(random.normal(size=128), 64, key, b"") is None for _ in range(30))
 
 
 def test_code_length():

@@ -17,8 +17,7 @@ from jaxmark.original import Original
 from jaxmark.reception import clean, receive
 from jaxmark.schemes import KeyedScheme, Layout
 
-# The whole chain, code and tag and interference, stays within this of the least energy that any code needs.
-GAP_DECIBEL = 2.5
+_GAP = 1.0  # decibel, of the polar code at a message error rate of 1e-3; `benchmarks/limit.py --code-only` measures it
 
 
 class Room(NamedTuple):
@@ -60,9 +59,15 @@ def least_energy(bits: int, error: float = 1e-3) -> float:
     return root**2 / 2
 
 
-def needed_energy(bits: int) -> float:
-    """E/N0 with which the whole chain reads so many bits, but for one message in a thousand."""
-    return 10 ** (GAP_DECIBEL / 10) * least_energy(bits)
+def needed_energy(bits: int, dimensions: float) -> float:
+    """E/N0 with which the whole chain reads so many bits, but for about one message in a thousand.
+
+    The code takes `_GAP` more than the least for message and tag. To one bit, the others are noise of E in all the
+    dimensions: with N0/2 of noise in each, E is worth E/(1 + 2(E/N0)/dimensions). Infinite where that is never enough.
+    """
+    alone = 10 ** (_GAP / 10) * least_energy(bits + TAG_BITS)
+    crowded = 1 - 2 * alone / dimensions
+    return alone / crowded if crowded > 0 else math.inf
 
 
 def needed_dimensions(bits: int) -> float:
@@ -106,10 +111,11 @@ class Capacity:
         left = self._rooms[layout]
         if conditions.coverage * left.dimensions < needed_dimensions(bits):
             return math.inf
+        needed = needed_energy(bits, conditions.coverage * left.dimensions)
         vertices = conditions.coverage * left.energy * int(original.used.sum())
         points = original.positions[original.used]
         radius = float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean())
-        return conditions.noise * radius * math.sqrt(needed_energy(bits) / (1.5 * vertices))
+        return conditions.noise * radius * math.sqrt(needed / (1.5 * vertices))
 
     def bits(self, conditions: Conditions) -> int:
         """The largest payload, a multiple of 8 bits; 0 if not even 8."""
