@@ -146,12 +146,12 @@ def embed_command(
         marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
         result, info = marker.embed(message, budget, noise=noise)
         said, reads = f"{info.record.bits} bits", lambda mesh: marker.detect(mesh).message == message
-    elif recipient is not None:
+    else:
         if scheme != DEFAULT_SCHEME:
             raise JaxmarkError(f"Fingerprints are carried by the scheme {DEFAULT_SCHEME!r}, not {scheme!r}.")
-        tracer = make_tracer(mesh, key)
-        result, info = tracer.fingerprint(recipient, budget)
-        said, reads = f"fingerprint of {recipient}", lambda mesh: tracer.finds(mesh, recipient)
+        tracer, name = make_tracer(mesh, key), str(recipient)
+        result, info = tracer.fingerprint(name, budget)
+        said, reads = f"fingerprint of {recipient}", lambda mesh: tracer.finds(mesh, name)
     with _replacing(marked) as draft, _replacing(record_file) as record_draft:
         save_mesh(result, draft, like=original)
         # What counts is the file: its numbers are rounded.

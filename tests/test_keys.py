@@ -9,7 +9,6 @@ import jaxmark as jm
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import commitment, derive, geometry_hash, permutation, signs
 from jaxmark.mesh import make_mesh
-from jaxmark.message import encode
 from jaxmark.sequences import orthogonal_sequences
 
 TETRAHEDRON = make_mesh(
@@ -26,8 +25,6 @@ def test_golden(key: jm.Key):
     assert permutation(key, geometry, "rows", 12).tolist() == [11, 0, 10, 6, 7, 5, 9, 8, 2, 4, 1, 3]
     rows = ["".join("+" if s > 0 else "-" for s in row) for row in orthogonal_sequences(key, geometry, 3, 12)]
     assert rows == ["-++++---+---", "++--+-+-+++-", "+-+---+++---"]
-    code = encode(bytes.fromhex("c0ffee"), key, geometry)
-    assert np.packbits(code > 0).tobytes().hex() == "c0ffee550c609b"
 
 
 def test_is_shake_256_with_a_label(key: jm.Key):

@@ -8,7 +8,7 @@ import jaxmark as jm
 from jaxmark import distortion
 from jaxmark.mesh import Mesh, make_mesh
 from jaxmark.message import encode
-from jaxmark.schemes import EigenScheme, HostScheme
+from jaxmark.schemes import EigenScheme, HostScheme, KeyedScheme
 from tests.samples import bumpy_sphere, exact_sheet
 
 MESSAGE = bytes.fromhex("0123456789abcdef")
@@ -54,14 +54,31 @@ def test_precisions_read_each_other(sphere: Mesh, key: jm.Key, scheme):
 def test_golden_displacement(key: jm.Key):
     """Held within a tolerance, for ever: the same mark on the same mesh."""
     mesh = exact_sheet(20)
-    marked, _ = jm.embed(mesh, b"\xc0\xff\xee", key, scheme=HostScheme(bands=64))
-    shift = 1e3 * (marked.vertices - mesh.vertices)[[0, 50, 100, 150]]
-    golden = [[-15.484, -5.869, -58.311], [1.913, -7.783, 0.393], [16.586, 8.25, 37.498], [5.61, 5.19, -10.514]]
-    np.testing.assert_allclose(shift, golden, atol=0.02)
-    marked, _ = jm.embed(mesh, b"\xc0\xff\xee", key, scheme=EigenScheme(pairs=32))
-    shift = 1e3 * (marked.vertices - mesh.vertices)[[0, 50, 100, 150]]
-    golden = [[24.692, -9.711, 31.279], [-2.858, 9.111, 9.88], [10.413, -9.114, 4.785], [19.78, -0.23, 9.279]]
-    np.testing.assert_allclose(shift, golden, atol=0.02)
+    for scheme, message, golden in [
+        (
+            KeyedScheme(),
+            b"\xc0",
+            [[-19.017, -31.94, 1.251], [16.167, 14.955, 15.839], [21.15, 8.627, -2.253], [-9.56, 9.741, 13.333]],
+        ),
+        (
+            KeyedScheme(direction="normals"),
+            b"\xc0",
+            [[-8.617, -7.818, 18.295], [-3.866, -3.008, -21.121], [1.101, 7.392, 20.352], [-5.586, -1.481, -20.897]],
+        ),
+        (
+            HostScheme(bands=64),
+            b"\xc0\xff\xee",
+            [[37.164, -0.895, -7.91], [4.745, -9.017, 0.993], [-11.729, 9.17, 17.165], [-12.876, 2.386, -9.905]],
+        ),
+        (
+            EigenScheme(pairs=32),
+            b"\xc0\xff\xee",
+            [[-2.976, -31.77, -26.949], [10.936, 9.312, 2.682], [12.766, -0.352, -12.194], [-0.457, -0.484, 20.686]],
+        ),
+    ]:
+        marked, _ = jm.embed(mesh, message, key, scheme=scheme, noise=0.0)
+        shift = 1e3 * (marked.vertices - mesh.vertices)[[0, 50, 100, 150]]
+        np.testing.assert_allclose(shift, golden, atol=0.02)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -233,7 +250,7 @@ def test_refusals(sphere: Mesh, key: jm.Key):
 
 
 def test_schemes_are_data():
-    for scheme in (HostScheme(), EigenScheme(pairs=10)):
+    for scheme in (KeyedScheme(direction="normals"), HostScheme(), EigenScheme(pairs=10)):
         again = jm.schemes.get_scheme(scheme.name, dataclasses.asdict(scheme))
         assert again == scheme
     for parameters in ({"bands": "many"}, {"colour": 1}):
