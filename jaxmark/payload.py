@@ -111,6 +111,8 @@ class Capacity:
         left = self._rooms[layout]
         if conditions.coverage * left.dimensions < needed_dimensions(bits):
             return math.inf
+        if conditions.noise == 0:
+            return 0.0
         needed = needed_energy(bits, conditions.coverage * left.dimensions)
         vertices = conditions.coverage * left.energy * int(original.used.sum())
         points = original.positions[original.used]
