@@ -10,9 +10,10 @@ from jaxtyping import Bool, Float64
 from jaxmark.mesh import Mesh
 from jaxmark.original import Original, residual
 
-# A point is masked if it is off by more than this, and by more than so many times what 60 % of the points are off.
+# A point is masked if it is off by more than this, and by more than so many times what 40 % of the points are off.
 _FAR = 0.005
 _OFF = 10.0
+_TRIMS = 30
 _ROUNDS = 10
 _ROUNDING = 1e-12  # of sums over all points; a smaller residual is none
 
@@ -37,7 +38,7 @@ def align(original: Original, suspect: Mesh) -> tuple[Float64[np.ndarray, "point
     sound = original.used & (spread <= 1e6 * max(np.quantile(spread[original.used], 0.6), 1e-9))
     x, y = x[sound], x[sound] + moved[sound]
     fits = [_fit(x, y, agreeing) for agreeing in (np.ones(len(x), bool), _agreeing(spread[sound]))]
-    error, agreeing = min(fits, key=lambda fit: np.quantile(np.linalg.norm(fit[0], axis=1), 0.6))
+    error, agreeing = min(fits, key=lambda fit: np.quantile(np.linalg.norm(fit[0], axis=1), 0.4))
     if np.abs(error).max() < _ROUNDING:
         error = np.zeros_like(error)
     displacement, weights = np.zeros(moved.shape), np.zeros(len(moved))
@@ -50,6 +51,12 @@ def _fit(
     x: Float64[np.ndarray, "points 3"], y: Float64[np.ndarray, "points 3"], agreeing: Bool[np.ndarray, " points"]
 ) -> tuple[Float64[np.ndarray, "points 3"], Bool[np.ndarray, " points"]]:
     """What is left of y - x after the affine map that fits the agreeing points, which it finds anew in each round."""
+    # Least trimmed squares first: what is far off must not draw the fit towards itself.
+    for _ in range(_TRIMS):
+        error = np.linalg.norm(_affine(x, _similar(x, y, agreeing), agreeing) - x, axis=1)
+        before, agreeing = agreeing, error <= np.quantile(error, 0.5)
+        if np.array_equal(agreeing, before):
+            break
     rounds = 0
     while True:
         error = _affine(x, _similar(x, y, agreeing), agreeing) - x

@@ -76,11 +76,11 @@ def joint(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Ar
 
     def forward(bits: Array) -> Array:
         spread = carrier.modulate(bits, model)
-        return filter(host.operator, whitening, clean(host, seen, received.factor, spread))
+        return filter(host.operator, whitening, clean(host, received.seen, received.factor, spread))
 
     def backward(white: Array) -> Array:
         dull = transpose(host.operator, whitening, white)
-        return carrier.correlate(clean(host, seen, received.factor, dull), model)
+        return carrier.correlate(clean(host, received.seen, received.factor, dull), model)
 
     def white(x: Array) -> Array:
         return filter(host.operator, whitening, x)
@@ -93,7 +93,7 @@ def joint(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Ar
     bits = jax.random.rademacher(key_bits, matched.shape, matched.dtype)
     signs = jax.random.rademacher(key_noise, observed.shape, observed.dtype)
     coloured = filter(host.operator, host.coefficients.T @ jnp.sqrt(received.power), signs)
-    response, noise = backward(forward(bits)), white(clean(host, seen, received.factor, coloured))
+    response, noise = backward(forward(bits)), white(clean(host, received.seen, received.factor, coloured))
     ridge = _noise_to_signal(
         jnp.stack([jnp.sum(observed**2), jnp.sum(matched**2)]),
         jnp.stack([bits @ response, jnp.sum(response**2)]),

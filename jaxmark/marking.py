@@ -165,7 +165,9 @@ class Marker:
         if least <= conditions.budget:
             return
         most = room.bits(conditions)
-        mend = "Use a shorter message" + (f", or a budget of at least {least:.2g}" if math.isfinite(least) else "")
+        mend = "Use a shorter message"
+        if math.isfinite(least):
+            mend += f", or a budget of at least {math.ceil(1e6 * least) / 1e6:g}"
         raise JaxmarkError(
             f"This mesh ({int(self.original.used.sum())} points) carries at most {most} bits at a budget of"
             f" {conditions.budget:g}, with noise of {conditions.noise:g} and half of it lost, not {self.bits}. {mend}."

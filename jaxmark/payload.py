@@ -63,10 +63,11 @@ def needed_energy(bits: int, dimensions: float) -> float:
     """E/N0 with which the whole chain reads so many bits, but for about one message in a thousand.
 
     The code takes `_GAP` more than the least for message and tag. To one bit, the others are noise of E in all the
-    dimensions: with N0/2 of noise in each, E is worth E/(1 + 2(E/N0)/dimensions). Infinite where that is never enough.
+    dimensions, of which joint decoding takes off half: E/N0 is worth (E/N0)/(1 + (E/N0)/dimensions). Infinite where
+    that is never enough.
     """
     alone = 10 ** (_GAP / 10) * least_energy(bits + TAG_BITS)
-    crowded = 1 - 2 * alone / dimensions
+    crowded = 1 - alone / dimensions
     return alone / crowded if crowded > 0 else math.inf
 
 
