@@ -4,7 +4,7 @@ Message error rate of the whole chain against Eb/N0: messages are written by `Ma
 on every coordinate, and the suspects are read by what `jaxmark.detect` calls: `Marker.observe` (affine alignment),
 `Marker.soft_values` (projection, joint detector) and `message.decode` (list decoder, keyed tag). A wrong message and
 none are both errors. Before it the code alone: the same decoder on code bits in white Gaussian noise, where a word is
-read if it is on the list, as the tag picks it but with probability 32 · 2^-28. `--code-only` stops there; without a
+read if it is on the list, as the tag picks it but with probability 64 · 2^-28. `--code-only` stops there; without a
 MESH, codes are then as long as is of use.
 
 Eb/N0 = η |w|² / (2 k σ²): w is the mark as written, η the share of such marks that survives the projection (`energy` of

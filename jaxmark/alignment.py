@@ -73,20 +73,20 @@ def _agreeing(error: Float64[np.ndarray, " points"]) -> Bool[np.ndarray, " point
 def _similar(
     x: Float64[np.ndarray, "points 3"], y: Float64[np.ndarray, "points 3"], agreeing: Bool[np.ndarray, " points"]
 ) -> Float64[np.ndarray, "points 3"]:
-    """Y by the similarity that fits x best (Umeyama, IEEE PAMI 13, 1991, eq. 39-42)."""
+    """The points y by the similarity that fits x best (Umeyama, IEEE PAMI 13, 1991, eq. 39-42)."""
     to, back = x[agreeing].mean(axis=0), y[agreeing].mean(axis=0)
     target, source = x[agreeing] - to, y[agreeing] - back
     u, size, vt = np.linalg.svd(target.T @ source)
-    size[2] *= np.sign(np.linalg.det(u @ vt))
-    turn = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    scale = size.sum() / max((source**2).sum(), np.finfo(float).tiny)
+    proper = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])  # a rotation, no reflection
+    turn = u * proper @ vt
+    scale = (size * proper).sum() / max((source**2).sum(), np.finfo(float).tiny)
     return to + scale * (y - back) @ turn.T
 
 
 def _affine(
     x: Float64[np.ndarray, "points 3"], y: Float64[np.ndarray, "points 3"], agreeing: Bool[np.ndarray, " points"]
 ) -> Float64[np.ndarray, "points 3"]:
-    """Y by the affine map that fits x best."""
+    """The points y by the affine map that fits x best."""
     to, back = x[agreeing].mean(axis=0), y[agreeing].mean(axis=0)
     source, difference = y[agreeing] - back, x[agreeing] - to - (y[agreeing] - back)
     variance, axes = np.linalg.eigh(source.T @ source)

@@ -51,6 +51,13 @@ class _Hexadecimal(click.ParamType):
 _MESH = click.Path(path_type=Path)
 _KEY = click.option("--key", "key_file", type=_MESH, required=True, help="Key file, from `jaxmark keygen`.")
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
+_NOISE = click.option(
+    "--noise",
+    type=float,
+    default=NOISE,
+    show_default=True,
+    help="Noise that the message must survive: half width, relative to the mean distance of vertices to the centre.",
+)
 _ALPHA = click.option(
     "--alpha", type=float, default=1e-6, show_default=True, help="Largest false-positive probability that counts."
 )
@@ -102,13 +109,7 @@ def keygen(keyfile: Path, as_json: bool) -> None:
 @click.option("--message", type=_Hexadecimal(), help="Hexadecimal digits; 16 of them are 64 bits.")
 @click.option("--recipient", help="Instead of a message: whose copy it is, for `jaxmark identify`.")
 @_BUDGET
-@click.option(
-    "--noise",
-    type=float,
-    default=NOISE,
-    show_default=True,
-    help="Noise that the message must survive with half of the vertices lost (see `jaxmark capacity`).",
-)
+@_NOISE
 @click.option(
     "--scheme",
     type=click.Choice(list(SCHEMES)),
@@ -328,13 +329,7 @@ def compare(original: Path, distorted: Path, as_json: bool) -> None:
 @cli.command(name="capacity")
 @click.argument("mesh", type=_MESH)
 @_BUDGET
-@click.option(
-    "--noise",
-    type=float,
-    default=NOISE,
-    show_default=True,
-    help="Half width of uniform noise, relative to the mean distance of the vertices to their centre.",
-)
+@_NOISE
 @click.option("--coverage", type=float, default=COVERAGE, show_default=True, help="Share of the vertices that is left.")
 @_JSON
 def capacity_command(mesh: Path, budget: float, noise: float, coverage: float, as_json: bool) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from jaxmark import distortion, evidence
 from jaxmark.alignment import align
-from jaxmark.carriers import Carrier
+from jaxmark.carriers import Carrier, KeyedCarrier
 from jaxmark.detectors import Detector
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import Key, commitment
@@ -78,8 +78,8 @@ class Marker:
         _check_budget(budget)
         if not 0 <= noise < math.inf:
             raise JaxmarkError(f"The noise to survive is a number of at least 0, got {noise}.")
-        if isinstance(self.scheme, KeyedScheme):
-            self._check_capacity(self.scheme, Conditions(budget, noise, COVERAGE))
+        if isinstance(self.scheme, KeyedScheme) and isinstance(self.carrier, KeyedCarrier):
+            self._check_capacity(self.scheme, self.carrier, Conditions(budget, noise, COVERAGE))
         marked, info = self.write(encode(message, self.key, self.original.geometry, self.code), budget)
         if self.detect(marked).message != message:
             raise JaxmarkError(
@@ -159,8 +159,8 @@ class Marker:
             raise JaxmarkError(f"weights must be {len(point)} finite numbers, not negative, one for each vertex.")
         return np.bincount(point, given) / np.bincount(point)
 
-    def _check_capacity(self, scheme: KeyedScheme, conditions: Conditions) -> None:
-        room = Capacity(self.original, scheme)
+    def _check_capacity(self, scheme: KeyedScheme, carrier: KeyedCarrier, conditions: Conditions) -> None:
+        room = Capacity(self.original, scheme, {self.bits: carrier})
         least = room.least_budget(self.bits, conditions)
         if least <= conditions.budget:
             return

@@ -1,6 +1,7 @@
 """How many bits a mesh carries: room for them in the pass band, and energy for them in noise."""
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -91,9 +92,14 @@ class Conditions(NamedTuple):
 class Capacity:
     """How many bits an original carries by the keyed scheme; measures each layout once."""
 
-    def __init__(self, original: Original, scheme: KeyedScheme) -> None:
+    def __init__(
+        self, original: Original, scheme: KeyedScheme, known: Mapping[int, KeyedCarrier] | None = None
+    ) -> None:
+        """Carriers that exist already, by their payload, need not be made again."""
         self._original, self._scheme = original, scheme
-        self._rooms: dict[Layout, Room] = {}
+        self._rooms: dict[Layout, Room] = {
+            scheme.layout(original, bits): room(carrier, original) for bits, carrier in (known or {}).items()
+        }
 
     def least_budget(self, bits: int, conditions: Conditions) -> float:
         """With which budget so many bits are carried; infinite where the dimensions do not suffice.

@@ -87,8 +87,8 @@ def receive(host: Host, seen: Observation) -> Reception:
     seen = seen._replace(weights=seen.weights * strange)
     factor = _factor(host, seen)
     # Twice, because the ridge leaves a little of a large nuisance behind.
-    once = seen.residual - _explained(host, seen, factor, seen.residual)
-    residual = clean(host, seen, factor, once)
+    nuisance = _explained(host, seen, factor, seen.residual)
+    residual = clean(host, seen, factor, seen.residual - nuisance)
     # A reference that is as strong in every direction as in any other.
     probe = jax.random.rademacher(jax.random.key(0), residual.shape, residual.dtype)
     bands = _energies(host, residual)
@@ -99,8 +99,7 @@ def receive(host: Host, seen: Observation) -> Reception:
     power = jnp.where(largest > 0, power / jnp.where(largest > 0, largest, 1), 1)
 
     # Where nothing is seen, the host is taken to have moved as the nuisance says: a hole would leak into every band.
-    filled = residual + _explained(host, seen, factor, seen.residual)
-    moved = band_components(host.operator, host.coefficients, filled)
+    moved = band_components(host.operator, host.coefficients, residual + nuisance)
     still = band_components(host.operator, host.coefficients, host.signal)
     mass = per_row(host.operator.degree, residual)
     change = jnp.sum(mass * moved * still, axis=(1, 2))

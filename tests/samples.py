@@ -7,12 +7,16 @@ from jaxmark.mesh import Mesh, make_mesh
 
 
 def bumpy_sphere(level: int, seed: int = 0) -> Mesh:
+    """A `rough_sphere` of 10 · 4^level + 2 vertices, as many as a subdivided icosahedron has."""
+    return rough_sphere(10 * 4**level + 2, seed)
+
+
+def rough_sphere(count: int, seed: int = 0) -> Mesh:
     """A closed surface of irregular triangles, with bumps, and a little roughness so that no band is empty.
 
-    10 · 4^level + 2 vertices. Random points on a sphere, joined by their convex hull: unlike a subdivided icosahedron,
-    its graph has no symmetry, and so no repeated eigenvalues.
+    Random points on a sphere, joined by their convex hull: unlike a subdivided icosahedron, its graph has no symmetry,
+    and so no repeated eigenvalues.
     """
-    count = 10 * 4**level + 2
     random = np.random.default_rng(seed)
     # A spiral spreads points evenly, a shake makes them irregular.
     turn = np.arange(count) * np.pi * (3 - np.sqrt(5))

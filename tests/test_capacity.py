@@ -7,7 +7,6 @@ import re
 import numpy as np
 import pytest
 from scipy import integrate, optimize
-from scipy.spatial import ConvexHull
 
 import jaxmark as jm
 from jaxmark.bands import scaling
@@ -16,29 +15,15 @@ from jaxmark.original import prepare
 from jaxmark.payload import Capacity, Conditions, least_energy, needed_dimensions, needed_energy, room
 from jaxmark.schemes import KeyedScheme
 from tests.dense import chebyshev_matrices
-from tests.samples import bumpy_sphere
+from tests.samples import bumpy_sphere, rough_sphere
 
 USUAL = Conditions(budget=8e-4, noise=0.005, coverage=0.5)
-
-
-def irregular_sphere(count: int) -> Mesh:
-    """`bumpy_sphere` with any number of vertices."""
-    random = np.random.default_rng(0)
-    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
-    height = 1 - (2 * np.arange(count) + 1) / count
-    ring = np.sqrt(1 - height**2)
-    points = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1)
-    points += 0.5 / np.sqrt(count) * random.normal(size=points.shape)
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    bumps = np.sin(points @ (2 * random.normal(size=(3, 6))) + random.uniform(0, 6, 6)).sum(axis=1)
-    radius = 1 + 0.05 * bumps + 0.01 * random.normal(size=count)
-    return make_mesh(points * radius[:, None] * [1.0, 0.8, 1.3], ConvexHull(points).simplices)
 
 
 @pytest.fixture(scope="module")
 def thousand() -> Mesh:
     """1,100 vertices."""
-    return irregular_sphere(1100)
+    return rough_sphere(1100)
 
 
 @pytest.fixture(scope="module")
