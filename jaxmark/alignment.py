@@ -35,11 +35,11 @@ def align(original: Original, suspect: Mesh) -> tuple[Float64[np.ndarray, "point
     x = np.asarray(original.positions, np.float64)
     # A coordinate of 1e200 would spoil every sum; such a point is lost in any case.
     spread = np.abs(moved - np.median(moved[original.used], axis=0)).max(axis=1)
-    sound = original.used & (spread <= 1e6 * max(np.quantile(spread[original.used], 0.6), 1e-9))
+    sound = original.used & (spread <= 1e6 * max(np.quantile(spread[original.used], 0.6), 1e-6))
     x, y = x[sound], x[sound] + moved[sound]
     fits = [_fit(x, y, agreeing) for agreeing in (np.ones(len(x), bool), _agreeing(spread[sound]))]
     error, agreeing = min(fits, key=lambda fit: np.quantile(np.linalg.norm(fit[0], axis=1), 0.4))
-    if np.abs(error).max() < _ROUNDING:
+    if np.abs(error[agreeing]).max() < _ROUNDING:
         error = np.zeros_like(error)
     displacement, weights = np.zeros(moved.shape), np.zeros(len(moved))
     displacement[sound] = np.where(agreeing[:, None], error, 0)

@@ -16,7 +16,7 @@ from jaxmark.carriers.carrier import Strength
 from jaxmark.chebyshev import filter, transpose
 from jaxmark.errors import JaxmarkError
 from jaxmark.observation import Observation
-from jaxmark.reception import clean, receive
+from jaxmark.reception import clean, receive, whitening
 
 Detector = Callable[[Carrier, Observation, Strength], Float[Array, " bits"]]
 
@@ -72,18 +72,18 @@ def joint(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Ar
     host = carrier.host
     received = receive(host, seen)
     model = carrier.shape(beta, received.gain)
-    whitening = host.coefficients.T @ (1 / jnp.sqrt(received.power))
+    equaliser = whitening(host, received.power)
 
     def forward(bits: Array) -> Array:
         spread = carrier.modulate(bits, model)
-        return filter(host.operator, whitening, clean(host, received.seen, received.factor, spread))
+        return white(clean(host, received.seen, received.factor, spread) @ received.axes)
 
     def backward(white: Array) -> Array:
-        dull = transpose(host.operator, whitening, white)
+        dull = transpose(host.operator, equaliser, white) @ received.axes
         return carrier.correlate(clean(host, received.seen, received.factor, dull), model)
 
     def white(x: Array) -> Array:
-        return filter(host.operator, whitening, x)
+        return filter(host.operator, equaliser, x)
 
     observed = white(received.residual)
     matched = backward(observed)

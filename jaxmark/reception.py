@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmark.bands import diffusion
-from jaxmark.chebyshev import band_components
+from jaxmark.chebyshev import band_components, filter
 from jaxmark.laplacian import Laplacian, per_row
 from jaxmark.observation import Observation
 
@@ -31,9 +31,10 @@ class Host(NamedTuple):
 class Reception(NamedTuple):
     """A suspect as the receiver sees it; free of the key."""
 
-    residual: Float[Array, "vertices 3"]  # weighed, and free of nuisance
+    residual: Float[Array, "vertices 3"]  # weighed, free of nuisance, as strong along each direction as along any other
     gain: Float[Array, " bands"]  # what the attack left of the host, and so of the mark
     power: Float[Array, " bands"]  # residual energy per dimension, relative to the largest
+    axes: Float[Array, "3 3"]  # what made it so, symmetric
     seen: Observation
     factor: Float[Array, "unknowns unknowns"]  # Cholesky factor of the nuisance as it is seen
 
@@ -76,7 +77,7 @@ def make_host(
 
 
 def receive(host: Host, seen: Observation) -> Reception:
-    """Project the nuisance off a residual, and measure gain and power of each band.
+    """Project the nuisance off a residual, and measure gain and power of each band, and the power along each direction.
 
     Args:
         host: from `make_host`.
@@ -96,7 +97,7 @@ def receive(host: Host, seen: Observation) -> Reception:
     tiny = 1e-6
     power = (bands + tiny * bands.sum()) / (reference + tiny * reference.sum() + jnp.finfo(bands.dtype).tiny)
     largest = power.max()
-    power = jnp.where(largest > 0, power / jnp.where(largest > 0, largest, 1), 1)
+    power = jnp.where(largest > 0, jnp.maximum(power / jnp.where(largest > 0, largest, 1), 1e-9), 1)
 
     # Where nothing is seen, the host is taken to have moved as the nuisance says: a hole would leak into every band.
     moved = band_components(host.operator, host.coefficients, residual + nuisance)
@@ -105,7 +106,41 @@ def receive(host: Host, seen: Observation) -> Reception:
     change = jnp.sum(mass * moved * still, axis=(1, 2))
     whole = jnp.sum(mass * still**2, axis=(1, 2))
     gain = 1 + jnp.where(whole > 0, change / jnp.where(whole > 0, whole, 1), 0)
-    return Reception(residual, jnp.clip(gain, 0, 2), power, seen, factor)
+    axes = _axes(filter(host.operator, whitening(host, power), residual), seen)
+    return Reception(residual @ axes, jnp.clip(gain, 0, 2), power, axes, seen, factor)
+
+
+def whitening(host: Host, power: Float[Array, " bands"]) -> Float[Array, " terms"]:
+    """Coefficients of the filter that makes all bands equally strong."""
+    return host.coefficients.T @ (1 / jnp.sqrt(power))
+
+
+def _axes(white: Float[Array, "vertices 3"], seen: Observation) -> Float[Array, "3 3"]:
+    """C^-1/2 of the covariance C of the three coordinates, which an inverted stretch leaves unequal; of mean 1."""
+    if seen.normals is not None:
+        return jnp.eye(3, dtype=white.dtype)
+    products = white.T @ white
+    total = jnp.trace(products)
+    covariance = products / jnp.where(total > jnp.finfo(white.dtype).tiny, total, 1)
+    # A direction in which nothing moved is not to count for everything.
+    axes = _inverse_root(covariance + 1e-4 * jnp.eye(3, dtype=white.dtype))
+    return axes / (jnp.trace(axes) / 3)
+
+
+@jax.custom_jvp
+def _inverse_root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """A^-1/2 of a symmetric positive matrix; its derivative (Daleckii, Krein 1965) exists where eigenvalues meet."""
+    values, vectors = jnp.linalg.eigh(matrix)
+    return vectors / jnp.sqrt(values) @ vectors.T
+
+
+@_inverse_root.defjvp
+def _inverse_root_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    values, vectors = jnp.linalg.eigh(primals[0])
+    root = jnp.sqrt(values)
+    slopes = -1 / (jnp.outer(root, root) * (root[:, None] + root))
+    change = vectors @ (slopes * (vectors.T @ tangents[0] @ vectors)) @ vectors.T
+    return vectors / root @ vectors.T, change
 
 
 def _robust(residual: Float[Array, "vertices 3"], weights: Float[Array, " vertices"]) -> Float[Array, " vertices"]:

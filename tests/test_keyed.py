@@ -311,13 +311,13 @@ def solved(carrier: KeyedCarrier, seen: Observation, beta: jax.Array) -> jax.Arr
 @pytest.mark.parametrize("condition", CONDITIONS)
 @pytest.mark.parametrize("noise", [0.0, 3.0])
 def test_joint_is_regularised_least_squares(condition, noise, small: Case, key: jm.Key, x64):
-    """(AᵀA + ρ)⁻¹Aᵀy with dense matrices, A = whitening · weighted projector · shaped chips · signs."""
+    """(AᵀA + ρ)⁻¹Aᵀy with dense matrices, A = whitening · axes · weighted projector · shaped chips · signs."""
     carrier = make_carrier(small, key, np.float64)
     random = np.random.default_rng(7)
     message = random.choice([-1.0, 1.0], BITS)
     beta = random.uniform(0.5, 1, len(FAMILY))
     residual = np.asarray(carrier.displacement(jnp.asarray(message), jnp.asarray(beta)))
-    residual = residual + noise * residual.std() * random.normal(size=residual.shape)
+    residual = residual + noise * residual.std() * random.normal(size=residual.shape) @ np.diag([1.0, 4.0, 0.5])
     seen = make_seen(small, condition, 1e-3 * residual, np.float64)
     soft = np.asarray(solved(carrier, seen, jnp.asarray(beta)))
 
@@ -333,7 +333,7 @@ def dense_equations(case: Case, carrier: KeyedCarrier, seen: Observation, beta) 
     """AᵀA and Aᵀy, given what is received."""
     received = receive(carrier.host, seen)
     clean = dense_clean(carrier, received.seen)
-    whitening = np.kron(np.einsum("j,juv->uv", 1 / np.sqrt(received.power), case.filters), np.eye(3))
+    whitening = np.kron(np.einsum("j,juv->uv", 1 / np.sqrt(received.power), case.filters), received.axes)
     model = shaping(case, (np.asarray(received.gain) * beta)[:, None] * np.ones(3), "coordinates")
     system = whitening @ clean @ model @ spreading(carrier)
     return system.T @ system, system.T @ whitening @ clean @ np.asarray(seen.residual).ravel()

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import linalg
 
 from jaxmark.bands import diffusion, scaling
 from jaxmark.chebyshev import filter
@@ -54,6 +55,11 @@ def apply(case: Case, function: np.ndarray, x: np.ndarray) -> np.ndarray:
 def responses(case: Case) -> np.ndarray:
     """f_j(λ) at the eigenvalues, `[bands, N]`."""
     return np.polynomial.chebyshev.chebval(case.values - 1, FAMILY.T)
+
+
+def bands(case: Case) -> np.ndarray:
+    """f_j(Δ), dense."""
+    return np.einsum("uk,jk,vk,v->juv", case.vectors, responses(case), case.vectors, case.operator.degree)
 
 
 def looking(case: Case, condition: str, residual: np.ndarray, dtype) -> Observation:
@@ -160,7 +166,7 @@ def test_clean_is_a_weighted_projection(condition, case: Case, x64):
 
     scale = np.abs(project(a)).max()
     np.testing.assert_allclose(project(a), dense_clean(case, seen, a), atol=1e-7 * scale)
-    np.testing.assert_allclose(received.residual, dense_clean(case, seen, a), atol=1e-7 * scale)
+    np.testing.assert_allclose(received.residual, dense_clean(case, seen, a) @ received.axes, atol=1e-7 * scale)
     assert np.vdot(project(a), b) == pytest.approx(np.vdot(a, project(b)), rel=1e-9, abs=1e-9 * scale)
     # Without the weights it changes nothing when it is done again.
     weights = np.asarray(seen.weights)[:, None]
@@ -218,6 +224,27 @@ def test_power_is_the_spectrum_of_noise(steps, condition, case: Case, x64):
     assert (np.abs(ratio - ratio.mean()) < error).all()
 
 
+@pytest.mark.parametrize("condition", ["everything", "half", "weights"])
+def test_axes_make_directions_alike(condition, case: Case, x64):
+    """The inverse root of the covariance of noise, by SciPy, whatever its colour."""
+    x, random = jnp.asarray(case.x), np.random.default_rng(6)
+    host = make_host(case.operator, x, x, FAMILY, scales=0, degree=1)
+    stretch = random.normal(size=(3, 3)) + np.diag([4.0, 1.0, 1.0])
+    root = np.linalg.inv(linalg.sqrtm(stretch.T @ stretch))
+    found = []
+    for _ in range(20):
+        noise = apply(case, (1 - case.values / 2) ** 2, random.normal(size=x.shape)) @ stretch
+        received = receive(host, looking(case, condition, noise, np.float64))
+        equal = np.einsum("j,juv->uv", 1 / np.sqrt(received.power), bands(case)) @ received.residual
+        products = equal.T @ equal
+        # Up to what keeps a direction without noise from counting for everything.
+        np.testing.assert_allclose(products / np.trace(products), np.eye(3) / 3, atol=2e-2)
+        found.append(received.axes)
+    np.testing.assert_allclose(np.mean(found, axis=0), 3 * root / np.trace(root), atol=0.1)
+    along = receive(host, looking(case, "normals", noise, np.float64))
+    np.testing.assert_array_equal(along.axes, np.eye(3))
+
+
 def test_strange_points_count_for_less(case: Case, x64):
     """Huber's weights by their definition, on the residual without its nuisance."""
     random = np.random.default_rng(4)
@@ -271,7 +298,12 @@ def test_differentiable_with_respect_to_suspect_and_original(case: Case, x64):
     def loss(suspect, original):
         host = make_host(case.operator, original, original, FAMILY, scales=SCALES, degree=DEGREE)
         received = receive(host, observe(suspect - original))
-        return jnp.sum(jnp.sin(20 * received.residual)) + jnp.sum(received.gain) + jnp.sum(jnp.sin(received.power))
+        return (
+            jnp.sum(jnp.sin(20 * received.residual))
+            + jnp.sum(received.gain)
+            + jnp.sum(jnp.sin(received.power))
+            + jnp.sum(jnp.sin(received.axes * jnp.arange(3.0)))
+        )
 
     value_and_slopes = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))
     suspect = jnp.asarray(apply(case, (1 - case.values / 2) ** 2, case.x) + 0.02 * random.normal(size=x.shape))

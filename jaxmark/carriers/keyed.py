@@ -77,7 +77,7 @@ class KeyedCarrier(NamedTuple):
 
     def matched(self, received: Reception, beta: Strength = 1.0) -> Float[Array, "vertices channels"]:
         """The vector that the keyed signs multiply: the residual through the filter matched to gain and power."""
-        return self.match(received.residual, self.shape(beta, received.gain / received.power))
+        return self.match(received.residual @ received.axes, self.shape(beta, received.gain / received.power))
 
     def shape(self, beta: Strength, weight: Float[Array, " bands"] | None = None) -> Float[Array, " terms *channels"]:
         """Chebyshev coefficients of Σ_j weight_j β_j f_j."""
