@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from scipy import optimize, stats
 
 from jaxmark.carriers import KeyedCarrier
@@ -30,20 +31,20 @@ class Room(NamedTuple):
 
 def room(carrier: KeyedCarrier, original: Original) -> Room:
     """Measure a carrier by one probe of random signs in place of the keyed ones."""
-    host = carrier.host
-    moving = jnp.asarray(original.used, host.signal.dtype)
-    shape = carrier.shape(1.0)
-    signs = jax.random.rademacher(jax.random.key(2), carrier.chips.signs.shape, host.signal.dtype) * moving[:, None]
+    kept, written, again = map(float, _probe(carrier, jnp.asarray(original.used, carrier.host.signal.dtype)))
+    return Room(kept**2 / again if again > 0 else 0.0, kept / written if written > 0 else 0.0)
+
+
+@jax.jit
+def _probe(carrier: KeyedCarrier, moving: Float[Array, " vertices"]) -> tuple[Array, Array, Array]:
+    """Energies of a probe of random signs: of what the projection leaves of it, as written, and of what is matched."""
+    host, shape = carrier.host, carrier.shape(1.0)
+    signs = jax.random.rademacher(jax.random.key(2), carrier.chips.signs.shape, moving.dtype) * moving[:, None]
     probe = carrier.shaped(signs, shape)
     received = receive(host, observe(jnp.zeros_like(host.signal), moving))
     kept = clean(host, received.seen, received.factor, probe)
     again = carrier.match(kept, shape) * moving[:, None]
-    energy = jnp.sum(probe * kept)
-    spread = jnp.sum(again**2)
-    return Room(
-        float(energy**2 / jnp.where(spread > 0, spread, 1)),
-        float(energy / jnp.maximum(jnp.sum(probe**2), jnp.finfo(probe.dtype).tiny)),
-    )
+    return jnp.sum(probe * kept), jnp.sum(probe**2), jnp.sum(again**2)
 
 
 def least_energy(bits: int, error: float = 1e-3) -> float:
