@@ -12,11 +12,12 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import click
 
 from jaxmark import distortion
+from jaxmark.alignment import Align
 from jaxmark.attacks import ATTACKS, attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
@@ -24,6 +25,7 @@ from jaxmark.files.atomic import write_atomically
 from jaxmark.keys import commitment, load_key, new_key, save_key
 from jaxmark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity, detect, make_marker
 from jaxmark.record import RECORD_SUFFIX, Record
+from jaxmark.report import save_report
 from jaxmark.schemes import DEFAULT_SCHEME, SCHEMES
 from jaxmark.tracing import identify, make_tracer
 
@@ -57,6 +59,14 @@ _NOISE = click.option(
     default=NOISE,
     show_default=True,
     help="Noise that the message must survive: half width, relative to the mean distance of vertices to the centre.",
+)
+_ALIGN = click.option(
+    "--align",
+    "how",
+    type=click.Choice(get_args(Align)),
+    default="auto",
+    show_default=True,
+    help="same: vertex by vertex in one order; similarity, affine: by surface, up to such a map; auto: as it can.",
 )
 _ALPHA = click.option(
     "--alpha", type=float, default=1e-6, show_default=True, help="Largest false-positive probability that counts."
@@ -196,6 +206,8 @@ def embed_command(
     type=click.Choice(list(SCHEMES)),
     help=f"Without a record: what carries the bits.  [default: {DEFAULT_SCHEME}]",
 )
+@_ALIGN
+@click.option("--report", type=_MESH, help="Folder for a picture of how SUSPECT was aligned (needs the extra `plot`).")
 @_ALPHA
 @_JSON
 def detect_command(
@@ -206,10 +218,12 @@ def detect_command(
     message: bytes | None,
     record_file: Path | None,
     scheme: str | None,
+    how: Align,
+    report: Path | None,
     alpha: float,
     as_json: bool,
 ) -> None:
-    """Look for a mark in SUSPECT, which must share the original's vertex and face order.
+    """Look for a mark in SUSPECT: any file in any pose, in the original's connectivity or not.
 
     Exit status 0 if the false-positive probability is at most --alpha, else 1. It holds for any suspect made without
     the key, as long as key, original and a claimed message were fixed before the suspect was seen.
@@ -218,15 +232,20 @@ def detect_command(
     if record is not None and scheme not in (None, record.scheme):
         raise JaxmarkError(f"--scheme {scheme} contradicts the record, which says {record.scheme}.")
     key = load_key(key_file)
+    mesh, still = load_mesh(suspect), load_mesh(original)
     found = detect(
-        load_mesh(suspect),
-        original=load_mesh(original),
+        mesh,
+        original=still,
         key=key,
         bits=bits,
         message=message,
         record=record,
         scheme=scheme or DEFAULT_SCHEME,
+        align=how,
     )
+    aligned = found.alignment
+    if report is not None:
+        save_report(report, still, mesh, aligned)
     detected = found.detected(alpha)
     answer = {
         "detected": detected,
@@ -235,6 +254,12 @@ def detect_command(
         "message": None if found.message is None else found.message.hex(),
         "scores": [float(score) for score in found.scores],
         "coverage": found.coverage,
+        "alignment": {
+            "method": aligned.method,
+            "pose": {"matrix": aligned.pose.matrix.tolist(), "shift": aligned.pose.shift.tolist()},
+            "residual": aligned.residual,
+            "seconds": aligned.seconds,
+        },
     }
     read = f"message {answer['message']}" if found.message is not None else "no message could be read"
     _answer(

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy.typing import ArrayLike
 
-from jaxmark import distortion, evidence
-from jaxmark.alignment import align
+from jaxmark import alignment, distortion, evidence
+from jaxmark.alignment import Align, Alignment
 from jaxmark.carriers import Carrier, KeyedCarrier
 from jaxmark.detectors import Detector
 from jaxmark.errors import JaxmarkError
@@ -45,6 +45,7 @@ class Detection(NamedTuple):
     log10_p_fitted: float  # the same if the score were Gaussian: an estimate, which decides nothing
     scores: Float64[np.ndarray, " code"]  # soft values of the code bits, of root mean square 1
     coverage: float  # share of the original's points that the suspect gave evidence for
+    alignment: Alignment  # how the suspect was brought back to the original
 
     def detected(self, alpha: float = 1e-6) -> bool:
         """Whether the false-positive probability is at most `alpha`.
@@ -89,11 +90,14 @@ class Marker:
             )
         return marked, info
 
-    def detect(self, suspect: Mesh, message: bytes | None = None, weights: ArrayLike | None = None) -> Detection:
+    def detect(
+        self, suspect: Mesh, message: bytes | None = None, weights: ArrayLike | None = None, align: Align = "auto"
+    ) -> Detection:
         """Read a suspect, with a claimed message or without; see `detect`."""
         if message is not None:
             self._check_size(message)
-        seen = self.observe(suspect, weights)
+        aligned = alignment.align(self.original, suspect, align)
+        seen = self.observe(aligned, weights)
         soft = self.soft_values(seen)
         found = decode(soft, self.bits, self.key, self.original.geometry)
         log10_p = fitted = 0.0
@@ -110,7 +114,7 @@ class Marker:
             fitted = evidence.log10_p_fitted(score, norm, 0 if message is not None else self.bits)
         size = np.sqrt(np.mean(soft**2)) or 1.0
         coverage = float(np.mean(np.asarray(seen.weights)[self.original.used] > 0))
-        return Detection(found, log10_p, fitted, soft / size, coverage)
+        return Detection(found, log10_p, fitted, soft / size, coverage, aligned)
 
     def write(self, amplitudes: Float64[np.ndarray, " code"], budget: float) -> tuple[Mesh, EmbedInfo]:
         """Displace the original by the carrier of any amplitudes, scaled to the budget exactly."""
@@ -140,13 +144,13 @@ class Marker:
         )
         return marked, EmbedInfo(rms, float(distortion.maximum(written)), beta, record)
 
-    def observe(self, suspect: Mesh, weights: ArrayLike | None = None) -> Observation:
+    def observe(self, suspect: Mesh | Alignment, weights: ArrayLike | None = None) -> Observation:
         """What a suspect shows of each point's displacement, in diagonals; free of the key."""
-        original, dtype = self.original, self.original.signal.dtype
-        moved, agreeing = align(original, suspect)
-        if weights is not None:
-            agreeing = agreeing * self._per_point(weights)
-        return observe(jnp.asarray(moved, dtype), jnp.asarray(agreeing, dtype))
+        found = suspect if isinstance(suspect, Alignment) else alignment.align(self.original, suspect)
+        agreeing = found.weights if weights is None else found.weights * self._per_point(weights)
+        dtype = self.original.signal.dtype
+        normals = None if found.normals is None else jnp.asarray(found.normals, dtype)
+        return observe(jnp.asarray(found.displacement, dtype), jnp.asarray(agreeing, dtype), normals)
 
     def soft_values(self, seen: Observation) -> Float64[np.ndarray, " code"]:
         """One soft value per code bit."""
@@ -309,13 +313,15 @@ def detect(
     scheme: str | Scheme = DEFAULT_SCHEME,
     detector: Detector | None = None,
     weights: ArrayLike | None = None,
+    align: Align = "auto",
 ) -> Detection:
     """Read a mark from a suspect, and say what the reading proves.
 
-    The suspect is brought back by the best affine map first; points that are far off are masked. Without `message`, the
-    message read counts only if its keyed tag fits; two proofs are then tried and paid for: the tag, and the union bound
-    over all messages. With `message`, log10_p is Hoeffding's bound for that message (see `evidence.log10_p_claimed`),
-    which can prove a mark whose message no longer reads; a claim is refuted (0) where another message reads.
+    The suspect is brought back to the original first (`jaxmark.alignment.align`); points that are far off are masked.
+    Without `message`, the message read counts only if its keyed tag fits; two proofs are then tried and paid for: the
+    tag, and the union bound over all messages. With `message`, log10_p is Hoeffding's bound for that message (see
+    `evidence.log10_p_claimed`), which can prove a mark whose message no longer reads; a claim is refuted (0) where
+    another message reads.
 
     Both hold for any suspect independent of the key, provided that key, original and claimed message were fixed before
     the suspect was seen; that weights depend on suspect and original only; and that the score is the plain correlation
@@ -323,7 +329,7 @@ def detect(
     independent of it: once its message no longer reads, a claim that has many bits in common with it may pass.
 
     Args:
-        suspect: a mesh with the original's connectivity.
+        suspect: any mesh: moved, reordered, cropped, remeshed.
         original: the unmarked mesh.
         key: 32 bytes.
         bits: payload, a multiple of 8; by default the record's, else the claimed message's, else 64.
@@ -331,16 +337,18 @@ def detect(
         record: see `make_marker`.
         scheme: as embedded, where there is no record.
         detector: see `make_marker`.
-        weights: for each vertex of the suspect how far it may be trusted, 0 not at all; free of the key.
+        weights: for each vertex of the original how far what the suspect shows of it may be trusted, 0 not at all; free
+            of the key.
+        align: how the suspect is compared: `"auto"`, `"same"`, `"similarity"` or `"affine"`.
 
     Returns:
         What was found; a suspect identical to the original gives log10_p = 0.
 
     Raises:
-        JaxmarkError: as `make_marker`; also if the suspect has another connectivity, or the claimed message another
-            size than the payload.
+        JaxmarkError: as `make_marker`; also if the suspect cannot be aligned, or the claimed message has another size
+            than the payload.
     """
     if bits is None and record is None and isinstance(message, bytes):
         bits = 8 * len(message)
     marker = make_marker(original, key, bits=bits, record=record, scheme=scheme, detector=detector)
-    return marker.detect(suspect, message, weights)
+    return marker.detect(suspect, message, weights, align)

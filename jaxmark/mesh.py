@@ -132,12 +132,13 @@ def diagonal(mesh: Mesh) -> float:
 
 def vertex_normals(mesh: Mesh) -> Float64[np.ndarray, "vertices 3"]:
     """Unit normals, the area-weighted means of the faces'; zero where they cancel or there is no area."""
-    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    area = np.cross(b - a, c - a)
-    normals = np.stack([np.bincount(faces.ravel(), np.repeat(column, 3), len(vertices)) for column in area.T], axis=1)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    corner, area, size = np.ravel(mesh.faces), _areas(mesh), len(mesh.vertices)
+    return _unit(np.stack([np.bincount(corner, np.repeat(column, 3), size) for column in area.T], axis=1))
+
+
+def face_normals(mesh: Mesh) -> Float64[np.ndarray, "faces 3"]:
+    """Unit normals; zero where a face has no area."""
+    return _unit(_areas(mesh))
 
 
 def boundary_vertices(faces: Int[Array | np.ndarray, "faces 3"]) -> Int64[np.ndarray, " boundary"]:
@@ -158,6 +159,18 @@ def same_connectivity(first: Mesh, second: Mesh) -> bool:
     return len(first.vertices) == len(second.vertices) and np.array_equal(
         np.asarray(first.faces), np.asarray(second.faces)
     )
+
+
+def _areas(mesh: Mesh) -> Float64[np.ndarray, "faces 3"]:
+    """The faces' normals, as long as twice their areas."""
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return np.cross(b - a, c - a)
+
+
+def _unit(x: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3"]:
+    length = np.linalg.norm(x, axis=1, keepdims=True)
+    return np.divide(x, length, out=np.zeros_like(x), where=length > 0)
 
 
 def _count_sides(

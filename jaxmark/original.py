@@ -77,7 +77,7 @@ def displacement(mesh: Mesh, suspect: Mesh, welded: Weld, length: float) -> Floa
         raise JaxmarkError(
             f"The suspect ({len(suspect.vertices)} vertices, {len(suspect.faces)} triangles) does not share the"
             f" connectivity of the original ({len(mesh.vertices)} vertices, {len(mesh.faces)} triangles), in the same"
-            " vertex and face order; this version compares vertex by vertex."
+            " vertex and face order, as this comparison needs it."
         )
     difference = (np.asarray(suspect.vertices) - np.asarray(mesh.vertices)) / length
     used = used_vertices(mesh)

@@ -108,7 +108,7 @@ def identify(
     """Say whose copies a suspect was made of, and how surely.
 
     Args:
-        suspect: a mesh with the original's connectivity.
+        suspect: any mesh.
         recipients: all who were given a copy.
         original: the unmarked mesh.
         key: 32 bytes.
@@ -120,6 +120,6 @@ def identify(
         suspect scores so high, whatever the others did; it rests on the codewords alone (see `jaxmark.tardos`).
 
     Raises:
-        JaxmarkError: as `make_tracer`; also if the suspect has another connectivity, or an identifier is empty.
+        JaxmarkError: as `make_tracer`; also if the suspect cannot be aligned, or an identifier is empty.
     """
     return make_tracer(original, key, record=record).identify(suspect, recipients, top)

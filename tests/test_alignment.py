@@ -1,13 +1,17 @@
 """Suspects brought back to the original, against least squares by NumPy."""
 
+import sys
+
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
 from jaxmark.alignment import align
-from jaxmark.mesh import Mesh, make_mesh
+from jaxmark.mesh import Mesh, make_mesh, vertex_normals
 from jaxmark.original import Original, prepare
+from jaxmark.pose import Pose
 from tests.samples import bumpy_sphere
 
 
@@ -41,7 +45,7 @@ def test_affine_maps_are_undone(seed, original: Original):
     random = np.random.default_rng(seed)
     matrix, shift = affine_map(random), 10 * random.normal(size=3)
     assert np.linalg.det(matrix) > 0
-    found, weights = align(original, moved(original, np.zeros((642, 3)), matrix, shift))
+    found, weights, *_ = align(original, moved(original, np.zeros((642, 3)), matrix, shift))
     np.testing.assert_allclose(found, 0, atol=1e-12)
     np.testing.assert_array_equal(weights, 1)
 
@@ -52,7 +56,7 @@ def test_a_small_displacement_survives_an_affine_map(seed, original: Original):
     random = np.random.default_rng(seed)
     displacement = 1e-3 * random.normal(size=(642, 3))
     matrix, shift = affine_map(random), 10 * random.normal(size=3)
-    found, weights = align(original, moved(original, displacement, matrix, shift))
+    found, weights, *_ = align(original, moved(original, displacement, matrix, shift))
     np.testing.assert_array_equal(weights, 1)
     expected = without_affine(original.positions, displacement)
     np.testing.assert_allclose(found, expected, atol=1e-10)
@@ -79,7 +83,7 @@ def test_a_mark_along_the_normal_of_a_flat_mesh_survives(seed):
     plane = np.stack([i, j, np.ones(400)], axis=1)
     expected = mark - plane @ np.linalg.lstsq(plane, mark, rcond=None)[0]
     for matrix, shift in ((None, 0.0), (1.7 * Rotation.random(rng=random).as_matrix(), np.array([3.0, -4.0, 5.0]))):
-        found, weights = align(sheet, moved(sheet, mark[:, None] * turn[:, 2], matrix, shift))
+        found, weights, *_ = align(sheet, moved(sheet, mark[:, None] * turn[:, 2], matrix, shift))
         np.testing.assert_array_equal(weights, 1)
         np.testing.assert_allclose(found @ turn[:, 2], expected, atol=1e-5)
         assert np.abs(found @ turn[:, :2]).max() < 1e-5
@@ -106,7 +110,7 @@ def test_up_to_half_of_the_points_may_be_elsewhere(where, how, share, turned, or
         edit *= 0.05 / np.linalg.norm(edit, axis=1, keepdims=True)
         matrix = Rotation.random(rng=random).as_matrix() if turned else np.eye(3)
         suspect = moved(original, displacement + lost[:, None] * edit, matrix, random.normal(size=3))
-        found, weights = align(original, suspect)
+        found, weights, *_ = align(original, suspect)
         np.testing.assert_array_equal(weights, ~lost)
         np.testing.assert_array_equal(found[lost], 0)
         expected = without_affine(original.positions[~lost], displacement[~lost])
@@ -119,7 +123,7 @@ def test_points_thrown_away_are_masked(far, original: Original):
     thrown = moved(original, displacement, affine_map(np.random.default_rng(5)), 3.0)
     thrown.vertices[[7, 99]] = [[0, far, 0], [far, -far, 1]]
     with np.errstate(over="raise", invalid="raise"):
-        found, weights = align(original, thrown)
+        found, weights, *_ = align(original, thrown)
     lost = np.isin(np.arange(642), [7, 99])
     np.testing.assert_array_equal(weights, ~lost)
     np.testing.assert_array_equal(found[lost], 0)
@@ -129,7 +133,7 @@ def test_points_thrown_away_are_masked(far, original: Original):
 
 def test_an_unmoved_suspect_is_exactly_zero(original: Original):
     for mesh in (original.mesh, make_mesh(2.5 * original.mesh.vertices + 1e3, original.mesh.faces)):
-        found, weights = align(original, mesh)
+        found, weights, *_ = align(original, mesh)
         np.testing.assert_array_equal(found, 0)
         np.testing.assert_array_equal(weights, 1)
 
@@ -139,8 +143,10 @@ def test_the_same_suspect_gives_the_same_to_the_last_bit(original: Original):
     suspect = moved(
         original, 1e-3 * np.random.default_rng(6).normal(size=(642, 3)), affine_map(np.random.default_rng(7))
     )
-    for one, again in zip(align(original, suspect), align(prepare(original.mesh), suspect), strict=True):
-        np.testing.assert_array_equal(one, again)
+    one, again = align(original, suspect), align(prepare(original.mesh), suspect)
+    np.testing.assert_array_equal(one.displacement, again.displacement)
+    np.testing.assert_array_equal(one.weights, again.weights)
+    np.testing.assert_array_equal(one.pose.matrix, again.pose.matrix)
 
 
 def test_points_that_no_face_uses_do_not_count():
@@ -150,13 +156,128 @@ def test_points_that_no_face_uses_do_not_count():
     original = prepare(mesh)
     suspect = make_mesh(1.3 * mesh.vertices + 2, mesh.faces)
     suspect.vertices[[0, -1]] = [[-1e7, 4, 5], [0, 0, 0]]
-    found, weights = align(original, suspect)
+    found, weights, *_ = align(original, suspect)
     np.testing.assert_array_equal(weights, [0, *np.ones(162), 0])
     np.testing.assert_allclose(found, 0, atol=1e-12)
 
 
-def test_another_connectivity_is_refused(original: Original):
+def test_what_must_share_the_connectivity_is_refused_without(original: Original, unchecked):
     faces = original.mesh.faces
     for other in (bumpy_sphere(2), original.mesh._replace(faces=faces[::-1]), original.mesh._replace(faces=faces[:-1])):
         with pytest.raises(jm.JaxmarkError, match="does not share the connectivity"):
+            align(original, other, "same")
+    with pytest.raises(jm.JaxmarkError, match="aligned by auto, same, similarity, affine, not 'rigid'"):
+        align(original, other, "rigid")  # pyright: ignore[reportArgumentType]
+
+
+def anywhere(mesh: Mesh, seed: int) -> tuple[Mesh, Pose]:
+    """In a random pose and scale."""
+    random = np.random.default_rng(seed)
+    scale = 10 ** random.uniform(-2, 2)
+    pose = Pose(scale * Rotation.random(rng=random).as_matrix(), 10 * scale * random.normal(size=3))
+    return make_mesh(pose(np.asarray(mesh.vertices)), mesh.faces), pose
+
+
+def check_pose(original: Original, found: Pose, true: Pose, tolerance: float) -> None:
+    """In the units of the files."""
+    points = np.asarray(original.mesh.vertices)
+    assert np.linalg.norm(found(true(points)) - points, axis=1).max() < tolerance * original.diagonal
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_are_found_in_any_order(seed, original: Original):
+    random = np.random.default_rng(seed)
+    displacement = 1e-3 * random.normal(size=(642, 3))
+    marked = moved(original, displacement)
+    posed, pose = anywhere(marked, seed)
+    order = random.permutation(642)
+    suspect = make_mesh(posed.vertices[order], random.permutation(np.argsort(order)[posed.faces]))
+    straight, found = align(original, marked), align(original, suspect)
+    assert (straight.method, found.method) == ("same", "connectivity")
+    np.testing.assert_allclose(found.displacement, straight.displacement, atol=1e-9)
+    np.testing.assert_array_equal(found.weights, 1)
+    assert found.normals is None
+    assert found.residual == pytest.approx(np.sqrt(np.mean(np.sum(found.displacement**2, axis=1))))
+    check_pose(original, found.pose, pose, 3e-3)
+    # As a soup of triangles, and with others around it.
+    corners = posed.vertices[posed.faces].reshape(-1, 3)
+    soup = make_mesh(np.concatenate([corners, 100 * corners[:30]]), np.arange(len(corners) + 30).reshape(-1, 3))
+    again = align(original, soup)
+    assert again.method == "connectivity"
+    np.testing.assert_allclose(again.displacement, straight.displacement, atol=1e-9)
+
+
+def test_what_was_cut_away_is_masked(original: Original):
+    displacement = 1e-3 * np.random.default_rng(3).normal(size=(642, 3))
+    posed, pose = anywhere(moved(original, displacement), 3)
+    keep = original.positions[:, 0] > np.quantile(original.positions[:, 0], 0.4)
+    faces = np.where(keep, np.cumsum(keep) - 1, -1)[posed.faces]
+    found = align(original, make_mesh(posed.vertices[keep], faces[(faces >= 0).all(axis=1)]))
+    assert found.method == "connectivity"
+    seen = found.weights > 0
+    assert 0.8 * keep.sum() < seen.sum() <= keep.sum()
+    assert not seen[~keep].any()
+    assert np.abs(found.displacement - displacement)[seen].max() < 1e-3
+    check_pose(original, found.pose, pose, 5e-3)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_surface_shows_displacement_along_its_normals(seed, original: Original):
+    """The same surface in twice as many triangles; its edges are straight, so closest points lie on it."""
+    vertices, faces = trimesh.remesh.subdivide(np.asarray(original.mesh.vertices), np.asarray(original.mesh.faces))
+    suspect, pose = anywhere(make_mesh(vertices, faces), seed)
+    found = align(original, suspect)
+    assert found.method == "surface"
+    check_pose(original, found.pose, pose, 1e-7)
+    np.testing.assert_allclose(found.displacement, 0, atol=1e-7)
+    np.testing.assert_array_equal(found.weights, 1)
+    assert found.normals is not None
+    np.testing.assert_allclose(np.linalg.norm(found.normals, axis=1), 1)
+    # Blown up along the normals by a known smooth amount.
+    amount = 2e-3 * np.sin(20 * original.positions[:, 0])
+    blown = moved(original, amount[:, None] * vertex_normals(original.mesh))
+    vertices, faces = trimesh.remesh.subdivide(np.asarray(blown.vertices), np.asarray(blown.faces))
+    seen = align(original, anywhere(make_mesh(vertices, faces), seed)[0])
+    assert seen.normals is not None
+    along = np.sum(seen.normals * seen.displacement, axis=1)
+    expected = amount * np.sum(seen.normals * vertex_normals(original.mesh), axis=1)
+    assert np.corrcoef(along, expected)[0, 1] > 0.9
+    # Along other directions a surface shows less.
+    assert np.std(along) == pytest.approx(np.std(expected), rel=0.2)
+
+
+def test_a_hole_in_a_surface_is_masked(original: Original):
+    vertices, faces = trimesh.remesh.subdivide(np.asarray(original.mesh.vertices), np.asarray(original.mesh.faces))
+    gone = vertices[:, 2] > np.quantile(vertices[:, 2], 0.9)
+    found = align(original, make_mesh(vertices, faces[~gone[faces].any(axis=1)]))
+    assert found.method == "surface"
+    beyond = np.asarray(original.mesh.vertices)[:, 2] > np.quantile(vertices[:, 2], 0.9)
+    assert not found.weights[beyond].any()
+    assert found.weights[~beyond].mean() > 0.9
+    np.testing.assert_allclose(found.displacement, 0, atol=1e-4)
+
+
+def test_an_affine_map_of_a_surface_is_undone_on_request(original: Original):
+    change = np.eye(3) + 0.03 * np.random.default_rng(4).normal(size=(3, 3))
+    vertices, faces = trimesh.remesh.subdivide(np.asarray(original.mesh.vertices), np.asarray(original.mesh.faces))
+    suspect = make_mesh(vertices @ change.T, faces)
+    assert align(original, suspect, "affine").residual < 1e-6 < 1e-4 < align(original, suspect).residual
+
+
+def test_what_cannot_be_aligned_is_refused(original: Original):
+    for other in (bumpy_sphere(4, 3), make_mesh(*tetrahedron())):
+        with pytest.raises(jm.JaxmarkError, match="could not be aligned"):
             align(original, other)
+
+
+def tetrahedron() -> tuple[np.ndarray, np.ndarray]:
+    return np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array(
+        [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+    )
+
+
+def test_without_libigl_surfaces_are_refused_by_the_name_of_the_extra(original: Original, monkeypatch):
+    monkeypatch.setitem(sys.modules, "igl", None)
+    with pytest.raises(jm.JaxmarkError, match=r"jaxmark\[align\]"):
+        align(original, bumpy_sphere(4, 3))
+    assert align(original, original.mesh).method == "same"

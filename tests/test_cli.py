@@ -202,9 +202,27 @@ def record_name() -> str:
     return "marked.ply.jaxmark.json"
 
 
-def test_other_connectivity_is_refused_by_name(workshop: Workshop):
+def test_other_connectivity_is_read_where_it_can_be(workshop: Workshop):
+    workshop.embed()
+    marked = jm.load_mesh("marked.ply")
+    vertices, faces = trimesh.remesh.subdivide(np.asarray(marked.vertices), np.asarray(marked.faces))
+    turn = trimesh.transformations.rotation_matrix(2.0, [1, 2, 3])[:3, :3]
+    trimesh.Trimesh(30 * vertices @ turn.T + 7, faces, process=False).export("finer.obj", digits=12)
+    told = workshop.json("detect", "finer.obj", *DETECT, "--report", "seen")
+    assert told["message"] == MESSAGE
+    alignment = told["alignment"]
+    assert alignment["method"] == "surface"
+    np.testing.assert_allclose(np.array(alignment["pose"]["matrix"]) @ turn * 30, np.eye(3), atol=1e-3)
+    assert 0 < alignment["residual"] < 1e-3
+    assert alignment["seconds"] > 0
+    assert Path("seen/alignment.png").read_bytes().startswith(b"\x89PNG")
+    assert workshop.json("detect", "marked.ply", *DETECT, "--align", "same")["alignment"]["method"] == "same"
+    assert "does not share" in workshop.refused("detect", "finer.obj", *DETECT, "--align", "same")
+
+
+def test_what_cannot_be_compared_is_refused_by_name(workshop: Workshop):
     trimesh.Trimesh(*bumpy_sphere(2), process=False).export("small.ply")
-    assert "does not share" in workshop.refused("detect", "small.ply", *DETECT)
+    assert "could not be aligned" in workshop.refused("detect", "small.ply", *DETECT)
     assert "does not share" in workshop.refused("compare", "model.ply", "small.ply")
 
 

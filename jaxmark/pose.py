@@ -1,0 +1,49 @@
+"""Maps of space, fitted by least squares; host side."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+Points = Float64[np.ndarray, "points 3"]
+
+
+class Pose(NamedTuple):
+    """The map x ↦ matrix · x + shift."""
+
+    matrix: Float64[np.ndarray, "3 3"]
+    shift: Float64[np.ndarray, " 3"]
+
+    def __call__(self, points: Points) -> Points:
+        """Where points go."""
+        return points @ self.matrix.T + self.shift
+
+    def then(self, other: "Pose") -> "Pose":
+        """This map, and after it the other."""
+        return Pose(other.matrix @ self.matrix, other.matrix @ self.shift + other.shift)
+
+    def inverse(self) -> "Pose":
+        """The map back."""
+        matrix = np.linalg.inv(self.matrix)
+        return Pose(matrix, -matrix @ self.shift)
+
+
+def similarity(source: Points, target: Points) -> Pose:
+    """The scale, rotation and shift that bring points closest to others (Umeyama, IEEE PAMI 13, 1991, eq. 39-42)."""
+    back, to = source.mean(axis=0), target.mean(axis=0)
+    u, size, vt = np.linalg.svd((target - to).T @ (source - back))
+    proper = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])  # a rotation, no reflection
+    scale = (size * proper).sum() / max(((source - back) ** 2).sum(), np.finfo(float).tiny)
+    turn = scale * (u * proper @ vt)
+    return Pose(turn, to - turn @ back)
+
+
+def affine(source: Points, target: Points) -> Pose:
+    """The affine map that brings points closest to others that lie nearby."""
+    back, to = source.mean(axis=0), target.mean(axis=0)
+    centred, difference = source - back, (target - to) - (source - back)
+    variance, axes = np.linalg.eigh(centred.T @ centred)
+    # Along an axis in which the shape is flat, the map would be fitted to the mark itself; there it stays as it is.
+    inverse = np.where(variance > 1e-4 * variance[2], 1 / np.maximum(variance, 1e-300), 0)
+    matrix = np.eye(3) + difference.T @ centred @ (axes * inverse) @ axes.T
+    return Pose(matrix, to - matrix @ back)
