@@ -8,12 +8,16 @@ else, on the points that agree with it. What lies far off was cut away, replaced
 import time
 from typing import Literal, NamedTuple, get_args
 
+import jax.numpy as jnp
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float64, Int64
 
+from jaxmark.bands import diffusion
+from jaxmark.chebyshev import band_components
 from jaxmark.connectivity import matching_vertices
 from jaxmark.errors import JaxmarkError
+from jaxmark.laplacian import make_laplacian
 from jaxmark.mesh import (
     Mesh,
     boundary_vertices,
@@ -26,7 +30,7 @@ from jaxmark.mesh import (
 )
 from jaxmark.original import Original, residual
 from jaxmark.pose import Pose, affine, similarity
-from jaxmark.registration import refine, register
+from jaxmark.registration import Surface, refine, register
 
 Align = Literal["auto", "same", "similarity", "affine"]
 
@@ -36,6 +40,8 @@ _OFF = 10.0
 _TRIMS = 30
 _ROUNDS = 10
 _ROUNDING = 1e-12  # of sums over all points; a smaller residual is none
+_SCALES = 6  # smoothing of the suspect's meshing, by 1 to 32 steps of half the way
+_MOST_LEFT, _ENOUGH = 0.1, 20_000
 _SEEN = 0.05  # share of the original that must be seen
 
 
@@ -45,6 +51,7 @@ class Alignment(NamedTuple):
     displacement: Float64[np.ndarray, "points 3"]  # of the original's points, in diagonals
     weights: Float64[np.ndarray, " points"]  # 1, or 0 where a point is masked or no face uses it
     normals: Float64[np.ndarray, "points 3"] | None  # given, only the displacement along them is known; unit length
+    nuisance: Float64[np.ndarray, "points columns"] | None  # what the suspect's meshing explains, where that is much
     method: Literal["same", "connectivity", "surface"]  # vertices by their order, by their surroundings, or none
     pose: Pose  # from the suspect's coordinates to the original's, as in their files
     residual: float  # root mean square of the displacement, where it counts
@@ -128,7 +135,7 @@ def _by_points(
     displacement[sound] = np.where(agreeing[:, None], error, 0)
     weights[sound] = agreeing
     size = float(np.sqrt(np.mean(np.sum(error[agreeing] ** 2, axis=1))))
-    return Alignment(displacement, weights, None, method, before.then(pose).then(_file(original)), size, 0.0)
+    return Alignment(displacement, weights, None, None, method, before.then(pose).then(_file(original)), size, 0.0)
 
 
 def _fit(
@@ -187,7 +194,53 @@ def _by_surface(original: Original, suspect: Mesh, by_affine: bool) -> Alignment
     displacement = np.where(weights[:, None], error, 0)
     # Closest points lie along the suspect's normals; that they are not the original's matters on coarse suspects.
     normals = face_normals(Mesh(pose(np.asarray(suspect.vertices)), suspect.faces))[face]
-    return Alignment(displacement, weights.astype(float), normals, "surface", pose.then(_file(original)), size, 0.0)
+    smoothed = _smoothed(mesh, suspect._replace(vertices=pose(np.asarray(suspect.vertices))), face, pose(closest))
+    explains = _explains(smoothed, x, displacement, normals, weights)
+    return Alignment(
+        displacement,
+        weights.astype(float),
+        normals,
+        smoothed if explains else None,
+        "surface",
+        pose.then(_file(original)),
+        size,
+        0.0,
+    )
+
+
+def _smoothed(
+    original: Mesh, suspect: Mesh, face: Int64[np.ndarray, " points"], closest: Float64[np.ndarray, "points 3"]
+) -> Float64[np.ndarray, "points columns"]:
+    """The original put through smoothing as the suspect's meshing does it, by several amounts, as seen from its points.
+
+    A suspect that was simplified and then smoothed has shrunk by another operator than the original's.
+    """
+    there = Surface(original).closest(np.asarray(suspect.vertices))[0]
+    family = diffusion(_SCALES, 4 * 2 ** (_SCALES // 2) + 1)
+    amounts = band_components(make_laplacian(suspect), family, jnp.asarray(there, jnp.float32))
+    share = _barycentric(suspect, face, closest)
+    seen = np.einsum("spkc,pk->psc", np.asarray(amounts, np.float64)[:, np.asarray(suspect.faces)[face]], share)
+    return seen.reshape(len(face), -1)
+
+
+def _explains(
+    columns: Float64[np.ndarray, "points columns"],
+    x: Float64[np.ndarray, "points 3"],
+    displacement: Float64[np.ndarray, "points 3"],
+    normals: Float64[np.ndarray, "points 3"],
+    weights: Bool[np.ndarray, " points"],
+) -> bool:
+    """Whether columns explain nine tenths of what an affine map does not: each takes some of the mark away, too."""
+    some = np.flatnonzero(weights)
+    some = some[np.random.default_rng(0).permutation(len(some))[:_ENOUGH]]
+    along = np.sum(normals[some] * displacement[some], axis=1)
+
+    def left(columns: Float64[np.ndarray, "points columns"]) -> float:
+        design = (columns[some][:, :, None] * normals[some][:, None, :]).reshape(len(some), -1)
+        return float(np.sum((along - design @ np.linalg.lstsq(design, along, rcond=1e-9)[0]) ** 2))
+
+    plain = np.concatenate([np.ones((len(x), 1)), x], axis=1)
+    return left(np.concatenate([plain, columns], axis=1)) < _MOST_LEFT * left(plain)
 
 
 def _on_boundary(
@@ -198,8 +251,14 @@ def _on_boundary(
     rim[boundary_vertices(mesh.faces)] = True
     if not rim.any():
         return np.zeros(len(face), bool)
-    corners = np.asarray(mesh.faces)[face]
-    share = trimesh.triangles.points_to_barycentric(np.asarray(mesh.vertices)[corners], closest)
-    # A degenerate face has no such coordinates, and no inside.
-    inside = np.nan_to_num(share, nan=0.0) > 1e-6
-    return np.all(~inside | rim[corners], axis=1) & ~np.all(inside, axis=1)
+    inside = _barycentric(mesh, face, closest) > 1e-6
+    return np.all(~inside | rim[np.asarray(mesh.faces)[face]], axis=1) & ~np.all(inside, axis=1)
+
+
+def _barycentric(
+    mesh: Mesh, face: Int64[np.ndarray, " points"], points: Float64[np.ndarray, "points 3"]
+) -> Float64[np.ndarray, "points 3"]:
+    """Shares of a face's corners in points on it; zeros on a face without area."""
+    with np.errstate(all="ignore"):
+        share = trimesh.triangles.points_to_barycentric(np.asarray(mesh.vertices)[np.asarray(mesh.faces)[face]], points)
+    return np.nan_to_num(share, nan=0.0, posinf=0.0, neginf=0.0)

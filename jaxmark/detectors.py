@@ -16,7 +16,7 @@ from jaxmark.carriers.carrier import Strength
 from jaxmark.chebyshev import filter, transpose
 from jaxmark.errors import JaxmarkError
 from jaxmark.observation import Observation
-from jaxmark.reception import clean, receive, whitening
+from jaxmark.reception import clean, extended, receive, whitening
 
 Detector = Callable[[Carrier, Observation, Strength], Float[Array, " bits"]]
 
@@ -69,7 +69,7 @@ def joint(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Ar
     """
     if not isinstance(carrier, KeyedCarrier):
         raise JaxmarkError(f"The joint detector reads keyed carriers, not {type(carrier).__name__}.")
-    host = carrier.host
+    host = extended(carrier.host, seen)
     received = receive(host, seen)
     model = carrier.shape(beta, received.gain)
     equaliser = whitening(host, received.power)

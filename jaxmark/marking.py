@@ -150,7 +150,8 @@ class Marker:
         agreeing = found.weights if weights is None else found.weights * self._per_point(weights)
         dtype = self.original.signal.dtype
         normals = None if found.normals is None else jnp.asarray(found.normals, dtype)
-        return observe(jnp.asarray(found.displacement, dtype), jnp.asarray(agreeing, dtype), normals)
+        seen = observe(jnp.asarray(found.displacement, dtype), jnp.asarray(agreeing, dtype), normals)
+        return seen if found.nuisance is None else seen._replace(nuisance=jnp.asarray(found.nuisance, dtype))
 
     def soft_values(self, seen: Observation) -> Float64[np.ndarray, " code"]:
         """One soft value per code bit."""

@@ -12,6 +12,7 @@ class Observation(NamedTuple):
     residual: Float[Array, "vertices 3"]  # in the units of the host's coordinates
     weights: Float[Array, " vertices"]  # relative inverse variance; 0 where nothing is known
     normals: Float[Array, "vertices 3"] | None = None  # given, only the component along these unit vectors is known
+    nuisance: Float[Array, "vertices columns"] | None = None  # what the suspect shows the host to have gone through
 
     def channels(self, x: Float[Array, "vertices 3"]) -> Float[Array, "vertices channels"]:
         """The components of a displacement that can be seen: three, or one along the normals."""

@@ -63,7 +63,18 @@ def make_host(
     if scales:
         scaled = band_components(operator, diffusion(scales, coefficients.shape[1]), signal)
         columns.append(jnp.moveaxis(scaled, 0, 1).reshape(len(signal), -1))
-    raw = jnp.concatenate(columns, axis=1)
+    return Host(operator, signal, coefficients, _basis(jnp.concatenate(columns, axis=1)))
+
+
+def extended(host: Host, seen: Observation) -> Host:
+    """The host with what the suspect shows it to have gone through as nuisance, too."""
+    if seen.nuisance is None:
+        return host
+    return host._replace(nuisance=_basis(jnp.concatenate([host.nuisance, seen.nuisance], axis=1)))
+
+
+def _basis(raw: Float[Array, "vertices columns"]) -> Float[Array, "vertices columns"]:
+    """The same span, nearly orthonormal."""
     # Only the span matters, so the change to a good basis is not differentiated. What depends on the columns before it
     # is rounding noise and is dropped.
     size = jax.lax.stop_gradient(jnp.linalg.norm(raw, axis=0))
@@ -73,7 +84,7 @@ def make_host(
     sound = pivot > 10 * jnp.finfo(raw.dtype).eps
     square = jnp.where(sound[:, None], triangle[: len(pivot)], jnp.eye(len(pivot), dtype=raw.dtype))
     change = jsl.solve_triangular(square, jnp.diag(sound.astype(raw.dtype)))
-    return Host(operator, signal, coefficients, raw @ change)
+    return raw @ change
 
 
 def receive(host: Host, seen: Observation) -> Reception:

@@ -264,6 +264,21 @@ def test_an_affine_map_of_a_surface_is_undone_on_request(original: Original):
     assert align(original, suspect, "affine").residual < 1e-6 < 1e-4 < align(original, suspect).residual
 
 
+def test_smoothing_of_another_meshing_is_noticed():
+    original = prepare(bumpy_sphere(4))
+    vertices, faces = trimesh.remesh.subdivide(np.asarray(original.mesh.vertices), np.asarray(original.mesh.faces))
+    finer = make_mesh(vertices, faces)
+    assert align(original, finer).nuisance is None
+    found = align(original, jm.attack(finer, "smoothing", 40, seed=0))
+    assert found.nuisance is not None
+    assert found.normals is not None
+    # It explains what happened to the original, far beyond chance.
+    design = (found.nuisance[:, :, None] * found.normals[:, None, :]).reshape(len(found.normals), -1)
+    along = np.sum(found.normals * found.displacement, axis=1)
+    left = along - design @ np.linalg.lstsq(design, along, rcond=1e-9)[0]
+    assert np.linalg.norm(left) < 0.35 * np.linalg.norm(along)
+
+
 def test_what_cannot_be_aligned_is_refused(original: Original):
     for other in (bumpy_sphere(4, 3), make_mesh(*tetrahedron())):
         with pytest.raises(jm.JaxmarkError, match="could not be aligned"):

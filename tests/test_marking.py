@@ -242,9 +242,13 @@ def test_refusals(sphere: Mesh, key: jm.Key):
         with pytest.raises(jm.JaxmarkError, match="32 bytes"):
             jm.embed(sphere, MESSAGE, bad)  # type: ignore[arg-type]
     other = bumpy_sphere(2)
-    for suspect in (other, sphere._replace(faces=sphere.faces[::-1])):
-        with pytest.raises(jm.JaxmarkError, match="does not share"):
-            jm.detect(suspect, original=sphere, key=key)
+    for suspect, align, sentence in (
+        (other, "auto", "could not be aligned"),
+        (other, "same", "does not share"),
+        (sphere._replace(faces=sphere.faces[::-1]), "same", "does not share"),
+    ):
+        with pytest.raises(jm.JaxmarkError, match=sentence):
+            jm.detect(suspect, original=sphere, key=key, align=align)
     with pytest.raises(jm.JaxmarkError, match="multiple of 8"):
         jm.detect(sphere, original=sphere, key=key, bits=7)
 

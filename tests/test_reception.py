@@ -13,7 +13,7 @@ from jaxmark.chebyshev import filter
 from jaxmark.laplacian import Laplacian, centre, make_laplacian
 from jaxmark.mesh import vertex_normals
 from jaxmark.observation import Observation, observe
-from jaxmark.reception import Host, clean, make_host, receive
+from jaxmark.reception import Host, clean, extended, make_host, receive
 from tests.dense import laplacian_matrix
 from tests.samples import bumpy_sphere
 
@@ -222,6 +222,19 @@ def test_power_is_the_spectrum_of_noise(steps, condition, case: Case, x64):
     ratio = np.mean(logarithms, axis=0)[3:]
     error = 6 * np.sqrt(2 / dimensions[3:] * (1 / 20 + 1))
     assert (np.abs(ratio - ratio.mean()) < error).all()
+
+
+@pytest.mark.parametrize("condition", CONDITIONS)
+def test_what_a_suspect_explains_is_projected_off_too(condition, case: Case, x64):
+    random = np.random.default_rng(8)
+    host, columns = make(case, np.float64), random.normal(size=(len(case.x), 2))
+    both = np.concatenate([columns, columns[:, :1] + np.asarray(host.nuisance)[:, :1]], axis=1)  # one depends on others
+    seen = looking(case, condition, columns @ random.normal(size=(2, 3)), np.float64)
+    assert extended(host, seen) is host
+    assert np.abs(receive(host, seen).residual).max() > 0.1
+    wide = extended(host, seen._replace(nuisance=jnp.asarray(1e-3 * both)))
+    assert np.linalg.matrix_rank(np.asarray(wide.nuisance)) == np.linalg.matrix_rank(np.asarray(host.nuisance)) + 2
+    assert np.abs(receive(wide, seen).residual).max() < 1e-6
 
 
 @pytest.mark.parametrize("condition", ["everything", "half", "weights"])

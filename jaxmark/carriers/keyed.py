@@ -16,7 +16,7 @@ from jaxmark.chebyshev import filter, transpose
 from jaxmark.keys import permutation, signs
 from jaxmark.laplacian import per_row
 from jaxmark.observation import Observation
-from jaxmark.reception import Host, Reception, receive
+from jaxmark.reception import Host, Reception, extended, receive
 
 
 class Chips(NamedTuple):
@@ -71,7 +71,7 @@ class KeyedCarrier(NamedTuple):
     @jax.jit
     def claim(self, seen: Observation, bits: Float[Array, " bits"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """See `Carrier`: a is what `matched` gives, up to the bits' signs."""
-        matched = jnp.abs(self._signs) * self.matched(receive(self.host, seen))
+        matched = jnp.abs(self._signs) * self.matched(receive(extended(self.host, seen), seen))
         score = jnp.sum(bits * self._despread(matched))
         return score, jnp.linalg.norm(matched)
 
