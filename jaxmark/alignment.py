@@ -21,6 +21,7 @@ from jaxmark.laplacian import make_laplacian
 from jaxmark.mesh import (
     Mesh,
     boundary_vertices,
+    components,
     face_normals,
     host_mesh,
     same_connectivity,
@@ -42,6 +43,7 @@ _ROUNDS = 10
 _ROUNDING = 1e-12  # of sums over all points; a smaller residual is none
 _SCALES = 6  # smoothing of the suspect's meshing, by 1 to 32 steps of half the way
 _MOST_LEFT, _ENOUGH = 0.1, 20_000
+_PARTS = 4  # largest components that are tried one by one
 _SEEN = 0.05  # share of the original that must be seen
 
 
@@ -56,11 +58,6 @@ class Alignment(NamedTuple):
     pose: Pose  # from the suspect's coordinates to the original's, as in their files
     residual: float  # root mean square of the displacement, where it counts
     seconds: float  # that it took
-
-    @property
-    def coverage(self) -> float:
-        """Share of the points that count."""
-        return float(np.mean(self.weights > 0))
 
 
 def align(original: Original, suspect: Mesh, how: Align = "auto") -> Alignment:
@@ -98,7 +95,7 @@ def _align(original: Original, suspect: Mesh, how: Align) -> Alignment:
                 there = np.asarray(points.vertices)[match]
                 scale = Pose(np.eye(3) / np.ptp(there[found], axis=0).max(), np.zeros(3))
                 return _by_points(original, scale(there), found, "connectivity", scale)
-    return _by_surface(original, welded, how == "affine")
+    return _by_surfaces(original, welded, how == "affine")
 
 
 def _points(original: Original) -> Mesh:
@@ -171,6 +168,23 @@ def _agreeing(
     return error <= max(_FAR, _OFF * np.quantile(error[among], 0.4))
 
 
+def _by_surfaces(original: Original, suspect: Mesh, by_affine: bool) -> Alignment:
+    """By the whole surface, or if that will not do by a part of it: there may be other objects beside."""
+    failed, parts = [], components(suspect)
+    for part in (suspect, *(parts[:_PARTS] if len(parts) > 1 else ())):
+        found = _by_surface(original, part, by_affine)
+        coverage = np.sum(found.weights > 0) / original.used.sum()
+        if found.residual <= _FAR and coverage >= _SEEN:
+            return found
+        failed.append((found.residual, coverage))
+    size, coverage = min(failed)
+    raise JaxmarkError(
+        f"The suspect could not be aligned: its surface lies {100 * size:.2g} % of the diagonal from the original's"
+        f" where {100 * coverage:.0f} % of the original are seen. Bring it into the original's pose and cut off what"
+        " does not belong to it."
+    )
+
+
 def _by_surface(original: Original, suspect: Mesh, by_affine: bool) -> Alignment:
     """Only how far the surface lies along its normal is known of each point."""
     mesh, used = _points(original), original.used
@@ -184,18 +198,11 @@ def _by_surface(original: Original, suspect: Mesh, by_affine: bool) -> Alignment
     known = used & ~_on_boundary(suspect, face, closest)
     weights = known & _agreeing(length, known) if known.any() else known
     size = float(np.sqrt(np.mean(length[weights] ** 2))) if weights.any() else np.inf
-    coverage = weights.sum() / used.sum()
-    if size > _FAR or coverage < _SEEN:
-        raise JaxmarkError(
-            f"The suspect could not be aligned: its surface lies {100 * size:.2g} % of the diagonal from the original's"
-            f" where {100 * coverage:.0f} % of the original are seen. Bring it into the original's pose and cut off"
-            " what does not belong to it."
-        )
     displacement = np.where(weights[:, None], error, 0)
     # Closest points lie along the suspect's normals; that they are not the original's matters on coarse suspects.
     normals = face_normals(Mesh(pose(np.asarray(suspect.vertices)), suspect.faces))[face]
     smoothed = _smoothed(mesh, suspect._replace(vertices=pose(np.asarray(suspect.vertices))), face, pose(closest))
-    explains = _explains(smoothed, x, displacement, normals, weights)
+    explains = weights.any() and _explains(smoothed, x, displacement, normals, weights)
     return Alignment(
         displacement,
         weights.astype(float),

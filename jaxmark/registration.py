@@ -15,6 +15,7 @@ import trimesh
 from jaxtyping import Int64
 from scipy.spatial import KDTree
 
+from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.mesh import Mesh, used_vertices, vertex_normals
 from jaxmark.pose import Points, Pose, similarity
@@ -53,7 +54,7 @@ def register(original: Mesh, suspect: Mesh) -> tuple[Pose, Surface]:
         The map from the suspect's coordinates to the original's, and the suspect's surface in its own coordinates.
 
     Raises:
-        JaxmarkError: if libigl is missing.
+        JaxmarkError: if libigl is missing, or a surface has no area.
     """
     surface = Surface(suspect)
     starts = _coarse(_sample(original), _sample(suspect))
@@ -98,6 +99,8 @@ def refine(surface: Surface, points: Points, normals: Points, pose: Pose, *, by_
 def _sample(mesh: Mesh) -> Points:
     """Points spread over a surface by area."""
     surface = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), process=False)
+    if not 0 < surface.area < np.inf:
+        raise JaxmarkError(f"A surface has an area of {surface.area:g}; nothing can be aligned with it.")
     return np.asarray(trimesh.sample.sample_surface(surface, _SAMPLES, seed=0)[0])
 
 

@@ -257,6 +257,19 @@ def test_a_hole_in_a_surface_is_masked(original: Original):
     np.testing.assert_allclose(found.displacement, 0, atol=1e-4)
 
 
+def test_other_objects_beside_a_surface_are_ignored(original: Original):
+    ball, torus = original.mesh, trimesh.creation.torus(2.0, 1.0)
+    vertices, faces = trimesh.remesh.subdivide(np.asarray(ball.vertices), np.asarray(ball.faces))
+    scene = make_mesh(
+        np.concatenate([torus.vertices + 9, vertices]), np.concatenate([torus.faces, faces + len(torus.vertices)])
+    )
+    suspect, pose = anywhere(scene, 5)
+    found = align(original, suspect)
+    assert found.method == "surface"
+    check_pose(original, found.pose, pose, 1e-7)
+    np.testing.assert_array_equal(found.weights, 1)
+
+
 def test_an_affine_map_of_a_surface_is_undone_on_request(original: Original):
     change = np.eye(3) + 0.03 * np.random.default_rng(4).normal(size=(3, 3))
     vertices, faces = trimesh.remesh.subdivide(np.asarray(original.mesh.vertices), np.asarray(original.mesh.faces))
@@ -283,6 +296,8 @@ def test_what_cannot_be_aligned_is_refused(original: Original):
     for other in (bumpy_sphere(4, 3), make_mesh(*tetrahedron())):
         with pytest.raises(jm.JaxmarkError, match="could not be aligned"):
             align(original, other)
+    with pytest.raises(jm.JaxmarkError, match="area of 0"):
+        align(original, make_mesh([[0.0, 0, 0], [1, 1, 1], [2, 2, 2]], [[0, 1, 2]]))
 
 
 def tetrahedron() -> tuple[np.ndarray, np.ndarray]:

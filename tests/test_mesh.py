@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.mesh import Mesh, boundary_vertices, diagonal, edges, make_mesh, weld, welded_mesh
+from jaxmark.mesh import Mesh, boundary_vertices, components, diagonal, edges, make_mesh, weld, welded_mesh
 
 TRIANGLE = np.array([[0, 1, 2]])
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
@@ -77,3 +77,18 @@ def test_welded_mesh_keeps_positions_of_faces():
     points = welded_mesh(soup, weld(soup.vertices))
     assert len(points.vertices) == 4
     np.testing.assert_array_equal(points.vertices[points.faces], soup.vertices[soup.faces])
+
+
+def test_components_are_the_connected_parts():
+    ball, torus = trimesh.creation.icosphere(2), trimesh.creation.torus(2.0, 1.0)
+    loose = [[0.0, 0, 9]]
+    both = make_mesh(
+        np.concatenate([ball.vertices, loose, torus.vertices]),
+        np.concatenate([ball.faces, np.asarray(torus.faces) + len(ball.vertices) + 1]),
+    )
+    first, second = components(both)
+    assert (len(first.faces), len(second.faces)) == (len(torus.faces), len(ball.faces))
+    np.testing.assert_array_equal(second.faces, ball.faces)
+    np.testing.assert_array_equal(first.vertices, both.vertices)
+    parts = trimesh.Trimesh(both.vertices, both.faces, process=False).split(only_watertight=False)
+    assert sorted(len(part.faces) for part in parts) == sorted([len(first.faces), len(second.faces)])
