@@ -25,11 +25,11 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
 @pytest.mark.skipif(not FILES, reason="shared meshes hard/ are absent (set JAXMARK_MESHES)")
 @pytest.mark.parametrize(
     ("path", "scheme"),
-    list(zip(FILES, cycle(["keyed", "host", "eigen"]), strict=False)),
+    list(zip(FILES[::2], cycle(["keyed", "host", "eigen"]), strict=False)),
     ids=lambda case: Path(case).name,
 )
 def test_marked_and_read_back_or_refused(path: Path, scheme, tmp_path, monkeypatch, capfd, unchecked):
-    """With one scheme each: every shape is compiled anew."""
+    """Every other file, with one scheme each: every shape is compiled anew."""
     jm.save_key(jm.Key(bytes(range(32))), tmp_path / "key")
     marked = tmp_path / f"marked{path.suffix}"
     embed = ("embed", path, marked, "--key", tmp_path / "key", "--message", MESSAGE, "--scheme", scheme, "--noise", 0)
@@ -54,10 +54,10 @@ def test_marked_and_read_back_or_refused(path: Path, scheme, tmp_path, monkeypat
 def test_not_all_are_refused(key, unchecked):
     """The first test would pass on a program that refuses everything; about half of the files can be marked."""
     marked = 0
-    for path in FILES[::4]:
+    for path in FILES[::6]:
         try:
             jm.embed(jm.load_mesh(path), b"\xc3", key, scheme="host")
             marked += 1
         except jm.JaxmarkError:
             pass
-    assert marked >= len(FILES[::4]) / 3
+    assert marked >= len(FILES[::6]) / 3

@@ -274,8 +274,12 @@ def make_seen(case: Case, condition: str, residual, dtype) -> Observation:
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
-def test_joint_reads(condition, medium: Case, key: jm.Key, dtype):
-    check_reading(condition, "coordinates", medium, key, dtype)
+def test_joint_reads(condition, medium: Case, key: jm.Key):
+    check_reading(condition, "coordinates", medium, key, np.float32)
+
+
+def test_joint_reads_in_double_precision(medium: Case, key: jm.Key, x64):
+    check_reading("everything", "coordinates", medium, key, np.float64)
 
 
 def test_joint_reads_chips_along_normals(medium: Case, key: jm.Key):
