@@ -91,9 +91,10 @@ def _align(original: Original, suspect: Mesh, how: Align) -> Alignment:
         for points in (welded, suspect):
             match = matching_vertices(_points(original), points)
             found = original.used & (match >= 0)
-            if found.sum() >= max(4, _SEEN * original.used.sum()):
-                there = np.asarray(points.vertices)[match]
-                scale = Pose(np.eye(3) / np.ptp(there[found], axis=0).max(), np.zeros(3))
+            there = np.asarray(points.vertices)[match]
+            size = np.ptp(there[found], axis=0).max() if found.any() else 0.0
+            if found.sum() >= max(4, _SEEN * original.used.sum()) and size > 0:
+                scale = Pose(np.eye(3) / size, np.zeros(3))
                 return _by_points(original, scale(there), found, "connectivity", scale)
     return _by_surfaces(original, welded, how == "affine")
 

@@ -298,6 +298,8 @@ def test_what_cannot_be_aligned_is_refused(original: Original):
             align(original, other)
     with pytest.raises(jm.JaxmarkError, match="area of 0"):
         align(original, make_mesh([[0.0, 0, 0], [1, 1, 1], [2, 2, 2]], [[0, 1, 2]]))
+    with pytest.raises(jm.JaxmarkError, match="area of 0"):
+        align(original, make_mesh(np.ones((642, 3)), np.asarray(original.mesh.faces)[::-1]))
 
 
 def tetrahedron() -> tuple[np.ndarray, np.ndarray]:
