@@ -86,17 +86,19 @@ def _align(original: Original, suspect: Mesh, how: Align) -> Alignment:
     if how == "same" or (how == "auto" and same_connectivity(suspect, original.mesh)):
         x = np.asarray(original.positions, np.float64)
         return _by_points(original, x + residual(original, suspect), original.used, "same", _file(original).inverse())
-    welded = welded_mesh(suspect, weld(suspect.vertices))
+    mesh, welded = _points(original), welded_mesh(suspect, weld(suspect.vertices))
     if how == "auto":
-        for points in (welded, suspect):
-            match = matching_vertices(_points(original), points)
+        # Of a suspect without copies, the welded mesh is the suspect itself.
+        copies = len(welded.vertices) < len(suspect.vertices)
+        for points in (welded, suspect) if copies else (welded,):
+            match = matching_vertices(mesh, points)
             found = original.used & (match >= 0)
             there = np.asarray(points.vertices)[match]
             size = np.ptp(there[found], axis=0).max() if found.any() else 0.0
             if found.sum() >= max(4, _SEEN * original.used.sum()) and size > 0:
                 scale = Pose(np.eye(3) / size, np.zeros(3))
                 return _by_points(original, scale(there), found, "connectivity", scale)
-    return _by_surfaces(original, welded, how == "affine")
+    return _by_surfaces(original, mesh, welded, how == "affine")
 
 
 def _points(original: Original) -> Mesh:
@@ -169,11 +171,11 @@ def _agreeing(
     return error <= max(_FAR, _OFF * np.quantile(error[among], 0.4))
 
 
-def _by_surfaces(original: Original, suspect: Mesh, by_affine: bool) -> Alignment:
+def _by_surfaces(original: Original, mesh: Mesh, suspect: Mesh, by_affine: bool) -> Alignment:
     """By the whole surface, or if that will not do by a part of it: there may be other objects beside."""
     failed, parts = [], components(suspect)
     for part in (suspect, *(parts[:_PARTS] if len(parts) > 1 else ())):
-        found = _by_surface(original, part, by_affine)
+        found = _by_surface(original, mesh, part, by_affine)
         coverage = np.sum(found.weights > 0) / original.used.sum()
         if found.residual <= _FAR and coverage >= _SEEN:
             return found
@@ -186,23 +188,23 @@ def _by_surfaces(original: Original, suspect: Mesh, by_affine: bool) -> Alignmen
     )
 
 
-def _by_surface(original: Original, suspect: Mesh, by_affine: bool) -> Alignment:
+def _by_surface(original: Original, mesh: Mesh, suspect: Mesh, by_affine: bool) -> Alignment:
     """Only how far the surface lies along its normal is known of each point."""
-    mesh, used = _points(original), original.used
+    used, x = original.used, np.asarray(mesh.vertices)
     pose, surface = register(mesh, suspect)
-    x, normals = np.asarray(original.positions, np.float64), vertex_normals(mesh)
     if by_affine:
-        pose = refine(surface, x[used], normals[used], pose, by_affine=True)
-    closest, face = surface.closest(pose.inverse()(x))
-    error = np.where(used[:, None], pose(closest) - x, 0)
+        pose = refine(surface, x[used], vertex_normals(mesh)[used], pose, by_affine=True)
+    closest, face = surface.closest(x, pose)
+    posed = suspect._replace(vertices=pose(np.asarray(suspect.vertices)))
+    error = np.where(used[:, None], closest - x, 0)
     length = np.linalg.norm(error, axis=1)
-    known = used & ~_on_boundary(suspect, face, closest)
+    known = used & ~_on_boundary(posed, face, closest)
     weights = known & _agreeing(length, known) if known.any() else known
     size = float(np.sqrt(np.mean(length[weights] ** 2))) if weights.any() else np.inf
     displacement = np.where(weights[:, None], error, 0)
     # Closest points lie along the suspect's normals; that they are not the original's matters on coarse suspects.
-    normals = face_normals(Mesh(pose(np.asarray(suspect.vertices)), suspect.faces))[face]
-    smoothed = _smoothed(mesh, suspect._replace(vertices=pose(np.asarray(suspect.vertices))), face, pose(closest))
+    normals = face_normals(posed)[face]
+    smoothed = _smoothed(mesh, posed, face, closest)
     explains = weights.any() and _explains(smoothed, x, displacement, normals, weights)
     return Alignment(
         displacement,

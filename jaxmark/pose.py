@@ -28,6 +28,9 @@ class Pose(NamedTuple):
         return Pose(matrix, -matrix @ self.shift)
 
 
+IDENTITY = Pose(np.eye(3), np.zeros(3))
+
+
 def similarity(source: Points, target: Points) -> Pose:
     """The scale, rotation and shift that bring points closest to others (Umeyama, IEEE PAMI 13, 1991, eq. 39-42)."""
     back, to = source.mean(axis=0), target.mean(axis=0)

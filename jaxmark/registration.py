@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.mesh import Mesh, used_vertices, vertex_normals
-from jaxmark.pose import Points, Pose, similarity
+from jaxmark.pose import IDENTITY, Points, Pose, similarity
 
 _SAMPLES, _COARSE, _FINE = 20_000, 300, 2000
 _TRIM = 0.8
@@ -37,10 +37,11 @@ class Surface:
         self._tree = igl.AABB()
         self._tree.init(self._vertices, self._faces)
 
-    def closest(self, points: Points) -> tuple[Points, Int64[np.ndarray, " points"]]:
-        """The closest points, and on which faces they lie."""
-        _, face, closest = self._tree.squared_distance(self._vertices, self._faces, np.ascontiguousarray(points))
-        return np.asarray(closest).reshape(-1, 3), np.asarray(face).ravel().astype(np.int64)
+    def closest(self, points: Points, pose: Pose = IDENTITY) -> tuple[Points, Int64[np.ndarray, " points"]]:
+        """The closest points when the surface is in a pose (a similarity, or nearly), and on which faces they lie."""
+        there = np.ascontiguousarray(pose.inverse()(points))
+        _, face, closest = self._tree.squared_distance(self._vertices, self._faces, there)
+        return pose(np.asarray(closest).reshape(-1, 3)), np.asarray(face).ravel().astype(np.int64)
 
 
 def register(original: Mesh, suspect: Mesh) -> tuple[Pose, Surface]:
@@ -68,13 +69,13 @@ def register(original: Mesh, suspect: Mesh) -> tuple[Pose, Surface]:
 
 def _distance(surface: Surface, points: Points, pose: Pose) -> float:
     """How far half of the points are off at most."""
-    return float(np.median(np.linalg.norm(pose(surface.closest(pose.inverse()(points))[0]) - points, axis=1)))
+    return float(np.median(np.linalg.norm(surface.closest(points, pose)[0] - points, axis=1)))
 
 
 def refine(surface: Surface, points: Points, normals: Points, pose: Pose, *, by_affine: bool = False) -> Pose:
     """Bring a surface closer to points along their normals, by a similarity or an affine map (Gauss-Newton)."""
-    for _ in range(30):
-        closest = pose(surface.closest(pose.inverse()(points))[0])
+    for _ in range(_ROUNDS):
+        closest, _ = surface.closest(points, pose)
         distance = np.sum(normals * (closest - points), axis=1)
         near = np.abs(distance) <= 4 * np.median(np.abs(distance)) + 1e-12
         near &= np.linalg.norm(closest - points, axis=1) <= 2 * np.abs(distance) + 1e-6

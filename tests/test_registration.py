@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from jaxmark.mesh import Mesh, make_mesh, vertex_normals
-from jaxmark.pose import Pose, affine, similarity
+from jaxmark.pose import IDENTITY, Pose, affine, similarity
 from jaxmark.registration import Surface, refine, register
 from tests.samples import bumpy_sphere
 
@@ -96,6 +96,6 @@ def test_an_affine_map_is_found_from_nearby(mesh: Mesh):
     change = Pose(np.eye(3) + 0.03 * np.random.default_rng(5).normal(size=(3, 3)), np.array([0.01, -0.01, 0.0]))
     surface = Surface(other._replace(vertices=change.inverse()(np.asarray(other.vertices))))
     points, normals = np.asarray(mesh.vertices), vertex_normals(mesh)
-    found = refine(surface, points, normals, Pose(np.eye(3), np.zeros(3)), by_affine=True)
+    found = refine(surface, points, normals, IDENTITY, by_affine=True)
     np.testing.assert_allclose(found.matrix, change.matrix, atol=1e-6)
     np.testing.assert_allclose(found.shift, change.shift, atol=1e-6)
