@@ -19,6 +19,8 @@ from jaxmark.laplacian import Laplacian, per_row
 
 Signal = Float[Array | np.ndarray, " vertices *columns"]
 
+_UNROLLED = 2**16  # values of a signal, from which on running takes longer than compiling
+
 
 def filter(
     operator: Laplacian,
@@ -173,17 +175,20 @@ def _scan_terms(
     start: Any,
 ) -> tuple[Any, Any]:
     """Run `step(carry, T_k x, T_{k-1} x, data[k])` over k = 1 … len(data) - 1; T_0 x = x is the caller's."""
+    product = operator.product(x)
 
     def body(state: tuple[Array, Array, Any], inputs: tuple[Array, Array]) -> tuple[tuple[Array, Array, Any], Any]:
         before, current, carry = state
         factor, datum = inputs
-        following = factor * (operator.apply(current) - current) - before
+        following = factor * (product(current) - current) - before
         carry, output = step(carry, following, current, datum)
         return (current, following, carry), output
 
     # T_1 = Δ̃T_0 is the recurrence with factor 1 and T_{-1} = 0.
     factors = jnp.full(len(data) - 1, 2, x.dtype).at[:1].set(1)
-    (_, _, carry), outputs = jax.lax.scan(body, (jnp.zeros_like(x), x, start), (factors, data[1:]))
+    # Unrolled, the carry is not copied in each step, but there is more to compile.
+    unroll = 3 if x.size >= _UNROLLED else 1
+    (_, _, carry), outputs = jax.lax.scan(body, (jnp.zeros_like(x), x, start), (factors, data[1:]), unroll=unroll)
     return carry, outputs
 
 
@@ -253,9 +258,10 @@ _projections.defvjp(_projections_forward, _projections_reverse, symbolic_zeros=T
 
 def _fixed(operator: Any, name: str, remedy: str) -> Laplacian:
     """The operator as it came into a rule, once it is known that it is not differentiated."""
-    if any(leaf.perturbed for leaf in operator):
+    leaves, structure = jax.tree.flatten(operator, is_leaf=lambda leaf: hasattr(leaf, "perturbed"))
+    if any(leaf.perturbed for leaf in leaves):
         raise JaxmarkError(f"{name} has no derivative with respect to the operator's weights in O(N) memory{remedy}.")
-    return Laplacian(*(leaf.value for leaf in operator))
+    return jax.tree.unflatten(structure, [leaf.value for leaf in leaves])
 
 
 def _instantiate(cotangent: Any) -> Array:

@@ -5,12 +5,13 @@ the paper prints D = diag(1/d), but its Lemma 3.1 holds for D = diag(d)). The sp
 is self-adjoint in the inner product ⟨x, y⟩_D = xᵀDy.
 """
 
-from typing import Literal, NamedTuple
+from collections.abc import Callable
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int, Num
+from jaxtyping import Array, Float, Float64, Int, Num, Shaped
 from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.sparse import csgraph
@@ -19,6 +20,20 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.mesh import Mesh, edges
 
 Weighting = Literal["valence", "inverse-length", "cotangent"]
+Lowering = Literal["auto", "gather", "segments"]
+
+_SCATTER = 8  # what adding to a row anywhere costs, in rows that are read; on a processor, measured roughly
+
+
+class Neighbours(NamedTuple):
+    """Each vertex's neighbours in a table of few slots; what does not fit in is added one by one.
+
+    Reading rows is several times faster than adding to them, and is spread over the cores.
+    """
+
+    vertices: Int[Array | np.ndarray, "slots vertices"]  # any vertex where a slot is empty
+    edges: Int[Array | np.ndarray, "slots vertices"]  # by which they are joined; past the last edge where empty
+    rest: Int[Array | np.ndarray, "rest 3"]  # vertex, neighbour and edge
 
 
 class Laplacian(NamedTuple):
@@ -30,24 +45,55 @@ class Laplacian(NamedTuple):
     edges: Int[Array | np.ndarray, "edges 2"]  # each undirected edge once, no vertex joined to itself
     weights: Float[Array | np.ndarray, " edges"]  # W, symmetric by construction, non-negative
     degree: Float[Array | np.ndarray, " vertices"]  # D: the weights' row sums, 0 where isolated
+    neighbours: Neighbours | None = None  # the edges once more, for products by gathering
 
     @jax.jit
     def apply(self, x: Float[Array, " vertices *columns"]) -> Float[Array, " vertices *columns"]:
-        """Δx for one signal `[N]` or several `[N, C]`: two segment-sums over the edges, in the dtype of `x`.
+        """Δx for one signal `[N]` or several `[N, C]`, in the dtype of `x`.
 
         Raises:
             JaxmarkError: if `x` is not floating.
         """
-        if not jnp.issubdtype(x.dtype, jnp.floating):
-            raise JaxmarkError(f"Laplacian.apply needs a floating-point signal, got {x.dtype}.")
-        tail, head = self.edges[:, 0], self.edges[:, 1]
-        weights = per_row(self.weights, x)
-        size = self.degree.shape[0]
-        total = jax.ops.segment_sum(weights * x[head], tail, size) + jax.ops.segment_sum(weights * x[tail], head, size)
-        degree = per_row(self.degree, x)
+        return self.product(x)(x)
+
+    def product(
+        self, like: Shaped[Array, " vertices *columns"]
+    ) -> Callable[[Float[Array, " vertices *columns"]], Float[Array, " vertices *columns"]]:
+        """The map x → Δx for signals of one shape and dtype; to be made outside a loop over products.
+
+        Raises:
+            JaxmarkError: if the signal is not floating.
+        """
+        if not jnp.issubdtype(like.dtype, jnp.floating):
+            raise JaxmarkError(f"Laplacian.apply needs a floating-point signal, got {like.dtype}.")
+        total = self._segments(like) if self.neighbours is None else self._gather(like, self.neighbours)
+        degree = per_row(self.degree, like)
         # Select before dividing, so that isolated vertices keep finite gradients.
         linked = degree > 0
-        return jnp.where(linked, x - total / jnp.where(linked, degree, 1), 0)
+        inverse = 1 / jnp.where(linked, degree, 1)
+        return lambda x: jnp.where(linked, x - inverse * total(x), 0)
+
+    def _segments(self, like: Array) -> Callable[[Array], Array]:
+        """The map x → Wx by two segment-sums over the edges."""
+        tail, head = self.edges[:, 0], self.edges[:, 1]
+        weights = per_row(self.weights, like)
+        size = self.degree.shape[0]
+        return lambda x: (
+            jax.ops.segment_sum(weights * x[head], tail, size) + jax.ops.segment_sum(weights * x[tail], head, size)
+        )
+
+    def _gather(self, like: Array, neighbours: Neighbours) -> Callable[[Array], Array]:
+        """The map x → Wx slot by slot."""
+        padded = jnp.append(jnp.asarray(self.weights).astype(like.dtype), 0)
+        slots = [
+            (per_row(padded[edge], like), vertex)
+            for edge, vertex in zip(neighbours.edges, neighbours.vertices, strict=True)
+        ]
+        tail, head, edge = jnp.asarray(neighbours.rest).T
+        rest = per_row(padded[edge], like)
+        return lambda x: (
+            sum(weight * x[vertex] for weight, vertex in slots) + jnp.zeros_like(x).at[tail].add(rest * x[head])
+        )
 
     @jax.jit
     def inner(
@@ -63,7 +109,7 @@ class Laplacian(NamedTuple):
         return jnp.sum(per_row(self.degree, x) * x * y, axis=0)
 
 
-def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence") -> Laplacian:
+def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence", *, lowering: Lowering = "auto") -> Laplacian:
     """Build the operator of a mesh's edges on the host.
 
     Vertices at the same position are *not* merged; see `jaxmark.mesh.weld`.
@@ -73,13 +119,18 @@ def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence") -> La
         weights: `"valence"`, each edge 1, so that w_ij = 1/d(v_i) as in the paper; `"inverse-length"`, 1 over the
             edge's length; `"cotangent"`, half the sum of the cotangents of the angles opposite the edge, clipped below
             at 1e-6 of the largest; or an array `[E]` of non-negative weights in the order of `jaxmark.mesh.edges`.
+        lowering: how products are computed: `"segments"`, by segment-sums over the edges; `"gather"`, by a table of
+            each vertex's neighbours; `"auto"`, by the table unless the valences differ so much that it does not pay.
 
     Returns:
         A `Laplacian` of NumPy arrays in float64; it computes in the dtype of the signal it is applied to.
 
     Raises:
-        JaxmarkError: if the weighting is unknown or not finite and non-negative, `[E]`, or a length is zero.
+        JaxmarkError: if the weighting is unknown or not finite and non-negative, `[E]`, or a length is zero; or the
+            lowering is unknown.
     """
+    if lowering not in get_args(Lowering):
+        raise JaxmarkError(f"Products are lowered by {', '.join(get_args(Lowering))}, not {lowering!r}.")
     pairs = edges(np.asarray(mesh.faces))
     if isinstance(weights, str):
         match weights:
@@ -100,7 +151,30 @@ def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence") -> La
         if not (np.isfinite(values) & (values >= 0)).all():
             raise JaxmarkError("weights must be finite and not negative; otherwise the spectrum leaves [0, 2].")
     degree = np.bincount(pairs.ravel(), np.repeat(values, 2), minlength=len(mesh.vertices))
-    return Laplacian(pairs.astype(np.int32), values, degree)
+    neighbours = None if lowering == "segments" else _neighbours(pairs, len(degree), lowering == "auto")
+    return Laplacian(pairs.astype(np.int32), values, degree, neighbours)
+
+
+def _neighbours(pairs: Int[np.ndarray, "edges 2"], size: int, if_it_pays: bool) -> Neighbours | None:
+    """The table with as many slots as make a product cheapest."""
+    tail, head, edge = (
+        np.r_[pairs[:, 0], pairs[:, 1]],
+        np.r_[pairs[:, 1], pairs[:, 0]],
+        np.tile(np.arange(len(pairs)), 2),
+    )
+    order = np.argsort(tail, kind="stable")
+    tail, head, edge = tail[order], head[order], edge[order]
+    slot = np.arange(len(tail)) - np.searchsorted(tail, tail)
+    left = len(tail) - np.cumsum(np.bincount(slot))  # past one slot, past two ...
+    slots = 1 + int(np.argmin(size * np.arange(1, 1 + len(left)) + _SCATTER * left)) if len(left) else 0
+    if if_it_pays and (slots == 0 or size * slots + _SCATTER * left[slots - 1] > _SCATTER * len(tail)):
+        return None
+    fits = slot < slots
+    vertices, edges = np.zeros((slots, size), np.int32), np.full((slots, size), len(pairs), np.int32)
+    # An empty slot reads the row that is being written: it is at hand.
+    vertices[:] = np.arange(size)
+    vertices[slot[fits], tail[fits]], edges[slot[fits], tail[fits]] = head[fits], edge[fits]
+    return Neighbours(vertices, edges, np.stack([tail, head, edge], axis=1)[~fits].astype(np.int32))
 
 
 def per_row(values: Num[Array | np.ndarray, " rows"], x: Array | np.ndarray) -> Array:

@@ -46,9 +46,7 @@ def prepare(mesh: Mesh) -> Original:
     positions = (positions - positions[used].mean(axis=0)) / length
     positions[~used] = 0
     signal = jnp.asarray(centre(operator, positions), dtype)
-    traced = Laplacian(
-        jnp.asarray(operator.edges), jnp.asarray(operator.weights, dtype), jnp.asarray(operator.degree, dtype)
-    )
+    traced = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype if leaf.dtype == np.float64 else None), operator)
     return Original(mesh, welded, used, length, points_hash(points), traced, positions, signal)
 
 

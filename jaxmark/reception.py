@@ -5,6 +5,7 @@ diffusion scales of the host and polynomials of the position. Projecting that nu
 How much of the mark each band still holds is seen from what the attack did to the host there.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -39,6 +40,7 @@ class Reception(NamedTuple):
     factor: Float[Array, "unknowns unknowns"]  # Cholesky factor of the nuisance as it is seen
 
 
+@partial(jax.jit, static_argnames=("scales", "degree"))
 def make_host(
     operator: Laplacian,
     signal: Float[Array, "vertices 3"],

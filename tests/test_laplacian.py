@@ -13,12 +13,14 @@ from jaxmark.spectrum import eigenpairs
 from tests.dense import laplacian_matrix, tolerance
 
 WEIGHTINGS = ["valence", "inverse-length", "cotangent"]
+LOWERINGS = ["gather", "segments"]
 
 
+@pytest.mark.parametrize("lowering", LOWERINGS)
 @pytest.mark.parametrize("weights", WEIGHTINGS)
 @pytest.mark.parametrize("columns", [(), (3,)])
-def test_apply_is_the_dense_matrix(hard_graph: Mesh, weights, columns, dtype):
-    operator = make_laplacian(hard_graph, weights)
+def test_apply_is_the_dense_matrix(hard_graph: Mesh, lowering, weights, columns, dtype):
+    operator = make_laplacian(hard_graph, weights, lowering=lowering)
     x = np.random.default_rng(0).normal(size=(len(hard_graph.vertices), *columns)).astype(dtype)
     y = operator.apply(jnp.asarray(x))
     assert y.dtype == dtype
@@ -121,8 +123,9 @@ def test_sparse_matrices(hard_graph: Mesh):
     np.testing.assert_allclose(stiffness.toarray(), mass.toarray() @ laplacian_matrix(operator), atol=1e-12)
 
 
-def test_transformations(hard_graph: Mesh, x64):
-    operator = make_laplacian(hard_graph)
+@pytest.mark.parametrize("lowering", LOWERINGS)
+def test_transformations(hard_graph: Mesh, lowering, x64):
+    operator = make_laplacian(hard_graph, lowering=lowering)
     matrix = laplacian_matrix(operator)
     batch = jnp.asarray(np.random.default_rng(3).normal(size=(4, len(matrix), 3)))
     np.testing.assert_allclose(jax.jit(Laplacian.apply)(operator, batch[0]), matrix @ batch[0], atol=1e-12)
@@ -133,12 +136,47 @@ def test_transformations(hard_graph: Mesh, x64):
     np.testing.assert_allclose(gradient, np.einsum("uv,bvc->buc", 2 * matrix.T @ matrix, batch), atol=1e-12)
 
 
-def test_gradients_of_weights_are_finite_at_isolated_vertices(hard_graph: Mesh, x64):
-    operator = make_laplacian(hard_graph)
+def fan(spokes: int) -> Mesh:
+    """A disc whose centre has many more neighbours than any other vertex."""
+    rim = 1 + np.arange(spokes)
+    faces = np.stack([np.zeros(spokes, int), rim, np.roll(rim, -1)], axis=1)
+    return make_mesh(np.random.default_rng(5).normal(size=(spokes + 1, 3)), faces)
+
+
+def test_what_a_table_has_no_slots_for_is_added_one_by_one(dtype):
+    mesh = fan(200)
+    operator = make_laplacian(mesh, "inverse-length")
+    assert operator.neighbours is not None
+    assert len(operator.neighbours.vertices) == 3
+    assert len(operator.neighbours.rest) == 197
+    x = np.random.default_rng(6).normal(size=(201, 3)).astype(dtype)
+    np.testing.assert_allclose(operator.apply(jnp.asarray(x)), laplacian_matrix(operator) @ x, atol=tolerance(dtype))
+
+
+def test_a_table_is_used_where_it_pays(unchecked):
+    assert make_laplacian(fan(5)).neighbours is not None
+    # One triangle among a thousand vertices without edges.
+    sparse = make_mesh(np.random.default_rng(7).normal(size=(1000, 3)), np.array([[0, 1, 2]]))
+    assert make_laplacian(sparse).neighbours is None
+    assert make_laplacian(sparse, lowering="gather").neighbours is not None
+    assert make_laplacian(fan(5), lowering="segments").neighbours is None
+    with pytest.raises(JaxmarkError, match="gather, segments, not 'scatter'"):
+        make_laplacian(sparse, lowering="scatter")
+
+
+@pytest.mark.parametrize("lowering", LOWERINGS)
+def test_gradients_of_weights_are_finite_and_right(hard_graph: Mesh, lowering, x64):
+    operator = make_laplacian(hard_graph, lowering=lowering)
     x = jnp.asarray(hard_graph.vertices)
 
     def loss(weights, degree):
         return jnp.sum(operator._replace(weights=weights, degree=degree).apply(x) ** 2)
 
-    for gradient in jax.grad(loss, (0, 1))(jnp.asarray(operator.weights), jnp.asarray(operator.degree)):
-        assert np.isfinite(gradient).all()
+    at = np.asarray(operator.weights), np.asarray(operator.degree)
+    gradients = jax.grad(loss, (0, 1))(*map(jnp.asarray, at))
+    rng = np.random.default_rng(8)
+    for step in ((rng.normal(size=len(at[0])), 0), (0, rng.normal(size=len(at[1])) * np.sign(at[1]))):
+        ahead, behind = (loss(at[0] + 1e-6 * sign * step[0], at[1] + 1e-6 * sign * step[1]) for sign in (1, -1))
+        along = sum(jnp.sum(gradient * part) for gradient, part in zip(gradients, step, strict=True))
+        assert along == pytest.approx(float(ahead - behind) / 2e-6, rel=1e-6)
+    assert all(np.isfinite(gradient).all() for gradient in gradients)
