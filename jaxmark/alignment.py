@@ -8,30 +8,29 @@ else, on the points that agree with it. What lies far off was cut away, replaced
 import time
 from typing import Literal, NamedTuple, get_args
 
-import jax.numpy as jnp
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float64, Int64
 
-from jaxmark.bands import diffusion
-from jaxmark.chebyshev import band_components
 from jaxmark.connectivity import matching_vertices
 from jaxmark.errors import JaxmarkError
-from jaxmark.laplacian import make_laplacian
 from jaxmark.mesh import (
     Mesh,
-    boundary_vertices,
+    area,
+    component_of,
     components,
     face_normals,
     host_mesh,
     same_connectivity,
+    used_vertices,
     vertex_normals,
     weld,
     welded_mesh,
 )
 from jaxmark.original import Original, residual
-from jaxmark.pose import Pose, affine, similarity
-from jaxmark.registration import Surface, refine, register
+from jaxmark.pose import Points, Pose, affine, similarity
+from jaxmark.registration import refine, register_part, register_whole
+from jaxmark.replay import replayed
+from jaxmark.surfaces import Surface, on_rim
 
 Align = Literal["auto", "same", "similarity", "affine"]
 
@@ -39,12 +38,12 @@ Align = Literal["auto", "same", "similarity", "affine"]
 _FAR = 0.005
 _OFF = 10.0
 _TRIMS = 30
+_FEW = 100  # points that a map of their own needs at least
 _ROUNDS = 10
 _ROUNDING = 1e-12  # of sums over all points; a smaller residual is none
-_SCALES = 6  # smoothing of the suspect's meshing, by 1 to 32 steps of half the way
-_MOST_LEFT, _ENOUGH = 0.1, 20_000
 _PARTS = 4  # largest components that are tried one by one
-_SEEN = 0.05  # share of the original that must be seen
+_SEEN, _ALL = 0.05, 0.95  # shares of the original: must be seen, and so nearly all that nothing else is looked for
+_PIECE = 0.01  # share of the original that a piece must show
 
 
 class Alignment(NamedTuple):
@@ -83,10 +82,12 @@ def align(original: Original, suspect: Mesh, how: Align = "auto") -> Alignment:
 
 
 def _align(original: Original, suspect: Mesh, how: Align) -> Alignment:
+    mesh = _points(original)
     if how == "same" or (how == "auto" and same_connectivity(suspect, original.mesh)):
         x = np.asarray(original.positions, np.float64)
-        return _by_points(original, x + residual(original, suspect), original.used, "same", _file(original).inverse())
-    mesh, welded = _points(original), welded_mesh(suspect, weld(suspect.vertices))
+        y, back = x + residual(original, suspect), _file(original).inverse()
+        return _by_points(original, y, original.used, np.asarray(mesh.faces), "same", back)
+    welded = welded_mesh(suspect, weld(suspect.vertices))
     if how == "auto":
         # Of a suspect without copies, the welded mesh is the suspect itself.
         copies = len(welded.vertices) < len(suspect.vertices)
@@ -97,7 +98,12 @@ def _align(original: Original, suspect: Mesh, how: Align) -> Alignment:
             size = np.ptp(there[found], axis=0).max() if found.any() else 0.0
             if found.sum() >= max(4, _SEEN * original.used.sum()) and size > 0:
                 scale = Pose(np.eye(3) / size, np.zeros(3))
-                return _by_points(original, scale(there), found, "connectivity", scale)
+                # The suspect's faces, as far as they are between points that were found.
+                point = np.full(len(points.vertices), -1)
+                point[match[found]] = np.flatnonzero(found)
+                faces = point[np.asarray(points.faces)]
+                faces = faces[(faces >= 0).all(axis=1)]
+                return _by_points(original, scale(there), found, faces, "connectivity", scale)
     return _by_surfaces(original, mesh, welded, how == "affine")
 
 
@@ -114,28 +120,62 @@ def _file(original: Original) -> Pose:
 
 def _by_points(
     original: Original,
-    y: Float64[np.ndarray, "points 3"],
+    y: Points,
     known: Bool[np.ndarray, " points"],
+    faces: Int64[np.ndarray, "faces 3"],
     method: Literal["same", "connectivity"],
     before: Pose,
 ) -> Alignment:
-    """Each known point has been found at y, where `before` brought the suspect."""
+    """Each known point has been found at y, where `before` brought the suspect, joined by the suspect's faces."""
     x = np.asarray(original.positions, np.float64)
     moved = y - x
     # A coordinate of 1e200 would spoil every sum; such a point is lost in any case.
     spread = np.abs(moved - np.median(moved[known], axis=0)).max(axis=1)
     sound = known & (spread <= 1e6 * max(np.quantile(spread[known], 0.6), 1e-6))
-    x, y = x[sound], y[sound]
-    fits = [_fit(x, y, agreeing) for agreeing in (np.ones(len(x), bool), _agreeing(spread[sound]))]
-    pose, agreeing = min(fits, key=lambda fit: np.quantile(np.linalg.norm(fit[0](y) - x, axis=1), 0.4))
-    error = pose(y) - x
-    if np.abs(error[agreeing]).max() < _ROUNDING:
+    pose, agreeing = _whole(x, y, sound, spread)
+    error = np.where(agreeing[:, None], pose(y) - x, 0)
+    # What does not agree may be in pieces that went elsewhere; so may be everything.
+    piece = np.where(sound, component_of(Mesh(y, faces)), -1)
+    others = _pieces(x, y, np.where(agreeing, -1, piece))
+    if _rms(error[agreeing]) > _FAR:
+        apart = _pieces(x, y, piece)
+        if 2 * sum(len(points) for points, _ in apart) > known.sum():
+            others, agreeing, pose = apart, np.zeros(len(x), bool), apart[0][1]
+    for points, back in others:
+        agreeing[points] = True
+        error[points] = back(y[points]) - x[points]
+    error = np.where(agreeing[:, None], error, 0)
+    if np.abs(error).max() < _ROUNDING:
         error = np.zeros_like(error)
-    displacement, weights = np.zeros(moved.shape), np.zeros(len(moved))
-    displacement[sound] = np.where(agreeing[:, None], error, 0)
-    weights[sound] = agreeing
-    size = float(np.sqrt(np.mean(np.sum(error[agreeing] ** 2, axis=1))))
-    return Alignment(displacement, weights, None, None, method, before.then(pose).then(_file(original)), size, 0.0)
+    pose = before.then(pose).then(_file(original))
+    return Alignment(error, agreeing.astype(float), None, None, method, pose, _rms(error[agreeing]), 0.0)
+
+
+def _pieces(x: Points, y: Points, piece: Int64[np.ndarray, " points"]) -> list[tuple[Int64[np.ndarray, " some"], Pose]]:
+    """Which points of each piece, numbered from 0, agree on a map of their own, and the map; the largest first."""
+    found = []
+    size = np.bincount(piece[piece >= 0], minlength=1)
+    for one in np.argsort(-size, kind="stable")[: np.sum(size >= max(_FEW, _PIECE * len(x)))]:
+        points = np.flatnonzero(piece == one)
+        back, near = _fit(x[points], y[points], np.ones(len(points), bool))
+        if 2 * near.sum() >= len(points) and _rms((back(y[points]) - x[points])[near]) <= _FAR:
+            found.append((points[near], back))
+    return found
+
+
+def _rms(x: Points) -> float:
+    return float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) if len(x) else np.inf
+
+
+def _whole(
+    x: Points, y: Points, sound: Bool[np.ndarray, " points"], spread: Float64[np.ndarray, " points"]
+) -> tuple[Pose, Bool[np.ndarray, " points"]]:
+    """The map on which most agree, and which points do."""
+    fits = [_fit(x[sound], y[sound], start) for start in (np.ones(sound.sum(), bool), _agreeing(spread[sound]))]
+    pose, near = min(fits, key=lambda fit: np.quantile(np.linalg.norm(fit[0](y[sound]) - x[sound], axis=1), 0.4))
+    agreeing = np.zeros(len(x), bool)
+    agreeing[sound] = near
+    return pose, agreeing
 
 
 def _fit(
@@ -172,103 +212,76 @@ def _agreeing(
 
 
 def _by_surfaces(original: Original, mesh: Mesh, suspect: Mesh, by_affine: bool) -> Alignment:
-    """By the whole surface, or if that will not do by a part of it: there may be other objects beside."""
-    failed, parts = [], components(suspect)
-    for part in (suspect, *(parts[:_PARTS] if len(parts) > 1 else ())):
-        found = _by_surface(original, mesh, part, by_affine)
-        coverage = np.sum(found.weights > 0) / original.used.sum()
-        if found.residual <= _FAR and coverage >= _SEEN:
-            return found
-        failed.append((found.residual, coverage))
+    """By the whole surface, or if that will not do as a part of the original, or by a part of the suspect."""
+    parts = [part for part in components(suspect)[:_PARTS] if area(part) > 0]
+    parts = parts if len(parts) > 1 else []
+    failed = [(np.inf, 0.0)]
+    for part, register in ((suspect, register_whole), (suspect, register_part), *((p, register_whole) for p in parts)):
+        if (pose := register(mesh, part)) is None:
+            continue
+        found = _by_surface(original, mesh, part, pose, by_affine)
+        if (fits := _coverage(original, found)) >= _SEEN and found.residual <= _FAR:
+            return _with_pieces(original, mesh, parts, found, pose) if fits < _ALL else found
+        failed.append((found.residual, fits))
     size, coverage = min(failed)
     raise JaxmarkError(
-        f"The suspect could not be aligned: its surface lies {100 * size:.2g} % of the diagonal from the original's"
-        f" where {100 * coverage:.0f} % of the original are seen. Bring it into the original's pose and cut off what"
-        " does not belong to it."
+        "The suspect could not be aligned: "
+        + (
+            f"its surface lies {100 * size:.2g} % of the diagonal from the original's where {100 * coverage:.0f} % of"
+            " the original are seen."
+            if coverage
+            else "in no pose is its surface near the original's."
+        )
+        + " Bring it into the original's pose and cut off what does not belong to it."
     )
 
 
-def _by_surface(original: Original, mesh: Mesh, suspect: Mesh, by_affine: bool) -> Alignment:
+def _coverage(original: Original, found: Alignment) -> float:
+    return float(np.sum(found.weights > 0) / original.used.sum())
+
+
+def _with_pieces(original: Original, mesh: Mesh, parts: list[Mesh], found: Alignment, pose: Pose) -> Alignment:
+    """What other parts of a suspect show of the original, wherever they went, each brought back by a map of its own."""
+    surface = Surface(mesh)
+    for part in parts:
+        there = pose(np.asarray(part.vertices)[used_vertices(part)])
+        if np.median(np.linalg.norm(surface.closest(there)[0] - there, axis=1)) <= _FAR:
+            continue  # seen already
+        if (of_its_own := register_part(mesh, part)) is None:
+            continue
+        piece = _by_surface(original, mesh, part, of_its_own, by_affine=True)
+        new = (piece.weights > 0) & (found.weights == 0)
+        if piece.residual <= _FAR and new.sum() >= _PIECE * original.used.sum():
+            both = {
+                name: np.where(new[:, None], getattr(piece, name), getattr(found, name))
+                for name in ("displacement", "normals")
+            }
+            found = found._replace(weights=np.where(new, piece.weights, found.weights), **both)
+    return found
+
+
+def _by_surface(original: Original, mesh: Mesh, suspect: Mesh, pose: Pose, by_affine: bool) -> Alignment:
     """Only how far the surface lies along its normal is known of each point."""
-    used, x = original.used, np.asarray(mesh.vertices)
-    pose, surface = register(mesh, suspect)
-    if by_affine:
-        pose = refine(surface, x[used], vertex_normals(mesh)[used], pose, by_affine=True)
-    closest, face = surface.closest(x, pose)
+    x, surface = np.asarray(mesh.vertices), Surface(suspect)
+    closest, face, seen = _closest(original, x, suspect, surface, pose)
+    if by_affine and seen.any():
+        pose = refine(surface, x[seen], vertex_normals(mesh)[seen], pose, by_affine=True)
+        closest, face, seen = _closest(original, x, suspect, surface, pose)
+    displacement = np.where(seen[:, None], closest - x, 0)
+    size = _rms(displacement[seen])
     posed = suspect._replace(vertices=pose(np.asarray(suspect.vertices)))
-    error = np.where(used[:, None], closest - x, 0)
-    length = np.linalg.norm(error, axis=1)
-    known = used & ~_on_boundary(posed, face, closest)
-    weights = known & _agreeing(length, known) if known.any() else known
-    size = float(np.sqrt(np.mean(length[weights] ** 2))) if weights.any() else np.inf
-    displacement = np.where(weights[:, None], error, 0)
     # Closest points lie along the suspect's normals; that they are not the original's matters on coarse suspects.
     normals = face_normals(posed)[face]
-    smoothed = _smoothed(mesh, posed, face, closest)
-    explains = weights.any() and _explains(smoothed, x, displacement, normals, weights)
-    return Alignment(
-        displacement,
-        weights.astype(float),
-        normals,
-        smoothed if explains else None,
-        "surface",
-        pose.then(_file(original)),
-        size,
-        0.0,
-    )
+    nuisance = replayed(mesh, posed, face, closest, normals, seen) if size <= _FAR else None
+    file = pose.then(_file(original))
+    return Alignment(displacement, seen.astype(float), normals, nuisance, "surface", file, size, 0.0)
 
 
-def _smoothed(
-    original: Mesh, suspect: Mesh, face: Int64[np.ndarray, " points"], closest: Float64[np.ndarray, "points 3"]
-) -> Float64[np.ndarray, "points columns"]:
-    """The original put through smoothing as the suspect's meshing does it, by several amounts, as seen from its points.
-
-    A suspect that was simplified and then smoothed has shrunk by another operator than the original's.
-    """
-    there = Surface(original).closest(np.asarray(suspect.vertices))[0]
-    family = diffusion(_SCALES, 4 * 2 ** (_SCALES // 2) + 1)
-    amounts = band_components(make_laplacian(suspect), family, jnp.asarray(there, jnp.float32))
-    share = _barycentric(suspect, face, closest)
-    seen = np.einsum("spkc,pk->psc", np.asarray(amounts, np.float64)[:, np.asarray(suspect.faces)[face]], share)
-    return seen.reshape(len(face), -1)
-
-
-def _explains(
-    columns: Float64[np.ndarray, "points columns"],
-    x: Float64[np.ndarray, "points 3"],
-    displacement: Float64[np.ndarray, "points 3"],
-    normals: Float64[np.ndarray, "points 3"],
-    weights: Bool[np.ndarray, " points"],
-) -> bool:
-    """Whether columns explain nine tenths of what an affine map does not: each takes some of the mark away, too."""
-    some = np.flatnonzero(weights)
-    some = some[np.random.default_rng(0).permutation(len(some))[:_ENOUGH]]
-    along = np.sum(normals[some] * displacement[some], axis=1)
-
-    def left(columns: Float64[np.ndarray, "points columns"]) -> float:
-        design = (columns[some][:, :, None] * normals[some][:, None, :]).reshape(len(some), -1)
-        return float(np.sum((along - design @ np.linalg.lstsq(design, along, rcond=1e-9)[0]) ** 2))
-
-    plain = np.concatenate([np.ones((len(x), 1)), x], axis=1)
-    return left(np.concatenate([plain, columns], axis=1)) < _MOST_LEFT * left(plain)
-
-
-def _on_boundary(
-    mesh: Mesh, face: Int64[np.ndarray, " points"], closest: Float64[np.ndarray, "points 3"]
-) -> Bool[np.ndarray, " points"]:
-    """Which closest points lie on the rim of a hole: what they are closest to is beyond it."""
-    rim = np.zeros(len(mesh.vertices), bool)
-    rim[boundary_vertices(mesh.faces)] = True
-    if not rim.any():
-        return np.zeros(len(face), bool)
-    inside = _barycentric(mesh, face, closest) > 1e-6
-    return np.all(~inside | rim[np.asarray(mesh.faces)[face]], axis=1) & ~np.all(inside, axis=1)
-
-
-def _barycentric(
-    mesh: Mesh, face: Int64[np.ndarray, " points"], points: Float64[np.ndarray, "points 3"]
-) -> Float64[np.ndarray, "points 3"]:
-    """Shares of a face's corners in points on it; zeros on a face without area."""
-    with np.errstate(all="ignore"):
-        share = trimesh.triangles.points_to_barycentric(np.asarray(mesh.vertices)[np.asarray(mesh.faces)[face]], points)
-    return np.nan_to_num(share, nan=0.0, posinf=0.0, neginf=0.0)
+def _closest(
+    original: Original, x: Points, suspect: Mesh, surface: Surface, pose: Pose
+) -> tuple[Points, Int64[np.ndarray, " points"], Bool[np.ndarray, " points"]]:
+    """Where and on which face a suspect in a pose comes closest to each point, and whether that says anything."""
+    closest, face = surface.closest(x, pose)
+    known = original.used & ~on_rim(suspect, face, pose.inverse()(closest))
+    error = np.linalg.norm(closest - x, axis=1)
+    return closest, face, known & _agreeing(error, known) if known.any() else known

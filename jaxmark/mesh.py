@@ -135,12 +135,12 @@ def diagonal(mesh: Mesh) -> float:
 def vertex_normals(mesh: Mesh) -> Float64[np.ndarray, "vertices 3"]:
     """Unit normals, the area-weighted means of the faces'; zero where they cancel or there is no area."""
     corner, area, size = np.ravel(mesh.faces), _areas(mesh), len(mesh.vertices)
-    return _unit(np.stack([np.bincount(corner, np.repeat(column, 3), size) for column in area.T], axis=1))
+    return unit(np.stack([np.bincount(corner, np.repeat(column, 3), size) for column in area.T], axis=1))
 
 
 def face_normals(mesh: Mesh) -> Float64[np.ndarray, "faces 3"]:
     """Unit normals; zero where a face has no area."""
-    return _unit(_areas(mesh))
+    return unit(_areas(mesh))
 
 
 def boundary_vertices(faces: Int[Array | np.ndarray, "faces 3"]) -> Int64[np.ndarray, " boundary"]:
@@ -149,12 +149,22 @@ def boundary_vertices(faces: Int[Array | np.ndarray, "faces 3"]) -> Int64[np.nda
     return np.unique(pairs[count == 1])
 
 
+def area(mesh: Mesh) -> float:
+    """Of the whole surface."""
+    return float(np.linalg.norm(_areas(mesh), axis=1).sum() / 2)
+
+
+def component_of(mesh: Mesh) -> Int64[np.ndarray, " vertices"]:
+    """The number of the connected part that each vertex is in."""
+    pairs, size = edges(mesh.faces), len(mesh.vertices)
+    graph = sparse.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (size, size))
+    return csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
+
+
 def components(mesh: Mesh) -> list[Mesh]:
     """The connected parts of a mesh, the one of most faces first; vertices stay as they are."""
-    faces, pairs = np.asarray(mesh.faces), edges(mesh.faces)
-    size = len(mesh.vertices)
-    graph = sparse.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (size, size))
-    label = csgraph.connected_components(graph, directed=False)[1][faces[:, 0]]
+    faces = np.asarray(mesh.faces)
+    label = component_of(mesh)[faces[:, 0]]
     largest = np.argsort(-np.bincount(label), kind="stable")
     return [mesh._replace(faces=faces[label == one]) for one in largest[: len(np.unique(label))]]
 
@@ -180,7 +190,8 @@ def _areas(mesh: Mesh) -> Float64[np.ndarray, "faces 3"]:
     return np.cross(b - a, c - a)
 
 
-def _unit(x: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3"]:
+def unit(x: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3"]:
+    """Vectors at length one; zero where they have none."""
     length = np.linalg.norm(x, axis=1, keepdims=True)
     return np.divide(x, length, out=np.zeros_like(x), where=length > 0)
 

@@ -6,17 +6,18 @@ import numpy as np
 from jaxtyping import Float64
 
 Points = Float64[np.ndarray, "points 3"]
+PointSets = Float64[np.ndarray, "... points 3"]
 
 
 class Pose(NamedTuple):
-    """The map x ↦ matrix · x + shift."""
+    """The map x ↦ matrix · x + shift, or a map for each of many sets of points."""
 
-    matrix: Float64[np.ndarray, "3 3"]
-    shift: Float64[np.ndarray, " 3"]
+    matrix: Float64[np.ndarray, "... 3 3"]
+    shift: Float64[np.ndarray, "... 3"]
 
-    def __call__(self, points: Points) -> Points:
+    def __call__(self, points: PointSets) -> PointSets:
         """Where points go."""
-        return points @ self.matrix.T + self.shift
+        return points @ np.swapaxes(self.matrix, -1, -2) + self.shift[..., None, :]
 
     def then(self, other: "Pose") -> "Pose":
         """This map, and after it the other."""
@@ -31,14 +32,16 @@ class Pose(NamedTuple):
 IDENTITY = Pose(np.eye(3), np.zeros(3))
 
 
-def similarity(source: Points, target: Points) -> Pose:
+def similarity(source: PointSets, target: PointSets) -> Pose:
     """The scale, rotation and shift that bring points closest to others (Umeyama, IEEE PAMI 13, 1991, eq. 39-42)."""
-    back, to = source.mean(axis=0), target.mean(axis=0)
-    u, size, vt = np.linalg.svd((target - to).T @ (source - back))
-    proper = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])  # a rotation, no reflection
-    scale = (size * proper).sum() / max(((source - back) ** 2).sum(), np.finfo(float).tiny)
-    turn = scale * (u * proper @ vt)
-    return Pose(turn, to - turn @ back)
+    back, to = source.mean(axis=-2, keepdims=True), target.mean(axis=-2, keepdims=True)
+    u, size, vt = np.linalg.svd(np.swapaxes(target - to, -1, -2) @ (source - back))
+    proper = np.ones(size.shape)
+    proper[..., 2] = np.sign(np.linalg.det(u @ vt))  # a rotation, no reflection
+    spread = np.maximum(((source - back) ** 2).sum(axis=(-1, -2)), np.finfo(float).tiny)
+    scale = (size * proper).sum(axis=-1) / spread
+    turn = scale[..., None, None] * ((u * proper[..., None, :]) @ vt)
+    return Pose(turn, (to - back @ np.swapaxes(turn, -1, -2))[..., 0, :])
 
 
 def affine(source: Points, target: Points) -> Pose:

@@ -1,70 +1,65 @@
 """The pose of a suspect of foreign connectivity, by its surface; host side, deterministic, free of the key.
 
-Coarse: the principal axes of both surfaces in all 24 ways, each improved by trimmed closest points (Chetverikov et al.,
-"Robust Euclidean alignment of 3D point sets: the trimmed iterative closest point algorithm", 2005), both ways, so that
-a scale can be found. Fine: the best of them, by distances from the original's points to the suspect's surface along the
-original's normals. Closest points on surfaces are libigl's, which agree with brute force at any scale of coordinates;
-trimesh's do not, and its registration compares against an absolute threshold.
+Whole suspects: the principal axes of both surfaces in all 24 ways, each improved by trimmed closest points (Chetverikov
+et al., "Robust Euclidean alignment of 3D point sets: the trimmed iterative closest point algorithm", 2005), both ways,
+so that a scale can be found. Parts: poses that local shape suggests (`jaxmark.features`). Either way the best is
+refined by distances along normals. trimesh's own registration compares against an absolute threshold.
 """
 
 from itertools import permutations, product
-from typing import Any
 
 import numpy as np
-import trimesh
-from jaxtyping import Int64
 from scipy.spatial import KDTree
 
-from jaxmark.errors import JaxmarkError
-from jaxmark.extras import require
-from jaxmark.mesh import Mesh, used_vertices, vertex_normals
+from jaxmark.features import poses_by_features
+from jaxmark.mesh import Mesh, unit, used_vertices, vertex_normals
 from jaxmark.pose import IDENTITY, Points, Pose, similarity
+from jaxmark.surfaces import Surface, sample
 
 _SAMPLES, _COARSE, _FINE = 20_000, 300, 2000
 _TRIM = 0.8
 _ROUNDS = 30
 _LIKELY = 2.0  # poses that leave up to so many times the least distance are tried on
+_WHOLE = 0.01  # the most that the best pose of a whole suspect leaves: several times what sampling does
+_CANDIDATES = 6  # poses by features that are tried on
 
 
-class Surface:
-    """A mesh that answers where its closest points are."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        """Raises JaxmarkError if libigl is missing."""
-        igl: Any = require("igl", "align")
-        self._vertices = np.ascontiguousarray(mesh.vertices, np.float64)
-        self._faces = np.ascontiguousarray(mesh.faces, np.int64)
-        self._tree = igl.AABB()
-        self._tree.init(self._vertices, self._faces)
-
-    def closest(self, points: Points, pose: Pose = IDENTITY) -> tuple[Points, Int64[np.ndarray, " points"]]:
-        """The closest points when the surface is in a pose (a similarity, or nearly), and on which faces they lie."""
-        there = np.ascontiguousarray(pose.inverse()(points))
-        _, face, closest = self._tree.squared_distance(self._vertices, self._faces, there)
-        return pose(np.asarray(closest).reshape(-1, 3)), np.asarray(face).ravel().astype(np.int64)
-
-
-def register(original: Mesh, suspect: Mesh) -> tuple[Pose, Surface]:
-    """Find the similarity that brings a suspect's surface onto an original's.
+def register_whole(original: Mesh, suspect: Mesh) -> Pose | None:
+    """The similarity that brings a suspect's surface onto an original's; None where much is missing, or beside it.
 
     Args:
         original: of welded points, about one in size.
-        suspect: in any pose and scale.
-
-    Returns:
-        The map from the suspect's coordinates to the original's, and the suspect's surface in its own coordinates.
+        suspect: in any pose and scale, with an area.
 
     Raises:
-        JaxmarkError: if libigl is missing, or a surface has no area.
+        JaxmarkError: if libigl is missing.
     """
     surface = Surface(suspect)
-    starts = _coarse(_sample(original), _sample(suspect))
+    starts = _coarse(sample(original, _SAMPLES).points, sample(suspect, _SAMPLES).points)
+    if not starts:
+        return None
     used = np.flatnonzero(used_vertices(original))
     some = used[np.random.default_rng(0).permutation(len(used))[:_FINE]]
     points, normals = np.asarray(original.vertices), vertex_normals(original)
     ends = [refine(surface, points[some], normals[some], start) for start in starts]
     best = ends[int(np.argmin([_distance(surface, points[some], end) for end in ends]))]
-    return refine(surface, points[used], normals[used], best), surface
+    return refine(surface, points[used], normals[used], best)
+
+
+def register_part(original: Mesh, suspect: Mesh) -> Pose | None:
+    """The same where the suspect is a part of the original, a fifth at least; None where no pose suggests itself."""
+    surface, (points, normals, _) = Surface(original), sample(suspect, _SAMPLES)
+    ends = []
+    for start in poses_by_features(original, suspect, _CANDIDATES):
+        # Every point of a part has its place on the original, but not the other way round: the original is brought
+        # onto the part, and back.
+        there, along = start(points), unit(normals @ start.matrix.T)
+        back = refine(surface, there[:_FINE], along[:_FINE], IDENTITY)
+        ends.append((_distance(surface, there[:_FINE], back), start, back))
+    if not ends:
+        return None
+    _, start, back = min(ends, key=lambda end: end[0])
+    return start.then(refine(surface, start(points), unit(normals @ start.matrix.T), back).inverse())
 
 
 def _distance(surface: Surface, points: Points, pose: Pose) -> float:
@@ -97,16 +92,8 @@ def refine(surface: Surface, points: Points, normals: Points, pose: Pose, *, by_
     return pose
 
 
-def _sample(mesh: Mesh) -> Points:
-    """Points spread over a surface by area."""
-    surface = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), process=False)
-    if not 0 < surface.area < np.inf:
-        raise JaxmarkError(f"A surface has an area of {surface.area:g}; nothing can be aligned with it.")
-    return np.asarray(trimesh.sample.sample_surface(surface, _SAMPLES, seed=0)[0])
-
-
 def _coarse(target: Points, source: Points) -> list[Pose]:
-    """The likeliest poses."""
+    """The likeliest poses, if any will do."""
     forward, backward = KDTree(target), KDTree(source)
     ends = [
         _closest_points(start, target[:_COARSE], source[:_COARSE], forward, backward) for start in _axes(target, source)
@@ -115,7 +102,7 @@ def _coarse(target: Points, source: Points) -> list[Pose]:
     return [
         _closest_points(pose, target[:_FINE], source[:_FINE], forward, backward)[0]
         for pose, off in ends
-        if off <= _LIKELY * least
+        if off <= min(_LIKELY * least, _WHOLE)
     ]
 
 

@@ -100,7 +100,7 @@ def test_a_mark_along_the_normal_of_a_flat_mesh_survives(seed):
     ],
 )
 def test_up_to_half_of_the_points_may_be_elsewhere(where, how, share, turned, original: Original):
-    """Those are masked, and the rest recovered as if they had never been there."""
+    """Those are masked, and the rest recovered as if they had never been there. What went together is recovered too."""
     for seed in range(4):
         random = np.random.default_rng(seed)
         displacement = 5e-4 * random.normal(size=(642, 3))
@@ -111,10 +111,12 @@ def test_up_to_half_of_the_points_may_be_elsewhere(where, how, share, turned, or
         matrix = Rotation.random(rng=random).as_matrix() if turned else np.eye(3)
         suspect = moved(original, displacement + lost[:, None] * edit, matrix, random.normal(size=3))
         found, weights, *_ = align(original, suspect)
-        np.testing.assert_array_equal(weights, ~lost)
-        np.testing.assert_array_equal(found[lost], 0)
-        expected = without_affine(original.positions[~lost], displacement[~lost])
-        np.testing.assert_allclose(found[~lost], expected, atol=1e-9)
+        seen = np.array([~lost, lost] if how == "together" else [~lost])
+        np.testing.assert_array_equal(weights, seen.any(axis=0))
+        np.testing.assert_array_equal(found[weights == 0], 0)
+        for piece in seen:
+            expected = without_affine(original.positions[piece], displacement[piece])
+            np.testing.assert_allclose(found[piece], expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("far", [1.0, 1e9, 1e200])
@@ -268,6 +270,50 @@ def test_other_objects_beside_a_surface_are_ignored(original: Original):
     assert found.method == "surface"
     check_pose(original, found.pose, pose, 1e-7)
     np.testing.assert_array_equal(found.weights, 1)
+
+
+def halves(mesh: Mesh) -> tuple[Mesh, Mesh]:
+    """On either side of a plane; the faces across it are gone."""
+    upper = (np.asarray(mesh.vertices)[:, 2] > np.median(mesh.vertices[:, 2]))[mesh.faces]
+    return mesh._replace(faces=mesh.faces[upper.all(axis=1)]), mesh._replace(faces=mesh.faces[~upper.any(axis=1)])
+
+
+def together(one: Mesh, other: Mesh) -> Mesh:
+    """As two objects of one file, with only the vertices that faces use."""
+    meshes = [trimesh.Trimesh(*mesh, process=False) for mesh in (one, other)]
+    for mesh in meshes:
+        mesh.remove_unreferenced_vertices()
+    both = trimesh.util.concatenate(meshes)
+    return make_mesh(both.vertices, both.faces)
+
+
+@pytest.mark.parametrize("foreign", [False, True])
+def test_pieces_that_moved_apart_are_aligned_one_by_one(foreign, original: Original):
+    displacement = 2e-4 * np.random.default_rng(8).normal(size=(642, 3))
+    marked = moved(original, displacement)
+    if foreign:
+        marked = make_mesh(*trimesh.remesh.subdivide(np.asarray(marked.vertices), np.asarray(marked.faces)))
+    upper, lower = halves(marked)
+    whole = align(original, together(upper, lower))
+    apart = align(original, together(anywhere(upper, 1)[0], anywhere(lower, 2)[0]))
+    assert whole.method == apart.method == ("surface" if foreign else "connectivity")
+    seen = (whole.weights > 0) & (apart.weights > 0)
+    assert seen.sum() > 0.8 * 642
+    assert apart.residual < 1e-3
+    # Each piece has a map of its own, so that a little less than of the whole is left.
+    left = np.vdot(apart.displacement[seen], whole.displacement[seen]) / np.sum(whole.displacement[seen] ** 2)
+    assert 0.85 < left <= 1
+
+
+def test_a_remeshed_part_is_aligned(original: Original):
+    vertices, faces = trimesh.remesh.subdivide(np.asarray(original.mesh.vertices), np.asarray(original.mesh.faces))
+    part, _ = halves(make_mesh(vertices, faces))
+    suspect, pose = anywhere(part, 4)
+    found = align(original, suspect)
+    assert found.method == "surface"
+    assert 0.4 < found.weights.mean() < 0.5
+    assert found.residual < 2e-4
+    check_pose(original, found.pose, pose, 1e-3)
 
 
 def test_an_affine_map_of_a_surface_is_undone_on_request(original: Original):

@@ -5,9 +5,11 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from jaxmark.features import descriptors
 from jaxmark.mesh import Mesh, make_mesh, vertex_normals
 from jaxmark.pose import IDENTITY, Pose, affine, similarity
-from jaxmark.registration import Surface, refine, register
+from jaxmark.registration import refine, register_part, register_whole
+from jaxmark.surfaces import Surface, sample
 from tests.samples import bumpy_sphere
 
 
@@ -71,9 +73,11 @@ def test_a_similarity_and_an_affine_map_by_least_squares(seed):
 @pytest.mark.parametrize("seed", range(4))
 def test_the_pose_of_another_meshing_is_found(seed, mesh: Mesh):
     other, pose = finer(mesh), anywhere(seed)
-    found, _ = register(mesh, other._replace(vertices=pose(np.asarray(other.vertices))))
+    found = register_whole(mesh, other._replace(vertices=pose(np.asarray(other.vertices))))
+    assert found is not None
     np.testing.assert_allclose(found(pose(np.asarray(mesh.vertices))), mesh.vertices, atol=1e-7)
-    again, _ = register(mesh, other._replace(vertices=pose(np.asarray(other.vertices))))
+    again = register_whole(mesh, other._replace(vertices=pose(np.asarray(other.vertices))))
+    assert again is not None
     np.testing.assert_array_equal(found.matrix, again.matrix)
 
 
@@ -86,9 +90,59 @@ def test_the_pose_of_a_coarser_and_noisy_surface_is_nearly_found(seed, mesh: Mes
     filters.meshing_decimation_quadric_edge_collapse(targetfacenum=800)
     coarse, pose = filters.current_mesh(), anywhere(seed)
     rough = coarse.vertex_matrix() + 1e-3 * np.random.default_rng(seed).normal(size=coarse.vertex_matrix().shape)
-    found, _ = register(mesh, make_mesh(pose(rough), coarse.face_matrix().astype(int)))
+    found = register_whole(mesh, make_mesh(pose(rough), coarse.face_matrix().astype(int)))
+    assert found is not None
     off = found(pose(np.asarray(mesh.vertices))) - mesh.vertices
     assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 1e-3
+
+
+def part_of(mesh: Mesh, share: float) -> Mesh:
+    """What lies on one side of a plane."""
+    height = np.asarray(mesh.vertices) @ [0.5, 0.3, 0.8]
+    return mesh._replace(faces=mesh.faces[(height <= np.quantile(height, share))[mesh.faces].all(axis=1)])
+
+
+@pytest.mark.parametrize("share", [0.7, 0.5, 0.3])
+def test_the_pose_of_a_part_is_found(share, mesh: Mesh):
+    """By its points, each of which lies on the original."""
+    rng = np.random.default_rng(6)
+    other, pose = part_of(finer(mesh), share), anywhere(6)
+    rough = np.asarray(other.vertices) + 2e-4 * rng.normal(size=other.vertices.shape)
+    suspect = other._replace(vertices=pose(rough))
+    assert register_whole(mesh, suspect) is None
+    found, again = register_part(mesh, suspect), register_part(mesh, suspect)
+    assert found is not None
+    assert again is not None
+    np.testing.assert_array_equal(found.matrix, again.matrix)
+    off = found(pose(np.asarray(mesh.vertices))) - mesh.vertices
+    assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 1e-3
+
+
+def test_descriptors_do_not_depend_on_pose_and_scale(mesh: Mesh):
+    points, normals, _ = sample(mesh, 600)
+    pose = anywhere(7)
+    scale = np.cbrt(np.linalg.det(pose.matrix))
+    one = descriptors(points, normals, 0.12)
+    other = descriptors(pose(points), normals @ pose.matrix.T / scale, 0.12 * scale)
+    # Angles on the edge between two bins may fall on either side.
+    assert np.mean(np.abs(one - other) > 1e-9) < 0.01
+    # Three angles, of the points around a point, and once more of those around its neighbours.
+    alone = one.sum(axis=1)
+    np.testing.assert_allclose(alone[alone > 0], 6, atol=1e-9)
+
+
+def test_descriptors_on_a_plane_and_a_sphere_are_what_their_angles_say():
+    rng = np.random.default_rng(8)
+    flat = np.concatenate([rng.uniform(-1, 1, (900, 2)), np.zeros((900, 1))], axis=1)
+    up = np.broadcast_to([0.0, 0, 1], flat.shape)
+    # No angle turns: the middle one of eleven bins has it all.
+    np.testing.assert_allclose(descriptors(flat, np.ascontiguousarray(up), 0.3)[:, 5::11].sum(), 6 * 900)
+    ball = rng.normal(size=(4000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    histogram = descriptors(ball, ball, 0.3).mean(axis=0)
+    # Seen along the normal, every other point of a sphere lies below: by half of its distance.
+    assert histogram[11:][:11][:5].sum() + histogram[11:][:11][5] == pytest.approx(2)
+    assert histogram[11:][:11][4] > 1
 
 
 def test_an_affine_map_is_found_from_nearby(mesh: Mesh):
