@@ -10,17 +10,22 @@ from itertools import permutations, product
 
 import numpy as np
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from jaxmark.features import poses_by_features
 from jaxmark.mesh import Mesh, unit, used_vertices, vertex_normals
 from jaxmark.pose import IDENTITY, Points, Pose, similarity
 from jaxmark.surfaces import Surface, sample
 
-_SAMPLES, _COARSE, _FINE = 20_000, 300, 2000
+_SAMPLES, _COARSE, _SOME, _FINE = 20_000, 300, 500, 2000
 _TRIM = 0.8
-_ROUNDS = 30
+_ROUNDS, _FEW = 30, 10  # few are enough to tell which pose is the best
+_REACH = 0.03  # of the distances that count in the first round of refinement
+_LOST = 0.005  # what a point that is far off counts, when poses are compared
 _LIKELY = 2.0  # poses that leave up to so many times the least distance are tried on
 _WHOLE = 0.01  # the most that the best pose of a whole suspect leaves: several times what sampling does
+_MOST, _BEST = 32, 4  # of them that differ, and that are looked at closely
+_ROUND = 1.1  # a shape that is so much wider along one axis than along another is round about the third
 _CANDIDATES = 6  # poses by features that are tried on
 
 
@@ -41,9 +46,13 @@ def register_whole(original: Mesh, suspect: Mesh) -> Pose | None:
     used = np.flatnonzero(used_vertices(original))
     some = used[np.random.default_rng(0).permutation(len(used))[:_FINE]]
     points, normals = np.asarray(original.vertices), vertex_normals(original)
-    ends = [refine(surface, points[some], normals[some], start) for start in starts]
-    best = ends[int(np.argmin([_distance(surface, points[some], end) for end in ends]))]
-    return refine(surface, points[used], normals[used], best)
+    # Principal axes say little of a shape that turns into itself, but for small features.
+    starts += poses_by_features(original, suspect, _CANDIDATES)
+    for count in (_SOME, _FINE):
+        part = some[:count]
+        ends = [refine(surface, points[part], normals[part], start, rounds=_FEW) for start in starts]
+        starts = sorted(ends, key=lambda end: _distance(surface, points[some], end))[:_BEST]
+    return refine(surface, points[used], normals[used], starts[0])
 
 
 def register_part(original: Mesh, suspect: Mesh) -> Pose | None:
@@ -54,7 +63,7 @@ def register_part(original: Mesh, suspect: Mesh) -> Pose | None:
         # Every point of a part has its place on the original, but not the other way round: the original is brought
         # onto the part, and back.
         there, along = start(points), unit(normals @ start.matrix.T)
-        back = refine(surface, there[:_FINE], along[:_FINE], IDENTITY)
+        back = refine(surface, there[:_FINE], along[:_FINE], IDENTITY, rounds=_FEW)
         ends.append((_distance(surface, there[:_FINE], back), start, back))
     if not ends:
         return None
@@ -63,16 +72,19 @@ def register_part(original: Mesh, suspect: Mesh) -> Pose | None:
 
 
 def _distance(surface: Surface, points: Points, pose: Pose) -> float:
-    """How far half of the points are off at most."""
-    return float(np.median(np.linalg.norm(surface.closest(points, pose)[0] - points, axis=1)))
+    """How far points are off in the mean, those that are lost by no more than a little."""
+    return float(np.mean(np.minimum(np.linalg.norm(surface.closest(points, pose)[0] - points, axis=1), _LOST)))
 
 
-def refine(surface: Surface, points: Points, normals: Points, pose: Pose, *, by_affine: bool = False) -> Pose:
+def refine(
+    surface: Surface, points: Points, normals: Points, pose: Pose, *, by_affine: bool = False, rounds: int = _ROUNDS
+) -> Pose:
     """Bring a surface closer to points along their normals, by a similarity or an affine map (Gauss-Newton)."""
-    for _ in range(_ROUNDS):
+    for one in range(rounds):
         closest, _ = surface.closest(points, pose)
         distance = np.sum(normals * (closest - points), axis=1)
-        near = np.abs(distance) <= 4 * np.median(np.abs(distance)) + 1e-12
+        # Where most of a shape fits in many poses, the rest must tell: at first nearly all counts.
+        near = np.abs(distance) <= max(4 * np.median(np.abs(distance)), _REACH * 0.8**one) + 1e-12
         near &= np.linalg.norm(closest - points, axis=1) <= 2 * np.abs(distance) + 1e-6
         c, n, d = closest[near], normals[near], distance[near]
         if by_affine:
@@ -93,35 +105,46 @@ def refine(surface: Surface, points: Points, normals: Points, pose: Pose, *, by_
 
 
 def _coarse(target: Points, source: Points) -> list[Pose]:
-    """The likeliest poses, if any will do."""
+    """The likeliest poses that differ, if any will do."""
     forward, backward = KDTree(target), KDTree(source)
     ends = [
         _closest_points(start, target[:_COARSE], source[:_COARSE], forward, backward) for start in _axes(target, source)
     ]
     least = min(off for _, off in ends)
-    return [
-        _closest_points(pose, target[:_FINE], source[:_FINE], forward, backward)[0]
+    fine = [
+        _closest_points(pose, target[:_FINE], source[:_FINE], forward, backward)
         for pose, off in ends
         if off <= min(_LIKELY * least, _WHOLE)
     ]
+    different: list[Pose] = []
+    for pose, _ in sorted(fine, key=lambda end: end[1]):
+        there = pose(source[:_COARSE])
+        if all(np.mean(np.sum((other(source[:_COARSE]) - there) ** 2, axis=1)) > _WHOLE**2 for other in different):
+            different.append(pose)
+    return different[:_MOST]
 
 
 def _axes(target: Points, source: Points) -> list[Pose]:
     """Principal axes onto principal axes, in all ways that do not mirror."""
-    frames, centres, sizes = [], [], []
-    for points in (target, source):
-        centres.append(points.mean(axis=0))
-        centred = points - centres[-1]
-        sizes.append(np.sqrt((centred**2).sum(axis=1).mean()))
-        axes = np.linalg.eigh(centred.T @ centred)[1]
-        frames.append(axes * [1, 1, np.sign(np.linalg.det(axes))])
+    (to, wide, onto), (back, size, of) = (_principal(points) for points in (target, source))
+    turns = [np.eye(3)]
+    for axis, near in ((0, wide[2] < _ROUND * wide[1]), (2, wide[1] < _ROUND * wide[0])):
+        if near:  # two axes that hardly differ: anything between them may be meant
+            turns = [Rotation.from_euler("xyz"[axis], 15 * step, degrees=True).as_matrix() for step in range(6)]
     starts = []
-    for order, signs in product(permutations(range(3)), product([1, -1], repeat=3)):
-        change = np.eye(3)[list(order)] * signs
+    for turn, order, signs in product(turns, permutations(range(3)), product([1, -1], repeat=3)):
+        change = turn @ (np.eye(3)[list(order)] * signs)
         if np.linalg.det(change) > 0:
-            matrix = sizes[0] / sizes[1] * frames[0] @ change @ frames[1].T
-            starts.append(Pose(matrix, centres[0] - matrix @ centres[1]))
+            matrix = np.linalg.norm(wide) / np.linalg.norm(size) * onto @ change @ of.T
+            starts.append(Pose(matrix, to - matrix @ back))
     return starts
+
+
+def _principal(points: Points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The mean, how wide the points spread along each axis, least first, and the axes as columns."""
+    centre = points.mean(axis=0)
+    variance, axes = np.linalg.eigh(np.cov((points - centre).T))
+    return centre, np.sqrt(np.maximum(variance, 0)), axes * [1, 1, np.sign(np.linalg.det(axes))]
 
 
 def _closest_points(

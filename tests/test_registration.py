@@ -96,6 +96,25 @@ def test_the_pose_of_a_coarser_and_noisy_surface_is_nearly_found(seed, mesh: Mes
     assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 1e-3
 
 
+def nearly_round(level: int = 4) -> Mesh:
+    """A disc as wide along one axis as along another, told apart by one small bump, off the middle."""
+    ball = trimesh.creation.icosphere(subdivisions=level)
+    points = np.asarray(ball.vertices) * [1.0, 1.0, 0.4]
+    for centre, size in (([0.6, 0.0, 0.3], 0.1), ([0.0, -0.5, 0.33], 0.06)):
+        points[:, 2] += size * np.exp(-np.sum((points - centre) ** 2, axis=1) / 0.03)
+    return make_mesh(points / np.linalg.norm(np.ptp(points, axis=0)), ball.faces)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_nearly_round_shape_is_told_by_its_small_features(seed):
+    mesh, pose = nearly_round(), anywhere(seed + 20)
+    other = nearly_round(5)
+    found = register_whole(mesh, other._replace(vertices=pose(np.asarray(other.vertices))))
+    assert found is not None
+    off = found(pose(np.asarray(mesh.vertices))) - mesh.vertices
+    assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 2e-3
+
+
 def part_of(mesh: Mesh, share: float) -> Mesh:
     """What lies on one side of a plane."""
     height = np.asarray(mesh.vertices) @ [0.5, 0.3, 0.8]
