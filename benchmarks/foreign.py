@@ -1,8 +1,9 @@
 """Marks in what other programs make of them: python benchmarks/foreign.py MESH... [--case 64:8e-4 ...].
 
 Each suspect is a marked mesh after ATTACKS, turned, shifted, scaled by 0.01 to 100 and shuffled, written to a file and
-read by a process, `jaxmark detect`. Printed are whether the message is exact, what its reading proves, and how far the
-pose found is from the true one. With --controls, also how often something is detected in suspects without this mark.
+read by a process, `jaxmark detect`. Printed are whether the message is exact, what its reading proves, or how many
+bits, with their tag, such a suspect could carry at most where it does not read, and how far the pose found is from the
+true one. With --controls, also how often something is detected in suspects without this mark.
 """
 
 import argparse
@@ -28,13 +29,16 @@ from scipy import sparse, stats
 from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
+from jaxmark.alignment import align
 from jaxmark.marking import NOISE
 from jaxmark.mesh import Mesh, boundary_vertices, diagonal, edges, used_vertices, weld, welded_mesh
+from jaxmark.original import prepare
 from jaxmark.pose import Pose
 from jaxmark.schemes import get_scheme
 
 Row = dict[str, Any]
 LEVEL = -6  # log10 of the false-positive probability that counts in the controls
+KEYS = 10  # that each of their suspects is read with
 
 try:
     names = ("fast_simplification", "igl", "pymeshlab", "skimage.measure")
@@ -191,13 +195,14 @@ def pose_error(original: Mesh, true: Pose, found: Pose) -> float:
     return float(jm.distortion.rms(found(true(points)) - points)) / diagonal(original)
 
 
-def read(marker: jm.Marker, suspect: Mesh, source: Path, suffix: str) -> Row:
-    """What a process of `jaxmark detect` says of a suspect's file."""
+def read(marker: jm.Marker, suspect: Mesh, source: Path, suffix: str, claim: bytes | None = None) -> Row:
+    """What a process of `jaxmark detect` says of a suspect's file, with a claimed message or without."""
     with tempfile.TemporaryDirectory() as folder:
         file, key = Path(folder) / f"suspect{suffix}", Path(folder) / "owner.key"
         jm.save_mesh(suspect, file)
         jm.save_key(marker.key, key)
         options = f"-m jaxmark detect --bits {marker.bits} --scheme {marker.scheme.name} --json".split()
+        options += ["--message", claim.hex()] if claim else []
         command, start = [sys.executable, *options, file, "--original", source, "--key", key], time.perf_counter()
         run = subprocess.run(command, capture_output=True, text=True)
     row: Row = {"seconds": time.perf_counter() - start}
@@ -231,6 +236,11 @@ def tried(marker: jm.Marker, marked: Mesh, message: bytes, source: Path, steps: 
     if "message" in answer:
         right = answer["message"] == message.hex()
         row["message"] = "yes" if right else "WRONG" if answer["message"] else "no"
+        if not right:
+            # What a claim proves of the true message, exp(-SNR/2), is also a bound on what such a suspect could carry:
+            # the capacity of a Gaussian channel is at most SNR/2 nats, in however many dimensions.
+            claimed = read(marker, suspect, source, suffix, message).get("log10_p")
+            row["most_bits"] = None if claimed is None else float(np.floor(-claimed * np.log2(10)))
     return row
 
 
@@ -247,8 +257,10 @@ def measured(source: Path, scheme: str, bits: int, budget: float, options: argpa
             yield row | {"attack": steps, "declared_noise": made[3]} | tried(*made[:3], source, steps, seed)
 
 
-def control(sources: list[Path], scheme: str, bits: int, budget: float, options: argparse.Namespace, trial: int) -> Row:
-    """One suspect that knows nothing of the key it is read with."""
+def controls(
+    sources: list[Path], scheme: str, bits: int, budget: float, options: argparse.Namespace, trial: int
+) -> Iterator[Row]:
+    """One suspect, aligned once, that knows nothing of the keys it is read with."""
     rng = np.random.default_rng([trial, 1])
     source = sources[trial % len(sources)]
     kind = ("unmarked", "other key", "other object")[trial // len(sources) % 3]
@@ -265,12 +277,16 @@ def control(sources: list[Path], scheme: str, bits: int, budget: float, options:
             suspect = jm.load_mesh(others[rng.integers(len(others))]) if others else rough
         suspect = found_again(attacked(suspect, steps, trial), rng)[0]
     except Exception as error:
-        return row | failed(error)
+        yield row | failed(error)
+        return
     try:
-        found = jm.make_marker(original, rng.bytes(32), bits=bits, scheme=scheme).detect(suspect)
+        aligned = align(prepare(original), suspect)
     except jm.JaxmarkError as error:
-        return row | {"note": f"refused: {error}"}
-    return row | {"log10_p": found.log10_p, "coverage": found.coverage}
+        yield row | {"note": f"refused: {error}"}
+        return
+    for _ in range(KEYS):
+        found = jm.make_marker(original, rng.bytes(32), bits=bits, scheme=scheme).detect(aligned)
+        yield row | {"log10_p": found.log10_p, "coverage": found.coverage}
 
 
 def summary(rows: list[Row]) -> str:
@@ -278,7 +294,7 @@ def summary(rows: list[Row]) -> str:
     text = [
         "## Controls",
         "",
-        f"| suspects | read | log10 p ≤ {LEVEL} | rate at most (95 %) | no answer |",
+        f"| suspects | readings | log10 p ≤ {LEVEL} | rate at most (95 %) | no answer |",
         "|---" * 5 + "|",
     ]
     for kind in (*dict.fromkeys(row["kind"] for row in rows), "all"):
@@ -299,8 +315,8 @@ def tables(rows: list[Row]) -> str:
         text = "" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
         return text.replace("|", "\\|")
 
-    columns = ["mesh", "attack", "seed", "vertices", "message", "log10_p", "coverage", "method", "pose_error"]
-    columns += ["residual", "seconds", "note"]
+    columns = ["mesh", "attack", "seed", "vertices", "message", "log10_p", "most_bits", "coverage", "method"]
+    columns += ["pose_error", "residual", "seconds", "note"]
     text = []
     for case in dict.fromkeys(row["case"] for row in rows):
         mine = [row for row in rows if row["case"] == case]
@@ -319,7 +335,9 @@ def main() -> None:
     parser.add_argument("--attacks", nargs="+", default=[""], metavar="NAME", help="only those whose names have it")
     parser.add_argument("--seeds", type=int, default=1, help="keys, messages, poses and random seeds")
     parser.add_argument("--noise", type=float, default=0.0, help=f"what to declare where {NOISE:g} is refused")
-    parser.add_argument("--controls", type=int, default=0, help="how many other suspects, of the first case")
+    parser.add_argument(
+        "--controls", type=int, default=0, help="how many other suspects, of the first case, each with 10 keys"
+    )
     parser.add_argument("--output", type=Path, help="for foreign.md and .json, rewritten after each mesh and case")
     options = parser.parse_args()
     known = " ".join(ATTACKS.split()).split("; ")
@@ -347,8 +365,9 @@ def main() -> None:
             report()
     scheme, bits, budget = cases[0]
     for trial in range(options.controls):
-        trials.append(control(options.mesh, scheme, int(bits), float(budget), options, trial))
-        print(*trials[-1].values(), sep=", ", file=sys.stderr, flush=True)
+        for row in controls(options.mesh, scheme, int(bits), float(budget), options, trial):
+            trials.append(row)
+            print(*row.values(), sep=", ", file=sys.stderr, flush=True)
     print(report())
 
 

@@ -91,12 +91,19 @@ class Marker:
         return marked, info
 
     def detect(
-        self, suspect: Mesh, message: bytes | None = None, weights: ArrayLike | None = None, align: Align = "auto"
+        self,
+        suspect: Mesh | Alignment,
+        message: bytes | None = None,
+        weights: ArrayLike | None = None,
+        align: Align = "auto",
     ) -> Detection:
-        """Read a suspect, with a claimed message or without; see `detect`."""
+        """Read a suspect, with a claimed message or without; see `detect`.
+
+        One that is read with several keys needs to be aligned only once, by `jaxmark.alignment.align`.
+        """
         if message is not None:
             self._check_size(message)
-        aligned = alignment.align(self.original, suspect, align)
+        aligned = suspect if isinstance(suspect, Alignment) else alignment.align(self.original, suspect, align)
         seen = self.observe(aligned, weights)
         soft = self.soft_values(seen)
         found = decode(soft, self.bits, self.key, self.original.geometry)
