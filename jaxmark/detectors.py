@@ -16,7 +16,7 @@ from jaxmark.carriers.carrier import Strength
 from jaxmark.chebyshev import filter, transpose
 from jaxmark.errors import JaxmarkError
 from jaxmark.observation import Observation
-from jaxmark.reception import clean, extended, receive, whitening
+from jaxmark.reception import Host, Reception, clean, extended, receive, whitening
 
 Detector = Callable[[Carrier, Observation, Strength], Float[Array, " bits"]]
 
@@ -48,7 +48,6 @@ def decorrelate(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Fl
     return jsl.cho_solve(factor, correlate(carrier, seen, beta))
 
 
-@jax.jit
 def joint(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Array, " bits"]:
     """All bits together: least mean square error, by conjugate gradients on the bits, nothing of size bits² formed.
 
@@ -70,7 +69,11 @@ def joint(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Ar
     if not isinstance(carrier, KeyedCarrier):
         raise JaxmarkError(f"The joint detector reads keyed carriers, not {type(carrier).__name__}.")
     host = extended(carrier.host, seen)
-    received = receive(host, seen)
+    return _decoded(carrier, host, receive(host, seen), beta)
+
+
+@jax.jit
+def _decoded(carrier: KeyedCarrier, host: Host, received: Reception, beta: Strength) -> Float[Array, " bits"]:
     model = carrier.shape(beta, received.gain)
     equaliser = whitening(host, received.power)
 
@@ -86,18 +89,19 @@ def joint(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Ar
         return filter(host.operator, equaliser, x)
 
     observed = white(received.residual)
-    matched = backward(observed)
     # What one bit of unit amplitude, and noise of the residual's spectrum and unit strength, contribute to the energy
     # before and after matching, as probes of random signs estimate it.
     key_bits, key_noise = jax.random.split(jax.random.key(1))
-    bits = jax.random.rademacher(key_bits, matched.shape, matched.dtype)
+    bits = jax.random.rademacher(key_bits, carrier.chips.population.shape, observed.dtype)
     signs = jax.random.rademacher(key_noise, observed.shape, observed.dtype)
     coloured = filter(host.operator, host.coefficients.T @ jnp.sqrt(received.power), signs)
-    response, noise = backward(forward(bits)), white(clean(host, received.seen, received.factor, coloured))
+    noise = white(clean(host, received.seen, received.factor, coloured))
+    # One after the other, so that there is less to compile.
+    matched, response, after = jax.lax.map(backward, jnp.stack([observed, forward(bits), noise]))
     ridge = _noise_to_signal(
         jnp.stack([jnp.sum(observed**2), jnp.sum(matched**2)]),
         jnp.stack([bits @ response, jnp.sum(response**2)]),
-        jnp.stack([jnp.sum(noise**2), jnp.sum(backward(noise) ** 2)]),
+        jnp.stack([jnp.sum(noise**2), jnp.sum(after**2)]),
     )
     energy = bits @ response / len(bits)
     ridge = jax.lax.stop_gradient(jnp.where(energy > 0, energy * jnp.clip(ridge / energy, *_BALANCE), 1))

@@ -75,6 +75,7 @@ def extended(host: Host, seen: Observation) -> Host:
     return host._replace(nuisance=_basis(jnp.concatenate([host.nuisance, seen.nuisance], axis=1)))
 
 
+@jax.jit
 def _basis(raw: Float[Array, "vertices columns"]) -> Float[Array, "vertices columns"]:
     """The same span, nearly orthonormal."""
     # Only the span matters, so the change to a good basis is not differentiated. What depends on the columns before it
@@ -89,6 +90,7 @@ def _basis(raw: Float[Array, "vertices columns"]) -> Float[Array, "vertices colu
     return raw @ change
 
 
+@jax.jit
 def receive(host: Host, seen: Observation) -> Reception:
     """Project the nuisance off a residual, and measure gain and power of each band, and the power along each direction.
 
@@ -165,10 +167,20 @@ def _robust(residual: Float[Array, "vertices 3"], weights: Float[Array, " vertic
 
 def _factor(host: Host, seen: Observation) -> Float[Array, "unknowns unknowns"]:
     """Cholesky factor of the nuisance's normal equations, with a ridge for what looks alike where it is seen."""
-    columns = _seen_columns(host, seen)
-    products = columns.T @ (seen.weights[:, None] * columns)
-    ridge = jnp.finfo(products.dtype).eps * (jnp.trace(products) + 1)
-    return jnp.linalg.cholesky(products + ridge * jnp.eye(len(products), dtype=products.dtype))
+
+    def products(weights: Array) -> Array:
+        return host.nuisance.T @ (weights[:, None] * host.nuisance)
+
+    if seen.normals is None:
+        normal = products(seen.weights)
+    else:
+        # Each column along each coordinate: one block for each pair of these, alike for a pair and its reverse.
+        pairs, which = np.triu_indices(3), np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+        along = seen.normals.T
+        blocks = jax.lax.map(products, seen.weights * along[pairs[0]] * along[pairs[1]])[which]
+        normal = blocks.transpose(2, 0, 3, 1).reshape(3 * blocks.shape[2], -1)
+    ridge = jnp.finfo(normal.dtype).eps * (jnp.trace(normal) + 1)
+    return jnp.linalg.cholesky(normal + ridge * jnp.eye(len(normal), dtype=normal.dtype))
 
 
 def clean(
@@ -180,18 +192,10 @@ def clean(
 
 def _explained(host: Host, seen: Observation, factor: Array, x: Array) -> Array:
     """The nuisance that fits a displacement best, where and as it is seen."""
-    columns = _seen_columns(host, seen)
-    fitted = jsl.cho_solve((factor, True), columns.T @ (seen.weights[:, None] * seen.channels(x)))
+    matched = host.nuisance.T @ seen.weigh(x)
     if seen.normals is None:
-        return host.nuisance @ fitted
-    return host.nuisance @ fitted.reshape(-1, 3)
-
-
-def _seen_columns(host: Host, seen: Observation) -> Float[Array, "vertices unknowns"]:
-    """The nuisance as it shows: once for all coordinates, or each column along each coordinate by the normals."""
-    if seen.normals is None:
-        return host.nuisance
-    return (host.nuisance[:, :, None] * seen.normals[:, None, :]).reshape(len(host.nuisance), -1)
+        return host.nuisance @ jsl.cho_solve((factor, True), matched)
+    return host.nuisance @ jsl.cho_solve((factor, True), matched.ravel()).reshape(-1, 3)
 
 
 def _energies(host: Host, x: Array) -> Float[Array, " bands"]:

@@ -46,8 +46,8 @@ def register_whole(original: Mesh, suspect: Mesh) -> Pose | None:
     used = np.flatnonzero(used_vertices(original))
     some = used[np.random.default_rng(0).permutation(len(used))[:_FINE]]
     points, normals = np.asarray(original.vertices), vertex_normals(original)
-    # Principal axes say little of a shape that turns into itself, but for small features.
-    starts += poses_by_features(original, suspect, _CANDIDATES)
+    if len(starts) > 1:  # principal axes say little of a shape that turns into itself, but for small features
+        starts += poses_by_features(original, suspect, _CANDIDATES)
     for count in (_SOME, _FINE):
         part = some[:count]
         ends = [refine(surface, points[part], normals[part], start, rounds=_FEW) for start in starts]

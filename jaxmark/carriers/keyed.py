@@ -68,12 +68,14 @@ class KeyedCarrier(NamedTuple):
         unit = jnp.eye(len(self.chips.population), dtype=self._signs.dtype)
         return jax.lax.map(lambda bits: self.adjoint(self.displacement(bits, beta), beta), unit)
 
-    @jax.jit
     def claim(self, seen: Observation, bits: Float[Array, " bits"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """See `Carrier`: a is what `matched` gives, up to the bits' signs."""
-        matched = jnp.abs(self._signs) * self.matched(receive(extended(self.host, seen), seen))
-        score = jnp.sum(bits * self._despread(matched))
-        return score, jnp.linalg.norm(matched)
+        return self._claim(receive(extended(self.host, seen), seen), bits)
+
+    @jax.jit
+    def _claim(self, received: Reception, bits: Float[Array, " bits"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        matched = jnp.abs(self._signs) * self.matched(received)
+        return jnp.sum(bits * self._despread(matched)), jnp.linalg.norm(matched)
 
     def matched(self, received: Reception, beta: Strength = 1.0) -> Float[Array, "vertices channels"]:
         """The vector that the keyed signs multiply: the residual through the filter matched to gain and power."""
