@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -69,11 +70,13 @@ def joint(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Ar
     if not isinstance(carrier, KeyedCarrier):
         raise JaxmarkError(f"The joint detector reads keyed carriers, not {type(carrier).__name__}.")
     host = extended(carrier.host, seen)
-    return _decoded(carrier, host, receive(host, seen), beta)
+    return _decoded(carrier, host, receive(host, seen), beta, _TOLERANCE, _STEPS)
 
 
-@jax.jit
-def _decoded(carrier: KeyedCarrier, host: Host, received: Reception, beta: Strength) -> Float[Array, " bits"]:
+@partial(jax.jit, static_argnames=("tolerance", "steps"))
+def _decoded(
+    carrier: KeyedCarrier, host: Host, received: Reception, beta: Strength, tolerance: float, steps: int
+) -> Float[Array, " bits"]:
     model = carrier.shape(beta, received.gain)
     equaliser = whitening(host, received.power)
 
@@ -105,7 +108,7 @@ def _decoded(carrier: KeyedCarrier, host: Host, received: Reception, beta: Stren
     )
     energy = bits @ response / len(bits)
     ridge = jax.lax.stop_gradient(jnp.where(energy > 0, energy * jnp.clip(ridge / energy, *_BALANCE), 1))
-    return cg(lambda bits: backward(forward(bits)) + ridge * bits, matched, tol=_TOLERANCE, maxiter=_STEPS)[0]
+    return cg(lambda bits: backward(forward(bits)) + ridge * bits, matched, tol=tolerance, maxiter=steps)[0]
 
 
 def _noise_to_signal(

@@ -1,5 +1,6 @@
 """The keyed carrier and its joint detector, against dense linear algebra."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
@@ -305,7 +306,7 @@ def check_reading(condition, direction, case: Case, key: jm.Key, dtype):
 
 @jax.jit
 def solved(carrier: KeyedCarrier, seen: Observation, beta: jax.Array) -> jax.Array:
-    """The joint detector, run to the end: its constants are read when it is traced."""
+    """The joint detector, run to the end."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(detectors, "_TOLERANCE", 1e-14)
         patch.setattr(detectors, "_STEPS", 500)
@@ -389,7 +390,16 @@ def test_pure_functions_by_transformation(medium: Case, key: jm.Key, x64):
         np.testing.assert_array_equal(np.sign(soft), message)
 
 
-def test_differentiable_with_respect_to_suspect_original_and_strength(small: Case, key: jm.Key, monkeypatch, x64):
+@pytest.fixture
+def fresh_traces() -> Iterator[None]:
+    """What is patched for a test shows in what it traces, and in nothing that is traced after it."""
+    jax.clear_caches()
+    yield
+    jax.clear_caches()
+
+
+@pytest.mark.usefixtures("fresh_traces", "x64")
+def test_differentiable_with_respect_to_suspect_original_and_strength(small: Case, key: jm.Key, monkeypatch):
     """By finite differences. The ridge is not differentiated on purpose; here it is, and all else has to fit."""
     stop = jax.lax.stop_gradient
     monkeypatch.setattr(jax.lax, "stop_gradient", lambda x: x if getattr(x, "ndim", 1) == 0 else stop(x))
