@@ -105,9 +105,8 @@ def nearly_round(level: int = 4) -> Mesh:
     return make_mesh(points / np.linalg.norm(np.ptp(points, axis=0)), ball.faces)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_nearly_round_shape_is_told_by_its_small_features(seed):
-    mesh, pose = nearly_round(), anywhere(seed + 20)
+def test_a_nearly_round_shape_is_told_by_its_small_features():
+    mesh, pose = nearly_round(), anywhere(20)
     other = nearly_round(5)
     found = register_whole(mesh, other._replace(vertices=pose(np.asarray(other.vertices))))
     assert found is not None
