@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial import KDTree
 
-from jaxmark.mesh import Mesh
+from jaxmark.mesh import Mesh, unit
 from jaxmark.pose import Points, Pose, similarity
 from jaxmark.surfaces import sample
 
@@ -42,15 +42,13 @@ def poses_by_features(original: Mesh, suspect: Mesh, count: int) -> list[Pose]:
 
 def descriptors(points: Points, normals: Points, radius: float) -> Float64[np.ndarray, "points bins"]:
     """Fast point feature histograms: of three angles between normals, for each point and its neighbours."""
-    near = KDTree(points).query(points, k=_NEIGHBOURS + 1, distance_upper_bound=radius)
-    distance, other = (np.asarray(array)[:, 1:] for array in near)  # without the point itself
+    found = KDTree(points).query(points, k=_NEIGHBOURS + 1, distance_upper_bound=radius)
+    distance, other = (np.asarray(array)[:, 1:] for array in found)  # without the point itself
     near = np.isfinite(distance) & (distance > 0)
     other, distance = np.where(near, other, 0), np.where(near, distance, 1)
     towards = (points[other] - points[:, None]) / distance[..., None]
     u = np.broadcast_to(normals[:, None], towards.shape)
-    v = np.cross(towards, u)
-    length = np.linalg.norm(v, axis=-1, keepdims=True)
-    v = v / np.where(length > 0, length, 1)
+    v = unit(np.cross(towards, u))
     w, normal = np.cross(u, v), normals[other]
     angles = [
         np.sum(v * normal, axis=-1),

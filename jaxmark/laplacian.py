@@ -157,11 +157,7 @@ def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence", *, lo
 
 def _neighbours(pairs: Int[np.ndarray, "edges 2"], size: int, if_it_pays: bool) -> Neighbours | None:
     """The table with as many slots as make a product cheapest."""
-    tail, head, edge = (
-        np.r_[pairs[:, 0], pairs[:, 1]],
-        np.r_[pairs[:, 1], pairs[:, 0]],
-        np.tile(np.arange(len(pairs)), 2),
-    )
+    (tail, head), edge = np.concatenate([pairs, pairs[:, ::-1]]).T, np.tile(np.arange(len(pairs)), 2)
     order = np.argsort(tail, kind="stable")
     tail, head, edge = tail[order], head[order], edge[order]
     slot = np.arange(len(tail)) - np.searchsorted(tail, tail)
@@ -170,9 +166,9 @@ def _neighbours(pairs: Int[np.ndarray, "edges 2"], size: int, if_it_pays: bool) 
     if if_it_pays and (slots == 0 or size * slots + _SCATTER * left[slots - 1] > _SCATTER * len(tail)):
         return None
     fits = slot < slots
-    vertices, edges = np.zeros((slots, size), np.int32), np.full((slots, size), len(pairs), np.int32)
     # An empty slot reads the row that is being written: it is at hand.
-    vertices[:] = np.arange(size)
+    vertices = np.tile(np.arange(size, dtype=np.int32), (slots, 1))
+    edges = np.full((slots, size), len(pairs), np.int32)
     vertices[slot[fits], tail[fits]], edges[slot[fits], tail[fits]] = head[fits], edge[fits]
     return Neighbours(vertices, edges, np.stack([tail, head, edge], axis=1)[~fits].astype(np.int32))
 

@@ -190,9 +190,9 @@ def _areas(mesh: Mesh) -> Float64[np.ndarray, "faces 3"]:
     return np.cross(b - a, c - a)
 
 
-def unit(x: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3"]:
+def unit(x: Float64[np.ndarray, "*rows 3"]) -> Float64[np.ndarray, "*rows 3"]:
     """Vectors at length one; zero where they have none."""
-    length = np.linalg.norm(x, axis=1, keepdims=True)
+    length = np.linalg.norm(x, axis=-1, keepdims=True)
     return np.divide(x, length, out=np.zeros_like(x), where=length > 0)
 
 

@@ -39,10 +39,10 @@ def register_whole(original: Mesh, suspect: Mesh) -> Pose | None:
     Raises:
         JaxmarkError: if libigl is missing.
     """
-    surface = Surface(suspect)
     starts = _coarse(sample(original, _SAMPLES).points, sample(suspect, _SAMPLES).points)
     if not starts:
         return None
+    surface = Surface(suspect)
     used = np.flatnonzero(used_vertices(original))
     some = used[np.random.default_rng(0).permutation(len(used))[:_FINE]]
     points, normals = np.asarray(original.vertices), vertex_normals(original)
