@@ -104,7 +104,7 @@ def _align(original: Original, suspect: Mesh, how: Align) -> Alignment:
                 faces = point[np.asarray(points.faces)]
                 faces = faces[(faces >= 0).all(axis=1)]
                 return _by_points(original, scale(there), found, faces, "connectivity", scale)
-    return _by_surfaces(original, mesh, welded, how == "affine")
+    return _by_surfaces(original, Surface(mesh), welded, how == "affine")
 
 
 def _points(original: Original) -> Mesh:
@@ -136,12 +136,12 @@ def _by_points(
     error = np.where(agreeing[:, None], pose(y) - x, 0)
     # What does not agree may be in pieces that went elsewhere; so may be everything.
     piece = np.where(sound, component_of(Mesh(y, faces)), -1)
-    others = _pieces(x, y, np.where(agreeing, -1, piece))
-    if _rms(error[agreeing]) > _FAR:
-        apart = _pieces(x, y, piece)
-        if 2 * sum(len(points) for points, _ in apart) > known.sum():
-            others, agreeing, pose = apart, np.zeros(len(x), bool), apart[0][1]
-    for points, back in others:
+    apart = _pieces(x, y, piece) if _rms(error[agreeing]) > _FAR else []
+    if 2 * sum(len(points) for points, _ in apart) > known.sum():
+        agreeing, pose = np.zeros(len(x), bool), apart[0][1]
+    else:
+        apart = _pieces(x, y, np.where(agreeing, -1, piece))
+    for points, back in apart:
         agreeing[points] = True
         error[points] = back(y[points]) - x[points]
     error = np.where(agreeing[:, None], error, 0)
@@ -211,17 +211,17 @@ def _agreeing(
     return error <= max(_FAR, _OFF * np.quantile(error[among], 0.4))
 
 
-def _by_surfaces(original: Original, mesh: Mesh, suspect: Mesh, by_affine: bool) -> Alignment:
+def _by_surfaces(original: Original, surface: Surface, suspect: Mesh, by_affine: bool) -> Alignment:
     """By the whole surface, or if that will not do as a part of the original, or by a part of the suspect."""
-    parts = [part for part in components(suspect)[:_PARTS] if area(part) > 0]
+    whole, parts = Surface(suspect), [Surface(part) for part in components(suspect)[:_PARTS] if area(part) > 0]
     parts = parts if len(parts) > 1 else []
     failed = [(np.inf, 0.0)]
-    for part, register in ((suspect, register_whole), (suspect, register_part), *((p, register_whole) for p in parts)):
-        if (pose := register(mesh, part)) is None:
+    for part, register in ((whole, register_whole), (whole, register_part), *((p, register_whole) for p in parts)):
+        if (pose := register(surface, part)) is None:
             continue
-        found = _by_surface(original, mesh, part, pose, by_affine)
+        found = _by_surface(original, surface, part, pose, by_affine)
         if (fits := _coverage(original, found)) >= _SEEN and found.residual <= _FAR:
-            return _with_pieces(original, mesh, parts, found, pose) if fits < _ALL else found
+            return _with_pieces(original, surface, parts, found, pose) if fits < _ALL else found
         failed.append((found.residual, fits))
     size, coverage = min(failed)
     raise JaxmarkError(
@@ -240,16 +240,15 @@ def _coverage(original: Original, found: Alignment) -> float:
     return float(np.sum(found.weights > 0) / original.used.sum())
 
 
-def _with_pieces(original: Original, mesh: Mesh, parts: list[Mesh], found: Alignment, pose: Pose) -> Alignment:
+def _with_pieces(original: Original, surface: Surface, parts: list[Surface], found: Alignment, pose: Pose) -> Alignment:
     """What other parts of a suspect show of the original, wherever they went, each brought back by a map of its own."""
-    surface = Surface(mesh)
     for part in parts:
-        there = pose(np.asarray(part.vertices)[used_vertices(part)])
+        there = pose(np.asarray(part.mesh.vertices)[used_vertices(part.mesh)])
         if np.median(np.linalg.norm(surface.closest(there)[0] - there, axis=1)) <= _FAR:
             continue  # seen already
-        if (of_its_own := register_part(mesh, part)) is None:
+        if (of_its_own := register_part(surface, part)) is None:
             continue
-        piece = _by_surface(original, mesh, part, of_its_own, by_affine=True)
+        piece = _by_surface(original, surface, part, of_its_own, by_affine=True)
         new = (piece.weights > 0) & (found.weights == 0)
         if piece.residual <= _FAR and new.sum() >= _PIECE * original.used.sum():
             both = {
@@ -260,28 +259,28 @@ def _with_pieces(original: Original, mesh: Mesh, parts: list[Mesh], found: Align
     return found
 
 
-def _by_surface(original: Original, mesh: Mesh, suspect: Mesh, pose: Pose, by_affine: bool) -> Alignment:
+def _by_surface(original: Original, surface: Surface, suspect: Surface, pose: Pose, by_affine: bool) -> Alignment:
     """Only how far the surface lies along its normal is known of each point."""
-    x, surface = np.asarray(mesh.vertices), Surface(suspect)
-    closest, face, seen = _closest(original, x, suspect, surface, pose)
+    x = np.asarray(surface.mesh.vertices)
+    closest, face, seen = _closest(original, x, suspect, pose)
     if by_affine and seen.any():
-        pose = refine(surface, x[seen], vertex_normals(mesh)[seen], pose, by_affine=True)
-        closest, face, seen = _closest(original, x, suspect, surface, pose)
+        pose = refine(suspect, x[seen], vertex_normals(surface.mesh)[seen], pose, by_affine=True)
+        closest, face, seen = _closest(original, x, suspect, pose)
     displacement = np.where(seen[:, None], closest - x, 0)
     size = _rms(displacement[seen])
-    posed = suspect._replace(vertices=pose(np.asarray(suspect.vertices)))
+    posed = suspect.mesh._replace(vertices=pose(np.asarray(suspect.mesh.vertices)))
     # Closest points lie along the suspect's normals; that they are not the original's matters on coarse suspects.
     normals = face_normals(posed)[face]
-    nuisance = replayed(mesh, posed, face, closest, normals, seen) if size <= _FAR else None
+    nuisance = replayed(surface, posed, face, closest, normals, seen) if size <= _FAR else None
     file = pose.then(_file(original))
     return Alignment(displacement, seen.astype(float), normals, nuisance, "surface", file, size, 0.0)
 
 
 def _closest(
-    original: Original, x: Points, suspect: Mesh, surface: Surface, pose: Pose
+    original: Original, x: Points, suspect: Surface, pose: Pose
 ) -> tuple[Points, Int64[np.ndarray, " points"], Bool[np.ndarray, " points"]]:
     """Where and on which face a suspect in a pose comes closest to each point, and whether that says anything."""
-    closest, face = surface.closest(x, pose)
-    known = original.used & ~on_rim(suspect, face, pose.inverse()(closest))
+    closest, face = suspect.closest(x, pose)
+    known = original.used & ~on_rim(suspect.mesh, face, pose.inverse()(closest))
     error = np.linalg.norm(closest - x, axis=1)
     return closest, face, known & _agreeing(error, known) if known.any() else known

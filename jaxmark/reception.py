@@ -209,12 +209,7 @@ def _polynomials(positions: Float[Array, "vertices 3"], degree: int) -> Float[Ar
     powers = [jnp.ones_like(inside), inside]
     while len(powers) <= degree:
         powers.append(2 * inside * powers[-1] - powers[-2])
-    return jnp.stack(
-        [
-            powers[i][:, 0] * powers[j][:, 1] * powers[k][:, 2]
-            for i in range(degree + 1)
-            for j in range(degree + 1 - i)
-            for k in range(degree + 1 - i - j)
-        ],
-        axis=1,
-    )
+    power = np.indices([degree + 1] * 3).reshape(3, -1)
+    i, j, k = power[:, power.sum(axis=0) <= degree]
+    x, y, z = jnp.moveaxis(jnp.stack(powers), 2, 0)
+    return (x[i] * y[j] * z[k]).T

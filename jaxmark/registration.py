@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from jaxmark.features import poses_by_features
-from jaxmark.mesh import Mesh, unit, used_vertices, vertex_normals
+from jaxmark.mesh import unit, used_vertices, vertex_normals
 from jaxmark.pose import IDENTITY, Points, Pose, similarity
 from jaxmark.surfaces import Surface, sample
 
@@ -29,7 +29,7 @@ _ROUND = 1.1  # a shape that is so much wider along one axis than along another 
 _CANDIDATES = 6  # poses by features that are tried on
 
 
-def register_whole(original: Mesh, suspect: Mesh) -> Pose | None:
+def register_whole(original: Surface, suspect: Surface) -> Pose | None:
     """The similarity that brings a suspect's surface onto an original's; None where much is missing, or beside it.
 
     Args:
@@ -39,36 +39,35 @@ def register_whole(original: Mesh, suspect: Mesh) -> Pose | None:
     Raises:
         JaxmarkError: if libigl is missing.
     """
-    starts = _coarse(sample(original, _SAMPLES).points, sample(suspect, _SAMPLES).points)
+    starts = _coarse(sample(original.mesh, _SAMPLES).points, sample(suspect.mesh, _SAMPLES).points)
     if not starts:
         return None
-    surface = Surface(suspect)
-    used = np.flatnonzero(used_vertices(original))
+    used = np.flatnonzero(used_vertices(original.mesh))
     some = used[np.random.default_rng(0).permutation(len(used))[:_FINE]]
-    points, normals = np.asarray(original.vertices), vertex_normals(original)
+    points, normals = np.asarray(original.mesh.vertices), vertex_normals(original.mesh)
     if len(starts) > 1:  # principal axes say little of a shape that turns into itself, but for small features
-        starts += poses_by_features(original, suspect, _CANDIDATES)
+        starts += poses_by_features(original.mesh, suspect.mesh, _CANDIDATES)
     for count in (_SOME, _FINE):
         part = some[:count]
-        ends = [refine(surface, points[part], normals[part], start, rounds=_FEW) for start in starts]
-        starts = sorted(ends, key=lambda end: _distance(surface, points[some], end))[:_BEST]
-    return refine(surface, points[used], normals[used], starts[0])
+        ends = [refine(suspect, points[part], normals[part], start, rounds=_FEW) for start in starts]
+        starts = sorted(ends, key=lambda end: _distance(suspect, points[some], end))[:_BEST]
+    return refine(suspect, points[used], normals[used], starts[0])
 
 
-def register_part(original: Mesh, suspect: Mesh) -> Pose | None:
+def register_part(original: Surface, suspect: Surface) -> Pose | None:
     """The same where the suspect is a part of the original, a fifth at least; None where no pose suggests itself."""
-    surface, (points, normals, _) = Surface(original), sample(suspect, _SAMPLES)
+    points, normals, _ = sample(suspect.mesh, _SAMPLES)
     ends = []
-    for start in poses_by_features(original, suspect, _CANDIDATES):
+    for start in poses_by_features(original.mesh, suspect.mesh, _CANDIDATES):
         # Every point of a part has its place on the original, but not the other way round: the original is brought
         # onto the part, and back.
         there, along = start(points), unit(normals @ start.matrix.T)
-        back = refine(surface, there[:_FINE], along[:_FINE], IDENTITY, rounds=_FEW)
-        ends.append((_distance(surface, there[:_FINE], back), start, back))
+        back = refine(original, there[:_FINE], along[:_FINE], IDENTITY, rounds=_FEW)
+        ends.append((_distance(original, there[:_FINE], back), start, back))
     if not ends:
         return None
     _, start, back = min(ends, key=lambda end: end[0])
-    return start.then(refine(surface, start(points), unit(normals @ start.matrix.T), back).inverse())
+    return start.then(refine(original, start(points), unit(normals @ start.matrix.T), back).inverse())
 
 
 def _distance(surface: Surface, points: Points, pose: Pose) -> float:

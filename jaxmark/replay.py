@@ -18,7 +18,7 @@ _MOST_LEFT, _ENOUGH = 0.1, 20_000
 
 
 def replayed(
-    original: Mesh,
+    original: Surface,
     suspect: Mesh,
     face: Int64[np.ndarray, " points"],
     closest: Float64[np.ndarray, "points 3"],
@@ -35,20 +35,20 @@ def replayed(
         normals: along which the suspect's displacement is known.
         weights: where it counts.
     """
-    x = np.asarray(original.vertices)
+    x = np.asarray(original.mesh.vertices)
     columns = _smoothed(original, suspect, face, closest)
     displacement = np.where(weights[:, None], closest - x, 0)
     return columns if weights.any() and _explains(columns, x, displacement, normals, weights) else None
 
 
 def _smoothed(
-    original: Mesh, suspect: Mesh, face: Int64[np.ndarray, " points"], closest: Float64[np.ndarray, "points 3"]
+    original: Surface, suspect: Mesh, face: Int64[np.ndarray, " points"], closest: Float64[np.ndarray, "points 3"]
 ) -> Float64[np.ndarray, "points columns"]:
     """The original put through smoothing as the suspect's meshing does it, by several amounts, as seen from its points.
 
     A suspect that was simplified and then smoothed has shrunk by another operator than the original's.
     """
-    there = Surface(original).closest(np.asarray(suspect.vertices))[0]
+    there = original.closest(np.asarray(suspect.vertices))[0]
     family = diffusion(_SCALES, 4 * 2 ** (_SCALES // 2) + 1)
     amounts = band_components(make_laplacian(suspect), family, jnp.asarray(there, jnp.float32))
     share = barycentric(suspect, face, closest)

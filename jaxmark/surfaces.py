@@ -3,6 +3,7 @@
 Closest points are libigl's, which agree with brute force at any scale of coordinates; trimesh's do not.
 """
 
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,20 +17,26 @@ from jaxmark.pose import IDENTITY, Points, Pose
 
 
 class Surface:
-    """A mesh that answers where its closest points are."""
+    """A mesh that answers where its closest points are; what that needs is built when it is first asked."""
 
     def __init__(self, mesh: Mesh) -> None:
-        """Raises JaxmarkError if libigl is missing."""
-        igl: Any = require("igl", "align")
-        self._vertices = np.ascontiguousarray(mesh.vertices, np.float64)
-        self._faces = np.ascontiguousarray(mesh.faces, np.int64)
-        self._tree = igl.AABB()
-        self._tree.init(self._vertices, self._faces)
+        self.mesh = mesh
+        self._arrays = np.ascontiguousarray(mesh.vertices, np.float64), np.ascontiguousarray(mesh.faces, np.int64)
+
+    @cached_property
+    def _tree(self) -> Any:
+        tree = require("igl", "align").AABB()
+        tree.init(*self._arrays)
+        return tree
 
     def closest(self, points: Points, pose: Pose = IDENTITY) -> tuple[Points, Int64[np.ndarray, " points"]]:
-        """The closest points when the surface is in a pose (a similarity, or nearly), and on which faces they lie."""
+        """The closest points when the surface is in a pose (a similarity, or nearly), and on which faces they lie.
+
+        Raises:
+            JaxmarkError: if libigl is missing.
+        """
         there = np.ascontiguousarray(pose.inverse()(points))
-        _, face, closest = self._tree.squared_distance(self._vertices, self._faces, there)
+        _, face, closest = self._tree.squared_distance(*self._arrays, there)
         return pose(np.asarray(closest).reshape(-1, 3)), np.asarray(face).ravel().astype(np.int64)
 
 

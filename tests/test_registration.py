@@ -28,6 +28,10 @@ def anywhere(seed: int) -> Pose:
     return Pose(scale * Rotation.random(rng=random).as_matrix(), 3 * scale * random.normal(size=3))
 
 
+def placed(mesh: Mesh, pose: Pose) -> Surface:
+    return Surface(mesh._replace(vertices=pose(np.asarray(mesh.vertices))))
+
+
 def finer(mesh: Mesh) -> Mesh:
     """The same surface with other vertices and faces."""
     vertices, faces = trimesh.remesh.subdivide(np.asarray(mesh.vertices), np.asarray(mesh.faces))
@@ -73,10 +77,10 @@ def test_a_similarity_and_an_affine_map_by_least_squares(seed):
 @pytest.mark.parametrize("seed", range(4))
 def test_the_pose_of_another_meshing_is_found(seed, mesh: Mesh):
     other, pose = finer(mesh), anywhere(seed)
-    found = register_whole(mesh, other._replace(vertices=pose(np.asarray(other.vertices))))
+    found = register_whole(Surface(mesh), placed(other, pose))
     assert found is not None
     np.testing.assert_allclose(found(pose(np.asarray(mesh.vertices))), mesh.vertices, atol=1e-7)
-    again = register_whole(mesh, other._replace(vertices=pose(np.asarray(other.vertices))))
+    again = register_whole(Surface(mesh), placed(other, pose))
     assert again is not None
     np.testing.assert_array_equal(found.matrix, again.matrix)
 
@@ -90,7 +94,7 @@ def test_the_pose_of_a_coarser_and_noisy_surface_is_nearly_found(seed, mesh: Mes
     filters.meshing_decimation_quadric_edge_collapse(targetfacenum=800)
     coarse, pose = filters.current_mesh(), anywhere(seed)
     rough = coarse.vertex_matrix() + 1e-3 * np.random.default_rng(seed).normal(size=coarse.vertex_matrix().shape)
-    found = register_whole(mesh, make_mesh(pose(rough), coarse.face_matrix().astype(int)))
+    found = register_whole(Surface(mesh), Surface(make_mesh(pose(rough), coarse.face_matrix().astype(int))))
     assert found is not None
     off = found(pose(np.asarray(mesh.vertices))) - mesh.vertices
     assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 1e-3
@@ -108,7 +112,7 @@ def nearly_round(level: int = 4) -> Mesh:
 def test_a_nearly_round_shape_is_told_by_its_small_features():
     mesh, pose = nearly_round(), anywhere(20)
     other = nearly_round(5)
-    found = register_whole(mesh, other._replace(vertices=pose(np.asarray(other.vertices))))
+    found = register_whole(Surface(mesh), placed(other, pose))
     assert found is not None
     off = found(pose(np.asarray(mesh.vertices))) - mesh.vertices
     assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 2e-3
@@ -126,9 +130,9 @@ def test_the_pose_of_a_part_is_found(share, mesh: Mesh):
     rng = np.random.default_rng(6)
     other, pose = part_of(finer(mesh), share), anywhere(6)
     rough = np.asarray(other.vertices) + 2e-4 * rng.normal(size=other.vertices.shape)
-    suspect = other._replace(vertices=pose(rough))
-    assert register_whole(mesh, suspect) is None
-    found, again = register_part(mesh, suspect), register_part(mesh, suspect)
+    surface, suspect = Surface(mesh), Surface(other._replace(vertices=pose(rough)))
+    assert register_whole(surface, suspect) is None
+    found, again = register_part(surface, suspect), register_part(surface, suspect)
     assert found is not None
     assert again is not None
     np.testing.assert_array_equal(found.matrix, again.matrix)
