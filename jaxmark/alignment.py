@@ -29,7 +29,7 @@ from jaxmark.mesh import (
 from jaxmark.original import Original, residual
 from jaxmark.pose import Points, Pose, affine, similarity
 from jaxmark.registration import refine, register_part, register_whole
-from jaxmark.replay import replayed
+from jaxmark.replay import replayed, replayed_points
 from jaxmark.surfaces import Surface, on_rim
 
 Align = Literal["auto", "same", "similarity", "affine"]
@@ -52,7 +52,7 @@ class Alignment(NamedTuple):
     displacement: Float64[np.ndarray, "points 3"]  # of the original's points, in diagonals
     weights: Float64[np.ndarray, " points"]  # 1, or 0 where a point is masked or no face uses it
     normals: Float64[np.ndarray, "points 3"] | None  # given, only the displacement along them is known; unit length
-    nuisance: Float64[np.ndarray, "points columns"] | None  # what the suspect's meshing explains, where that is much
+    nuisance: Float64[np.ndarray, "points columns"] | None  # what smoothing explains, where that is much
     method: Literal["same", "connectivity", "surface"]  # vertices by their order, by their surroundings, or none
     pose: Pose  # from the suspect's coordinates to the original's, as in their files
     residual: float  # root mean square of the displacement, where it counts
@@ -86,7 +86,7 @@ def _align(original: Original, suspect: Mesh, how: Align) -> Alignment:
     if how == "same" or (how == "auto" and same_connectivity(suspect, original.mesh)):
         x = np.asarray(original.positions, np.float64)
         y, back = x + residual(original, suspect), _file(original).inverse()
-        return _by_points(original, y, original.used, np.asarray(mesh.faces), "same", back)
+        return _by_points(original, mesh, y, original.used, np.asarray(mesh.faces), "same", back)
     welded = welded_mesh(suspect, weld(suspect.vertices))
     if how == "auto":
         # Of a suspect without copies, the welded mesh is the suspect itself.
@@ -103,7 +103,7 @@ def _align(original: Original, suspect: Mesh, how: Align) -> Alignment:
                 point[match[found]] = np.flatnonzero(found)
                 faces = point[np.asarray(points.faces)]
                 faces = faces[(faces >= 0).all(axis=1)]
-                return _by_points(original, scale(there), found, faces, "connectivity", scale)
+                return _by_points(original, mesh, scale(there), found, faces, "connectivity", scale)
     return _by_surfaces(original, Surface(mesh), welded, how == "affine")
 
 
@@ -120,6 +120,7 @@ def _file(original: Original) -> Pose:
 
 def _by_points(
     original: Original,
+    mesh: Mesh,
     y: Points,
     known: Bool[np.ndarray, " points"],
     faces: Int64[np.ndarray, "faces 3"],
@@ -127,7 +128,7 @@ def _by_points(
     before: Pose,
 ) -> Alignment:
     """Each known point has been found at y, where `before` brought the suspect, joined by the suspect's faces."""
-    x = np.asarray(original.positions, np.float64)
+    x = np.asarray(mesh.vertices, np.float64)
     moved = y - x
     # A coordinate of 1e200 would spoil every sum; such a point is lost in any case.
     spread = np.abs(moved - np.median(moved[known], axis=0)).max(axis=1)
@@ -148,7 +149,8 @@ def _by_points(
     if np.abs(error).max() < _ROUNDING:
         error = np.zeros_like(error)
     pose = before.then(pose).then(_file(original))
-    return Alignment(error, agreeing.astype(float), None, None, method, pose, _rms(error[agreeing]), 0.0)
+    nuisance = replayed_points(mesh, error, agreeing)
+    return Alignment(error, agreeing.astype(float), None, nuisance, method, pose, _rms(error[agreeing]), 0.0)
 
 
 def _pieces(x: Points, y: Points, piece: Int64[np.ndarray, " points"]) -> list[tuple[Int64[np.ndarray, " some"], Pose]]:

@@ -9,68 +9,97 @@ from jaxtyping import Bool, Float64, Int64
 
 from jaxmark.bands import diffusion
 from jaxmark.chebyshev import band_components
-from jaxmark.laplacian import make_laplacian
-from jaxmark.mesh import Mesh
+from jaxmark.laplacian import Weighting, make_laplacian
+from jaxmark.mesh import Mesh, area
+from jaxmark.pose import Points
 from jaxmark.surfaces import Surface, barycentric
 
-_SCALES = 6  # smoothing of the suspect's meshing, by 1 to 32 steps of half the way
-_MOST_LEFT, _ENOUGH = 0.1, 20_000
+_SCALES = 9  # of smoothing, by 1 to 256 steps of half the way
+_WEIGHTINGS: tuple[Weighting, ...] = ("valence", "cotangent")
+# Along normals only, columns take a good part of the mark away with what they explain; of known points, next to none.
+_MOST_LEFT, _MOST_LEFT_OF_POINTS = 0.1, 0.5
+_ENOUGH = 20_000
+
+Columns = Float64[np.ndarray, "points columns"]
 
 
 def replayed(
     original: Surface,
     suspect: Mesh,
     face: Int64[np.ndarray, " points"],
-    closest: Float64[np.ndarray, "points 3"],
-    normals: Float64[np.ndarray, "points 3"],
+    closest: Points,
+    normals: Points,
     weights: Bool[np.ndarray, " points"],
-) -> Float64[np.ndarray, "points columns"] | None:
-    """What smoothing would have done to the original, if it explains nearly all that a suspect shows.
+) -> Columns | None:
+    """What smoothing by the suspect's meshing would have done to the original, if it explains nearly all that is seen.
+
+    A suspect that was simplified and then smoothed has shrunk by another operator than the original's.
 
     Args:
         original: about one in size.
-        suspect: in the original's pose.
+        suspect: in the original's pose, with an area.
         face: on which the suspect comes closest to each of the original's points.
         closest: where.
         normals: along which the suspect's displacement is known.
         weights: where it counts.
     """
     x = np.asarray(original.mesh.vertices)
-    columns = _smoothed(original, suspect, face, closest)
-    displacement = np.where(weights[:, None], closest - x, 0)
-    return columns if weights.any() and _explains(columns, x, displacement, normals, weights) else None
-
-
-def _smoothed(
-    original: Surface, suspect: Mesh, face: Int64[np.ndarray, " points"], closest: Float64[np.ndarray, "points 3"]
-) -> Float64[np.ndarray, "points columns"]:
-    """The original put through smoothing as the suspect's meshing does it, by several amounts, as seen from its points.
-
-    A suspect that was simplified and then smoothed has shrunk by another operator than the original's.
-    """
     there = original.closest(np.asarray(suspect.vertices))[0]
+    share, corners = barycentric(suspect, face, closest), np.asarray(suspect.faces)[face]
+    smoothed = [
+        np.concatenate(
+            [np.einsum("pkc,pk->pc", one[corners], share) for one in _smoothed(suspect, weighting, there)], 1
+        )
+        for weighting in _WEIGHTINGS
+    ]
+    displacement = np.where(weights[:, None], closest - x, 0)
+    return _likeliest(smoothed, x, displacement, normals, weights, _MOST_LEFT)
+
+
+def replayed_points(original: Mesh, displacement: Points, weights: Bool[np.ndarray, " points"]) -> Columns | None:
+    """The same of points that are known, by the original's cotangents; what its valences explain is nuisance anyway.
+
+    Args:
+        original: about one in size.
+        displacement: of its points.
+        weights: where it counts.
+    """
+    if area(original) == 0:
+        return None
+    x = np.asarray(original.vertices)
+    columns = np.concatenate(_smoothed(original, "cotangent", x), axis=1)
+    return _likeliest([columns], x, displacement, None, weights, _MOST_LEFT_OF_POINTS)
+
+
+def _smoothed(mesh: Mesh, weighting: Weighting, signal: Points) -> list[Points]:
+    """A signal after smoothing by a mesh's Laplacian, by several amounts."""
     family = diffusion(_SCALES, 4 * 2 ** (_SCALES // 2) + 1)
-    amounts = band_components(make_laplacian(suspect), family, jnp.asarray(there, jnp.float32))
-    share = barycentric(suspect, face, closest)
-    seen = np.einsum("spkc,pk->psc", np.asarray(amounts, np.float64)[:, np.asarray(suspect.faces)[face]], share)
-    return seen.reshape(len(face), -1)
+    amounts = band_components(make_laplacian(mesh, weighting), family, jnp.asarray(signal, jnp.float32))
+    return [np.asarray(amount, np.float64) for amount in amounts]
 
 
-def _explains(
-    columns: Float64[np.ndarray, "points columns"],
-    x: Float64[np.ndarray, "points 3"],
-    displacement: Float64[np.ndarray, "points 3"],
-    normals: Float64[np.ndarray, "points 3"],
+def _likeliest(
+    candidates: list[Columns],
+    x: Points,
+    displacement: Points,
+    normals: Points | None,
     weights: Bool[np.ndarray, " points"],
-) -> bool:
-    """Whether columns explain nine tenths of what an affine map does not: each takes some of the mark away, too."""
+    most_left: float,
+) -> Columns | None:
+    """The columns that explain most of what an affine map does not, if that is enough."""
     some = np.flatnonzero(weights)
     some = some[np.random.default_rng(0).permutation(len(some))[:_ENOUGH]]
-    along = np.sum(normals[some] * displacement[some], axis=1)
+    if not len(some):
+        return None
+    plain, shown = np.concatenate([np.ones((len(some), 1)), x[some]], axis=1), displacement[some]
 
-    def left(columns: Float64[np.ndarray, "points columns"]) -> float:
-        design = (columns[some][:, :, None] * normals[some][:, None, :]).reshape(len(some), -1)
+    def left(columns: Columns) -> float:
+        if normals is None:
+            design, along = columns, shown
+        else:
+            design = (columns[:, :, None] * normals[some][:, None, :]).reshape(len(some), -1)
+            along = np.sum(normals[some] * shown, axis=1)
         return float(np.sum((along - design @ np.linalg.lstsq(design, along, rcond=1e-9)[0]) ** 2))
 
-    plain = np.concatenate([np.ones((len(x), 1)), x], axis=1)
-    return left(np.concatenate([plain, columns], axis=1)) < _MOST_LEFT * left(plain)
+    rest = [left(np.concatenate([plain, columns[some]], axis=1)) for columns in candidates]
+    return candidates[int(np.argmin(rest))] if min(rest) < most_left * left(plain) else None

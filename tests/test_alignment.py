@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 import trimesh
+from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
@@ -336,6 +337,35 @@ def test_smoothing_of_another_meshing_is_noticed():
     along = np.sum(found.normals * found.displacement, axis=1)
     left = along - design @ np.linalg.lstsq(design, along, rcond=1e-9)[0]
     assert np.linalg.norm(left) < 0.35 * np.linalg.norm(along)
+
+
+def test_smoothing_by_cotangents_is_noticed_and_taken_off():
+    """Implicitly, by libigl's cotangents: another operator than the filters', and another function of it."""
+    igl = pytest.importorskip("igl")
+    message = b"16"
+    marker = jm.make_marker(rippled_ball(), bytes(32), bits=16)
+    marked = marker.embed(message, budget=3e-4, noise=0)[0]
+    vertices, faces = np.asarray(marked.vertices, np.float64), np.asarray(marked.faces)
+    mass = igl.massmatrix(vertices, faces, igl.MASSMATRIX_TYPE_VORONOI)
+    smoothed = spsolve((mass - 2e-3 * igl.cotmatrix(vertices, faces)).tocsc(), mass @ vertices)
+    aligned = align(marker.original, make_mesh(smoothed, faces))
+    assert aligned.nuisance is not None
+    before, after = (marker.detect(one, message=message).log10_p for one in (aligned._replace(nuisance=None), aligned))
+    assert marker.detect(aligned).message == message
+    assert after < 1.5 * before
+    for other in (marked, jm.attack(marked, "noise", 1e-3, seed=0)):
+        assert align(marker.original, other).nuisance is None
+
+
+def rippled_ball() -> Mesh:
+    """Of irregular triangles, with waves that smoothing takes away."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(2500, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    hull = trimesh.convex.convex_hull(points)
+    vertices = np.asarray(hull.vertices)
+    waves = np.cos(9 * vertices @ rng.normal(size=(3, 12))).sum(axis=1, keepdims=True)
+    return make_mesh(vertices * (1 + 0.02 * waves), np.asarray(hull.faces))
 
 
 def test_what_cannot_be_aligned_is_refused(original: Original):
