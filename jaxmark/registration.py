@@ -26,6 +26,7 @@ _LIKELY = 2.0  # poses that leave up to so many times the least distance are tri
 _WHOLE = 0.01  # the most that the best pose of a whole suspect leaves: several times what sampling does
 _MOST, _BEST = 32, 4  # of them that differ, and that are looked at closely
 _ROUND = 1.1  # a shape that is so much wider along one axis than along another is round about the third
+_TURN, _TURNS = 1.0, 100  # degrees, and how many that fit are tried on
 _CANDIDATES = 6  # poses by features that are tried on
 
 
@@ -39,7 +40,8 @@ def register_whole(original: Surface, suspect: Surface) -> Pose | None:
     Raises:
         JaxmarkError: if libigl is missing.
     """
-    starts = _coarse(sample(original.mesh, _SAMPLES).points, sample(suspect.mesh, _SAMPLES).points)
+    target, source = sample(original.mesh, _SAMPLES).points, sample(suspect.mesh, _SAMPLES).points
+    starts = _coarse(target, source)
     if not starts:
         return None
     used = np.flatnonzero(used_vertices(original.mesh))
@@ -47,6 +49,7 @@ def register_whole(original: Surface, suspect: Surface) -> Pose | None:
     points, normals = np.asarray(original.mesh.vertices), vertex_normals(original.mesh)
     if len(starts) > 1:  # principal axes say little of a shape that turns into itself, but for small features
         starts += poses_by_features(original.mesh, suspect.mesh, _CANDIDATES)
+        starts += _turned(suspect, target, source, starts)
     for count in (_SOME, _FINE):
         part = some[:count]
         ends = [refine(suspect, points[part], normals[part], start, rounds=_FEW) for start in starts]
@@ -126,17 +129,38 @@ def _coarse(target: Points, source: Points) -> list[Pose]:
 def _axes(target: Points, source: Points) -> list[Pose]:
     """Principal axes onto principal axes, in all ways that do not mirror."""
     (to, wide, onto), (back, size, of) = (_principal(points) for points in (target, source))
-    turns = [np.eye(3)]
-    for axis, near in ((0, wide[2] < _ROUND * wide[1]), (2, wide[1] < _ROUND * wide[0])):
-        if near:  # two axes that hardly differ: anything between them may be meant
-            turns = [Rotation.from_euler("xyz"[axis], 15 * step, degrees=True).as_matrix() for step in range(6)]
     starts = []
-    for turn, order, signs in product(turns, permutations(range(3)), product([1, -1], repeat=3)):
-        change = turn @ (np.eye(3)[list(order)] * signs)
+    for order, signs in product(permutations(range(3)), product([1, -1], repeat=3)):
+        change = np.eye(3)[list(order)] * signs
         if np.linalg.det(change) > 0:
             matrix = np.linalg.norm(wide) / np.linalg.norm(size) * onto @ change @ of.T
             starts.append(Pose(matrix, to - matrix @ back))
     return starts
+
+
+def _turned(suspect: Surface, target: Points, source: Points, starts: list[Pose]) -> list[Pose]:
+    """Turns about the axis of a shape that is round about it, upright and upside down, that fit better than those near.
+
+    The teeth of a wheel fit in many places.
+    """
+    (centre, wide, axes), (_, _, of) = _principal(target), _principal(source)
+    for one, near in ((0, wide[2] < _ROUND * wide[1]), (2, wide[1] < _ROUND * wide[0])):
+        if not near:
+            continue
+        axis, some = axes[:, one], target[:_COARSE]
+        turns = Rotation.from_rotvec(np.arange(0, 360, _TURN)[:, None] * axis, degrees=True).as_matrix()
+        ends = []
+        for side in (True, False):
+            same = [start for start in starts if (axis @ start.matrix @ of[:, one] > 0) == side]
+            if not same:
+                continue
+            best = min(same, key=lambda pose: _distance(suspect, some, pose))
+            turned = [best.then(Pose(turn, centre - turn @ centre)) for turn in turns]
+            off = np.array([_distance(suspect, some, pose) for pose in turned])
+            least = np.flatnonzero((off <= np.roll(off, 1)) & (off <= np.roll(off, -1)))
+            ends += [(off[place], turned[place]) for place in least]
+        return [pose for _, pose in sorted(ends, key=lambda end: end[0])[:_TURNS]]
+    return []
 
 
 def _principal(points: Points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
