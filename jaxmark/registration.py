@@ -2,9 +2,9 @@
 
 Whole suspects: the principal axes of both surfaces in all 24 ways, each improved by trimmed closest points (Chetverikov
 et al., "Robust Euclidean alignment of 3D point sets: the trimmed iterative closest point algorithm", 2005), both ways,
-so that a scale can be found; where several fit, also poses that local shape suggests (`jaxmark.features`), and all turns
-about the axis of what is round. Parts: poses by local shape only. Either way the best is refined by distances along
-normals. trimesh's own registration compares against an absolute threshold.
+so that a scale can be found; where several fit, also poses that local shape suggests (`jaxmark.features`), and all
+turns about the axis of what is round. Parts: poses by local shape only. Either way the best is refined by distances
+along normals. trimesh's own registration compares against an absolute threshold.
 """
 
 from itertools import permutations, product
