@@ -72,7 +72,13 @@ def suspects(marker: jm.Marker) -> dict[str, Observation]:
         "affine": mesh._replace(vertices=vertices @ np.diag([1, 1.1, 0.9]) + 3),
         "sign of the position": mesh._replace(vertices=vertices + 1e-3 * size * np.sign(vertices)),
     }
-    return {name: marker.observe(suspect) for name, suspect in meshes.items()}
+    seen = {name: marker.observe(suspect) for name, suspect in meshes.items()}
+    # As many columns for each, so that they stack; those of zeros are dropped.
+    columns = [one.nuisance for one in seen.values() if one.nuisance is not None]
+    if not columns:
+        return seen
+    none = jnp.zeros_like(columns[0])
+    return {name: one if one.nuisance is not None else one._replace(nuisance=none) for name, one in seen.items()}
 
 
 def claims(
