@@ -1,6 +1,7 @@
-"""The original put through what a suspect has evidently gone through, by the suspect's own meshing; free of the key.
+"""The original put through the smoothing that a suspect has evidently gone through; free of the key.
 
-What that explains of a suspect's displacement is nuisance, as is what the original's own operator explains.
+By the suspect's own meshing or, where its vertices are known, by the original's cotangents. What that explains of a
+suspect's displacement is nuisance, as is what the original's own operator explains.
 """
 
 import jax.numpy as jnp

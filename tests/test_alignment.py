@@ -351,6 +351,7 @@ def test_smoothing_by_cotangents_is_noticed_and_taken_off():
     aligned = align(marker.original, make_mesh(smoothed, faces))
     assert aligned.nuisance is not None
     before, after = (marker.detect(one, message=message).log10_p for one in (aligned._replace(nuisance=None), aligned))
+    assert marker.detect(aligned).message == message
     assert after < 1.5 * before
     for other in (marked, jm.attack(marked, "noise", 1e-3, seed=0)):
         assert align(marker.original, other).nuisance is None
