@@ -173,7 +173,7 @@ def embed_command(
                 " more digits."
             )
         write_atomically(record_draft, info.record.to_json().encode())
-    change = distortion.compare(mesh, written)
+    change = distortion.moved(mesh, written)
     answer = {
         "rms": change.rms,
         "max": change.max,
@@ -336,7 +336,7 @@ def attack_command(source: Path, target: Path, kind: str, strength: float, seed:
     mesh = load_mesh(source)
     with _replacing(target) as draft:
         save_mesh(attack(mesh, kind, strength, seed=seed), draft, like=source)
-        change = distortion.compare(mesh, load_mesh(draft))
+        change = distortion.moved(mesh, load_mesh(draft))
     answer = {"kind": kind, "strength": strength, "seed": seed, "rms": change.rms, "max": change.max}
     _answer(as_json, answer, f"{kind} {strength:g} → {target}, RMS {change.rms:.3g} of the diagonal")
 
@@ -346,9 +346,17 @@ def attack_command(source: Path, target: Path, kind: str, strength: float, seed:
 @click.argument("distorted", type=_MESH)
 @_JSON
 def compare(original: Path, distorted: Path, as_json: bool) -> None:
-    """Measure how far DISTORTED was moved from ORIGINAL, relative to the diagonal of the bounding box."""
-    change = distortion.compare(load_mesh(original), load_mesh(distorted))
-    _answer(as_json, change._asdict(), f"RMS {change.rms:.6g}, max {change.max:.6g} of the diagonal")
+    """Measure how DISTORTED differs from ORIGINAL, by all metrics.
+
+    rms, max, mrms, hausdorff and gl are relative to the original's bounding-box diagonal, dame is in radians, the
+    others lie between 0 and 1. Needs the extra `align`.
+    """
+    found = distortion.compare(load_mesh(original), load_mesh(distorted))._asdict()
+    lines = [
+        f"{name:<9} {'needs the same connectivity' if value is None else f'{value:.6g}'}"
+        for name, value in found.items()
+    ]
+    _answer(as_json, found, "\n".join(lines))
 
 
 @cli.command(name="capacity")

@@ -124,7 +124,7 @@ def _attacked(marker: Marker, marked: Mesh, message: bytes) -> Iterator[Row]:
         yield Row(
             marker.scheme.name,
             kind if kind == "none" else f"{kind} {strength:g}",
-            distortion.compare(marked, suspect).rms,
+            distortion.moved(marked, suspect).rms,
             float(np.mean(np.sign(blind.scores) != sent)),
             blind.message == message,
             blind.log10_p,

@@ -153,7 +153,7 @@ def test_vertices_that_no_face_uses_neither_move_nor_count(sphere: Mesh, key: jm
     np.testing.assert_array_equal(shift[2562:], 0)
     assert np.sqrt(np.mean(shift[:2562] ** 2)) == pytest.approx(8e-4, rel=1e-6)
     assert info.rms == pytest.approx(8e-4, rel=1e-9)
-    assert jm.compare(mesh, marked).rms == pytest.approx(8e-4, rel=1e-9)
+    assert distortion.moved(mesh, marked).rms == pytest.approx(8e-4, rel=1e-9)
     thrown = marked._replace(vertices=np.where(np.arange(len(shift))[:, None] < 2562, marked.vertices, 1e200))
     assert jm.detect(thrown, original=mesh, key=key).message == MESSAGE
 
@@ -262,11 +262,11 @@ def test_schemes_are_data():
             jm.schemes.get_scheme("host", parameters)
 
 
-def test_compare(sphere: Mesh):
+def test_displacements_are_relative_to_the_diagonal(sphere: Mesh):
     moved = sphere._replace(vertices=sphere.vertices.copy())
     moved.vertices[3] += [0.3, 0.4, 0]
     length = np.linalg.norm(np.ptp(sphere.vertices, axis=0))
-    found = jm.compare(sphere, moved)
+    found = distortion.moved(sphere, moved)
     assert found.max == pytest.approx(0.5 / length)
     assert found.rms == pytest.approx(0.5 / length / np.sqrt(len(sphere.vertices)))
 

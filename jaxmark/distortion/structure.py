@@ -1,0 +1,77 @@
+"""Statistics of curvature in windows, which MSDM and MSDM2 compare as SSIM compares pictures."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxmark.distortion.neighbourhoods import Neighbourhoods, share_inside
+
+
+class Statistics(NamedTuple):
+    """Of curvature in the window around each vertex, on the original (1) and on the distorted mesh (2)."""
+
+    mean: tuple[Float[Array, " vertices"], Float[Array, " vertices"]]
+    deviation: tuple[Float[Array, " vertices"], Float[Array, " vertices"]]
+    covariance: Float[Array, " vertices"]
+
+
+def window_statistics(
+    curvatures: tuple[Float[Array, " vertices"], Float[Array, " vertices"]],
+    positions: tuple[Float[Array, "vertices 3"], Float[Array, "vertices 3"]],
+    windows: Neighbourhoods,
+    sigma: float | Float[Array, ""],
+) -> Statistics:
+    """Means, deviations and covariance, weighed by a Gaussian of the distance from the window's centre.
+
+    Args:
+        curvatures: of the original and the distorted mesh, at the vertices of the windows' mesh.
+        positions: likewise.
+        windows: the points, from `make_neighbourhoods`, of the distorted mesh.
+        sigma: of the Gaussian, in the units of the positions.
+    """
+    count = len(curvatures[0])
+    share = share_inside(positions[1], windows)
+
+    def at(values: Array) -> Array:
+        part = share if values.ndim == 1 else share[:, None]
+        return (1 - part) * values[windows.tail] + part * values[windows.head]
+
+    def total(values: Array) -> Array:
+        return jax.ops.segment_sum(values, windows.centre, count, indices_are_sorted=True)
+
+    values = [at(one) for one in curvatures]
+    weights = [jnp.exp(-jnp.sum((at(x) - x[windows.centre]) ** 2, axis=1) / (2 * sigma**2)) for x in positions]
+    sums = [jnp.where(whole > 0, whole, 1) for whole in map(total, weights)]
+    means = [total(w * v) / s for w, v, s in zip(weights, values, sums, strict=True)]
+    off = [v - m[windows.centre] for v, m in zip(values, means, strict=True)]
+    deviations = [_root(total(w * d**2) / s) for w, d, s in zip(weights, off, sums, strict=True)]
+    # Weights of the one and sum of the other, as in MEPP.
+    covariance = total(weights[0] * off[0] * off[1]) / sums[1]
+    return Statistics((means[0], means[1]), (deviations[0], deviations[1]), covariance)
+
+
+def contributions(found: Statistics, offset: float) -> tuple[Array, Array, Array]:
+    """Differences of curvature, contrast and structure, each relative to its size plus an offset (0 if all is 0)."""
+
+    def relative(difference: Array, size: Array) -> Array:
+        whole = size + offset
+        return jnp.where(whole > 0, jnp.abs(difference) / jnp.where(whole > 0, whole, 1), 0)
+
+    (m1, m2), (s1, s2) = found.mean, found.deviation
+    return (
+        relative(m1 - m2, jnp.maximum(m1, m2)),
+        relative(s1 - s2, jnp.maximum(s1, s2)),
+        relative(s1 * s2 - found.covariance, s1 * s2),
+    )
+
+
+def cubic_mean(values: Float[Array, " vertices"]) -> Float[Array, ""]:
+    """(mean of cubes)^(1/3), with slope 0 where all is 0."""
+    mean = jnp.mean(values**3)
+    return jnp.where(mean > 0, jnp.cbrt(jnp.where(mean > 0, mean, 1)), 0)
+
+
+def _root(square: Array) -> Array:
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
