@@ -39,18 +39,20 @@ def curvature(tensor: Float[Array, "vertices 3 3"]) -> Float[Array, " vertices"]
 def _eigenvalues(matrix: Float[Array, "matrices 3 3"]) -> Float[Array, "matrices 3"]:
     """Of symmetric matrices (Smith, Communications of the ACM 4, 1961).
 
-    In closed form, because on a processor LAPACK's for many matrices, several at once, can wait for each other forever.
+    In closed form, and the determinant, too: LAPACK's programs for many matrices, several at once, can wait for each
+    other forever on a processor.
     """
     mean = jnp.trace(matrix, axis1=1, axis2=2) / 3
     rest = matrix - mean[:, None, None] * jnp.eye(3, dtype=matrix.dtype)
     square = jnp.sum(rest**2, axis=(1, 2)) / 6
     round_ = square <= 0
     size = jnp.sqrt(jnp.where(round_, 1, square))
-    half = jnp.where(round_, 0, jnp.linalg.det(rest / size[:, None, None]) / 2)
+    first, second, third = jnp.moveaxis(rest / size[:, None, None], 1, 0)
+    half = jnp.where(round_, 0, jnp.sum(first * jnp.cross(second, third), axis=1) / 2)
     # The arc cosine's slope at ±1, where two eigenvalues meet, is infinite: stop just before it.
     limit = 1 - 4 * jnp.finfo(matrix.dtype).eps
-    third = jnp.arccos(jnp.clip(half, -limit, limit)) / 3
-    turns = third[:, None] + 2 * np.pi / 3 * np.arange(3)
+    angle = jnp.arccos(jnp.clip(half, -limit, limit)) / 3
+    turns = angle[:, None] + 2 * np.pi / 3 * np.arange(3)
     return mean[:, None] + jnp.where(round_, 0, 2 * size)[:, None] * jnp.cos(turns).astype(matrix.dtype)
 
 

@@ -23,6 +23,7 @@ from jaxmark.surfaces import Surface, barycentric
 _BALL, _WINDOW, _SIGMA = 0.005, 0.015, 0.008
 _BALLS, _WINDOW_BALLS, _SIGMA_BALLS = (0.002, 0.003, 0.004), 5.0, 2.5
 _OFFSET = 1.0  # of MSDM2
+_CENTRES = 20_000  # most windows; of larger meshes, as many vertices chosen at random
 
 
 class Scale(NamedTuple):
@@ -41,6 +42,7 @@ class Views(NamedTuple):
     corners: Int[np.ndarray, "vertices 3"]  # of the original's face that is closest to each of the distorted's vertices
     share: Float[np.ndarray, "vertices 3"]  # of the corners in the closest point
     scales: tuple[Scale, ...]
+    centres: Int[np.ndarray, " centres"]  # the distorted mesh's vertices in whose windows the meshes are compared
     unit: float | Float[Array, ""]  # longest side of the distorted mesh's box
 
 
@@ -71,20 +73,21 @@ def _views(
     sizes: list[tuple[float, float, float]],
 ) -> Views:
     meshes = [(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)) for mesh in (original, distorted)]
-    unit = float(np.ptp(meshes[1][0], axis=0).max())
+    unit, count = float(np.ptp(meshes[1][0], axis=0).max()), len(meshes[1][0])
+    centres = np.sort(np.random.default_rng(0).permutation(count)[:_CENTRES])
     scales = []
     for ball, window, sigma in sizes:
         one, other = (make_neighbourhoods(*mesh, unit * ball)[0] for mesh in meshes)
-        scales.append(Scale(one, other, make_neighbourhoods(*meshes[1], unit * window)[1], unit * sigma))
+        scales.append(Scale(one, other, make_neighbourhoods(*meshes[1], unit * window, centres)[1], unit * sigma))
     first, second = (make_hinges(faces) for _, faces in meshes)
-    return Views((first, second), corners, share, tuple(scales), unit)
+    return Views((first, second), corners, share, tuple(scales), centres, unit)
 
 
 @jax.jit
 def local_msdm2(
     original: Float[Array, "originals 3"], distorted: Float[Array, "vertices 3"], views: Views
-) -> Float[Array, " vertices"]:
-    """Distortion at each of the distorted mesh's vertices, from 0 to 1: (L + C + S/2)/2.5, averaged over scales."""
+) -> Float[Array, " centres"]:
+    """Distortion at the centres of the views, from 0 to 1: (L + C + S/2)/2.5, averaged over scales."""
     local = [
         (curved + contrast + structure / 2) / 2.5
         for curved, contrast, structure in _compared(original, distorted, views, _OFFSET)
@@ -130,7 +133,7 @@ def _compared(original: Array, distorted: Array, views: Views, offset: float) ->
         second = curvature(curvature_tensor(distorted, views.hinges[1], scale.distorted)) * views.unit
         matched = jnp.einsum("vk,vk->v", share, first[views.corners])
         found = window_statistics((matched, second), (there, distorted), scale.windows, scale.sigma)
-        results.append(contributions(found, offset))
+        results.append(contributions(jax.tree.map(lambda value: value[views.centres], found), offset))
     return results
 
 

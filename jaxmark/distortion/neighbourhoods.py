@@ -12,6 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxmark.mesh import edges
 
+_REACHED_AT_ONCE = 2**24  # pairs of a centre and a vertex that one search keeps track of
+
 
 class Neighbourhoods(NamedTuple):
     """Pieces of edges that run outward in a ball around a vertex, for many balls."""
@@ -40,32 +42,63 @@ def make_neighbourhoods(
     Returns:
         The edges, and the points as edges of which the far end is meant; a vertex is an edge from and to itself.
     """
-    count, pairs = len(vertices), edges(faces)
+    pairs = edges(faces)
     tail, head = np.concatenate([pairs, pairs[:, ::-1]]).T
     order = np.argsort(tail, kind="stable")
-    tail, head, edge = tail[order], head[order], np.tile(np.arange(len(pairs)), 2)[order]
-    first = np.searchsorted(tail, np.arange(count + 1))
-    centre = np.arange(count) if centres is None else np.asarray(centres)
-    reached, at, found = centre * count + centre, centre, []
-    while len(centre):
-        degree = first[at + 1] - first[at]
-        here = np.repeat(np.arange(len(at)), degree)
-        place = np.arange(len(here)) + np.repeat(first[at] - (np.cumsum(degree) - degree), degree)
-        c, p, q = centre[here], at[here], head[place]
-        outward = (p == c) | (np.sum((vertices[q] - vertices[p]) * (vertices[p] - vertices[c]), axis=1) > 0)
-        c, p, q, e = c[outward], p[outward], q[outward], edge[place][outward]
-        inside = np.sum((vertices[q] - vertices[c]) ** 2, axis=1) < radius**2
-        found.append((c, p, q, e, inside))
-        new = np.setdiff1d(c[inside] * count + q[inside], reached)
-        reached = np.concatenate([reached, new])
-        centre, at = new // count, new % count
+    first = np.searchsorted(tail[order], np.arange(len(vertices) + 1))
+    graph = _Graph(np.asarray(vertices), first, head[order], np.tile(np.arange(len(pairs)), 2)[order])
+    centre = np.arange(len(vertices)) if centres is None else np.sort(centres)
+    blocks = np.array_split(centre, max(1, len(centre) * len(vertices) // _REACHED_AT_ONCE))
+    found, alone = [], []
+    for block in blocks:
+        pieces, points = _search(graph, block, radius)
+        found.append(pieces)
+        alone.append(points)
     c, p, q, e, inside = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-    reached.sort()
-    vertices_inside = (reached // count, reached % count, reached % count, np.full(len(reached), -1))
+    centre_of, vertex = (np.concatenate(arrays) for arrays in zip(*alone, strict=True))
+    vertices_inside = (centre_of, vertex, vertex, np.full(len(vertex), -1))
     c0, p0, q0, e0 = (
         np.concatenate([one, other[~inside]]) for one, other in zip(vertices_inside, (c, p, q, e), strict=True)
     )
     return _sorted(c, p, q, e, radius), _sorted(c0, p0, q0, e0, radius)
+
+
+class _Graph(NamedTuple):
+    """Edges by the vertex that they leave."""
+
+    vertices: np.ndarray
+    first: np.ndarray  # of each vertex's edges
+    head: np.ndarray
+    edge: np.ndarray
+
+
+def _search(graph: _Graph, centres: np.ndarray, radius: float) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    """Breadth-first from several centres at once: edges (with whether they end inside), and vertices inside."""
+    vertices, count = graph.vertices, len(graph.vertices)
+    row, at = np.arange(len(centres)), centres
+    reached = np.zeros(len(centres) * count, bool)
+    reached[row * count + at] = True
+    # Which of several edges to a vertex is the last to write here is taken.
+    last = np.empty(len(reached), np.int32)
+    found, points = [], [(centres, centres)]
+    while len(row):
+        degree = graph.first[at + 1] - graph.first[at]
+        here = np.repeat(np.arange(len(at)), degree)
+        place = np.arange(len(here)) + np.repeat(graph.first[at] - (np.cumsum(degree) - degree), degree)
+        r, p, q, e = row[here], at[here], graph.head[place], graph.edge[place]
+        c = centres[r]
+        outward = (p == c) | (np.sum((vertices[q] - vertices[p]) * (vertices[p] - vertices[c]), axis=1) > 0)
+        r, c, p, q, e = (array[outward] for array in (r, c, p, q, e))
+        inside = np.sum((vertices[q] - vertices[c]) ** 2, axis=1) < radius**2
+        found.append((c, p, q, e, inside))
+        code = (r * count + q)[inside]
+        code = code[~reached[code]]
+        last[code] = np.arange(len(code))
+        code = code[last[code] == np.arange(len(code))]
+        reached[code] = True
+        row, at = code // count, code % count
+        points.append((centres[row], at))
+    return tuple(map(np.concatenate, zip(*found, strict=True))), tuple(map(np.concatenate, zip(*points, strict=True)))
 
 
 def _sorted(centre: np.ndarray, tail: np.ndarray, head: np.ndarray, edge: np.ndarray, radius: float) -> Neighbourhoods:
