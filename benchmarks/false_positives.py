@@ -21,6 +21,7 @@ import trimesh
 from scipy import stats
 
 import jaxmark as jm
+from jaxmark.budget import make_budget
 from jaxmark.carriers import KeyedCarrier, make_chips
 from jaxmark.evidence import log10_p_claimed, log10_p_read
 from jaxmark.mesh import Mesh
@@ -46,7 +47,7 @@ def suspects(marker: jm.Marker) -> dict[str, Observation]:
 
     def marked(seed: int, budget: float = 8e-4) -> Mesh:
         other = jm.make_marker(mesh, jm.Key(bytes([seed] * 32)), bits=marker.bits, scheme=marker.scheme)
-        return other.write(encode(MESSAGE, other.key, other.original.geometry, other.code), budget)[0]
+        return other.write(encode(MESSAGE, other.key, other.original.geometry, other.code), make_budget(budget))[0]
 
     half = (vertices[:, 0] > np.median(vertices[:, 0]))[:, None]
     spike = np.zeros_like(vertices)

@@ -27,6 +27,7 @@ from scipy import stats
 
 import jaxmark as jm
 from jaxmark import message, polar
+from jaxmark.budget import make_budget
 from jaxmark.carriers import KeyedCarrier
 from jaxmark.marking import Marker, make_marker
 from jaxmark.original import displaced, residual
@@ -110,7 +111,7 @@ def prepare(marker: Marker, text: bytes, random: np.random.Generator) -> Callabl
     """Write a mark; the result says whether one reading of it fails at an Eb/N0."""
     original, carrier = marker.original, marker.carrier
     assert isinstance(carrier, KeyedCarrier)
-    marked, _ = marker.write(message.encode(text, marker.key, original.geometry, marker.code), BUDGET)
+    marked, _ = marker.write(message.encode(text, marker.key, original.geometry, marker.code), make_budget(BUDGET))
     mark = residual(original, marked)
     energy = room(carrier, original).energy * np.sum(mark**2)
 

@@ -8,8 +8,9 @@ else, on the points that agree with it. What lies far off was cut away, replaced
 import time
 from typing import Literal, NamedTuple, get_args
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Array, Bool, Float64, Int64
 
 from jaxmark.connectivity import matching_vertices
 from jaxmark.errors import JaxmarkError
@@ -26,6 +27,7 @@ from jaxmark.mesh import (
     weld,
     welded_mesh,
 )
+from jaxmark.observation import Observation
 from jaxmark.original import Original, residual
 from jaxmark.pose import Points, Pose, affine, similarity
 from jaxmark.registration import refine, register_part, register_whole
@@ -57,6 +59,21 @@ class Alignment(NamedTuple):
     pose: Pose  # from the suspect's coordinates to the original's, as in their files
     residual: float  # root mean square of the displacement, where it counts
     seconds: float  # that it took
+
+
+def observation(original: Original, found: Alignment) -> Observation:
+    """What an aligned suspect shows of each point's displacement, in diagonals, in the original's dtype; key-free."""
+    dtype = original.signal.dtype
+
+    def array(value: np.ndarray | None) -> Array | None:
+        return None if value is None else jnp.asarray(value, dtype)
+
+    return Observation(
+        jnp.asarray(found.displacement, dtype),
+        jnp.asarray(found.weights, dtype),
+        array(found.normals),
+        array(found.nuisance),
+    )
 
 
 def align(original: Original, suspect: Mesh, how: Align = "auto") -> Alignment:

@@ -19,6 +19,7 @@ import click
 from jaxmark import distortion
 from jaxmark.alignment import Align
 from jaxmark.attacks import ATTACKS, attack
+from jaxmark.budget import DEFAULT_LIMITS, make_budget
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
 from jaxmark.files.atomic import write_atomically
@@ -50,6 +51,22 @@ class _Hexadecimal(click.ParamType):
         return message
 
 
+class _Limit(click.ParamType):
+    """A metric and the most that it may reach."""
+
+    name = "name=value"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
+        """Both."""
+        if isinstance(value, tuple):
+            return value
+        name, _, number = value.partition("=")
+        try:
+            return name, float(number)
+        except ValueError:
+            self.fail(f"{value!r} is no limit: give a metric and a number, e.g. dame=0.008.", param, ctx)
+
+
 _MESH = click.Path(path_type=Path)
 _KEY = click.option("--key", "key_file", type=_MESH, required=True, help="Key file, from `jaxmark keygen`.")
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
@@ -74,9 +91,16 @@ _ALPHA = click.option(
 _BUDGET = click.option(
     "--budget",
     type=float,
-    default=8e-4,
-    show_default=True,
     help="RMS displacement of the vertices, relative to the diagonal of the bounding box.",
+)
+_LIMIT = click.option(
+    "--limit",
+    "limits",
+    type=_Limit(),
+    multiple=True,
+    help="The most that a metric of `jaxmark compare` may reach; may be repeated.  [default, without --budget: "
+    + " ".join(f"{name}={value:g}" for name, value in DEFAULT_LIMITS.items())
+    + "]",
 )
 
 
@@ -119,6 +143,7 @@ def keygen(keyfile: Path, as_json: bool) -> None:
 @click.option("--message", type=_Hexadecimal(), help="Hexadecimal digits; 16 of them are 64 bits.")
 @click.option("--recipient", help="Instead of a message: whose copy it is, for `jaxmark identify`.")
 @_BUDGET
+@_LIMIT
 @_NOISE
 @click.option(
     "--scheme",
@@ -135,7 +160,8 @@ def embed_command(
     key_file: Path,
     message: bytes | None,
     recipient: str | None,
-    budget: float,
+    budget: float | None,
+    limits: tuple[tuple[str, float], ...],
     noise: float,
     scheme: str,
     record_file: Path | None,
@@ -155,13 +181,13 @@ def embed_command(
         raise JaxmarkError("Give either --message or --recipient.")
     if message is not None:
         marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
-        result, info = marker.embed(message, budget, noise=noise)
+        result, info = marker.embed(message, budget, limits=dict(limits) or None, noise=noise)
         said, reads = f"{info.record.bits} bits", lambda mesh: marker.detect(mesh).message == message
     else:
         if scheme != DEFAULT_SCHEME:
             raise JaxmarkError(f"Fingerprints are carried by the scheme {DEFAULT_SCHEME!r}, not {scheme!r}.")
         tracer, name = make_tracer(mesh, key), str(recipient)
-        result, info = tracer.fingerprint(name, budget)
+        result, info = tracer.fingerprint(name, budget, limits=dict(limits) or None)
         said, reads = f"fingerprint of {recipient}", lambda mesh: tracer.finds(mesh, name)
     with _replacing(marked) as draft, _replacing(record_file) as record_draft:
         save_mesh(result, draft, like=original)
@@ -362,14 +388,23 @@ def compare(original: Path, distorted: Path, as_json: bool) -> None:
 @cli.command(name="capacity")
 @click.argument("mesh", type=_MESH)
 @_BUDGET
+@_LIMIT
 @_NOISE
 @click.option("--coverage", type=float, default=COVERAGE, show_default=True, help="Share of the vertices that is left.")
 @_JSON
-def capacity_command(mesh: Path, budget: float, noise: float, coverage: float, as_json: bool) -> None:
+def capacity_command(
+    mesh: Path,
+    budget: float | None,
+    limits: tuple[tuple[str, float], ...],
+    noise: float,
+    coverage: float,
+    as_json: bool,
+) -> None:
     """Say how many bits MESH carries by the keyed scheme, so that they read in noise and with vertices lost."""
-    bits = capacity(load_mesh(mesh), budget, noise=noise, coverage=coverage)
-    answer = {"bits": bits, "budget": budget, "noise": noise, "coverage": coverage}
-    _answer(as_json, answer, f"{bits} bits at a budget of {budget:g}, noise {noise:g}, coverage {coverage:g}")
+    bounds = make_budget(budget, dict(limits) or None)
+    bits = capacity(load_mesh(mesh), bounds.rms, limits=bounds.limits, noise=noise, coverage=coverage)
+    answer = {"bits": bits, "budget": bounds.rms, "limits": bounds.limits, "noise": noise, "coverage": coverage}
+    _answer(as_json, answer, f"{bits} bits at {bounds}, noise {noise:g}, coverage {coverage:g}")
 
 
 @cli.command()

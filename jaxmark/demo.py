@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxmark import distortion
 from jaxmark.attacks import attack
+from jaxmark.budget import make_budget
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import package_folder, require
 from jaxmark.files import load_mesh, save_mesh
@@ -88,7 +89,7 @@ def run_demo(
     say(f"{source.name}: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
     key = new_key()
     message = os.urandom(8)
-    say(f"message {message.hex()} (64 bits), budget RMS 0.0008 of the bounding-box diagonal")
+    say(f"message {message.hex()} (64 bits), as strong as the eye allows ({make_budget()})")
     rows: list[Row] = []
     for scheme in SCHEMES:
         try:

@@ -1,6 +1,7 @@
 """Marking meshes: messages and keys in, meshes and evidence out."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,14 +12,15 @@ from numpy.typing import ArrayLike
 
 from jaxmark import alignment, distortion, evidence
 from jaxmark.alignment import Align, Alignment
+from jaxmark.budget import Budget, make_budget, write
 from jaxmark.carriers import Carrier, KeyedCarrier
 from jaxmark.detectors import Detector
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import Key, commitment
 from jaxmark.mesh import Mesh
 from jaxmark.message import CANDIDATES, TAG_BITS, decode, encode
-from jaxmark.observation import Observation, observe
-from jaxmark.original import Original, displaced, prepare, residual
+from jaxmark.observation import Observation
+from jaxmark.original import Original, prepare
 from jaxmark.payload import Capacity, Conditions
 from jaxmark.record import Record
 from jaxmark.schemes import DEFAULT_SCHEME, KeyedScheme, Scheme, get_scheme, parameters_of
@@ -73,15 +75,24 @@ class Marker:
     code: int  # how many code bits are carried
     detector: Detector
 
-    def embed(self, message: bytes, budget: float = 8e-4, *, noise: float = NOISE) -> tuple[Mesh, EmbedInfo]:
+    def embed(
+        self,
+        message: bytes,
+        budget: float | None = None,
+        *,
+        limits: Mapping[str, float] | None = None,
+        noise: float = NOISE,
+    ) -> tuple[Mesh, EmbedInfo]:
         """Hide a message of just the payload's size in the original; see `embed`."""
         self._check_size(message)
-        _check_budget(budget)
+        bounds = make_budget(budget, limits)
         if not 0 <= noise < math.inf:
             raise JaxmarkError(f"The noise to survive is a number of at least 0, got {noise}.")
+        marked, info = self.write(encode(message, self.key, self.original.geometry, self.code), bounds)
         if isinstance(self.scheme, KeyedScheme) and isinstance(self.carrier, KeyedCarrier):
-            self._check_capacity(self.scheme, self.carrier, Conditions(budget, noise, COVERAGE))
-        marked, info = self.write(encode(message, self.key, self.original.geometry, self.code), budget)
+            # A budget without limits is met up to rounding.
+            reached = info.rms if bounds.limits else bounds.rms or 0.0
+            self._check_capacity(self.scheme, self.carrier, reached, Conditions(bounds, noise, COVERAGE))
         if self.detect(marked).message != message:
             raise JaxmarkError(
                 f"This mesh ({int(self.original.used.sum())} points) cannot carry {self.bits} bits with the scheme"
@@ -123,9 +134,8 @@ class Marker:
         coverage = float(np.mean(np.asarray(seen.weights)[self.original.used] > 0))
         return Detection(found, log10_p, fitted, soft / size, coverage, aligned)
 
-    def write(self, amplitudes: Float64[np.ndarray, " code"], budget: float) -> tuple[Mesh, EmbedInfo]:
-        """Displace the original by the carrier of any amplitudes, scaled to the budget exactly."""
-        _check_budget(budget)
+    def write(self, amplitudes: Float64[np.ndarray, " code"], budget: Budget) -> tuple[Mesh, EmbedInfo]:
+        """Displace the original by the carrier of any amplitudes, as far as the budget allows; see `budget.write`."""
         original = self.original
         unit = np.asarray(self.carrier.displacement(jnp.asarray(amplitudes, original.signal.dtype)), np.float64)
         size = float(distortion.rms(unit[original.used]))
@@ -133,32 +143,23 @@ class Marker:
             raise JaxmarkError(
                 f"The {len(unit)} points of this mesh leave the scheme {self.scheme.name!r} nothing to write in."
             )
-        beta = float(budget) / size
-        marked = displaced(original, beta * unit)
-        written = residual(original, marked)[original.used]
-        rms = float(distortion.rms(written))
-        if abs(rms - budget) > 0.01 * budget:
-            raise JaxmarkError(
-                f"A budget of {budget:g} is lost in the rounding of this mesh's coordinates; use a larger one."
-            )
+        written = write(original, unit, budget)
         record = Record(
             scheme=self.scheme.name,
             bits=self.bits,
-            beta=beta,
+            beta=written.scale,
             original=original.geometry.hex(),
             key=commitment(self.key),
             parameters=parameters_of(self.scheme),
         )
-        return marked, EmbedInfo(rms, float(distortion.maximum(written)), beta, record)
+        return written.mesh, EmbedInfo(written.moved.rms, written.moved.max, written.scale, record)
 
     def observe(self, suspect: Mesh | Alignment, weights: ArrayLike | None = None) -> Observation:
         """What a suspect shows of each point's displacement, in diagonals; free of the key."""
         found = suspect if isinstance(suspect, Alignment) else alignment.align(self.original, suspect)
-        agreeing = found.weights if weights is None else found.weights * self._per_point(weights)
-        dtype = self.original.signal.dtype
-        normals = None if found.normals is None else jnp.asarray(found.normals, dtype)
-        seen = observe(jnp.asarray(found.displacement, dtype), jnp.asarray(agreeing, dtype), normals)
-        return seen if found.nuisance is None else seen._replace(nuisance=jnp.asarray(found.nuisance, dtype))
+        if weights is not None:
+            found = found._replace(weights=found.weights * self._per_point(weights))
+        return alignment.observation(self.original, found)
 
     def soft_values(self, seen: Observation) -> Float64[np.ndarray, " code"]:
         """One soft value per code bit."""
@@ -171,18 +172,20 @@ class Marker:
             raise JaxmarkError(f"weights must be {len(point)} finite numbers, not negative, one for each vertex.")
         return np.bincount(point, given) / np.bincount(point)
 
-    def _check_capacity(self, scheme: KeyedScheme, carrier: KeyedCarrier, conditions: Conditions) -> None:
+    def _check_capacity(
+        self, scheme: KeyedScheme, carrier: KeyedCarrier, reached: float, conditions: Conditions
+    ) -> None:
         room = Capacity(self.original, scheme, {self.bits: carrier})
         least = room.least_budget(self.bits, conditions)
-        if least <= conditions.budget:
+        if least <= reached:
             return
         most = room.bits(conditions)
         mend = "Use a shorter message"
         if math.isfinite(least):
             mend += f", or a budget of at least {math.ceil(1e6 * least) / 1e6:g}"
         raise JaxmarkError(
-            f"This mesh ({int(self.original.used.sum())} points) carries at most {most} bits at a budget of"
-            f" {conditions.budget:g}, with noise of {conditions.noise:g} and half of it lost, not {self.bits}. {mend}."
+            f"This mesh ({int(self.original.used.sum())} points) carries at most {most} bits at"
+            f" {conditions.budget}, with noise of {conditions.noise:g} and half of it lost, not {self.bits}. {mend}."
         )
 
     def _check_size(self, message: bytes) -> None:
@@ -190,11 +193,6 @@ class Marker:
             raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
         if 8 * len(message) != self.bits:
             raise JaxmarkError(f"The message has {8 * len(message)} bits, but the payload is {self.bits} bits.")
-
-
-def _check_budget(budget: float) -> None:
-    if not 0 < budget < 1:
-        raise JaxmarkError(f"The budget is relative to the bounding box's diagonal and in (0, 1), got {budget}.")
 
 
 def make_marker(
@@ -248,20 +246,24 @@ def embed(
     message: bytes,
     key: bytes,
     *,
-    budget: float = 8e-4,
+    budget: float | None = None,
+    limits: Mapping[str, float] | None = None,
     noise: float = NOISE,
     scheme: str | Scheme = DEFAULT_SCHEME,
 ) -> tuple[Mesh, EmbedInfo]:
     """Hide a message in the vertex positions of a mesh.
 
-    The mark is read back before the mesh is returned: a mesh that does not carry it is refused, not marked in vain.
+    The mark is as strong as budget and limits allow; by default as people do not notice (`budget.DEFAULT_LIMITS`). It
+    is read back before the mesh is returned: a mesh that does not carry it is refused, not marked in vain.
 
     Args:
         mesh: the original.
         message: any bytes, at least one.
         key: 32 bytes, from `new_key`.
         budget: RMS displacement of the welded vertices that faces use, unweighted, relative to the diagonal of their
-            axis-aligned bounding box: 0.0008 is 0.08 % of it. It is met exactly.
+            axis-aligned bounding box: 0.0008 is 0.08 % of it. It is met exactly, unless a limit is reached first.
+        limits: the most that metrics of `distortion.METRICS` may reach, by name, in the units of
+            `distortion.Comparison`.
         noise: which the message must survive when half of the vertices are lost, see `capacity`; 0 asks only that there
             are dimensions enough. For the keyed scheme only.
         scheme: see `make_marker`.
@@ -275,13 +277,15 @@ def embed(
     """
     if not isinstance(message, bytes):
         raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
-    return make_marker(mesh, key, bits=8 * len(message), scheme=scheme).embed(message, budget, noise=noise)
+    marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
+    return marker.embed(message, budget, limits=limits, noise=noise)
 
 
 def capacity(
     mesh: Mesh,
-    budget: float = 8e-4,
+    budget: float | None = None,
     *,
+    limits: Mapping[str, float] | None = None,
     noise: float = NOISE,
     coverage: float = COVERAGE,
     scheme: KeyedScheme | None = None,
@@ -291,6 +295,7 @@ def capacity(
     Args:
         mesh: the original.
         budget: see `embed`.
+        limits: see `embed`; how much displacement they allow is tried for each payload.
         noise: half width of uniform noise on each coordinate, relative to the mean distance of the vertices to their
             centre; by default the strongest of the SMI 2010 protocol (Wang et al.), 0.5 %.
         coverage: share of the vertices that may be left.
@@ -302,12 +307,12 @@ def capacity(
     Raises:
         JaxmarkError: if the mesh is unusable or a number out of range.
     """
-    if not (0 < budget < 1 and 0 <= noise < math.inf and 0 < coverage <= 1):
+    if not (0 <= noise < math.inf and 0 < coverage <= 1):
         raise JaxmarkError(
-            f"capacity needs a budget in (0, 1), a noise of at least 0 and a coverage in (0, 1], got {budget:g},"
-            f" {noise:g} and {coverage:g}."
+            f"capacity needs a noise of at least 0 and a coverage in (0, 1], got {noise:g} and {coverage:g}."
         )
-    return Capacity(prepare(mesh), scheme or KeyedScheme()).bits(Conditions(budget, noise, coverage))
+    conditions = Conditions(make_budget(budget, limits), noise, coverage)
+    return Capacity(prepare(mesh), scheme or KeyedScheme()).bits(conditions)
 
 
 def detect(

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import optimize, stats
 
+from jaxmark.budget import Budget, write
 from jaxmark.carriers import KeyedCarrier
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import KEY_BYTES
@@ -85,7 +86,7 @@ def needed_dimensions(bits: int) -> float:
 class Conditions(NamedTuple):
     """Under which a message must still read."""
 
-    budget: float  # RMS displacement over the diagonal
+    budget: Budget
     noise: float  # half width of uniform noise over the mean distance of the vertices to their centre
     coverage: float  # share of the vertices that are left
 
@@ -101,6 +102,7 @@ class Capacity:
         self._rooms: dict[Layout, Room] = {
             scheme.layout(original, bits): room(carrier, original) for bits, carrier in (known or {}).items()
         }
+        self._reached: dict[Layout, float] = {}
 
     def least_budget(self, bits: int, conditions: Conditions) -> float:
         """With which budget so many bits are carried; infinite where the dimensions do not suffice.
@@ -115,7 +117,7 @@ class Capacity:
             return math.inf
         layout = scheme.layout(original, bits)
         if layout not in self._rooms:
-            self._rooms[layout] = room(scheme.carrier(original, bytes(KEY_BYTES), bits, code), original)
+            self._rooms[layout] = room(self._carrier(bits, code), original)
         left = self._rooms[layout]
         if conditions.coverage * left.dimensions < needed_dimensions(bits):
             return math.inf
@@ -127,11 +129,28 @@ class Capacity:
         radius = float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean())
         return conditions.noise * radius * math.sqrt(needed / (1.5 * vertices))
 
+    def reach(self, bits: int, budget: Budget) -> float:
+        """The RMS displacement that a budget surely allows a mark of so many bits."""
+        if budget.rms is not None and not budget.limits:
+            return budget.rms
+        layout = self._scheme.layout(self._original, bits)
+        if layout not in self._reached:
+            carrier = self._carrier(bits, self._scheme.code_length(self._original, bits))
+            probe = carrier.displacement(jnp.ones(len(carrier.chips.population), carrier.host.signal.dtype))
+            reached = write(self._original, np.asarray(probe, np.float64), budget).moved.rms
+            # Two marks under the same limits differ by a percent or so.
+            self._reached[layout] = 0.98 * reached
+        return self._reached[layout]
+
+    def _carrier(self, bits: int, code: int) -> KeyedCarrier:
+        return self._scheme.carrier(self._original, bytes(KEY_BYTES), bits, code)
+
     def bits(self, conditions: Conditions) -> int:
         """The largest payload, a multiple of 8 bits; 0 if not even 8."""
 
         def fits(size: int) -> bool:
-            return self.least_budget(8 * size, conditions) <= conditions.budget
+            least = self.least_budget(8 * size, conditions)
+            return math.isfinite(least) and least <= self.reach(8 * size, conditions.budget)
 
         least, most = 0, 1
         while fits(most):

@@ -22,6 +22,7 @@ from jaxmark.original import Original
 from jaxmark.reception import make_host
 from jaxmark.sequences import orthogonal_sequences
 from jaxmark.spectrum import eigenpairs
+from jaxmark.visibility import masking
 
 
 @runtime_checkable
@@ -61,11 +62,16 @@ class KeyedScheme:
     bit of message and tag, but at most what lies below λ = 0.44 unless the payload needs it. Dimensions are counted as
     on a regular triangle mesh, √3/2π · λ for each coordinate of each vertex. The nuisance that is projected off has at
     most a sixth of them, apart from affine maps.
+
+    With a profile, the mark is written in just these bands, and the dimensions are the number of equally strong ones
+    that it is worth.
     """
 
     name: ClassVar[str] = "keyed"
     bands: int = 64  # Jackson-damped scaling functions over the whole spectrum, of which the lowest pass
     direction: Literal["coordinates", "normals"] = "coordinates"
+    profile: tuple[float, ...] = ()  # relative strengths of the lowest bands, from `tune`; all alike unless given
+    masking: bool = False  # whether rough regions are moved more than smooth ones; see `jaxmark.visibility.masking`
 
     @property
     def detector(self) -> Detector:
@@ -78,12 +84,12 @@ class KeyedScheme:
 
     def dimensions(self, original: Original, bits: int) -> int:
         """How many dimensions the pass band for a payload has, as they are counted here."""
-        return int(self._dimensions(original, self._passing(original, bits)))
+        return int(self._worth(original, self._passing(original, bits)))
 
     def layout(self, original: Original, bits: int) -> Layout:
         """Pass band and nuisance for a payload, free of the key."""
         passing = self._passing(original, bits)
-        columns = self._dimensions(original, passing) / self._channels
+        columns = self._worth(original, passing) / self._channels
         # Affine maps are 4 columns; each scale has one for each coordinate.
         scales = min(9, max(0, int(columns / 3 - 4) // 3))
         degree = 1
@@ -103,10 +109,13 @@ class KeyedScheme:
             degree=layout.degree,
         )
         chips = make_chips(key, original.geometry, original.used, code_bits, channels=self._channels)
-        if self.direction == "coordinates":
-            return KeyedCarrier(host, chips)
-        normals = vertex_normals(Mesh(original.positions, original.weld.point[np.asarray(original.mesh.faces)]))
-        return KeyedCarrier(host, chips, jnp.asarray(normals, dtype))
+        carrier = KeyedCarrier(host, chips)
+        if self.direction == "normals":
+            normals = vertex_normals(Mesh(original.positions, original.weld.point[np.asarray(original.mesh.faces)]))
+            carrier = carrier._replace(normals=jnp.asarray(normals, dtype))
+        if self.profile:
+            carrier = carrier._replace(profile=np.array(self.profile, dtype))
+        return carrier._replace(masking=masking(original)) if self.masking else carrier
 
     @property
     def _channels(self) -> int:
@@ -119,6 +128,10 @@ class KeyedScheme:
 
     def _passing(self, original: Original, bits: int) -> int:
         """How many bands the mark is written in: six at least, for narrower bands leak too much."""
+        if self.profile:
+            if len(self.profile) > self.bands or not min(self.profile) >= 0 < max(self.profile) < math.inf:
+                raise JaxmarkError(f"A profile is up to {self.bands} numbers, none negative and not all 0.")
+            return len(self.profile)
         information = bits + TAG_BITS
         usual = self._dimensions(original, round(self.bands * 0.31))
         wanted = max(min(1024 + 12 * information, usual), 6 * information)
@@ -126,6 +139,14 @@ class KeyedScheme:
         while passing < self.bands and self._dimensions(original, passing) < wanted:
             passing += 1
         return passing
+
+    def _worth(self, original: Original, passing: int) -> float:
+        """How many equally strong dimensions the pass band is worth: (Σ n β²)²/Σ n β⁴."""
+        if not self.profile:
+            return self._dimensions(original, passing)
+        each = np.diff([self._dimensions(original, band) for band in range(passing + 1)])
+        power = np.square(self.profile)
+        return float(np.sum(each * power) ** 2 / np.sum(each * power**2))
 
     def _dimensions(self, original: Original, passing: int) -> float:
         edge = 1 - math.cos(math.pi * passing / self.bands)
@@ -207,8 +228,16 @@ def get_scheme(scheme: str | Scheme, parameters: Mapping[str, Any] | None = None
     if scheme not in SCHEMES:
         raise JaxmarkError(f"There is no scheme {scheme!r}; there are {', '.join(SCHEMES)}.")
     known = {field.name: type(field.default) for field in fields(SCHEMES[scheme])}
-    given = dict(parameters or {})
-    if any(name not in known or type(value) is not known[name] for name, value in given.items()):
+    # JSON has lists for tuples.
+    given: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in (parameters or {}).items()
+    }
+    if any(
+        name not in known
+        or type(value) is not known[name]
+        or (isinstance(value, tuple) and not all(isinstance(item, float) for item in value))
+        for name, value in given.items()
+    ):
         raise JaxmarkError(f"The scheme {scheme!r} takes the parameters {', '.join(known)}, not {given}.")
     return SCHEMES[scheme](**given)
 

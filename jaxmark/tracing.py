@@ -5,9 +5,10 @@ The carrier is that of messages under a subkey of its own; its code bits are the
 copy under the same key is no stranger to the chips.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
+from jaxmark.budget import make_budget
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import KEY_BYTES, Key, commitment, derive
 from jaxmark.marking import EmbedInfo, Marker
@@ -30,11 +31,13 @@ class Tracer:
     marker: Marker  # with the subkey
     commitment: str  # to the owner's key
 
-    def fingerprint(self, recipient: str, budget: float = 8e-4) -> tuple[Mesh, EmbedInfo]:
+    def fingerprint(
+        self, recipient: str, budget: float | None = None, *, limits: Mapping[str, float] | None = None
+    ) -> tuple[Mesh, EmbedInfo]:
         """The copy of one recipient; see `fingerprint`."""
         key, geometry = self.marker.key, self.marker.original.geometry
         word = codewords([recipient], key, geometry, biases(key, geometry, self.marker.code))[0]
-        marked, info = self.marker.write(word.astype(float), budget)
+        marked, info = self.marker.write(word.astype(float), make_budget(budget, limits))
         if not self.finds(marked, recipient):
             raise JaxmarkError(
                 f"This mesh ({int(self.marker.original.used.sum())} points) cannot carry a fingerprint: its own"
@@ -78,7 +81,14 @@ def make_tracer(original: Mesh, key: bytes, *, record: Record | None = None) -> 
     return Tracer(Marker(ready, own, slots, scheme, carrier, slots, scheme.detector), commitment(key))
 
 
-def fingerprint(mesh: Mesh, recipient: str, key: bytes, *, budget: float = 8e-4) -> tuple[Mesh, EmbedInfo]:
+def fingerprint(
+    mesh: Mesh,
+    recipient: str,
+    key: bytes,
+    *,
+    budget: float | None = None,
+    limits: Mapping[str, float] | None = None,
+) -> tuple[Mesh, EmbedInfo]:
     """Make the copy of a mesh for one recipient.
 
     Args:
@@ -86,6 +96,7 @@ def fingerprint(mesh: Mesh, recipient: str, key: bytes, *, budget: float = 8e-4)
         recipient: any identifier, not empty; the same one gives the same copy.
         key: 32 bytes, from `new_key`.
         budget: see `embed`.
+        limits: see `embed`.
 
     Returns:
         The copy (float64 vertices, same faces) and what was done to it.
@@ -93,7 +104,7 @@ def fingerprint(mesh: Mesh, recipient: str, key: bytes, *, budget: float = 8e-4)
     Raises:
         JaxmarkError: if the mesh, key, budget or identifier is unusable, or the mesh is too small.
     """
-    return make_tracer(mesh, key).fingerprint(recipient, budget)
+    return make_tracer(mesh, key).fingerprint(recipient, budget, limits=limits)
 
 
 def identify(

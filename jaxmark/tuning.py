@@ -1,101 +1,389 @@
-"""Strengths per band by jaxopt: the most that every attack leaves readable, within a distortion budget.
+"""Strengths per band by jaxopt: the most that the worst of some attacks leaves readable, within a distortion budget.
 
-The one module that imports jaxopt, and only when it is called.
+The one module that imports jaxopt, and only when it is called. `tune` measures and solves for a mesh; `allocate` solves
+for given channels and can be differentiated; `upper_bound` says how much better any other strengths could be.
 """
 
 import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from types import ModuleType
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Float64, PRNGKeyArray
+from scipy import optimize
 
+from jaxmark.alignment import align, observation
+from jaxmark.attacks import attack
+from jaxmark.bands import scaling
+from jaxmark.budget import Budget, make_budget, write
+from jaxmark.carriers.carrier import Displacement
+from jaxmark.channels import Channels, Margin, margins, measure
+from jaxmark.chebyshev import cross_moments, filter
 from jaxmark.errors import JaxmarkError
+from jaxmark.mesh import Mesh
+from jaxmark.original import Original, prepare
+from jaxmark.reception import make_host
+from jaxmark.schemes import KeyedScheme
+from jaxmark.visibility import band_visibility
+
+Solver = Literal["projected-gradient", "lbfgsb"]
+Attacker = tuple[str, float] | Callable[[Mesh, int], Mesh]  # a name in `ATTACKS` and a strength, or (mesh, seed) → mesh
+
+_ANNEALING = (0.01, 0.1)  # of the final sharpness, in the stages before it
+_BALANCING = 30  # rounds in which several limits are weighed against each other
 
 
-class Channels(NamedTuple):
-    """What each of a set of attacks does to a mark of strength β_j in band j: SNR_aj = gain_aj² β_j² / noise_aj."""
+class Report(NamedTuple):
+    """How a tuning ended."""
 
-    gain: Float[Array, "attacks bands"]  # share of the band's amplitude that the attack leaves
-    noise: Float[Array, "attacks bands"]  # variance it adds to each dimension of the band, in units of β², positive
-    dimensions: Float[Array, " bands"]  # how many dimensions n_j the band has
+    margins: Float64[np.ndarray, " attacks"]  # of the tuned strengths, by the channels
+    bound: float  # no strengths within the budget have a worst margin above this
+    gap: float  # (bound - worst margin) / bound
+    binding: Mapping[str, float]  # weights of the limits in the tuned budget
 
 
-def rate(channels: Channels, beta: Float[Array, " bands"]) -> Float[Array, " attacks"]:
-    """Bits that each attack leaves readable: Σ_j (n_j/2) log₂(1 + SNR_j), the capacity of parallel Gauss channels."""
-    return _rate(channels, beta**2)
+class Tuned(NamedTuple):
+    """Strengths that a mesh was tuned to."""
+
+    scheme: KeyedScheme  # with them as its profile: what `embed` takes
+    beta: Float64[np.ndarray, " bands"]  # in diagonals, within the budget
+    channels: Channels  # as measured
+    cost: Float64[np.ndarray, "limits bands"]  # share of each limit, squared, that β_j² = 1 takes
+    detector_weights: Float64[np.ndarray, "attacks bands"]  # matched to each attack: gain · β / noise
+    report: Report
 
 
 def tune(
+    mesh: Mesh,
+    attacks: Sequence[Attacker],
+    budget: float | None = None,
+    *,
+    limits: Mapping[str, float] | None = None,
+    key: PRNGKeyArray,
+    bits: int = 64,
+    scheme: KeyedScheme | None = None,
+    seeds: int = 1,
+    margin: Margin = "rate",
+    cap: float = 0.125,
+    solver: Solver = "projected-gradient",
+    start: Float[np.ndarray, " bands"] | None = None,
+) -> Tuned:
+    """Tune the strengths of the keyed scheme's bands to a mesh, a set of attacks and a budget.
+
+    Each attack's channel is measured from a probe that writes equal shares of the budget in all bands. Limits other
+    than on RMS displacement count as quadratic in the strengths, with the visibility of each band as measured; the
+    strengths that result are brought within the real limits by a common factor.
+
+    Args:
+        mesh: the original.
+        attacks: what to survive, each a name and a strength or a function of mesh and seed.
+        budget: see `embed`.
+        limits: see `embed`.
+        key: a JAX random key, of the attacks' randomness; no secret.
+        bits: of the payload.
+        scheme: whose bands are tuned; its profile is replaced.
+        seeds: how often each attack is tried; gain and noise are averaged.
+        margin: see `jaxmark.channels.margins`.
+        cap: the largest share of the budget that one band gets, so that losing a band does not lose the mark.
+        solver: see `allocate`.
+        start: strengths to start from, of an earlier tuning.
+
+    Returns:
+        The strengths, and the scheme that has them.
+
+    Raises:
+        JaxmarkError: if the mesh, an attack, the budget or a number is unusable.
+    """
+    if not attacks or seeds < 1:
+        raise JaxmarkError(f"tune needs at least one attack and one seed, got {len(attacks)} and {seeds}.")
+    bounds, scheme = make_budget(budget, limits), scheme or KeyedScheme()
+    original, family = prepare(mesh), scaling(scheme.bands, damping="jackson")
+    signs = jax.random.rademacher(jax.random.key(5), original.signal.shape, original.signal.dtype)
+    signs = signs * jnp.asarray(original.used, signs.dtype)[:, None]
+
+    def shaped(strengths: Float64[np.ndarray, " bands"]) -> Float64[np.ndarray, "points 3"]:
+        return np.asarray(filter(original.operator, family.T @ strengths, signs), np.float64)
+
+    cost = _costs(original, family, signs, bounds)
+    equal = 1 / np.sqrt(len(family) * cost.sum(axis=0))
+    # Equal shares, so that each band is measured.
+    probe = shaped(equal)
+    written = write(original, probe, bounds)
+    mark = jnp.asarray(written.scale * probe, original.signal.dtype)
+    numbers = np.asarray(jax.random.randint(key, (seeds,), 0, 2**31 - 1))
+    suspects = [[_apply(one, written.mesh, int(seed)) for seed in numbers] for one in attacks]
+    seen = [[observation(original, align(original, suspect)) for suspect in row] for row in suspects]
+
+    def measured(profile: tuple[float, ...]) -> Channels:
+        layout = replace(scheme, profile=profile).layout(original, bits)
+        host = make_host(
+            *(original.operator, original.signal, jnp.asarray(original.positions, original.signal.dtype), family),
+            scales=layout.scales,
+            degree=layout.degree,
+        )
+        rows = [_mean([measure(host, one, mark) for one in row]) for row in seen]
+        return Channels(*map(jnp.concatenate, zip(*rows, strict=True)))
+
+    # What the receiver projects off depends on the profile: once for a first one, and again for what it was tuned to.
+    first = measured(_profile(equal if start is None else np.asarray(start, np.float64)))
+    start, _ = _balanced(first, cost, margin, cap, solver, start)
+    channels = measured(_profile(start))
+    beta, weights = _balanced(channels, cost, margin, cap, solver, start)
+    profile = _profile(beta)
+    worth = np.asarray(margins(channels, jnp.asarray(beta**2, original.signal.dtype), margin), np.float64)
+    bound = upper_bound(channels, weights @ cost, cap=cap, margin=margin)
+    report = Report(
+        worth, bound, 1 - float(worth.min()) / bound, dict(zip(_names(bounds), map(float, weights), strict=True))
+    )
+    # The real metrics decide on the mark that the profile makes.
+    exact = np.zeros(len(family))
+    exact[: len(profile)] = profile
+    exact *= write(original, shaped(exact), bounds).scale
+    matched = np.asarray(channels.gain * exact / channels.noise, np.float64)
+    return Tuned(replace(scheme, profile=profile), exact, channels, cost, matched, report)
+
+
+def allocate(
     channels: Channels,
     cost: Float[Array, " bands"],
-    budget: float | Float[Array, ""],
+    budget: float | Float[Array, ""] = 1.0,
     *,
+    margin: Margin = "rate",
+    cap: float = 1.0,
     sharpness: float = 100.0,
     steps: int = 500,
+    solver: Solver = "projected-gradient",
+    start: Float[Array, " bands"] | None = None,
 ) -> Float[Array, " bands"]:
-    """Strengths per band that maximise the worst attack's `rate` under Σ_j cost_j β_j² = budget².
+    """Strengths per band that maximise the worst attack's margin under Σ_j cost_j β_j² = budget²; can be traced.
 
-    Projected gradient on the shares of the budget, which live on a simplex, so the budget is met exactly. The worst is
-    a soft minimum; its gap to the minimum is at most log(attacks)/sharpness of the rate at equal shares.
+    Solved for the shares of the budget, which live on a simplex cut off at `cap`, so the budget is met exactly. The
+    worst is a soft minimum, annealed: its gap to the minimum is at most log(attacks)/sharpness of the margin at equal
+    shares. Reverse mode goes through the solution (implicit differentiation), with respect to channels, cost and
+    budget; there is no forward mode, and none with respect to `start`.
 
     Args:
         channels: of the attacks to survive.
-        cost: mean square displacement that the band makes at β = 1, positive; then the budget is an RMS displacement.
-        budget: in the same length unit.
+        cost: of each band at β = 1, positive: if it is the mean square displacement, the budget is an RMS.
+        budget: the bound.
+        margin: see `jaxmark.channels.margins`.
+        cap: the largest share of the budget that one band gets, at least 1/bands.
         sharpness: of the soft minimum.
         steps: at most so many iterations.
+        solver: `"projected-gradient"` (jaxopt's `ProjectedGradient`, on the simplex) or `"lbfgsb"` (`LBFGSB`, on the
+            box, with shares normalised).
+        start: strengths to start from; equal shares unless given.
 
     Returns:
         β ≥ 0, `[bands]`.
 
     Raises:
-        JaxmarkError: if the shapes do not fit, or the budget is not positive.
+        JaxmarkError: if the shapes do not fit, or a number is out of range.
     """
     attacks, bands = channels.gain.shape
-    if channels.noise.shape != (attacks, bands) or channels.dimensions.shape != (bands,) or cost.shape != (bands,):
+    if not channels.noise.shape == channels.dimensions.shape == (attacks, bands) or cost.shape != (bands,):
         raise JaxmarkError(
-            f"tune needs gain and noise [attacks, bands] and dimensions and cost [bands], got {channels.gain.shape},"
-            f" {channels.noise.shape}, {channels.dimensions.shape} and {cost.shape}."
+            "allocate needs gain, noise and dimensions [attacks, bands] and cost [bands], got"
+            f" {channels.gain.shape}, {channels.noise.shape}, {channels.dimensions.shape} and {cost.shape}."
         )
     if isinstance(budget, float | int) and not budget > 0:
-        raise JaxmarkError(f"tune needs a positive budget, got {budget}.")
-    return _tune(channels, cost, jnp.asarray(budget, cost.dtype), jnp.asarray(sharpness, cost.dtype), steps)
+        raise JaxmarkError(f"allocate needs a positive budget, got {budget}.")
+    if not cap * bands >= 1:
+        raise JaxmarkError(f"{bands} bands with at most {cap:g} of the budget each cannot spend it; raise the cap.")
+    if solver not in get_args(Solver):
+        raise JaxmarkError(f"solver must be one of {', '.join(get_args(Solver))}, got {solver!r}.")
+    first = jnp.full_like(cost, 1 / bands) if start is None else cost * jnp.asarray(start, cost.dtype) ** 2
+    first = _capped_simplex(first / first.sum(), min(cap, 1.0))
+    numbers = (jnp.asarray(budget, cost.dtype), jnp.asarray(sharpness, cost.dtype))
+    return _allocate(channels, cost, *numbers, first, margin, min(cap, 1.0), steps, solver)
 
 
-@partial(jax.jit, static_argnames="steps")
-def _tune(channels: Channels, cost: Array, budget: Array, sharpness: Array, steps: int) -> Array:
+@partial(jax.jit, static_argnames=("margin", "cap", "steps", "solver"))
+def _allocate(
+    channels: Channels,
+    cost: Array,
+    budget: Array,
+    sharpness: Array,
+    first: Array,
+    margin: Margin,
+    cap: float,
+    steps: int,
+    solver: Solver,
+) -> Array:
     jaxopt = _import_jaxopt()
-
-    equal = jnp.full_like(cost, 1 / len(cost))
     # A band's share of the budget buys this much β².
     scaled = channels._replace(gain=channels.gain * budget / jnp.sqrt(cost))
-    weight = sharpness / _rate(scaled, equal).mean()
+    level = 1 / margins(scaled, jnp.full_like(cost, 1 / len(cost)), margin).mean()
 
     # jaxopt differentiates its solution with respect to arguments, not to what a closure holds.
-    def loss(shares: Array, scaled: Channels, weight: Array, sharpness: Array) -> Array:
-        return jax.nn.logsumexp(-weight * _rate(scaled, shares)) / sharpness
+    def loss(shares: Array, scaled: Channels, level: Array, sharpness: Array) -> Array:
+        if solver == "lbfgsb":
+            shares = shares / shares.sum()
+        return jax.nn.logsumexp(-sharpness * level * margins(scaled, shares, margin)) / sharpness
 
-    solver = jaxopt.ProjectedGradient(
-        fun=loss,
-        projection=lambda x, _: jaxopt.projection.projection_simplex(x),
-        maxiter=steps,
-        tol=1e-7,
-        acceleration=False,  # accelerated steps leave the simplex, where a rate has no meaning
-    )
+    if solver == "lbfgsb":
+        box = (jnp.zeros_like(first), jnp.full_like(first, cap))
+        run = partial(jaxopt.LBFGSB(fun=loss, maxiter=steps, tol=1e-6).run, bounds=box)
+    else:
+        # Accelerated steps would leave the simplex, where a margin has no meaning.
+        simplex = jaxopt.ProjectedGradient(
+            fun=loss,
+            projection=lambda x, _: _capped_simplex(x, cap),
+            maxiter=steps,
+            tol=1e-7,
+            acceleration=False,
+        )
+        run = partial(simplex.run, hyperparams_proj=None)
+
+    def stage(shares: Array, share: Array) -> tuple[Array, None]:
+        return run(shares, scaled=scaled, level=level, sharpness=share * sharpness).params, None
+
     with jax.numpy_dtype_promotion("standard"):  # jaxopt mixes integers into its floats
-        shares = solver.run(equal, None, scaled, weight, sharpness).params
+        warm = jax.lax.stop_gradient(jax.lax.scan(stage, first, jnp.asarray(_ANNEALING, first.dtype))[0])
+        shares = stage(warm, jnp.ones_like(sharpness))[0]
+    shares = _capped_simplex(shares / shares.sum(), cap) if solver == "lbfgsb" else shares
     # The root's slope at an empty band is infinite: select before it. NaN is not empty, and stays.
     empty = shares <= 0
     return jnp.where(empty, 0, budget * jnp.sqrt(jnp.where(empty, 1, shares) / cost))
 
 
-def _rate(channels: Channels, power: Array) -> Array:
-    """`rate` as a function of β², in which it is concave and smooth at 0."""
-    snr = channels.gain**2 * power / channels.noise
-    return (channels.dimensions / 2 * jnp.log2(1 + snr)).sum(axis=1)
+def _capped_simplex(x: Float[Array, " bands"], cap: float) -> Float[Array, " bands"]:
+    """The nearest point with Σ_j s_j = 1 and 0 ≤ s_j ≤ cap: all less one number, cut off."""
+
+    def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        middle = (ends[0] + ends[1]) / 2
+        high = jnp.clip(x - middle, 0, cap).sum() > 1
+        return jnp.where(high, middle, ends[0]), jnp.where(high, ends[1], middle)
+
+    ends = jax.lax.stop_gradient((x.min() - 1, x.max()))
+    level = jax.lax.stop_gradient(jax.lax.fori_loop(0, 60, halve, ends)[1])
+    # Exactly, and with its derivative: the sum is linear while the same bands are free.
+    free = (x - level > 0) & (x - level < cap)
+    level = level + (jnp.clip(x - level, 0, cap).sum() - 1) / jnp.maximum(free.sum(), 1)
+    return jnp.clip(x - level, 0, cap)
+
+
+def upper_bound(
+    channels: Channels, cost: Float[Array | np.ndarray, " bands"], *, cap: float = 1.0, margin: Margin = "rate"
+) -> float:
+    """What no strengths with Σ_j cost_j β_j² ≤ 1 exceed, in the worst attack's margin; host side, in float64.
+
+    By weak duality: for weights w ≥ 0, Σ_a w_a = 1 of the attacks and a price μ ≥ 0 of the budget, the worst margin is
+    at most μ + Σ_j max_p [Σ_a w_a m_aj(p) - μ cost_j p] over 0 ≤ p ≤ cap/cost_j, whatever w and μ are; the least such
+    bound is looked for, and is tight because the problem is concave (Boyd, Vandenberghe, "Convex Optimization", 5.2).
+    """
+    gain, noise, dimensions = (np.asarray(field, np.float64) for field in channels)
+    cost = np.asarray(cost, np.float64)
+    # In shares s = cost · p of the budget.
+    worth, slope = dimensions / (2 * np.log(2)), gain**2 / noise / cost
+    unit = dimensions * slope
+
+    def spent(weights: np.ndarray, price: float) -> np.ndarray:
+        """The share of each band that is best at a price."""
+        if margin == "snr":
+            return np.where(weights @ unit > price, cap, 0.0)
+        low, high = np.zeros(len(cost)), np.full(len(cost), min(cap, 1.0))
+        for _ in range(60):
+            middle = (low + high) / 2
+            rising = weights @ (worth * slope / (1 + slope * middle)) > price
+            low, high = np.where(rising, middle, low), np.where(rising, high, middle)
+        return low
+
+    def by_attack(shares: np.ndarray) -> np.ndarray:
+        return (unit * shares if margin == "snr" else worth * np.log1p(slope * shares)).sum(axis=1)
+
+    def bound(variables: np.ndarray) -> tuple[float, np.ndarray]:
+        weights = np.exp(variables[:-1] - variables[:-1].max())
+        weights /= weights.sum()
+        price = float(np.exp(variables[-1]))
+        shares = spent(weights, price)
+        values = by_attack(shares)
+        total = float(weights @ values + price * (1 - shares.sum()))
+        return total, np.append(weights * (values - weights @ values), price * (1 - shares.sum()))
+
+    even = by_attack(np.full(len(cost), 1 / len(cost)))
+    start = np.append(np.zeros(len(gain)), np.log(max(even.min(), 1e-300)))
+    best = np.inf
+    # The bound holds at every trial, so the least of all counts; a bend of it can stop a search, so it starts again.
+    for _ in range(20):
+        found = optimize.minimize(bound, start, jac=True, method="L-BFGS-B", options={"maxiter": 500})
+        improved, best, start = found.fun < best * (1 - 1e-6), min(best, float(found.fun)), found.x
+        if not improved:
+            break
+    return best
+
+
+def _balanced(
+    channels: Channels,
+    cost: Float64[np.ndarray, "limits bands"],
+    margin: Margin,
+    cap: float,
+    solver: Solver,
+    start: Float[np.ndarray, " bands"] | None,
+) -> tuple[Float64[np.ndarray, " bands"], Float64[np.ndarray, " limits"]]:
+    """Strengths within several limits at once, and the weights of the one budget that has the same solution.
+
+    Any weighted mean of the limits is a weaker bound than all of them; the weights for which its solution keeps all are
+    looked for by raising those of limits that are passed.
+    """
+    weights, dtype = np.full(len(cost), 1 / len(cost)), channels.gain.dtype
+    best: tuple[float, np.ndarray, np.ndarray] | None = None
+    for _ in range(_BALANCING if len(cost) > 1 else 1):
+        given = None if start is None else jnp.asarray(start, dtype)
+        mixed = jnp.asarray(weights @ cost, dtype)
+        solved = allocate(channels, mixed, margin=margin, cap=cap, solver=solver, start=given)
+        power = np.asarray(solved, np.float64) ** 2
+        used = cost @ power
+        power /= used.max()
+        worst = float(margins(channels, jnp.asarray(power, dtype), margin).min())
+        if best is None or worst > best[0]:
+            best = worst, np.sqrt(power), weights
+        if used.max() < 1.001:
+            break
+        start, weights = np.sqrt(power), weights * used**0.5
+        weights = weights / weights.sum()
+    assert best is not None
+    return best[1], best[2]
+
+
+def _costs(
+    original: Original, family: Float64[np.ndarray, "bands terms"], signs: Displacement, bounds: Budget
+) -> Float64[np.ndarray, "limits bands"]:
+    """Share of each limit, squared, that β_j = 1 takes in band j."""
+    mass = original.operator.degree
+    moments = cross_moments(original.operator, signs, signs, degree=family.shape[1] - 1)
+    energy = np.maximum(family @ np.asarray(moments, np.float64).sum(axis=1) / float(mass.sum()), 1e-12)
+    seen = list(bounds.limits)
+    visible = band_visibility(original, family, seen) if seen else np.empty((0, len(family)))
+    rows = [energy * (row / bounds.limits[name]) ** 2 for name, row in zip(seen, visible, strict=True)]
+    return np.stack(rows + ([energy / bounds.rms**2] if bounds.rms is not None else []))
+
+
+def _names(bounds: Budget) -> list[str]:
+    return list(bounds.limits) + (["budget"] if bounds.rms is not None else [])
+
+
+def _profile(beta: Float64[np.ndarray, " bands"]) -> tuple[float, ...]:
+    """Relative strengths, to four digits; bands of less than a hundredth of the strongest do not count."""
+    relative = np.where(beta >= 0.01 * beta.max(), beta / beta.max(), 0)
+    return tuple(float(f"{value:.4g}") for value in relative[: 1 + np.flatnonzero(relative)[-1]])
+
+
+def _mean(channels: list[Channels]) -> Channels:
+    """Of trials of one attack."""
+    return jax.tree.map(lambda *values: jnp.mean(jnp.stack(values), axis=0), *channels)
+
+
+def _apply(attacker: Attacker, mesh: Mesh, seed: int) -> Mesh:
+    if callable(attacker):
+        return attacker(mesh, seed)
+    kind, strength = attacker
+    return attack(mesh, kind, strength, seed=seed)
 
 
 def _import_jaxopt() -> ModuleType:

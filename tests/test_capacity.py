@@ -10,6 +10,7 @@ from scipy import integrate, optimize
 
 import jaxmark as jm
 from jaxmark.bands import scaling
+from jaxmark.budget import make_budget
 from jaxmark.mesh import Mesh, make_mesh, vertex_normals
 from jaxmark.original import prepare
 from jaxmark.payload import Capacity, Conditions, least_energy, needed_dimensions, needed_energy, room
@@ -17,7 +18,7 @@ from jaxmark.schemes import KeyedScheme
 from tests.dense import chebyshev_matrices
 from tests.samples import bumpy_sphere, rough_sphere
 
-USUAL = Conditions(budget=8e-4, noise=0.005, coverage=0.5)
+USUAL = Conditions(make_budget(8e-4), noise=0.005, coverage=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +128,7 @@ def test_least_budget_scales(known: Capacity):
     least = known.least_budget(16, USUAL)
     assert known.least_budget(16, USUAL._replace(noise=0.015)) == pytest.approx(3 * least, rel=1e-12)
     assert known.least_budget(16, USUAL._replace(noise=0.0)) == 0
-    assert known.least_budget(16, USUAL._replace(budget=1e-9)) == least
+    assert known.least_budget(16, USUAL._replace(budget=make_budget(1e-9))) == least
     # As 1/√coverage, but for the interference of the bits, which a smaller coverage raises.
     whole = known.least_budget(16, USUAL._replace(coverage=1.0))
     scheme, original = KeyedScheme(), known._original
@@ -142,7 +143,7 @@ def test_least_budget_scales(known: Capacity):
 
 def test_bits_are_monotone(coarse: Capacity):
     rising = {
-        "budget": [coarse.bits(USUAL._replace(budget=b)) for b in (1e-4, 4e-4, 8e-4, 1.2e-3, 1.6e-3)],
+        "budget": [coarse.bits(USUAL._replace(budget=make_budget(b))) for b in (1e-4, 4e-4, 8e-4, 1.2e-3, 1.6e-3)],
         "noise": [coarse.bits(USUAL._replace(noise=n)) for n in (0.1, 0.01, 0.005, 0.003, 0.002)],
         "coverage": [coarse.bits(USUAL._replace(coverage=c)) for c in (0.05, 0.3, 0.5, 0.7, 1.0)],
     }
@@ -156,7 +157,7 @@ def test_bits_are_monotone(coarse: Capacity):
 @pytest.mark.parametrize("budget", [8e-4, 1.16e-3, 1.5e-3])
 def test_bits_is_the_largest_payload(budget, coarse: Capacity):
     """No larger one fits, and every smaller one does."""
-    conditions = USUAL._replace(budget=budget)
+    conditions = USUAL._replace(budget=make_budget(budget))
     most = coarse.bits(conditions)
     assert most > 0
     for bits in range(8, 400, 8):
@@ -184,12 +185,12 @@ def test_payloads_that_must_not_be_refused(vertices, bits, budget, known: Capaci
 
 def test_what_is_stated_is_kept(thousand: Mesh, known: Capacity, key: jm.Key):
     """A refusal names a payload and a budget, and both are accepted as they stand."""
-    most = jm.capacity(thousand)
+    most = jm.capacity(thousand, 8e-4)
     assert most == known.bits(USUAL)
-    jm.embed(thousand, bytes(most // 8), key)
+    jm.embed(thousand, bytes(most // 8), key, budget=8e-4)
     larger = bytes(most // 8 + 1)
     with pytest.raises(jm.JaxmarkError) as refusal:
-        jm.embed(thousand, larger, key)
+        jm.embed(thousand, larger, key, budget=8e-4)
     stated = re.search(r"at most (\d+) bits .* not (\d+)\. .*at least ([0-9.e-]+\d)\.$", str(refusal.value))
     assert stated is not None
     assert int(stated[1]) == most
@@ -200,9 +201,9 @@ def test_what_is_stated_is_kept(thousand: Mesh, known: Capacity, key: jm.Key):
     with pytest.raises(jm.JaxmarkError, match="carries at most"):
         jm.embed(thousand, larger, key, budget=0.99 * least)
     # Where nothing but the noise asked for is too much, less of it is accepted.
-    jm.embed(thousand, larger, key, noise=0.99 * 0.005 * 8e-4 / least)
+    jm.embed(thousand, larger, key, budget=8e-4, noise=0.99 * 0.005 * 8e-4 / least)
     with pytest.raises(jm.JaxmarkError, match=r"Use a shorter message\.$"):
-        jm.embed(thousand, bytes(110), key)
+        jm.embed(thousand, bytes(110), key, budget=8e-4)
 
 
 @pytest.mark.parametrize("bits", [16, 24, 48])
@@ -218,13 +219,13 @@ def test_a_stated_least_budget_is_never_below_the_least(bits, thousand: Mesh, kn
 
 def test_a_message_at_capacity_reads_after_the_noise_it_is_stated_for(thousand: Mesh, key: jm.Key):
     """With half of the vertices unknown."""
-    bits = jm.capacity(thousand)
+    bits = jm.capacity(thousand, 8e-4)
     marker = jm.make_marker(thousand, key, bits=bits)
     radius = np.linalg.norm(thousand.vertices - thousand.vertices.mean(axis=0), axis=1).mean()
     for seed in range(5):
         random = np.random.default_rng(seed)
         message = random.bytes(bits // 8)
-        marked, _ = marker.embed(message)
+        marked, _ = marker.embed(message, 8e-4)
         noisy = marked.vertices + 0.005 * radius * random.uniform(-1, 1, marked.vertices.shape)
         known = random.permutation(len(noisy)) < len(noisy) // 2
         found = marker.detect(make_mesh(noisy, thousand.faces), weights=known.astype(float))
@@ -248,7 +249,7 @@ def test_numbers_out_of_range_are_refused():
         {"coverage": 1.01},
         {"coverage": math.nan},
     ):
-        with pytest.raises(jm.JaxmarkError, match="capacity needs a budget"):
+        with pytest.raises(jm.JaxmarkError, match=r"budget is relative|capacity needs"):
             jm.capacity(mesh, **change)
     nowhere = mesh._replace(vertices=np.where(mesh.vertices > 0.5, np.nan, mesh.vertices))
     with pytest.raises(jm.JaxmarkError, match="not a finite number"):

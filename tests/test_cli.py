@@ -69,7 +69,7 @@ DETECT = ("--original", "model.ply", "--key", "owner.key")
 
 @pytest.mark.parametrize("scheme", ["keyed", "host", "eigen"])
 def test_the_main_job(workshop: Workshop, scheme):
-    told = workshop.embed("--scheme", scheme)
+    told = workshop.embed("--scheme", scheme, "--budget", "0.0008")
     assert told["bits"] == 64
     assert told["scheme"] == scheme
     assert told["record"] == "marked.ply.jaxmark.json"
@@ -92,20 +92,22 @@ def test_the_main_job(workshop: Workshop, scheme):
     claimed = workshop.json("detect", "suspect.ply", *DETECT, "--scheme", scheme, "--message", MESSAGE)
     assert claimed["detected"] is True
     compared = workshop.json("compare", "model.ply", "marked.ply")
-    assert compared == {"rms": told["rms"], "max": told["max"]}
+    assert (compared["rms"], compared["max"]) == (told["rms"], told["max"])
 
 
 def test_capacity_is_what_embed_takes(workshop: Workshop):
-    bits = workshop.json("capacity", "model.ply")["bits"]
+    budget = ("--budget", "0.0008")
+    bits = workshop.json("capacity", "model.ply", *budget)["bits"]
     assert 64 <= bits < 1000
     for size, status in ((bits, 0), (bits + 8, 2)):
         code, _, err = workshop(
-            "embed", "model.ply", "full.ply", "--key", "owner.key", "--message", "5a" * (size // 8), "--json"
+            *("embed", "model.ply", "full.ply", "--key", "owner.key", "--message", "5a" * (size // 8), "--json"),
+            *budget,
         )
         assert code == status, err
     assert f"at most {bits} bits" in err
     assert workshop.json("capacity", "model.ply", "--budget", "0.0004")["bits"] < bits
-    assert workshop.json("capacity", "model.ply", "--noise", "0.01")["bits"] < bits
+    assert workshop.json("capacity", "model.ply", *budget, "--noise", "0.01")["bits"] < bits
 
 
 def test_copies_are_traced(workshop: Workshop):
@@ -220,10 +222,9 @@ def test_other_connectivity_is_read_where_it_can_be(workshop: Workshop):
     assert "does not share" in workshop.refused("detect", "finer.obj", *DETECT, "--align", "same")
 
 
-def test_what_cannot_be_compared_is_refused_by_name(workshop: Workshop):
+def test_what_cannot_be_aligned_is_refused_by_name(workshop: Workshop):
     trimesh.Trimesh(*bumpy_sphere(2), process=False).export("small.ply")
     assert "could not be aligned" in workshop.refused("detect", "small.ply", *DETECT)
-    assert "does not share" in workshop.refused("compare", "model.ply", "small.ply")
 
 
 def test_key_files_are_private_and_keys_never_shown(workshop: Workshop):

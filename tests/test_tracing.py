@@ -17,7 +17,7 @@ def tracer(key: jm.Key) -> jm.Tracer:
 
 @pytest.fixture(scope="module")
 def copies(tracer: jm.Tracer) -> np.ndarray:
-    return np.stack([tracer.fingerprint(name)[0].vertices for name in NAMES[:4]])
+    return np.stack([tracer.fingerprint(name, 8e-4)[0].vertices for name in NAMES[:4]])
 
 
 def accused(tracer: jm.Tracer, vertices: np.ndarray) -> set[str]:

@@ -54,6 +54,8 @@ class KeyedCarrier(NamedTuple):
     host: Host
     chips: Chips
     normals: Float[Array, "vertices 3"] | None = None  # with one chip a vertex: where it moves
+    profile: Float[Array | np.ndarray, " bands"] | None = None  # factor on β for each band
+    masking: Float[Array | np.ndarray, " vertices"] | None = None  # factor on what each vertex is moved by
 
     def displacement(self, bits: Float[Array, " bits"], beta: Strength = 1.0) -> Displacement:
         """See `Carrier`: one filter, whatever the number of bits."""
@@ -86,8 +88,9 @@ class KeyedCarrier(NamedTuple):
         strength = jnp.asarray(beta).astype(self._signs.dtype)
         if strength.ndim == 0:
             strength = jnp.broadcast_to(strength, len(self.host.coefficients))
-        if weight is not None:
-            strength = per_row(weight, strength) * strength
+        for factor in (weight, self.profile):
+            if factor is not None:
+                strength = per_row(jnp.asarray(factor), strength) * strength
         return self.host.coefficients.T @ strength
 
     def modulate(self, bits: Float[Array, " bits"], shape: Float[Array, " terms *channels"]) -> Displacement:
@@ -101,6 +104,8 @@ class KeyedCarrier(NamedTuple):
     def shaped(self, chips: Float[Array, "vertices channels"], shape: Float[Array, " terms *channels"]) -> Displacement:
         """Any chips through a filter, as a displacement."""
         along = filter(self.host.operator, shape, chips)
+        if self.masking is not None:
+            along = jnp.asarray(self.masking)[:, None] * along
         return along if self.normals is None else self.normals * along
 
     def match(
@@ -108,6 +113,8 @@ class KeyedCarrier(NamedTuple):
     ) -> Float[Array, "vertices channels"]:
         """The plain adjoint of `shaped`."""
         along = residual if self.normals is None else jnp.sum(self.normals * residual, axis=1, keepdims=True)
+        if self.masking is not None:
+            along = jnp.asarray(self.masking)[:, None] * along
         return transpose(self.host.operator, shape, along)
 
     def _despread(self, matched: Float[Array, "vertices channels"]) -> Float[Array, " bits"]:

@@ -1,5 +1,6 @@
 """How far a mesh was moved, and how it looks: metrics, one a module."""
 
+from jaxmark.distortion.compare import METRICS as METRICS
 from jaxmark.distortion.compare import Comparison as Comparison
 from jaxmark.distortion.compare import Moved as Moved
 from jaxmark.distortion.compare import compare as compare

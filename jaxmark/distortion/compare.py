@@ -1,17 +1,20 @@
 """All metrics of a pair of meshes at once, on the host."""
 
+from collections.abc import Callable, Collection, Mapping
+from functools import cached_property
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxmark.distortion.curvature import curvature_tensor, tensor_distance
-from jaxmark.distortion.dihedral import dame, make_hinges
+from jaxmark.distortion.dihedral import Hinges, dame, make_hinges
 from jaxmark.distortion.displacement import maximum, rms
 from jaxmark.distortion.geometric_laplacian import gl
-from jaxmark.distortion.msdm import msdm, msdm2, msdm2_views, msdm_views
+from jaxmark.distortion.msdm import Views, msdm, msdm2, msdm2_views, msdm_views
 from jaxmark.distortion.roughness import fmpd, local_roughness
-from jaxmark.distortion.surface import surface_distance
+from jaxmark.distortion.surface import SurfaceDistance, surface_distance
 from jaxmark.errors import JaxmarkError
 from jaxmark.mesh import (
     Mesh,
@@ -37,20 +40,20 @@ class Moved(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """Distortions of a mesh; None where a metric needs the same connectivity, and it differs.
+    """Distortions of a mesh; None where a metric was not asked for, or needs the same connectivity and it differs.
 
     Lengths are over the original's bounding-box diagonal.
     """
 
     rms: float | None  # displacement of the welded vertices that faces use, unweighted
     max: float | None
-    mrms: float  # root mean square distance between the surfaces, the larger of both directions
-    hausdorff: float  # their largest distance
+    mrms: float | None  # root mean square distance between the surfaces, the larger of both directions
+    hausdorff: float | None  # their largest distance
     gl: float | None  # change of position and geometric Laplacian (Karni, Gotsman)
     dame: float | None  # mean masked change of dihedral angles, in radians (Váša, Rus)
-    fmpd: float  # difference of roughness, 0 to 1 (Wang, Torkhani, Montanvert)
+    fmpd: float | None  # difference of roughness, 0 to 1 (Wang, Torkhani, Montanvert)
     msdm: float | None  # difference of structure, 0 to 1 (Lavoué et al. 2006)
-    msdm2: float  # the same at three scales (Lavoué 2011)
+    msdm2: float | None  # the same at three scales (Lavoué 2011)
     curvature: float | None  # change of curvature tensors, 0 to 1 (in the manner of Torkhani et al.)
 
 
@@ -67,43 +70,82 @@ def moved(original: Mesh, distorted: Mesh) -> Moved:
         return Moved(float(rms(change)), float(maximum(change)))
 
 
-def compare(original: Mesh, distorted: Mesh) -> Comparison:
-    """Measure how far a mesh was distorted, by all metrics; seconds for 35,000 vertices.
+class _Pair:
+    """Two meshes at unit size, with what several metrics need, made when first asked for."""
+
+    def __init__(self, original: Mesh, distorted: Mesh) -> None:
+        first, second = host_mesh(original), host_mesh(distorted)
+        self.given = first, second
+        self.same = same_connectivity(first, second)
+        length, welded = diagonal(first), weld(first.vertices)
+        centre = np.asarray(first.vertices, np.float64)[used_vertices(first)].mean(axis=0)
+        self.meshes = [
+            _plain(mesh._replace(vertices=(np.asarray(mesh.vertices, np.float64) - centre) / length), points)
+            for mesh, points in ((first, welded), (second, welded if self.same else weld(second.vertices)))
+        ]
+        for which, mesh in zip(("original", "distorted mesh"), self.meshes, strict=True):
+            if not 0 < area(mesh) < np.inf:
+                raise JaxmarkError(f"The {which} has an area of {area(mesh):g}; its shape cannot be compared.")
+        self.faces = [np.asarray(mesh.faces) for mesh in self.meshes]
+        self.x, self.y = (jnp.asarray(mesh.vertices, jnp.float32) for mesh in self.meshes)
+
+    @cached_property
+    def moved(self) -> Moved:
+        return moved(*self.given)
+
+    @cached_property
+    def surfaces(self) -> SurfaceDistance:
+        return surface_distance(*self.meshes)
+
+    @cached_property
+    def hinges(self) -> Hinges:
+        return make_hinges(self.faces[0])
+
+    @cached_property
+    def views(self) -> Views:
+        return msdm2_views(*self.meshes)
+
+    def tensor_distance(self) -> Array:
+        scale = self.views.scales[-1]
+        balls = (self.x, scale.original), (self.y, scale.distorted)
+        return tensor_distance(*(curvature_tensor(points, self.hinges, ball) for points, ball in balls))
+
+
+_METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
+    "rms": lambda pair: pair.moved.rms,
+    "max": lambda pair: pair.moved.max,
+    "mrms": lambda pair: pair.surfaces.mrms,
+    "hausdorff": lambda pair: pair.surfaces.hausdorff,
+    "gl": lambda pair: gl(pair.x, pair.y, edges(pair.faces[0])),
+    "dame": lambda pair: dame(pair.x, pair.y, pair.hinges),
+    "fmpd": lambda pair: fmpd(local_roughness(pair.x, pair.faces[0]), local_roughness(pair.y, pair.faces[1])),
+    "msdm": lambda pair: msdm(pair.x, pair.y, msdm_views(*pair.meshes)),
+    "msdm2": lambda pair: msdm2(pair.x, pair.y, pair.views),
+    "curvature": _Pair.tensor_distance,
+}
+METRICS = tuple(_METRICS)
+_ANY_CONNECTIVITY = {"mrms", "hausdorff", "fmpd", "msdm2"}
+
+
+def compare(original: Mesh, distorted: Mesh, metrics: Collection[str] = METRICS) -> Comparison:
+    """Measure how far a mesh was distorted; all metrics take seconds for 35,000 vertices.
 
     Points at the same position count as one; by the original's, where the connectivity is the same.
 
+    Args:
+        original: any mesh with an area.
+        distorted: another one.
+        metrics: which of `METRICS`; the others are None.
+
     Raises:
-        JaxmarkError: if a mesh has no area or is unusable (see `make_mesh`, `diagonal`), or libigl is missing.
+        JaxmarkError: if there is no such metric, a mesh has no area or is unusable (see `make_mesh`, `diagonal`), or
+            libigl is missing: mrms, hausdorff, msdm2 and curvature need it.
     """
-    first, second = host_mesh(original), host_mesh(distorted)
-    same = same_connectivity(first, second)
-    length, welded = diagonal(first), weld(first.vertices)
-    centre = np.asarray(first.vertices, np.float64).mean(axis=0)
-    meshes = [
-        _plain(mesh._replace(vertices=(np.asarray(mesh.vertices, np.float64) - centre) / length), points)
-        for mesh, points in ((first, welded), (second, welded if same else weld(second.vertices)))
-    ]
-    for which, mesh in zip(("original", "distorted mesh"), meshes, strict=True):
-        if not 0 < area(mesh) < np.inf:
-            raise JaxmarkError(f"The {which} has an area of {area(mesh):g}; its shape cannot be compared.")
-    x, y = (jnp.asarray(mesh.vertices, jnp.float32) for mesh in meshes)
-    faces = [np.asarray(mesh.faces) for mesh in meshes]
-    views = msdm2_views(*meshes)
-    answer = {
-        **dict(zip(("mrms", "hausdorff"), surface_distance(*meshes), strict=True)),
-        "fmpd": fmpd(local_roughness(x, faces[0]), local_roughness(y, faces[1])),
-        "msdm2": msdm2(x, y, views),
-    }
-    if same:
-        hinges, largest = make_hinges(faces[0]), views.scales[-1]
-        tensors = [curvature_tensor(p, hinges, balls) for p, balls in ((x, largest.original), (y, largest.distorted))]
-        answer |= moved(original, distorted)._asdict() | {
-            "gl": gl(x, y, edges(faces[0])),
-            "dame": dame(x, y, hinges),
-            "msdm": msdm(x, y, msdm_views(*meshes)),
-            "curvature": tensor_distance(tensors[0], tensors[1]),
-        }
-    return Comparison(*(None if name not in answer else float(answer[name]) for name in Comparison._fields))  # pyright: ignore
+    if unknown := [name for name in metrics if name not in METRICS]:
+        raise JaxmarkError(f"There is no metric {unknown[0]!r}; there are {', '.join(METRICS)}.")
+    pair = _Pair(original, distorted)
+    wanted = {name for name in metrics if pair.same or name in _ANY_CONNECTIVITY}
+    return Comparison(**{name: float(_METRICS[name](pair)) if name in wanted else None for name in METRICS})  # pyright: ignore
 
 
 def _plain(mesh: Mesh, welded: Weld) -> Mesh:

@@ -52,7 +52,7 @@ def _eigenvalues(matrix: Float[Array, "matrices 3 3"]) -> Float[Array, "matrices
     # The arc cosine's slope at ±1, where two eigenvalues meet, is infinite: stop just before it.
     limit = 1 - 4 * jnp.finfo(matrix.dtype).eps
     angle = jnp.arccos(jnp.clip(half, -limit, limit)) / 3
-    turns = angle[:, None] + 2 * np.pi / 3 * np.arange(3)
+    turns = angle[:, None] + 2 * np.pi / 3 * jnp.arange(3, dtype=matrix.dtype)
     return mean[:, None] + jnp.where(round_, 0, 2 * size)[:, None] * jnp.cos(turns).astype(matrix.dtype)
 
 

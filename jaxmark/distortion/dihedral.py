@@ -4,6 +4,7 @@ Váša, Rus, "Dihedral Angle Mesh Error: a fast perception correlated distortion
 meshes", Computer Graphics Forum 31(5), 2012.
 """
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -81,7 +82,7 @@ def dame(
         In radians; 0 for equal shapes, whatever their scale.
     """
     before, after = dihedral_angles(original, hinges), dihedral_angles(distorted, hinges)
-    masking = jnp.exp(np.log(_LEFT_OF_FOLDED) * (before / np.pi) ** 2)
+    masking = jnp.exp(math.log(_LEFT_OF_FOLDED) * (before / np.pi) ** 2)
     inner = jnp.asarray(hinges.inner).astype(before.dtype)
     return jnp.sum(inner * masking * jnp.abs(after - before)) / jnp.maximum(inner.sum(), 1)
 

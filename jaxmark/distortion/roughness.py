@@ -51,7 +51,7 @@ def local_roughness(
     half = jnp.where(sine > 0, half, jnp.where(cosine > 0, _COTANGENTS[1], _COTANGENTS[0]))
 
     zeros = jnp.zeros(len(x), x.dtype)
-    defect = jnp.abs(jnp.where(boundary, np.pi, 2 * np.pi) - zeros.at[faces].add(angle))
+    defect = jnp.abs(jnp.where(boundary, np.pi, 2 * np.pi).astype(x.dtype) - zeros.at[faces].add(angle))
     start, end = jnp.roll(jnp.asarray(faces), -1, axis=1), jnp.roll(jnp.asarray(faces), -2, axis=1)
     total = zeros.at[start].add(half).at[end].add(half)
     around = zeros.at[start].add(half * defect[end]).at[end].add(half * defect[start])

@@ -1,0 +1,86 @@
+"""What attacks leave of a mark, band by band: parallel Gaussian channels, and what they let through.
+
+The bands f_j ≥ 0 with Σ_j f_j = 1 share each eigenvector's energy: ⟨u, v⟩ = Σ_j ⟨u, f_j(Δ)v⟩. All is had from moments,
+in O(N) memory however many the bands.
+"""
+
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxmark.carriers.carrier import Displacement
+from jaxmark.chebyshev import cross_moments
+from jaxmark.observation import Observation
+from jaxmark.reception import Host, clean, extended, receive
+
+Margin = Literal["rate", "snr"]
+
+_FEW = 3  # dimensions of which no variance can be told
+
+
+class Channels(NamedTuple):
+    """What attacks do to a mark of strength β_j in band j: SNR_aj = gain_aj² β_j² / noise_aj in each dimension."""
+
+    gain: Float[Array, "attacks bands"]  # share of the band's amplitude that the attack leaves
+    noise: Float[Array, "attacks bands"]  # variance it adds to each dimension of the band, in units of β², positive
+    dimensions: Float[Array, "attacks bands"]  # how many dimensions of the band are left for evidence
+
+
+def margins(channels: Channels, power: Float[Array, " bands"], margin: Margin = "rate") -> Float[Array, " attacks"]:
+    """What each attack leaves readable of a mark with powers β_j²; concave in them.
+
+    Args:
+        channels: of the attacks.
+        power: β², one per band.
+        margin: `"rate"`, in bits: Σ_j (n_j/2) log₂(1 + SNR_j), the capacity of parallel Gaussian channels (Cover,
+            Thomas, "Elements of Information Theory", 9.4). `"snr"`: Σ_j n_j SNR_j, 2 ln 2 times its limit for weak
+            marks, which is brittle: the best of it lies in as many bands as there are attacks.
+    """
+    ratio = channels.gain**2 * power / channels.noise
+    return (channels.dimensions * (ratio if margin == "snr" else jnp.log2(1 + ratio) / 2)).sum(axis=1)
+
+
+def rate(channels: Channels, beta: Float[Array, " bands"]) -> Float[Array, " attacks"]:
+    """Bits that each attack leaves readable of a mark with strengths β; see `margins`."""
+    return margins(channels, beta**2)
+
+
+@jax.jit
+def measure(host: Host, seen: Observation, mark: Displacement) -> Channels:
+    """One attack's channel, from a suspect with a known mark; can be differentiated with respect to `seen`.
+
+    Args:
+        host: the original, with the bands that share its spectrum as coefficients.
+        seen: the suspect.
+        mark: what had been written, with some strength in each band.
+
+    Returns:
+        One row. A band of less than three dimensions tells nothing, and leaves nothing.
+    """
+    host = extended(host, seen)
+    received = receive(host, seen)
+
+    def kept(x: Array) -> Array:
+        return clean(host, received.seen, received.factor, x) @ received.axes
+
+    def shared(u: Array, v: Array) -> Array:
+        moments = cross_moments(host.operator, u, v, degree=host.coefficients.shape[1] - 1)
+        return host.coefficients @ moments.sum(axis=1)
+
+    written, found = kept(mark), received.residual
+    probe = kept(jax.random.rademacher(jax.random.key(3), mark.shape, mark.dtype))
+    mass = host.operator.degree.astype(mark.dtype)
+    dimensions = shared(probe, probe) * jnp.sum(mass > 0) / mass.sum()
+    sound = dimensions > _FEW
+    own, cross, whole = shared(written, written), shared(found, written), shared(found, found)
+    marked = sound & (own > 0)
+    gain = jnp.where(marked, jnp.maximum(cross, 0) / jnp.where(marked, own, 1), 0)
+    # Weak bands are small differences of large numbers: below this it is rounding.
+    floor = 10 * jnp.finfo(mark.dtype).eps * whole.sum() / len(whole)
+    left = jnp.maximum(whole - gain * jnp.maximum(cross, 0), floor) * jnp.sum(mass > 0) / mass.sum()
+    noise = jnp.where(sound, left / jnp.where(sound, dimensions, 1), 1)
+    # A suspect that is its original has no noise at all.
+    noise = jnp.maximum(noise, jnp.finfo(mark.dtype).tiny)
+    return Channels(gain[None], noise[None], jnp.where(sound, dimensions, 0)[None])

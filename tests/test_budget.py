@@ -1,0 +1,116 @@
+"""How strong a mark is: RMS displacement, limits on metrics, or both."""
+
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+
+import jaxmark as jm
+from jaxmark import cli
+from jaxmark.budget import DEFAULT_LIMITS, make_budget, write
+from jaxmark.mesh import Mesh, make_mesh
+from jaxmark.original import prepare
+from tests.samples import rough_sphere
+
+MESSAGE = b"\xa5\x5a"
+SUBSET = ["gl", "dame", "fmpd", "msdm", "max", "mrms"]
+
+
+@pytest.fixture(scope="module")
+def mesh() -> Mesh:
+    return rough_sphere(2000)
+
+
+@pytest.fixture(scope="module")
+def noise(mesh: Mesh) -> np.ndarray:
+    return np.random.default_rng(0).normal(size=mesh.vertices.shape)
+
+
+@pytest.mark.parametrize("name", SUBSET)
+def test_a_limit_is_reached_and_never_passed(name, mesh: Mesh, noise: np.ndarray):
+    original = prepare(mesh)
+    goal = 0.02 if name in ("dame", "fmpd", "msdm") else 3e-4
+    written = write(original, noise, make_budget(limits={name: goal}))
+    assert 0.98 * goal <= jm.compare(mesh, written.mesh)._asdict()[name] <= goal
+
+
+def test_the_tightest_of_several_bounds_counts(mesh: Mesh, noise: np.ndarray):
+    original = prepare(mesh)
+    for budget in (make_budget(1e-4, {"dame": 1.0}), make_budget(1e-4)):
+        assert write(original, noise, budget).moved.rms == pytest.approx(1e-4)
+    budget = make_budget(0.5, {"dame": 0.01, "msdm": 0.9})
+    found = jm.compare(mesh, write(original, noise, budget).mesh)
+    assert 0.0098 <= (found.dame or 0) <= 0.01
+    assert (found.msdm or 0) <= 0.9
+
+
+def test_without_a_word_the_mark_stays_below_what_people_notice(mesh: Mesh, key: jm.Key):
+    marked, info = jm.embed(mesh, MESSAGE, key, noise=0)
+    found = jm.compare(mesh, marked, ["dame", "rms"])
+    assert DEFAULT_LIMITS.keys() == {"dame"}
+    assert 0.98 * DEFAULT_LIMITS["dame"] <= (found.dame or 0) <= DEFAULT_LIMITS["dame"] < 0.0092
+    assert found.rms == pytest.approx(info.rms, rel=1e-6)
+    assert found.msdm2 is None  # not asked for
+    assert jm.detect(marked, original=mesh, key=key, bits=16).message == MESSAGE
+
+
+def test_capacity_under_limits_is_that_of_the_displacement_they_allow(mesh: Mesh, key: jm.Key):
+    noise = 0.002
+    most = jm.capacity(mesh, limits={"dame": 0.02}, noise=noise)
+    assert 8 <= most < jm.capacity(mesh, limits={"dame": 0.04}, noise=noise)
+    _, info = jm.embed(mesh, bytes(most // 8), key, limits={"dame": 0.02}, noise=noise)
+    assert jm.capacity(mesh, info.rms, noise=noise) >= most
+    with pytest.raises(jm.JaxmarkError, match=f"carries at most {most} bits at dame of at most 0.02,"):
+        jm.embed(mesh, bytes(most // 8 + 3), key, limits={"dame": 0.02}, noise=noise)
+
+
+def test_limits_from_the_shell(mesh: Mesh, tmp_path, monkeypatch, capsys):
+    def run(*arguments: str) -> dict:
+        monkeypatch.setattr(sys, "argv", ["jaxmark", *arguments, "--json"])
+        cli.main()
+        return json.loads(capsys.readouterr().out)
+
+    model, marked, key = (str(tmp_path / name) for name in ("model.ply", "marked.ply", "key"))
+    jm.save_mesh(mesh, model)
+    run("keygen", key)
+    mark = ("embed", model, marked, "--key", key, "--message", "a55a", "--noise", "0")
+    written = run(*mark, "--limit", "dame=0.004", "--limit", "gl=0.0001")
+    found = run("compare", model, marked)
+    assert found["dame"] <= 0.004 * 1.001  # rounded to the file's numbers
+    assert found["gl"] <= 0.0001 * 1.001
+    assert max(found["dame"] / 0.004, found["gl"] / 0.0001) > 0.98
+    assert found["rms"] == pytest.approx(written["rms"], rel=1e-5)
+    assert run("capacity", model, "--limit", "dame=0.05")["limits"] == {"dame": 0.05}
+    for wrong, sentence in (("dame", "is no limit"), ("dame=x", "is no limit"), ("size=1", "no metric 'size'")):
+        monkeypatch.setattr(sys, "argv", ["jaxmark", *mark, "--limit", wrong])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        assert end.value.code == 2
+        assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("budget", "limits", "sentence"),
+    [
+        (None, {}, "budget or at least one limit"),
+        (None, {"dame": 0.0}, "must be a positive number"),
+        (None, {"dame": math.nan}, "must be a positive number"),
+        (1.5, None, "in \\(0, 1\\)"),
+        (None, {"hausdorf": 1.0}, "no metric 'hausdorf'"),
+    ],
+)
+def test_budgets_out_of_range_are_refused(budget, limits, sentence):
+    with pytest.raises(jm.JaxmarkError, match=sentence):
+        make_budget(budget, limits)
+
+
+def test_limits_that_bind_nothing_are_refused_without_a_budget(mesh: Mesh, noise: np.ndarray):
+    original = prepare(mesh)
+    with pytest.raises(jm.JaxmarkError, match="give a budget"):
+        write(original, noise, make_budget(limits={"rms": 0.5}))
+    # Three triangles without a common edge have no dihedral angle.
+    loose = prepare(make_mesh(np.random.default_rng(0).normal(size=(9, 3)), np.arange(9).reshape(3, 3)))
+    with pytest.raises(jm.JaxmarkError, match="give a budget"):
+        write(loose, np.ones((9, 3)) * [1, 2, 3], make_budget())
