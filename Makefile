@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: demo test lint types tests clean
+.PHONY: demo test lint types tests slow-tests clean
 
 demo: $(VENV)/.all  ## mark, attack and read a mesh: make demo [MESH=file]
 	$(BIN)/jaxmark demo $(MESH) --output demo-output
@@ -19,6 +19,9 @@ types: $(VENV)/.dev
 
 tests: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -n auto
+
+slow-tests: $(VENV)/.dev
+	$(BIN)/python -m pytest -q -n auto -m slow
 
 $(VENV)/.%: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

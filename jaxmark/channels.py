@@ -15,7 +15,7 @@ from jaxmark.chebyshev import cross_moments
 from jaxmark.observation import Observation
 from jaxmark.reception import Host, clean, extended, receive
 
-Margin = Literal["rate", "snr"]
+Margin = Literal["rate", "evidence", "snr"]
 
 _FEW = 3  # dimensions of which no variance can be told
 
@@ -35,16 +35,26 @@ def margins(channels: Channels, power: Float[Array, " bands"], margin: Margin = 
         channels: of the attacks.
         power: β², one per band.
         margin: `"rate"`, in bits: Σ_j (n_j/2) log₂(1 + SNR_j), the capacity of parallel Gaussian channels (Cover,
-            Thomas, "Elements of Information Theory", 9.4). `"snr"`: Σ_j n_j SNR_j, 2 ln 2 times its limit for weak
-            marks, which is brittle: the best of it lies in as many bands as there are attacks.
+            Thomas, "Elements of Information Theory", 9.4). `"evidence"`, in nats: Σ_j (n_j/2) SNR_j/(1 + SNR_j), what a
+            claimed message's S²/2‖a‖² comes to (`evidence.log10_p_claimed`), for ‖a‖ holds the mark as well as the
+            noise. `"snr"`: Σ_j (n_j/2) SNR_j, the limit of both for weak marks, up to the unit; it is brittle: the best
+            of it lies in as many bands as there are attacks.
     """
     ratio = channels.gain**2 * power / channels.noise
-    return (channels.dimensions * (ratio if margin == "snr" else jnp.log2(1 + ratio) / 2)).sum(axis=1)
+    worth = {"rate": lambda: jnp.log2(1 + ratio), "evidence": lambda: ratio / (1 + ratio), "snr": lambda: ratio}
+    return (channels.dimensions / 2 * worth[margin]()).sum(axis=1)
 
 
 def rate(channels: Channels, beta: Float[Array, " bands"]) -> Float[Array, " attacks"]:
     """Bits that each attack leaves readable of a mark with strengths β; see `margins`."""
     return margins(channels, beta**2)
+
+
+def band_energies(host: Host, u: Displacement, v: Displacement) -> Float[Array, " bands"]:
+    """⟨u, f_j(Δ)v⟩ for each band, with vertices weighed by valence over its mean; of unit noise, the dimensions."""
+    moments = cross_moments(host.operator, u, v, degree=host.coefficients.shape[1] - 1)
+    mass = host.operator.degree.astype(u.dtype)
+    return host.coefficients @ moments.sum(axis=1) * (jnp.sum(jnp.sign(mass)) / mass.sum())
 
 
 @jax.jit
@@ -65,21 +75,16 @@ def measure(host: Host, seen: Observation, mark: Displacement) -> Channels:
     def kept(x: Array) -> Array:
         return clean(host, received.seen, received.factor, x) @ received.axes
 
-    def shared(u: Array, v: Array) -> Array:
-        moments = cross_moments(host.operator, u, v, degree=host.coefficients.shape[1] - 1)
-        return host.coefficients @ moments.sum(axis=1)
-
     written, found = kept(mark), received.residual
     probe = kept(jax.random.rademacher(jax.random.key(3), mark.shape, mark.dtype))
-    mass = host.operator.degree.astype(mark.dtype)
-    dimensions = shared(probe, probe) * jnp.sum(mass > 0) / mass.sum()
+    dimensions = band_energies(host, probe, probe)
     sound = dimensions > _FEW
-    own, cross, whole = shared(written, written), shared(found, written), shared(found, found)
+    own, cross, whole = (band_energies(host, *pair) for pair in ((written, written), (found, written), (found, found)))
     marked = sound & (own > 0)
     gain = jnp.where(marked, jnp.maximum(cross, 0) / jnp.where(marked, own, 1), 0)
     # Weak bands are small differences of large numbers: below this it is rounding.
     floor = 10 * jnp.finfo(mark.dtype).eps * whole.sum() / len(whole)
-    left = jnp.maximum(whole - gain * jnp.maximum(cross, 0), floor) * jnp.sum(mass > 0) / mass.sum()
+    left = jnp.maximum(whole - gain * jnp.maximum(cross, 0), floor)
     noise = jnp.where(sound, left / jnp.where(sound, dimensions, 1), 1)
     # A suspect that is its original has no noise at all.
     noise = jnp.maximum(noise, jnp.finfo(mark.dtype).tiny)

@@ -7,11 +7,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Float64
 from scipy import optimize, stats
 
 from jaxmark.budget import Budget, write
 from jaxmark.carriers import KeyedCarrier
+from jaxmark.channels import band_energies
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import KEY_BYTES
 from jaxmark.message import TAG_BITS
@@ -28,24 +29,41 @@ class Room(NamedTuple):
 
     dimensions: float  # equivalent number of equally strong ones
     energy: float  # share of the mark's
+    bands: Float64[np.ndarray, " bands"]  # dimensions left in each band
+    strength: Float64[np.ndarray, " bands"]  # β² for a mean square displacement of 1, by the carrier's profile
 
 
 def room(carrier: KeyedCarrier, original: Original) -> Room:
     """Measure a carrier by one probe of random signs in place of the keyed ones."""
-    kept, written, again = map(float, _probe(carrier, jnp.asarray(original.used, carrier.host.signal.dtype)))
-    return Room(kept**2 / again if again > 0 else 0.0, kept / written if written > 0 else 0.0)
+    energies, bands = _probe(carrier, jnp.asarray(original.used, carrier.host.signal.dtype))
+    kept, written, again = map(float, energies)
+    whole, left = np.asarray(bands, np.float64).clip(0)
+    relative = np.square(np.ones(len(whole)) if carrier.profile is None else np.asarray(carrier.profile, np.float64))
+    # Three coordinates, or one along normals, of each vertex make a band's whole.
+    displaced = whole @ relative / original.used.sum()
+    return Room(
+        kept**2 / again if again > 0 else 0.0,
+        kept / written if written > 0 else 0.0,
+        left,
+        relative / displaced if displaced > 0 else relative,
+    )
 
 
 @jax.jit
-def _probe(carrier: KeyedCarrier, moving: Float[Array, " vertices"]) -> tuple[Array, Array, Array]:
-    """Energies of a probe of random signs: of what the projection leaves of it, as written, and of what is matched."""
+def _probe(carrier: KeyedCarrier, moving: Float[Array, " vertices"]) -> tuple[Array, Array]:
+    """Energies of a probe of random signs: of what the projection leaves of it, as written, and of what is matched.
+
+    And of the signs themselves in each band, before and after projection.
+    """
     host, shape = carrier.host, carrier.shape(1.0)
     signs = jax.random.rademacher(jax.random.key(2), carrier.chips.signs.shape, moving.dtype) * moving[:, None]
     probe = carrier.shaped(signs, shape)
     received = receive(host, observe(jnp.zeros_like(host.signal), moving))
     kept = clean(host, received.seen, received.factor, probe)
     again = carrier.match(kept, shape) * moving[:, None]
-    return jnp.sum(probe * kept), jnp.sum(probe**2), jnp.sum(again**2)
+    white = signs if carrier.normals is None else carrier.normals * signs
+    bands = [band_energies(host, x, x) for x in (white, clean(host, received.seen, received.factor, white))]
+    return jnp.stack([jnp.sum(probe * kept), jnp.sum(probe**2), jnp.sum(again**2)]), jnp.stack(bands)
 
 
 def least_energy(bits: int, error: float = 1e-3) -> float:
@@ -119,15 +137,36 @@ class Capacity:
         if layout not in self._rooms:
             self._rooms[layout] = room(self._carrier(bits, code), original)
         left = self._rooms[layout]
+        if scheme.profile:
+            return self._least_by_bands(bits, left, conditions)
         if conditions.coverage * left.dimensions < needed_dimensions(bits):
             return math.inf
         if conditions.noise == 0:
             return 0.0
         needed = needed_energy(bits, conditions.coverage * left.dimensions)
         vertices = conditions.coverage * left.energy * int(original.used.sum())
-        points = original.positions[original.used]
-        radius = float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean())
-        return conditions.noise * radius * math.sqrt(needed / (1.5 * vertices))
+        return conditions.noise * self._radius() * math.sqrt(needed / (1.5 * vertices))
+
+    def _least_by_bands(self, bits: int, left: Room, conditions: Conditions) -> float:
+        """The same for a profile: each band's E/N0 is worth what `needed_energy` says, in the band's dimensions."""
+        dimensions = conditions.coverage * left.bands * (left.strength > 0)
+        alone = 10 ** (_GAP / 10) * least_energy(bits + TAG_BITS)
+        if dimensions.sum() < max(needed_dimensions(bits), alone):
+            return math.inf
+        if conditions.noise == 0:
+            return 0.0
+        # Of one dimension, in units of the squared budget.
+        energy = left.strength / (2 * (conditions.noise * self._radius()) ** 2 / 3)
+
+        def excess(logarithm: float) -> float:
+            each = math.exp(2 * logarithm) * energy
+            return float(np.sum(dimensions * each / (1 + each))) - alone
+
+        return math.exp(optimize.root_scalar(excess, bracket=(-100.0, 100.0)).root)
+
+    def _radius(self) -> float:
+        points = self._original.positions[self._original.used]
+        return float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean())
 
     def reach(self, bits: int, budget: Budget) -> float:
         """The RMS displacement that a budget surely allows a mark of so many bits."""

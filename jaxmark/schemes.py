@@ -63,8 +63,7 @@ class KeyedScheme:
     on a regular triangle mesh, √3/2π · λ for each coordinate of each vertex. The nuisance that is projected off has at
     most a sixth of them, apart from affine maps.
 
-    With a profile, the mark is written in just these bands, and the dimensions are the number of equally strong ones
-    that it is worth.
+    With a profile, the mark is written in the bands that it names, whatever the payload.
     """
 
     name: ClassVar[str] = "keyed"
@@ -84,12 +83,12 @@ class KeyedScheme:
 
     def dimensions(self, original: Original, bits: int) -> int:
         """How many dimensions the pass band for a payload has, as they are counted here."""
-        return int(self._worth(original, self._passing(original, bits)))
+        return int(self._written(original, self._passing(original, bits)))
 
     def layout(self, original: Original, bits: int) -> Layout:
         """Pass band and nuisance for a payload, free of the key."""
         passing = self._passing(original, bits)
-        columns = self._worth(original, passing) / self._channels
+        columns = self._written(original, passing) / self._channels
         # Affine maps are 4 columns; each scale has one for each coordinate.
         scales = min(9, max(0, int(columns / 3 - 4) // 3))
         degree = 1
@@ -140,13 +139,12 @@ class KeyedScheme:
             passing += 1
         return passing
 
-    def _worth(self, original: Original, passing: int) -> float:
-        """How many equally strong dimensions the pass band is worth: (Σ n β²)²/Σ n β⁴."""
+    def _written(self, original: Original, passing: int) -> float:
+        """Dimensions of the bands that are written in."""
         if not self.profile:
             return self._dimensions(original, passing)
         each = np.diff([self._dimensions(original, band) for band in range(passing + 1)])
-        power = np.square(self.profile)
-        return float(np.sum(each * power) ** 2 / np.sum(each * power**2))
+        return float(np.sum(each[np.array(self.profile) > 0]))
 
     def _dimensions(self, original: Original, passing: int) -> float:
         edge = 1 - math.cos(math.pi * passing / self.bands)

@@ -176,7 +176,7 @@ def allocate(
         sharpness: of the soft minimum.
         steps: at most so many iterations.
         solver: `"projected-gradient"` (jaxopt's `ProjectedGradient`, on the simplex) or `"lbfgsb"` (`LBFGSB`, on the
-            box, with shares normalised).
+            box, of what is nearest on the simplex).
         start: strengths to start from; equal shares unless given.
 
     Returns:
@@ -223,7 +223,7 @@ def _allocate(
     # jaxopt differentiates its solution with respect to arguments, not to what a closure holds.
     def loss(shares: Array, scaled: Channels, level: Array, sharpness: Array) -> Array:
         if solver == "lbfgsb":
-            shares = shares / shares.sum()
+            shares = _capped_simplex(shares, cap)
         return jax.nn.logsumexp(-sharpness * level * margins(scaled, shares, margin)) / sharpness
 
     if solver == "lbfgsb":
@@ -246,7 +246,7 @@ def _allocate(
     with jax.numpy_dtype_promotion("standard"):  # jaxopt mixes integers into its floats
         warm = jax.lax.stop_gradient(jax.lax.scan(stage, first, jnp.asarray(_ANNEALING, first.dtype))[0])
         shares = stage(warm, jnp.ones_like(sharpness))[0]
-    shares = _capped_simplex(shares / shares.sum(), cap) if solver == "lbfgsb" else shares
+    shares = _capped_simplex(shares, cap) if solver == "lbfgsb" else shares
     # The root's slope at an empty band is infinite: select before it. NaN is not empty, and stays.
     empty = shares <= 0
     return jnp.where(empty, 0, budget * jnp.sqrt(jnp.where(empty, 1, shares) / cost))
@@ -255,7 +255,7 @@ def _allocate(
 def _capped_simplex(x: Float[Array, " bands"], cap: float) -> Float[Array, " bands"]:
     """The nearest point with Σ_j s_j = 1 and 0 ≤ s_j ≤ cap: all less one number, cut off."""
 
-    def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halve(_: Array | int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         middle = (ends[0] + ends[1]) / 2
         high = jnp.clip(x - middle, 0, cap).sum() > 1
         return jnp.where(high, middle, ends[0]), jnp.where(high, ends[1], middle)
@@ -264,7 +264,7 @@ def _capped_simplex(x: Float[Array, " bands"], cap: float) -> Float[Array, " ban
     level = jax.lax.stop_gradient(jax.lax.fori_loop(0, 60, halve, ends)[1])
     # Exactly, and with its derivative: the sum is linear while the same bands are free.
     free = (x - level > 0) & (x - level < cap)
-    level = level + (jnp.clip(x - level, 0, cap).sum() - 1) / jnp.maximum(free.sum(), 1)
+    level = level + (jnp.clip(x - level, 0, cap).sum() - 1) / jnp.maximum(free.sum().astype(x.dtype), 1)
     return jnp.clip(x - level, 0, cap)
 
 
@@ -279,23 +279,27 @@ def upper_bound(
     """
     gain, noise, dimensions = (np.asarray(field, np.float64) for field in channels)
     cost = np.asarray(cost, np.float64)
-    # In shares s = cost · p of the budget.
-    worth, slope = dimensions / (2 * np.log(2)), gain**2 / noise / cost
-    unit = dimensions * slope
+    # In shares s = cost · p of the budget, of which slope · s is the SNR.
+    half, slope = dimensions / 2, gain**2 / noise / cost
+
+    def rising(shares: np.ndarray) -> np.ndarray:
+        """Derivative of each attack's margin in each band."""
+        snr = slope * shares
+        each = {"rate": 1 / (1 + snr) / np.log(2), "evidence": 1 / (1 + snr) ** 2, "snr": np.ones_like(snr)}
+        return half * slope * each[margin]
 
     def spent(weights: np.ndarray, price: float) -> np.ndarray:
         """The share of each band that is best at a price."""
-        if margin == "snr":
-            return np.where(weights @ unit > price, cap, 0.0)
         low, high = np.zeros(len(cost)), np.full(len(cost), min(cap, 1.0))
         for _ in range(60):
             middle = (low + high) / 2
-            rising = weights @ (worth * slope / (1 + slope * middle)) > price
-            low, high = np.where(rising, middle, low), np.where(rising, high, middle)
+            worthwhile = weights @ rising(middle) > price
+            low, high = np.where(worthwhile, middle, low), np.where(worthwhile, high, middle)
         return low
 
     def by_attack(shares: np.ndarray) -> np.ndarray:
-        return (unit * shares if margin == "snr" else worth * np.log1p(slope * shares)).sum(axis=1)
+        snr = slope * shares
+        return (half * {"rate": np.log2(1 + snr), "evidence": snr / (1 + snr), "snr": snr}[margin]).sum(axis=1)
 
     def bound(variables: np.ndarray) -> tuple[float, np.ndarray]:
         weights = np.exp(variables[:-1] - variables[:-1].max())

@@ -82,7 +82,7 @@ def masking(original: Original) -> Float[Array, " points"]:
     hidden = jnp.where(used, jnp.clip(rough, 5e-4, 0.2) ** _MASKING, 0)
     # Averaged, so that masking does not make high frequencies of low ones.
     averaged = jnp.where(used, _average(original.operator, hidden), 0)
-    return averaged / jnp.sqrt(jnp.sum(averaged**2) / used.sum())
+    return averaged / jnp.sqrt(jnp.sum(averaged**2) / used.sum().astype(averaged.dtype))
 
 
 @jax.jit

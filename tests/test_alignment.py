@@ -339,6 +339,7 @@ def test_smoothing_of_another_meshing_is_noticed():
     assert np.linalg.norm(left) < 0.35 * np.linalg.norm(along)
 
 
+@pytest.mark.slow
 def test_smoothing_by_cotangents_is_noticed_and_taken_off():
     """Implicitly, by libigl's cotangents: another operator than the filters', and another function of it."""
     igl = pytest.importorskip("igl")

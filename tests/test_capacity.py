@@ -141,6 +141,7 @@ def test_least_budget_scales(known: Capacity):
     assert known.least_budget(10**5, USUAL) == math.inf
 
 
+@pytest.mark.slow
 def test_bits_are_monotone(coarse: Capacity):
     rising = {
         "budget": [coarse.bits(USUAL._replace(budget=make_budget(b))) for b in (1e-4, 4e-4, 8e-4, 1.2e-3, 1.6e-3)],
@@ -183,6 +184,7 @@ def test_payloads_that_must_not_be_refused(vertices, bits, budget, known: Capaci
     assert Capacity(prepare(mesh), KeyedScheme()).least_budget(bits, USUAL) <= budget
 
 
+@pytest.mark.slow
 def test_what_is_stated_is_kept(thousand: Mesh, known: Capacity, key: jm.Key):
     """A refusal names a payload and a budget, and both are accepted as they stand."""
     most = jm.capacity(thousand, 8e-4)

@@ -51,6 +51,7 @@ def test_the_fitted_value_is_the_gaussian_tail():
     assert -1000 < log10_p_fitted(60.0, 1.0) < -700  # far below the floor of a claim, and finite
 
 
+@pytest.mark.slow
 def test_false_positive_rates_of_unmarked_suspects():
     """The benchmark in small: nominal against counted, with controls that must fail; it exits 1 if one does not."""
     command = [sys.executable, BENCHMARKS / "false_positives.py", "--keys", "2500"]
@@ -58,6 +59,7 @@ def test_false_positive_rates_of_unmarked_suspects():
     assert ended.returncode == 0, ended.stdout + ended.stderr
 
 
+@pytest.mark.slow
 def test_wrong_keys_and_other_suspects_read_nothing():
     mesh = bumpy_sphere(4)
     marked, _ = jm.embed(mesh, b"original", jm.new_key())

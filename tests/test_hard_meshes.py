@@ -22,6 +22,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
     return int(end.value.code or 0)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not FILES, reason="shared meshes hard/ are absent (set JAXMARK_MESHES)")
 @pytest.mark.parametrize(
     ("path", "scheme"),
@@ -50,6 +51,7 @@ def test_marked_and_read_back_or_refused(path: Path, scheme, tmp_path, monkeypat
     np.testing.assert_array_equal(before.faces, after.faces)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not FILES, reason="shared meshes hard/ are absent (set JAXMARK_MESHES)")
 def test_not_all_are_refused(key, unchecked):
     """The first test would pass on a program that refuses everything; about half of the files can be marked."""

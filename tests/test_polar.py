@@ -150,6 +150,7 @@ def failures(decibel: float, trials: int) -> int:
     return count
 
 
+@pytest.mark.slow
 def test_five_decibel_better_than_uncoded():
     """Messages of 64 bits fail once in a thousand at 9.4 dB uncoded; coded, no more often at 4.4 dB.
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Collection, Mapping
 from functools import cached_property
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -106,8 +107,8 @@ class _Pair:
         return msdm2_views(*self.meshes)
 
     def tensor_distance(self) -> Array:
-        scale = self.views.scales[-1]
-        balls = (self.x, scale.original), (self.y, scale.distorted)
+        largest = jax.tree.map(lambda leaf: leaf[-1], self.views.scales)
+        balls = (self.x, largest.original), (self.y, largest.distorted)
         return tensor_distance(*(curvature_tensor(points, self.hinges, ball) for points, ball in balls))
 
 

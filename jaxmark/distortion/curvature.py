@@ -12,6 +12,7 @@ from jaxmark.distortion.dihedral import Hinges, dihedral_sine_cosine
 from jaxmark.distortion.neighbourhoods import Neighbourhoods, share_inside
 
 
+@jax.jit
 def curvature_tensor(
     x: Float[Array, "vertices 3"], hinges: Hinges, balls: Neighbourhoods
 ) -> Float[Array, "vertices 3 3"]:
@@ -27,9 +28,10 @@ def curvature_tensor(
     weight = jnp.where(square > 0, angle[balls.edge] * jax.lax.rsqrt(jnp.where(square > 0, square, 1)), 0)
     products = weight[:, None, None] * along[:, :, None] * along[:, None, :]
     total = jax.ops.segment_sum(products, balls.centre, len(x), indices_are_sorted=True)
-    return total / (np.pi * balls.radius**2)
+    return total / (np.pi * jnp.asarray(balls.radius).astype(x.dtype) ** 2)
 
 
+@jax.jit
 def curvature(tensor: Float[Array, "vertices 3 3"]) -> Float[Array, " vertices"]:
     """(|K_max| + |K_min|)/2: the mean of the two eigenvalues that are largest in size."""
     sizes = jnp.sort(jnp.abs(_eigenvalues(tensor)), axis=1)
@@ -56,6 +58,7 @@ def _eigenvalues(matrix: Float[Array, "matrices 3 3"]) -> Float[Array, "matrices
     return mean[:, None] + jnp.where(round_, 0, 2 * size)[:, None] * jnp.cos(turns).astype(matrix.dtype)
 
 
+@jax.jit
 def tensor_distance(
     original: Float[Array, "vertices 3 3"], distorted: Float[Array, "vertices 3 3"]
 ) -> Float[Array, ""]:

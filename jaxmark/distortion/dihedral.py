@@ -7,6 +7,7 @@ meshes", Computer Graphics Forum 31(5), 2012.
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -60,11 +61,13 @@ def dihedral_sine_cosine(
     return jnp.where(sound, sine / scale, 0), jnp.where(sound, cosine / scale, 1)
 
 
+@jax.jit
 def dihedral_angles(x: Float[Array, "vertices 3"], hinges: Hinges) -> Float[Array, " edges"]:
     """By how much the surface turns at each edge, in radians from -π to π; 0 where it is flat, or no hinge."""
     return jnp.arctan2(*dihedral_sine_cosine(x, hinges))
 
 
+@jax.jit
 def dame(
     original: Float[Array, "vertices 3"], distorted: Float[Array, "vertices 3"], hinges: Hinges
 ) -> Float[Array, ""]:

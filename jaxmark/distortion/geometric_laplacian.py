@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, Int
 from jaxmark.distortion.displacement import rms
 
 
+@jax.jit
 def geometric_laplacian(
     x: Float[Array, "vertices 3"], edges: Int[Array | np.ndarray, "edges 2"]
 ) -> Float[Array, "vertices 3"]:
@@ -23,6 +24,7 @@ def geometric_laplacian(
     return jnp.where(total > 0, x - near / jnp.where(total > 0, total, 1), 0)
 
 
+@jax.jit
 def gl(
     original: Float[Array, "vertices 3"],
     distorted: Float[Array, "vertices 3"],

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxmark.distortion.curvature import curvature, curvature_tensor
 from jaxmark.distortion.dihedral import Hinges, make_hinges
-from jaxmark.distortion.neighbourhoods import Neighbourhoods, make_neighbourhoods
+from jaxmark.distortion.neighbourhoods import Neighbourhoods, filled, make_neighbourhoods
 from jaxmark.distortion.structure import contributions, cubic_mean, window_statistics
 from jaxmark.mesh import Mesh
 from jaxmark.surfaces import Surface, barycentric
@@ -27,12 +27,12 @@ _CENTRES = 20_000  # most windows; of larger meshes, as many vertices chosen at 
 
 
 class Scale(NamedTuple):
-    """What one scale looks at."""
+    """What one scale looks at; of several scales, their stack."""
 
     original: Neighbourhoods  # over which the curvature of each mesh is averaged
     distorted: Neighbourhoods
     windows: Neighbourhoods  # points of the distorted mesh whose curvatures are compared
-    sigma: float | Float[Array, ""]
+    sigma: float | np.ndarray | Float[Array, "*scales"]
 
 
 class Views(NamedTuple):
@@ -41,7 +41,7 @@ class Views(NamedTuple):
     hinges: tuple[Hinges, Hinges]  # of the original and the distorted mesh
     corners: Int[np.ndarray, "vertices 3"]  # of the original's face that is closest to each of the distorted's vertices
     share: Float[np.ndarray, "vertices 3"]  # of the corners in the closest point
-    scales: tuple[Scale, ...]
+    scales: Scale
     centres: Int[np.ndarray, " centres"]  # the distorted mesh's vertices in whose windows the meshes are compared
     unit: float | Float[Array, ""]  # longest side of the distorted mesh's box
 
@@ -75,12 +75,19 @@ def _views(
     meshes = [(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)) for mesh in (original, distorted)]
     unit, count = float(np.ptp(meshes[1][0], axis=0).max()), len(meshes[1][0])
     centres = np.sort(np.random.default_rng(0).permutation(count)[:_CENTRES])
-    scales = []
-    for ball, window, sigma in sizes:
-        one, other = (make_neighbourhoods(*mesh, unit * ball)[0] for mesh in meshes)
-        scales.append(Scale(one, other, make_neighbourhoods(*meshes[1], unit * window, centres)[1], unit * sigma))
-    first, second = (make_hinges(faces) for _, faces in meshes)
-    return Views((first, second), corners, share, tuple(scales), centres, unit)
+    balls = [[make_neighbourhoods(*mesh, unit * ball)[0] for ball, _, _ in sizes] for mesh in meshes]
+    windows = [make_neighbourhoods(*meshes[1], unit * window, centres)[1] for _, window, _ in sizes]
+    counts = [len(vertices) for vertices, _ in meshes]
+    first, second, third = map(_stacked, (*balls, windows), (*counts, counts[1]))
+    scales = Scale(first, second, third, np.array([unit * sigma for _, _, sigma in sizes]))
+    before, after = (make_hinges(faces) for _, faces in meshes)
+    return Views((before, after), corners, share, scales, centres, unit)
+
+
+def _stacked(scales: list[Neighbourhoods], count: int) -> Neighbourhoods:
+    """Filled up to the largest, so that one program serves all."""
+    most = max(len(balls.centre) for balls in scales)
+    return Neighbourhoods(*map(np.stack, zip(*(filled(balls, most, count) for balls in scales), strict=True)))
 
 
 @jax.jit
@@ -88,11 +95,8 @@ def local_msdm2(
     original: Float[Array, "originals 3"], distorted: Float[Array, "vertices 3"], views: Views
 ) -> Float[Array, " centres"]:
     """Distortion at the centres of the views, from 0 to 1: (L + C + S/2)/2.5, averaged over scales."""
-    local = [
-        (curved + contrast + structure / 2) / 2.5
-        for curved, contrast, structure in _compared(original, distorted, views, _OFFSET)
-    ]
-    return jnp.mean(jnp.stack(local), axis=0)
+    curved, contrast, structure = _compared(original, distorted, views, _OFFSET)
+    return jnp.mean((curved + contrast + structure / 2) / 2.5, axis=0)
 
 
 @jax.jit
@@ -120,21 +124,27 @@ def msdm(original: Float[Array, "vertices 3"], distorted: Float[Array, "vertices
         distorted: positions of the same vertices.
         views: from `msdm_views`, of these positions or others near them.
     """
-    curved, contrast, structure = _compared(original, distorted, views, 0.0)[0]
+    curved, contrast, structure = (values[0] for values in _compared(original, distorted, views, 0.0))
     return cubic_mean(_cubic_root((curved**3 + contrast**3 + structure**3 / 2) / 2.5))
 
 
-def _compared(original: Array, distorted: Array, views: Views, offset: float) -> list[tuple[Array, Array, Array]]:
+def _compared(original: Array, distorted: Array, views: Views, offset: float) -> tuple[Array, Array, Array]:
+    """Contributions of curvature, contrast and structure, `[scales, centres]` each."""
     share = jnp.asarray(views.share).astype(distorted.dtype)
     there = jnp.einsum("vk,vkc->vc", share, original[views.corners])
-    results = []
-    for scale in views.scales:
+
+    def one(scale: Scale) -> tuple[Array, Array, Array]:
         first = curvature(curvature_tensor(original, views.hinges[0], scale.original)) * views.unit
         second = curvature(curvature_tensor(distorted, views.hinges[1], scale.distorted)) * views.unit
-        matched = jnp.einsum("vk,vk->v", share, first[views.corners])
+        matched = jnp.einsum("vk,vk->v", share, first[jnp.asarray(views.corners)])
         found = window_statistics((matched, second), (there, distorted), scale.windows, scale.sigma)
-        results.append(contributions(jax.tree.map(lambda value: value[views.centres], found), offset))
-    return results
+        return contributions(jax.tree.map(lambda value: value[jnp.asarray(views.centres)], found), offset)
+
+    # One after the other: the balls' pieces are many.
+    def real(leaf: Array | np.ndarray) -> Array:
+        return jnp.asarray(leaf, distorted.dtype if jnp.issubdtype(leaf.dtype, jnp.floating) else None)
+
+    return jax.lax.map(one, jax.tree.map(real, views.scales))
 
 
 def _cubic_root(values: Array) -> Array:

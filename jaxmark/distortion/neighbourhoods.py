@@ -16,13 +16,17 @@ _REACHED_AT_ONCE = 2**24  # pairs of a centre and a vertex that one search keeps
 
 
 class Neighbourhoods(NamedTuple):
-    """Pieces of edges that run outward in a ball around a vertex, for many balls."""
+    """Pieces of edges that run outward in a ball around a vertex, for many balls.
 
-    centre: Int[np.ndarray, " pieces"]  # a vertex, in rising order
-    tail: Int[np.ndarray, " pieces"]  # inside of the ball
-    head: Int[np.ndarray, " pieces"]  # inside or beyond
-    edge: Int[np.ndarray, " pieces"]  # as `jaxmark.mesh.edges`; -1 for a point
-    radius: float | Float[Array, ""]
+    Filled up behind with pieces around no vertex, so that balls of other meshes and sizes often have the same shape,
+    and what was compiled serves again.
+    """
+
+    centre: Int[np.ndarray, "*scales pieces"]  # a vertex, in rising order; beyond the last, to fill up
+    tail: Int[np.ndarray, "*scales pieces"]  # inside of the ball
+    head: Int[np.ndarray, "*scales pieces"]  # inside or beyond
+    edge: Int[np.ndarray, "*scales pieces"]  # as `jaxmark.mesh.edges`; -1 for a point
+    radius: float | np.ndarray | Float[Array, "*scales"]
 
 
 def make_neighbourhoods(
@@ -60,7 +64,7 @@ def make_neighbourhoods(
     c0, p0, q0, e0 = (
         np.concatenate([one, other[~inside]]) for one, other in zip(vertices_inside, (c, p, q, e), strict=True)
     )
-    return _sorted(c, p, q, e, radius), _sorted(c0, p0, q0, e0, radius)
+    return _sorted(len(vertices), radius, c, p, q, e), _sorted(len(vertices), radius, c0, p0, q0, e0)
 
 
 class _Graph(NamedTuple):
@@ -101,10 +105,26 @@ def _search(graph: _Graph, centres: np.ndarray, radius: float) -> tuple[tuple[np
     return tuple(map(np.concatenate, zip(*found, strict=True))), tuple(map(np.concatenate, zip(*points, strict=True)))
 
 
-def _sorted(centre: np.ndarray, tail: np.ndarray, head: np.ndarray, edge: np.ndarray, radius: float) -> Neighbourhoods:
-    order = np.argsort(centre, kind="stable")
-    c, p, q, e = (array[order].astype(np.int32) for array in (centre, tail, head, edge))
-    return Neighbourhoods(c, p, q, e, radius)
+def _sorted(count: int, radius: float, *pieces: np.ndarray) -> Neighbourhoods:
+    order = np.argsort(pieces[0], kind="stable")
+    c, p, q, e = (array[order].astype(np.int32) for array in pieces)
+    return filled(Neighbourhoods(c, p, q, e, radius), _rounded(len(c)), count)
+
+
+def filled(balls: Neighbourhoods, pieces: int, count: int) -> Neighbourhoods:
+    """Filled up to a number of pieces, on a mesh of so many vertices."""
+    more = pieces - len(balls.centre)
+    c, p, q, e = (
+        np.concatenate([array, np.full(more, value, np.int32)])
+        for array, value in zip(balls[:4], (count, 0, 0, -1), strict=True)
+    )
+    return Neighbourhoods(c, p, q, e, balls.radius)
+
+
+def _rounded(size: int) -> int:
+    """Up, to one of four numbers between powers of two."""
+    step = 1 << max(0, size.bit_length() - 3)
+    return -(-size // step) * step
 
 
 def share_inside(x: Float[Array, "vertices 3"], pieces: Neighbourhoods) -> Float[Array, " pieces"]:
@@ -113,7 +133,7 @@ def share_inside(x: Float[Array, "vertices 3"], pieces: Neighbourhoods) -> Float
     a, b, c = (
         jnp.sum(along**2, axis=1),
         jnp.sum(along * out, axis=1),
-        jnp.sum(out**2, axis=1) - pieces.radius**2,
+        jnp.sum(out**2, axis=1) - jnp.asarray(pieces.radius).astype(x.dtype) ** 2,
     )
     discriminant = b**2 - a * c
     sound: Bool[Array, " pieces"] = (a > 0) & (discriminant > 0)

@@ -6,6 +6,7 @@ Graphics 36(7), 2012, with the constants of the authors' program.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -39,7 +40,14 @@ def local_roughness(
     """
     if boundary is None:
         boundary = np.isin(np.arange(len(x)), boundary_vertices(np.asarray(faces)))
-    corners = x[jnp.asarray(faces)]
+    return _local_roughness(x, jnp.asarray(faces), jnp.asarray(boundary))
+
+
+@jax.jit
+def _local_roughness(
+    x: Float[Array, "vertices 3"], faces: Int[Array, "faces 3"], boundary: Bool[Array, " vertices"]
+) -> Rough:
+    corners = x[faces]
     u, v = jnp.roll(corners, -1, axis=1) - corners, jnp.roll(corners, -2, axis=1) - corners
     cosine, cross = jnp.sum(u * v, axis=2), jnp.cross(u[:, 0], v[:, 0])
     square = jnp.sum(cross**2, axis=1)
@@ -52,7 +60,7 @@ def local_roughness(
 
     zeros = jnp.zeros(len(x), x.dtype)
     defect = jnp.abs(jnp.where(boundary, np.pi, 2 * np.pi).astype(x.dtype) - zeros.at[faces].add(angle))
-    start, end = jnp.roll(jnp.asarray(faces), -1, axis=1), jnp.roll(jnp.asarray(faces), -2, axis=1)
+    start, end = jnp.roll(faces, -1, axis=1), jnp.roll(faces, -2, axis=1)
     total = zeros.at[start].add(half).at[end].add(half)
     around = zeros.at[start].add(half * defect[end]).at[end].add(half * defect[start])
     used = total > 0
@@ -60,6 +68,7 @@ def local_roughness(
     return Rough(rough, zeros.at[faces].add(jnp.broadcast_to(sine / 6, angle.shape)))
 
 
+@jax.jit
 def fmpd(first: Rough, second: Rough) -> Float[Array, ""]:
     """Fast mesh perceptual distance, 0 to 1: how much rougher one surface is than another, as a whole.
 

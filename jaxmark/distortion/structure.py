@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmark.distortion.neighbourhoods import Neighbourhoods, share_inside
@@ -21,7 +22,7 @@ def window_statistics(
     curvatures: tuple[Float[Array, " vertices"], Float[Array, " vertices"]],
     positions: tuple[Float[Array, "vertices 3"], Float[Array, "vertices 3"]],
     windows: Neighbourhoods,
-    sigma: float | Float[Array, ""],
+    sigma: float | np.ndarray | Float[Array, ""],
 ) -> Statistics:
     """Means, deviations and covariance, weighed by a Gaussian of the distance from the window's centre.
 
