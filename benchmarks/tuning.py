@@ -1,4 +1,4 @@
-"""What tuning the bands' strengths is worth: python benchmarks/tuning.py MESH... --train MESH... [--limit dame=0.008 ...].
+"""What tuning the bands is worth: python benchmarks/tuning.py MESH... --train MESH... [--limit dame=0.008 ...].
 
 For each mesh and limit, marks of equal distortion: flat over the whole spectrum, low-pass by hand, the library's
 default, the mean profile of the training meshes (never those reported on), and tuned on the mesh itself. Each is

@@ -3,6 +3,7 @@
 from jaxmark import attacks as attacks
 from jaxmark import bands as bands
 from jaxmark import carriers as carriers
+from jaxmark import channels as channels
 from jaxmark import chebyshev as chebyshev
 from jaxmark import detectors as detectors
 from jaxmark import distortion as distortion
@@ -11,6 +12,7 @@ from jaxmark import laplacian as laplacian
 from jaxmark import schemes as schemes
 from jaxmark import spectrum as spectrum
 from jaxmark import tuning as tuning
+from jaxmark import visibility as visibility
 from jaxmark import watermark as watermark
 from jaxmark.attacks import attack as attack
 from jaxmark.distortion import compare as compare
@@ -36,3 +38,4 @@ from jaxmark.tracing import Tracer as Tracer
 from jaxmark.tracing import fingerprint as fingerprint
 from jaxmark.tracing import identify as identify
 from jaxmark.tracing import make_tracer as make_tracer
+from jaxmark.tuning import tune as tune

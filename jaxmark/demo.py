@@ -16,11 +16,13 @@ from jaxmark.files import load_mesh, save_mesh
 from jaxmark.files.atomic import write_atomically
 from jaxmark.keys import new_key
 from jaxmark.marking import Marker, make_marker
-from jaxmark.mesh import Mesh, diagonal
+from jaxmark.mesh import Mesh
 from jaxmark.message import encode
+from jaxmark.original import Original
 from jaxmark.plot import View, save_views
 from jaxmark.record import RECORD_SUFFIX
 from jaxmark.schemes import DEFAULT_SCHEME, SCHEMES
+from jaxmark.visibility import masking
 
 _ATTACKS = (
     ("noise", 0.001),
@@ -107,7 +109,7 @@ def run_demo(
         for row in rows[-len(_ATTACKS) - 1 :]:
             say("  " + _line(row))
         if scheme == DEFAULT_SCHEME:
-            _pictures(folder, mesh, marked)
+            _pictures(folder, marker.original, marked)
             say(f"pictures → {folder / 'mark.png'}, {folder / 'attacked.png'}")
     if not rows:
         raise JaxmarkError(f"No scheme can mark {source.name}.")
@@ -154,15 +156,20 @@ def _table(rows: list[Row]) -> str:
     return head + "".join(lines)
 
 
-def _pictures(folder: Path, mesh: Mesh, marked: Mesh) -> None:
+def _pictures(folder: Path, original: Original, marked: Mesh) -> None:
+    mesh = original.mesh
     shift = marked.vertices - mesh.vertices
-    percent = 100 * np.linalg.norm(shift, axis=1) / diagonal(mesh)
+    percent = 100 * np.linalg.norm(shift, axis=1) / original.diagonal
+    hidden = np.asarray(masking(original), np.float64)[original.weld.point]
+    visible = np.divide(percent, hidden, out=np.zeros_like(percent), where=hidden > 0)
     exaggerated = mesh._replace(vertices=mesh.vertices + _EXAGGERATION * shift)
     save_views(
         [
             View("original", mesh),
             View("marked", marked),
-            View(f"displacement, drawn {_EXAGGERATION} ×", exaggerated, percent, "true displacement, % of diagonal"),
+            View(f"{_EXAGGERATION} × the mark", exaggerated),
+            View("displacement", mesh, percent, "% of diagonal"),
+            View("visibility: displacement over what roughness hides", mesh, visible, "% of diagonal"),
         ],
         folder / "mark.png",
     )

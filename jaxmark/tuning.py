@@ -29,7 +29,7 @@ from jaxmark.mesh import Mesh
 from jaxmark.original import Original, prepare
 from jaxmark.reception import make_host
 from jaxmark.schemes import KeyedScheme
-from jaxmark.visibility import band_visibility
+from jaxmark.visibility import band_visibility, masking
 
 Solver = Literal["projected-gradient", "lbfgsb"]
 Attacker = tuple[str, float] | Callable[[Mesh, int], Mesh]  # a name in `ATTACKS` and a strength, or (mesh, seed) → mesh
@@ -102,12 +102,16 @@ def tune(
     if not attacks or seeds < 1:
         raise JaxmarkError(f"tune needs at least one attack and one seed, got {len(attacks)} and {seeds}.")
     bounds, scheme = make_budget(budget, limits), scheme or KeyedScheme()
+    if scheme.direction != "coordinates":
+        raise JaxmarkError(f"tune knows marks along coordinates, not along {scheme.direction}.")
     original, family = prepare(mesh), scaling(scheme.bands, damping="jackson")
     signs = jax.random.rademacher(jax.random.key(5), original.signal.shape, original.signal.dtype)
     signs = signs * jnp.asarray(original.used, signs.dtype)[:, None]
 
+    hidden = np.asarray(masking(original), np.float64)[:, None] if scheme.masking else 1.0
+
     def shaped(strengths: Float64[np.ndarray, " bands"]) -> Float64[np.ndarray, "points 3"]:
-        return np.asarray(filter(original.operator, family.T @ strengths, signs), np.float64)
+        return hidden * np.asarray(filter(original.operator, family.T @ strengths, signs), np.float64)
 
     cost = _costs(original, family, signs, bounds)
     equal = 1 / np.sqrt(len(family) * cost.sum(axis=0))

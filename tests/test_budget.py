@@ -56,6 +56,7 @@ def test_without_a_word_the_mark_stays_below_what_people_notice(mesh: Mesh, key:
     assert jm.detect(marked, original=mesh, key=key, bits=16).message == MESSAGE
 
 
+@pytest.mark.slow
 def test_capacity_under_limits_is_that_of_the_displacement_they_allow(mesh: Mesh, key: jm.Key):
     noise = 0.005
     most = jm.capacity(mesh, limits={"dame": 0.02}, noise=noise)

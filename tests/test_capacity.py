@@ -155,6 +155,7 @@ def test_bits_are_monotone(coarse: Capacity):
         assert all(size % 8 == 0 for size in sizes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("budget", [8e-4, 1.16e-3, 1.5e-3])
 def test_bits_is_the_largest_payload(budget, coarse: Capacity):
     """No larger one fits, and every smaller one does."""
@@ -219,6 +220,7 @@ def test_a_stated_least_budget_is_never_below_the_least(bits, thousand: Mesh, kn
     assert least <= stated < 1.1 * least
 
 
+@pytest.mark.slow
 def test_a_message_at_capacity_reads_after_the_noise_it_is_stated_for(thousand: Mesh, key: jm.Key):
     """With half of the vertices unknown."""
     bits = jm.capacity(thousand, 8e-4)

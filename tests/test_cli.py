@@ -95,6 +95,7 @@ def test_the_main_job(workshop: Workshop, scheme):
     assert (compared["rms"], compared["max"]) == (told["rms"], told["max"])
 
 
+@pytest.mark.slow
 def test_capacity_is_what_embed_takes(workshop: Workshop):
     budget = ("--budget", "0.0008")
     bits = workshop.json("capacity", "model.ply", *budget)["bits"]
@@ -279,6 +280,7 @@ def test_module_and_script_are_the_same_program(tmp_path):
     assert module.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_closed_pipe_does_not_change_the_status(workshop: Workshop):
     workshop.embed()
     for suspect, status in (("marked.ply", 0), ("model.ply", 1)):
@@ -293,6 +295,7 @@ def test_an_interrupted_write_leaves_no_output(workshop: Workshop, monkeypatch):
     )
 
 
+@pytest.mark.slow
 def test_demo_leaves_tables_and_pictures(workshop: Workshop, monkeypatch):
     # A key that a scheme cannot use is said to be refused; here is one that all schemes take.
     monkeypatch.setattr("jaxmark.demo.new_key", lambda: jm.Key(bytes(32)))

@@ -92,6 +92,7 @@ def test_bound_is_finite_and_in_range(key: jm.Key):
     np.testing.assert_array_equal(log10_p(np.zeros(2), np.zeros(12), p), [0, 0])
 
 
+@pytest.mark.slow
 def test_innocents_are_accused_as_seldom_as_said(key: jm.Key):
     """Nominal against counted over 200 000 innocents: never more often, and not thirty times more seldom."""
     random = np.random.default_rng(1)

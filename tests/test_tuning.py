@@ -258,5 +258,7 @@ def test_refusals(x64, unchecked):
         allocate(channels, jnp.asarray(cost), solver="newton")  # type: ignore[arg-type]
     with pytest.raises(jm.JaxmarkError, match="at least one attack"):
         tune(rough_sphere(300), [], key=jax.random.key(0))
+    with pytest.raises(jm.JaxmarkError, match="not along normals"):
+        tune(rough_sphere(300), ATTACKS, key=jax.random.key(0), scheme=KeyedScheme(direction="normals"))
     with pytest.raises(jm.JaxmarkError, match="profile is up to 64"):
         jm.make_marker(rough_sphere(300), jm.new_key(), scheme=KeyedScheme(profile=(1.0,) * 65))
