@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ DEFAULT_LIMITS: Mapping[str, float] = {"dame": 0.008}
 _MOST = 0.01  # RMS, where limits alone decide: more is no watermark
 _START = 2e-4
 _EXACT = 0.99  # of a limit is as good as all of it
+_SECANTS = 10  # then halves, which cannot fail
 
 
 class Budget(NamedTuple):
@@ -101,7 +103,7 @@ def _largest(within: Callable[[float], float], most: float) -> float:
     """
     low, high = 0.0, math.inf
     size, slope, before = min(_START, most), 1.0, None
-    while True:
+    for tries in count():
         value = within(size)
         if value <= 1:
             low = size
@@ -116,8 +118,9 @@ def _largest(within: Callable[[float], float], most: float) -> float:
         before = size, value
         aim = (1 + _EXACT) / 2
         guess = size * (aim / value) ** (1 / slope) if value > 0 and slope > 0.2 else most
-        if not low < guess < high:
+        if tries >= _SECANTS or not low < guess < high:
             guess = math.sqrt(low * high) if low > 0 and high < math.inf else 2 * low if low else high / 4
         size = min(guess, most)
         if size < 1e-12:
-            raise JaxmarkError("No displacement, however small, keeps the limits; use larger ones.")
+            break
+    raise JaxmarkError("No displacement, however small, keeps the limits; use larger ones.")

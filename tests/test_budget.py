@@ -9,7 +9,7 @@ import pytest
 
 import jaxmark as jm
 from jaxmark import cli
-from jaxmark.budget import DEFAULT_LIMITS, make_budget, write
+from jaxmark.budget import DEFAULT_LIMITS, _largest, make_budget, write
 from jaxmark.mesh import Mesh, make_mesh
 from jaxmark.original import prepare
 from tests.samples import rough_sphere
@@ -54,6 +54,24 @@ def test_without_a_word_the_mark_stays_below_what_people_notice(mesh: Mesh, key:
     assert found.rms == pytest.approx(info.rms, rel=1e-6)
     assert found.msdm2 is None  # not asked for
     assert jm.detect(marked, original=mesh, key=key, bits=16).message == MESSAGE
+
+
+@pytest.mark.parametrize(
+    "rising",
+    [
+        lambda size: size / 3e-4,
+        lambda size: (size / 3e-4) ** 3,
+        lambda size: (size / 3e-4) ** 0.1,
+        lambda size: size / 6e-4 if size < 3e-4 else 5.0,  # a jump over the limit
+        lambda size: math.inf if size > 3e-4 else 0.0,
+        lambda size: 1.5 * math.tanh(size / 3e-4 * math.atanh(2 / 3)),
+        lambda size: size / 3e-4 if size < 0.0029 else math.nan,
+    ],
+)
+def test_the_largest_size_is_found_for_any_rising_metric(rising):
+    found = _largest(rising, 0.01)
+    assert rising(found) <= 1
+    assert 0.88 * 3e-4 < found <= 3e-4
 
 
 @pytest.mark.slow
