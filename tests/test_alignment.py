@@ -260,6 +260,7 @@ def test_a_hole_in_a_surface_is_masked(original: Original):
     np.testing.assert_allclose(found.displacement, 0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_other_objects_beside_a_surface_are_ignored(original: Original):
     ball, torus = original.mesh, trimesh.creation.torus(2.0, 1.0)
     vertices, faces = trimesh.remesh.subdivide(np.asarray(ball.vertices), np.asarray(ball.faces))
@@ -288,6 +289,7 @@ def together(one: Mesh, other: Mesh) -> Mesh:
     return make_mesh(both.vertices, both.faces)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("foreign", [False, True])
 def test_pieces_that_moved_apart_are_aligned_one_by_one(foreign, original: Original):
     displacement = 2e-4 * np.random.default_rng(8).normal(size=(642, 3))
@@ -392,6 +394,7 @@ def test_without_libigl_surfaces_are_refused_by_the_name_of_the_extra(original: 
     assert align(original, original.mesh).method == "same"
 
 
+@pytest.mark.slow
 def test_a_suspect_is_aligned_once_for_several_keys(original: Original):
     mesh, message = original.mesh, b"m"
     first, second = (jm.make_marker(mesh, bytes([i]) * 32, bits=8) for i in (1, 2))

@@ -85,6 +85,7 @@ def test_capacity_under_limits_is_that_of_the_displacement_they_allow(mesh: Mesh
         jm.embed(mesh, bytes(most // 8 + 3), key, limits={"dame": 0.02}, noise=noise)
 
 
+@pytest.mark.slow
 def test_limits_from_the_shell(mesh: Mesh, tmp_path, monkeypatch, capsys):
     def run(*arguments: str) -> dict:
         monkeypatch.setattr(sys, "argv", ["jaxmark", *arguments, "--json"])

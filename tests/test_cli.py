@@ -205,6 +205,7 @@ def record_name() -> str:
     return "marked.ply.jaxmark.json"
 
 
+@pytest.mark.slow
 def test_other_connectivity_is_read_where_it_can_be(workshop: Workshop):
     workshop.embed()
     marked = jm.load_mesh("marked.ply")

@@ -55,6 +55,7 @@ def test_make_targets_of_the_readme_exist():
         subprocess.run(["make", "-n", target], cwd=ROOT, check=True, capture_output=True)
 
 
+@pytest.mark.slow
 def test_payloads_of_the_readme_are_carried():
     mesh, key = bumpy_sphere(4), jm.Key(bytes(32))
     for scheme, bits in (("host", 192), ("eigen", 96)):

@@ -398,6 +398,7 @@ def fresh_traces() -> Iterator[None]:
     jax.clear_caches()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("fresh_traces", "x64")
 def test_differentiable_with_respect_to_suspect_original_and_strength(small: Case, key: jm.Key, monkeypatch):
     """By finite differences. The ridge is not differentiated on purpose; here it is, and all else has to fit."""

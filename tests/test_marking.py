@@ -91,6 +91,7 @@ def test_a_mark_far_from_the_origin_and_at_any_scale(key: jm.Key, scheme):
         assert jm.detect(marked, original=mesh, key=key, scheme=scheme).message == MESSAGE
 
 
+@pytest.mark.slow
 def test_copies_move_together_and_isolated_vertices_stay(sphere: Mesh, key: jm.Key):
     soup = make_mesh(
         np.vstack([sphere.vertices[sphere.faces].reshape(-1, 3), [[7.0, 7, 7]]]),
@@ -133,6 +134,7 @@ def test_an_unmoved_suspect_is_no_evidence(sphere: Mesh, key: jm.Key):
         np.testing.assert_array_equal(found.scores, 0)
 
 
+@pytest.mark.slow
 def test_hard_graph_is_marked(key: jm.Key):
     """Several components, a boundary, an edge with three faces, degenerate and duplicate faces, isolated vertices."""
     a, b = bumpy_sphere(4), bumpy_sphere(2, seed=1)
@@ -144,6 +146,7 @@ def test_hard_graph_is_marked(key: jm.Key):
         assert jm.detect(marked, original=mesh, key=key, scheme=scheme).message == MESSAGE
 
 
+@pytest.mark.slow
 def test_vertices_that_no_face_uses_neither_move_nor_count(sphere: Mesh, key: jm.Key):
     far = np.random.default_rng(0).normal(size=(5000, 3)) + 1e5
     mesh = make_mesh(np.vstack([sphere.vertices, far]), sphere.faces)
@@ -216,6 +219,7 @@ def test_damaged_records_are_refused(tmp_path, text):
         jm.Record.load(tmp_path / "absent")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unchecked")
 def test_refusals(sphere: Mesh, key: jm.Key):
     tiny = make_mesh(np.vstack([np.eye(3), [[0, 0, 0]]]), np.array([[0, 1, 2], [0, 1, 3], [1, 2, 3], [2, 0, 3]]))

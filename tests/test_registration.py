@@ -122,6 +122,7 @@ def lumps(level: int) -> Mesh:
     return make_mesh(points / np.linalg.norm(np.ptp(points, axis=0)), ball.faces)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("shape", [wheel, lumps])
 def test_a_nearly_round_shape_is_told_by_its_small_features(shape, seed):

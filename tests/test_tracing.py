@@ -61,6 +61,7 @@ def test_nobody_is_accused_by_strangers(tracer: jm.Tracer, copies: np.ndarray):
     assert all(one.log10_p > -3 for one in tracer.identify(suspect, NAMES[4:]))
 
 
+@pytest.mark.slow
 def test_functions_and_record(key: jm.Key):
     mesh = bumpy_sphere(3)
     copy, info = jm.fingerprint(mesh, "alice", key)

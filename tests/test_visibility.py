@@ -37,6 +37,7 @@ def test_the_eye_sees_high_frequencies_first(half_rough: Mesh):
     assert 0.9 * (1 + edges[0]) / 2 < gl[4] < 1.2 * (1 + edges[1]) / 2
 
 
+@pytest.mark.slow
 def test_rough_regions_are_moved_more(half_rough: Mesh, key: jm.Key):
     original = prepare(half_rough)
     hidden = np.asarray(masking(original))
@@ -76,6 +77,7 @@ def test_a_profile_is_what_is_written(half_rough: Mesh, key: jm.Key, dtype):
     )
 
 
+@pytest.mark.slow
 def test_profiles_pass_through_records(half_rough: Mesh, key: jm.Key, tmp_path):
     profile = (0.2, 0.7, 1.0, 1.0, 1.0, 0.5, 0.25, 0.125, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1)
     scheme = KeyedScheme(profile=profile)
