@@ -31,7 +31,7 @@ from jaxmark.reception import make_host
 from jaxmark.schemes import KeyedScheme
 from jaxmark.visibility import band_visibility, masking
 
-Solver = Literal["projected-gradient", "lbfgsb"]
+Solver = Literal["projected-gradient", "accelerated-gradient"]
 Attacker = tuple[str, float] | Callable[[Mesh, int], Mesh]  # a name in `ATTACKS` and a strength, or (mesh, seed) → mesh
 
 _ANNEALING = (0.01, 0.1)  # of the final sharpness, in the stages before it
@@ -179,8 +179,8 @@ def allocate(
         cap: the largest share of the budget that one band gets, at least 1/bands.
         sharpness: of the soft minimum.
         steps: at most so many iterations.
-        solver: `"projected-gradient"` (jaxopt's `ProjectedGradient`, on the simplex) or `"lbfgsb"` (`LBFGSB`, on the
-            box, of what is nearest on the simplex).
+        solver: `"projected-gradient"` (jaxopt's `ProjectedGradient`) or `"accelerated-gradient"` (the same with FISTA's
+            momentum). `LBFGSB` on the box was tried: it stops short of the best, and ends in NaN under newer JAX.
         start: strengths to start from; equal shares unless given.
 
     Returns:
@@ -226,23 +226,19 @@ def _allocate(
 
     # jaxopt differentiates its solution with respect to arguments, not to what a closure holds.
     def loss(shares: Array, scaled: Channels, level: Array, sharpness: Array) -> Array:
-        if solver == "lbfgsb":
-            shares = _capped_simplex(shares, cap)
-        return jax.nn.logsumexp(-sharpness * level * margins(scaled, shares, margin)) / sharpness
+        # Momentum may leave the simplex, where a margin has no meaning.
+        inside = jnp.where(shares < 0, 0, shares)
+        return jax.nn.logsumexp(-sharpness * level * margins(scaled, inside, margin)) / sharpness
 
-    if solver == "lbfgsb":
-        box = (jnp.zeros_like(first), jnp.full_like(first, cap))
-        run = partial(jaxopt.LBFGSB(fun=loss, maxiter=steps, tol=1e-6).run, bounds=box)
-    else:
-        # Accelerated steps would leave the simplex, where a margin has no meaning.
-        simplex = jaxopt.ProjectedGradient(
-            fun=loss,
-            projection=lambda x, _: _capped_simplex(x, cap),
-            maxiter=steps,
-            tol=1e-7,
-            acceleration=False,
-        )
-        run = partial(simplex.run, hyperparams_proj=None)
+    accelerated = solver == "accelerated-gradient"
+    simplex = jaxopt.ProjectedGradient(
+        fun=loss,
+        projection=lambda x, _: _capped_simplex(x, cap),
+        maxiter=steps,
+        tol=1e-7,
+        acceleration=accelerated,
+    )
+    run = partial(simplex.run, hyperparams_proj=None)
 
     def stage(shares: Array, share: Array) -> tuple[Array, None]:
         return run(shares, scaled=scaled, level=level, sharpness=share * sharpness).params, None
@@ -250,7 +246,7 @@ def _allocate(
     with jax.numpy_dtype_promotion("standard"):  # jaxopt mixes integers into its floats
         warm = jax.lax.stop_gradient(jax.lax.scan(stage, first, jnp.asarray(_ANNEALING, first.dtype))[0])
         shares = stage(warm, jnp.ones_like(sharpness))[0]
-    shares = _capped_simplex(shares, cap) if solver == "lbfgsb" else shares
+    shares = _capped_simplex(shares, cap) if accelerated else shares
     # The root's slope at an empty band is infinite: select before it. NaN is not empty, and stays.
     empty = shares <= 0
     return jnp.where(empty, 0, budget * jnp.sqrt(jnp.where(empty, 1, shares) / cost))
