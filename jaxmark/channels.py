@@ -4,6 +4,7 @@ The bands f_j ≥ 0 with Σ_j f_j = 1 share each eigenvector's energy: ⟨u, v�
 in O(N) memory however many the bands.
 """
 
+from functools import partial
 from typing import Literal, NamedTuple
 
 import jax
@@ -12,6 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxmark.carriers.carrier import Displacement
 from jaxmark.chebyshev import cross_moments
+from jaxmark.laplacian import Laplacian
 from jaxmark.observation import Observation
 from jaxmark.reception import Host, clean, extended, receive
 
@@ -50,11 +52,13 @@ def rate(channels: Channels, beta: Float[Array, " bands"]) -> Float[Array, " att
     return margins(channels, beta**2)
 
 
-def band_energies(host: Host, u: Displacement, v: Displacement) -> Float[Array, " bands"]:
+def band_energies(
+    operator: Laplacian, coefficients: Float[Array, "bands terms"], u: Displacement, v: Displacement
+) -> Float[Array, " bands"]:
     """⟨u, f_j(Δ)v⟩ for each band, with vertices weighed by valence over its mean; of unit noise, the dimensions."""
-    moments = cross_moments(host.operator, u, v, degree=host.coefficients.shape[1] - 1)
-    mass = host.operator.degree.astype(u.dtype)
-    return host.coefficients @ moments.sum(axis=1) * (jnp.sum(jnp.sign(mass)) / mass.sum())
+    moments = cross_moments(operator, u, v, degree=coefficients.shape[1] - 1)
+    mass = operator.degree.astype(u.dtype)
+    return coefficients @ moments.sum(axis=1) * (jnp.sum(jnp.sign(mass)) / mass.sum())
 
 
 @jax.jit
@@ -77,9 +81,10 @@ def measure(host: Host, seen: Observation, mark: Displacement) -> Channels:
 
     written, found = kept(mark), received.residual
     probe = kept(jax.random.rademacher(jax.random.key(3), mark.shape, mark.dtype))
-    dimensions = band_energies(host, probe, probe)
+    energies = partial(band_energies, host.operator, host.coefficients)
+    dimensions = energies(probe, probe)
     sound = dimensions > _FEW
-    own, cross, whole = (band_energies(host, *pair) for pair in ((written, written), (found, written), (found, found)))
+    own, cross, whole = energies(written, written), energies(found, written), energies(found, found)
     marked = sound & (own > 0)
     gain = jnp.where(marked, jnp.maximum(cross, 0) / jnp.where(marked, own, 1), 0)
     # Weak bands are small differences of large numbers: below this it is rounding.

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -62,7 +63,8 @@ def _probe(carrier: KeyedCarrier, moving: Float[Array, " vertices"]) -> tuple[Ar
     kept = clean(host, received.seen, received.factor, probe)
     again = carrier.match(kept, shape) * moving[:, None]
     white = signs if carrier.normals is None else carrier.normals * signs
-    bands = [band_energies(host, x, x) for x in (white, clean(host, received.seen, received.factor, white))]
+    energies = partial(band_energies, host.operator, host.coefficients)
+    bands = [energies(x, x) for x in (white, clean(host, received.seen, received.factor, white))]
     return jnp.stack([jnp.sum(probe * kept), jnp.sum(probe**2), jnp.sum(again**2)]), jnp.stack(bands)
 
 

@@ -22,8 +22,8 @@ from jaxmark.attacks import attack
 from jaxmark.bands import scaling
 from jaxmark.budget import Budget, make_budget, write
 from jaxmark.carriers.carrier import Displacement
-from jaxmark.channels import Channels, Margin, margins, measure
-from jaxmark.chebyshev import cross_moments, filter
+from jaxmark.channels import Channels, Margin, band_energies, margins, measure
+from jaxmark.chebyshev import filter
 from jaxmark.errors import JaxmarkError
 from jaxmark.mesh import Mesh
 from jaxmark.original import Original, prepare
@@ -359,9 +359,8 @@ def _costs(
     original: Original, family: Float64[np.ndarray, "bands terms"], signs: Displacement, bounds: Budget
 ) -> Float64[np.ndarray, "limits bands"]:
     """Share of each limit, squared, that β_j = 1 takes in band j."""
-    mass = original.operator.degree
-    moments = cross_moments(original.operator, signs, signs, degree=family.shape[1] - 1)
-    energy = np.maximum(family @ np.asarray(moments, np.float64).sum(axis=1) / float(mass.sum()), 1e-12)
+    whole = band_energies(original.operator, jnp.asarray(family, signs.dtype), signs, signs)
+    energy = np.maximum(np.asarray(whole, np.float64) / original.used.sum(), 1e-12)
     seen = list(bounds.limits)
     visible = band_visibility(original, family, seen) if seen else np.empty((0, len(family)))
     rows = [energy * (row / bounds.limits[name]) ** 2 for name, row in zip(seen, visible, strict=True)]

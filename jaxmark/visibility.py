@@ -8,16 +8,16 @@ import numpy as np
 from jaxtyping import Array, Float, Float64
 
 from jaxmark import distortion
+from jaxmark.bands import diffusion
 from jaxmark.chebyshev import filter
-from jaxmark.laplacian import Laplacian
+from jaxmark.distortion.roughness import LEAST, MOST, POWER
 from jaxmark.mesh import welded_mesh
 from jaxmark.original import Original, displaced
 
 _SAMPLES = 16  # bands tried; visibility varies smoothly from one to the next
 _TRIED = 1e-3  # RMS displacement that is tried first
 _LARGE = 0.1  # values of a metric from which on it may saturate
-_MASKING = 0.15  # exponent of roughness in FMPD's model of masking (Wang et al. 2012, section 3.2)
-_SMOOTH = 32  # steps over which roughness is averaged
+_SCALE = 5  # roughness is averaged over 2^5 steps of diffusion
 
 
 def band_visibility(
@@ -79,15 +79,8 @@ def masking(original: Original) -> Float[Array, " points"]:
     positions = jnp.asarray(original.positions, original.signal.dtype)
     rough = distortion.local_roughness(positions, np.asarray(points.faces)).roughness
     used = jnp.asarray(original.used)
-    hidden = jnp.where(used, jnp.clip(rough, 5e-4, 0.2) ** _MASKING, 0)
+    hidden = jnp.where(used, jnp.clip(rough, LEAST, MOST) ** POWER, 0)
     # Averaged, so that masking does not make high frequencies of low ones.
-    averaged = jnp.where(used, _average(original.operator, hidden), 0)
+    average = diffusion(_SCALE + 1, 2**_SCALE + 1)[_SCALE]
+    averaged = jnp.where(used, filter(original.operator, average, hidden), 0)
     return averaged / jnp.sqrt(jnp.sum(averaged**2) / used.sum().astype(averaged.dtype))
-
-
-@jax.jit
-def _average(operator: Laplacian, values: Float[Array, " points"]) -> Float[Array, " points"]:
-    def step(x: Array, _: None) -> tuple[Array, None]:
-        return x - 0.5 * operator.apply(x), None
-
-    return jax.lax.scan(step, values, None, length=_SMOOTH)[0]

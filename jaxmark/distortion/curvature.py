@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxmark.distortion.dihedral import Hinges, dihedral_sine_cosine
 from jaxmark.distortion.neighbourhoods import Neighbourhoods, share_inside
+from jaxmark.distortion.roots import root
 
 
 @jax.jit
@@ -70,8 +71,7 @@ def tensor_distance(
     """
 
     def size(tensor: Array) -> Array:
-        square = jnp.sum(tensor**2, axis=(1, 2))
-        return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+        return root(jnp.sum(tensor**2, axis=(1, 2)))
 
     before, after = size(original), size(distorted)
     whole = before + after + 0.05 * before.mean()

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxmark.distortion.roots import root
 from jaxmark.mesh import edges
 
 _LEFT_OF_FOLDED = 0.01  # of an angle's weight, where the surface is folded back onto itself
@@ -91,5 +92,4 @@ def dame(
 
 
 def _norm(x: Float[Array, "rows 3"]) -> Float[Array, " rows"]:
-    square = jnp.sum(x**2, axis=1)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+    return root(jnp.sum(x**2, axis=1))

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxmark.distortion.roots import root
 from jaxmark.mesh import boundary_vertices
 
-_POWER, _TURN = 0.15, 0.5  # modulation of roughness, and slope of what exceeds the average
-_LEAST, _MOST, _OF_MEAN = 5e-4, 0.2, 5.0  # roughness that counts; the largest may also be so many times the mean
+POWER, _TURN = 0.15, 0.5  # modulation of roughness, and slope of what exceeds the average
+LEAST, MOST, _OF_MEAN = 5e-4, 0.2, 5.0  # roughness that counts; the largest may also be so many times the mean
 _COTANGENTS = (1e-3, 1e3)  # halves of them, clipped
 _SCALE = 8.0  # brings the distance into [0, 1]
 
@@ -50,9 +51,7 @@ def _local_roughness(
     corners = x[faces]
     u, v = jnp.roll(corners, -1, axis=1) - corners, jnp.roll(corners, -2, axis=1) - corners
     cosine, cross = jnp.sum(u * v, axis=2), jnp.cross(u[:, 0], v[:, 0])
-    square = jnp.sum(cross**2, axis=1)
-    double = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
-    sine = double[:, None]  # of every corner, up to the same factor as its cosine
+    sine = root(jnp.sum(cross**2, axis=1))[:, None]  # of every corner, up to the same factor as its cosine
     sound = (sine > 0) | (cosine != 0)
     angle = jnp.arctan2(jnp.where(sound, sine, 0), jnp.where(sound, cosine, 1))
     half = jnp.clip(cosine / jnp.where(sine > 0, sine, 1) / 2, *_COTANGENTS)
@@ -79,11 +78,11 @@ def fmpd(first: Rough, second: Rough) -> Float[Array, ""]:
         second: of the other mesh.
     """
     means = jnp.minimum(*(_mean(rough.roughness, rough.area) for rough in (first, second)))
-    floor = _LEAST**_POWER
-    turn = jnp.maximum(means, _LEAST) ** _POWER - floor
+    floor = LEAST**POWER
+    turn = jnp.maximum(means, LEAST) ** POWER - floor
 
     def overall(rough: Rough) -> Array:
-        value = jnp.clip(rough.roughness, _LEAST, jnp.maximum(_MOST, _OF_MEAN * means)) ** _POWER - floor
+        value = jnp.clip(rough.roughness, LEAST, jnp.maximum(MOST, _OF_MEAN * means)) ** POWER - floor
         return _mean(jnp.where(value > turn, turn + _TURN * (value - turn), value), rough.area)
 
     return jnp.minimum(_SCALE * jnp.abs(overall(first) - overall(second)), 1)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmark.distortion.neighbourhoods import Neighbourhoods, share_inside
+from jaxmark.distortion.roots import root
 
 
 class Statistics(NamedTuple):
@@ -47,7 +48,7 @@ def window_statistics(
     sums = [jnp.where(whole > 0, whole, 1) for whole in map(total, weights)]
     means = [total(w * v) / s for w, v, s in zip(weights, values, sums, strict=True)]
     off = [v - m[windows.centre] for v, m in zip(values, means, strict=True)]
-    deviations = [_root(total(w * d**2) / s) for w, d, s in zip(weights, off, sums, strict=True)]
+    deviations = [root(total(w * d**2) / s) for w, d, s in zip(weights, off, sums, strict=True)]
     # Weights of the one and sum of the other, as in MEPP.
     covariance = total(weights[0] * off[0] * off[1]) / sums[1]
     return Statistics((means[0], means[1]), (deviations[0], deviations[1]), covariance)
@@ -72,7 +73,3 @@ def cubic_mean(values: Float[Array, " vertices"]) -> Float[Array, ""]:
     """(mean of cubes)^(1/3), with slope 0 where all is 0."""
     mean = jnp.mean(values**3)
     return jnp.where(mean > 0, jnp.cbrt(jnp.where(mean > 0, mean, 1)), 0)
-
-
-def _root(square: Array) -> Array:
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
