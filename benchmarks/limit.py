@@ -113,7 +113,8 @@ def prepare(marker: Marker, text: bytes, random: np.random.Generator) -> Callabl
     assert isinstance(carrier, KeyedCarrier)
     marked, _ = marker.write(message.encode(text, marker.key, original.geometry, marker.code), make_budget(BUDGET))
     mark = residual(original, marked)
-    energy = room(carrier, original).energy * np.sum(mark**2)
+    left = room(carrier, original)
+    energy = left.dimensions @ left.energy * np.sum(mark**2) / original.used.sum()
 
     def fails(level: float) -> bool:
         noise = math.sqrt(energy / (2 * marker.bits * level)) * random.normal(size=mark.shape)

@@ -188,7 +188,8 @@ def measure(mesh: Mesh, source: Path, bits: int, budget: float, options: argpars
     """All rows of one mesh and case."""
     probe = jm.make_marker(mesh, bytes(32), bits=bits)
     assert isinstance(probe.carrier, KeyedCarrier)
-    kept = int(probe.original.used.sum()) * room(probe.carrier, probe.original).energy
+    left = room(probe.carrier, probe.original)
+    kept = left.dimensions @ left.energy
     ceiling = f"{budget * math.sqrt(1.5 * kept / (10**0.25 * least_energy(bits))):.5f}"
     parts = [part for part in ("required", "strengths") if part not in options.skip]
     cases = [(part, name, get_scheme(name), budget, options.noise) for part in parts for name in options.schemes]

@@ -1,10 +1,11 @@
-"""What tuning the bands is worth: python benchmarks/tuning.py MESH... --train MESH... [--limit dame=0.008 ...].
+"""What tuning the bands is worth: python benchmarks/tuning.py [MESH...] --train MESH... [--limit dame=0.008 ...].
 
 For each mesh and limit, marks of equal distortion: flat over the whole spectrum, low-pass by hand, the library's
 default, the mean profile of the training meshes (never those reported on), and tuned on the mesh itself. Each is
 attacked with seeds that tuning has not seen. The margin is the evidence for a claimed message in nats, S²/2‖a‖², and
 the bound is what no profile of these bands exceeds on the measured channels. --strengths adds the largest strength of
-each kind of attack from which a message of --bits bits still reads.
+each kind of attack from which a message of --bits bits still reads. Without meshes to report on, only the mean profile
+is printed: so the library's default is derived (`schemes.DERIVED`).
 """
 
 import argparse
@@ -54,15 +55,11 @@ def profiles(mesh: Mesh, mean: KeyedScheme, own: Tuned) -> dict[str, KeyedScheme
 
 
 def average(found: list[Tuned]) -> KeyedScheme:
-    """Geometric mean of profiles of unit power; bands that one of them leaves out count for a thousandth there."""
-    logs = []
-    for one in found:
-        relative = one.beta / np.linalg.norm(one.beta)
-        logs.append(np.log(np.maximum(relative, 1e-3 * relative.max())))
-    mean = np.exp(np.mean(logs, axis=0))
-    kept = mean >= 0.01 * mean.max()
-    values = np.where(kept, mean / mean.max(), 0)[: 1 + np.flatnonzero(kept)[-1]]
-    return replace(found[0].scheme, profile=tuple(float(f"{value:.4g}") for value in values))
+    """Mean power in each band of profiles of equal whole power."""
+    power = np.mean([np.square(one.beta) / np.sum(one.beta**2) for one in found], axis=0)
+    relative = np.sqrt(power / power.max())
+    kept = np.where(relative >= 0.01, relative, 0)[: 1 + np.flatnonzero(relative >= 0.01)[-1]]
+    return replace(found[0].scheme, profile=tuple(float(f"{value:.2f}") for value in kept))
 
 
 def evidence(mesh: Mesh, scheme: KeyedScheme, limits: Mapping[str, float], bits: int, seeds: int) -> list[float]:
@@ -147,7 +144,7 @@ def table(rows: list[Row]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("mesh", nargs="+", type=Path)
+    parser.add_argument("mesh", nargs="*", type=Path)
     parser.add_argument("--train", nargs="+", type=Path, required=True, help="meshes whose mean profile is tried")
     parser.add_argument("--limit", nargs="+", default=LIMITS, metavar="NAME=VALUE")
     parser.add_argument("--bits", type=int, default=16)

@@ -26,46 +26,31 @@ _GAP = 1.0  # decibel, of the polar code at a message error rate of 1e-3; `bench
 
 
 class Room(NamedTuple):
-    """What the projection leaves of a carrier's mark."""
+    """What the projection leaves of a carrier's mark, band by band."""
 
-    dimensions: float  # equivalent number of equally strong ones
-    energy: float  # share of the mark's
-    bands: Float64[np.ndarray, " bands"]  # dimensions left in each band
-    strength: Float64[np.ndarray, " bands"]  # β² for a mean square displacement of 1, by the carrier's profile
+    dimensions: Float64[np.ndarray, " bands"]  # left of those that are written in
+    energy: Float64[np.ndarray, " bands"]  # of each dimension, for a mean square displacement of 1
 
 
 def room(carrier: KeyedCarrier, original: Original) -> Room:
     """Measure a carrier by one probe of random signs in place of the keyed ones."""
-    energies, bands = _probe(carrier, jnp.asarray(original.used, carrier.host.signal.dtype))
-    kept, written, again = map(float, energies)
-    whole, left = np.asarray(bands, np.float64).clip(0)
-    relative = np.square(np.ones(len(whole)) if carrier.profile is None else np.asarray(carrier.profile, np.float64))
+    dtype = carrier.host.signal.dtype
+    whole, left = np.asarray(_probe(carrier, jnp.asarray(original.used, dtype)), np.float64).clip(0)
+    strength = np.ones(len(whole)) if carrier.profile is None else np.asarray(carrier.profile, np.float64)
     # Three coordinates, or one along normals, of each vertex make a band's whole.
-    displaced = whole @ relative / original.used.sum()
-    return Room(
-        kept**2 / again if again > 0 else 0.0,
-        kept / written if written > 0 else 0.0,
-        left,
-        relative / displaced if displaced > 0 else relative,
-    )
+    displaced = whole @ strength**2 / original.used.sum()
+    return Room(left * (strength > 0), strength**2 / displaced if displaced > 0 else strength**2)
 
 
 @jax.jit
-def _probe(carrier: KeyedCarrier, moving: Float[Array, " vertices"]) -> tuple[Array, Array]:
-    """Energies of a probe of random signs: of what the projection leaves of it, as written, and of what is matched.
-
-    And of the signs themselves in each band, before and after projection.
-    """
-    host, shape = carrier.host, carrier.shape(1.0)
+def _probe(carrier: KeyedCarrier, moving: Float[Array, " vertices"]) -> Float[Array, "2 bands"]:
+    """Energies of random signs in each band, before and after projection."""
+    host = carrier.host
     signs = jax.random.rademacher(jax.random.key(2), carrier.chips.signs.shape, moving.dtype) * moving[:, None]
-    probe = carrier.shaped(signs, shape)
     received = receive(host, observe(jnp.zeros_like(host.signal), moving))
-    kept = clean(host, received.seen, received.factor, probe)
-    again = carrier.match(kept, shape) * moving[:, None]
     white = signs if carrier.normals is None else carrier.normals * signs
     energies = partial(band_energies, host.operator, host.coefficients)
-    bands = [energies(x, x) for x in (white, clean(host, received.seen, received.factor, white))]
-    return jnp.stack([jnp.sum(probe * kept), jnp.sum(probe**2), jnp.sum(again**2)]), jnp.stack(bands)
+    return jnp.stack([energies(x, x) for x in (white, clean(host, received.seen, received.factor, white))])
 
 
 def least_energy(bits: int, error: float = 1e-3) -> float:
@@ -82,16 +67,20 @@ def least_energy(bits: int, error: float = 1e-3) -> float:
     return root**2 / 2
 
 
-def needed_energy(bits: int, dimensions: float) -> float:
-    """E/N0 with which the whole chain reads so many bits, but for about one message in a thousand.
+def needed_energy(bits: int) -> float:
+    """E/N0 with which the whole chain reads so many bits alone, but for about one message in a thousand.
 
-    The code takes `_GAP` more than the least for message and tag. To one bit, the others are noise of E in all the
-    dimensions, of which joint decoding takes off half: E/N0 is worth (E/N0)/(1 + (E/N0)/dimensions). Infinite where
-    that is never enough.
+    The code takes `_GAP` more than the least for message and tag.
     """
-    alone = 10 ** (_GAP / 10) * least_energy(bits + TAG_BITS)
-    crowded = 1 - alone / dimensions
-    return alone / crowded if crowded > 0 else math.inf
+    return 10 ** (_GAP / 10) * least_energy(bits + TAG_BITS)
+
+
+def worth(ratio: Float64[np.ndarray, " bands"], dimensions: Float64[np.ndarray, " bands"]) -> float:
+    """E/N0 to one bit where the others are noise to it: Σ_j n_j x_j/(1 + x_j), for E/N0 of x_j in each dimension.
+
+    Half of that noise is taken off by joint decoding.
+    """
+    return float(np.sum(dimensions * ratio / (1 + ratio)))
 
 
 def needed_dimensions(bits: int) -> float:
@@ -127,8 +116,8 @@ class Capacity:
     def least_budget(self, bits: int, conditions: Conditions) -> float:
         """With which budget so many bits are carried; infinite where the dimensions do not suffice.
 
-        Uniform noise on three coordinates has the RMS displacement ν = noise · radius, and E/N0 = 3N (budget/ν)² / 2
-        for N vertices, times what coverage and projection leave.
+        N0/2 is the variance of uniform noise of half width ν = noise · radius, ν²/3, and the energy what coverage and
+        projection leave of the mark's.
         """
         original, scheme = self._original, self._scheme
         try:
@@ -138,31 +127,16 @@ class Capacity:
         layout = scheme.layout(original, bits)
         if layout not in self._rooms:
             self._rooms[layout] = room(self._carrier(bits, code), original)
-        left = self._rooms[layout]
-        if scheme.profile:
-            return self._least_by_bands(bits, left, conditions)
-        if conditions.coverage * left.dimensions < needed_dimensions(bits):
+        left, needed = self._rooms[layout], needed_energy(bits)
+        dimensions = conditions.coverage * left.dimensions
+        if dimensions.sum() <= max(needed_dimensions(bits), needed):
             return math.inf
         if conditions.noise == 0:
             return 0.0
-        needed = needed_energy(bits, conditions.coverage * left.dimensions)
-        vertices = conditions.coverage * left.energy * int(original.used.sum())
-        return conditions.noise * self._radius() * math.sqrt(needed / (1.5 * vertices))
-
-    def _least_by_bands(self, bits: int, left: Room, conditions: Conditions) -> float:
-        """The same for a profile: each band's E/N0 is worth what `needed_energy` says, in the band's dimensions."""
-        dimensions = conditions.coverage * left.bands * (left.strength > 0)
-        alone = 10 ** (_GAP / 10) * least_energy(bits + TAG_BITS)
-        if dimensions.sum() < max(needed_dimensions(bits), alone):
-            return math.inf
-        if conditions.noise == 0:
-            return 0.0
-        # Of one dimension, in units of the squared budget.
-        energy = left.strength / (2 * (conditions.noise * self._radius()) ** 2 / 3)
+        ratio = left.energy / (2 * (conditions.noise * self._radius()) ** 2 / 3)
 
         def excess(logarithm: float) -> float:
-            each = math.exp(2 * logarithm) * energy
-            return float(np.sum(dimensions * each / (1 + each))) - alone
+            return worth(math.exp(2 * logarithm) * ratio, dimensions) - needed
 
         return math.exp(optimize.root_scalar(excess, bracket=(-100.0, 100.0)).root)
 

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkab
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float64
 
 from jaxmark.bands import scaling
 from jaxmark.carriers import Carrier, KeyedCarrier, ModulatedCarrier, eigenspaces, host_bands, make_chips
@@ -23,6 +24,17 @@ from jaxmark.reception import make_host
 from jaxmark.sequences import orthogonal_sequences
 from jaxmark.spectrum import eigenpairs
 from jaxmark.visibility import masking
+
+# Strengths of the lowest 20 of 64 bands: the mean over meshes tuned to noise, smoothing and quantisation at the default
+# budget. `benchmarks/tuning.py --limit dame=0.008 --train blub_7106.obj fertility_12448.obj armadillo_14587.obj
+# kitten.obj` prints them.
+DERIVED = (0, 0.99, 1, 0.9, 0.83, 0.75, 0.67, 0.58, 0.5, 0.44, 0.4, 0.35, 0.3, 0.26, 0.23, 0.19, 0.16, 0.12, 0.07, 0.03)
+
+# Dimensions of the mark to each of the nuisance that is projected off, apart from affine maps.
+_NUISANCE = {"tapered": 12, "narrow": 6}
+
+# What records say that were written before a field existed.
+_BEFORE: Mapping[str, Mapping[str, Any]] = {"keyed": {"passband": "narrow", "profile": (), "masking": False}}
 
 
 @runtime_checkable
@@ -58,19 +70,22 @@ class Layout(NamedTuple):
 class KeyedScheme:
     """Keyed chips in a pass band of low frequencies; the host's part is projected off when reading.
 
-    The pass band is as narrow as the payload allows, for the eye and for smoothing: 1,024 dimensions and 12 for each
-    bit of message and tag, but at most what lies below λ = 0.44 unless the payload needs it. Dimensions are counted as
-    on a regular triangle mesh, √3/2π · λ for each coordinate of each vertex. The nuisance that is projected off has at
-    most a sixth of them, apart from affine maps.
+    The pass band is tapered: it reaches to λ = 0.44 with the strengths of `DERIVED`, but for the lowest bands, of which
+    the nuisance takes most. It is stretched where the payload needs more, 12 dimensions for each bit of message and
+    tag. A narrow one is flat, and as narrow as the payload allows: 1,024 dimensions and 12 for each bit of message and
+    tag, but at most to λ = 0.44 unless the payload needs it. With a profile, the mark is written in the bands that it
+    names, whatever the payload.
 
-    With a profile, the mark is written in the bands that it names, whatever the payload.
+    Dimensions are counted as on a regular triangle mesh, √3/2π · λ for each coordinate of each vertex. The nuisance
+    that is projected off has at most a twelfth of them, apart from affine maps; with a narrow band, a sixth.
     """
 
     name: ClassVar[str] = "keyed"
     bands: int = 64  # Jackson-damped scaling functions over the whole spectrum, of which the lowest pass
     direction: Literal["coordinates", "normals"] = "coordinates"
-    profile: tuple[float, ...] = ()  # relative strengths of the lowest bands, from `tune`; all alike unless given
+    profile: tuple[float, ...] = ()  # relative strengths of the lowest bands, from `tune`; by `passband` unless given
     masking: bool = False  # whether rough regions are moved more than smooth ones; see `jaxmark.visibility.masking`
+    passband: Literal["tapered", "narrow"] = "tapered"  # how bands and nuisance are chosen
 
     @property
     def detector(self) -> Detector:
@@ -83,18 +98,29 @@ class KeyedScheme:
 
     def dimensions(self, original: Original, bits: int) -> int:
         """How many dimensions the pass band for a payload has, as they are counted here."""
-        return int(self._written(original, self._passing(original, bits)))
+        return int(self._written(original, self.strengths(original, bits)))
 
     def layout(self, original: Original, bits: int) -> Layout:
         """Pass band and nuisance for a payload, free of the key."""
-        passing = self._passing(original, bits)
-        columns = self._written(original, passing) / self._channels
+        strengths = self._strengths(original, bits)
+        columns = self._written(original, strengths) / self._channels
         # Affine maps are 4 columns; each scale has one for each coordinate.
         scales = min(9, max(0, int(columns / 3 - 4) // 3))
         degree = 1
-        while degree < 8 and math.comb(degree + 4, 3) + 3 * scales <= columns / 6:
+        while degree < 8 and math.comb(degree + 4, 3) + 3 * scales <= columns / _NUISANCE[self.passband]:
             degree += 1
-        return Layout(passing, scales, degree)
+        return Layout(len(strengths), scales, degree)
+
+    def strengths(self, original: Original, bits: int) -> Float64[np.ndarray, " passing"]:
+        """Relative strengths of the bands of the pass band for a payload."""
+        strengths = self._strengths(original, bits)
+        if self.profile or self.passband == "narrow":
+            return strengths
+        # What is written where most is nuisance is seen by the eye only.
+        layout = self.layout(original, bits)
+        nuisance = math.comb(layout.degree + 3, 3) + 3 * layout.scales
+        held = np.array([self._dimensions(original, band + 1) for band in range(len(strengths))]) / self._channels
+        return np.where(held > min(nuisance, held[-1]) / 2, strengths, 0)
 
     def carrier(self, original: Original, key: bytes, bits: int, code_bits: int) -> KeyedCarrier:
         """See `Scheme`."""
@@ -108,12 +134,10 @@ class KeyedScheme:
             degree=layout.degree,
         )
         chips = make_chips(key, original.geometry, original.used, code_bits, channels=self._channels)
-        carrier = KeyedCarrier(host, chips)
+        carrier = KeyedCarrier(host, chips, profile=self.strengths(original, bits).astype(dtype))
         if self.direction == "normals":
             normals = vertex_normals(Mesh(original.positions, original.weld.point[np.asarray(original.mesh.faces)]))
             carrier = carrier._replace(normals=jnp.asarray(normals, dtype))
-        if self.profile:
-            carrier = carrier._replace(profile=np.array(self.profile, dtype))
         return carrier._replace(masking=masking(original)) if self.masking else carrier
 
     @property
@@ -125,26 +149,35 @@ class KeyedScheme:
                 return 1
         raise JaxmarkError(f"direction must be 'coordinates' or 'normals', got {self.direction!r}.")
 
-    def _passing(self, original: Original, bits: int) -> int:
-        """How many bands the mark is written in: six at least, for narrower bands leak too much."""
+    def _strengths(self, original: Original, bits: int) -> Float64[np.ndarray, " passing"]:
+        """`strengths`, whatever the nuisance."""
         if self.profile:
             if len(self.profile) > self.bands or not min(self.profile) >= 0 < max(self.profile) < math.inf:
                 raise JaxmarkError(f"A profile is up to {self.bands} numbers, none negative and not all 0.")
-            return len(self.profile)
+            return np.array(self.profile)
         information = bits + TAG_BITS
-        usual = self._dimensions(original, round(self.bands * 0.31))
-        wanted = max(min(1024 + 12 * information, usual), 6 * information)
-        passing = min(6, self.bands)
-        while passing < self.bands and self._dimensions(original, passing) < wanted:
+        usual = round(self.bands * len(DERIVED) / 64)
+        match self.passband:
+            case "tapered":
+                passing = self._reaching(original, 12 * information, min(usual, self.bands))
+                places = (np.arange(passing) + 0.5) / passing
+                return np.interp(places, (np.arange(len(DERIVED)) + 0.5) / len(DERIVED), DERIVED)
+            case "narrow":
+                wanted = min(1024 + 12 * information, self._dimensions(original, usual))
+                return np.ones(self._reaching(original, max(wanted, 6 * information), 0))
+        raise JaxmarkError(f"passband must be 'tapered' or 'narrow', got {self.passband!r}.")
+
+    def _reaching(self, original: Original, dimensions: float, least: int) -> int:
+        """So many bands have them: six at least, for narrower bands leak too much."""
+        passing = max(least, min(6, self.bands))
+        while passing < self.bands and self._dimensions(original, passing) < dimensions:
             passing += 1
         return passing
 
-    def _written(self, original: Original, passing: int) -> float:
+    def _written(self, original: Original, strengths: Float64[np.ndarray, " passing"]) -> float:
         """Dimensions of the bands that are written in."""
-        if not self.profile:
-            return self._dimensions(original, passing)
-        each = np.diff([self._dimensions(original, band) for band in range(passing + 1)])
-        return float(np.sum(each[np.array(self.profile) > 0]))
+        each = np.diff([self._dimensions(original, band) for band in range(len(strengths) + 1)])
+        return float(np.sum(each[strengths > 0]))
 
     def _dimensions(self, original: Original, passing: int) -> float:
         edge = 1 - math.cos(math.pi * passing / self.bands)
@@ -216,7 +249,7 @@ DEFAULT_SCHEME = KeyedScheme.name
 
 
 def get_scheme(scheme: str | Scheme, parameters: Mapping[str, Any] | None = None) -> Scheme:
-    """A scheme by its name, with its defaults or the given fields; a scheme itself is returned as it is.
+    """A scheme by its name, with its defaults or the fields of a record; a scheme itself is returned as it is.
 
     Raises:
         JaxmarkError: if there is no such scheme, or it has no such field.
@@ -237,7 +270,8 @@ def get_scheme(scheme: str | Scheme, parameters: Mapping[str, Any] | None = None
         for name, value in given.items()
     ):
         raise JaxmarkError(f"The scheme {scheme!r} takes the parameters {', '.join(known)}, not {given}.")
-    return SCHEMES[scheme](**given)
+    before = {} if parameters is None else _BEFORE.get(scheme, {})
+    return SCHEMES[scheme](**{**before, **given})
 
 
 def parameters_of(scheme: Scheme) -> dict[str, Any]:

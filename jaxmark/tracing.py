@@ -21,6 +21,7 @@ from jaxmark.tardos import Accusation, biases, codewords, rank
 # The pass band is that of a message of so many bits: wide enough for 2,048 slots on a mesh of 10,000 vertices.
 _BITS = 232
 _MOST_SLOTS = 2048
+_LEAST_SLOTS = 8  # fewer prove nothing
 _ALPHA = -6.0
 
 
@@ -36,15 +37,16 @@ class Tracer:
     ) -> tuple[Mesh, EmbedInfo]:
         """The copy of one recipient; see `fingerprint`."""
         key, geometry = self.marker.key, self.marker.original.geometry
-        word = codewords([recipient], key, geometry, biases(key, geometry, self.marker.code))[0]
-        marked, info = self.marker.write(word.astype(float), make_budget(budget, limits))
-        if not self.finds(marked, recipient):
-            raise JaxmarkError(
-                f"This mesh ({int(self.marker.original.used.sum())} points) cannot carry a fingerprint: its own"
-                " recipient would not be found, even unattacked. Use a finer or less regular mesh."
-            )
-        record = replace(info.record, content="fingerprint", key=self.commitment)
-        return marked, info._replace(record=record)
+        if self.marker.code >= _LEAST_SLOTS:
+            word = codewords([recipient], key, geometry, biases(key, geometry, self.marker.code))[0]
+            marked, info = self.marker.write(word.astype(float), make_budget(budget, limits))
+            if self.finds(marked, recipient):
+                record = replace(info.record, content="fingerprint", key=self.commitment)
+                return marked, info._replace(record=record)
+        raise JaxmarkError(
+            f"This mesh ({int(self.marker.original.used.sum())} points) cannot carry a fingerprint: its own"
+            " recipient would not be found, even unattacked. Use a finer or less regular mesh."
+        )
 
     def finds(self, suspect: Mesh, recipient: str) -> bool:
         """Whether one recipient alone would be accused by a suspect, at 1e-6."""

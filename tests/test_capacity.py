@@ -13,7 +13,7 @@ from jaxmark.bands import scaling
 from jaxmark.budget import make_budget
 from jaxmark.mesh import Mesh, make_mesh, vertex_normals
 from jaxmark.original import prepare
-from jaxmark.payload import Capacity, Conditions, least_energy, needed_dimensions, needed_energy, room
+from jaxmark.payload import Capacity, Conditions, least_energy, needed_dimensions, needed_energy, room, worth
 from jaxmark.schemes import KeyedScheme
 from tests.dense import chebyshev_matrices
 from tests.samples import bumpy_sphere, rough_sphere
@@ -74,42 +74,48 @@ def test_least_energy_falls_to_shannons():
 
 def test_needed_energy_is_more_than_the_least():
     for bits in (8, 64, 256):
-        apart = needed_energy(bits, 1e9)
-        assert 0 < decibel(apart / least_energy(bits + 28)) < 3  # 28 bits of tag
-        assert needed_energy(bits, 10 * apart) > needed_energy(bits, 100 * apart) > apart
-        assert needed_energy(bits, 0.9 * apart) == math.inf
+        assert 0 < decibel(needed_energy(bits) / least_energy(bits + 28)) < 3  # 28 bits of tag
+
+
+def test_bits_are_noise_to_each_other():
+    """In n dimensions no energy is worth more than n; little energy is worth what it is."""
+    dimensions = np.array([100.0, 300.0, 0.0])
+    assert worth(np.full(3, 1e9), dimensions) == pytest.approx(400, rel=1e-6)
+    assert worth(np.full(3, 1e-6), dimensions) == pytest.approx(400e-6, rel=1e-5)
+    # E/N0 of 10 in 400 dimensions to each bit: the others' energy adds to the noise's, N0/2 in each dimension.
+    assert worth(np.full(3, 10 / 400), dimensions) == pytest.approx(10 / (1 + 10 / 400), rel=1e-12)
 
 
 @pytest.mark.parametrize("direction", ["coordinates", "normals"])
-def test_room_is_what_the_projection_leaves(direction, x64):
-    """By dense matrices: tr T over the mark's energy and (tr T)²/tr T², T from chips to what is left of them."""
-    original, scheme = prepare(bumpy_sphere(2)), KeyedScheme(bands=32, direction=direction)
+@pytest.mark.parametrize("passband", ["tapered", "narrow"])
+def test_room_is_what_the_projection_leaves(direction, passband, x64):
+    """By dense matrices: of white displacements in each band, and the energy of a mark of unit mean square."""
+    original, scheme = prepare(bumpy_sphere(2)), KeyedScheme(bands=32, direction=direction, passband=passband)
     carrier = scheme.carrier(original, bytes(32), 8, 32)
     passing = scheme.layout(original, 8).passing
     terms = chebyshev_matrices(original.operator, 31)
-    filter = np.einsum("jk,kuv->uv", scaling(32, damping="jackson")[:passing], terms)
-    nuisance = np.asarray(carrier.host.nuisance)
-    if direction == "coordinates":
-        written = np.kron(filter, np.eye(3))
-    else:
-        normals = vertex_normals(original.mesh)
-        written = (normals[:, :, None] * filter[:, None, :]).reshape(3 * len(filter), len(filter))
-    columns = np.kron(nuisance, np.eye(3))
+    mass = np.asarray(original.operator.degree) / np.mean(np.asarray(original.operator.degree))
+    filters = mass[:, None] * np.einsum("jk,kuv->juv", scaling(32, damping="jackson")[:passing], terms)
+    columns = np.kron(np.asarray(carrier.host.nuisance), np.eye(3))
     basis, size, _ = np.linalg.svd(columns, full_matrices=False)
     basis = basis[:, size > 1e-6 * size[0]]
-    left = written - basis @ (basis.T @ written)
-    products = left.T @ left
-    energy, spread = np.trace(products), np.sum(products**2)
+    white = np.eye(3 * len(terms[0]))
+    if direction == "normals":
+        normals = vertex_normals(original.mesh)
+        white = np.einsum("vc,vu->vcu", normals, np.eye(len(normals))).reshape(-1, len(normals))
+    left = white - basis @ (basis.T @ white)
+    strengths = np.asarray(carrier.profile)
     found = room(carrier, original)
-    # One probe of random signs: its variance is twice the energy off the diagonal.
-    off = np.sum(products**2) - np.sum(np.diag(products) ** 2)
-    fourth = products @ products
-    deviation = np.hypot(
-        2 * np.sqrt(2 * off) / energy, np.sqrt(2 * (np.sum(fourth**2) - np.sum(np.diag(fourth) ** 2))) / spread
-    )
-    assert found.dimensions == pytest.approx(energy**2 / spread, rel=4 * deviation)
-    assert found.energy == pytest.approx(energy / np.sum(written**2), abs=0.05)
-    assert 0.3 < found.energy < 0.97
+    energy = 0.0
+    for band, filter in enumerate(filters):
+        # One probe of random signs: its variance is twice the energy off the diagonal.
+        products = left.T @ np.kron(filter, np.eye(3)) @ left
+        off = np.sum(products**2) - np.sum(np.diag(products) ** 2)
+        expected = np.trace(products) * (strengths[band] > 0)
+        assert found.dimensions[band] == pytest.approx(expected, abs=4 * np.sqrt(2 * off) + 1e-9)
+        energy += strengths[band] ** 2 * np.trace(white.T @ np.kron(filter, np.eye(3)) @ white)
+    np.testing.assert_allclose(found.energy, strengths**2 * len(terms[0]) / energy, rtol=0.1, atol=1e-12)
+    assert 0.2 < found.dimensions @ found.energy / len(terms[0]) < 0.97
 
 
 def test_least_budget_by_its_definition(known: Capacity, thousand: Mesh):
@@ -120,23 +126,21 @@ def test_least_budget_by_its_definition(known: Capacity, thousand: Mesh):
     width = 0.005 * np.linalg.norm(points, axis=1).mean() / np.linalg.norm(np.ptp(thousand.vertices, axis=0))
     budget = known.least_budget(16, USUAL)
     # The budget is the root mean square length of the displacements, N0/2 the noise's variance in one dimension.
-    energy = 1100 * 0.5 * left.energy * budget**2 / (2 * width**2 / 3)
-    assert energy == pytest.approx(needed_energy(16, 0.5 * left.dimensions), rel=1e-3)
+    ratio = left.energy * budget**2 / (2 * width**2 / 3)
+    assert worth(ratio, 0.5 * left.dimensions) == pytest.approx(needed_energy(16), rel=1e-6)
 
 
 def test_least_budget_scales(known: Capacity):
     least = known.least_budget(16, USUAL)
-    assert known.least_budget(16, USUAL._replace(noise=0.015)) == pytest.approx(3 * least, rel=1e-12)
+    assert known.least_budget(16, USUAL._replace(noise=0.015)) == pytest.approx(3 * least, rel=1e-9)
     assert known.least_budget(16, USUAL._replace(noise=0.0)) == 0
     assert known.least_budget(16, USUAL._replace(budget=make_budget(1e-9))) == least
     # As 1/√coverage, but for the interference of the bits, which a smaller coverage raises.
     whole = known.least_budget(16, USUAL._replace(coverage=1.0))
-    scheme, original = KeyedScheme(), known._original
-    dimensions = known._rooms[scheme.layout(original, 16)].dimensions
-    crowding = needed_energy(16, 0.5 * dimensions) / needed_energy(16, dimensions)
-    assert crowding > 1
-    assert least / whole == pytest.approx(math.sqrt(2 * crowding), rel=1e-12)
+    assert 1.05 * math.sqrt(2) < least / whole < 2
     assert known.least_budget(16, USUAL._replace(coverage=0.01)) == math.inf
+    scheme, original = KeyedScheme(), known._original
+    dimensions = known._rooms[scheme.layout(original, 16)].dimensions.sum()
     assert 0.99 * needed_dimensions(16) / dimensions > 0.01  # and so it must be
     assert known.least_budget(10**5, USUAL) == math.inf
 

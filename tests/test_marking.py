@@ -58,10 +58,25 @@ def test_golden_displacement(key: jm.Key):
         (
             KeyedScheme(),
             b"\xc0",
-            [[-19.017, -31.94, 1.251], [16.167, 14.955, 15.839], [21.15, 8.627, -2.253], [-9.56, 9.741, 13.333]],
+            [
+                [-18.465, -16.606, 34.287],
+                [12.879, -10.867, 4.157],
+                [19.453, 19.894, -19.215],
+                [-16.826, -10.212, 3.595],
+            ],
         ),
         (
             KeyedScheme(direction="normals"),
+            b"\xc0",
+            [[-17.092, -15.506, 36.287], [-2.832, -2.203, -15.47], [0.972, 6.526, 17.969], [-6.306, -1.671, -23.59]],
+        ),
+        (
+            KeyedScheme(passband="narrow"),
+            b"\xc0",
+            [[-19.017, -31.94, 1.251], [16.167, 14.955, 15.839], [21.15, 8.627, -2.253], [-9.56, 9.741, 13.333]],
+        ),
+        (
+            KeyedScheme(direction="normals", passband="narrow"),
             b"\xc0",
             [[-8.617, -7.818, 18.295], [-3.866, -3.008, -21.121], [1.101, 7.392, 20.352], [-5.586, -1.481, -20.897]],
         ),
@@ -261,6 +276,9 @@ def test_schemes_are_data():
     for scheme in (KeyedScheme(direction="normals"), HostScheme(), EigenScheme(pairs=10)):
         again = jm.schemes.get_scheme(scheme.name, dataclasses.asdict(scheme))
         assert again == scheme
+    # Records from before pass bands were tapered do not say so.
+    assert jm.schemes.get_scheme("keyed", {"bands": 64}) == KeyedScheme(passband="narrow")
+    assert jm.schemes.get_scheme("keyed") == KeyedScheme(passband="tapered")
     for parameters in ({"bands": "many"}, {"colour": 1}):
         with pytest.raises(jm.JaxmarkError, match="takes the parameters bands"):
             jm.schemes.get_scheme("host", parameters)
