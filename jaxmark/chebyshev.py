@@ -19,6 +19,7 @@ from jaxmark.laplacian import Laplacian, per_row
 
 Signal = Float[Array | np.ndarray, " vertices *columns"]
 
+_AT_ONCE = 5  # band components that are formed at a time where each is used once
 _UNROLLED = 2**16  # values of a signal, from which on running takes longer than compiling
 
 
@@ -93,6 +94,31 @@ def band_components(
         return total + jnp.multiply.outer(c_k, t), None
 
     return _scan_terms(operator, x, c.T, add, jnp.multiply.outer(c[:, 0], x))[0]
+
+
+def over_bands(
+    function: Callable[[Float[Array, " vertices *columns"]], Any],
+    operator: Laplacian,
+    coefficients: Float[Array | np.ndarray, "bands terms"],
+    x: Signal,
+) -> Any:
+    """What a function gives for each band component f_j(Δ)x, stacked: O(N) memory, for a few are formed at a time.
+
+    Args:
+        function: of one component, in the shape of `x`; gives an array or a tuple of arrays.
+        operator: see `band_components`.
+        coefficients: see `band_components`.
+        x: see `band_components`.
+    """
+    c = _check_bands(coefficients)
+    groups = jnp.pad(c, ((0, -len(c) % _AT_ONCE), (0, 0))).reshape(-1, _AT_ONCE, c.shape[1])
+
+    @jax.checkpoint
+    def some(group: Array) -> Any:
+        return jax.vmap(function)(band_components(operator, group, x))
+
+    found = jax.lax.map(some, groups)
+    return jax.tree.map(lambda one: one.reshape(-1, *one.shape[2:])[: len(c)], found)
 
 
 @partial(jax.jit, static_argnames="degree")

@@ -5,6 +5,7 @@ diffusion scales of the host and polynomials of the position. Projecting that nu
 How much of the mark each band still holds is seen from what the attack did to the host there.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -15,9 +16,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmark.bands import diffusion
-from jaxmark.chebyshev import band_components, filter
+from jaxmark.chebyshev import band_components, filter, over_bands
 from jaxmark.laplacian import Laplacian, per_row
 from jaxmark.observation import Observation
+
+_BLOCK = 2**14  # vertices whose nuisance is handled at a time
 
 
 class Host(NamedTuple):
@@ -61,33 +64,62 @@ def make_host(
         degree: total degree of the polynomials of the position that are nuisance, at least 1 (affine maps).
     """
     coefficients = jnp.asarray(coefficients).astype(signal.dtype)
-    columns = [_polynomials(positions, degree)]
-    if scales:
-        scaled = band_components(operator, diffusion(scales, coefficients.shape[1]), signal)
-        columns.append(jnp.moveaxis(scaled, 0, 1).reshape(len(signal), -1))
-    return Host(operator, signal, coefficients, _basis(jnp.concatenate(columns, axis=1)))
+    low, high = jax.lax.stop_gradient((positions.min(axis=0), positions.max(axis=0)))
+    inside = (2 * positions - (high + low)) / jnp.where(high > low, high - low, 1)
+    smooth = (
+        band_components(operator, diffusion(scales, coefficients.shape[1]), signal)
+        if scales
+        else jnp.zeros((0, *signal.shape), signal.dtype)
+    )
+
+    def columns(inside: Array, smooth: Array) -> Array:
+        return jnp.concatenate([_polynomials(inside, degree), smooth.reshape(len(inside), -1)], axis=1)
+
+    return Host(operator, signal, coefficients, _basis(columns, inside, jnp.moveaxis(smooth, 0, 1)))
 
 
 def extended(host: Host, seen: Observation) -> Host:
     """The host with what the suspect shows it to have gone through as nuisance, too."""
     if seen.nuisance is None:
         return host
-    return host._replace(nuisance=_basis(jnp.concatenate([host.nuisance, seen.nuisance], axis=1)))
+    return host._replace(nuisance=_wider(host.nuisance, seen.nuisance))
 
 
 @jax.jit
-def _basis(raw: Float[Array, "vertices columns"]) -> Float[Array, "vertices columns"]:
-    """The same span, nearly orthonormal."""
+def _wider(first: Array, second: Array) -> Float[Array, "vertices columns"]:
+    return _basis(lambda *both: jnp.concatenate(both, axis=1), first, second)
+
+
+def _basis(columns: Callable[..., Array], *rows: Array) -> Float[Array, "vertices columns"]:
+    """The span of columns(*rows), nearly orthonormal. They are formed block by block, never as a whole."""
+    count, size = len(rows[0]), min(len(rows[0]), _BLOCK)
+    starts = jnp.arange(0, count, size)
+
+    def block(start: Array) -> tuple[Array, Array]:
+        """Columns of so many rows; the last ones are rows of the block before, too, which does not count twice."""
+        place = jnp.minimum(start, count - size)
+        fresh = place + jnp.arange(size) >= start
+        return columns(*(jax.lax.dynamic_slice_in_dim(part, place, size) for part in rows)), fresh
+
+    def triangle(above: Array, start: Array) -> tuple[Array, None]:
+        raw, fresh = block(start)
+        return jnp.linalg.qr(jnp.concatenate([above, jnp.where(fresh[:, None], raw, 0)]), mode="r"), None
+
+    def write(basis: Array, start: Array) -> tuple[Array, None]:
+        part = jax.checkpoint(lambda: block(start)[0] @ change)()
+        return jax.lax.dynamic_update_slice_in_dim(basis, part, jnp.minimum(start, count - size), 0), None
+
     # Only the span matters, so the change to a good basis is not differentiated. What depends on the columns before it
     # is rounding noise and is dropped.
-    size = jax.lax.stop_gradient(jnp.linalg.norm(raw, axis=0))
-    raw = raw / jnp.where(size > 0, size, 1)
-    triangle = jnp.linalg.qr(jax.lax.stop_gradient(raw), mode="r")
-    pivot = jnp.abs(jnp.diagonal(triangle))
-    sound = pivot > 10 * jnp.finfo(raw.dtype).eps
-    square = jnp.where(sound[:, None], triangle[: len(pivot)], jnp.eye(len(pivot), dtype=raw.dtype))
-    change = jsl.solve_triangular(square, jnp.diag(sound.astype(raw.dtype)))
-    return raw @ change
+    shape = jax.eval_shape(lambda: block(starts[0])[0])
+    dtype, width = shape.dtype, shape.shape[1]
+    whole = jax.lax.stop_gradient(jax.lax.scan(triangle, jnp.zeros((width, width), dtype), starts)[0])
+    norm = jnp.linalg.norm(whole, axis=0)
+    scale = 1 / jnp.where(norm > 0, norm, 1)
+    sound = jnp.abs(jnp.diagonal(whole)) * scale > 10 * jnp.finfo(dtype).eps
+    square = jnp.where(sound[:, None], whole * scale, jnp.eye(width, dtype=dtype))
+    change = scale[:, None] * jsl.solve_triangular(square, jnp.diag(sound.astype(dtype)))
+    return jax.lax.scan(write, jnp.zeros((count, width), dtype), starts)[0]
 
 
 @jax.jit
@@ -107,19 +139,24 @@ def receive(host: Host, seen: Observation) -> Reception:
     residual = clean(host, seen, factor, seen.residual - nuisance)
     # A reference that is as strong in every direction as in any other.
     probe = jax.random.rademacher(jax.random.key(0), residual.shape, residual.dtype)
-    bands = _energies(host, residual)
-    reference = _energies(host, clean(host, seen, factor, probe))
+    mass = per_row(host.operator.degree, residual)
+
+    def energies(pair: Float[Array, "vertices 6"]) -> Float[Array, " 2"]:
+        return jnp.sum((mass * pair**2).reshape(-1, 2, 3), axis=(0, 2))
+
+    pair = jnp.concatenate([residual, clean(host, seen, factor, probe)], axis=1)
+    bands, reference = over_bands(energies, host.operator, host.coefficients, pair).T
     tiny = 1e-6
     power = (bands + tiny * bands.sum()) / (reference + tiny * reference.sum() + jnp.finfo(bands.dtype).tiny)
     largest = power.max()
     power = jnp.where(largest > 0, jnp.maximum(power / jnp.where(largest > 0, largest, 1), 1e-9), 1)
 
     # Where nothing is seen, the host is taken to have moved as the nuisance says: a hole would leak into every band.
-    moved = band_components(host.operator, host.coefficients, residual + nuisance)
-    still = band_components(host.operator, host.coefficients, host.signal)
-    mass = per_row(host.operator.degree, residual)
-    change = jnp.sum(mass * moved * still, axis=(1, 2))
-    whole = jnp.sum(mass * still**2, axis=(1, 2))
+    def products(pair: Float[Array, "vertices 6"]) -> tuple[Array, Array]:
+        return jnp.sum(mass * pair[:, 3:] * pair[:, :3]), jnp.sum(mass * pair[:, 3:] ** 2)
+
+    pair = jnp.concatenate([residual + nuisance, host.signal], axis=1)
+    change, whole = over_bands(products, host.operator, host.coefficients, pair)
     gain = 1 + jnp.where(whole > 0, change / jnp.where(whole > 0, whole, 1), 0)
     axes = _axes(filter(host.operator, whitening(host, power), residual), seen)
     return Reception(residual @ axes, jnp.clip(gain, 0, 2), power, axes, seen, factor)
@@ -167,9 +204,17 @@ def _robust(residual: Float[Array, "vertices 3"], weights: Float[Array, " vertic
 
 def _factor(host: Host, seen: Observation) -> Float[Array, "unknowns unknowns"]:
     """Cholesky factor of the nuisance's normal equations, with a ridge for what looks alike where it is seen."""
+    count, size = len(host.nuisance), min(len(host.nuisance), _BLOCK)
 
     def products(weights: Array) -> Array:
-        return host.nuisance.T @ (weights[:, None] * host.nuisance)
+        def add(total: Array, start: Array) -> tuple[Array, None]:
+            place = jnp.minimum(start, count - size)
+            rows, weight = (jax.lax.dynamic_slice_in_dim(one, place, size) for one in (host.nuisance, weights))
+            weight = jnp.where(place + jnp.arange(size) >= start, weight, 0)
+            return total + rows.T @ (weight[:, None] * rows), None
+
+        width = host.nuisance.shape[1]
+        return jax.lax.scan(add, jnp.zeros((width, width), weights.dtype), jnp.arange(0, count, size))[0]
 
     if seen.normals is None:
         normal = products(seen.weights)
@@ -198,14 +243,8 @@ def _explained(host: Host, seen: Observation, factor: Array, x: Array) -> Array:
     return host.nuisance @ jsl.cho_solve((factor, True), matched.ravel()).reshape(-1, 3)
 
 
-def _energies(host: Host, x: Array) -> Float[Array, " bands"]:
-    return jnp.sum(band_components(host.operator, host.coefficients, x) ** 2, axis=(1, 2))
-
-
-def _polynomials(positions: Float[Array, "vertices 3"], degree: int) -> Float[Array, "vertices columns"]:
+def _polynomials(inside: Float[Array, "vertices 3"], degree: int) -> Float[Array, "vertices columns"]:
     """Products of Chebyshev polynomials of the position in its box, up to a total degree."""
-    low, high = jax.lax.stop_gradient((positions.min(axis=0), positions.max(axis=0)))
-    inside = (2 * positions - (high + low)) / jnp.where(high > low, high - low, 1)
     powers = [jnp.ones_like(inside), inside]
     while len(powers) <= degree:
         powers.append(2 * inside * powers[-1] - powers[-2])

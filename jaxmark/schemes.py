@@ -33,6 +33,8 @@ DERIVED = (0, 0.99, 1, 0.9, 0.83, 0.75, 0.67, 0.58, 0.5, 0.44, 0.4, 0.35, 0.3, 0
 # Dimensions of the mark to each of the nuisance that is projected off, apart from affine maps.
 _NUISANCE = {"tapered": 12, "narrow": 6}
 
+_DEGREE = {"tapered": 6, "narrow": 8}  # of its polynomials, at most
+
 # What records say that were written before a field existed.
 _BEFORE: Mapping[str, Mapping[str, Any]] = {"keyed": {"passband": "narrow", "profile": (), "masking": False}}
 
@@ -107,7 +109,10 @@ class KeyedScheme:
         # Affine maps are 4 columns; each scale has one for each coordinate.
         scales = min(9, max(0, int(columns / 3 - 4) // 3))
         degree = 1
-        while degree < 8 and math.comb(degree + 4, 3) + 3 * scales <= columns / _NUISANCE[self.passband]:
+        while (
+            degree < _DEGREE[self.passband]
+            and math.comb(degree + 4, 3) + 3 * scales <= columns / _NUISANCE[self.passband]
+        ):
             degree += 1
         return Layout(len(strengths), scales, degree)
 
