@@ -142,10 +142,16 @@ def moments(operator: Laplacian, x: Signal, *, degree: int) -> Float[Array, " mo
     """m_k = ⟨x, T_k(Δ̃)x⟩_D for k = 0 … 2·degree from only `degree` products, column by column.
 
     By T_{j+k} + T_{|j-k|} = 2T_jT_k: m_2k = 2⟨T_k x, T_k x⟩_D - m_0 and m_{2k-1} = 2⟨T_k x, T_{k-1} x⟩_D - m_1. Reverse
-    mode stores the recurrence, O(degree · N) memory.
+    mode takes O(N) memory, a filter of twice the degree; there is no forward mode and no derivative with respect to the
+    operator.
     """
     x = jnp.asarray(x)
     _check_signal("moments", operator, x)
+    return _moments(operator, x, degree)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _moments(operator: Laplacian, x: Array, degree: int) -> Array:
 
     def products(_: None, t: Array, before: Array, __: Array) -> tuple[None, tuple[Array, Array]]:
         return None, (operator.inner(t, before), operator.inner(t, t))
@@ -156,6 +162,20 @@ def moments(operator: Laplacian, x: Signal, *, degree: int) -> Float[Array, " mo
         return m0
     pairs = jnp.stack([2 * odd - odd[0], 2 * even - m0], axis=1)
     return jnp.concatenate([m0, pairs.reshape(2 * degree, *x.shape[1:])])
+
+
+def _moments_forward(operator: Any, x: Any, degree: int) -> tuple[Array, tuple[Laplacian, Array]]:
+    inputs = (_fixed(operator, "moments", ""), x.value)
+    return _moments(*inputs, degree), inputs
+
+
+def _moments_reverse(degree: int, inputs: tuple[Laplacian, Array], cotangent: Any) -> tuple[None, Array]:
+    """Each moment is a quadratic form, of which T_k(Δ̃) is self-adjoint: x̄ = 2D Σ_k m̄_k T_k(Δ̃)x."""
+    operator, x = inputs
+    return None, 2 * per_row(operator.degree, x) * _filter_recompute(operator, _instantiate(cotangent), x)
+
+
+_moments.defvjp(_moments_forward, _moments_reverse, symbolic_zeros=True)
 
 
 @partial(jax.jit, static_argnames="method")

@@ -5,7 +5,7 @@ diffusion scales of the host and polynomials of the position. Projecting that nu
 How much of the mark each band still holds is seen from what the attack did to the host there.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -13,14 +13,15 @@ import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxmark.bands import diffusion
-from jaxmark.chebyshev import band_components, filter, over_bands
+from jaxmark.chebyshev import band_components, filter, gram, over_bands
 from jaxmark.laplacian import Laplacian, per_row
 from jaxmark.observation import Observation
 
 _BLOCK = 2**14  # vertices whose nuisance is handled at a time
+_SAMPLE = 2**13  # that tell a basis well enough
 
 
 class Host(NamedTuple):
@@ -92,34 +93,58 @@ def _wider(first: Array, second: Array) -> Float[Array, "vertices columns"]:
 
 def _basis(columns: Callable[..., Array], *rows: Array) -> Float[Array, "vertices columns"]:
     """The span of columns(*rows), nearly orthonormal. They are formed block by block, never as a whole."""
-    count, size = len(rows[0]), min(len(rows[0]), _BLOCK)
-    starts = jnp.arange(0, count, size)
+    count = len(rows[0])
+    # Only the span matters, so the change to a good basis is not differentiated. A sample makes one that is nearly
+    # good, and normal equations do the rest. What depends on the columns before it is rounding noise and is dropped.
+    still = jax.lax.stop_gradient(rows)
+    some = np.sort(np.random.default_rng(0).permutation(count)[:_SAMPLE])
+    raw = columns(*(part[some] for part in still))
+    norm = jnp.linalg.norm(raw, axis=0)
+    scale = 1 / jnp.where(norm > 0, norm, 1)
+    triangle = jnp.linalg.qr(raw * scale, mode="r")
+    eye = jnp.eye(len(norm), dtype=raw.dtype)
+    pivot = jnp.zeros_like(norm).at[: len(triangle)].set(jnp.abs(jnp.diagonal(triangle)))
+    sound = pivot > 10 * jnp.finfo(raw.dtype).eps
+    square = jnp.where(sound[:, None], eye.at[: len(triangle)].set(triangle), eye)
+    nearly = scale[:, None] * jsl.solve_triangular(square, jnp.diag(sound.astype(raw.dtype)))
 
-    def block(start: Array) -> tuple[Array, Array]:
-        """Columns of so many rows; the last ones are rows of the block before, too, which does not count twice."""
-        place = jnp.minimum(start, count - size)
-        fresh = place + jnp.arange(size) >= start
-        return columns(*(jax.lax.dynamic_slice_in_dim(part, place, size) for part in rows)), fresh
+    def products(fresh: Array, *block: Array) -> Array:
+        part = columns(*block) @ nearly
+        return part.T @ (fresh[:, None] * part)
 
-    def triangle(above: Array, start: Array) -> tuple[Array, None]:
-        raw, fresh = block(start)
-        return jnp.linalg.qr(jnp.concatenate([above, jnp.where(fresh[:, None], raw, 0)]), mode="r"), None
+    normal = jnp.where(sound[:, None] & sound, _sum_over_blocks(products, *still), eye)
+    change = jsl.solve_triangular(jnp.linalg.cholesky(normal), nearly.T, lower=True).T
 
     def write(basis: Array, start: Array) -> tuple[Array, None]:
-        part = jax.checkpoint(lambda: block(start)[0] @ change)()
-        return jax.lax.dynamic_update_slice_in_dim(basis, part, jnp.minimum(start, count - size), 0), None
+        place, block = _block(start, rows)
+        part = jax.checkpoint(lambda *block: columns(*block) @ change)(*block)
+        return jax.lax.dynamic_update_slice_in_dim(basis, part, place, 0), None
 
-    # Only the span matters, so the change to a good basis is not differentiated. What depends on the columns before it
-    # is rounding noise and is dropped.
-    shape = jax.eval_shape(lambda: block(starts[0])[0])
-    dtype, width = shape.dtype, shape.shape[1]
-    whole = jax.lax.stop_gradient(jax.lax.scan(triangle, jnp.zeros((width, width), dtype), starts)[0])
-    norm = jnp.linalg.norm(whole, axis=0)
-    scale = 1 / jnp.where(norm > 0, norm, 1)
-    sound = jnp.abs(jnp.diagonal(whole)) * scale > 10 * jnp.finfo(dtype).eps
-    square = jnp.where(sound[:, None], whole * scale, jnp.eye(width, dtype=dtype))
-    change = scale[:, None] * jsl.solve_triangular(square, jnp.diag(sound.astype(dtype)))
-    return jax.lax.scan(write, jnp.zeros((count, width), dtype), starts)[0]
+    return jax.lax.scan(write, jnp.zeros((count, len(norm)), raw.dtype), _starts(count))[0]
+
+
+def _starts(count: int) -> Int[Array, " blocks"]:
+    return jnp.arange(0, count, min(count, _BLOCK))
+
+
+def _block(start: Array, rows: Sequence[Array]) -> tuple[Array, list[Array]]:
+    """So many rows from a start on, and where they begin: the last block takes some of the block before, too."""
+    size = min(len(rows[0]), _BLOCK)
+    place = jnp.minimum(start, len(rows[0]) - size)
+    return place, [jax.lax.dynamic_slice_in_dim(part, place, size) for part in rows]
+
+
+def _sum_over_blocks(function: Callable[..., Array], *rows: Array) -> Array:
+    """Σ function(fresh, *block) over blocks of rows; fresh is 0 where a row was in the block before, else 1."""
+
+    def one(start: Array) -> Array:
+        place, block = _block(start, rows)
+        fresh = place + jnp.arange(len(block[0])) >= start
+        return function(fresh.astype(rows[0].dtype), *block)
+
+    starts = _starts(len(rows[0]))
+    zero = jnp.zeros_like(jax.eval_shape(one, starts[0]))
+    return jax.lax.scan(lambda total, start: (total + one(start), None), zero, starts)[0]
 
 
 @jax.jit
@@ -139,19 +164,19 @@ def receive(host: Host, seen: Observation) -> Reception:
     residual = clean(host, seen, factor, seen.residual - nuisance)
     # A reference that is as strong in every direction as in any other.
     probe = jax.random.rademacher(jax.random.key(0), residual.shape, residual.dtype)
-    mass = per_row(host.operator.degree, residual)
-
-    def energies(pair: Float[Array, "vertices 6"]) -> Float[Array, " 2"]:
-        return jnp.sum((mass * pair**2).reshape(-1, 2, 3), axis=(0, 2))
-
     pair = jnp.concatenate([residual, clean(host, seen, factor, probe)], axis=1)
-    bands, reference = over_bands(energies, host.operator, host.coefficients, pair).T
+    squares = gram(host.operator, host.coefficients, pair, method="moments")
+    # Rounding may leave less than nothing in a band.
+    bands, reference = jnp.maximum(jnp.einsum("pcjj->pj", squares.reshape(2, 3, *squares.shape[1:])), 0)
     tiny = 1e-6
     power = (bands + tiny * bands.sum()) / (reference + tiny * reference.sum() + jnp.finfo(bands.dtype).tiny)
     largest = power.max()
     power = jnp.where(largest > 0, jnp.maximum(power / jnp.where(largest > 0, largest, 1), 1e-9), 1)
 
     # Where nothing is seen, the host is taken to have moved as the nuisance says: a hole would leak into every band.
+    # These bands differ by orders of magnitude, more than moments tell apart.
+    mass = per_row(host.operator.degree, residual)
+
     def products(pair: Float[Array, "vertices 6"]) -> tuple[Array, Array]:
         return jnp.sum(mass * pair[:, 3:] * pair[:, :3]), jnp.sum(mass * pair[:, 3:] ** 2)
 
@@ -204,17 +229,11 @@ def _robust(residual: Float[Array, "vertices 3"], weights: Float[Array, " vertic
 
 def _factor(host: Host, seen: Observation) -> Float[Array, "unknowns unknowns"]:
     """Cholesky factor of the nuisance's normal equations, with a ridge for what looks alike where it is seen."""
-    count, size = len(host.nuisance), min(len(host.nuisance), _BLOCK)
 
     def products(weights: Array) -> Array:
-        def add(total: Array, start: Array) -> tuple[Array, None]:
-            place = jnp.minimum(start, count - size)
-            rows, weight = (jax.lax.dynamic_slice_in_dim(one, place, size) for one in (host.nuisance, weights))
-            weight = jnp.where(place + jnp.arange(size) >= start, weight, 0)
-            return total + rows.T @ (weight[:, None] * rows), None
-
-        width = host.nuisance.shape[1]
-        return jax.lax.scan(add, jnp.zeros((width, width), weights.dtype), jnp.arange(0, count, size))[0]
+        return _sum_over_blocks(
+            lambda fresh, rows, weight: rows.T @ ((fresh * weight)[:, None] * rows), host.nuisance, weights
+        )
 
     if seen.normals is None:
         normal = products(seen.weights)
