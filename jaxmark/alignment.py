@@ -42,6 +42,7 @@ _OFF = 10.0
 _TRIMS = 30
 _FEW = 100  # points that a map of their own needs at least
 _ROUNDS = 10
+_ENOUGH = 50_000  # points, to find a map
 _ROUNDING = 1e-12  # of sums over all points; a smaller residual is none
 _PARTS = 4  # largest components that are tried one by one
 _SEEN, _ALL = 0.05, 0.95  # shares of the original: must be seen, and so nearly all that nothing else is looked for
@@ -191,7 +192,7 @@ def _whole(
 ) -> tuple[Pose, Bool[np.ndarray, " points"]]:
     """The map on which most agree, and which points do."""
     fits = [_fit(x[sound], y[sound], start) for start in (np.ones(sound.sum(), bool), _agreeing(spread[sound]))]
-    pose, near = min(fits, key=lambda fit: np.quantile(np.linalg.norm(fit[0](y[sound]) - x[sound], axis=1), 0.4))
+    pose, near = min(fits, key=lambda fit: np.quantile(_distance(fit[0](y[sound]), x[sound]), 0.4))
     agreeing = np.zeros(len(x), bool)
     agreeing[sound] = near
     return pose, agreeing
@@ -201,19 +202,38 @@ def _fit(
     x: Float64[np.ndarray, "points 3"], y: Float64[np.ndarray, "points 3"], agreeing: Bool[np.ndarray, " points"]
 ) -> tuple[Pose, Bool[np.ndarray, " points"]]:
     """The affine map that brings y onto x, fitted to the points that agree with it, found anew in each round."""
+    if len(x) <= _ENOUGH:
+        return _fit_to_all(x, y, agreeing)
+    # A sample finds it; two rounds with all points make it exact.
+    some = np.sort(np.random.default_rng(0).permutation(len(x))[:_ENOUGH])
+    pose = _fit_to_all(x[some], y[some], agreeing[some])[0]
+    for _ in range(2):
+        agreeing = _agreeing(_distance(pose(y), x))
+        pose = _map(x, y, agreeing)
+    return pose, _agreeing(_distance(pose(y), x))
+
+
+def _fit_to_all(
+    x: Float64[np.ndarray, "points 3"], y: Float64[np.ndarray, "points 3"], agreeing: Bool[np.ndarray, " points"]
+) -> tuple[Pose, Bool[np.ndarray, " points"]]:
     # Least trimmed squares first: what is far off must not draw the fit towards itself.
     for _ in range(_TRIMS):
-        error = np.linalg.norm(_map(x, y, agreeing)(y) - x, axis=1)
+        error = _distance(_map(x, y, agreeing)(y), x)
         before, agreeing = agreeing, error <= np.quantile(error, 0.5)
         if np.array_equal(agreeing, before):
             break
     rounds = 0
     while True:
         pose = _map(x, y, agreeing)
-        before, agreeing = agreeing, _agreeing(np.linalg.norm(pose(y) - x, axis=1))
+        before, agreeing = agreeing, _agreeing(_distance(pose(y), x))
         rounds += 1
         if rounds == _ROUNDS or np.array_equal(agreeing, before):
             return pose, agreeing
+
+
+def _distance(x: Points, y: Points) -> Float64[np.ndarray, " points"]:
+    difference = x - y
+    return np.sqrt(np.einsum("pc,pc->p", difference, difference))
 
 
 def _map(

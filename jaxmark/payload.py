@@ -19,7 +19,7 @@ from jaxmark.keys import KEY_BYTES
 from jaxmark.message import TAG_BITS
 from jaxmark.observation import observe
 from jaxmark.original import Original
-from jaxmark.reception import clean, receive
+from jaxmark.reception import clean, normal_factor
 from jaxmark.schemes import KeyedScheme, Layout
 
 _GAP = 1.0  # decibel, of the polar code at a message error rate of 1e-3; `benchmarks/limit.py --code-only` measures it
@@ -47,10 +47,11 @@ def _probe(carrier: KeyedCarrier, moving: Float[Array, " vertices"]) -> Float[Ar
     """Energies of random signs in each band, before and after projection."""
     host = carrier.host
     signs = jax.random.rademacher(jax.random.key(2), carrier.chips.signs.shape, moving.dtype) * moving[:, None]
-    received = receive(host, observe(jnp.zeros_like(host.signal), moving))
+    everything = observe(jnp.zeros_like(host.signal), moving)
+    factor = normal_factor(host, everything)
     white = signs if carrier.normals is None else carrier.normals * signs
     energies = partial(band_energies, host.operator, host.coefficients)
-    return jnp.stack([energies(x, x) for x in (white, clean(host, received.seen, received.factor, white))])
+    return jnp.stack([energies(x, x) for x in (white, clean(host, everything, factor, white))])
 
 
 def least_energy(bits: int, error: float = 1e-3) -> float:

@@ -156,9 +156,9 @@ def receive(host: Host, seen: Observation) -> Reception:
         seen: the suspect's residual, in the units of the host.
     """
     # Points that are far off once the nuisance is gone were edited, or lost: they count for less.
-    strange = _robust(clean(host, seen, _factor(host, seen), seen.residual), seen.weights)
+    strange = _robust(clean(host, seen, normal_factor(host, seen), seen.residual), seen.weights)
     seen = seen._replace(weights=seen.weights * strange)
-    factor = _factor(host, seen)
+    factor = normal_factor(host, seen)
     # Twice, because the ridge leaves a little of a large nuisance behind.
     nuisance = _explained(host, seen, factor, seen.residual)
     residual = clean(host, seen, factor, seen.residual - nuisance)
@@ -227,7 +227,7 @@ def _robust(residual: Float[Array, "vertices 3"], weights: Float[Array, " vertic
     return jnp.where(square > limit, limit / jnp.where(square > limit, square, 1), 1)
 
 
-def _factor(host: Host, seen: Observation) -> Float[Array, "unknowns unknowns"]:
+def normal_factor(host: Host, seen: Observation) -> Float[Array, "unknowns unknowns"]:
     """Cholesky factor of the nuisance's normal equations, with a ridge for what looks alike where it is seen."""
 
     def products(weights: Array) -> Array:
