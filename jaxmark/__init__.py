@@ -10,6 +10,7 @@ from jaxmark import distortion as distortion
 from jaxmark import evidence as evidence
 from jaxmark import laplacian as laplacian
 from jaxmark import schemes as schemes
+from jaxmark import sharding as sharding
 from jaxmark import spectrum as spectrum
 from jaxmark import tuning as tuning
 from jaxmark import visibility as visibility

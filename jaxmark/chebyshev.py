@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.laplacian import Laplacian, per_row
+from jaxmark.laplacian import Laplacian, Operator, per_row
 
 Signal = Float[Array | np.ndarray, " vertices *columns"]
 
@@ -24,7 +24,7 @@ _UNROLLED = 2**16  # values of a signal, from which on running takes longer than
 
 
 def filter(
-    operator: Laplacian,
+    operator: Operator,
     coefficients: Float[Array | np.ndarray, " terms *filters"],
     x: Signal,
     *,
@@ -63,7 +63,7 @@ def filter(
 
 
 def transpose(
-    operator: Laplacian, coefficients: Float[Array | np.ndarray, " terms *filters"], y: Signal
+    operator: Operator, coefficients: Float[Array | np.ndarray, " terms *filters"], y: Signal
 ) -> Float[Array, " vertices *columns"]:
     """f(Δ)ᵀy = D f(Δ) D⁻¹y, by the self-adjointness of Δ: the plain adjoint of `filter`, with its arguments."""
     y = jnp.asarray(y)
@@ -214,7 +214,7 @@ def gram(
 
 
 def _scan_terms(
-    operator: Laplacian,
+    operator: Operator,
     x: Array,
     data: Array,
     step: Callable[[Any, Array, Array, Array], tuple[Any, Any]],
@@ -239,7 +239,7 @@ def _scan_terms(
 
 
 @jax.jit
-def _filter_scan(operator: Laplacian, coefficients: Array, x: Array) -> Array:
+def _filter_scan(operator: Operator, coefficients: Array, x: Array) -> Array:
     def add(total: Array, t: Array, _: Array, c_k: Array) -> tuple[Array, None]:
         return total + c_k * t, None
 
@@ -247,11 +247,11 @@ def _filter_scan(operator: Laplacian, coefficients: Array, x: Array) -> Array:
 
 
 @jax.custom_vjp
-def _filter_recompute(operator: Laplacian, coefficients: Array, x: Array) -> Array:
+def _filter_recompute(operator: Operator, coefficients: Array, x: Array) -> Array:
     return _filter_scan(operator, coefficients, x)
 
 
-def _filter_forward(operator: Any, coefficients: Any, x: Any) -> tuple[Array, tuple[Laplacian, Array, Array]]:
+def _filter_forward(operator: Any, coefficients: Any, x: Any) -> tuple[Array, tuple[Operator, Array, Array]]:
     inputs = (
         _fixed(operator, "filter", "; call it with derivative='scan' for one in O(degree · N)"),
         coefficients.value,
@@ -260,7 +260,7 @@ def _filter_forward(operator: Any, coefficients: Any, x: Any) -> tuple[Array, tu
     return _filter_scan(*inputs), inputs
 
 
-def _filter_reverse(inputs: tuple[Laplacian, Array, Array], cotangent: Any) -> tuple[None, Array, Array]:
+def _filter_reverse(inputs: tuple[Operator, Array, Array], cotangent: Any) -> tuple[None, Array, Array]:
     operator, coefficients, x = inputs
     y_bar = _instantiate(cotangent)
     c_bar: Any = _projections(operator, y_bar, x, len(coefficients) - 1)
@@ -271,13 +271,13 @@ _filter_recompute.defvjp(_filter_forward, _filter_reverse, symbolic_zeros=True)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
-def _projections(operator: Laplacian, u: Array, x: Array, degree: int) -> Array:
+def _projections(operator: Operator, u: Array, x: Array, degree: int) -> Array:
     """Σ_v u_v (T_k(Δ̃)x)_v for k = 0 … degree, column by column."""
     return _projections_scan(operator, u, x, degree)
 
 
 @partial(jax.jit, static_argnums=3)
-def _projections_scan(operator: Laplacian, u: Array, x: Array, degree: int) -> Array:
+def _projections_scan(operator: Operator, u: Array, x: Array, degree: int) -> Array:
     def project(_: None, t: Array, __: Array, ___: Array) -> tuple[None, Array]:
         return None, jnp.sum(u * t, axis=0)
 
@@ -285,13 +285,13 @@ def _projections_scan(operator: Laplacian, u: Array, x: Array, degree: int) -> A
     return jnp.concatenate([jnp.sum(u * x, axis=0)[None], rest])
 
 
-def _projections_forward(operator: Any, u: Any, x: Any, degree: int) -> tuple[Array, tuple[Laplacian, Array, Array]]:
+def _projections_forward(operator: Any, u: Any, x: Any, degree: int) -> tuple[Array, tuple[Operator, Array, Array]]:
     inputs = (_fixed(operator, "cross_moments", ""), u.value, x.value)
     return _projections_scan(*inputs, degree), inputs
 
 
 def _projections_reverse(
-    degree: int, inputs: tuple[Laplacian, Array, Array], cotangent: Any
+    degree: int, inputs: tuple[Operator, Array, Array], cotangent: Any
 ) -> tuple[None, Array, Array]:
     """The cotangents of the moments are the coefficients of two filters."""
     operator, u, x = inputs
@@ -302,7 +302,7 @@ def _projections_reverse(
 _projections.defvjp(_projections_forward, _projections_reverse, symbolic_zeros=True)
 
 
-def _fixed(operator: Any, name: str, remedy: str) -> Laplacian:
+def _fixed(operator: Any, name: str, remedy: str) -> Operator:
     """The operator as it came into a rule, once it is known that it is not differentiated."""
     leaves, structure = jax.tree.flatten(operator, is_leaf=lambda leaf: hasattr(leaf, "perturbed"))
     if any(leaf.perturbed for leaf in leaves):
@@ -317,7 +317,7 @@ def _instantiate(cotangent: Any) -> Array:
     return jnp.asarray(cotangent)  # it may come as NumPy's
 
 
-def _check_signal(name: str, operator: Laplacian, x: Array | np.ndarray) -> None:
+def _check_signal(name: str, operator: Operator, x: Array | np.ndarray) -> None:
     if x.ndim not in (1, 2) or x.shape[0] != operator.degree.shape[0]:
         raise JaxmarkError(
             f"{name} needs a signal [N] or [N, C] with N = {operator.degree.shape[0]} vertices, got {x.shape}."

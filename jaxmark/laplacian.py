@@ -6,7 +6,7 @@ is self-adjoint in the inner product ⟨x, y⟩_D = xᵀDy.
 """
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,22 @@ Weighting = Literal["valence", "inverse-length", "cotangent"]
 Lowering = Literal["auto", "gather", "segments"]
 
 _SCATTER = 8  # what adding to a row anywhere costs, in rows that are read; on a processor, measured roughly
+
+
+@runtime_checkable
+class Operator(Protocol):
+    """What polynomials need of Δ: D, and products. A `Laplacian`, or one device's part of it."""
+
+    @property
+    def degree(self) -> Float[Array | np.ndarray, " vertices"]:
+        """D, 0 where a vertex is isolated."""
+        ...
+
+    def product(
+        self, like: Shaped[Array, " vertices *columns"]
+    ) -> Callable[[Float[Array, " vertices *columns"]], Float[Array, " vertices *columns"]]:
+        """The map x → Δx for signals of one shape and dtype."""
+        ...
 
 
 class Neighbours(NamedTuple):
@@ -151,12 +167,12 @@ def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence", *, lo
         if not (np.isfinite(values) & (values >= 0)).all():
             raise JaxmarkError("weights must be finite and not negative; otherwise the spectrum leaves [0, 2].")
     degree = np.bincount(pairs.ravel(), np.repeat(values, 2), minlength=len(mesh.vertices))
-    neighbours = None if lowering == "segments" else _neighbours(pairs, len(degree), lowering == "auto")
+    neighbours = None if lowering == "segments" else make_neighbours(pairs, len(degree), lowering == "auto")
     return Laplacian(pairs.astype(np.int32), values, degree, neighbours)
 
 
-def _neighbours(pairs: Int[np.ndarray, "edges 2"], size: int, if_it_pays: bool) -> Neighbours | None:
-    """The table with as many slots as make a product cheapest."""
+def make_neighbours(pairs: Int[np.ndarray, "edges 2"], size: int, if_it_pays: bool) -> Neighbours | None:
+    """The table with as many slots as make a product cheapest; none where it does not pay and that is asked."""
     (tail, head), edge = np.concatenate([pairs, pairs[:, ::-1]]).T, np.tile(np.arange(len(pairs)), 2)
     order = np.argsort(tail, kind="stable")
     tail, head, edge = tail[order], head[order], edge[order]
