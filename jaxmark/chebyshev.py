@@ -164,12 +164,12 @@ def _moments(operator: Laplacian, x: Array, degree: int) -> Array:
     return jnp.concatenate([m0, pairs.reshape(2 * degree, *x.shape[1:])])
 
 
-def _moments_forward(operator: Any, x: Any, degree: int) -> tuple[Array, tuple[Laplacian, Array]]:
-    inputs = (_fixed(operator, "moments", ""), x.value)
+def _moments_forward(operator: Any, x: Any, degree: int) -> tuple[Array, tuple[Any, Array]]:
+    inputs: Any = (_fixed(operator, "moments", ""), x.value)
     return _moments(*inputs, degree), inputs
 
 
-def _moments_reverse(degree: int, inputs: tuple[Laplacian, Array], cotangent: Any) -> tuple[None, Array]:
+def _moments_reverse(degree: int, inputs: tuple[Any, Array], cotangent: Any) -> tuple[None, Array]:
     """Each moment is a quadratic form, of which T_k(Δ̃) is self-adjoint: x̄ = 2D Σ_k m̄_k T_k(Δ̃)x."""
     operator, x = inputs
     return None, 2 * per_row(operator.degree, x) * _filter_recompute(operator, _instantiate(cotangent), x)
