@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple, get_args
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float64, Int64
+from jaxtyping import Array, Bool, Float, Float64, Int64
 
 from jaxmark.connectivity import matching_vertices
 from jaxmark.errors import JaxmarkError
@@ -55,7 +55,7 @@ class Alignment(NamedTuple):
     displacement: Float64[np.ndarray, "points 3"]  # of the original's points, in diagonals
     weights: Float64[np.ndarray, " points"]  # 1, or 0 where a point is masked or no face uses it
     normals: Float64[np.ndarray, "points 3"] | None  # given, only the displacement along them is known; unit length
-    nuisance: Float64[np.ndarray, "points columns"] | None  # what smoothing explains, where that is much
+    nuisance: Float[np.ndarray, "points columns"] | None  # what smoothing explains, where that is much
     method: Literal["same", "connectivity", "surface"]  # vertices by their order, by their surroundings, or none
     pose: Pose  # from the suspect's coordinates to the original's, as in their files
     residual: float  # root mean square of the displacement, where it counts

@@ -15,7 +15,7 @@ from jaxmark.carriers.carrier import Displacement
 from jaxmark.chebyshev import cross_moments
 from jaxmark.laplacian import Laplacian
 from jaxmark.observation import Observation
-from jaxmark.reception import Host, clean, extended, receive
+from jaxmark.reception import Host, clean, receive
 
 Margin = Literal["rate", "evidence", "snr"]
 
@@ -73,8 +73,8 @@ def measure(host: Host, seen: Observation, mark: Displacement) -> Channels:
     Returns:
         One row. A band of less than three dimensions tells nothing, and leaves nothing.
     """
-    host = extended(host, seen)
     received = receive(host, seen)
+    host = received.host
 
     def kept(x: Array) -> Array:
         return clean(host, received.seen, received.factor, x) @ received.axes

@@ -179,9 +179,10 @@ def embed_command(
     mesh = load_mesh(original)
     if (message is None) == (recipient is None):
         raise JaxmarkError("Give either --message or --recipient.")
+    marker = None
     if message is not None:
         marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
-        result, info = marker.embed(message, budget, limits=dict(limits) or None, noise=noise)
+        result, info = marker.embed(message, budget, limits=dict(limits) or None, noise=noise, read_back=False)
         said, reads = f"{info.record.bits} bits", lambda mesh: marker.detect(mesh).message == message
     else:
         if scheme != DEFAULT_SCHEME:
@@ -194,6 +195,8 @@ def embed_command(
         # What counts is the file: its numbers are rounded.
         written = load_mesh(draft)
         if not reads(written):
+            if marker is not None and message is not None:
+                marker.check(result, message)
             raise JaxmarkError(
                 f"Rounded to the numbers of {original}, the mark no longer reads; use a larger budget, or a file with"
                 " more digits."

@@ -17,7 +17,7 @@ from jaxmark.carriers.carrier import Strength
 from jaxmark.chebyshev import filter, transpose
 from jaxmark.errors import JaxmarkError
 from jaxmark.observation import Observation
-from jaxmark.reception import Host, Reception, clean, extended, receive, whitening
+from jaxmark.reception import Reception, clean, whitening
 
 Detector = Callable[[Carrier, Observation, Strength], Float[Array, " bits"]]
 
@@ -49,7 +49,7 @@ def decorrelate(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Fl
     return jsl.cho_solve(factor, correlate(carrier, seen, beta))
 
 
-def joint(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Array, " bits"]:
+def joint(carrier: Carrier, seen: Observation | Reception, beta: Strength = 1.0) -> Float[Array, " bits"]:
     """All bits together: least mean square error, by conjugate gradients on the bits, nothing of size bits² formed.
 
     The nuisance is projected off and each band weighed by its power (`jaxmark.reception`); there the mark is modelled
@@ -58,7 +58,8 @@ def joint(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Ar
 
     Args:
         carrier: a `KeyedCarrier`.
-        seen: the residual with its weights and, if only normal components are known, its normals.
+        seen: the residual with its weights and, if only normal components are known, its normals; or what
+            `KeyedCarrier.received` made of it, to be made only once.
         beta: the strengths' profile over the bands, as embedded.
 
     Returns:
@@ -69,14 +70,14 @@ def joint(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Ar
     """
     if not isinstance(carrier, KeyedCarrier):
         raise JaxmarkError(f"The joint detector reads keyed carriers, not {type(carrier).__name__}.")
-    host = extended(carrier.host, seen)
-    return _decoded(carrier, host, receive(host, seen), beta, _TOLERANCE, _STEPS)
+    return _decoded(carrier, carrier.received(seen), beta, _TOLERANCE, _STEPS)
 
 
 @partial(jax.jit, static_argnames=("tolerance", "steps"))
 def _decoded(
-    carrier: KeyedCarrier, host: Host, received: Reception, beta: Strength, tolerance: float, steps: int
+    carrier: KeyedCarrier, received: Reception, beta: Strength, tolerance: float, steps: int
 ) -> Float[Array, " bits"]:
+    host = received.host
     model = carrier.shape(beta, received.gain)
     equaliser = whitening(host, received.power)
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from jaxmark import alignment, distortion, evidence
 from jaxmark.alignment import Align, Alignment
 from jaxmark.budget import Budget, make_budget, write
 from jaxmark.carriers import Carrier, KeyedCarrier
-from jaxmark.detectors import Detector
+from jaxmark.detectors import Detector, joint
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import Key, commitment
 from jaxmark.mesh import Mesh
@@ -82,8 +83,12 @@ class Marker:
         *,
         limits: Mapping[str, float] | None = None,
         noise: float = NOISE,
+        read_back: bool = True,
     ) -> tuple[Mesh, EmbedInfo]:
-        """Hide a message of just the payload's size in the original; see `embed`."""
+        """Hide a message of just the payload's size in the original; see `embed`.
+
+        Who reads the mark back elsewhere, from the file it went to, can leave that out here.
+        """
         self._check_size(message)
         bounds = make_budget(budget, limits)
         if not 0 <= noise < math.inf:
@@ -93,13 +98,22 @@ class Marker:
             # A budget without limits is met up to rounding.
             reached = info.rms if bounds.limits else bounds.rms or 0.0
             self._check_capacity(self.scheme, self.carrier, reached, Conditions(bounds, noise, COVERAGE))
+        if read_back:
+            self.check(marked, message)
+        return marked, info
+
+    def check(self, marked: Mesh, message: bytes) -> None:
+        """Refuse a mesh from which the message does not read, unattacked as it is.
+
+        Raises:
+            JaxmarkError: if so.
+        """
         if self.detect(marked).message != message:
             raise JaxmarkError(
                 f"This mesh ({int(self.original.used.sum())} points) cannot carry {self.bits} bits with the scheme"
                 f" {self.scheme.name!r}: they do not read back, even unattacked. Use a shorter message, or a finer or"
                 " less regular mesh."
             )
-        return marked, info
 
     def detect(
         self,
@@ -115,14 +129,19 @@ class Marker:
         if message is not None:
             self._check_size(message)
         aligned = suspect if isinstance(suspect, Alignment) else alignment.align(self.original, suspect, align)
-        seen = self.observe(aligned, weights)
-        soft = self.soft_values(seen)
+        observed = self.observe(aligned, weights)
+        if isinstance(self.carrier, KeyedCarrier) and self.detector is joint:
+            # Reading and claiming begin alike.
+            received = self.carrier.received(observed)
+            soft, claim = np.asarray(joint(self.carrier, received), np.float64), partial(self.carrier.claim, received)
+        else:
+            soft, claim = self.soft_values(observed), partial(self.carrier.claim, observed)
         found = decode(soft, self.bits, self.key, self.original.geometry)
         log10_p = fitted = 0.0
         # Another message that reads refutes the claim, however much the two have in common.
         if (chosen := message or found) is not None and found in (None, chosen):
             codeword = encode(chosen, self.key, self.original.geometry, self.code)
-            score, norm = self.carrier.claim(seen, jnp.asarray(codeword, seen.residual.dtype))
+            score, norm = claim(jnp.asarray(codeword, observed.residual.dtype))
             if message is not None:
                 log10_p = evidence.log10_p_claimed(score, norm)
             else:
@@ -131,7 +150,7 @@ class Marker:
                 )
             fitted = evidence.log10_p_fitted(score, norm, 0 if message is not None else self.bits)
         size = np.sqrt(np.mean(soft**2)) or 1.0
-        coverage = float(np.mean(np.asarray(seen.weights)[self.original.used] > 0))
+        coverage = float(np.mean(np.asarray(observed.weights)[self.original.used] > 0))
         return Detection(found, log10_p, fitted, soft / size, coverage, aligned)
 
     def write(self, amplitudes: Float64[np.ndarray, " code"], budget: Budget) -> tuple[Mesh, EmbedInfo]:

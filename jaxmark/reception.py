@@ -36,6 +36,7 @@ class Host(NamedTuple):
 class Reception(NamedTuple):
     """A suspect as the receiver sees it; free of the key."""
 
+    host: Host  # with what the suspect shows it to have gone through as nuisance, too
     residual: Float[Array, "vertices 3"]  # weighed, free of nuisance, as strong along each direction as along any other
     gain: Float[Array, " bands"]  # what the attack left of the host, and so of the mark
     power: Float[Array, " bands"]  # residual energy per dimension, relative to the largest
@@ -147,7 +148,6 @@ def _sum_over_blocks(function: Callable[..., Array], *rows: Array) -> Array:
     return jax.lax.scan(lambda total, start: (total + one(start), None), zero, starts)[0]
 
 
-@jax.jit
 def receive(host: Host, seen: Observation) -> Reception:
     """Project the nuisance off a residual, and measure gain and power of each band, and the power along each direction.
 
@@ -155,6 +155,13 @@ def receive(host: Host, seen: Observation) -> Reception:
         host: from `make_host`.
         seen: the suspect's residual, in the units of the host.
     """
+    host = extended(host, seen)
+    # A compiled function would return a copy of the host.
+    return Reception(host, *_receive(host, seen))
+
+
+@jax.jit
+def _receive(host: Host, seen: Observation) -> tuple[Array, Array, Array, Array, Observation, Array]:
     # Points that are far off once the nuisance is gone were edited, or lost: they count for less.
     strange = _robust(clean(host, seen, normal_factor(host, seen), seen.residual), seen.weights)
     seen = seen._replace(weights=seen.weights * strange)
@@ -184,7 +191,7 @@ def receive(host: Host, seen: Observation) -> Reception:
     change, whole = over_bands(products, host.operator, host.coefficients, pair)
     gain = 1 + jnp.where(whole > 0, change / jnp.where(whole > 0, whole, 1), 0)
     axes = _axes(filter(host.operator, whitening(host, power), residual), seen)
-    return Reception(residual @ axes, jnp.clip(gain, 0, 2), power, axes, seen, factor)
+    return (residual @ axes, jnp.clip(gain, 0, 2), power, axes, seen, factor)
 
 
 def whitening(host: Host, power: Float[Array, " bands"]) -> Float[Array, " terms"]:

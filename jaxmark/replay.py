@@ -6,7 +6,7 @@ suspect's displacement is nuisance, as is what the original's own operator expla
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 
 from jaxmark.bands import diffusion
 from jaxmark.chebyshev import band_components
@@ -21,7 +21,7 @@ _WEIGHTINGS: tuple[Weighting, ...] = ("valence", "cotangent")
 _MOST_LEFT, _MOST_LEFT_OF_POINTS = 0.1, 0.5
 _ENOUGH = 20_000
 
-Columns = Float64[np.ndarray, "points columns"]
+Columns = Float[np.ndarray, "points columns"]
 
 
 def replayed(
@@ -72,11 +72,11 @@ def replayed_points(original: Mesh, displacement: Points, weights: Bool[np.ndarr
     return _likeliest([columns], x, displacement, None, weights, _MOST_LEFT_OF_POINTS)
 
 
-def _smoothed(mesh: Mesh, weighting: Weighting, signal: Points) -> list[Points]:
+def _smoothed(mesh: Mesh, weighting: Weighting, signal: Points) -> list[Float32[np.ndarray, "points 3"]]:
     """A signal after smoothing by a mesh's Laplacian, by several amounts."""
     family = diffusion(_SCALES, 4 * 2 ** (_SCALES // 2) + 1)
     amounts = band_components(make_laplacian(mesh, weighting), family, jnp.asarray(signal, jnp.float32))
-    return [np.asarray(amount, np.float64) for amount in amounts]
+    return list(np.asarray(amounts))
 
 
 def _likeliest(
@@ -102,5 +102,5 @@ def _likeliest(
             along = np.sum(normals[some] * shown, axis=1)
         return float(np.sum((along - design @ np.linalg.lstsq(design, along, rcond=1e-9)[0]) ** 2))
 
-    rest = [left(np.concatenate([plain, columns[some]], axis=1)) for columns in candidates]
+    rest = [left(np.concatenate([plain, columns[some].astype(np.float64)], axis=1)) for columns in candidates]
     return candidates[int(np.argmin(rest))] if min(rest) < most_left * left(plain) else None

@@ -16,7 +16,7 @@ from jaxmark.chebyshev import filter, transpose
 from jaxmark.keys import permutation, signs
 from jaxmark.laplacian import per_row
 from jaxmark.observation import Observation
-from jaxmark.reception import Host, Reception, extended, receive
+from jaxmark.reception import Host, Reception, receive
 
 
 class Chips(NamedTuple):
@@ -70,9 +70,15 @@ class KeyedCarrier(NamedTuple):
         unit = jnp.eye(len(self.chips.population), dtype=self._signs.dtype)
         return jax.lax.map(lambda bits: self.adjoint(self.displacement(bits, beta), beta), unit)
 
-    def claim(self, seen: Observation, bits: Float[Array, " bits"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def received(self, seen: Observation | Reception) -> Reception:
+        """What its receiver makes of a suspect, unless that has been made."""
+        return seen if isinstance(seen, Reception) else receive(self.host, seen)
+
+    def claim(
+        self, seen: Observation | Reception, bits: Float[Array, " bits"]
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """See `Carrier`: a is what `matched` gives, up to the bits' signs."""
-        return self._claim(receive(extended(self.host, seen), seen), bits)
+        return self._claim(self.received(seen), bits)
 
     @jax.jit
     def _claim(self, received: Reception, bits: Float[Array, " bits"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
