@@ -145,9 +145,49 @@ def test_memory_does_not_grow_with_the_degree():
         compiled = jax.jit(jax.value_and_grad(loss, (0, 1))).lower(x, x).compile()
         return compiled.memory_analysis().temp_size_in_bytes
 
+    def scratch_of_own_moments(degree: int) -> int:
+        def loss(x):
+            return jnp.sum(chebyshev.moments(operator, x, degree=degree) ** 2)
+
+        return jax.jit(jax.value_and_grad(loss)).lower(x).compile().memory_analysis().temp_size_in_bytes
+
     assert scratch_of_moments(256) < 1.1 * scratch_of_moments(32)
+    assert scratch_of_own_moments(256) < 1.1 * scratch_of_own_moments(32)
     assert scratch(256, "recompute") < 1.1 * scratch(32, "recompute")
     assert scratch(256, "scan") > 4 * scratch(32, "scan")  # what the rule is for
+
+
+def test_band_by_band_is_the_same_as_all_at_once(operator, dtype):
+    """Also where the last group of bands is not full."""
+    bands = random_array(7, DEGREE + 1).astype(dtype)
+    x = jnp.asarray(random_array(len(operator.degree), 3, seed=1).astype(dtype))
+    every = chebyshev.band_components(operator, bands, x)
+    sums, squares = chebyshev.over_bands(lambda y: (y.sum(axis=0), jnp.sum(y**2)), operator, bands, x)
+    np.testing.assert_allclose(sums, every.sum(axis=1), atol=tolerance(dtype, 100))
+    np.testing.assert_allclose(squares, jnp.sum(every**2, axis=(1, 2)), rtol=tolerance(dtype, 100))
+
+
+def test_memory_does_not_grow_with_the_bands():
+    operator = jax.tree.map(jnp.asarray, make_laplacian(bumpy_sphere(4)))
+    x = jnp.ones((len(operator.degree), 3), jnp.float32)
+
+    def scratch(bands: int) -> int:
+        def energies(x):
+            c = jnp.ones((bands, 17), jnp.float32)
+            return chebyshev.over_bands(lambda y: jnp.sum(y**2), operator, c, x)
+
+        return jax.jit(energies).lower(x).compile().memory_analysis().temp_size_in_bytes
+
+    assert scratch(80) < 1.1 * scratch(10)
+
+
+def test_derivative_of_moments(operator, x64):
+    x = jnp.asarray(random_array(len(operator.degree), 3))
+    check_grads(lambda x: chebyshev.moments(operator, x, degree=DEGREE), (x,), order=1, modes=["rev"])
+    with pytest.raises(JaxmarkError, match="moments has no derivative"):
+        jax.grad(lambda w: chebyshev.moments(operator._replace(weights=w), x, degree=2).sum())(
+            jnp.asarray(operator.weights)
+        )
 
 
 def test_moments_in_float32_lose_weak_bands_and_components_do_not(sphere):

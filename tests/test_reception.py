@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
+from jaxmark import reception
 from jaxmark.bands import diffusion, scaling
 from jaxmark.chebyshev import filter
 from jaxmark.laplacian import Laplacian, centre, make_laplacian
@@ -125,6 +126,26 @@ def test_nuisance_is_nearly_orthonormal(case: Case, dtype):
     kept = np.diagonal(products) > 0.5
     assert kept.sum() >= 10 + 3
     np.testing.assert_allclose(products, np.diag(kept.astype(float)), atol=1e-9 if dtype == np.float64 else 0.2)
+
+
+def test_nuisance_by_blocks_is_the_same(case: Case, x64, monkeypatch):
+    """With a last block that is not full, and a sample that tells the basis."""
+    whole = make(case, np.float64)
+    seen = looking(case, "weights", np.random.default_rng(3).normal(size=case.x.shape), np.float64)
+    expected = receive(whole, seen)
+    jax.clear_caches()
+    monkeypatch.setattr(reception, "_BLOCK", 50)
+    monkeypatch.setattr(reception, "_SAMPLE", 100)
+    assert len(case.x) % 50 > 0
+    parts = make(case, np.float64)
+    found = receive(parts, seen)
+    jax.clear_caches()
+    # The same span: each explains the other.
+    left = parts.nuisance - whole.nuisance @ jnp.linalg.lstsq(whole.nuisance, parts.nuisance)[0]
+    assert np.linalg.matrix_rank(np.asarray(parts.nuisance)) == np.linalg.matrix_rank(np.asarray(whole.nuisance))
+    np.testing.assert_allclose(left, 0, atol=1e-7)
+    np.testing.assert_allclose(found.residual, expected.residual, atol=1e-7 * np.abs(expected.residual).max())
+    np.testing.assert_allclose(found.power, expected.power, rtol=1e-5)
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
