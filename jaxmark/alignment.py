@@ -167,7 +167,7 @@ def _by_points(
     if np.abs(error).max() < _ROUNDING:
         error = np.zeros_like(error)
     pose = before.then(pose).then(_file(original))
-    nuisance = replayed_points(mesh, error, agreeing)
+    nuisance = replayed_points(original.operator, mesh, error, agreeing)
     return Alignment(error, agreeing.astype(float), None, nuisance, method, pose, _rms(error[agreeing]), 0.0)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float32, Int64
 
 from jaxmark.bands import diffusion
 from jaxmark.chebyshev import band_components
-from jaxmark.laplacian import Weighting, make_laplacian
+from jaxmark.laplacian import Laplacian, Weighting, make_laplacian
 from jaxmark.mesh import Mesh, area
 from jaxmark.pose import Points
 from jaxmark.surfaces import Surface, barycentric
@@ -19,6 +19,9 @@ _SCALES = 9  # of smoothing, by 1 to 256 steps of half the way
 _WEIGHTINGS: tuple[Weighting, ...] = ("valence", "cotangent")
 # Along normals only, columns take a good part of the mark away with what they explain; of known points, next to none.
 _MOST_LEFT, _MOST_LEFT_OF_POINTS = 0.1, 0.5
+# What a first glance may leave of smoothing: of marks and noise it leaves over 99.5 % on real meshes, of smoothing less
+# than 87 %.
+_SIGNS_LEFT = 0.98
 _ENOUGH = 20_000
 
 Columns = Float[np.ndarray, "points columns"]
@@ -57,10 +60,13 @@ def replayed(
     return _likeliest(smoothed, x, displacement, normals, weights, _MOST_LEFT)
 
 
-def replayed_points(original: Mesh, displacement: Points, weights: Bool[np.ndarray, " points"]) -> Columns | None:
+def replayed_points(
+    operator: Laplacian, original: Mesh, displacement: Points, weights: Bool[np.ndarray, " points"]
+) -> Columns | None:
     """The same of points that are known, by the original's cotangents; what its valences explain is nuisance anyway.
 
     Args:
+        operator: of the original.
         original: about one in size.
         displacement: of its points.
         weights: where it counts.
@@ -68,6 +74,11 @@ def replayed_points(original: Mesh, displacement: Points, weights: Bool[np.ndarr
     if area(original) == 0:
         return None
     x = np.asarray(original.vertices)
+    # Smoothing of any kind and amount shows in these already; marks and noise do not, and end here.
+    once = operator.apply(jnp.asarray(x, jnp.float32))
+    signs = np.concatenate([once, operator.apply(once)], axis=1)
+    if _likeliest([signs], x, displacement, None, weights, _SIGNS_LEFT) is None:
+        return None
     columns = np.concatenate(_smoothed(original, "cotangent", x), axis=1)
     return _likeliest([columns], x, displacement, None, weights, _MOST_LEFT_OF_POINTS)
 
