@@ -152,7 +152,6 @@ def moments(operator: Laplacian, x: Signal, *, degree: int) -> Float[Array, " mo
 
 @partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _moments(operator: Laplacian, x: Array, degree: int) -> Array:
-
     def products(_: None, t: Array, before: Array, __: Array) -> tuple[None, tuple[Array, Array]]:
         return None, (operator.inner(t, before), operator.inner(t, t))
 

@@ -39,7 +39,7 @@ _NUISANCE = {"tapered": 12, "narrow": 6}
 _DEGREE = {"tapered": 6, "narrow": 8}  # of its polynomials, at most
 
 # What records say that were written before a field existed.
-_BEFORE: Mapping[str, Mapping[str, Any]] = {"keyed": {"passband": "narrow", "profile": (), "masking": False}}
+_BEFORE: Mapping[str, Mapping[str, Any]] = {"keyed": {"passband": "narrow"}}
 
 
 @runtime_checkable
@@ -164,10 +164,10 @@ class KeyedScheme:
                 raise JaxmarkError(f"A profile is up to {self.bands} numbers, none negative and not all 0.")
             return np.array(self.profile)
         information = bits + TAG_BITS
-        usual = round(self.bands * len(DERIVED) / 64)
+        usual = round(self.bands * 0.31)
         match self.passband:
             case "tapered":
-                passing = self._reaching(original, 12 * information, min(usual, self.bands))
+                passing = self._reaching(original, 12 * information, usual)
                 places = (np.arange(passing) + 0.5) / passing
                 return np.interp(places, (np.arange(len(DERIVED)) + 0.5) / len(DERIVED), DERIVED)
             case "narrow":

@@ -8,6 +8,7 @@ import jaxmark as jm
 from jaxmark import distortion
 from jaxmark.mesh import Mesh, make_mesh
 from jaxmark.message import encode
+from jaxmark.original import prepare
 from jaxmark.schemes import EigenScheme, HostScheme, KeyedScheme
 from tests.samples import bumpy_sphere, exact_sheet
 
@@ -282,6 +283,13 @@ def test_schemes_are_data():
     for parameters in ({"bands": "many"}, {"colour": 1}):
         with pytest.raises(jm.JaxmarkError, match="takes the parameters bands"):
             jm.schemes.get_scheme("host", parameters)
+
+
+def test_narrow_bands_stay_where_old_marks_have_them(sphere: Mesh):
+    """Also where 31 % of the bands is not 20/64 of them."""
+    original = prepare(sphere)
+    for bands, passing in {32: 10, 64: 20, 256: 79, 400: 124}.items():
+        assert KeyedScheme(bands=bands, passband="narrow").layout(original, 8).passing == passing
 
 
 def test_displacements_are_relative_to_the_diagonal(sphere: Mesh):
