@@ -6,8 +6,9 @@ over a minute. The parts:
 
 filter     f(Δ)x of three float32 columns, ours against SciPy, PyGSP and torch (extra `peers`; what is missing is
            named), with the largest difference from ours over the largest value. Traffic counts once a step the
-           neighbours' indices and weights, degrees and which are 0, x, the term before, the next one, and the sum read
-           and written; "of a copy" is its share of what a pass over a large array, read and written, reaches then.
+           neighbours' indices, and weights if any, two numbers of each vertex, x, the term before, the next one, and
+           the sum read and written; "of a copy" is its share of what a pass over a large array, read and written,
+           reaches then.
 gradients  all bands, moments, and the filter with both gradients: time over the plain filter's; and peak memory, each
            in a process of its own, beyond what is held once the operator is built and the function compiled.
 stages     the library's functions from end to end, each in a process of its own: first call, of which lowering and
@@ -147,8 +148,9 @@ def filters(bench: Bench) -> Iterator[Row]:
 def traffic(operator: Laplacian, x: Any) -> int:
     """Bytes of the arrays that a step of the filter reads and writes, each counted once."""
     table = operator.neighbours
-    places = 2 * np.size(operator.weights) if table is None else np.size(table.vertices) + np.size(table.rest) // 3
-    return places * (4 + x.itemsize) + len(x) * (x.itemsize + 1) + 5 * x.nbytes
+    places = 2 * len(operator.edges) if table is None else np.size(table.vertices) + np.size(table.rest) // 3
+    weighing = 0 if operator.weights is None else x.itemsize
+    return places * (4 + weighing) + 2 * len(x) * x.itemsize + 5 * x.nbytes
 
 
 def gradients(bench: Bench) -> Iterator[Row]:

@@ -89,11 +89,12 @@ def band_components(
     x = jnp.asarray(x)
     _check_signal("band_components", operator, x)
     c = _check_bands(coefficients).astype(x.dtype)
+    x = operator.enter(x)
 
     def add(total: Array, t: Array, _: Array, c_k: Array) -> tuple[Array, None]:
         return total + jnp.multiply.outer(c_k, t), None
 
-    return _scan_terms(operator, x, c.T, add, jnp.multiply.outer(c[:, 0], x))[0]
+    return jax.vmap(operator.leave)(_scan_terms(operator, x, c.T, add, jnp.multiply.outer(c[:, 0], x))[0])
 
 
 def over_bands(
@@ -152,11 +153,13 @@ def moments(operator: Laplacian, x: Signal, *, degree: int) -> Float[Array, " mo
 
 @partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _moments(operator: Laplacian, x: Array, degree: int) -> Array:
+    x, mass = operator.enter(x), operator.enter(per_row(operator.degree, x))
+
     def products(_: None, t: Array, before: Array, __: Array) -> tuple[None, tuple[Array, Array]]:
-        return None, (operator.inner(t, before), operator.inner(t, t))
+        return None, (jnp.sum(mass * t * before, axis=0), jnp.sum(mass * t * t, axis=0))
 
     _, (odd, even) = _scan_terms(operator, x, jnp.zeros(degree + 1, x.dtype), products, None)
-    m0 = operator.inner(x, x)[None]
+    m0 = jnp.sum(mass * x * x, axis=0)[None]
     if degree == 0:
         return m0
     pairs = jnp.stack([2 * odd - odd[0], 2 * even - m0], axis=1)
@@ -219,7 +222,10 @@ def _scan_terms(
     step: Callable[[Any, Array, Array, Array], tuple[Any, Any]],
     start: Any,
 ) -> tuple[Any, Any]:
-    """Run `step(carry, T_k x, T_{k-1} x, data[k])` over k = 1 … len(data) - 1; T_0 x = x is the caller's."""
+    """Run `step(carry, T_k x, T_{k-1} x, data[k])` over k = 1 … len(data) - 1; T_0 x = x is the caller's.
+
+    All in the operator's own order.
+    """
     product = operator.product(x)
 
     def body(state: tuple[Array, Array, Any], inputs: tuple[Array, Array]) -> tuple[tuple[Array, Array, Any], Any]:
@@ -242,7 +248,8 @@ def _filter_scan(operator: Operator, coefficients: Array, x: Array) -> Array:
     def add(total: Array, t: Array, _: Array, c_k: Array) -> tuple[Array, None]:
         return total + c_k * t, None
 
-    return _scan_terms(operator, x, coefficients, add, coefficients[0] * x)[0]
+    x = operator.enter(x)
+    return operator.leave(_scan_terms(operator, x, coefficients, add, coefficients[0] * x)[0])
 
 
 @jax.custom_vjp
@@ -277,6 +284,8 @@ def _projections(operator: Operator, u: Array, x: Array, degree: int) -> Array:
 
 @partial(jax.jit, static_argnums=3)
 def _projections_scan(operator: Operator, u: Array, x: Array, degree: int) -> Array:
+    u, x = operator.enter(u), operator.enter(x)
+
     def project(_: None, t: Array, __: Array, ___: Array) -> tuple[None, Array]:
         return None, jnp.sum(u * t, axis=0)
 

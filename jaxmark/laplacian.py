@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int, Num, Shaped
+from jaxtyping import Array, Float, Float64, Int, Int64, Num, Shaped
 from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.sparse import csgraph
@@ -23,11 +23,17 @@ Weighting = Literal["valence", "inverse-length", "cotangent"]
 Lowering = Literal["auto", "gather", "segments"]
 
 _SCATTER = 8  # what adding to a row anywhere costs, in rows that are read; on a processor, measured roughly
+_PASS = 4  # and what it costs, for each vertex, that there are such additions at all
+_ORDERED = 2**14  # vertices, from which on a signal outgrows the fastest memory
 
 
 @runtime_checkable
 class Operator(Protocol):
-    """What polynomials need of Δ: D, and products. A `Laplacian`, or one device's part of it."""
+    """What polynomials need of Δ: D, and products. A `Laplacian`, or one device's part of it.
+
+    Products have rows in an order of the operator's own, in which neighbours are near in memory: signals `enter` it
+    before the first product, and results `leave` it after the last.
+    """
 
     @property
     def degree(self) -> Float[Array | np.ndarray, " vertices"]:
@@ -37,19 +43,31 @@ class Operator(Protocol):
     def product(
         self, like: Shaped[Array, " vertices *columns"]
     ) -> Callable[[Float[Array, " vertices *columns"]], Float[Array, " vertices *columns"]]:
-        """The map x → Δx for signals of one shape and dtype."""
+        """The map x → Δx in the operator's own order, for signals of one shape and dtype."""
+        ...
+
+    def enter(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+        """Rows in the operator's own order, from the vertices' order."""
+        ...
+
+    def leave(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+        """Rows in the vertices' order, from the operator's own."""
         ...
 
 
 class Neighbours(NamedTuple):
     """Each vertex's neighbours in a table of few slots; what does not fit in is added one by one.
 
-    Reading rows is several times faster than adding to them, and is spread over the cores.
+    Reading rows is several times faster than adding to them, and is spread over the cores. Vertices are rows of the
+    table here.
     """
 
-    vertices: Int[Array | np.ndarray, "slots vertices"]  # any vertex where a slot is empty
-    edges: Int[Array | np.ndarray, "slots vertices"]  # by which they are joined; past the last edge where empty
-    rest: Int[Array | np.ndarray, "rest 3"]  # vertex, neighbour and edge
+    vertices: Int[Array | np.ndarray, "slots vertices"]  # the vertex itself where a slot is empty
+    empty: Int[Array | np.ndarray, " vertices"]  # how many slots are
+    rest: Int[Array | np.ndarray, "rest 3"]  # vertex, neighbour and edge; past the last vertex counts nothing
+    edges: Int[Array | np.ndarray, "slots vertices"] | None  # past the last where empty; None if no edge has a weight
+    order: Int[Array | np.ndarray, " vertices"] | None  # the vertex that each row is of; None if its own
+    rank: Int[Array | np.ndarray, " vertices"] | None  # the row of each vertex
 
 
 class Laplacian(NamedTuple):
@@ -58,8 +76,8 @@ class Laplacian(NamedTuple):
     A vertex without edges is an eigenvector of its own with eigenvalue 0 and has no weight in the inner product.
     """
 
-    edges: Int[Array | np.ndarray, "edges 2"]  # each undirected edge once, no vertex joined to itself
-    weights: Float[Array | np.ndarray, " edges"]  # W, symmetric by construction, non-negative
+    edges: Int[Array | np.ndarray, "edges 2"]  # each once, no vertex joined to itself; past the last vertex, none
+    weights: Float[Array | np.ndarray, " edges"] | None  # W, symmetric by construction, non-negative; None if all are 1
     degree: Float[Array | np.ndarray, " vertices"]  # D: the weights' row sums, 0 where isolated
     neighbours: Neighbours | None = None  # the edges once more, for products by gathering
 
@@ -70,45 +88,53 @@ class Laplacian(NamedTuple):
         Raises:
             JaxmarkError: if `x` is not floating.
         """
-        return self.product(x)(x)
+        return self.leave(self.product(x)(self.enter(x)))
 
     def product(
         self, like: Shaped[Array, " vertices *columns"]
     ) -> Callable[[Float[Array, " vertices *columns"]], Float[Array, " vertices *columns"]]:
-        """The map x → Δx for signals of one shape and dtype; to be made outside a loop over products.
+        """The map x → Δx for signals of one shape and dtype, in the operator's own order; to be made outside a loop.
 
         Raises:
             JaxmarkError: if the signal is not floating.
         """
         if not jnp.issubdtype(like.dtype, jnp.floating):
             raise JaxmarkError(f"Laplacian.apply needs a floating-point signal, got {like.dtype}.")
-        total = self._segments(like) if self.neighbours is None else self._gather(like, self.neighbours)
-        degree = per_row(self.degree, like)
+        degree = per_row(self.enter(jnp.asarray(self.degree)), like)
         # Select before dividing, so that isolated vertices keep finite gradients.
         linked = degree > 0
-        inverse = 1 / jnp.where(linked, degree, 1)
-        return lambda x: jnp.where(linked, x - inverse * total(x), 0)
+        inverse = jnp.where(linked, 1 / jnp.where(linked, degree, 1), 0)
+        own = linked.astype(like.dtype)
+        if (table := self._table) is None:
+            total = self._segments(like)
+        elif self.weights is None:
+            # What the empty slots add is known beforehand.
+            own, total = own + inverse * per_row(table.empty, like), _gather(table)
+        else:
+            total = _weighted_gather(table, self.weights, like)
+        return lambda x: own * x - inverse * total(x)
+
+    def enter(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+        """Rows in the operator's own order; see `Operator`."""
+        return x if self._table is None or self._table.order is None else x[self._table.order]
+
+    def leave(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+        """Rows in the vertices' order; see `Operator`."""
+        return x if self._table is None or self._table.rank is None else x[self._table.rank]
+
+    @property
+    def _table(self) -> Neighbours | None:
+        """The table, unless weights have been put in that it knows nothing of: then, segments serve."""
+        table = self.neighbours
+        return None if table is None or (self.weights is not None and table.edges is None) else table
 
     def _segments(self, like: Array) -> Callable[[Array], Array]:
         """The map x → Wx by two segment-sums over the edges."""
         tail, head = self.edges[:, 0], self.edges[:, 1]
-        weights = per_row(self.weights, like)
+        weights = 1 if self.weights is None else per_row(self.weights, like)
         size = self.degree.shape[0]
         return lambda x: (
             jax.ops.segment_sum(weights * x[head], tail, size) + jax.ops.segment_sum(weights * x[tail], head, size)
-        )
-
-    def _gather(self, like: Array, neighbours: Neighbours) -> Callable[[Array], Array]:
-        """The map x → Wx slot by slot."""
-        padded = jnp.append(jnp.asarray(self.weights).astype(like.dtype), 0)
-        slots = [
-            (per_row(padded[edge], like), vertex)
-            for edge, vertex in zip(neighbours.edges, neighbours.vertices, strict=True)
-        ]
-        tail, head, edge = jnp.asarray(neighbours.rest).T
-        rest = per_row(padded[edge], like)
-        return lambda x: (
-            sum(weight * x[vertex] for weight, vertex in slots) + jnp.zeros_like(x).at[tail].add(rest * x[head])
         )
 
     @jax.jit
@@ -139,7 +165,8 @@ def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence", *, lo
             each vertex's neighbours; `"auto"`, by the table unless the valences differ so much that it does not pay.
 
     Returns:
-        A `Laplacian` of NumPy arrays in float64; it computes in the dtype of the signal it is applied to.
+        A `Laplacian` of NumPy arrays in float64; it computes in the dtype of the signal it is applied to. It has no
+        weights where all are 1; to differentiate by them, put some in by `_replace`.
 
     Raises:
         JaxmarkError: if the weighting is unknown or not finite and non-negative, `[E]`, or a length is zero; or the
@@ -151,7 +178,7 @@ def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence", *, lo
     if isinstance(weights, str):
         match weights:
             case "valence":  # needs no positions: they may be traced
-                values = np.ones(len(pairs))
+                values = None
             case "inverse-length":
                 values = _inverse_lengths(np.asarray(mesh.vertices, np.float64), pairs)
             case "cotangent":
@@ -166,27 +193,78 @@ def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence", *, lo
             raise JaxmarkError(f"weights must have one value for each of the {len(pairs)} edges, got {values.shape}.")
         if not (np.isfinite(values) & (values >= 0)).all():
             raise JaxmarkError("weights must be finite and not negative; otherwise the spectrum leaves [0, 2].")
-    degree = np.bincount(pairs.ravel(), np.repeat(values, 2), minlength=len(mesh.vertices))
-    neighbours = None if lowering == "segments" else make_neighbours(pairs, len(degree), lowering == "auto")
+    size = len(mesh.vertices)
+    degree = np.bincount(pairs.ravel(), None if values is None else np.repeat(values, 2), size).astype(np.float64)
+    neighbours = None
+    if lowering != "segments":
+        order = cuthill_mckee(pairs, size) if size >= _ORDERED else None
+        neighbours = make_neighbours(pairs, size, order, weighted=values is not None, if_it_pays=lowering == "auto")
     return Laplacian(pairs.astype(np.int32), values, degree, neighbours)
 
 
-def make_neighbours(pairs: Int[np.ndarray, "edges 2"], size: int, if_it_pays: bool) -> Neighbours | None:
+def make_neighbours(
+    pairs: Int[np.ndarray, "edges 2"],
+    size: int,
+    order: Int[np.ndarray, " vertices"] | None = None,
+    *,
+    weighted: bool,
+    if_it_pays: bool = False,
+) -> Neighbours | None:
     """The table with as many slots as make a product cheapest; none where it does not pay and that is asked."""
-    (tail, head), edge = np.concatenate([pairs, pairs[:, ::-1]]).T, np.tile(np.arange(len(pairs)), 2)
-    order = np.argsort(tail, kind="stable")
-    tail, head, edge = tail[order], head[order], edge[order]
-    slot = np.arange(len(tail)) - np.searchsorted(tail, tail)
+    rank = None if order is None else np.argsort(order)
+    graph = _adjacency(pairs if rank is None else rank[pairs], size)
+    head, edge, valence = graph.indices, graph.data, np.diff(graph.indptr)
+    tail = np.repeat(np.arange(size), valence)
+    slot = np.arange(len(tail)) - np.repeat(graph.indptr[:-1], valence)
     left = len(tail) - np.cumsum(np.bincount(slot))  # past one slot, past two ...
-    slots = 1 + int(np.argmin(size * np.arange(1, 1 + len(left)) + _SCATTER * left)) if len(left) else 0
-    if if_it_pays and (slots == 0 or size * slots + _SCATTER * left[slots - 1] > _SCATTER * len(tail)):
+    costs = size * np.arange(1, 1 + len(left)) + _SCATTER * left + _PASS * size * (left > 0)
+    if if_it_pays and (len(left) == 0 or costs.min() > _SCATTER * len(tail)):
         return None
+    slots = 1 + int(np.argmin(costs)) if len(left) else 0
     fits = slot < slots
     # An empty slot reads the row that is being written: it is at hand.
     vertices = np.tile(np.arange(size, dtype=np.int32), (slots, 1))
-    edges = np.full((slots, size), len(pairs), np.int32)
-    vertices[slot[fits], tail[fits]], edges[slot[fits], tail[fits]] = head[fits], edge[fits]
-    return Neighbours(vertices, edges, np.stack([tail, head, edge], axis=1)[~fits].astype(np.int32))
+    vertices[slot[fits], tail[fits]] = head[fits]
+    edges = None
+    if weighted:
+        edges = np.full((slots, size), len(pairs), np.int32)
+        edges[slot[fits], tail[fits]] = edge[fits]
+    rest = np.stack([tail, head, edge], axis=1)[~fits].astype(np.int32)
+    empty = slots - np.minimum(valence, slots)
+    orders = (None, None) if rank is None or order is None else (order.astype(np.int32), rank.astype(np.int32))
+    return Neighbours(vertices, empty.astype(np.int32), rest, edges, *orders)
+
+
+def cuthill_mckee(pairs: Int[np.ndarray, "edges 2"], size: int) -> Int64[np.ndarray, " vertices"]:
+    """Vertices in an order that keeps neighbours near."""
+    return csgraph.reverse_cuthill_mckee(_adjacency(pairs, size), symmetric_mode=True).astype(np.int64)
+
+
+def _adjacency(pairs: Int[np.ndarray, "edges 2"], size: int) -> sparse.csr_array:
+    """Each vertex's neighbours; the entries are the numbers of the edges."""
+    (tail, head), edge = np.concatenate([pairs, pairs[:, ::-1]]).T, np.tile(np.arange(len(pairs)), 2)
+    return sparse.csr_array(sparse.coo_array((edge, (tail, head)), shape=(size, size)))
+
+
+def _gather(table: Neighbours) -> Callable[[Array], Array]:
+    """The map x → Wx slot by slot, where no edge has a weight; an empty slot adds the row itself."""
+    slots, rest = list(table.vertices), jnp.asarray(table.rest)
+    return lambda x: _with_rest(sum((x[vertex] for vertex in slots), jnp.zeros_like(x)), rest, x)
+
+
+def _weighted_gather(table: Neighbours, weights: Array | np.ndarray, like: Array) -> Callable[[Array], Array]:
+    """The map x → Wx slot by slot."""
+    assert table.edges is not None
+    padded = jnp.append(jnp.asarray(weights).astype(like.dtype), 0)
+    slots = [(per_row(padded[edge], like), vertex) for edge, vertex in zip(table.edges, table.vertices, strict=True)]
+    rest = jnp.asarray(table.rest)
+    factor = per_row(padded[rest[:, 2]], like)
+    return lambda x: _with_rest(sum((w * x[vertex] for w, vertex in slots), jnp.zeros_like(x)), rest, x, factor)
+
+
+def _with_rest(total: Array, rest: Array, x: Array, factor: Array | float = 1.0) -> Array:
+    """What the table has no slots for, added one by one."""
+    return total.at[rest[:, 0]].add(factor * x[rest[:, 1]]) if len(rest) else total
 
 
 def per_row(values: Num[Array | np.ndarray, " rows"], x: Array | np.ndarray) -> Array:
@@ -206,8 +284,9 @@ def centre(
     x = np.asarray(x, np.float64)
     degree = np.asarray(operator.degree, np.float64)
     size = len(degree)
+    pairs, weights = host_edges(operator)
     # An edge of weight zero joins nothing.
-    tail, head = np.asarray(operator.edges)[np.asarray(operator.weights) > 0].T
+    tail, head = pairs[weights > 0].T
     graph = sparse.coo_array((np.ones(len(tail)), (tail, head)), shape=(size, size))
     count, component = csgraph.connected_components(graph, directed=False)
     mass = np.where(degree > 0, degree, 1.0)
@@ -222,13 +301,20 @@ def centre(
 def sparse_matrices(operator: Laplacian) -> tuple[sparse.csr_array, sparse.dia_array]:
     """(D - W, D) as SciPy sparse matrices in float64, for host-side linear algebra; D⁻¹(D - W) is Δ."""
     degree = np.asarray(operator.degree, np.float64)
-    tail, head = np.asarray(operator.edges).T
-    weights = np.asarray(operator.weights, np.float64)
-    adjacency = sparse.coo_array((weights, (tail, head)), shape=(len(degree), len(degree)))
+    pairs, weights = host_edges(operator)
+    adjacency = sparse.coo_array((weights, tuple(pairs.T)), shape=(len(degree), len(degree)))
     mass = sparse.diags_array(degree)
     stiffness = sparse.csr_array(mass - adjacency - adjacency.T)
     stiffness.eliminate_zeros()
     return stiffness, mass
+
+
+def host_edges(operator: Laplacian) -> tuple[Int[np.ndarray, "edges 2"], Float64[np.ndarray, " edges"]]:
+    """Edges and weights as NumPy arrays, whichever have none in the operator."""
+    pairs = np.asarray(operator.edges)
+    there = pairs[:, 0] < len(operator.degree)
+    weights = np.ones(len(pairs)) if operator.weights is None else np.asarray(operator.weights, np.float64)
+    return pairs[there], weights[there]
 
 
 def _inverse_lengths(vertices: np.ndarray, pairs: np.ndarray) -> np.ndarray:

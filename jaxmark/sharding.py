@@ -19,12 +19,10 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, Int64, Shaped
 from numpy.typing import ArrayLike
-from scipy import sparse
-from scipy.sparse import csgraph
 
 from jaxmark import chebyshev
 from jaxmark.errors import JaxmarkError
-from jaxmark.laplacian import Laplacian, Neighbours, make_neighbours, per_row
+from jaxmark.laplacian import Laplacian, Neighbours, cuthill_mckee, host_edges, make_neighbours, per_row
 
 _AXIS = "devices"
 _PADDING = 0.12  # of what is needed, at most: rounds of unlike flows are fewer, but partly empty
@@ -63,7 +61,7 @@ class Shard(NamedTuple):
     def product(
         self, like: Shaped[Array, " rows *columns"]
     ) -> Callable[[Float[Array, " rows *columns"]], Float[Array, " rows *columns"]]:
-        """The map x → Δx on the block's rows; see `Laplacian.product`. Within `shard_map` only.
+        """The map x → Δx on the block's rows; see `Operator`. Within `shard_map` only.
 
         Raises:
             JaxmarkError: if the signal is not floating.
@@ -74,6 +72,14 @@ class Shard(NamedTuple):
         factor = per_row(self.weights, like) / jnp.where(degree > 0, degree, 1)
         # What is received enters last: meanwhile the block's own edges can be worked on.
         return lambda x: inside(x).at[row].add(-factor * self._received(x)[place])
+
+    def enter(self, x: Shaped[Array, " rows *columns"]) -> Shaped[Array, " rows *columns"]:
+        """The same rows: they came in a good order."""
+        return x
+
+    def leave(self, x: Shaped[Array, " rows *columns"]) -> Shaped[Array, " rows *columns"]:
+        """The same rows."""
+        return x
 
     def _received(self, x: Array) -> Array:
         """The other devices' rows that this one needs, round after round."""
@@ -166,7 +172,8 @@ def partition(operator: Laplacian, count: int, positions: ArrayLike | None = Non
     size = len(operator.degree)
     if not 1 <= count <= size:
         raise JaxmarkError(f"{size} vertices can be shared by 1 to {size} devices, not by {count}.")
-    order = _cuthill_mckee(operator) if positions is None else _along_curve(_checked(positions, size))
+    pairs, weights = host_edges(operator)
+    order = cuthill_mckee(pairs, size) if positions is None else _along_curve(_checked(positions, size))
     rows = -(-size // count)
     # Blocks differ by one vertex at most: no device is left without any.
     start = np.arange(count + 1) * size // count
@@ -177,10 +184,10 @@ def partition(operator: Laplacian, count: int, positions: ArrayLike | None = Non
     vertices[place] = np.arange(size)
     degree = np.zeros(count * rows)
     degree[place] = operator.degree
-    pairs, weights = place[np.asarray(operator.edges)], np.asarray(operator.weights, np.float64)
+    pairs = place[pairs]
     cut = pairs[:, 0] // rows != pairs[:, 1] // rows
-    table = operator.neighbours is not None
-    interior = _interior(pairs[~cut], weights[~cut], degree.reshape(count, rows), table)
+    inside = weights[~cut] if operator.weights is not None else None
+    interior = _interior(pairs[~cut], inside, degree.reshape(count, rows), operator.neighbours is not None)
     return ShardedLaplacian(
         _with_cut(interior, pairs[cut], weights[cut], size), vertices.reshape(count, rows).astype(np.int32)
     )
@@ -244,14 +251,6 @@ def traffic(operator: ShardedLaplacian) -> Traffic:
     return Traffic(sent, plan.boundary, plan.cut)
 
 
-def _cuthill_mckee(operator: Laplacian) -> Int64[np.ndarray, " vertices"]:
-    """Vertices in an order that keeps neighbours near."""
-    size = len(operator.degree)
-    tail, head = np.concatenate([operator.edges, np.asarray(operator.edges)[:, ::-1]]).T
-    graph = sparse.csr_array((np.ones(len(tail), np.int8), (tail, head)), shape=(size, size))
-    return csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
-
-
 def _along_curve(positions: np.ndarray) -> Int64[np.ndarray, " vertices"]:
     """Vertices in their order along a Hilbert curve (Skilling, *Programming the Hilbert curve*, 2004)."""
     low = positions.min(axis=0)
@@ -277,33 +276,37 @@ def _along_curve(positions: np.ndarray) -> Int64[np.ndarray, " vertices"]:
 
 def _interior(
     pairs: Int64[np.ndarray, "edges 2"],
-    weights: Float[np.ndarray, " edges"],
+    weights: Float[np.ndarray, " edges"] | None,
     degree: Float[np.ndarray, "devices rows"],
     table: bool,
 ) -> Laplacian:
     """All devices' own edges; vertices come as device · rows + row."""
     count, rows = degree.shape
     order = np.argsort(pairs[:, 0] // rows, kind="stable")
-    pairs, weights = pairs[order], weights[order]
+    pairs = pairs[order]
     device = pairs[:, 0] // rows
     start = np.searchsorted(device, np.arange(count))
-    edges = _grouped(pairs % rows, device, count, 0)
+    edges = _grouped(pairs % rows, device, count, rows)
     most = edges.shape[1]
-    made = make_neighbours(pairs, count * rows, False) if table else None
+    weights = None if weights is None else _grouped(weights[order], device, count, 0)
+    made = make_neighbours(pairs, count * rows, weighted=weights is not None) if table else None
     if made is not None:
         split = (-1, count, rows)
-        empty = made.edges == len(pairs)
-        edge = np.where(empty, most, made.edges - np.repeat(start, rows)).reshape(split)
+        edge = None
+        if made.edges is not None:
+            edge = np.where(made.edges == len(pairs), most, made.edges - np.repeat(start, rows)).reshape(split)
+            edge = np.moveaxis(edge, 1, 0).astype(np.int32)
         owner = made.rest[:, 0] // rows
         rest = np.c_[made.rest[:, :2] % rows, made.rest[:, 2] - start[owner]]
-        # Nowhere is past the last edge, where the weight is 0.
-        nowhere = np.array([0, 0, most])
         made = Neighbours(
             np.moveaxis(made.vertices.reshape(split) % rows, 1, 0),
-            np.moveaxis(edge, 1, 0).astype(np.int32),
-            _grouped(rest, owner, count, nowhere).astype(np.int32),
+            made.empty.reshape(count, rows),
+            _grouped(rest, owner, count, rows).astype(np.int32),
+            edge,
+            None,
+            None,
         )
-    return Laplacian(edges.astype(np.int32), _grouped(weights, device, count, 0), degree, made)
+    return Laplacian(edges.astype(np.int32), weights, degree, made)
 
 
 def _with_cut(

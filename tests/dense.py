@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from jaxmark.laplacian import Laplacian
+from jaxmark.laplacian import Laplacian, host_edges
 
 
 def laplacian_matrix(operator: Laplacian) -> np.ndarray:
     """Δ = I - D⁻¹W entry by entry, a zero row for an isolated vertex."""
     degree = np.asarray(operator.degree, np.float64)
     weights = np.zeros((len(degree), len(degree)))
-    for (i, j), value in zip(np.asarray(operator.edges), np.asarray(operator.weights, np.float64), strict=True):
+    for (i, j), value in zip(*host_edges(operator), strict=True):
         weights[i, j] += value
         weights[j, i] += value
     matrix = np.zeros_like(weights)

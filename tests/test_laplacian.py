@@ -7,16 +7,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.laplacian import Laplacian, centre, make_laplacian, sparse_matrices
+from jaxmark.laplacian import Laplacian, centre, host_edges, make_laplacian, sparse_matrices
 from jaxmark.mesh import Mesh, edges, make_mesh
 from jaxmark.spectrum import eigenpairs
 from tests.dense import laplacian_matrix, tolerance
 
 WEIGHTINGS = ["valence", "inverse-length", "cotangent"]
-LOWERINGS = ["gather", "segments"]
 
 
-@pytest.mark.parametrize("lowering", LOWERINGS)
+@pytest.fixture(params=["gather", "segments", "ordered"])
+def lowering(request, monkeypatch):
+    """Small meshes are not ordered otherwise."""
+    if request.param != "ordered":
+        return request.param
+    monkeypatch.setattr("jaxmark.laplacian._ORDERED", 0)
+    return "gather"
+
+
 @pytest.mark.parametrize("weights", WEIGHTINGS)
 @pytest.mark.parametrize("columns", [(), (3,)])
 def test_apply_is_the_dense_matrix(hard_graph: Mesh, lowering, weights, columns, dtype):
@@ -123,7 +130,6 @@ def test_sparse_matrices(hard_graph: Mesh):
     np.testing.assert_allclose(stiffness.toarray(), mass.toarray() @ laplacian_matrix(operator), atol=1e-12)
 
 
-@pytest.mark.parametrize("lowering", LOWERINGS)
 def test_transformations(hard_graph: Mesh, lowering, x64):
     operator = make_laplacian(hard_graph, lowering=lowering)
     matrix = laplacian_matrix(operator)
@@ -143,9 +149,10 @@ def fan(spokes: int) -> Mesh:
     return make_mesh(np.random.default_rng(5).normal(size=(spokes + 1, 3)), faces)
 
 
-def test_what_a_table_has_no_slots_for_is_added_one_by_one(dtype):
+@pytest.mark.parametrize("weights", WEIGHTINGS)
+def test_what_a_table_has_no_slots_for_is_added_one_by_one(weights, dtype):
     mesh = fan(200)
-    operator = make_laplacian(mesh, "inverse-length")
+    operator = make_laplacian(mesh, weights)
     assert operator.neighbours is not None
     assert len(operator.neighbours.vertices) == 3
     assert len(operator.neighbours.rest) == 197
@@ -164,15 +171,29 @@ def test_a_table_is_used_where_it_pays(unchecked):
         make_laplacian(sparse, lowering="scatter")
 
 
-@pytest.mark.parametrize("lowering", LOWERINGS)
-def test_gradients_of_weights_are_finite_and_right(hard_graph: Mesh, lowering, x64):
+def test_what_is_past_the_last_vertex_counts_nothing(hard_graph: Mesh, lowering, dtype):
+    """Arrays can be filled up to one shape."""
     operator = make_laplacian(hard_graph, lowering=lowering)
+    size = len(hard_graph.vertices)
+    filled = operator._replace(edges=np.concatenate([operator.edges, np.full((3, 2), size)]))
+    if (table := operator.neighbours) is not None:
+        table = table._replace(rest=np.concatenate([table.rest, np.full((2, 3), size)]))
+    filled = filled._replace(neighbours=table)
+    x = jnp.asarray(hard_graph.vertices, dtype)
+    np.testing.assert_array_equal(filled.apply(x), operator.apply(x))
+    np.testing.assert_array_equal(laplacian_matrix(filled), laplacian_matrix(operator))
+
+
+@pytest.mark.parametrize("weights", WEIGHTINGS)
+def test_gradients_of_weights_are_finite_and_right(hard_graph: Mesh, lowering, weights, x64):
+    operator = make_laplacian(hard_graph, weights, lowering=lowering)
+    assert (operator.weights is None) == (weights == "valence")
     x = jnp.asarray(hard_graph.vertices)
 
     def loss(weights, degree):
         return jnp.sum(operator._replace(weights=weights, degree=degree).apply(x) ** 2)
 
-    at = np.asarray(operator.weights), np.asarray(operator.degree)
+    at = host_edges(operator)[1], np.asarray(operator.degree)
     gradients = jax.grad(loss, (0, 1))(*map(jnp.asarray, at))
     rng = np.random.default_rng(8)
     for step in ((rng.normal(size=len(at[0])), 0), (0, rng.normal(size=len(at[1])) * np.sign(at[1]))):
