@@ -133,7 +133,8 @@ def _points(original: Original) -> Mesh:
 def _file(original: Original) -> Pose:
     """From positions in diagonals to the original's file."""
     vertices = np.asarray(original.mesh.vertices)[original.weld.first]
-    return Pose(original.diagonal * np.eye(3), vertices[original.used].mean(axis=0))
+    used = original.used[: len(vertices)]
+    return Pose(original.diagonal * np.eye(3), vertices[used].mean(axis=0))
 
 
 def _by_points(

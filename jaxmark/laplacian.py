@@ -220,7 +220,9 @@ def make_neighbours(
     costs = size * np.arange(1, 1 + len(left)) + _SCATTER * left + _PASS * size * (left > 0)
     if if_it_pays and (len(left) == 0 or costs.min() > _SCATTER * len(tail)):
         return None
+    # Even, so that the tables of more meshes have one shape.
     slots = 1 + int(np.argmin(costs)) if len(left) else 0
+    slots += slots % 2
     fits = slot < slots
     # An empty slot reads the row that is being written: it is at hand.
     vertices = np.tile(np.arange(size, dtype=np.int32), (slots, 1))

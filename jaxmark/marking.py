@@ -189,7 +189,8 @@ class Marker:
         given, point = np.asarray(weights, np.float64), self.original.weld.point
         if given.shape != point.shape or not (np.isfinite(given) & (given >= 0)).all():
             raise JaxmarkError(f"weights must be {len(point)} finite numbers, not negative, one for each vertex.")
-        return np.bincount(point, given) / np.bincount(point)
+        size = len(self.original.used)
+        return np.bincount(point, given, size) / np.maximum(np.bincount(point, minlength=size), 1)
 
     def _check_capacity(
         self, scheme: KeyedScheme, carrier: KeyedCarrier, reached: float, conditions: Conditions

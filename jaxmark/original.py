@@ -11,6 +11,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.keys import points_hash
 from jaxmark.laplacian import Laplacian, centre, make_laplacian
 from jaxmark.mesh import Mesh, Weld, diagonal, host_mesh, same_connectivity, used_vertices, weld, welded_mesh
+from jaxmark.shapes import fill, with_common_shapes, with_common_size
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +20,7 @@ class Original:
 
     mesh: Mesh  # as in its file
     weld: Weld
-    used: Bool[np.ndarray, " points"]  # which points faces use
+    used: Bool[np.ndarray, " points"]  # which points faces use; those past the weld's only fill up arrays
     diagonal: float  # in the file's units
     geometry: bytes  # hash of the canonical geometry
     operator: Laplacian  # on the welded points
@@ -38,8 +39,9 @@ def prepare(mesh: Mesh) -> Original:
     mesh = host_mesh(mesh)
     welded = weld(mesh.vertices)
     points = welded_mesh(mesh, welded)
-    length = diagonal(mesh)
-    operator = make_laplacian(points)
+    length, geometry = diagonal(mesh), points_hash(points)
+    points = with_common_size(points)
+    operator = with_common_shapes(make_laplacian(points))
     dtype = jax.dtypes.canonicalize_dtype(np.float64)
     used = used_vertices(points)
     positions = np.asarray(points.vertices, np.float64)
@@ -47,7 +49,7 @@ def prepare(mesh: Mesh) -> Original:
     positions[~used] = 0
     signal = jnp.asarray(centre(operator, positions), dtype)
     traced = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype if leaf.dtype == np.float64 else None), operator)
-    return Original(mesh, welded, used, length, points_hash(points), traced, positions, signal)
+    return Original(mesh, welded, used, length, geometry, traced, positions, signal)
 
 
 def displaced(original: Original, shift: Float64[np.ndarray, "points 3"]) -> Mesh:
@@ -58,7 +60,8 @@ def displaced(original: Original, shift: Float64[np.ndarray, "points 3"]) -> Mes
 
 def residual(original: Original, suspect: Mesh) -> Float64[np.ndarray, "points 3"]:
     """How far a suspect's points lie from the original's; see `displacement`."""
-    return displacement(original.mesh, suspect, original.weld, original.diagonal)
+    shift = displacement(original.mesh, suspect, original.weld, original.diagonal)
+    return fill(shift, len(original.used))
 
 
 def displacement(mesh: Mesh, suspect: Mesh, welded: Weld, length: float) -> Float64[np.ndarray, "points 3"]:
