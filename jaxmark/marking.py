@@ -24,7 +24,7 @@ from jaxmark.observation import Observation
 from jaxmark.original import Original, prepare
 from jaxmark.payload import Capacity, Conditions
 from jaxmark.record import Record
-from jaxmark.schemes import DEFAULT_SCHEME, KeyedScheme, Scheme, get_scheme, parameters_of
+from jaxmark.schemes import DEFAULT_SCHEME, SCHEMES, KeyedScheme, Scheme, get_scheme, parameters_of
 
 DEFAULT_BITS = 64
 NOISE = 0.005  # the strongest of the SMI 2010 protocol
@@ -250,7 +250,7 @@ def make_marker(
         bits = record.bits
         if isinstance(scheme, str):
             scheme = get_scheme(record.scheme, record.parameters)
-        elif (scheme.name, parameters_of(scheme)) != (record.scheme, record.parameters):
+        elif not _recorded(scheme, record):
             raise JaxmarkError(
                 f"The record is of the scheme {record.scheme!r} with {dict(record.parameters)}, not {scheme}."
             )
@@ -259,6 +259,13 @@ def make_marker(
     code = scheme.code_length(ready, payload)
     carrier = scheme.carrier(ready, key, payload, code)
     return Marker(ready, key, payload, scheme, carrier, code, detector or scheme.detector)
+
+
+def _recorded(scheme: Scheme, record: Record) -> bool:
+    """Whether a record is of a scheme, which may be one of the caller's own."""
+    if scheme.name in SCHEMES:
+        return scheme == get_scheme(record.scheme, record.parameters)
+    return (scheme.name, parameters_of(scheme)) == (record.scheme, dict(record.parameters))
 
 
 def embed(

@@ -1,4 +1,5 @@
 import dataclasses
+from functools import partial
 
 import jax
 import numpy as np
@@ -309,3 +310,17 @@ def test_distortions_have_finite_gradients_at_zero(dtype):
         assert metric(one).dtype == dtype
     assert float(distortion.maximum(one)) == 3.0
     assert float(distortion.rms(one)) == pytest.approx(3 / np.sqrt(5))
+
+
+def test_a_record_is_of_the_scheme_that_wrote_it(sphere: Mesh, key: jm.Key, tmp_path):
+    """Also once its tuples have been through JSON, and where it lacks what schemes had not then."""
+    scheme, path = KeyedScheme(profile=(1.0, 0.5) * 10), tmp_path / "record.json"
+    record = jm.embed(sphere, b"record", key, scheme=scheme)[1].record
+    path.write_text(record.to_json())
+    make = partial(jm.make_marker, sphere, key)
+    assert make(record=jm.Record.load(path), scheme=scheme).scheme == scheme
+    old = dataclasses.replace(record, parameters={k: v for k, v in record.parameters.items() if k != "passband"})
+    narrow = dataclasses.replace(scheme, passband="narrow")
+    assert make(record=old, scheme=narrow).scheme == make(record=old).scheme == narrow
+    with pytest.raises(jm.JaxmarkError, match="record is of the scheme 'keyed'"):
+        make(record=old, scheme=scheme)
