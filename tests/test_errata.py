@@ -103,7 +103,7 @@ def test_bands_cover_the_spectrum_up_to_58_percent():
 
 
 def test_side_lobes_where_meshes_have_their_energy():
-    """Printed: a band is small outside its own. At λ = 0 the next ones keep -0.42, 0.25, -0.18 of their node's value."""
+    """Printed: bands are small elsewhere. At λ = 0 the next ones keep -0.42, 0.25 and -0.18 of their node's value."""
     at_zero = chebyshev.chebval(-1, scaling(64).T)
     np.testing.assert_allclose(at_zero[1:4], [-0.42, 0.25, -0.18], atol=5e-3)
 
