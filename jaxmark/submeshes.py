@@ -1,0 +1,173 @@
+"""Sub-meshes, each marked on its own: what is lost with one part leaves the others' messages whole.
+
+Parts grow from feature vertices by breadth-first search (Sohn et al.), all at once: a point belongs to the feature that
+it is fewest edges away from. Every point is in one part, and a part's faces are those that have all corners in it: the
+faces along seams are nobody's, so that a mesh put together again has the faces it had and no gap.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int, Int64
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from jaxmark import alignment
+from jaxmark.alignment import Align, Alignment
+from jaxmark.errors import JaxmarkError
+from jaxmark.marking import Detection, EmbedInfo, Marker, make_marker
+from jaxmark.mesh import Mesh, edges, host_mesh, used_vertices, weld, welded_mesh
+from jaxmark.original import Original, prepare
+from jaxmark.schemes import DEFAULT_SCHEME, Scheme
+from jaxmark.shapes import fill
+
+
+@dataclass(frozen=True, eq=False)
+class PartMarker:
+    """A marker for each part of an original. Make one with `make_part_marker`."""
+
+    original: Original
+    label: Int64[np.ndarray, " vertices"]  # the part of each vertex
+    markers: Sequence[Marker]
+
+    def embed(self, messages: Sequence[bytes], budget: float) -> tuple[Mesh, list[EmbedInfo]]:
+        """Hide a message in each part.
+
+        Args:
+            messages: one for each part, each of the markers' payload.
+            budget: RMS displacement of each part's points, relative to the diagonal of the *whole* original.
+
+        Returns:
+            The marked mesh (float64 vertices, same faces), and what was done to each part, in its own diagonals.
+
+        Raises:
+            JaxmarkError: if there is not one message for each part, or a part cannot carry its own; see `embed`.
+        """
+        if len(messages) != len(self.markers):
+            raise JaxmarkError(f"{len(self.markers)} parts need as many messages, got {len(messages)}.")
+        vertices, infos = np.array(self.original.mesh.vertices, np.float64), []
+        for part, (marker, message) in enumerate(zip(self.markers, messages, strict=True)):
+            try:
+                marked, info = marker.embed(message, budget * self.original.diagonal / marker.original.diagonal)
+            except JaxmarkError as error:
+                raise JaxmarkError(f"Part {part} of {len(self.markers)}: {error}") from None
+            vertices[self.label == part] = marked.vertices
+            infos.append(info)
+        return Mesh(vertices, self.original.mesh.faces), infos
+
+    def detect(self, suspect: Mesh, align: Align = "auto") -> list[Detection]:
+        """Read all parts of a suspect, which is aligned as a whole and only once.
+
+        A detection's false-positive probability is of its own part alone.
+
+        Raises:
+            JaxmarkError: see `alignment.align`.
+        """
+        whole = alignment.align(self.original, suspect, align)
+        return [marker.detect(self._of_part(whole, part)) for part, marker in enumerate(self.markers)]
+
+    def _of_part(self, whole: Alignment, part: int) -> Alignment:
+        """What a suspect shows of a part, in the part's diagonals."""
+        own = self.markers[part].original
+        vertices = np.flatnonzero(self.label == part)[own.weld.first]
+        points, scale = self.original.weld.point[vertices], self.original.diagonal / own.diagonal
+
+        def rows(values: np.ndarray | None) -> np.ndarray | None:
+            return None if values is None else fill(values[points], len(own.used))
+
+        displacement, weights = scale * whole.displacement[points], whole.weights[points] * own.used[: len(points)]
+        return whole._replace(
+            displacement=fill(displacement, len(own.used)),
+            weights=fill(weights, len(own.used)),
+            normals=rows(whole.normals),
+            nuisance=rows(whole.nuisance),
+            residual=scale * whole.residual,
+        )
+
+
+def make_part_marker(
+    original: Mesh,
+    key: bytes,
+    features: int | Int[np.ndarray, " parts"],
+    *,
+    bits: int,
+    scheme: str | Scheme = DEFAULT_SCHEME,
+) -> PartMarker:
+    """Cut an original into parts and prepare each for marking.
+
+    Args:
+        original: the unmarked mesh.
+        key: 32 bytes, from `new_key`; parts share nothing that is derived from it, for their geometry differs.
+        features: vertices that the parts grow from; or how many, for those that are farthest from each other.
+        bits: payload of each part.
+        scheme: see `make_marker`.
+
+    Raises:
+        JaxmarkError: if a feature is no vertex that faces use, or is named twice; or see `make_marker`.
+    """
+    ready = prepare(original)
+    chosen = farthest_vertices(ready.mesh, features) if isinstance(features, int) else np.asarray(features)
+    label, markers = parts(ready.mesh, chosen), []
+    for part in range(len(chosen)):
+        inside = np.flatnonzero(label == part)
+        place = np.full(len(label), -1)
+        place[inside] = np.arange(len(inside))
+        faces = place[np.asarray(ready.mesh.faces)]
+        faces = faces[(faces >= 0).all(axis=1)]
+        if not len(faces):
+            raise JaxmarkError(f"Part {part}, from vertex {chosen[part]}, has no face; use fewer or other features.")
+        markers.append(make_marker(Mesh(np.asarray(ready.mesh.vertices)[inside], faces), key, bits=bits, scheme=scheme))
+    return PartMarker(ready, label, markers)
+
+
+def parts(mesh: Mesh, features: Int[np.ndarray, " parts"]) -> Int64[np.ndarray, " vertices"]:
+    """The part of each vertex: its nearest feature by number of edges between welded points; -1 if none is reached.
+
+    Raises:
+        JaxmarkError: if a feature is no vertex that faces use, or two are the same point.
+    """
+    mesh, features = host_mesh(mesh), np.asarray(features)
+    used = used_vertices(mesh)
+    if len(features) == 0 or not ((features >= 0) & (features < len(used))).all() or not used[features].all():
+        raise JaxmarkError(f"Features are vertices that faces use, at least one, got {features.tolist()}.")
+    welded = weld(mesh.vertices)
+    points = welded.point[features]
+    if len(np.unique(points)) < len(points):
+        raise JaxmarkError(f"Features must be different points, got {features.tolist()}.")
+    graph = _graph(welded_mesh(mesh, welded))
+    _, _, nearest = csgraph.dijkstra(graph, indices=points, unweighted=True, min_only=True, return_predecessors=True)
+    part = np.full(len(welded.first) + 1, -1)  # one more, for those that nothing reaches
+    part[points] = np.arange(len(points))
+    return part[np.maximum(nearest, -1)][welded.point]
+
+
+def farthest_vertices(mesh: Mesh, count: int) -> Int64[np.ndarray, " parts"]:
+    """Vertices far from each other: from the one farthest from the middle on, the one most edges from all before it.
+
+    Args:
+        mesh: any mesh; parts that are connected with no vertex yet come first.
+        count: how many, at least 1.
+
+    Raises:
+        JaxmarkError: if there are not so many points.
+    """
+    mesh = host_mesh(mesh)
+    welded = weld(mesh.vertices)
+    points = welded_mesh(mesh, welded)
+    used = used_vertices(points)
+    if not 1 <= count <= used.sum():
+        raise JaxmarkError(f"This mesh has 1 to {int(used.sum())} feature vertices, not {count}.")
+    graph, position = _graph(points), np.asarray(points.vertices)
+    off = np.where(used, np.linalg.norm(position - position[used].mean(axis=0), axis=1), -1)
+    chosen, hops = [int(np.argmax(off))], np.where(used, np.inf, -1)
+    while len(chosen) < count:
+        hops = np.minimum(hops, csgraph.dijkstra(graph, indices=chosen[-1], unweighted=True))
+        chosen.append(int(np.argmax(hops)))
+    return welded.first[chosen]
+
+
+def _graph(mesh: Mesh) -> sparse.csr_array:
+    pairs, size = edges(mesh.faces), len(mesh.vertices)
+    both = np.concatenate([pairs, pairs[:, ::-1]]).T
+    return sparse.csr_array((np.ones(len(both[0])), tuple(both)), shape=(size, size))
