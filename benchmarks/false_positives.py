@@ -103,7 +103,7 @@ def claims(
         chips, words = [], []
         for seed in range(start, start + BATCH):
             key = jm.Key(seed.to_bytes(32, "little"))
-            chips.append(make_chips(key, original.geometry, original.used, marker.code))
+            chips.append(make_chips(key, original.geometry, original.moving, marker.code))
             words.append([encode(message, key, original.geometry, marker.code) for message in messages])
         batch = jax.tree.map(lambda *leaves: np.stack(leaves), *chips)
         found.append([np.asarray(part).T for part in best(batch, jnp.asarray(np.array(words), jnp.float32))])

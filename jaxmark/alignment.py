@@ -8,7 +8,6 @@ else, on the points that agree with it. What lies far off was cut away, replaced
 import time
 from typing import Literal, NamedTuple, get_args
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int64
 
@@ -64,14 +63,13 @@ class Alignment(NamedTuple):
 
 def observation(original: Original, found: Alignment) -> Observation:
     """What an aligned suspect shows of each point's displacement, in diagonals, in the original's dtype; key-free."""
-    dtype = original.signal.dtype
 
     def array(value: np.ndarray | None) -> Array | None:
-        return None if value is None else jnp.asarray(value, dtype)
+        return None if value is None else original.traced(value)
 
     return Observation(
-        jnp.asarray(found.displacement, dtype),
-        jnp.asarray(found.weights, dtype),
+        original.traced(found.displacement),
+        original.traced(found.weights),
         array(found.normals),
         array(found.nuisance),
     )
@@ -133,8 +131,7 @@ def _points(original: Original) -> Mesh:
 def _file(original: Original) -> Pose:
     """From positions in diagonals to the original's file."""
     vertices = np.asarray(original.mesh.vertices)[original.weld.first]
-    used = original.used[: len(vertices)]
-    return Pose(original.diagonal * np.eye(3), vertices[used].mean(axis=0))
+    return Pose(original.diagonal * np.eye(3), vertices[original.used].mean(axis=0))
 
 
 def _by_points(

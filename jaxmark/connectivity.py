@@ -29,7 +29,7 @@ def matching_vertices(mesh: Mesh, other: Mesh) -> Int64[np.ndarray, " vertices"]
             _, i, j = np.intersect1d(first[alone], second[there], assume_unique=True, return_indices=True)
             # A wider neighbourhood tells more than a narrower one.
             found[alone[i]] = there[j]
-            if len(i) in (0, used_vertices(mesh).sum()):
+            if len(i) == 0 or len(i) == len(found):
                 break
     found = _once(found, len(other.vertices))
     if np.sum(found >= 0) < _TRUSTED * min(used_vertices(mesh).sum(), used_vertices(other).sum()):

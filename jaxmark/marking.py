@@ -150,13 +150,13 @@ class Marker:
                 )
             fitted = evidence.log10_p_fitted(score, norm, 0 if message is not None else self.bits)
         size = np.sqrt(np.mean(soft**2)) or 1.0
-        coverage = float(np.mean(np.asarray(observed.weights)[self.original.used] > 0))
+        coverage = float(np.mean(self.original.on_host(observed.weights)[self.original.used] > 0))
         return Detection(found, log10_p, fitted, soft / size, coverage, aligned)
 
     def write(self, amplitudes: Float64[np.ndarray, " code"], budget: Budget) -> tuple[Mesh, EmbedInfo]:
         """Displace the original by the carrier of any amplitudes, as far as the budget allows; see `budget.write`."""
         original = self.original
-        unit = np.asarray(self.carrier.displacement(jnp.asarray(amplitudes, original.signal.dtype)), np.float64)
+        unit = original.on_host(self.carrier.displacement(jnp.asarray(amplitudes, original.signal.dtype)))
         size = float(distortion.rms(unit[original.used]))
         if not (math.isfinite(size) and size > 0):
             raise JaxmarkError(
@@ -189,8 +189,7 @@ class Marker:
         given, point = np.asarray(weights, np.float64), self.original.weld.point
         if given.shape != point.shape or not (np.isfinite(given) & (given >= 0)).all():
             raise JaxmarkError(f"weights must be {len(point)} finite numbers, not negative, one for each vertex.")
-        size = len(self.original.used)
-        return np.bincount(point, given, size) / np.maximum(np.bincount(point, minlength=size), 1)
+        return np.bincount(point, given) / np.bincount(point)
 
     def _check_capacity(
         self, scheme: KeyedScheme, carrier: KeyedCarrier, reached: float, conditions: Conditions

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float64
+from jaxtyping import Array, Bool, Float, Float64, Shaped
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import points_hash
@@ -16,16 +16,32 @@ from jaxmark.shapes import fill, with_common_shapes, with_common_size
 
 @dataclass(frozen=True, eq=False)
 class Original:
-    """What embedding and detection need of an original; lengths are in units of its bounding-box diagonal."""
+    """What embedding and detection need of an original; lengths are in units of its bounding-box diagonal.
+
+    Traced arrays have some rows more than there are points, of isolated vertices: see `jaxmark.shapes`.
+    """
 
     mesh: Mesh  # as in its file
     weld: Weld
-    used: Bool[np.ndarray, " points"]  # which points faces use; those past the weld's only fill up arrays
+    used: Bool[np.ndarray, " points"]  # which points faces use
     diagonal: float  # in the file's units
     geometry: bytes  # hash of the canonical geometry
-    operator: Laplacian  # on the welded points
+    operator: Laplacian  # on the welded points, traced
     positions: Float64[np.ndarray, "points 3"]  # welded points, centred as a whole, in diagonals
-    signal: Float[Array, "points 3"]  # the same, centred per component
+    signal: Float[Array, "rows 3"]  # the same, centred per component, traced
+
+    @property
+    def moving(self) -> Bool[np.ndarray, " rows"]:
+        """Which rows of traced arrays are of points that faces use."""
+        return fill(self.used, len(self.signal))
+
+    def traced(self, values: Shaped[np.ndarray, " points *columns"]) -> Float[Array, " rows *columns"]:
+        """Values of each point for traced code, in its dtype."""
+        return jnp.asarray(fill(values, len(self.signal)), self.signal.dtype)
+
+    def on_host(self, values: Float[Array, " rows *columns"]) -> Float64[np.ndarray, " points *columns"]:
+        """Values of each point, back from traced code."""
+        return np.asarray(values[: len(self.used)], np.float64)
 
 
 def prepare(mesh: Mesh) -> Original:
@@ -40,14 +56,13 @@ def prepare(mesh: Mesh) -> Original:
     welded = weld(mesh.vertices)
     points = welded_mesh(mesh, welded)
     length, geometry = diagonal(mesh), points_hash(points)
-    points = with_common_size(points)
-    operator = with_common_shapes(make_laplacian(points))
+    operator = with_common_shapes(make_laplacian(with_common_size(points)))
     dtype = jax.dtypes.canonicalize_dtype(np.float64)
     used = used_vertices(points)
     positions = np.asarray(points.vertices, np.float64)
     positions = (positions - positions[used].mean(axis=0)) / length
     positions[~used] = 0
-    signal = jnp.asarray(centre(operator, positions), dtype)
+    signal = jnp.asarray(centre(operator, fill(positions, len(operator.degree))), dtype)
     traced = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype if leaf.dtype == np.float64 else None), operator)
     return Original(mesh, welded, used, length, geometry, traced, positions, signal)
 
@@ -60,8 +75,7 @@ def displaced(original: Original, shift: Float64[np.ndarray, "points 3"]) -> Mes
 
 def residual(original: Original, suspect: Mesh) -> Float64[np.ndarray, "points 3"]:
     """How far a suspect's points lie from the original's; see `displacement`."""
-    shift = displacement(original.mesh, suspect, original.weld, original.diagonal)
-    return fill(shift, len(original.used))
+    return displacement(original.mesh, suspect, original.weld, original.diagonal)
 
 
 def displacement(mesh: Mesh, suspect: Mesh, welded: Weld, length: float) -> Float64[np.ndarray, "points 3"]:

@@ -34,8 +34,7 @@ class Room(NamedTuple):
 
 def room(carrier: KeyedCarrier, original: Original) -> Room:
     """Measure a carrier by one probe of random signs in place of the keyed ones."""
-    dtype = carrier.host.signal.dtype
-    whole, left = np.asarray(_probe(carrier, jnp.asarray(original.used, dtype)), np.float64).clip(0)
+    whole, left = np.asarray(_probe(carrier, original.traced(original.used)), np.float64).clip(0)
     strength = np.ones(len(whole)) if carrier.profile is None else np.asarray(carrier.profile, np.float64)
     # Three coordinates, or one along normals, of each vertex make a band's whole.
     displaced = whole @ strength**2 / original.used.sum()
@@ -153,7 +152,7 @@ class Capacity:
         if layout not in self._reached:
             carrier = self._carrier(bits, self._scheme.code_length(self._original, bits))
             probe = carrier.displacement(jnp.ones(len(carrier.chips.population), carrier.host.signal.dtype))
-            reached = write(self._original, np.asarray(probe, np.float64), budget).moved.rms
+            reached = write(self._original, self._original.on_host(probe), budget).moved.rms
             # Two marks under the same limits differ by a percent or so.
             self._reached[layout] = 0.98 * reached
         return self._reached[layout]

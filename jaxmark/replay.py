@@ -13,6 +13,7 @@ from jaxmark.chebyshev import band_components
 from jaxmark.laplacian import Laplacian, Weighting, make_laplacian
 from jaxmark.mesh import Mesh, area
 from jaxmark.pose import Points
+from jaxmark.shapes import fill, with_common_shapes, with_common_size
 from jaxmark.surfaces import Surface, barycentric
 
 _SCALES = 9  # of smoothing, by 1 to 256 steps of half the way
@@ -75,8 +76,8 @@ def replayed_points(
         return None
     x = np.asarray(original.vertices)
     # Smoothing of any kind and amount shows in these already; marks and noise do not, and end here.
-    once = operator.apply(jnp.asarray(x, jnp.float32))
-    signs = np.concatenate([once, operator.apply(once)], axis=1)
+    once = operator.apply(jnp.asarray(fill(x, len(operator.degree)), jnp.float32))
+    signs = np.concatenate([once, operator.apply(once)], axis=1)[: len(x)]
     if _likeliest([signs], x, displacement, None, weights, _SIGNS_LEFT) is None:
         return None
     columns = np.concatenate(_smoothed(original, "cotangent", x), axis=1)
@@ -86,8 +87,9 @@ def replayed_points(
 def _smoothed(mesh: Mesh, weighting: Weighting, signal: Points) -> list[Float32[np.ndarray, "points 3"]]:
     """A signal after smoothing by a mesh's Laplacian, by several amounts."""
     family = diffusion(_SCALES, 4 * 2 ** (_SCALES // 2) + 1)
-    amounts = band_components(make_laplacian(mesh, weighting), family, jnp.asarray(signal, jnp.float32))
-    return list(np.asarray(amounts))
+    operator = with_common_shapes(make_laplacian(with_common_size(mesh), weighting))
+    amounts = band_components(operator, family, jnp.asarray(fill(signal, len(operator.degree)), jnp.float32))
+    return list(np.asarray(amounts)[:, : len(signal)])
 
 
 def _likeliest(

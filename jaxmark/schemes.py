@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
@@ -136,16 +135,16 @@ class KeyedScheme:
         host = make_host(
             original.operator,
             original.signal,
-            jnp.asarray(original.positions, dtype),
+            original.traced(original.positions),
             scaling(self.bands, damping="jackson")[: layout.passing],
             scales=layout.scales,
             degree=layout.degree,
         )
-        chips = make_chips(key, original.geometry, original.used, code_bits, channels=self._channels)
+        chips = make_chips(key, original.geometry, original.moving, code_bits, channels=self._channels)
         carrier = KeyedCarrier(host, chips, profile=self.strengths(original, bits).astype(dtype))
         if self.direction == "normals":
             normals = vertex_normals(Mesh(original.positions, original.weld.point[np.asarray(original.mesh.faces)]))
-            carrier = carrier._replace(normals=jnp.asarray(normals, dtype))
+            carrier = carrier._replace(normals=original.traced(normals))
         return carrier._replace(masking=masking(original)) if self.masking else carrier
 
     @property

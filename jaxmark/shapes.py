@@ -32,16 +32,17 @@ def with_common_size(mesh: Mesh) -> Mesh:
 
 
 def with_common_shapes(operator: Laplacian) -> Laplacian:
-    """An operator of NumPy arrays, without weights, with as many edges as others have on as many vertices.
+    """An operator of NumPy arrays with as many edges as others have on as many vertices.
 
     What is filled in is past the last vertex.
     """
-    size = len(operator.degree)
-    if operator.weights is not None or size > _LARGE:
+    size, edges = len(operator.degree), np.asarray(operator.edges)
+    if size > _LARGE:
         return operator
     # A closed surface of triangles has about three edges per vertex.
-    edges = np.asarray(operator.edges)
-    filled = operator._replace(edges=fill(edges, 3 * size if len(edges) <= 3 * size else common(len(edges)), size))
+    count = 3 * size if len(edges) <= 3 * size else common(len(edges))
+    weights = None if operator.weights is None else fill(np.asarray(operator.weights), count)
+    filled = operator._replace(edges=fill(edges, count, size), weights=weights)
     if (table := operator.neighbours) is None:
         return filled
     rest = np.asarray(table.rest)

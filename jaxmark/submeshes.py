@@ -20,7 +20,6 @@ from jaxmark.marking import Detection, EmbedInfo, Marker, make_marker
 from jaxmark.mesh import Mesh, edges, host_mesh, used_vertices, weld, welded_mesh
 from jaxmark.original import Original, prepare
 from jaxmark.schemes import DEFAULT_SCHEME, Scheme
-from jaxmark.shapes import fill
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,18 +69,13 @@ class PartMarker:
     def _of_part(self, whole: Alignment, part: int) -> Alignment:
         """What a suspect shows of a part, in the part's diagonals."""
         own = self.markers[part].original
-        vertices = np.flatnonzero(self.label == part)[own.weld.first]
-        points, scale = self.original.weld.point[vertices], self.original.diagonal / own.diagonal
-
-        def rows(values: np.ndarray | None) -> np.ndarray | None:
-            return None if values is None else fill(values[points], len(own.used))
-
-        displacement, weights = scale * whole.displacement[points], whole.weights[points] * own.used[: len(points)]
+        points = self.original.weld.point[np.flatnonzero(self.label == part)[own.weld.first]]
+        scale = self.original.diagonal / own.diagonal
         return whole._replace(
-            displacement=fill(displacement, len(own.used)),
-            weights=fill(weights, len(own.used)),
-            normals=rows(whole.normals),
-            nuisance=rows(whole.nuisance),
+            displacement=scale * whole.displacement[points],
+            weights=whole.weights[points] * own.used,
+            normals=None if whole.normals is None else whole.normals[points],
+            nuisance=None if whole.nuisance is None else whole.nuisance[points],
             residual=scale * whole.residual,
         )
 

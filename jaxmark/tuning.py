@@ -106,19 +106,19 @@ def tune(
         raise JaxmarkError(f"tune knows marks along coordinates, not along {scheme.direction}.")
     original, family = prepare(mesh), scaling(scheme.bands, damping="jackson")
     signs = jax.random.rademacher(jax.random.key(5), original.signal.shape, original.signal.dtype)
-    signs = signs * jnp.asarray(original.used, signs.dtype)[:, None]
+    signs = signs * original.traced(original.used)[:, None]
 
-    hidden = np.asarray(masking(original), np.float64)[:, None] if scheme.masking else 1.0
+    hidden = original.on_host(masking(original))[:, None] if scheme.masking else 1.0
 
     def shaped(strengths: Float64[np.ndarray, " bands"]) -> Float64[np.ndarray, "points 3"]:
-        return hidden * np.asarray(filter(original.operator, family.T @ strengths, signs), np.float64)
+        return hidden * original.on_host(filter(original.operator, family.T @ strengths, signs))
 
     cost = _costs(original, family, signs, bounds)
     equal = 1 / np.sqrt(len(family) * cost.sum(axis=0))
     # Equal shares, so that each band is measured.
     probe = shaped(equal)
     written = write(original, probe, bounds)
-    mark = jnp.asarray(written.scale * probe, original.signal.dtype)
+    mark = original.traced(written.scale * probe)
     numbers = np.asarray(jax.random.randint(key, (seeds,), 0, 2**31 - 1))
     suspects = [[_apply(one, written.mesh, int(seed)) for seed in numbers] for one in attacks]
     seen = [[observation(original, align(original, suspect)) for suspect in row] for row in suspects]
@@ -126,7 +126,7 @@ def tune(
     def measured(profile: tuple[float, ...]) -> Channels:
         layout = replace(scheme, profile=profile).layout(original, bits)
         host = make_host(
-            *(original.operator, original.signal, jnp.asarray(original.positions, original.signal.dtype), family),
+            *(original.operator, original.signal, original.traced(original.positions), family),
             scales=layout.scales,
             degree=layout.degree,
         )

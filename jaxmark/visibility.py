@@ -36,12 +36,12 @@ def band_visibility(
         JaxmarkError: see `distortion.compare`.
     """
     signs = jax.random.rademacher(jax.random.key(4), original.signal.shape, original.signal.dtype)
-    signs = signs * jnp.asarray(original.used, signs.dtype)[:, None]
+    signs = signs * original.traced(original.used)[:, None]
     count = len(coefficients)
     tried = np.unique(np.round(np.geomspace(1, count, min(_SAMPLES, count))).astype(int)) - 1
     values = []
     for band in tried:
-        shift = np.asarray(filter(original.operator, coefficients[band], signs), np.float64)
+        shift = original.on_host(filter(original.operator, coefficients[band], signs))
         size = float(distortion.rms(shift[original.used]))
         # Beyond the mesh's spectrum there is nothing to see.
         found = _per_rms(original, shift / size, metrics) if size > 1e-6 else [np.inf] * len(metrics)

@@ -165,16 +165,16 @@ def test_a_channel_is_what_was_done_to_the_bands():
     """A mark weakened by a known filter, in noise of known strength."""
     original, family = prepare(rough_sphere(2000)), scaling(16, damping="jackson")
     host = make_host(
-        *(original.operator, original.signal, jnp.asarray(original.positions, original.signal.dtype), family),
+        *(original.operator, original.signal, original.traced(original.positions), family),
         scales=2,
         degree=2,
     )
     random = np.random.default_rng(0)
-    signs = jnp.asarray(random.choice([-1.0, 1.0], (2000, 3)), jnp.float32)
+    signs = original.traced(random.choice([-1.0, 1.0], (2000, 3)))
     response = np.linspace(1, 0.2, 16)
-    noise = jnp.asarray(random.normal(size=(2000, 3)), jnp.float32)
+    noise = original.traced(random.normal(size=(2000, 3)))
     residual = 1e-3 * filter(original.operator, family.T @ response, signs) + 3e-4 * noise
-    found = measure(host, observe(residual), 1e-3 * signs)
+    found = measure(host, observe(residual, original.traced(original.used)), 1e-3 * signs)
     counted = np.asarray(found.dimensions[0])
     assert counted.sum() == pytest.approx(3 * (2000 - host.nuisance.shape[1]), rel=0.02)
     # The response of a band is its own, averaged with its neighbours'.
