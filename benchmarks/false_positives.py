@@ -93,7 +93,7 @@ def claims(
     @jax.jit
     def best(chips, codewords):
         def claim(one, chip, words):
-            score, norm = jax.vmap(lambda word: carrier._replace(chips=chip).claim(one, word))(words)
+            score, norm = jax.lax.map(lambda word: carrier._replace(chips=chip).claim(one, word), words)
             return score.max(), norm.max()
 
         return jax.lax.map(lambda one: jax.vmap(lambda chip, words: claim(one, chip, words))(chips, codewords), stacked)

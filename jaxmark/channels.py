@@ -15,6 +15,7 @@ from jaxmark.carriers.carrier import Displacement
 from jaxmark.chebyshev import cross_moments
 from jaxmark.laplacian import Laplacian
 from jaxmark.observation import Observation
+from jaxmark.precision import matmul
 from jaxmark.reception import Host, clean, receive
 
 Margin = Literal["rate", "evidence", "snr"]
@@ -58,7 +59,7 @@ def band_energies(
     """⟨u, f_j(Δ)v⟩ for each band, with vertices weighed by valence over its mean; of unit noise, the dimensions."""
     moments = cross_moments(operator, u, v, degree=coefficients.shape[1] - 1)
     mass = operator.degree.astype(u.dtype)
-    return coefficients @ moments.sum(axis=1) * (jnp.sum(jnp.sign(mass)) / mass.sum())
+    return matmul(coefficients, moments.sum(axis=1)) * (jnp.sum(jnp.sign(mass)) / mass.sum())
 
 
 @jax.jit
@@ -77,7 +78,7 @@ def measure(host: Host, seen: Observation, mark: Displacement) -> Channels:
     host = received.host
 
     def kept(x: Array) -> Array:
-        return clean(host, received.seen, received.factor, x) @ received.axes
+        return matmul(clean(host, received.seen, received.factor, x), received.axes)
 
     written, found = kept(mark), received.residual
     probe = kept(jax.random.rademacher(jax.random.key(3), mark.shape, mark.dtype))

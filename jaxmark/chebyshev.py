@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.laplacian import Laplacian, Operator, per_row
+from jaxmark.precision import einsum
 
 Signal = Float[Array | np.ndarray, " vertices *columns"]
 
@@ -206,12 +207,12 @@ def gram(
     match method:
         case "bands":
             y = band_components(operator, c, x)
-            return jnp.einsum("v,iv...,jv...->...ij", jnp.asarray(operator.degree).astype(x.dtype), y, y)
+            return einsum("v,iv...,jv...->...ij", jnp.asarray(operator.degree).astype(x.dtype), y, y)
         case "moments":
             terms = c.shape[1]
             m = moments(operator, x, degree=terms - 1)
             j, k = np.indices((terms, terms))
-            return jnp.einsum("ij,jk...,lk->...il", c, (m[j + k] + m[np.abs(j - k)]) / 2, c)
+            return einsum("ij,jk...,lk->...il", c, (m[j + k] + m[np.abs(j - k)]) / 2, c)
     raise JaxmarkError(f"gram(method=...) must be 'bands' or 'moments', got {method!r}.")
 
 

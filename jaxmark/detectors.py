@@ -17,6 +17,7 @@ from jaxmark.carriers.carrier import Strength
 from jaxmark.chebyshev import filter, transpose
 from jaxmark.errors import JaxmarkError
 from jaxmark.observation import Observation
+from jaxmark.precision import matmul
 from jaxmark.reception import Reception, clean, whitening
 
 Detector = Callable[[Carrier, Observation, Strength], Float[Array, " bits"]]
@@ -83,10 +84,10 @@ def _decoded(
 
     def forward(bits: Array) -> Array:
         spread = carrier.modulate(bits, model)
-        return white(clean(host, received.seen, received.factor, spread) @ received.axes)
+        return white(matmul(clean(host, received.seen, received.factor, spread), received.axes))
 
     def backward(white: Array) -> Array:
-        dull = transpose(host.operator, equaliser, white) @ received.axes
+        dull = matmul(transpose(host.operator, equaliser, white), received.axes)
         return carrier.correlate(clean(host, received.seen, received.factor, dull), model)
 
     def white(x: Array) -> Array:
@@ -98,16 +99,16 @@ def _decoded(
     key_bits, key_noise = jax.random.split(jax.random.key(1))
     bits = jax.random.rademacher(key_bits, carrier.chips.population.shape, observed.dtype)
     signs = jax.random.rademacher(key_noise, observed.shape, observed.dtype)
-    coloured = filter(host.operator, host.coefficients.T @ jnp.sqrt(received.power), signs)
+    coloured = filter(host.operator, matmul(host.coefficients.T, jnp.sqrt(received.power)), signs)
     noise = white(clean(host, received.seen, received.factor, coloured))
     # One after the other, so that there is less to compile.
     matched, response, after = jax.lax.map(backward, jnp.stack([observed, forward(bits), noise]))
     ridge = _noise_to_signal(
         jnp.stack([jnp.sum(observed**2), jnp.sum(matched**2)]),
-        jnp.stack([bits @ response, jnp.sum(response**2)]),
+        jnp.stack([jnp.sum(bits * response), jnp.sum(response**2)]),
         jnp.stack([jnp.sum(noise**2), jnp.sum(after**2)]),
     )
-    energy = bits @ response / len(bits)
+    energy = jnp.sum(bits * response) / len(bits)
     ridge = jax.lax.stop_gradient(jnp.where(energy > 0, energy * jnp.clip(ridge / energy, *_BALANCE), 1))
     return cg(lambda bits: backward(forward(bits)) + ridge * bits, matched, tol=tolerance, maxiter=steps)[0]
 

@@ -1,7 +1,8 @@
 """What a score proves: probabilities of false detection that hold for any suspect independent of the key.
 
 All results are log10 of an upper bound on the probability, at most 0, and at least -77: a 256-bit key supports no claim
-below 2⁻²⁵⁶.
+below 2⁻²⁵⁶. Scores and norms are taken in the type that they were summed in: what `precision.sum_and_norm` may be off
+by there is taken from the score, so that rounding makes no probability too small.
 """
 
 import math
@@ -11,6 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 from scipy import stats
+
+from jaxmark.precision import matmul
 
 FLOOR = -77.0
 
@@ -76,7 +79,8 @@ def _log10_tail(score: ArrayLike, norm: ArrayLike) -> float:
     s, a = float(np.asarray(score, np.float64)), float(np.asarray(norm, np.float64))
     if not (s > 0 and a > 0 and math.isfinite(s) and math.isfinite(a)):
         return 0.0
-    return -((s / a) ** 2) / 2 / math.log(10)
+    rounding = 4 * float(np.finfo(np.result_type(np.asarray(score), np.asarray(norm), np.float16)).eps)
+    return -(max(s / a - rounding * (1 + s / a), 0.0) ** 2) / 2 / math.log(10)
 
 
 def _bounded(log10_p: float) -> float:
@@ -107,4 +111,4 @@ def correlation_bound(
     """
     k, n = sequences.shape
     spread = beta * k * n + jnp.abs(attack).sum()
-    return beta * n - jnp.abs(sequences @ attack) - coherence * (n - 1) * spread
+    return beta * n - jnp.abs(matmul(sequences, attack)) - coherence * (n - 1) * spread

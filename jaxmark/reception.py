@@ -19,6 +19,7 @@ from jaxmark.bands import diffusion
 from jaxmark.chebyshev import band_components, filter, gram, over_bands
 from jaxmark.laplacian import Laplacian, per_row
 from jaxmark.observation import Observation
+from jaxmark.precision import einsum, matmul
 
 _BLOCK = 2**14  # vertices whose nuisance is handled at a time
 _SAMPLE = 2**13  # that tell a basis well enough
@@ -110,15 +111,15 @@ def _basis(columns: Callable[..., Array], *rows: Array) -> Float[Array, "vertice
     nearly = scale[:, None] * jsl.solve_triangular(square, jnp.diag(sound.astype(raw.dtype)))
 
     def products(fresh: Array, *block: Array) -> Array:
-        part = columns(*block) @ nearly
-        return part.T @ (fresh[:, None] * part)
+        part = matmul(columns(*block), nearly)
+        return matmul(part.T, fresh[:, None] * part)
 
     normal = jnp.where(sound[:, None] & sound, _sum_over_blocks(products, *still), eye)
     change = jsl.solve_triangular(jnp.linalg.cholesky(normal), nearly.T, lower=True).T
 
     def write(basis: Array, start: Array) -> tuple[Array, None]:
         place, block = _block(start, rows)
-        part = jax.checkpoint(lambda *block: columns(*block) @ change)(*block)
+        part = jax.checkpoint(lambda *block: matmul(columns(*block), change))(*block)
         return jax.lax.dynamic_update_slice_in_dim(basis, part, place, 0), None
 
     return jax.lax.scan(write, jnp.zeros((count, len(norm)), raw.dtype), _starts(count))[0]
@@ -174,7 +175,7 @@ def _receive(host: Host, seen: Observation) -> tuple[Array, Array, Array, Array,
     pair = jnp.concatenate([residual, clean(host, seen, factor, probe)], axis=1)
     squares = gram(host.operator, host.coefficients, pair, method="moments")
     # Rounding may leave less than nothing in a band.
-    bands, reference = jnp.maximum(jnp.einsum("pcjj->pj", squares.reshape(2, 3, *squares.shape[1:])), 0)
+    bands, reference = jnp.maximum(einsum("pcjj->pj", squares.reshape(2, 3, *squares.shape[1:])), 0)
     tiny = 1e-6
     power = (bands + tiny * bands.sum()) / (reference + tiny * reference.sum() + jnp.finfo(bands.dtype).tiny)
     largest = power.max()
@@ -191,19 +192,19 @@ def _receive(host: Host, seen: Observation) -> tuple[Array, Array, Array, Array,
     change, whole = over_bands(products, host.operator, host.coefficients, pair)
     gain = 1 + jnp.where(whole > 0, change / jnp.where(whole > 0, whole, 1), 0)
     axes = _axes(filter(host.operator, whitening(host, power), residual), seen)
-    return (residual @ axes, jnp.clip(gain, 0, 2), power, axes, seen, factor)
+    return (matmul(residual, axes), jnp.clip(gain, 0, 2), power, axes, seen, factor)
 
 
 def whitening(host: Host, power: Float[Array, " bands"]) -> Float[Array, " terms"]:
     """Coefficients of the filter that makes all bands equally strong."""
-    return host.coefficients.T @ (1 / jnp.sqrt(power))
+    return matmul(host.coefficients.T, 1 / jnp.sqrt(power))
 
 
 def _axes(white: Float[Array, "vertices 3"], seen: Observation) -> Float[Array, "3 3"]:
     """C^-1/2 of the covariance C of the three coordinates, which an inverted stretch leaves unequal; of mean 1."""
     if seen.normals is not None:
         return jnp.eye(3, dtype=white.dtype)
-    products = white.T @ white
+    products = matmul(white.T, white)
     total = jnp.trace(products)
     covariance = products / jnp.where(total > jnp.finfo(white.dtype).tiny, total, 1)
     # A direction in which nothing moved is not to count for everything.
@@ -215,7 +216,7 @@ def _axes(white: Float[Array, "vertices 3"], seen: Observation) -> Float[Array, 
 def _inverse_root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """A^-1/2 of a symmetric positive matrix; its derivative (Daleckii, Krein 1965) exists where eigenvalues meet."""
     values, vectors = jnp.linalg.eigh(matrix)
-    return vectors / jnp.sqrt(values) @ vectors.T
+    return matmul(vectors / jnp.sqrt(values), vectors.T)
 
 
 @_inverse_root.defjvp
@@ -223,8 +224,8 @@ def _inverse_root_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Ar
     values, vectors = jnp.linalg.eigh(primals[0])
     root = jnp.sqrt(values)
     slopes = -1 / (jnp.outer(root, root) * (root[:, None] + root))
-    change = vectors @ (slopes * (vectors.T @ tangents[0] @ vectors)) @ vectors.T
-    return vectors / root @ vectors.T, change
+    change = slopes * einsum("ki,kl,lj->ij", vectors, tangents[0], vectors)
+    return matmul(vectors / root, vectors.T), einsum("ik,kl,jl->ij", vectors, change, vectors)
 
 
 def _robust(residual: Float[Array, "vertices 3"], weights: Float[Array, " vertices"]) -> Float[Array, " vertices"]:
@@ -239,7 +240,7 @@ def normal_factor(host: Host, seen: Observation) -> Float[Array, "unknowns unkno
 
     def products(weights: Array) -> Array:
         return _sum_over_blocks(
-            lambda fresh, rows, weight: rows.T @ ((fresh * weight)[:, None] * rows), host.nuisance, weights
+            lambda fresh, rows, weight: matmul(rows.T, (fresh * weight)[:, None] * rows), host.nuisance, weights
         )
 
     if seen.normals is None:
@@ -263,10 +264,10 @@ def clean(
 
 def _explained(host: Host, seen: Observation, factor: Array, x: Array) -> Array:
     """The nuisance that fits a displacement best, where and as it is seen."""
-    matched = host.nuisance.T @ seen.weigh(x)
+    matched = matmul(host.nuisance.T, seen.weigh(x))
     if seen.normals is None:
-        return host.nuisance @ jsl.cho_solve((factor, True), matched)
-    return host.nuisance @ jsl.cho_solve((factor, True), matched.ravel()).reshape(-1, 3)
+        return matmul(host.nuisance, jsl.cho_solve((factor, True), matched))
+    return matmul(host.nuisance, jsl.cho_solve((factor, True), matched.ravel()).reshape(-1, 3))
 
 
 def _polynomials(inside: Float[Array, "vertices 3"], degree: int) -> Float[Array, "vertices columns"]:

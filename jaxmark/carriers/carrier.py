@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxmark.observation import Observation
+from jaxmark.precision import einsum, sum_and_norm
 
 Displacement = Float[Array, "vertices 3"]
 Strength = (
@@ -69,28 +70,25 @@ class ModulatedCarrier(NamedTuple):
 
     def displacement(self, bits: Float[Array, " bits"], beta: Strength = 1.0) -> Displacement:
         """See `Carrier`."""
-        amplitudes = jnp.tensordot(self._as_real(bits), self._sequences, 1)
+        amplitudes = einsum("k,kjc->jc", self._as_real(bits), self._sequences)
         return self.components.synthesise(self._per_band(beta) * amplitudes)
 
     def adjoint(self, residual: Displacement, beta: Strength = 1.0) -> Float[Array, " bits"]:
         """See `Carrier`."""
         found = self._per_band(beta) * self.components.analyse(self._as_real(residual))
-        return jnp.einsum("kjc,jc->k", self._sequences, found)
+        return einsum("kjc,jc->k", self._sequences, found)
 
     def gram(self, beta: Strength = 1.0) -> Float[Array, "bits bits"]:
         """See `Carrier`."""
         weighted = self._per_band(beta) * self._sequences
-        return jnp.einsum("ajc,cjl,blc->ab", weighted, self.components.gram, weighted)
+        return einsum("ajc,cjl,blc->ab", weighted, self.components.gram, weighted)
 
     def claim(self, seen: Observation, bits: Float[Array, " bits"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """See `Carrier`; one sign per band and coordinate, or per band where coordinates share their sequences."""
         found = self.components.analyse(self._as_real(seen.weigh(seen.residual)))
         if self.sequences.shape[-1] == 1:
             found = found.sum(axis=1, keepdims=True)
-        terms = jnp.tensordot(self._as_real(bits), self._as_real(self.sequences), 1) * found
-        # Squares of tiny terms underflow where their sum does not: S/‖a‖ must not depend on the residual's size.
-        peak = jnp.max(jnp.abs(terms))
-        return terms.sum(), peak * jnp.linalg.norm(terms / jnp.where(peak > 0, peak, 1))
+        return sum_and_norm(einsum("k,kjc->jc", self._as_real(bits), self._as_real(self.sequences)) * found)
 
     @property
     def _sequences(self) -> Float[Array, "bits bands 3"]:

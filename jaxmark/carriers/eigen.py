@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmark.laplacian import Laplacian
+from jaxmark.precision import einsum, matmul
 from jaxmark.spectrum import Eigenpairs
 
 
@@ -29,15 +30,15 @@ class Eigenspaces(NamedTuple):
     def gram(self) -> Float[Array, "3 bands bands"]:
         """See `Components`: eigenspaces are orthogonal, so it is 1 on the diagonal where a band is used, else 0."""
         used = jax.ops.segment_sum(self.direction**2, self.space, len(self.space))
-        return jnp.einsum("jc,jk->cjk", used, jnp.eye(len(self.space), dtype=used.dtype))
+        return einsum("jc,jk->cjk", used, jnp.eye(len(self.space), dtype=used.dtype))
 
     def synthesise(self, amplitudes: Float[Array, "bands 3"]) -> Float[Array, "vertices 3"]:
         """See `Components`."""
-        return self.vectors @ (self.direction * amplitudes[self.space])
+        return matmul(self.vectors, self.direction * amplitudes[self.space])
 
     def analyse(self, residual: Float[Array, "vertices 3"]) -> Float[Array, "bands 3"]:
         """See `Components`."""
-        found = self.direction * (self.vectors.T @ (self.degree[:, None] * residual))
+        found = self.direction * matmul(self.vectors.T, self.degree[:, None] * residual)
         return jax.ops.segment_sum(found, self.space, len(self.space))
 
 
@@ -56,7 +57,7 @@ def eigenspaces(operator: Laplacian, signal: Float[Array | np.ndarray, "vertices
     vectors = jnp.asarray(pairs.vectors).astype(signal.dtype)
     degree = jnp.asarray(operator.degree).astype(signal.dtype)
     space = jnp.asarray(pairs.space)
-    found = vectors.T @ (degree[:, None] * signal)
+    found = matmul(vectors.T, degree[:, None] * signal)
     squares = jax.ops.segment_sum(found**2, space, len(space))
     full = squares > 1e-12 * operator.inner(signal, signal)
     scale = jnp.where(full, 1 / jnp.sqrt(jnp.where(full, squares, 1)), 0)

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxmark.chebyshev import cross_moments, filter, gram
 from jaxmark.laplacian import Laplacian
+from jaxmark.precision import matmul
 
 # A band that holds less than this share of the host's norm holds its neighbours' leakage and rounding noise; scaled up
 # to unit norm it would carry nothing else.
@@ -25,13 +26,13 @@ class HostBands(NamedTuple):
 
     def synthesise(self, amplitudes: Float[Array, "bands 3"]) -> Float[Array, "vertices 3"]:
         """See `Components`: all bands are one filter per coordinate, with coefficients Cᵀ·amplitudes."""
-        return filter(self.operator, self.coefficients.T @ (self.scale * amplitudes), self.signal)
+        return filter(self.operator, matmul(self.coefficients.T, self.scale * amplitudes), self.signal)
 
     def analyse(self, residual: Float[Array, "vertices 3"]) -> Float[Array, "bands 3"]:
         """See `Components`: all bands need only the moments ⟨residual, T_k(Δ̃)x⟩_D."""
         terms = self.coefficients.shape[1]
         products = cross_moments(self.operator, residual, self.signal, degree=terms - 1)
-        return self.scale * (self.coefficients @ products)
+        return self.scale * matmul(self.coefficients, products)
 
 
 def host_bands(

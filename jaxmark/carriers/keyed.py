@@ -16,6 +16,7 @@ from jaxmark.chebyshev import filter, transpose
 from jaxmark.keys import permutation, signs
 from jaxmark.laplacian import per_row
 from jaxmark.observation import Observation
+from jaxmark.precision import matmul, sum_and_norm
 from jaxmark.reception import Host, Reception, receive
 
 
@@ -77,17 +78,19 @@ class KeyedCarrier(NamedTuple):
     def claim(
         self, seen: Observation | Reception, bits: Float[Array, " bits"]
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """See `Carrier`: a is what `matched` gives, up to the bits' signs."""
+        """See `Carrier`: a is what `matched` gives, up to the bits' signs.
+
+        a is free of the key as it is computed, rounding and all: only the two sums can be wrong, see `sum_and_norm`.
+        """
         return self._claim(self.received(seen), bits)
 
     @jax.jit
     def _claim(self, received: Reception, bits: Float[Array, " bits"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        matched = jnp.abs(self._signs) * self.matched(received)
-        return jnp.sum(bits * self._despread(matched)), jnp.linalg.norm(matched)
+        return sum_and_norm(self._spread(bits) * self.matched(received))
 
     def matched(self, received: Reception, beta: Strength = 1.0) -> Float[Array, "vertices channels"]:
         """The vector that the keyed signs multiply: the residual through the filter matched to gain and power."""
-        return self.match(received.residual @ received.axes, self.shape(beta, received.gain / received.power))
+        return self.match(matmul(received.residual, received.axes), self.shape(beta, received.gain / received.power))
 
     def shape(self, beta: Strength, weight: Float[Array, " bands"] | None = None) -> Float[Array, " terms *channels"]:
         """Chebyshev coefficients of Σ_j weight_j β_j f_j."""
@@ -97,11 +100,11 @@ class KeyedCarrier(NamedTuple):
         for factor in (weight, self.profile):
             if factor is not None:
                 strength = per_row(jnp.asarray(factor), strength) * strength
-        return self.host.coefficients.T @ strength
+        return matmul(self.host.coefficients.T, strength)
 
     def modulate(self, bits: Float[Array, " bits"], shape: Float[Array, " terms *channels"]) -> Displacement:
         """The chips of the bits through a filter of the given coefficients."""
-        return self.shaped(self._signs * jnp.asarray(bits).astype(self._signs.dtype)[self.chips.slots], shape)
+        return self.shaped(self._spread(bits), shape)
 
     def correlate(self, residual: Displacement, shape: Float[Array, " terms *channels"]) -> Float[Array, " bits"]:
         """The plain adjoint of `modulate`: Σ_v ⟨modulate(a)_v, r_v⟩ is the dot product of a and this."""
@@ -122,6 +125,9 @@ class KeyedCarrier(NamedTuple):
         if self.masking is not None:
             along = jnp.asarray(self.masking)[:, None] * along
         return transpose(self.host.operator, shape, along)
+
+    def _spread(self, bits: Float[Array, " bits"]) -> Float[Array, "vertices channels"]:
+        return self._signs * jnp.asarray(bits).astype(self._signs.dtype)[self.chips.slots]
 
     def _despread(self, matched: Float[Array, "vertices channels"]) -> Float[Array, " bits"]:
         products = self._signs * matched

@@ -17,6 +17,7 @@ from jaxmark.distortion.dihedral import Hinges, make_hinges
 from jaxmark.distortion.neighbourhoods import Neighbourhoods, filled, make_neighbourhoods
 from jaxmark.distortion.structure import contributions, cubic_mean, window_statistics
 from jaxmark.mesh import Mesh
+from jaxmark.precision import einsum
 from jaxmark.surfaces import Surface, barycentric
 
 # In longest sides of the distorted mesh's box.
@@ -131,12 +132,12 @@ def msdm(original: Float[Array, "vertices 3"], distorted: Float[Array, "vertices
 def _compared(original: Array, distorted: Array, views: Views, offset: float) -> tuple[Array, Array, Array]:
     """Contributions of curvature, contrast and structure, `[scales, centres]` each."""
     share = jnp.asarray(views.share).astype(distorted.dtype)
-    there = jnp.einsum("vk,vkc->vc", share, original[views.corners])
+    there = einsum("vk,vkc->vc", share, original[views.corners])
 
     def one(scale: Scale) -> tuple[Array, Array, Array]:
         first = curvature(curvature_tensor(original, views.hinges[0], scale.original)) * views.unit
         second = curvature(curvature_tensor(distorted, views.hinges[1], scale.distorted)) * views.unit
-        matched = jnp.einsum("vk,vk->v", share, first[jnp.asarray(views.corners)])
+        matched = einsum("vk,vk->v", share, first[jnp.asarray(views.corners)])
         found = window_statistics((matched, second), (there, distorted), scale.windows, scale.sigma)
         return contributions(jax.tree.map(lambda value: value[jnp.asarray(views.centres)], found), offset)
 
