@@ -183,7 +183,7 @@ def embed_command(
     if message is not None:
         marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
         result, info = marker.embed(message, budget, limits=dict(limits) or None, noise=noise, read_back=False)
-        said, reads = f"{info.record.bits} bits", lambda mesh: marker.detect(mesh).message == message
+        said, reads = f"{info.record.bits} bits", lambda mesh: marker.reads(mesh, message)
     else:
         if scheme != DEFAULT_SCHEME:
             raise JaxmarkError(f"Fingerprints are carried by the scheme {DEFAULT_SCHEME!r}, not {scheme!r}.")

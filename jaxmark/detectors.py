@@ -1,6 +1,6 @@
 """Detectors: from what a suspect shows to one soft value per bit.
 
-`correlate` and `decorrelate` go with any carrier; `joint` needs a keyed one, which knows its host.
+`correlate` and `decorrelate` go with any carrier; `matched` and `joint` need a keyed one, which knows its host.
 """
 
 from collections.abc import Callable
@@ -49,6 +49,20 @@ def decorrelate(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Fl
     return jsl.cho_solve(factor, correlate(carrier, seen, beta))
 
 
+def matched(carrier: Carrier, seen: Observation | Reception, beta: Strength = 1.0) -> Float[Array, " bits"]:
+    """Plain correlations of what is received: one filter, with the other bits as noise to each.
+
+    The score of a claimed message is the sum of these, each by its code bit. Arguments and errors as `joint`.
+    """
+    return _matched(*_received("matched", carrier, seen), beta)
+
+
+@jax.jit
+def _matched(carrier: KeyedCarrier, received: Reception, beta: Strength) -> Float[Array, " bits"]:
+    shape = carrier.shape(beta, received.gain / received.power)
+    return carrier.correlate(received.residual @ received.axes, shape)
+
+
 def joint(carrier: Carrier, seen: Observation | Reception, beta: Strength = 1.0) -> Float[Array, " bits"]:
     """All bits together: least mean square error, by conjugate gradients on the bits, nothing of size bits² formed.
 
@@ -68,9 +82,13 @@ def joint(carrier: Carrier, seen: Observation | Reception, beta: Strength = 1.0)
     Raises:
         JaxmarkError: if the carrier knows no host.
     """
+    return _decoded(*_received("joint", carrier, seen), beta, _TOLERANCE, _STEPS)
+
+
+def _received(name: str, carrier: Carrier, seen: Observation | Reception) -> tuple[KeyedCarrier, Reception]:
     if not isinstance(carrier, KeyedCarrier):
-        raise JaxmarkError(f"The joint detector reads keyed carriers, not {type(carrier).__name__}.")
-    return _decoded(carrier, carrier.received(seen), beta, _TOLERANCE, _STEPS)
+        raise JaxmarkError(f"The {name} detector reads keyed carriers, not {type(carrier).__name__}.")
+    return carrier, carrier.received(seen)
 
 
 @partial(jax.jit, static_argnames=("tolerance", "steps"))

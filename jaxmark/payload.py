@@ -19,7 +19,7 @@ from jaxmark.keys import KEY_BYTES
 from jaxmark.message import TAG_BITS
 from jaxmark.observation import observe
 from jaxmark.original import Original
-from jaxmark.reception import clean, normal_factor
+from jaxmark.reception import Receiver, clean, make_receiver, normal_factor
 from jaxmark.schemes import KeyedScheme, Layout
 
 _GAP = 1.0  # decibel, of the polar code at a message error rate of 1e-3; `benchmarks/limit.py --code-only` measures it
@@ -35,7 +35,9 @@ class Room(NamedTuple):
 def room(carrier: KeyedCarrier, original: Original) -> Room:
     """Measure a carrier by one probe of random signs in place of the keyed ones."""
     dtype = carrier.host.signal.dtype
-    whole, left = np.asarray(_probe(carrier, jnp.asarray(original.used, dtype)), np.float64).clip(0)
+    whole, left = np.asarray(
+        _probe(carrier, make_receiver(carrier.host), jnp.asarray(original.used, dtype)), np.float64
+    ).clip(0)
     strength = np.ones(len(whole)) if carrier.profile is None else np.asarray(carrier.profile, np.float64)
     # Three coordinates, or one along normals, of each vertex make a band's whole.
     displaced = whole @ strength**2 / original.used.sum()
@@ -43,9 +45,8 @@ def room(carrier: KeyedCarrier, original: Original) -> Room:
 
 
 @jax.jit
-def _probe(carrier: KeyedCarrier, moving: Float[Array, " vertices"]) -> Float[Array, "2 bands"]:
+def _probe(carrier: KeyedCarrier, host: Receiver, moving: Float[Array, " vertices"]) -> Float[Array, "2 bands"]:
     """Energies of random signs in each band, before and after projection."""
-    host = carrier.host
     signs = jax.random.rademacher(jax.random.key(2), carrier.chips.signs.shape, moving.dtype) * moving[:, None]
     everything = observe(jnp.zeros_like(host.signal), moving)
     factor = normal_factor(host, everything)

@@ -12,11 +12,11 @@ import jaxmark as jm
 from jaxmark import detectors
 from jaxmark.bands import scaling
 from jaxmark.carriers import Carrier, KeyedCarrier, ModulatedCarrier, host_bands, make_chips
-from jaxmark.detectors import joint
+from jaxmark.detectors import joint, matched
 from jaxmark.laplacian import centre, make_laplacian
 from jaxmark.mesh import vertex_normals
 from jaxmark.observation import Observation, observe
-from jaxmark.reception import make_host, receive
+from jaxmark.reception import make_host, make_receiver, receive
 from jaxmark.watermark import detect, embed
 from tests.dense import chebyshev_matrices
 from tests.samples import bumpy_sphere
@@ -179,10 +179,13 @@ def test_claim_is_a_sum_over_keyed_signs(direction, small: Case, key: jm.Key, dt
     tolerance = 1e-9 if dtype == np.float64 else 1e-3
     assert terms.sum() == pytest.approx(float(score), rel=tolerance, abs=tolerance * float(norm))
     assert np.linalg.norm(terms) == pytest.approx(float(norm), rel=tolerance)
-    matched = np.asarray(carrier.matched(receive(carrier.host, seen)), np.float64)
-    expected = matched * carrier.chips.signs * np.asarray(bits)[carrier.chips.slots]
+    vector = np.asarray(carrier.matched(receive(carrier.host, seen)), np.float64)
+    expected = vector * carrier.chips.signs * np.asarray(bits)[carrier.chips.slots]
     np.testing.assert_allclose(terms, expected, atol=tolerance * float(norm))
-    assert np.abs(matched[~small.moving]).max() > 0  # and yet it takes no part
+    assert np.abs(vector[~small.moving]).max() > 0  # and yet it takes no part
+    # Bit by bit, without the bits' signs, these are the plain correlations.
+    plain = np.bincount(np.ravel(carrier.chips.slots), np.ravel(vector * carrier.chips.signs))
+    np.testing.assert_allclose(matched(carrier, seen), plain, atol=tolerance * float(norm))
 
 
 @pytest.mark.parametrize("direction", ["coordinates", "normals"])
@@ -347,7 +350,7 @@ def dense_equations(case: Case, carrier: KeyedCarrier, seen: Observation, beta) 
 def dense_clean(carrier: KeyedCarrier, seen: Observation) -> np.ndarray:
     """x ↦ Ω(x - best nuisance), as a matrix `[3N, 3N]`, by least squares on what is seen."""
     count = len(seen.weights)
-    columns = np.kron(np.asarray(carrier.host.nuisance), np.eye(3))
+    columns = np.kron(np.asarray(make_receiver(carrier.host).nuisance), np.eye(3))
     look = np.eye(3 * count)
     if seen.normals is not None:
         look = np.zeros((count, count, 3))
@@ -427,8 +430,9 @@ def test_differentiable_with_respect_to_suspect_original_and_strength(small: Cas
             assert float(jnp.vdot(slope, way)) == pytest.approx(float(ahead - behind) / 2, rel=1e-4)
 
 
-def test_joint_refuses_a_carrier_without_a_host(small: Case, x64):
+def test_a_carrier_without_a_host_is_refused_without_a_host(small: Case, x64):
     x = jnp.asarray(small.x)
     carrier = ModulatedCarrier(host_bands(small.operator, x, FAMILY), np.ones((2, len(FAMILY), 3), np.int8))
-    with pytest.raises(jm.JaxmarkError, match="keyed carriers, not ModulatedCarrier"):
-        joint(carrier, observe(x))
+    for detector in (matched, joint):
+        with pytest.raises(jm.JaxmarkError, match="keyed carriers, not ModulatedCarrier"):
+            detector(carrier, observe(x))

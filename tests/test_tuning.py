@@ -16,7 +16,7 @@ from jaxmark.chebyshev import filter
 from jaxmark.message import encode
 from jaxmark.observation import observe
 from jaxmark.original import prepare
-from jaxmark.reception import make_host
+from jaxmark.reception import make_host, make_receiver
 from jaxmark.schemes import KeyedScheme
 from jaxmark.tuning import allocate, tune, upper_bound
 from tests.samples import rough_sphere
@@ -169,14 +169,15 @@ def test_a_channel_is_what_was_done_to_the_bands():
         scales=2,
         degree=2,
     )
+    receiver = make_receiver(host)
     random = np.random.default_rng(0)
     signs = jnp.asarray(random.choice([-1.0, 1.0], (2000, 3)), jnp.float32)
     response = np.linspace(1, 0.2, 16)
     noise = jnp.asarray(random.normal(size=(2000, 3)), jnp.float32)
     residual = 1e-3 * filter(original.operator, family.T @ response, signs) + 3e-4 * noise
-    found = measure(host, observe(residual), 1e-3 * signs)
+    found = measure(receiver, observe(residual), 1e-3 * signs)
     counted = np.asarray(found.dimensions[0])
-    assert counted.sum() == pytest.approx(3 * (2000 - host.nuisance.shape[1]), rel=0.02)
+    assert counted.sum() == pytest.approx(3 * (2000 - receiver.nuisance.shape[1]), rel=0.02)
     # The response of a band is its own, averaged with its neighbours'.
     some = (counted > 100) & (np.arange(16) > 0)
     assert some.sum() > 6
