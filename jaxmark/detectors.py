@@ -1,6 +1,6 @@
 """Detectors: from what a suspect shows to one soft value per bit.
 
-`correlate` and `decorrelate` go with any carrier; `matched` and `joint` need a keyed one, which knows its host.
+`correlate` and `decorrelate` go with any carrier; `projected` and `joint` need a keyed one, which knows its host.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from jaxmark.carriers.carrier import Strength
 from jaxmark.chebyshev import filter, transpose
 from jaxmark.errors import JaxmarkError
 from jaxmark.observation import Observation
-from jaxmark.reception import Reception, clean, whitening
+from jaxmark.reception import Receiver, Reception, clean, make_receiver, normal_factor, whitening
 
 Detector = Callable[[Carrier, Observation, Strength], Float[Array, " bits"]]
 
@@ -49,18 +49,19 @@ def decorrelate(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Fl
     return jsl.cho_solve(factor, correlate(carrier, seen, beta))
 
 
-def matched(carrier: Carrier, seen: Observation | Reception, beta: Strength = 1.0) -> Float[Array, " bits"]:
-    """Plain correlations of what is received: one filter, with the other bits as noise to each.
+def projected(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Array, " bits"]:
+    """Plain correlations of what is seen once the nuisance is projected off: little work, for what nobody attacked.
 
-    The score of a claimed message is the sum of these, each by its code bit. Arguments and errors as `joint`.
+    Bits are noise to each other, and no band is weighed. Arguments and errors as `joint`.
     """
-    return _matched(*_received("matched", carrier, seen), beta)
+    carrier = _keyed("projected", carrier)
+    return _projected(carrier, make_receiver(carrier.host), seen, beta)
 
 
 @jax.jit
-def _matched(carrier: KeyedCarrier, received: Reception, beta: Strength) -> Float[Array, " bits"]:
-    shape = carrier.shape(beta, received.gain / received.power)
-    return carrier.correlate(received.residual @ received.axes, shape)
+def _projected(carrier: KeyedCarrier, host: Receiver, seen: Observation, beta: Strength) -> Float[Array, " bits"]:
+    residual = clean(host, seen, normal_factor(host, seen), seen.residual)
+    return carrier.correlate(residual, carrier.shape(beta))
 
 
 def joint(carrier: Carrier, seen: Observation | Reception, beta: Strength = 1.0) -> Float[Array, " bits"]:
@@ -82,13 +83,14 @@ def joint(carrier: Carrier, seen: Observation | Reception, beta: Strength = 1.0)
     Raises:
         JaxmarkError: if the carrier knows no host.
     """
-    return _decoded(*_received("joint", carrier, seen), beta, _TOLERANCE, _STEPS)
+    carrier = _keyed("joint", carrier)
+    return _decoded(carrier, carrier.received(seen), beta, _TOLERANCE, _STEPS)
 
 
-def _received(name: str, carrier: Carrier, seen: Observation | Reception) -> tuple[KeyedCarrier, Reception]:
+def _keyed(name: str, carrier: Carrier) -> KeyedCarrier:
     if not isinstance(carrier, KeyedCarrier):
         raise JaxmarkError(f"The {name} detector reads keyed carriers, not {type(carrier).__name__}.")
-    return carrier, carrier.received(seen)
+    return carrier
 
 
 @partial(jax.jit, static_argnames=("tolerance", "steps"))

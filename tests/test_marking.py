@@ -66,7 +66,7 @@ def test_reading_back_means_the_message(sphere: Mesh, key: jm.Key, scheme):
 def test_reading_back_decodes_jointly_where_plain_correlations_fail(sphere: Mesh, key: jm.Key, monkeypatch):
     marker = jm.make_marker(sphere, key, bits=64)
     marked, _ = marker.embed(MESSAGE, 8e-4, read_back=False)
-    monkeypatch.setattr(marking, "matched", lambda *_: np.zeros(marker.code))
+    monkeypatch.setattr(marking, "projected", lambda *_: np.zeros(marker.code))
     assert marker.reads(marked, MESSAGE)
 
 
