@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64
-from scipy import optimize, stats
+from scipy import optimize
+from scipy.special import log_ndtr, ndtri  # scipy.stats takes long to import
 
 from jaxmark.budget import Budget, write
 from jaxmark.carriers import KeyedCarrier
@@ -63,7 +64,7 @@ def least_energy(bits: int, error: float = 1e-3) -> float:
     """
 
     def excess(root: float) -> float:
-        return float(stats.norm.logsf(root + stats.norm.ppf(error))) + bits * math.log(2)
+        return float(log_ndtr(-(root + ndtri(error)))) + bits * math.log(2)
 
     root = optimize.root_scalar(excess, bracket=(0.0, 10.0 + 4.0 * math.sqrt(bits))).root
     return root**2 / 2
