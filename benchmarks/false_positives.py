@@ -86,7 +86,7 @@ def claims(
     marker: jm.Marker, seen: dict[str, Observation], keys: int, messages: list[bytes]
 ) -> tuple[np.ndarray, np.ndarray]:
     """The best score of several messages, and its norm, `[keys, suspects]`, under fresh keys."""
-    original, carrier = marker.original, marker.carrier
+    original, carrier = marker.original, marker.reader
     assert isinstance(carrier, KeyedCarrier)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen.values())
 

@@ -109,7 +109,7 @@ def code_alone(bits: int, length: int, random: np.random.Generator, level: float
 
 def prepare(marker: Marker, text: bytes, random: np.random.Generator) -> Callable[[float], bool]:
     """Write a mark; the result says whether one reading of it fails at an Eb/N0."""
-    original, carrier = marker.original, marker.carrier
+    original, carrier = marker.original, marker.reader
     assert isinstance(carrier, KeyedCarrier)
     marked, _ = marker.write(message.encode(text, marker.key, original.geometry, marker.code), make_budget(BUDGET))
     mark = residual(original, marked)

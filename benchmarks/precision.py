@@ -20,7 +20,7 @@ from jaxmark.demo import sample_mesh
 from jaxmark.detectors import joint
 from jaxmark.evidence import log10_p_claimed
 from jaxmark.message import encode
-from jaxmark.reception import receive
+from jaxmark.reception import Receiver, receive
 
 KEY, MESSAGE, BUDGET, NOISE = jm.Key(bytes(range(32))), b"jaxmark!", 5e-5, 5e-3
 BANDS = 64
@@ -32,8 +32,9 @@ Stages = Mapping[str, np.ndarray]
 def chain(mesh: jm.Mesh, suspect: jm.Mesh | None) -> tuple[Stages, jm.Mesh]:
     """All stages in the precision that JAX is in, as float64, and the suspect, which the first run makes."""
     marker = jm.make_marker(mesh, KEY, bits=8 * len(MESSAGE))
-    carrier, operator, signal = marker.carrier, marker.original.operator, marker.original.signal
+    carrier, operator, signal = marker.reader, marker.original.operator, marker.original.signal
     assert isinstance(carrier, KeyedCarrier)
+    assert isinstance(carrier.host, Receiver)
     marked, _ = marker.embed(MESSAGE, BUDGET, noise=0, read_back=False)
     suspect = jm.attack(marked, "noise", NOISE, seed=0) if suspect is None else suspect
     family = scaling(BANDS, damping="jackson")

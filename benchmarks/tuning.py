@@ -73,7 +73,7 @@ def evidence(mesh: Mesh, scheme: KeyedScheme, limits: Mapping[str, float], bits:
         nats = []
         for seed in range(seeds):
             suspect = jm.attack(marked, kind, strength, seed=UNSEEN + seed)
-            score, norm = marker.carrier.claim(marker.observe(suspect), claimed)
+            score, norm = marker.reader.claim(marker.observe(suspect), claimed)
             nats.append(float(score) ** 2 / (2 * float(norm) ** 2))
         found.append(float(np.mean(nats)))
     return found

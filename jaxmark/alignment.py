@@ -152,8 +152,10 @@ def _by_points(
     pose, agreeing = _whole(x, y, sound, spread)
     error = np.where(agreeing[:, None], pose(y) - x, 0)
     # What does not agree may be in pieces that went elsewhere; so may be everything.
-    piece = np.where(sound, component_of(Mesh(y, faces)), -1)
-    apart = _pieces(x, y, piece) if _rms(error[agreeing]) > _FAR else []
+    far = _rms(error[agreeing]) > _FAR
+    some = far or np.sum(sound & ~agreeing) >= _least_piece(x)
+    piece = np.where(sound, component_of(Mesh(y, faces)), -1) if some else np.full(len(x), -1)
+    apart = _pieces(x, y, piece) if far else []
     if 2 * sum(len(points) for points, _ in apart) > known.sum():
         agreeing, pose = np.zeros(len(x), bool), apart[0][1]
     else:
@@ -173,12 +175,16 @@ def _pieces(x: Points, y: Points, piece: Int64[np.ndarray, " points"]) -> list[t
     """Which points of each piece, numbered from 0, agree on a map of their own, and the map; the largest first."""
     found = []
     size = np.bincount(piece[piece >= 0], minlength=1)
-    for one in np.argsort(-size, kind="stable")[: np.sum(size >= max(_FEW, _PIECE * len(x)))]:
+    for one in np.argsort(-size, kind="stable")[: np.sum(size >= _least_piece(x))]:
         points = np.flatnonzero(piece == one)
         back, near = _fit(x[points], y[points], np.ones(len(points), bool))
         if 2 * near.sum() >= len(points) and _rms((back(y[points]) - x[points])[near]) <= _FAR:
             found.append((points[near], back))
     return found
+
+
+def _least_piece(x: Points) -> float:
+    return max(_FEW, _PIECE * len(x))
 
 
 def _rms(x: Points) -> float:
@@ -189,8 +195,11 @@ def _whole(
     x: Points, y: Points, sound: Bool[np.ndarray, " points"], spread: Float64[np.ndarray, " points"]
 ) -> tuple[Pose, Bool[np.ndarray, " points"]]:
     """The map on which most agree, and which points do."""
-    fits = [_fit(x[sound], y[sound], start) for start in (np.ones(sound.sum(), bool), _agreeing(spread[sound]))]
-    pose, near = min(fits, key=lambda fit: np.quantile(_distance(fit[0](y[sound]), x[sound]), 0.4))
+    pose, near = _fit(x[sound], y[sound], np.ones(sound.sum(), bool))
+    # Where all agree there is no other.
+    if not near.all():
+        fits = (pose, near), _fit(x[sound], y[sound], _agreeing(spread[sound]))
+        pose, near = min(fits, key=lambda fit: np.quantile(_distance(fit[0](y[sound]), x[sound]), 0.4))
     agreeing = np.zeros(len(x), bool)
     agreeing[sound] = near
     return pose, agreeing

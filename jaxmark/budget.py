@@ -88,8 +88,7 @@ def write(original: Original, shift: Float64[np.ndarray, "points 3"], budget: Bu
                 f"Moved by {_MOST:g} of its diagonal, this mesh still keeps {budget}; give a budget, too."
             )
     marked = displaced(original, rms / size * shift)
-    written = residual(original, marked)[original.used]
-    reached = distortion.Moved(float(distortion.rms(written)), float(distortion.maximum(written)))
+    reached = distortion.Moved.of(residual(original, marked)[original.used])
     if abs(reached.rms - rms) > 0.01 * rms:
         raise JaxmarkError(f"A budget of {rms:g} is lost in the rounding of this mesh's coordinates; use a larger one.")
     return Written(marked, rms / size, reached)

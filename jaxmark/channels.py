@@ -16,7 +16,7 @@ from jaxmark.chebyshev import cross_moments
 from jaxmark.laplacian import Laplacian
 from jaxmark.observation import Observation
 from jaxmark.precision import matmul
-from jaxmark.reception import Host, clean, receive
+from jaxmark.reception import Receiver, clean, receive
 
 Margin = Literal["rate", "evidence", "snr"]
 
@@ -63,7 +63,7 @@ def band_energies(
 
 
 @jax.jit
-def measure(host: Host, seen: Observation, mark: Displacement) -> Channels:
+def measure(host: Receiver, seen: Observation, mark: Displacement) -> Channels:
     """One attack's channel, from a suspect with a known mark; can be differentiated with respect to `seen`.
 
     Args:

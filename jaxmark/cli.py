@@ -25,6 +25,7 @@ from jaxmark.files import load_mesh, save_mesh
 from jaxmark.files.atomic import write_atomically
 from jaxmark.keys import commitment, load_key, new_key, save_key
 from jaxmark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity, detect, make_marker
+from jaxmark.original import residual
 from jaxmark.record import RECORD_SUFFIX, Record
 from jaxmark.report import save_report
 from jaxmark.schemes import DEFAULT_SCHEME, SCHEMES
@@ -183,12 +184,14 @@ def embed_command(
     if message is not None:
         marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
         result, info = marker.embed(message, budget, limits=dict(limits) or None, noise=noise, read_back=False)
-        said, reads = f"{info.record.bits} bits", lambda mesh: marker.detect(mesh).message == message
+        prepared = marker.original
+        said, reads = f"{info.record.bits} bits", lambda mesh: marker.reads(mesh, message)
     else:
         if scheme != DEFAULT_SCHEME:
             raise JaxmarkError(f"Fingerprints are carried by the scheme {DEFAULT_SCHEME!r}, not {scheme!r}.")
         tracer, name = make_tracer(mesh, key), str(recipient)
         result, info = tracer.fingerprint(name, budget, limits=dict(limits) or None)
+        prepared = tracer.marker.original
         said, reads = f"fingerprint of {recipient}", lambda mesh: tracer.finds(mesh, name)
     with _replacing(marked) as draft, _replacing(record_file) as record_draft:
         save_mesh(result, draft, like=original)
@@ -202,7 +205,7 @@ def embed_command(
                 " more digits."
             )
         write_atomically(record_draft, info.record.to_json().encode())
-    change = distortion.moved(mesh, written)
+    change = distortion.Moved.of(residual(prepared, written)[prepared.used])
     answer = {
         "rms": change.rms,
         "max": change.max,

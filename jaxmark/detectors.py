@@ -1,6 +1,6 @@
 """Detectors: from what a suspect shows to one soft value per bit.
 
-`correlate` and `decorrelate` go with any carrier; `joint` needs a keyed one, which knows its host.
+`correlate` and `decorrelate` go with any carrier; `projected` and `joint` need a keyed one, which knows its host.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from jaxmark.chebyshev import filter, transpose
 from jaxmark.errors import JaxmarkError
 from jaxmark.observation import Observation
 from jaxmark.precision import matmul
-from jaxmark.reception import Reception, clean, whitening
+from jaxmark.reception import Receiver, Reception, clean, make_receiver, normal_factor, whitening
 
 Detector = Callable[[Carrier, Observation, Strength], Float[Array, " bits"]]
 
@@ -50,6 +50,21 @@ def decorrelate(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Fl
     return jsl.cho_solve(factor, correlate(carrier, seen, beta))
 
 
+def projected(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Float[Array, " bits"]:
+    """Plain correlations of what is seen once the nuisance is projected off: little work, for what nobody attacked.
+
+    Bits are noise to each other, and no band is weighed. Arguments and errors as `joint`.
+    """
+    carrier = _keyed("projected", carrier)
+    return _projected(carrier, make_receiver(carrier.host), seen, beta)
+
+
+@jax.jit
+def _projected(carrier: KeyedCarrier, host: Receiver, seen: Observation, beta: Strength) -> Float[Array, " bits"]:
+    residual = clean(host, seen, normal_factor(host, seen), seen.residual)
+    return carrier.correlate(residual, carrier.shape(beta))
+
+
 def joint(carrier: Carrier, seen: Observation | Reception, beta: Strength = 1.0) -> Float[Array, " bits"]:
     """All bits together: least mean square error, by conjugate gradients on the bits, nothing of size bits² formed.
 
@@ -69,9 +84,14 @@ def joint(carrier: Carrier, seen: Observation | Reception, beta: Strength = 1.0)
     Raises:
         JaxmarkError: if the carrier knows no host.
     """
-    if not isinstance(carrier, KeyedCarrier):
-        raise JaxmarkError(f"The joint detector reads keyed carriers, not {type(carrier).__name__}.")
+    carrier = _keyed("joint", carrier)
     return _decoded(carrier, carrier.received(seen), beta, _TOLERANCE, _STEPS)
+
+
+def _keyed(name: str, carrier: Carrier) -> KeyedCarrier:
+    if not isinstance(carrier, KeyedCarrier):
+        raise JaxmarkError(f"The {name} detector reads keyed carriers, not {type(carrier).__name__}.")
+    return carrier
 
 
 @partial(jax.jit, static_argnames=("tolerance", "steps"))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy.special import log_ndtr  # scipy.stats takes long to import
 
 from jaxmark.precision import matmul
 
@@ -71,7 +71,7 @@ def log10_p_fitted(score: ArrayLike, norm: ArrayLike, bits: int = 0) -> float:
     s, a = float(np.asarray(score, np.float64)), float(np.asarray(norm, np.float64))
     if not (a > 0 and math.isfinite(s) and math.isfinite(a)):
         return 0.0
-    return min(0.0, float(stats.norm.logsf(s / a)) / math.log(10) + bits * math.log10(2))
+    return min(0.0, float(log_ndtr(-s / a)) / math.log(10) + bits * math.log10(2))
 
 
 def _log10_tail(score: ArrayLike, norm: ArrayLike) -> float:

@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64
-from scipy import optimize, stats
+from scipy import optimize
+from scipy.special import log_ndtr, ndtri  # scipy.stats takes long to import
 
 from jaxmark.budget import Budget, write
 from jaxmark.carriers import KeyedCarrier
@@ -19,7 +20,7 @@ from jaxmark.keys import KEY_BYTES
 from jaxmark.message import TAG_BITS
 from jaxmark.observation import observe
 from jaxmark.original import Original
-from jaxmark.reception import clean, normal_factor
+from jaxmark.reception import Receiver, clean, make_receiver, normal_factor
 from jaxmark.schemes import KeyedScheme, Layout
 
 _GAP = 1.0  # decibel, of the polar code at a message error rate of 1e-3; `benchmarks/limit.py --code-only` measures it
@@ -34,7 +35,8 @@ class Room(NamedTuple):
 
 def room(carrier: KeyedCarrier, original: Original) -> Room:
     """Measure a carrier by one probe of random signs in place of the keyed ones."""
-    whole, left = np.asarray(_probe(carrier, original.traced(original.used)), np.float64).clip(0)
+    measured = _probe(carrier, make_receiver(carrier.host), original.traced(original.used))
+    whole, left = np.asarray(measured, np.float64).clip(0)
     strength = np.ones(len(whole)) if carrier.profile is None else np.asarray(carrier.profile, np.float64)
     # Three coordinates, or one along normals, of each vertex make a band's whole.
     displaced = whole @ strength**2 / original.used.sum()
@@ -42,9 +44,8 @@ def room(carrier: KeyedCarrier, original: Original) -> Room:
 
 
 @jax.jit
-def _probe(carrier: KeyedCarrier, moving: Float[Array, " vertices"]) -> Float[Array, "2 bands"]:
+def _probe(carrier: KeyedCarrier, host: Receiver, moving: Float[Array, " vertices"]) -> Float[Array, "2 bands"]:
     """Energies of random signs in each band, before and after projection."""
-    host = carrier.host
     signs = jax.random.rademacher(jax.random.key(2), carrier.chips.signs.shape, moving.dtype) * moving[:, None]
     everything = observe(jnp.zeros_like(host.signal), moving)
     factor = normal_factor(host, everything)
@@ -61,7 +62,7 @@ def least_energy(bits: int, error: float = 1e-3) -> float:
     """
 
     def excess(root: float) -> float:
-        return float(stats.norm.logsf(root + stats.norm.ppf(error))) + bits * math.log(2)
+        return float(log_ndtr(-(root + ndtri(error)))) + bits * math.log(2)
 
     root = optimize.root_scalar(excess, bracket=(0.0, 10.0 + 4.0 * math.sqrt(bits))).root
     return root**2 / 2

@@ -6,7 +6,7 @@ How much of the mark each band still holds is seen from what the attack did to t
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -25,19 +25,38 @@ _BLOCK = 2**14  # vertices whose nuisance is handled at a time
 _SAMPLE = 2**13  # that tell a basis well enough
 
 
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Extent:
+    """What of an original's shape is nuisance."""
+
+    scales: int  # diffusion scales of each coordinate, from one smoothing step on
+    degree: int  # total degree of the polynomials of the position, at least 1 (affine maps)
+
+
 class Host(NamedTuple):
-    """An original as the receiver sees it; free of the key."""
+    """An original as marks are written in it, and what says what of its shape is nuisance; free of the key."""
 
     operator: Laplacian
     signal: Float[Array, "vertices 3"]  # centred per component
     coefficients: Float[Array, "bands terms"]  # of the bands that the mark is written in
+    positions: Float[Array, "vertices 3"]
+    extent: Extent
+
+
+class Receiver(NamedTuple):
+    """An original as it is read with; free of the key."""
+
+    operator: Laplacian
+    signal: Float[Array, "vertices 3"]  # as of the host
+    coefficients: Float[Array, "bands terms"]  # as of the host
     nuisance: Float[Array, "vertices columns"]  # nearly orthonormal, for each coordinate
 
 
 class Reception(NamedTuple):
     """A suspect as the receiver sees it; free of the key."""
 
-    host: Host  # with what the suspect shows it to have gone through as nuisance, too
+    host: Receiver  # with what the suspect shows it to have gone through as nuisance, too
     residual: Float[Array, "vertices 3"]  # weighed, free of nuisance, as strong along each direction as along any other
     gain: Float[Array, " bands"]  # what the attack left of the host, and so of the mark
     power: Float[Array, " bands"]  # residual energy per dimension, relative to the largest
@@ -46,7 +65,6 @@ class Reception(NamedTuple):
     factor: Float[Array, "unknowns unknowns"]  # Cholesky factor of the nuisance as it is seen
 
 
-@partial(jax.jit, static_argnames=("scales", "degree"))
 def make_host(
     operator: Laplacian,
     signal: Float[Array, "vertices 3"],
@@ -56,33 +74,46 @@ def make_host(
     scales: int,
     degree: int,
 ) -> Host:
-    """Prepare what the receiver projects off; can be traced and differentiated with respect to signal and positions.
+    """An original for writing; `make_receiver` prepares it for reading.
 
     Args:
         operator: the Laplacian, of N vertices.
         signal: the host's coordinates, centred per component.
         positions: the host's coordinates.
         coefficients: the bands that the mark is written in.
-        scales: how many diffusion scales of each coordinate are nuisance, from one smoothing step on.
-        degree: total degree of the polynomials of the position that are nuisance, at least 1 (affine maps).
+        scales: see `Extent`.
+        degree: see `Extent`.
     """
-    coefficients = jnp.asarray(coefficients).astype(signal.dtype)
-    low, high = jax.lax.stop_gradient((positions.min(axis=0), positions.max(axis=0)))
-    inside = (2 * positions - (high + low)) / jnp.where(high > low, high - low, 1)
+    return Host(operator, signal, jnp.asarray(coefficients).astype(signal.dtype), positions, Extent(scales, degree))
+
+
+def make_receiver(host: Host | Receiver) -> Receiver:
+    """Form what is projected off, unless it has been; can be traced and differentiated with respect to the host."""
+    if isinstance(host, Receiver):
+        return host
+    # A compiled function would return copies of the rest.
+    return Receiver(host.operator, host.signal, host.coefficients, _nuisance(host))
+
+
+@jax.jit
+def _nuisance(host: Host) -> Float[Array, "vertices columns"]:
+    low, high = jax.lax.stop_gradient((host.positions.min(axis=0), host.positions.max(axis=0)))
+    inside = (2 * host.positions - (high + low)) / jnp.where(high > low, high - low, 1)
     smooth = (
-        band_components(operator, diffusion(scales, coefficients.shape[1]), signal)
-        if scales
-        else jnp.zeros((0, *signal.shape), signal.dtype)
+        band_components(host.operator, diffusion(host.extent.scales, host.coefficients.shape[1]), host.signal)
+        if host.extent.scales
+        else jnp.zeros((0, *host.signal.shape), host.signal.dtype)
     )
 
     def columns(inside: Array, smooth: Array) -> Array:
-        return jnp.concatenate([_polynomials(inside, degree), smooth.reshape(len(inside), -1)], axis=1)
+        polynomials = _polynomials(inside, host.extent.degree)
+        return jnp.concatenate([polynomials, smooth.reshape(len(inside), -1)], axis=1)
 
-    return Host(operator, signal, coefficients, _basis(columns, inside, jnp.moveaxis(smooth, 0, 1)))
+    return _basis(columns, inside, jnp.moveaxis(smooth, 0, 1))
 
 
-def extended(host: Host, seen: Observation) -> Host:
-    """The host with what the suspect shows it to have gone through as nuisance, too."""
+def extended(host: Receiver, seen: Observation) -> Receiver:
+    """The receiver with what the suspect shows the host to have gone through as nuisance, too."""
     if seen.nuisance is None:
         return host
     return host._replace(nuisance=_wider(host.nuisance, seen.nuisance))
@@ -149,20 +180,20 @@ def _sum_over_blocks(function: Callable[..., Array], *rows: Array) -> Array:
     return jax.lax.scan(lambda total, start: (total + one(start), None), zero, starts)[0]
 
 
-def receive(host: Host, seen: Observation) -> Reception:
+def receive(host: Host | Receiver, seen: Observation) -> Reception:
     """Project the nuisance off a residual, and measure gain and power of each band, and the power along each direction.
 
     Args:
-        host: from `make_host`.
+        host: from `make_receiver`, to form the nuisance only once; or from `make_host`.
         seen: the suspect's residual, in the units of the host.
     """
-    host = extended(host, seen)
+    host = extended(make_receiver(host), seen)
     # A compiled function would return a copy of the host.
     return Reception(host, *_receive(host, seen))
 
 
 @jax.jit
-def _receive(host: Host, seen: Observation) -> tuple[Array, Array, Array, Array, Observation, Array]:
+def _receive(host: Receiver, seen: Observation) -> tuple[Array, Array, Array, Array, Observation, Array]:
     # Points that are far off once the nuisance is gone were edited, or lost: they count for less.
     strange = _robust(clean(host, seen, normal_factor(host, seen), seen.residual), seen.weights)
     seen = seen._replace(weights=seen.weights * strange)
@@ -195,7 +226,7 @@ def _receive(host: Host, seen: Observation) -> tuple[Array, Array, Array, Array,
     return (matmul(residual, axes), jnp.clip(gain, 0, 2), power, axes, seen, factor)
 
 
-def whitening(host: Host, power: Float[Array, " bands"]) -> Float[Array, " terms"]:
+def whitening(host: Receiver, power: Float[Array, " bands"]) -> Float[Array, " terms"]:
     """Coefficients of the filter that makes all bands equally strong."""
     return matmul(host.coefficients.T, 1 / jnp.sqrt(power))
 
@@ -235,7 +266,7 @@ def _robust(residual: Float[Array, "vertices 3"], weights: Float[Array, " vertic
     return jnp.where(square > limit, limit / jnp.where(square > limit, square, 1), 1)
 
 
-def normal_factor(host: Host, seen: Observation) -> Float[Array, "unknowns unknowns"]:
+def normal_factor(host: Receiver, seen: Observation) -> Float[Array, "unknowns unknowns"]:
     """Cholesky factor of the nuisance's normal equations, with a ridge for what looks alike where it is seen."""
 
     def products(weights: Array) -> Array:
@@ -256,13 +287,13 @@ def normal_factor(host: Host, seen: Observation) -> Float[Array, "unknowns unkno
 
 
 def clean(
-    host: Host, seen: Observation, factor: Float[Array, "unknowns unknowns"], x: Float[Array, "vertices 3"]
+    host: Receiver, seen: Observation, factor: Float[Array, "unknowns unknowns"], x: Float[Array, "vertices 3"]
 ) -> Float[Array, "vertices 3"]:
     """ΩPx: a displacement without its nuisance, weighed; symmetric in the plain inner product."""
     return seen.weigh(x - _explained(host, seen, factor, x))
 
 
-def _explained(host: Host, seen: Observation, factor: Array, x: Array) -> Array:
+def _explained(host: Receiver, seen: Observation, factor: Array, x: Array) -> Array:
     """The nuisance that fits a displacement best, where and as it is seen."""
     matched = matmul(host.nuisance.T, seen.weigh(x))
     if seen.normals is None:

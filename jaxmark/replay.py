@@ -72,13 +72,11 @@ def replayed_points(
         displacement: of its points.
         weights: where it counts.
     """
-    if area(original) == 0:
-        return None
     x = np.asarray(original.vertices)
     # Smoothing of any kind and amount shows in these already; marks and noise do not, and end here.
     once = operator.apply(jnp.asarray(fill(x, len(operator.degree)), jnp.float32))
     signs = np.concatenate([once, operator.apply(once)], axis=1)[: len(x)]
-    if _likeliest([signs], x, displacement, None, weights, _SIGNS_LEFT) is None:
+    if _likeliest([signs], x, displacement, None, weights, _SIGNS_LEFT) is None or area(original) == 0:
         return None
     columns = np.concatenate(_smoothed(original, "cotangent", x), axis=1)
     return _likeliest([columns], x, displacement, None, weights, _MOST_LEFT_OF_POINTS)

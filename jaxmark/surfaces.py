@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float64, Int64
 
 from jaxmark.errors import JaxmarkError
@@ -54,6 +53,8 @@ def sample(mesh: Mesh, count: int) -> Samples:
     Raises:
         JaxmarkError: if the surface has no area.
     """
+    import trimesh  # takes long to import, and most suspects do without
+
     size = area(mesh)
     if not 0 < size < np.inf:
         raise JaxmarkError(f"A surface has an area of {size:g}; nothing can be aligned with it.")
@@ -80,6 +81,8 @@ def barycentric(
     mesh: Mesh, face: Int64[np.ndarray, " points"], points: Float64[np.ndarray, "points 3"]
 ) -> Float64[np.ndarray, "points 3"]:
     """Shares of a face's corners in points on it; zeros on a face without area."""
+    from trimesh import triangles
+
     with np.errstate(all="ignore"):
-        share = trimesh.triangles.points_to_barycentric(np.asarray(mesh.vertices)[np.asarray(mesh.faces)[face]], points)
+        share = triangles.points_to_barycentric(np.asarray(mesh.vertices)[np.asarray(mesh.faces)[face]], points)
     return np.nan_to_num(share, nan=0.0, posinf=0.0, neginf=0.0)

@@ -27,7 +27,7 @@ from jaxmark.chebyshev import filter
 from jaxmark.errors import JaxmarkError
 from jaxmark.mesh import Mesh
 from jaxmark.original import Original, prepare
-from jaxmark.reception import make_host
+from jaxmark.reception import make_host, make_receiver
 from jaxmark.schemes import KeyedScheme
 from jaxmark.visibility import band_visibility, masking
 
@@ -130,7 +130,8 @@ def tune(
             scales=layout.scales,
             degree=layout.degree,
         )
-        rows = [_mean([measure(host, one, mark) for one in row]) for row in seen]
+        receiver = make_receiver(host)
+        rows = [_mean([measure(receiver, one, mark) for one in row]) for row in seen]
         return Channels(*map(jnp.concatenate, zip(*rows, strict=True)))
 
     # What the receiver projects off depends on the profile: once for a first one, and again for what it was tuned to.

@@ -14,6 +14,7 @@ from jaxmark.budget import make_budget
 from jaxmark.mesh import Mesh, make_mesh, vertex_normals
 from jaxmark.original import prepare
 from jaxmark.payload import Capacity, Conditions, least_energy, needed_dimensions, needed_energy, room, worth
+from jaxmark.reception import make_receiver
 from jaxmark.schemes import KeyedScheme
 from tests.dense import chebyshev_matrices
 from tests.samples import bumpy_sphere, rough_sphere
@@ -98,7 +99,7 @@ def test_room_is_what_the_projection_leaves(direction, passband, x64):
     degree = original.on_host(original.operator.degree)
     mass = degree / np.mean(degree)
     filters = mass[:, None] * np.einsum("jk,kuv->juv", scaling(32, damping="jackson")[:passing], terms)
-    columns = np.kron(original.on_host(carrier.host.nuisance), np.eye(3))
+    columns = np.kron(original.on_host(make_receiver(carrier.host).nuisance), np.eye(3))
     basis, size, _ = np.linalg.svd(columns, full_matrices=False)
     basis = basis[:, size > 1e-6 * size[0]]
     white = np.eye(3 * len(terms[0]))

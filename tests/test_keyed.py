@@ -12,11 +12,11 @@ import jaxmark as jm
 from jaxmark import detectors
 from jaxmark.bands import scaling
 from jaxmark.carriers import Carrier, KeyedCarrier, ModulatedCarrier, host_bands, make_chips
-from jaxmark.detectors import joint
+from jaxmark.detectors import joint, projected
 from jaxmark.laplacian import centre, make_laplacian
 from jaxmark.mesh import vertex_normals
 from jaxmark.observation import Observation, observe
-from jaxmark.reception import make_host, receive
+from jaxmark.reception import make_host, make_receiver, receive
 from jaxmark.watermark import detect, embed
 from tests.dense import chebyshev_matrices
 from tests.samples import bumpy_sphere
@@ -347,7 +347,7 @@ def dense_equations(case: Case, carrier: KeyedCarrier, seen: Observation, beta) 
 def dense_clean(carrier: KeyedCarrier, seen: Observation) -> np.ndarray:
     """x ↦ Ω(x - best nuisance), as a matrix `[3N, 3N]`, by least squares on what is seen."""
     count = len(seen.weights)
-    columns = np.kron(np.asarray(carrier.host.nuisance), np.eye(3))
+    columns = np.kron(np.asarray(make_receiver(carrier.host).nuisance), np.eye(3))
     look = np.eye(3 * count)
     if seen.normals is not None:
         look = np.zeros((count, count, 3))
@@ -357,6 +357,18 @@ def dense_clean(carrier: KeyedCarrier, seen: Observation) -> np.ndarray:
     root = np.sqrt(weights)[:, None] * look
     fit = np.linalg.lstsq(root @ columns, root, rcond=None)[0]
     return look.T @ (weights[:, None] * look) @ (np.eye(3 * count) - columns @ fit)
+
+
+@pytest.mark.parametrize("direction", ["coordinates", "normals"])
+def test_projected_correlations_by_dense_algebra(direction, small: Case, key: jm.Key, dtype):
+    carrier, random = make_carrier(small, key, dtype, direction), np.random.default_rng(11)
+    normals = carrier.normals if direction == "normals" else None
+    weights = jnp.asarray(random.uniform(0.1, 1, len(small.x)), dtype)
+    seen = observe(jnp.asarray(random.normal(size=small.x.shape), dtype), weights, normals)
+    beta = random.uniform(size=len(FAMILY))
+    mark = shaping(small, beta[:, None] * np.ones(len(carrier.chips.signs[0])), direction) @ spreading(carrier)
+    expected = mark.T @ dense_clean(carrier, seen) @ np.asarray(seen.residual, np.float64).ravel()
+    close(projected(carrier, seen, jnp.asarray(beta, dtype)), expected, dtype, factor=100)
 
 
 def test_no_residual_gives_zero_scores_with_finite_gradients(small: Case, key: jm.Key):
@@ -427,8 +439,9 @@ def test_differentiable_with_respect_to_suspect_original_and_strength(small: Cas
             assert float(jnp.vdot(slope, way)) == pytest.approx(float(ahead - behind) / 2, rel=1e-4)
 
 
-def test_joint_refuses_a_carrier_without_a_host(small: Case, x64):
+def test_a_carrier_without_a_host_is_refused_without_a_host(small: Case, x64):
     x = jnp.asarray(small.x)
     carrier = ModulatedCarrier(host_bands(small.operator, x, FAMILY), np.ones((2, len(FAMILY), 3), np.int8))
-    with pytest.raises(jm.JaxmarkError, match="keyed carriers, not ModulatedCarrier"):
-        joint(carrier, observe(x))
+    for detector in (projected, joint):
+        with pytest.raises(jm.JaxmarkError, match="keyed carriers, not ModulatedCarrier"):
+            detector(carrier, observe(x))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark import distortion
+from jaxmark import distortion, marking
 from jaxmark.mesh import Mesh, make_mesh
 from jaxmark.message import encode
 from jaxmark.original import prepare
@@ -51,6 +51,24 @@ def test_precisions_read_each_other(sphere: Mesh, key: jm.Key, scheme):
         doubly, _ = jm.embed(sphere, MESSAGE, key, scheme=scheme)
     assert jm.detect(doubly, original=sphere, key=key, scheme=scheme).message == MESSAGE
     np.testing.assert_allclose(doubly.vertices, marked.vertices, atol=1e-5)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_reading_back_means_the_message(sphere: Mesh, key: jm.Key, scheme):
+    marker = jm.make_marker(sphere, key, bits=64, scheme=scheme)
+    marked, _ = marker.embed(MESSAGE, 8e-4, read_back=False)
+    assert marker.reads(marked, MESSAGE)
+    assert not marker.reads(marked, b"somebody")
+    assert not marker.reads(sphere, MESSAGE)
+    with pytest.raises(jm.JaxmarkError, match="do not read back"):
+        marker.check(sphere, MESSAGE)
+
+
+def test_reading_back_decodes_jointly_where_plain_correlations_fail(sphere: Mesh, key: jm.Key, monkeypatch):
+    marker = jm.make_marker(sphere, key, bits=64)
+    marked, _ = marker.embed(MESSAGE, 8e-4, read_back=False)
+    monkeypatch.setattr(marking, "projected", lambda *_: np.zeros(marker.code))
+    assert marker.reads(marked, MESSAGE)
 
 
 def test_golden_displacement(key: jm.Key):

@@ -14,7 +14,7 @@ from jaxmark.chebyshev import filter
 from jaxmark.laplacian import Laplacian, centre, make_laplacian
 from jaxmark.mesh import vertex_normals
 from jaxmark.observation import Observation, observe
-from jaxmark.reception import Host, clean, extended, make_host, receive
+from jaxmark.reception import Receiver, clean, extended, make_host, make_receiver, receive
 from tests.dense import laplacian_matrix
 from tests.samples import bumpy_sphere
 
@@ -43,9 +43,9 @@ def case() -> Case:
     return Case(operator, centre(operator, mesh.vertices), vertex_normals(mesh), values, vectors / root[:, None])
 
 
-def make(case: Case, dtype) -> Host:
+def make(case: Case, dtype) -> Receiver:
     x = jnp.asarray(case.x, dtype)
-    return make_host(case.operator, x, x + 3, FAMILY, scales=SCALES, degree=DEGREE)
+    return make_receiver(make_host(case.operator, x, x + 3, FAMILY, scales=SCALES, degree=DEGREE))
 
 
 def apply(case: Case, function: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from jaxmark.chebyshev import filter
 from jaxmark.message import encode
 from jaxmark.observation import observe
 from jaxmark.original import prepare
-from jaxmark.reception import make_host
+from jaxmark.reception import make_host, make_receiver
 from jaxmark.schemes import KeyedScheme
 from jaxmark.tuning import allocate, tune, upper_bound
 from tests.samples import rough_sphere
@@ -169,14 +169,15 @@ def test_a_channel_is_what_was_done_to_the_bands():
         scales=2,
         degree=2,
     )
+    receiver = make_receiver(host)
     random = np.random.default_rng(0)
     signs = original.traced(random.choice([-1.0, 1.0], (2000, 3)))
     response = np.linspace(1, 0.2, 16)
     noise = original.traced(random.normal(size=(2000, 3)))
     residual = 1e-3 * filter(original.operator, family.T @ response, signs) + 3e-4 * noise
-    found = measure(host, observe(residual, original.traced(original.used)), 1e-3 * signs)
+    found = measure(receiver, observe(residual, original.traced(original.used)), 1e-3 * signs)
     counted = np.asarray(found.dimensions[0])
-    assert counted.sum() == pytest.approx(3 * (2000 - host.nuisance.shape[1]), rel=0.02)
+    assert counted.sum() == pytest.approx(3 * (2000 - receiver.nuisance.shape[1]), rel=0.02)
     # The response of a band is its own, averaged with its neighbours'.
     some = (counted > 100) & (np.arange(16) > 0)
     assert some.sum() > 6
@@ -205,7 +206,7 @@ def test_what_was_predicted_is_measured(tuned, key: jm.Key):
     predicted = margins(found.channels, jnp.asarray(found.beta**2, jnp.float32), "evidence")
     for one, expected in zip(ATTACKS, predicted, strict=True):
         seen = marker.observe(jm.attack(marked, *one, seed=11))
-        score, norm = marker.carrier.claim(seen, word)
+        score, norm = marker.reader.claim(seen, word)
         # What smoothing leaves of the host is no white noise within a band.
         least = 0.6 if one[0] == "smoothing" else 0.8
         assert least < float(score**2 / (2 * norm**2)) / float(expected) < 1.25

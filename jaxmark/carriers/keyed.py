@@ -17,7 +17,7 @@ from jaxmark.keys import permutation, signs
 from jaxmark.laplacian import per_row
 from jaxmark.observation import Observation
 from jaxmark.precision import matmul, sum_and_norm
-from jaxmark.reception import Host, Reception, receive
+from jaxmark.reception import Host, Receiver, Reception, make_receiver, receive
 
 
 class Chips(NamedTuple):
@@ -52,12 +52,13 @@ def make_chips(
 class KeyedCarrier(NamedTuple):
     """Shaped keyed chips; see `Carrier`. β is the root mean square of the chips before the filter, one per band."""
 
-    host: Host
+    host: Host | Receiver
     chips: Chips
     normals: Float[Array, "vertices 3"] | None = None  # with one chip a vertex: where it moves
     profile: Float[Array | np.ndarray, " bands"] | None = None  # factor on β for each band
     masking: Float[Array | np.ndarray, " vertices"] | None = None  # factor on what each vertex is moved by
 
+    @jax.jit
     def displacement(self, bits: Float[Array, " bits"], beta: Strength = 1.0) -> Displacement:
         """See `Carrier`: one filter, whatever the number of bits."""
         return self.modulate(bits, self.shape(beta))
@@ -70,6 +71,10 @@ class KeyedCarrier(NamedTuple):
         """See `Carrier`; one filter per bit, for tests and small codes."""
         unit = jnp.eye(len(self.chips.population), dtype=self._signs.dtype)
         return jax.lax.map(lambda bits: self.adjoint(self.displacement(bits, beta), beta), unit)
+
+    def prepared(self) -> "KeyedCarrier":
+        """The same, with what only reading needs formed once for all suspects."""
+        return self._replace(host=make_receiver(self.host))
 
     def received(self, seen: Observation | Reception) -> Reception:
         """What its receiver makes of a suspect, unless that has been made."""

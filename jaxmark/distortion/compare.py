@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxmark.distortion.curvature import curvature_tensor, tensor_distance
 from jaxmark.distortion.dihedral import Hinges, dame, make_hinges
@@ -39,6 +39,12 @@ class Moved(NamedTuple):
     rms: float
     max: float
 
+    @classmethod
+    def of(cls, displacement: Float[np.ndarray, "points 3"]) -> "Moved":
+        """Both of the displacement of those vertices, in diagonals."""
+        with np.errstate(over="ignore"):  # a vertex thrown to the end of the number range is infinitely far
+            return cls(float(rms(displacement)), float(maximum(displacement)))
+
 
 class Comparison(NamedTuple):
     """Distortions of a mesh; None where a metric was not asked for, or needs the same connectivity and it differs.
@@ -66,9 +72,7 @@ def moved(original: Mesh, distorted: Mesh) -> Moved:
     """
     mesh = host_mesh(original)
     welded = weld(mesh.vertices)
-    change = displacement(mesh, distorted, welded, diagonal(mesh))[used_vertices(welded_mesh(mesh, welded))]
-    with np.errstate(over="ignore"):  # a vertex thrown to the end of the number range is infinitely far
-        return Moved(float(rms(change)), float(maximum(change)))
+    return Moved.of(displacement(mesh, distorted, welded, diagonal(mesh))[used_vertices(welded_mesh(mesh, welded))])
 
 
 class _Pair:
