@@ -3,8 +3,8 @@
 The parts:
 
 table      one row a family, one cell a mesh: median leakage / median coherence / ε, the largest coherence, of the unit
-           components of x, y and z (the paper's Condition 3 wants both near 0) / the smallest degree, or order, whose
-           median leakage is at most 1 % ("-": none up to degree 255, or order 8). A band's pass band is its own part and
+           components of x, y and z (the paper's Condition 3 wants both near 0) / the degree, or order, from which on
+           median leakage is at most 1 % ("-": not by degree 255, or order 8). A band's pass band is its own part and
            both its neighbours'; bands without energy have leakage 1. Overshoot is the largest of a response beyond
            [0, 1]. Products are with Δ, for all bands and three columns at once; of conjugate gradients, the range over
            the meshes, counted in float64 at float32's tolerance.
@@ -31,7 +31,7 @@ from scipy.sparse import linalg as sparse_linalg
 from stages import median_time
 
 from jaxmark import load_mesh, product, rational
-from jaxmark.bands import bernstein, equal_edges, hat, intervals, lagrange, report, scaling
+from jaxmark.bands import bernstein, equal_edges, hat, intervals, lagrange, nodes, report, scaling
 from jaxmark.bands.damping import Damping
 from jaxmark.chebyshev import band_components, filter, moments
 from jaxmark.laplacian import Laplacian, centre, make_laplacian, sparse_matrices
@@ -52,8 +52,8 @@ class Sample(NamedTuple):
     operator: Laplacian
     x: Float64[np.ndarray, "vertices 3"]
     measures: tuple[Quadrature, ...]  # of x, y and z
-    count: Float64[np.ndarray, " terms"]  # moments of the spectral density
-    energy: Float64[np.ndarray, " terms"]  # of the host
+    density: Float64[np.ndarray, " terms"]  # moments of the spectrum
+    energy: Float64[np.ndarray, " terms"]  # and of the host
 
 
 class Family(NamedTuple):
@@ -70,7 +70,7 @@ def in_angle(bands: int, *_: object) -> Float64[np.ndarray, " edges"]:
 
 
 def by_count(bands: int, sample: Sample) -> Float64[np.ndarray, " edges"]:
-    return equal_edges(sample.count, bands)
+    return equal_edges(sample.density, bands)
 
 
 def by_energy(bands: int, sample: Sample) -> Float64[np.ndarray, " edges"]:
@@ -89,7 +89,7 @@ def summed(family: Callable[..., np.ndarray], **options: Any) -> Callable[[int, 
 
 @cache
 def hats(bands: int, degree: int) -> np.ndarray:
-    return hat(1 - np.cos((np.arange(bands) + 0.5) * np.pi / bands), degree)
+    return hat(nodes(bands), degree)
 
 
 def butterworth(edges: Callable[[int, Sample], np.ndarray]) -> Callable[[int, int, Sample], Callable]:
@@ -124,11 +124,11 @@ def load(path: str, degree: int) -> Sample:
     operator = make_laplacian(points)
     x = centre(operator, np.asarray(points.vertices))
     with jax.enable_x64(True):
-        count, energy = (
+        density, energy = (
             np.asarray(moments(operator, jnp.asarray(signal), degree=degree // 2 + 1)).sum(axis=1)[: degree + 1]
             for signal in (white(operator, jax.random.key(0), PROBES), x)
         )
-    return Sample(Path(path).stem, operator, x, tuple(quadrature(operator, one, NODES) for one in x.T), count, energy)
+    return Sample(Path(path).stem, operator, x, tuple(quadrature(operator, one, NODES) for one in x.T), density, energy)
 
 
 def products_of(operator: Laplacian, bank: Float64[np.ndarray, "bands sections 6"], x: np.ndarray) -> int:
@@ -147,10 +147,8 @@ def products_of(operator: Laplacian, bank: Float64[np.ndarray, "bands sections 6
         y = root * x
         for section in sections:
             right = quadratic(section[:3], y).ravel()
-            shape = (x.size, x.size)
-            solver: Any = sparse_linalg.LinearOperator(
-                shape, lambda z, c=section[3:]: quadratic(c, z.reshape(x.shape)).ravel(), dtype=np.float64
-            )  # pyright: ignore[reportCallIssue]
+            size, matvec = (x.size, x.size), lambda z, c=section[3:]: quadratic(c, z.reshape(x.shape)).ravel()
+            solver: Any = sparse_linalg.LinearOperator(size, matvec, dtype=np.float64)  # pyright: ignore[reportCallIssue]
             tolerance = 10 * float(np.finfo(np.float32).eps)
             y = sparse_linalg.cg(solver, right, rtol=tolerance, maxiter=2000)[0].reshape(x.shape)
     return counted
@@ -167,7 +165,11 @@ def cell(family: Family, sample: Sample, bands: int, degree: int) -> str:
         )
 
     sizes = {"degree": [step * bands - 1 for step in STEPS], "order": ORDERS, "none": []}[family.degrees]
-    least = next((str(size) for size in sizes if found(size)[0] <= SELECTIVE), "-")
+    least = "-"
+    for size in reversed(sizes):
+        if found(size)[0] > SELECTIVE:
+            break
+        least = str(size)
     return " / ".join([*(f"{value:.3f}" for value in found(degree)), least])
 
 
@@ -200,7 +202,7 @@ def dense_bands(operator: Laplacian, coefficients: np.ndarray, x: np.ndarray) ->
     return (responses * (vectors.T @ (operator.degree * x))) @ vectors.T
 
 
-def method_errors(operator: Laplacian, nodes: np.ndarray, coefficients: np.ndarray, dtype: str) -> list[str]:
+def method_errors(operator: Laplacian, points: np.ndarray, coefficients: np.ndarray, dtype: str) -> list[str]:
     """Of Method 2, Method 1 in Leja's order and as printed, on white noise."""
     noise = np.random.default_rng(0).normal(size=(len(operator.degree), 1))
     x = centre(operator, noise)[:, 0]
@@ -209,7 +211,7 @@ def method_errors(operator: Laplacian, nodes: np.ndarray, coefficients: np.ndarr
         signal = jnp.asarray(x.astype(dtype))
         found = [band_components(operator, coefficients, signal)]
         for order in ("leja", "printed"):
-            factors = product.lagrange_factors(nodes, order=order)
+            factors = product.lagrange_factors(points, order=order)
             found.append(jax.jit(jax.vmap(product.filter, (None, 0, None)))(operator, factors, signal))
         errors = [float(np.abs(np.asarray(one) - expected).max() / np.abs(expected).max()) for one in found]
     return [f"{error:.0e}" if error < 1 else "lost" if np.isfinite(error) else "overflow" for error in errors]
@@ -221,21 +223,20 @@ def methods(sample: Sample, repeat: int) -> None:
     print("|---|---|---|---|---|---|")
     for dtype in ("float32", "float64"):
         for bands in (8, 16, 32, 64, 128, 256):
-            nodes = 1 - np.cos((np.arange(bands) + 0.5) * np.pi / bands)
-            errors = method_errors(sample.operator, nodes, scaling(bands), dtype)
+            errors = method_errors(sample.operator, nodes(bands), scaling(bands), dtype)
             print(f"| scaling | {bands - 1} | {dtype} | {' | '.join(errors)} |")
     for name in ("icosahedron", "icosphere of 42"):
         solid = trimesh.creation.icosphere(subdivisions=int(name != "icosahedron"))
         operator = make_laplacian(make_mesh(solid.vertices, solid.faces))
         pairs = eigenpairs(operator)
-        nodes = np.append(0, pairs.values[np.unique(pairs.space)])
+        values = np.append(0, pairs.values[np.unique(pairs.space)])
         for dtype in ("float32", "float64"):
-            errors = method_errors(operator, nodes, lagrange(nodes), dtype)
-            print(f"| eigenvalues of an {name} | {len(nodes) - 1} | {dtype} | {' | '.join(errors)} |")
+            errors = method_errors(operator, values, lagrange(values), dtype)
+            print(f"| eigenvalues of an {name} | {len(values) - 1} | {dtype} | {' | '.join(errors)} |")
 
     x, bands = jnp.asarray(sample.x, jnp.float32), 64
     family = scaling(bands)
-    factors = product.lagrange_factors(1 - np.cos((np.arange(bands) + 0.5) * np.pi / bands))
+    factors = product.lagrange_factors(nodes(bands))
     once, one = jax.jit(product.filter), jax.jit(filter)
     singles = [product.Factors(*(part[j] for part in factors)) for j in range(bands)]
     second = median_time(lambda: band_components(sample.operator, family, x), repeat)

@@ -18,9 +18,7 @@ class Factors(NamedTuple):
     scales: Float[Array | np.ndarray, "*bands factors"]
 
 
-def lagrange_factors(
-    nodes: Float[np.ndarray, " bands"], *, order: Literal["leja", "printed"] = "leja"
-) -> Factors:
+def lagrange_factors(nodes: Float[np.ndarray, " bands"], *, order: Literal["leja", "printed"] = "leja") -> Factors:
     """Lagrange polynomials Π_{i≠j} (λ - λ_i)/(λ_j - λ_i) in factors, one node a row.
 
     At the zeros of a Chebyshev polynomial these are the scaling functions, `lagrange` has their Chebyshev series.

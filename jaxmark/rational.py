@@ -1,7 +1,6 @@
 """Rational functions of the Laplacian by conjugate gradients: bands without ripples (Sohn et al., further work).
 
-A polynomial band of degree n leaks everywhere what it cannot resolve; a rational one falls as a power of λ away from its
-pass band. It is given in second-order sections, as in signal processing: f(λ) is the product of
+They are given in second-order sections, as in signal processing: f(λ) is the product of
 (b_0 + b_1λ + b_2λ²)/(a_0 + a_1λ + a_2λ²), each a row [b_0, b_1, b_2, a_0, a_1, a_2] of `[sections, 6]`.
 """
 
@@ -29,8 +28,8 @@ def filter(
     D^½, with condition κ = max a / min a over [0, 2]: about √κ/2 · ln(2/tolerance) iterations of two products, or
     fewer, and an error of about κ times the larger of `tolerance` and the dtype's rounding.
 
-    All bands of a bank are `jax.vmap(filter, (None, 0, None))(operator, bank, x)`. Derivatives in all modes, in `x`, the
-    sections and the operator's weights, are by implicit differentiation: further solves, memory O(sections · N).
+    All bands of a bank are `jax.vmap(filter, (None, 0, None))(operator, bank, x)`. Derivatives in all modes, in `x`,
+    the sections and the operator's weights, are by implicit differentiation: further solves, memory O(sections · N).
 
     Args:
         operator: the Laplacian, of N vertices.
@@ -83,9 +82,7 @@ def response(
     return ((sections[..., :3] @ powers) / (sections[..., 3:] @ powers)).prod(axis=-2)
 
 
-def butterworth(
-    edges: Float[np.ndarray, " edges"], order: int
-) -> Float64[np.ndarray, "bands sections 6"]:
+def butterworth(edges: Float[np.ndarray, " edges"], order: int) -> Float64[np.ndarray, "bands sections 6"]:
     """Bands as differences of Butterworth low-passes 1/(1 + (λ/e)^2p), one at each inner edge e.
 
     A partition of unity within [0, 1], without any overshoot. Every band but the first has a zero of order 2p at λ = 0,

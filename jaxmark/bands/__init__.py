@@ -11,4 +11,5 @@ from jaxmark.bands.minimax import Minimax as Minimax
 from jaxmark.bands.minimax import minimax as minimax
 from jaxmark.bands.report import FamilyReport as FamilyReport
 from jaxmark.bands.report import report as report
+from jaxmark.bands.scaling import nodes as nodes
 from jaxmark.bands.scaling import scaling as scaling

@@ -2,9 +2,9 @@
 
 import numpy as np
 from jaxtyping import Float64
-from numpy.polynomial import chebyshev
 from scipy import stats
 
+from jaxmark.bands.scaling import nodes, scaling
 from jaxmark.errors import JaxmarkError
 
 
@@ -25,7 +25,5 @@ def bernstein(bands: int) -> Float64[np.ndarray, "bands terms"]:
     """
     if bands < 1:
         raise JaxmarkError(f"bernstein needs at least one band, got {bands}.")
-    # Nowhere above 1, so interpolation at Chebyshev points is exact to rounding; binomials alone would overflow.
-    return chebyshev.chebinterpolate(
-        lambda t: stats.binom.pmf(np.arange(bands), bands - 1, (1 + t[:, None]) / 2), bands - 1
-    ).T
+    # Nowhere above 1, so that interpolating is exact to rounding.
+    return stats.binom.pmf(np.arange(bands)[:, None], bands - 1, nodes(bands) / 2) @ scaling(bands)

@@ -1,5 +1,7 @@
 """Hat functions: bands with local support, approximated best (the further work that Sohn et al. name, Fig. 15-16)."""
 
+from itertools import pairwise
+
 import numpy as np
 from jaxtyping import Float, Float64
 
@@ -30,6 +32,6 @@ def hat(knots: Float[np.ndarray, " bands"], degree: int) -> Float64[np.ndarray, 
         raise JaxmarkError(f"hat needs two knots or more that ascend within [0, 2], got {knots}.")
     ramps = np.zeros((len(knots) + 1, degree + 1))
     ramps[0, 0] = 1
-    for j, ends in enumerate(zip(knots, knots[1:], strict=False), 1):
+    for j, ends in enumerate(pairwise(knots), 1):
         ramps[j] = minimax(lambda x, ends=ends: np.interp(x, ends, (0, 1)), degree, kinks=ends).coefficients
     return -np.diff(ramps, axis=0)

@@ -62,8 +62,7 @@ def _exchange(error: Float64[np.ndarray, " points"], size: int) -> Int64[np.ndar
     """Where the error is largest between its changes of sign, less what is too many, smallest first."""
     starts = np.flatnonzero(np.diff(np.sign(error), prepend=0))
     places = [
-        start + int(np.argmax(np.abs(run)))
-        for start, run in zip(starts, np.split(error, starts[1:]), strict=True)
+        start + int(np.argmax(np.abs(run))) for start, run in zip(starts, np.split(error, starts[1:]), strict=True)
     ]
     heights = list(np.abs(error[places]))
     while len(places) > size:

@@ -9,7 +9,7 @@ from numpy.polynomial import chebyshev
 
 from jaxmark.spectrum import Quadrature
 
-_GRID = 8192  # points on which responses are looked at, or 16 a term if that is more
+_GRID = 4096  # points on which responses are looked at; of polynomials, 16 a term
 
 
 class FamilyReport(NamedTuple):
@@ -48,7 +48,7 @@ def report(
     if callable(family):
         responses, points = family, _GRID
     else:
-        responses, points = lambda values: chebyshev.chebval(values - 1, family.T), max(_GRID, 16 * family.shape[1])
+        responses, points = lambda values: chebyshev.chebval(values - 1, family.T), 16 * family.shape[1]
     shape = responses(1 - np.cos(np.linspace(0, np.pi, points + 1)))
     bands = len(shape)
     peak = np.abs(shape).max(axis=1)

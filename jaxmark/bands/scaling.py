@@ -48,3 +48,12 @@ def scaling(
         case "halved":
             return coefficients * np.where(k == 0, 1, 2) / bands
     raise JaxmarkError(f"kernel must be 'halved' or 'printed', got {kernel!r}.")
+
+
+def nodes(bands: int) -> Float64[np.ndarray, " bands"]:
+    """λ at the zeros of T_bands(λ - 1), ascending.
+
+    There the scaling functions of the halved kernel are 1 each in turn and 0 otherwise, so that
+    `values @ scaling(bands)` is the Chebyshev series of degree bands - 1 through any values there.
+    """
+    return 1 - np.cos((np.arange(bands) + 0.5) * np.pi / bands)
