@@ -88,8 +88,10 @@ def butterworth(edges: Float[np.ndarray, " edges"], order: int) -> Float64[np.nd
     A partition of unity within [0, 1], without any overshoot. Every band but the first has a zero of order 2p at λ = 0,
     where meshes have their energy, and every band falls as (λ/e)^∓2p away from its edges. In sections, from
     1 + u^2p = Π_i (1 - 2u cos α_i + u²), α_i = (2i + 1)π/2p; a band's two low-passes differ by
-    (1 - (e/e')^2p) u^2p over both denominators. Condition of a solve: up to (2/e + 1)²/sin² α_0, so that edges below
-    0.01 or so are beyond float32.
+    (1 - (e/e')^2p) u^2p over both denominators.
+
+    The condition of a solve is up to (2/e + 1)²/sin² α_0: edges below 0.005 or so, and orders above 3 there, are for
+    float64.
 
     Args:
         edges: λ `[bands + 1]`, ascending in [0, 2]; the first and last stand for the ends of the spectrum.
