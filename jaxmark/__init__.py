@@ -9,6 +9,8 @@ from jaxmark import detectors as detectors
 from jaxmark import distortion as distortion
 from jaxmark import evidence as evidence
 from jaxmark import laplacian as laplacian
+from jaxmark import product as product
+from jaxmark import rational as rational
 from jaxmark import schemes as schemes
 from jaxmark import sharding as sharding
 from jaxmark import spectrum as spectrum

@@ -5,14 +5,15 @@ Filters never need it; the eigenvector scheme, the tests and the reports do.
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64, Int64, PRNGKeyArray
 from scipy import linalg, sparse
 from scipy.sparse import csgraph
 from scipy.sparse import linalg as sparse_linalg
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.laplacian import Laplacian, sparse_matrices
+from jaxmark.laplacian import Laplacian, centre, sparse_matrices
 
 # Below this many vertices a dense decomposition is faster than it is to iterate, and finds every eigenvalue.
 _DENSE_LIMIT = 2500
@@ -116,6 +117,27 @@ def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: 
         basis[k + 1] = following / betas[-1]
     nodes, vectors = linalg.eigh_tridiagonal(alphas, betas[: len(alphas) - 1])
     return Quadrature(nodes, norm**2 * vectors[0] ** 2)
+
+
+def white(operator: Laplacian, key: PRNGKeyArray, probes: int) -> Float64[np.ndarray, "vertices probes"]:
+    """Signals whose spectral measures sum, on average, to the count of eigenvalues above the null space.
+
+    Keyed signs over √D, by Hutchinson: Σ_p ⟨u_p, f(Δ)u_p⟩_D estimates Σ_i f(λ_i), with a variance of at most
+    2 Σ_i f(λ_i)²/probes (Avron, Toledo, J. ACM 58, 2011). Their `chebyshev.moments`, summed, are those of the spectral
+    density.
+
+    Args:
+        operator: the Laplacian, of N vertices.
+        key: any, but not a mark's: what bands are made from must not depend on that.
+        probes: how many signals.
+
+    Returns:
+        `[N, probes]`, centred, 0 at isolated vertices.
+    """
+    degree = np.asarray(operator.degree, np.float64)
+    signs = np.asarray(jax.random.rademacher(key, (len(degree), probes)), np.float64)
+    scale = np.where(degree > 0, 1 / np.sqrt(np.where(degree > 0, probes * degree, 1)), 0)
+    return centre(operator, scale[:, None] * signs)
 
 
 def _symmetric(operator: Laplacian) -> tuple[Int64[np.ndarray, " linked"], np.ndarray, sparse.csc_array]:

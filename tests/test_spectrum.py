@@ -1,3 +1,4 @@
+import jax
 import numpy as np
 import pytest
 import trimesh
@@ -6,7 +7,7 @@ from jaxmark import spectrum
 from jaxmark.errors import JaxmarkError
 from jaxmark.laplacian import centre, make_laplacian
 from jaxmark.mesh import Mesh, make_mesh
-from jaxmark.spectrum import eigenpairs, quadrature
+from jaxmark.spectrum import eigenpairs, quadrature, white
 from tests.dense import laplacian_matrix
 
 
@@ -64,6 +65,19 @@ def test_quadrature_is_exact_for_polynomials(hard_graph: Mesh):
             exact = x @ (operator.degree * (np.linalg.matrix_power(delta, power) @ x))
             assert found.weights @ found.nodes**power == pytest.approx(exact, rel=1e-9)
     assert quadrature(operator, 0 * x, 3).nodes.size == 0
+
+
+def test_white_signals_estimate_traces(hard_graph: Mesh):
+    """Σ f(λ_i) above the null space, within four of Hutchinson's standard deviations; without isolated vertices."""
+    operator = make_laplacian(hard_graph, "inverse-length")
+    signals = white(operator, jax.random.key(0), 1000)
+    delta, values = laplacian_matrix(operator), eigenpairs(operator).values
+    np.testing.assert_array_equal(signals[[5, 10]], 0)
+    for power in (0, 1, 3):
+        applied = np.linalg.matrix_power(delta, power) @ signals
+        estimate = (operator.degree[:, None] * signals * applied).sum()
+        deviation = np.sqrt(2 * (values ** (2 * power)).sum() / 1000)
+        assert abs(estimate - (values**power).sum()) < 4 * deviation
 
 
 def test_refuses_no_pairs(sphere: Mesh):

@@ -1,15 +1,15 @@
 """How cleanly a family separates a mesh into bands: the conditions of Sohn et al., section 3, in figures."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from numpy.polynomial import chebyshev
 
-from jaxmark.chebyshev import gram
-from jaxmark.laplacian import Laplacian
-from jaxmark.spectrum import quadrature
+from jaxmark.spectrum import Quadrature
+
+_GRID = 4096  # points on which responses are looked at; of polynomials, 16 a term
 
 
 class FamilyReport(NamedTuple):
@@ -23,48 +23,49 @@ class FamilyReport(NamedTuple):
 
 
 def report(
-    operator: Laplacian,
-    coefficients: Float64[np.ndarray, "bands terms"],
-    x: Float64[np.ndarray, " vertices"],
+    measure: Quadrature,
+    family: Float[np.ndarray, "bands terms"] | Callable[[np.ndarray], np.ndarray],
     *,
-    nodes: int | None = None,
+    edges: Float[np.ndarray, " edges"] | None = None,
 ) -> FamilyReport:
-    """Measure a family on a mesh, on the host.
+    """Measure a family on a signal, on the host.
 
-    The pass band of band j of B is where a partition into B bands, equally wide in the angle θ = arccos(1 - λ) as the
-    scaling functions' nodes are, with one band's width to either side. Leakage takes the spectral measure of `x` by
-    Gauss quadrature: exact as a whole, resolved to the spacing of the nodes at the edges of a pass band.
+    All that a family makes of a signal follows from the signal's spectral measure: ⟨f_i(Δ)x, f_j(Δ)x⟩_D is the integral
+    of f_i f_j. By Gauss quadrature that is exact for polynomials of degree below the number of nodes; leakage is
+    resolved to the spacing of the nodes at the edges of a pass band.
 
     Args:
-        operator: the Laplacian, of N vertices.
-        coefficients: one Chebyshev series per row, `[bands, degree + 1]`, by increasing frequency.
-        x: one signal `[N]`, centred.
-        nodes: of the quadrature; 4 · (degree + 1) by default, and exact from N on.
+        measure: `spectrum.quadrature` of one centred signal, with more nodes than the degree, better four times as
+            many; one serves any number of families.
+        family: one Chebyshev series per row, `[bands, degree + 1]`, by increasing frequency; or any responses, as a
+            function from λ `[values]` to `[bands, values]`.
+        edges: λ `[bands + 1]` where the bands meet; by default those of a partition equally wide in the angle
+            arccos(1 - λ), as the scaling functions' is. A band's pass band is its own part and both its neighbours'.
 
     Returns:
         The figures. A band without any energy has leakage 1 and takes no part in the coherence.
     """
-    bands, terms = coefficients.shape
-    responses = chebyshev.chebval(np.cos(np.linspace(0, np.pi, 16 * terms + 1)), coefficients.T)
-    peak = np.abs(responses).max(axis=1)
-    overshoot = np.maximum(responses.max(axis=1) - 1, -responses.min(axis=1)).clip(min=0) / peak
+    if callable(family):
+        responses, points = family, _GRID
+    else:
+        responses, points = lambda values: chebyshev.chebval(values - 1, family.T), 16 * family.shape[1]
+    shape = responses(1 - np.cos(np.linspace(0, np.pi, points + 1)))
+    bands = len(shape)
+    peak = np.abs(shape).max(axis=1)
+    overshoot = np.maximum(shape.max(axis=1) - 1, -shape.min(axis=1)).clip(min=0) / peak
 
-    measure = quadrature(operator, x, 4 * terms if nodes is None else nodes)
-    angle = np.arccos(np.clip(1 - measure.nodes, -1, 1)) * bands / np.pi  # in band widths
-    energy = measure.weights * chebyshev.chebval(measure.nodes - 1, coefficients.T) ** 2
-    inside = np.abs(angle - (np.arange(bands)[:, None] + 0.5)) <= 1.5
-    total = energy.sum(axis=1)
+    edges = 1 - np.cos(np.linspace(0, np.pi, bands + 1)) if edges is None else edges
+    first, last = edges[np.maximum(np.arange(bands) - 1, 0)], edges[np.minimum(np.arange(bands) + 2, bands)]
+    inside = (measure.nodes >= first[:, None]) & (measure.nodes <= last[:, None])
+    components = responses(measure.nodes) * np.sqrt(measure.weights)
+    total = (components**2).sum(axis=1)
     alive = total > np.finfo(np.float64).eps ** 2 * measure.weights.sum()
-    leakage = np.where(alive, (energy * ~inside).sum(axis=1) / np.where(alive, total, 1), 1.0)
+    leakage = np.where(alive, (components**2 * ~inside).sum(axis=1) / np.where(alive, total, 1), 1.0)
 
-    dtype = jax.dtypes.canonicalize_dtype(np.float64)
-    products = np.asarray(gram(operator, coefficients, x.astype(dtype)), np.float64)
-    norm = np.sqrt(np.diag(products))
-    seen = norm > np.sqrt(len(x)) * np.finfo(dtype).eps * np.sqrt(measure.weights.sum())
-    cosines = np.abs(products / np.where(seen, norm, np.inf) / np.where(seen, norm, np.inf)[:, None])
-    pairs = cosines[np.triu_indices(bands, 1)][(seen & seen[:, None])[np.triu_indices(bands, 1)]]
+    unit = components[alive] / np.sqrt(total[alive, None])
+    pairs = np.abs(unit @ unit.T)[np.triu_indices(len(unit), 1)]
     return FamilyReport(
-        partition_error=float(np.abs(responses.sum(axis=0) - 1).max()),
+        partition_error=float(np.abs(shape.sum(axis=0) - 1).max()),
         overshoot=overshoot,
         leakage=leakage,
         coherence_max=float(pairs.max(initial=0.0)),

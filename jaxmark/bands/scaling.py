@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64
 
+from jaxmark.bands.damping import Damping, damping_factors
 from jaxmark.errors import JaxmarkError
 
 
@@ -15,7 +16,7 @@ def scaling(
     bands: int,
     *,
     kernel: Literal["halved", "printed"] = "halved",
-    damping: Literal["none", "jackson", "lanczos"] = "none",
+    damping: Damping = "none",
 ) -> Float64[np.ndarray, "bands terms"]:
     """Chebyshev coefficients of the scaling functions, one band a row, of degree bands - 1.
 
@@ -27,9 +28,7 @@ def scaling(
         kernel: `"printed"` as the paper has it, scale 1/bands: the k = 0 term counts in full, so a band is not zero
             at the other nodes but 1/2 of the scale 1/bands. `"halved"` halves that term, scale 2/bands: the Lagrange
             basis at the nodes. Both are partitions of unity.
-        damping: factors g_k on the terms, with g_0 = 1, against the Gibbs oscillation: `"jackson"` (Jackson's kernel,
-            Weiße et al., Rev. Mod. Phys. 78, 2006, eq. 71) or `"lanczos"` (σ-factors sinc(k/bands)). They keep the
-            partition of unity.
+        damping: `damping_factors` on the terms, against the Gibbs oscillation. They keep the partition of unity.
 
     Returns:
         `[bands, bands]`.
@@ -42,7 +41,7 @@ def scaling(
     k = np.arange(bands)
     # Descending j is ascending frequency.
     angles = (2 * np.arange(bands)[::-1] + 1) * np.pi / (2 * bands)
-    coefficients = np.cos(np.outer(angles, k)) * _damping(damping, bands)
+    coefficients = np.cos(np.outer(angles, k)) * damping_factors(damping, bands)
     match kernel:
         case "printed":
             return coefficients / bands
@@ -51,14 +50,10 @@ def scaling(
     raise JaxmarkError(f"kernel must be 'halved' or 'printed', got {kernel!r}.")
 
 
-def _damping(name: str, terms: int) -> Float64[np.ndarray, " terms"]:
-    k = np.arange(terms)
-    match name:
-        case "none":
-            return np.ones(terms)
-        case "jackson":
-            q = np.pi / (terms + 1)
-            return ((terms - k + 1) * np.cos(q * k) + np.sin(q * k) / np.tan(q)) / (terms + 1)
-        case "lanczos":
-            return np.sinc(k / terms)
-    raise JaxmarkError(f"damping must be 'none', 'jackson' or 'lanczos', got {name!r}.")
+def nodes(bands: int) -> Float64[np.ndarray, " bands"]:
+    """λ at the zeros of T_bands(λ - 1), ascending.
+
+    There the scaling functions of the halved kernel are 1 each in turn and 0 otherwise, so that
+    `values @ scaling(bands)` is the Chebyshev series of degree bands - 1 through any values there.
+    """
+    return 1 - np.cos((np.arange(bands) + 0.5) * np.pi / bands)
