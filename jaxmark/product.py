@@ -103,9 +103,10 @@ def filter(
             f" got {zeros.shape}, {scales.shape} and {x.shape}."
         )
     product = operator.product(x)
+    x = operator.enter(x)
 
     def step(y: Array, factor: tuple[Array, Array]) -> tuple[Array, None]:
         zero, scale = factor
         return scale * (product(y) - zero * y), None
 
-    return jax.lax.scan(step, x, (zeros, scales))[0]
+    return operator.leave(jax.lax.scan(step, x, (zeros, scales))[0])

@@ -55,7 +55,7 @@ def filter(
         )
     tolerance = 10 * float(jnp.finfo(x.dtype).eps) if tolerance is None else tolerance
     product = operator.product(x)
-    degree = per_row(operator.degree, x)
+    degree = per_row(operator.enter(jnp.asarray(operator.degree)), x)
     root = jnp.sqrt(jnp.where(degree > 0, degree, 1))  # an isolated vertex is its own block of Δ
 
     def quadratic(c: Array, y: Array) -> Array:
@@ -71,7 +71,7 @@ def filter(
         )
         return z / root, None
 
-    return jax.lax.scan(solve, x, sections)[0]
+    return operator.leave(jax.lax.scan(solve, operator.enter(x), sections)[0])
 
 
 def response(

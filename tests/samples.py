@@ -1,8 +1,10 @@
 """Meshes made on the spot."""
 
 import numpy as np
+import pytest
 from scipy.spatial import ConvexHull
 
+from jaxmark.laplacian import Laplacian, Weighting, make_laplacian
 from jaxmark.mesh import Mesh, make_mesh
 
 
@@ -47,3 +49,13 @@ def exact_sheet(size: int) -> Mesh:
         ]
     )
     return make_mesh(vertices, faces)
+
+
+def ordered_laplacian(mesh: Mesh, weights: Weighting) -> Laplacian:
+    """With rows in an order of its own, as large meshes have them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jaxmark.laplacian._ORDERED", 0)
+        made = make_laplacian(mesh, weights)
+    assert made.neighbours is not None
+    assert not np.array_equal(made.neighbours.order, np.arange(len(made.degree)))
+    return made

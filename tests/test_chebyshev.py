@@ -12,7 +12,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.laplacian import Laplacian, make_laplacian
 from jaxmark.mesh import Mesh, make_mesh
 from tests.dense import chebyshev_matrices, tolerance
-from tests.samples import bumpy_sphere
+from tests.samples import bumpy_sphere, ordered_laplacian
 
 DEGREE = 9
 
@@ -28,13 +28,7 @@ def graph() -> Mesh:
 
 @pytest.fixture(scope="module")
 def operator(graph: Mesh) -> Laplacian:
-    """With rows in an order of its own, as large meshes have them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxmark.laplacian._ORDERED", 0)
-        made = make_laplacian(graph, "inverse-length")
-    assert made.neighbours is not None
-    assert not np.array_equal(made.neighbours.order, np.arange(len(made.degree)))
-    return made
+    return ordered_laplacian(graph, "inverse-length")
 
 
 @pytest.fixture(scope="module")

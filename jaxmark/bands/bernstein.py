@@ -2,7 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float64
-from scipy import stats
+from scipy import special
 
 from jaxmark.bands.scaling import nodes, scaling
 from jaxmark.errors import JaxmarkError
@@ -26,4 +26,6 @@ def bernstein(bands: int) -> Float64[np.ndarray, "bands terms"]:
     if bands < 1:
         raise JaxmarkError(f"bernstein needs at least one band, got {bands}.")
     # Nowhere above 1, so that interpolating is exact to rounding.
-    return stats.binom.pmf(np.arange(bands)[:, None], bands - 1, nodes(bands) / 2) @ scaling(bands)
+    j, at, n = np.arange(bands)[:, None], nodes(bands) / 2, bands - 1
+    logarithm = -special.betaln(n - j + 1, j + 1) - np.log(n + 1) + special.xlogy(j, at) + special.xlog1py(n - j, -at)
+    return np.exp(logarithm) @ scaling(bands)
