@@ -20,7 +20,7 @@ from jaxmark.laplacian import Laplacian
 from jaxmark.observation import observe
 from jaxmark.original import Original, prepare
 from jaxmark.precision import compensated_sum, sum_and_norm
-from jaxmark.reception import Host, Reception, make_host
+from jaxmark.reception import Receiver, Reception, make_host, make_receiver
 from jaxmark.schemes import EigenScheme, HostScheme, KeyedScheme
 from jaxmark.watermark import detect, embed
 from tests.samples import bumpy_sphere
@@ -104,7 +104,7 @@ def test_a_claim_of_millions_of_chips():
     signs, slots = random.choice([-1, 1], zeros.shape).astype(np.int8), random.integers(0, code, zeros.shape)
     bits = random.choice([-1.0, 1.0], code)
     terms = rising(zeros.size, np.float32).reshape(zeros.shape)
-    host = Host(operator, zeros, jnp.ones((1, 1), jnp.float32), zeros[:, :1])
+    host = Receiver(operator, zeros, jnp.ones((1, 1), jnp.float32), zeros[:, :1])
     one, seen = jnp.ones(1, jnp.float32), observe(zeros)
     received = Reception(
         *(host, jnp.asarray(terms * signs * bits[slots], jnp.float32), one, one),
@@ -169,7 +169,9 @@ def test_products_of_preparing_embedding_and_reading(scheme, original, key: jm.K
 
     def others(x, bits, beta):
         carrier, marked = written(x, bits, beta)
-        more = [payload._probe(carrier, jnp.ones_like(x[:, 0]))] if isinstance(carrier, KeyedCarrier) else []
+        more = []
+        if isinstance(carrier, KeyedCarrier):
+            more = [payload._probe(carrier, make_receiver(carrier.host), jnp.ones_like(x[:, 0]))]
         seen = observe(marked - x)._replace(nuisance=x)
         return carrier.claim(seen, bits), carrier.adjoint(x, beta), carrier.gram(beta), decorrelate(carrier, seen), more
 
@@ -181,7 +183,7 @@ def test_products_of_preparing_embedding_and_reading(scheme, original, key: jm.K
 
 def test_products_of_tuning(original, key: jm.Key):
     x, family = original.signal, jnp.asarray(scaling(16, damping="jackson"), jnp.float32)
-    host = make_host(original.operator, x, x, family, scales=2, degree=3)
+    host = make_receiver(make_host(original.operator, x, x, family, scales=2, degree=3))
     seen = observe(0.01 * x)
     assert check_products(channels.measure, host, seen, x)
     assert check_products(jax.grad(lambda x: channels.band_energies(original.operator, family, x, x).sum()), x)
