@@ -59,7 +59,8 @@ import jaxmark as jm
 from jaxmark.bands import scaling
 from jaxmark.chebyshev import band_components, filter, moments
 from jaxmark.extras import require
-from jaxmark.laplacian import Laplacian, sparse_matrices
+from jaxmark.laplacian import Laplacian, make_laplacian, sparse_matrices
+from jaxmark.mesh import welded_mesh
 from jaxmark.original import Original, prepare
 from jaxmark.schemes import KeyedScheme
 
@@ -100,6 +101,12 @@ def shifted(operator: Laplacian) -> sparse.csr_array:
     return matrix
 
 
+def graph(original: Original) -> tuple[Laplacian, jax.Array]:
+    """Operator and signal of just its points, on the device."""
+    points = welded_mesh(original.mesh, original.weld)
+    return jax.tree.map(jnp.asarray, make_laplacian(points)), original.signal[: len(points.vertices)]
+
+
 def exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float:
     return float(np.polyfit(np.log(sizes), np.log(seconds), 1)[0])
 
@@ -122,7 +129,7 @@ class Bench(NamedTuple):
 def filters(bench: Bench) -> Iterator[Row]:
     c = coefficients(DEGREE)
     for index in range(len(bench.sizes)):
-        operator, x = bench.original(index).operator, bench.original(index).signal
+        operator, x = graph(bench.original(index))
         ours, seconds = np.asarray(filter(operator, c, x)), bench.time(filter, operator, c, x)
         moved = traffic(operator, x)
         row = {"vertices": len(x), "edges": len(operator.edges), "program": OURS, "s": seconds, "times ours": 1.0}
@@ -162,7 +169,7 @@ def gradients(bench: Bench) -> Iterator[Row]:
         f"band_components, {len(bands)} bands": (band_components, bands),
     }
     for index in range(len(bench.sizes)):
-        operator, x = bench.original(index).operator, bench.original(index).signal
+        operator, x = graph(bench.original(index))
         plain = 0.0
         for name, (function, numbers) in list(timed.items())[: 4 if index == 0 else 2]:
             seconds = bench.time(function, operator, numbers, x)
@@ -187,7 +194,7 @@ def stages(bench: Bench) -> Iterator[Row]:
     sizes: list[int] = []
     seconds: list[float] = []
     for size in DENSE:
-        stiffness, mass = sparse_matrices(prepare(torus(size)).operator)
+        stiffness, mass = sparse_matrices(make_laplacian(torus(size)))
         root = 1 / np.sqrt(mass.diagonal())
         dense = root[:, None] * stiffness.toarray() * root
         sizes.append(len(dense))
@@ -201,13 +208,13 @@ def exponents(bench: Bench) -> Iterator[Row]:
         points = {"from": places[0], "to": places[-1], "s": seconds[0], "s at the end": seconds[-1]}
         return {"what": what, "exponent of": of, "exponent": exponent(places, seconds)} | points
 
-    everything = [bench.original(index) for index in range(len(bench.sizes))]
-    sizes = [len(one.signal) for one in everything]
+    everything = [graph(bench.original(index)) for index in range(len(bench.sizes))]
+    sizes = [len(x) for _, x in everything]
     c = coefficients(DEGREE)
     if len(sizes) > 1:
-        yield row(OURS, "vertices", sizes, [bench.time(filter, one.operator, c, one.signal) for one in everything])
-    one = everything[min(1, len(sizes) - 1)]
-    by_degree = [bench.time(filter, one.operator, coefficients(degree), one.signal) for degree in DEGREES]
+        yield row(OURS, "vertices", sizes, [bench.time(filter, operator, c, x) for operator, x in everything])
+    operator, x = everything[min(1, len(sizes) - 1)]
+    by_degree = [bench.time(filter, operator, coefficients(degree), x) for degree in DEGREES]
     yield row(OURS, "degree", list(DEGREES), by_degree)
     # Smaller ones, since each is compiled anew.
     small, usual = [torus(bench.sizes[0] // part) for part in (4, 2, 1)], KeyedScheme()
