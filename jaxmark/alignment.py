@@ -214,10 +214,13 @@ def _fit(
     # A sample finds it; two rounds with all points make it exact.
     some = np.sort(np.random.default_rng(0).permutation(len(x))[:_ENOUGH])
     pose = _fit_to_all(x[some], y[some], agreeing[some])[0]
+    agreeing = _agreeing(_distance(pose(y), x))
     for _ in range(2):
-        agreeing = _agreeing(_distance(pose(y), x))
         pose = _map(x, y, agreeing)
-    return pose, _agreeing(_distance(pose(y), x))
+        before, agreeing = agreeing, _agreeing(_distance(pose(y), x))
+        if np.array_equal(agreeing, before):
+            break
+    return pose, agreeing
 
 
 def _fit_to_all(
