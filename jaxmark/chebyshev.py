@@ -21,6 +21,7 @@ from jaxmark.precision import einsum
 Signal = Float[Array | np.ndarray, " vertices *columns"]
 
 _AT_ONCE = 5  # band components that are formed at a time where each is used once
+_WIDE = 128  # rows that are summed at once
 _UNROLLED = 2**16  # values of a signal, from which on running takes longer than compiling
 
 
@@ -157,7 +158,7 @@ def _moments(operator: Laplacian, x: Array, degree: int) -> Array:
     x, mass = operator.enter(x), operator.enter(per_row(operator.degree, x))
 
     def products(_: None, t: Array, before: Array, __: Array) -> tuple[None, tuple[Array, Array]]:
-        return None, (jnp.sum(mass * t * before, axis=0), jnp.sum(mass * t * t, axis=0))
+        return None, (_sums(mass * t * before), _sums(mass * t * t))
 
     _, (odd, even) = _scan_terms(operator, x, jnp.zeros(degree + 1, x.dtype), products, None)
     m0 = jnp.sum(mass * x * x, axis=0)[None]
@@ -268,13 +269,53 @@ def _filter_forward(operator: Any, coefficients: Any, x: Any) -> tuple[Array, tu
 
 
 def _filter_reverse(inputs: tuple[Operator, Array, Array], cotangent: Any) -> tuple[None, Array, Array]:
-    operator, coefficients, x = inputs
-    y_bar = _instantiate(cotangent)
-    c_bar: Any = _projections(operator, y_bar, x, len(coefficients) - 1)
-    return None, c_bar if coefficients.ndim == x.ndim else c_bar.sum(axis=1), transpose(operator, coefficients, y_bar)
+    return None, *_cotangents(*inputs, _instantiate(cotangent))
 
 
 _filter_recompute.defvjp(_filter_forward, _filter_reverse, symbolic_zeros=True)
+
+
+@jax.custom_vjp
+def _cotangents(operator: Operator, coefficients: Array, x: Array, y_bar: Array) -> tuple[Array, Array]:
+    """c̄_k = Σ ȳ·T_k(Δ̃)x and x̄ = D f(Δ) D⁻¹ȳ, by one recurrence of both signals: a row is read for either at once."""
+    return _cotangents_scan(operator, coefficients, x, y_bar)
+
+
+@jax.jit
+def _cotangents_scan(operator: Operator, coefficients: Array, x: Array, y_bar: Array) -> tuple[Array, Array]:
+    x, y_bar = operator.enter(x), operator.enter(y_bar)
+    mass = operator.enter(per_row(operator.degree, y_bar))
+    mass = jnp.where(mass > 0, mass, 1)
+    pair = jnp.stack([x, y_bar / mass], axis=-1)
+
+    def add(total: Array, t: Array, _: Array, c_k: Array) -> tuple[Array, Array]:
+        return total + c_k * t[..., 1], _sums(y_bar * t[..., 0])
+
+    total, rest = _scan_terms(operator, pair, coefficients, add, coefficients[0] * pair[..., 1])
+    c_bar = jnp.concatenate([_sums(y_bar * x)[None], rest])
+    shared = coefficients.ndim < x.ndim
+    return c_bar.sum(axis=1) if shared else c_bar, operator.leave(mass * total)
+
+
+def _cotangents_forward(
+    operator: Operator, coefficients: Array, x: Array, y_bar: Array
+) -> tuple[tuple[Array, Array], tuple[Operator, Array, Array, Array]]:
+    return _cotangents_scan(operator, coefficients, x, y_bar), (operator, coefficients, x, y_bar)
+
+
+def _cotangents_reverse(
+    inputs: tuple[Operator, Array, Array, Array], cotangent: Any
+) -> tuple[None, Array, Array, Array]:
+    """Both are bilinear: Σ_k a_k c̄_k = ȳ·f_a(Δ)x, and b·x̄ = ȳ·f(Δ)b."""
+    operator, coefficients, x, y_bar = inputs
+    a, b = map(jnp.asarray, cotangent)  # they may come as NumPy's
+    along_x, back = _filter_recompute(operator, a, x), transpose(operator, a, y_bar)
+    c_bar: Any = _projections(operator, y_bar, b, len(coefficients) - 1)
+    shared = coefficients.ndim < x.ndim
+    return None, c_bar.sum(axis=1) if shared else c_bar, back, along_x + _filter_recompute(operator, coefficients, b)
+
+
+_cotangents.defvjp(_cotangents_forward, _cotangents_reverse)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
@@ -288,10 +329,10 @@ def _projections_scan(operator: Operator, u: Array, x: Array, degree: int) -> Ar
     u, x = operator.enter(u), operator.enter(x)
 
     def project(_: None, t: Array, __: Array, ___: Array) -> tuple[None, Array]:
-        return None, jnp.sum(u * t, axis=0)
+        return None, _sums(u * t)
 
     _, rest = _scan_terms(operator, x, jnp.zeros(degree + 1, x.dtype), project, None)
-    return jnp.concatenate([jnp.sum(u * x, axis=0)[None], rest])
+    return jnp.concatenate([_sums(u * x)[None], rest])
 
 
 def _projections_forward(operator: Any, u: Any, x: Any, degree: int) -> tuple[Array, tuple[Operator, Array, Array]]:
@@ -309,6 +350,13 @@ def _projections_reverse(
 
 
 _projections.defvjp(_projections_forward, _projections_reverse, symbolic_zeros=True)
+
+
+def _sums(x: Array) -> Array:
+    """Σ over vertices, column by column; many rows at a time, for processors add few columns slowly."""
+    whole = len(x) // _WIDE * _WIDE
+    wide = x[:whole].reshape(-1, _WIDE * (x.size // max(len(x), 1))).sum(axis=0)
+    return wide.reshape(_WIDE, *x.shape[1:]).sum(axis=0) + x[whole:].sum(axis=0)
 
 
 def _fixed(operator: Any, name: str, remedy: str) -> Operator:

@@ -1,3 +1,5 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -117,6 +119,21 @@ def test_derivatives_by_transformation(operator, x64):
         return jnp.sum(jnp.sin(chebyshev.filter(operator._replace(weights=weights), c, x, derivative="scan")))
 
     check_grads(scanned, (c, x[0], jnp.asarray(operator.weights)), order=1, modes=["fwd", "rev"])
+
+
+@pytest.mark.parametrize(("columns", "per_column"), [((), False), ((3,), False), ((3,), True)])
+def test_derivatives_of_either_kind_agree(columns, per_column, dtype):
+    """On more vertices than are summed at once: those in O(N) memory, and JAX's own of the recurrence."""
+    operator = make_laplacian(bumpy_sphere(3), "inverse-length")
+    c = jnp.asarray(random_array(DEGREE + 1, *(columns if per_column else ())), dtype)
+    x, u = (jnp.asarray(random_array(642, *columns, seed=seed), dtype) for seed in (1, 2))
+
+    def loss(c, x, derivative):
+        return jnp.sum(u * jnp.sin(chebyshev.filter(operator, c, x, derivative=derivative)))
+
+    gradients = [jax.jit(jax.grad(partial(loss, derivative=kind), (0, 1)))(c, x) for kind in ("recompute", "scan")]
+    for got, expected in zip(*gradients, strict=True):
+        np.testing.assert_allclose(got, expected, atol=tolerance(dtype, 30))
 
 
 def test_derivative_of_weights_is_refused_by_name(operator, x64):
