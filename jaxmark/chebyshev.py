@@ -269,53 +269,13 @@ def _filter_forward(operator: Any, coefficients: Any, x: Any) -> tuple[Array, tu
 
 
 def _filter_reverse(inputs: tuple[Operator, Array, Array], cotangent: Any) -> tuple[None, Array, Array]:
-    return None, *_cotangents(*inputs, _instantiate(cotangent))
+    operator, coefficients, x = inputs
+    y_bar = _instantiate(cotangent)
+    c_bar: Any = _projections(operator, y_bar, x, len(coefficients) - 1)
+    return None, c_bar if coefficients.ndim == x.ndim else c_bar.sum(axis=1), transpose(operator, coefficients, y_bar)
 
 
 _filter_recompute.defvjp(_filter_forward, _filter_reverse, symbolic_zeros=True)
-
-
-@jax.custom_vjp
-def _cotangents(operator: Operator, coefficients: Array, x: Array, y_bar: Array) -> tuple[Array, Array]:
-    """c̄_k = Σ ȳ·T_k(Δ̃)x and x̄ = D f(Δ) D⁻¹ȳ, by one recurrence of both signals: a row is read for either at once."""
-    return _cotangents_scan(operator, coefficients, x, y_bar)
-
-
-@jax.jit
-def _cotangents_scan(operator: Operator, coefficients: Array, x: Array, y_bar: Array) -> tuple[Array, Array]:
-    x, y_bar = operator.enter(x), operator.enter(y_bar)
-    mass = operator.enter(per_row(operator.degree, y_bar))
-    mass = jnp.where(mass > 0, mass, 1)
-    pair = jnp.stack([x, y_bar / mass], axis=-1)
-
-    def add(total: Array, t: Array, _: Array, c_k: Array) -> tuple[Array, Array]:
-        return total + c_k * t[..., 1], _sums(y_bar * t[..., 0])
-
-    total, rest = _scan_terms(operator, pair, coefficients, add, coefficients[0] * pair[..., 1])
-    c_bar = jnp.concatenate([_sums(y_bar * x)[None], rest])
-    shared = coefficients.ndim < x.ndim
-    return c_bar.sum(axis=1) if shared else c_bar, operator.leave(mass * total)
-
-
-def _cotangents_forward(
-    operator: Operator, coefficients: Array, x: Array, y_bar: Array
-) -> tuple[tuple[Array, Array], tuple[Operator, Array, Array, Array]]:
-    return _cotangents_scan(operator, coefficients, x, y_bar), (operator, coefficients, x, y_bar)
-
-
-def _cotangents_reverse(
-    inputs: tuple[Operator, Array, Array, Array], cotangent: Any
-) -> tuple[None, Array, Array, Array]:
-    """Both are bilinear: Σ_k a_k c̄_k = ȳ·f_a(Δ)x, and b·x̄ = ȳ·f(Δ)b."""
-    operator, coefficients, x, y_bar = inputs
-    a, b = map(jnp.asarray, cotangent)  # they may come as NumPy's
-    along_x, back = _filter_recompute(operator, a, x), transpose(operator, a, y_bar)
-    c_bar: Any = _projections(operator, y_bar, b, len(coefficients) - 1)
-    shared = coefficients.ndim < x.ndim
-    return None, c_bar.sum(axis=1) if shared else c_bar, back, along_x + _filter_recompute(operator, coefficients, b)
-
-
-_cotangents.defvjp(_cotangents_forward, _cotangents_reverse)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
