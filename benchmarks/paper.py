@@ -38,7 +38,7 @@ from numpy.polynomial import chebyshev
 from numpy.random import Generator
 from panels import Curves, Panel, pictures
 from scipy.spatial.transform import Rotation
-from speed import TOLERANCE, exponent, shifted, table, torus
+from speed import TOLERANCE, exponent, graph, shifted, table, torus
 from stages import Row, coefficients, median_time
 
 import jaxmark as jm
@@ -48,7 +48,6 @@ from jaxmark.carriers import host_bands
 from jaxmark.chebyshev import band_components, filter
 from jaxmark.detectors import Detector, correlate, decorrelate
 from jaxmark.distortion import rms
-from jaxmark.laplacian import Laplacian, centre, make_laplacian
 from jaxmark.observation import observe
 from jaxmark.original import Original, displaced, prepare, residual
 from jaxmark.schemes import EigenScheme, HostScheme, Scheme
@@ -113,11 +112,6 @@ def kernel(_: Mapping[str, jm.Mesh], __: argparse.Namespace) -> Part:
     return [rows], panels
 
 
-def ready(mesh: jm.Mesh) -> tuple[Laplacian, jax.Array]:
-    operator = make_laplacian(mesh)
-    return jax.tree.map(jnp.asarray, operator), jnp.asarray(centre(operator, np.asarray(mesh.vertices)), jnp.float32)
-
-
 def dense_filter(matrix: np.ndarray, c: np.ndarray, x: np.ndarray) -> np.ndarray:
     """The paper's Method 2, corrected, with the matrix as it is printed."""
     before, current = x, matrix @ x
@@ -129,7 +123,7 @@ def dense_filter(matrix: np.ndarray, c: np.ndarray, x: np.ndarray) -> np.ndarray
 
 
 def timed(mesh: jm.Mesh, degree: int, largest: int, repeat: int) -> Row:
-    operator, x = ready(mesh)
+    operator, x = graph(prepare(mesh))
     c, run = coefficients(degree), jax.jit(filter)
     row: Row = {"vertices": len(x), "sparse, s": median_time(lambda: run(operator, c, x), repeat)}
     if len(x) <= largest:
@@ -168,7 +162,7 @@ def time(meshes: Mapping[str, jm.Mesh], options: argparse.Namespace) -> Part:
 def degree(meshes: Mapping[str, jm.Mesh], options: argparse.Namespace) -> Part:
     rows, exponents, panels = [], [], []
     for name, mesh in meshes.items():
-        (operator, x), mine = ready(mesh), []
+        (operator, x), mine = graph(prepare(mesh)), []
         for n in DEGREES:
             family = jnp.asarray(scaling(n + 1), jnp.float32)
             row = {"mesh": name, "degree": n} | timed(mesh, n, len(x), options.repeat)
