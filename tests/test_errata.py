@@ -197,7 +197,7 @@ def test_bound_3_says_nothing_on_meshes(sphere: Mesh, x64):
     assert (n - np.triu(np.abs(exact), 1).max(axis=(1, 2)) * n * (n - 1) > n - 1e-9).all()
 
 
-def test_the_detection_value_depends_on_the_position_unless_centred(sphere: Mesh, x64):
+def test_components_depend_on_the_position_unless_centred(sphere: Mesh, x64):
     """Not in the paper: λ = 0 is where the mesh stands, so without centring the mark grows with the distance to 0."""
     operator, rows = make_laplacian(sphere), scaling(16, kernel="printed")
     near, far = (jnp.asarray(np.asarray(sphere.vertices) + shift) for shift in (0.0, 100.0))
