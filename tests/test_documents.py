@@ -1,5 +1,6 @@
 """What the documents say is run."""
 
+import pkgutil
 import re
 import shlex
 import subprocess
@@ -53,6 +54,20 @@ def test_make_targets_of_the_readme_exist():
     assert targets == {"demo", "test"}
     for target in targets:
         subprocess.run(["make", "-n", target], cwd=ROOT, check=True, capture_output=True)
+
+
+def test_tests_that_the_page_on_the_paper_names_exist():
+    named = re.findall(r"`tests/(\w+\.py)::(\w+)`", (ROOT / "docs" / "paper.md").read_text())
+    assert len(named) >= 20
+    for file, test in named:
+        assert re.search(rf"^def {test}\(", (ROOT / "tests" / file).read_text(), re.MULTILINE), f"{file}::{test}"
+
+
+def test_names_that_the_page_on_the_paper_gives_exist():
+    named = set(re.findall(r"`(jaxmark(?:\.\w+)+)", (ROOT / "docs" / "paper.md").read_text()))
+    assert len(named) >= 20
+    for name in named:
+        pkgutil.resolve_name(name)
 
 
 @pytest.mark.slow

@@ -4,13 +4,16 @@ Each test shows that the printed form fails and the corrected one holds, with Nu
 the matter, else with what jaxmark does. `docs/paper.md` lists them all.
 """
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.polynomial import chebyshev
 
 from jaxmark.bands import scaling
-from jaxmark.carriers import ModulatedCarrier, eigenspaces
+from jaxmark.carriers import ModulatedCarrier, eigenspaces, host_bands
 from jaxmark.chebyshev import filter, transpose
 from jaxmark.detectors import correlate
 from jaxmark.laplacian import centre, make_laplacian
@@ -62,6 +65,41 @@ def test_method_2_saves_before_it_assigns():
     true = np.cos(8 * np.arccos(GRID))
     np.testing.assert_allclose(recurrence(True), true, atol=1e-12)
     assert np.abs(recurrence(False) - true).max() > 1
+
+
+def test_method_1_needs_its_factor():
+    """Printed: Π_{i≠j}(Δ̃ - ξ_i) without A_j = 1/Π_{i≠j}(ξ_j - ξ_i), by which it is another band than Method 2's."""
+    rows, nodes = kernels(12, 0.5)
+    for j, second in enumerate(chebyshev.chebval(GRID, rows.T) / 6):
+        others = np.delete(nodes, j)
+        first = (GRID[:, None] - others).prod(axis=1)
+        np.testing.assert_allclose(first / (nodes[j] - others).prod(), second, atol=1e-12)
+        assert np.abs(first - second).max() > 0.9
+
+
+def test_a_filter_costs_what_its_edges_do():
+    """Printed: O(nN²). Four times the vertices take four times the work and the memory; a dense product sixteen."""
+
+    def cost(level: int, dense: bool) -> tuple[float, float]:
+        operator = make_laplacian(bumpy_sphere(level))
+        x = jnp.ones((len(operator.degree), 3), jnp.float32)
+        matrix = jnp.zeros((len(x), len(x)), jnp.float32)
+        program = jax.jit(jnp.matmul if dense else type(operator).apply).lower(matrix if dense else operator, x)
+        compiled = program.compile()
+        analysis: Any = compiled.cost_analysis()
+        return analysis["flops"], analysis["bytes accessed"]
+
+    for dense, growth in ((False, 4), (True, 16)):
+        np.testing.assert_allclose(np.divide(cost(4, dense), cost(3, dense)), growth, rtol=0.05)
+
+
+def test_bands_are_numbered_from_the_highest():
+    """Printed: in increasing frequency. ξ_j falls with j, so peaks do; `scaling` numbers them the other way."""
+    rows, nodes = kernels(16, 0.5)
+    for family, step in ((rows, -1), (scaling(16), 1)):
+        peaks = GRID[chebyshev.chebval(GRID, family.T).argmax(axis=1)]
+        assert (step * np.diff(peaks) > 0).all()
+    assert (np.diff(nodes) < 0).all()
 
 
 def test_there_are_n_plus_1_bands():
@@ -145,6 +183,31 @@ def test_bound_3_needs_the_strength(sphere: Mesh, x64):
     value = float(correlate(carrier, seen, jnp.asarray(1 / norm))[0])
     assert value == pytest.approx(n * beta, rel=1e-9)
     assert value < n / 100
+
+
+def test_bound_3_says_nothing_on_meshes(sphere: Mesh, x64):
+    """Printed: for small ε. Of n components, the others' part of W is bounded by εn(n - 1), and ε is near 1."""
+    operator, n = make_laplacian(sphere), 16
+    signal = jnp.asarray(centre(operator, sphere.vertices))
+    products = np.asarray(host_bands(operator, signal, scaling(n, kernel="printed")).gram)
+    printed = np.abs(products - np.eye(n)).max(axis=(1, 2))
+    assert (printed > 0.9).all()
+    assert (n - printed * n * (n - 1) < 0).all()
+    exact = np.asarray(eigenspaces(operator, signal, eigenpairs(operator, n)).gram)
+    assert (n - np.triu(np.abs(exact), 1).max(axis=(1, 2)) * n * (n - 1) > n - 1e-9).all()
+
+
+def test_components_depend_on_the_position_unless_centred(sphere: Mesh, x64):
+    """Not in the paper: λ = 0 is where the mesh stands, so without centring the mark grows with the distance to 0."""
+    operator, rows = make_laplacian(sphere), scaling(16, kernel="printed")
+    near, far = (jnp.asarray(np.asarray(sphere.vertices) + shift) for shift in (0.0, 100.0))
+
+    def marks(position) -> np.ndarray:
+        return np.asarray(filter(operator, rows[3], position))
+
+    assert np.abs(marks(far) - marks(near)).max() > 1
+    still = [marks(jnp.asarray(centre(operator, np.asarray(position)))) for position in (near, far)]
+    np.testing.assert_allclose(*still, atol=1e-10)
 
 
 def test_the_spectrum_is_real_for_symmetric_weights_only(sphere: Mesh):
