@@ -25,6 +25,7 @@ from jaxmark.files import load_mesh, save_mesh
 from jaxmark.files.atomic import write_atomically
 from jaxmark.keys import commitment, load_key, new_key, save_key
 from jaxmark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity, detect, make_marker
+from jaxmark.mesh import same_connectivity
 from jaxmark.original import residual
 from jaxmark.record import RECORD_SUFFIX, Record
 from jaxmark.report import save_report
@@ -362,13 +363,21 @@ _KINDS = "; ".join(f"{name}: {entry.unit}" for name, entry in ATTACKS.items())
 )
 @_JSON
 def attack_command(source: Path, target: Path, kind: str, strength: float, seed: int, as_json: bool) -> None:
-    """Put a mesh through an attack, to see what a mark survives."""
+    """Put a mesh through an attack, to see what a mark survives.
+
+    OUT is the file IN with other positions, or a new file if faces change.
+    """
     _check_outputs(source, target)
     _distinct(IN=source, OUT=target)
     mesh = load_mesh(source)
     with _replacing(target) as draft:
-        save_mesh(attack(mesh, kind, strength, seed=seed), draft, like=source)
-        change = distortion.moved(mesh, load_mesh(draft))
+        attacked = attack(mesh, kind, strength, seed=seed)
+        if same_connectivity(mesh, attacked):
+            save_mesh(attacked, draft, like=source)
+            attacked = load_mesh(draft)
+        else:
+            save_mesh(attacked, draft)
+        change = distortion.moved(mesh, attacked._replace(faces=mesh.faces))
     answer = {"kind": kind, "strength": strength, "seed": seed, "rms": change.rms, "max": change.max}
     _answer(as_json, answer, f"{kind} {strength:g} → {target}, RMS {change.rms:.3g} of the diagonal")
 

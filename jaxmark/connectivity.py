@@ -6,9 +6,9 @@ cropped, merged into a scene or moved, but not what was remeshed.
 """
 
 import numpy as np
-from jaxtyping import Array, Int, Int64, UInt64
+from jaxtyping import Int64, UInt64
 
-from jaxmark.mesh import Mesh, edges, used_vertices
+from jaxmark.mesh import Mesh, edges, sides, used_vertices
 
 _LEAST, _MOST = 3, 40  # rings: with fewer, chance alike; with more, still not alike
 _TRUSTED = 0.2  # share of the smaller mesh that must be alone of its kind; remeshed regular surfaces have up to a tenth
@@ -89,8 +89,8 @@ def _spread(
     valence_there: Int64[np.ndarray, " others"],
 ) -> Int64[np.ndarray, " vertices"]:
     """Where two corners of a face have matches, the third matches what completes their face there."""
-    corners, wanted = _sides(mesh.faces)
-    there, completes = _sides(other.faces)
+    corners, wanted = sides(mesh.faces)
+    there, completes = sides(other.faces)
     codes = there[:, 0] * len(other.vertices) + there[:, 1]
     order = np.argsort(codes, kind="stable")
     codes, completes = codes[order], completes[order]
@@ -114,12 +114,3 @@ def _spread(
         new, match = new[first], match[first]
         _, first = np.unique(match, return_index=True)
         found[new[first]], taken[match[first]] = match[first], True
-
-
-def _sides(
-    faces: Int[Array | np.ndarray, "faces 3"],
-) -> tuple[Int64[np.ndarray, "sides 2"], Int64[np.ndarray, " sides"]]:
-    """Each side of each face in its direction, and the corner opposite."""
-    faces = np.asarray(faces, np.int64)
-    turned = [faces, faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]]
-    return np.concatenate([face[:, :2] for face in turned]), np.concatenate([face[:, 2] for face in turned])

@@ -118,6 +118,15 @@ def edges(faces: Int[Array | np.ndarray, "faces 3"]) -> Int64[np.ndarray, "edges
     return _count_sides(faces)[0]
 
 
+def sides(
+    faces: Int[Array | np.ndarray, "faces 3"],
+) -> tuple[Int64[np.ndarray, "sides 2"], Int64[np.ndarray, " sides"]]:
+    """Each side of each face in its direction, and the corner opposite: first sides of all faces, second, third."""
+    faces = np.asarray(faces, np.int64)
+    turned = [faces, faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]]
+    return np.concatenate([face[:, :2] for face in turned]), np.concatenate([face[:, 2] for face in turned])
+
+
 def diagonal(mesh: Mesh) -> float:
     """Length of the diagonal of the axis-aligned box of the vertices that faces use, in the mesh's units.
 

@@ -3,10 +3,28 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
+from numpy.typing import ArrayLike
+from scipy.stats import kstest
 
 import jaxmark as jm
-from jaxmark.attacks import ATTACKS, laplacian_smoothing, quantisation, uniform_noise
+from jaxmark.attacks import (
+    ATTACKS,
+    affine,
+    diagonal_noise,
+    laplacian_smoothing,
+    mark_noise,
+    quantisation,
+    similarity,
+    uniform_noise,
+)
 from jaxmark.mesh import Mesh, make_mesh
+from tests.samples import bumpy_sphere
+
+# All that move vertices.
+MILD = (
+    *(("noise", 0.01), ("diagonal-noise", 0.01), ("smoothing", 3), ("quantisation", 8)),
+    *(("similarity", 0.3), ("affine", 0.02)),
+)
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +47,87 @@ def test_noise_is_uniform_relative_to_the_mean_radius(cap: Mesh, dtype):
     assert np.abs(free).max() <= 1 + 1e-3
     assert np.abs(free).max() > 0.99
     assert free.std() == pytest.approx(1 / np.sqrt(3), rel=0.05)
+
+
+def check_uniform(shift: np.ndarray, width: float, used: np.ndarray) -> None:
+    """Kolmogorov and Smirnov do not reject it, coordinates do not correlate, and no used vertex is left alone."""
+    np.testing.assert_array_equal(np.delete(shift, used, axis=0), 0)
+    shift = shift[used]
+    for column in shift.T:
+        assert kstest(column, "uniform", (-width, 2 * width)).pvalue > 1e-3
+    assert np.abs(np.corrcoef(shift.T) - np.eye(3)).max() < 4 / np.sqrt(len(shift))
+    assert (np.abs(shift).max(axis=1) > 0).all()
+    # The vertices' root mean square is the half width.
+    assert np.sqrt(np.mean(np.sum(shift**2, axis=1))) == pytest.approx(width, rel=0.05)
+
+
+def test_noise_relative_to_the_diagonal_moves_boundaries_too(cap: Mesh, dtype):
+    vertices = jnp.asarray(cap.vertices, dtype)
+    moved = diagonal_noise(Mesh(vertices, cap.faces), 0.01, jax.random.key(2)).vertices
+    assert moved.dtype == dtype
+    used = np.unique(cap.faces)
+    width = 0.01 * float(np.linalg.norm(np.ptp(cap.vertices[used], axis=0)))
+    check_uniform(np.asarray(moved - vertices, np.float64), width, used)
+
+
+def test_noise_relative_to_the_mark(cap: Mesh, dtype):
+    vertices = jnp.asarray(cap.vertices, dtype)
+    used = np.unique(cap.faces)
+    mark = 1e-3 * np.random.default_rng(0).normal(size=vertices.shape)
+    marked, original = Mesh(vertices + jnp.asarray(mark, dtype), cap.faces), Mesh(vertices, cap.faces)
+    moved = mark_noise(marked, original, 3.0, jax.random.key(4)).vertices
+    assert moved.dtype == dtype
+    width = 3 * np.sqrt(np.mean(np.sum(mark[used] ** 2, axis=1)))
+    check_uniform(np.asarray(moved - marked.vertices, np.float64), width, used)
+    np.testing.assert_array_equal(mark_noise(original, original, 3.0, jax.random.key(4)).vertices, vertices)
+
+
+def linear_map(before: ArrayLike, after: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """The affine map between two sets of points, which must be one: its matrix, and where the mean goes from where."""
+    before, after = np.asarray(before), np.asarray(after)
+    centred, other = before - before.mean(axis=0), after - after.mean(axis=0)
+    matrix = np.linalg.lstsq(centred, other, rcond=None)[0].T
+    np.testing.assert_allclose(centred @ matrix.T, other, atol=1e-12)
+    return matrix, after.mean(axis=0) - before.mean(axis=0)
+
+
+def test_similarities_turn_scale_and_shift(cap: Mesh, x64):
+    used, strength = np.unique(cap.faces), 0.3
+    start = cap.vertices[used]
+    turns, scales = [], []
+    keys = jax.random.split(jax.random.key(0), 200)
+    for moved in np.asarray(jax.jit(jax.vmap(lambda key: similarity(cap, strength, key).vertices))(keys)):
+        np.testing.assert_array_equal(np.delete(moved, used, axis=0), np.delete(cap.vertices, used, axis=0))
+        matrix, shift = linear_map(start, moved[used])
+        scale = np.cbrt(np.linalg.det(matrix))
+        np.testing.assert_allclose(matrix @ matrix.T, scale**2 * np.eye(3), atol=1e-12)
+        assert np.linalg.norm(shift) == pytest.approx(strength * np.linalg.norm(np.ptp(start, axis=0)), rel=1e-9)
+        turns.append(np.trace(matrix / scale))
+        scales.append(np.log(scale) / np.log1p(strength))
+    assert kstest(scales, "uniform", (-1, 2)).pvalue > 1e-3
+    # Of uniformly random rotations, the angle has the distribution (θ - sin θ)/π.
+    angle = np.arccos((np.array(turns) - 1) / 2)
+    assert kstest((angle - np.sin(angle)) / np.pi, "uniform").pvalue > 1e-3
+
+
+def test_affine_maps_are_as_far_from_the_identity_as_asked(cap: Mesh, x64):
+    used = np.unique(cap.faces)
+    keys = jax.random.split(jax.random.key(0), 20)
+    for strength in (0.2, 0.99):
+        for moved in np.asarray(
+            jax.jit(jax.vmap(lambda s, key: affine(cap, s, key).vertices, (None, 0)))(strength, keys)
+        ):
+            np.testing.assert_array_equal(np.delete(moved, used, axis=0), np.delete(cap.vertices, used, axis=0))
+            matrix, shift = linear_map(cap.vertices[used], moved[used])
+            assert np.linalg.norm(matrix - np.eye(3)) == pytest.approx(strength, rel=1e-9)
+            assert np.linalg.det(matrix) > 0
+            np.testing.assert_allclose(shift, 0, atol=1e-12)
+
+
+def test_affine_maps_keep_the_dtype(cap: Mesh, dtype):
+    vertices = jnp.asarray(cap.vertices, dtype)
+    for kind in (similarity, affine):
+        assert kind(Mesh(vertices, cap.faces), 0.2, jax.random.key(0)).vertices.dtype == dtype
 
 
 def test_smoothing_by_hand(cap: Mesh, x64):
@@ -76,7 +175,13 @@ def test_attacks_are_differentiable(cap: Mesh, x64):
     def smoothed(v):
         return jnp.sum(jnp.sin(laplacian_smoothing(Mesh(v, cap.faces), 4).vertices))
 
+    def others(v, strength):
+        key = jax.random.key(1)
+        meshes = [kind(Mesh(v, cap.faces), strength, key) for kind in (diagonal_noise, similarity, affine)]
+        return sum(jnp.sum(jnp.sin(mesh.vertices)) for mesh in [*meshes, mark_noise(meshes[0], cap, strength, key)])
+
     check_grads(jax.jit(noisy), (v, 0.01), order=1, modes=["rev", "fwd"])
+    check_grads(jax.jit(others), (v, 0.2), order=1, modes=["rev", "fwd"])
     check_grads(jax.jit(smoothed), (v,), order=1, modes=["rev", "fwd"])
     straight = jax.grad(lambda v: jnp.sum(quantisation(Mesh(v, cap.faces), 4).vertices * 2))(v)
     np.testing.assert_array_equal(straight, 2)
@@ -84,7 +189,7 @@ def test_attacks_are_differentiable(cap: Mesh, x64):
 
 def test_host_function_keeps_copies_together_and_digits_far_away(cap: Mesh):
     soup = make_mesh(cap.vertices[cap.faces].reshape(-1, 3) + 1e6, np.arange(3 * len(cap.faces)).reshape(-1, 3))
-    for kind, strength in (("noise", 0.01), ("smoothing", 3), ("quantisation", 8)):
+    for kind, strength in MILD:
         once = jm.attack(soup, kind, strength, seed=3)
         np.testing.assert_array_equal(once.vertices, jm.attack(soup, kind, strength, seed=3).vertices)
         pairs = {(tuple(a), tuple(b)) for a, b in zip(soup.vertices, once.vertices, strict=True)}
@@ -98,12 +203,12 @@ def test_host_function_keeps_copies_together_and_digits_far_away(cap: Mesh):
 
 def test_a_stray_vertex_changes_nothing(cap: Mesh):
     stray = make_mesh(np.vstack([cap.vertices, [[1e9, 0, 0]]]), cap.faces)
-    for kind, strength in (("noise", 0.01), ("smoothing", 3), ("quantisation", 8)):
+    for kind, strength in MILD:
         alone, beside = (jm.attack(mesh, kind, strength, seed=0).vertices for mesh in (cap, stray))
         np.testing.assert_array_equal(beside[-1], stray.vertices[-1])
-        if kind != "noise":  # whose draws depend on the number of vertices
+        if "noise" not in kind:  # whose draws depend on the number of vertices
             np.testing.assert_allclose(beside[:-1], alone, atol=1e-6)
-        assert np.abs(beside[:-1] - cap.vertices).max() < 0.05
+        assert kind == "similarity" or np.abs(beside[:-1] - cap.vertices).max() < 0.05
 
 
 def test_repeated_smoothing_is_compiled_once(cap: Mesh, caplog: pytest.LogCaptureFixture):
@@ -120,12 +225,13 @@ def test_repeated_smoothing_is_compiled_once(cap: Mesh, caplog: pytest.LogCaptur
 
 def test_registry_states_units():
     assert all(entry.unit for entry in ATTACKS.values())
+    assert {kind for kind, _ in MILD} | {"edge-flips"} == ATTACKS.keys()
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_refusals(cap: Mesh):
     for kind, strength, sentence in [
-        ("melting", 1, "there are noise, smoothing, quantisation"),
+        ("melting", 1, "there are noise, .*, edge-flips"),
         ("noise", -1, "not negative"),
         ("noise", float("nan"), "must be a number"),
         ("smoothing", 2.5, "whole number"),
@@ -134,3 +240,36 @@ def test_refusals(cap: Mesh):
     ]:
         with pytest.raises(jm.JaxmarkError, match=sentence):
             jm.attack(cap, kind, strength, seed=0)
+
+
+@pytest.fixture(scope="module")
+def marked(key: jm.Key) -> tuple[jm.Marker, Mesh]:
+    marker = jm.make_marker(bumpy_sphere(4), key, bits=64)
+    return marker, marker.embed(b"jaxmark!")[0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "strength"),
+    [
+        *(("noise", 0.005), ("diagonal-noise", 0.002), ("smoothing", 30), ("quantisation", 9)),
+        *(("similarity", 0.5), ("affine", 0.3), ("edge-flips", 0.01), ("edge-flips", 0.3)),
+    ],
+)
+def test_marks_of_the_default_budget_read(kind, strength, marked: tuple[jm.Marker, Mesh]):
+    marker, mesh = marked
+    suspect = jm.attack(mesh, kind, strength, seed=1)
+    if (kind, strength) == ("edge-flips", 0.3):
+        pytest.importorskip("igl")
+    found = marker.detect(suspect)
+    assert found.message == b"jaxmark!"
+    assert found.detected()
+    # A few flips leave most vertices' surroundings as they were; many leave only the surface.
+    assert (
+        found.alignment.method == {0.01: "connectivity", 0.3: "surface"}[strength] if kind == "edge-flips" else "same"
+    )
+
+
+def test_a_mark_reads_in_noise_of_twice_its_size(marked: tuple[jm.Marker, Mesh]):
+    marker, mesh = marked
+    noisy = mark_noise(mesh, marker.original.mesh, 2.0, jax.random.key(0))
+    assert marker.detect(noisy).message == b"jaxmark!"

@@ -95,6 +95,16 @@ def test_the_main_job(workshop: Workshop, scheme):
     assert (compared["rms"], compared["max"]) == (told["rms"], told["max"])
 
 
+def test_an_attack_that_changes_faces_writes_a_new_file(workshop: Workshop):
+    told = workshop.json("attack", "model.ply", "flipped.ply", "edge-flips", "0.05")
+    assert told["rms"] == 0
+    before, after = (trimesh.load(name, process=False) for name in ("model.ply", "flipped.ply"))
+    np.testing.assert_allclose(after.vertices, before.vertices, rtol=1e-6)
+    same = {tuple(edge) for edge in before.edges_unique} & {tuple(edge) for edge in after.edges_unique}
+    assert len(same) == pytest.approx(0.95 * len(before.edges_unique), abs=1)
+    assert len(after.edges_unique) == len(before.edges_unique)
+
+
 @pytest.mark.slow
 def test_capacity_is_what_embed_takes(workshop: Workshop):
     budget = ("--budget", "0.0008")

@@ -4,6 +4,11 @@ Under `jit`, `vmap` and `grad`, close over the faces: graphs are prepared on the
 part of the surface: they neither move nor count.
 """
 
+from jaxmark.attacks.affine import affine as affine
+from jaxmark.attacks.affine import similarity as similarity
+from jaxmark.attacks.flips import edge_flips as edge_flips
+from jaxmark.attacks.noise import diagonal_noise as diagonal_noise
+from jaxmark.attacks.noise import mark_noise as mark_noise
 from jaxmark.attacks.noise import uniform_noise as uniform_noise
 from jaxmark.attacks.quantisation import quantisation as quantisation
 from jaxmark.attacks.registry import ATTACKS as ATTACKS

@@ -1,0 +1,109 @@
+"""Remeshing that keeps the number of edges (Sohn et al.): edges are flipped, vertices stay where they are."""
+
+import math
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float64, Int64, PRNGKeyArray
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.mesh import Mesh, edges, sides, unit
+
+_THIN = 0.01  # least height of a new face, over its longest side
+Faces = Int64[np.ndarray, "faces 3"]
+Codes = Int64[np.ndarray, " edges"]
+
+
+def edge_flips(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+    """Put the other diagonal in place of edges between two faces; on the host, in NumPy.
+
+    An edge is flipped only if it has exactly two faces, of one orientation, and if neither new face is thin (height
+    below 1 % of the longest side) nor turned by 90 degrees or more from the mean of the old ones' unit normals. No flip
+    makes an edge that is or was there, and none that was made is flipped again. So there are as many vertices, edges
+    and faces as before, no edge gets a third face, and just the share of the edges that was asked for is replaced.
+
+    Args:
+        mesh: any mesh, concrete. Vertices are not welded: an edge between two copies of a point has no second face.
+        strength: share of the edges to flip, in [0, 1]. Which, is random.
+        key: a JAX random key.
+
+    Returns:
+        The mesh with other faces, as many, those that did not change in their place.
+
+    Raises:
+        JaxmarkError: if the share is outside [0, 1], or not so many edges can be flipped.
+    """
+    if not 0 <= strength <= 1:
+        raise JaxmarkError(f"A share of edges to flip is in [0, 1], got {strength:g}.")
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+    random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    present = _codes(edges(faces), len(vertices))
+    total, made = len(present), np.zeros(0, np.int64)
+    wanted = round(strength * total)
+    while len(made) < wanted:
+        quads, beside = _flippable(vertices, faces, np.concatenate([present, made]), made)
+        if len(quads) == 0:
+            share = math.floor(1000 * len(made) / total) / 1000
+            raise JaxmarkError(
+                f"Only {len(made)} of the mesh's {total} edges can be flipped with this key, not {wanted}; ask for a"
+                f" share of at most {share:g}."
+            )
+        a, b, c, d = quads.T
+        new = _codes(quads[:, 2:], len(vertices))
+        chosen = _apart(beside, new, len(faces), random)[: wanted - len(made)]
+        faces[beside[chosen, 0]] = np.stack([a, d, c], axis=1)[chosen]
+        faces[beside[chosen, 1]] = np.stack([d, b, c], axis=1)[chosen]
+        made = np.concatenate([made, new[chosen]])
+    return Mesh(mesh.vertices, faces)
+
+
+def _codes(pairs: Int64[np.ndarray, "edges 2"], size: int) -> Codes:
+    """One integer for each pair of vertices, in any order."""
+    return pairs.min(axis=1) * size + pairs.max(axis=1)
+
+
+def _flippable(
+    vertices: Float64[np.ndarray, "vertices 3"],
+    faces: Faces,
+    taken: Int64[np.ndarray, " taken"],
+    made: Int64[np.ndarray, " made"],
+) -> tuple[Int64[np.ndarray, "edges 4"], Int64[np.ndarray, "edges 2"]]:
+    """Edges that can be flipped each by itself: corners a, b, c, d of faces abc and bad; and the two faces' places."""
+    corners, apex = sides(faces)
+    (tail, head), code = corners.T, _codes(corners, len(vertices))
+    order = np.argsort(code, kind="stable")
+    _, first, count = np.unique(code[order], return_index=True, return_counts=True)
+    forth, back = order[first[count == 2]], order[first[count == 2] + 1]
+    quads = np.stack([tail[forth], head[forth], apex[forth], apex[back]], axis=1)
+    beside = np.stack([forth, back], axis=1) % len(faces)
+    good = (tail[forth] == head[back]) & ~np.isin(code[forth], made)
+    good &= ~np.isin(_codes(quads[:, 2:], len(vertices)), taken)
+    quads, beside = quads[good], beside[good]
+    good = _stays_smooth(vertices, quads)
+    return quads[good], beside[good]
+
+
+def _stays_smooth(
+    vertices: Float64[np.ndarray, "vertices 3"], quads: Int64[np.ndarray, "edges 4"]
+) -> Bool[np.ndarray, " edges"]:
+    """Whether no new face would be thin or turned; a face that names a corner twice has no height."""
+    a, b, c, d = vertices[quads.T]
+    normal = unit(np.cross(b - a, c - a)) + unit(np.cross(a - b, d - b))
+    good = np.ones(len(quads), bool)
+    for i, j, k in ((a, d, c), (d, b, c)):
+        area = np.cross(j - i, k - i)  # doubled
+        longest = np.max([np.sum(side**2, axis=1) for side in (j - i, k - j, i - k)], axis=0)
+        good &= (np.sum(area * normal, axis=1) > 0) & (np.linalg.norm(area, axis=1) > _THIN * longest)
+    return good
+
+
+def _apart(
+    beside: Int64[np.ndarray, "edges 2"], new: Codes, size: int, random: np.random.Generator
+) -> Int64[np.ndarray, " chosen"]:
+    """Random edges of which no two share a face or would become the same, in random order (Luby, 1986)."""
+    rank = random.permutation(len(beside))
+    least = np.full(size, len(beside))
+    np.minimum.at(least, beside.ravel(), np.repeat(rank, 2))
+    chosen = np.flatnonzero((least[beside] == rank[:, None]).all(axis=1))
+    chosen = chosen[np.argsort(rank[chosen])]
+    return chosen[np.sort(np.unique(new[chosen], return_index=True)[1])]
