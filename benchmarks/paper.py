@@ -10,10 +10,9 @@ time       12: f(Δ)x of three float32 columns at degree 64, over N, on the mesh
 degree     13: the same over the degree; "all bands" forms all n + 1 components in one pass, as the paper does.
 attacks    14: bit error rate of 64 bits without a code, RMS 0.08 % of the diagonal, mean of --trials keys, messages
            and seeds. "as printed": printed kernel, components as they are, plain correlation; "working": Jackson-damped
-           bands at unit norm, decorrelated; "eigenvectors": decorrelated, too. "uniform" adds a share of the diagonal,
-           "relative" a multiple of the mark's length at each vertex, times uniform numbers in [-1, 1] for each
-           component; "similarity" is a random rotation, a scale of so much or one over it, and a shift of so many
-           diagonals, brought back by `jaxmark.alignment`. The others are compared as they stand.
+           bands at unit norm, decorrelated; "eigenvectors": decorrelated, too. The attacks are `jaxmark.attacks`'s:
+           diagonal-noise, mark_noise, similarity and edge-flips; the last two are brought back by
+           `jaxmark.alignment`, the others compared as they stand.
 collinear  median |⟨x_i, x_j⟩_D| of unit components that are not empty, over x, y and z, and bit errors of 64 bits
            with no attack, components as they are and plain correlation, for each form of the kernel.
 gibbs      15 and 16: 16 bands of best approximated hats, and of sums of neighbouring scaling functions of the same
@@ -35,14 +34,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.polynomial import chebyshev
-from numpy.random import Generator
 from panels import Curves, Panel, pictures
-from scipy.spatial.transform import Rotation
 from speed import TOLERANCE, exponent, graph, shifted, table, torus
 from stages import Row, coefficients, median_time
 
 import jaxmark as jm
 from jaxmark.alignment import align, observation
+from jaxmark.attacks import mark_noise
 from jaxmark.bands import hat, nodes, scaling
 from jaxmark.carriers import host_bands
 from jaxmark.chebyshev import band_components, filter
@@ -55,6 +53,7 @@ from jaxmark.schemes import EigenScheme, HostScheme, Scheme
 SIZES = (1000, 2000, 4000, 8000, 16_000, 32_000, 64_000, 128_000)
 DEGREE, DEGREES, BANDS = 64, (16, 32, 64, 128, 256), (32, 64)
 BITS, BUDGET, DELTA = 64, 8e-4, 0.5
+ALIGNED = ("similarity", "edge flips")
 KERNELS: Mapping[str, dict[str, Any]] = {
     "printed": {"kernel": "printed", "damping": "none"},
     "halved": {"kernel": "halved", "damping": "none"},
@@ -68,28 +67,23 @@ READERS: Mapping[str, tuple[Scheme, Detector]] = {
 
 
 Part = tuple[list[list[Row]], list[Panel]]  # tables, and what is drawn of them
+Attacker = Callable[[jm.Mesh, jm.Mesh, float, int], jm.Mesh]  # marked, original, strength, seed
 
 
-def uniform(vertices: np.ndarray, strength: float, length: float, _: np.ndarray, rng: Generator) -> np.ndarray:
-    return vertices + strength * length * rng.uniform(-1, 1, vertices.shape)
+def by_name(name: str) -> Attacker:
+    return lambda marked, _, strength, seed: jm.attack(marked, name, strength, seed=seed)
 
 
-def relative(vertices: np.ndarray, strength: float, _: float, mark: np.ndarray, rng: Generator) -> np.ndarray:
-    size = np.linalg.norm(mark, axis=1, keepdims=True)
-    return vertices + strength * size * rng.uniform(-1, 1, vertices.shape)
+def relative(marked: jm.Mesh, original: jm.Mesh, strength: float, seed: int) -> jm.Mesh:
+    return mark_noise(marked, original, strength, jax.random.key(seed))
 
 
-def similarity(vertices: np.ndarray, strength: float, length: float, _: np.ndarray, rng: Generator) -> np.ndarray:
-    shift = rng.normal(size=3)
-    shift *= strength * length / np.linalg.norm(shift)
-    return vertices @ Rotation.random(rng=rng).as_matrix().T * float(strength) ** rng.choice([-1, 1]) + shift
-
-
-ATTACKS: Mapping[str, tuple[Callable[..., np.ndarray], Sequence[float], str]] = {
-    "none": (uniform, (0,), ""),
-    "uniform": (uniform, (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2), "half width / diagonal"),
-    "relative": (relative, (0.25, 0.5, 1, 2, 4, 8, 16, 32), "half width / the mark's length"),
-    "similarity": (similarity, (1, 2, 5, 10), "scale, and shift / diagonal"),
+ATTACKS: Mapping[str, tuple[Attacker, Sequence[float], str]] = {
+    "none": (lambda marked, *_: marked, (0,), ""),
+    "uniform": (by_name("diagonal-noise"), (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2), "half width / diagonal"),
+    "relative": (relative, (0.25, 0.5, 1, 2, 4, 8, 16), "RMS / the mark's"),
+    "similarity": (by_name("similarity"), (0.5, 1, 4, 9), "shift / diagonal, and scale less 1"),
+    "edge flips": (by_name("edge-flips"), (0.01, 0.03, 0.1, 0.3), "share of the edges"),
 }
 
 
@@ -186,11 +180,10 @@ def errors(
         rng = np.random.default_rng(trial)
         carrier, bits = scheme.carrier(original, rng.bytes(32), BITS, BITS), rng.choice([-1.0, 1.0], BITS)
         unit = original.on_host(carrier.displacement(jnp.asarray(bits, original.signal.dtype)))
-        vertices = np.asarray(displaced(original, BUDGET / float(rms(unit[original.used])) * unit).vertices)
-        mark = vertices - np.asarray(original.mesh.vertices)
+        marked = displaced(original, BUDGET / float(rms(unit[original.used])) * unit)
         for name, strength in [(kind, strength) for kind in kinds for strength in ATTACKS[kind][1]]:
-            suspect = jm.Mesh(ATTACKS[name][0](vertices, strength, original.diagonal, mark, rng), original.mesh.faces)
-            if name == "similarity":
+            suspect = ATTACKS[name][0](marked, original.mesh, strength, trial)
+            if name in ALIGNED:
                 seen = observation(original, align(original, suspect))
             else:
                 seen = observe(original.traced(residual(original, suspect)))
