@@ -22,7 +22,9 @@ from jaxmark.mesh import Mesh, edges
 Weighting = Literal["valence", "inverse-length", "cotangent"]
 Lowering = Literal["auto", "gather", "segments"]
 
-_SCATTER = 8  # what adding to a row anywhere costs, in rows that are read; on a processor, measured roughly
+# What adding to a row anywhere costs, in rows that are read: measured on processors; elsewhere assumed, for an atomic
+# addition reads and writes.
+_SCATTER, _SCATTER_ELSEWHERE = 8, 2
 _PASS = 4  # and what it costs, for each vertex, that there are such additions at all
 _ORDERED = 2**14  # vertices, from which on a signal outgrows the fastest memory
 
@@ -162,7 +164,8 @@ def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence", *, lo
             edge's length; `"cotangent"`, half the sum of the cotangents of the angles opposite the edge, clipped below
             at 1e-6 of the largest; or an array `[E]` of non-negative weights in the order of `jaxmark.mesh.edges`.
         lowering: how products are computed: `"segments"`, by segment-sums over the edges; `"gather"`, by a table of
-            each vertex's neighbours; `"auto"`, by the table unless the valences differ so much that it does not pay.
+            each vertex's neighbours; `"auto"`, by the table unless the valences differ so much that it does not pay on
+            this platform.
 
     Returns:
         A `Laplacian` of NumPy arrays in float64; it computes in the dtype of the signal it is applied to. It has no
@@ -217,8 +220,9 @@ def make_neighbours(
     tail = np.repeat(np.arange(size), valence)
     slot = np.arange(len(tail)) - np.repeat(graph.indptr[:-1], valence)
     left = len(tail) - np.cumsum(np.bincount(slot))  # past one slot, past two ...
-    costs = size * np.arange(1, 1 + len(left)) + _SCATTER * left + _PASS * size * (left > 0)
-    if if_it_pays and (len(left) == 0 or costs.min() > _SCATTER * len(tail)):
+    addition = _SCATTER if jax.default_backend() == "cpu" else _SCATTER_ELSEWHERE
+    costs = size * np.arange(1, 1 + len(left)) + addition * left + _PASS * size * (left > 0)
+    if if_it_pays and (len(left) == 0 or costs.min() > addition * len(tail)):
         return None
     # Even, so that the tables of more meshes have one shape.
     slots = 1 + int(np.argmin(costs)) if len(left) else 0
