@@ -160,7 +160,7 @@ def _pictures(folder: Path, original: Original, marked: Mesh) -> None:
     mesh = original.mesh
     shift = marked.vertices - mesh.vertices
     percent = 100 * np.linalg.norm(shift, axis=1) / original.diagonal
-    hidden = np.asarray(masking(original), np.float64)[original.weld.point]
+    hidden = original.on_host(masking(original))[original.weld.point]
     visible = np.divide(percent, hidden, out=np.zeros_like(percent), where=hidden > 0)
     exaggerated = mesh._replace(vertices=mesh.vertices + _EXAGGERATION * shift)
     save_views(

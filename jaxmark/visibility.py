@@ -68,7 +68,7 @@ def _per_rms(original: Original, shift: Float64[np.ndarray, "points 3"], metrics
     return list(values.values())
 
 
-def masking(original: Original) -> Float[Array, " points"]:
+def masking(original: Original) -> Float[Array, " rows"]:
     """How much displacement each vertex hides, relative to the others: roughness^0.15, averaged around it; of RMS 1.
 
     Rough regions hide what smooth ones show. The model is FMPD's (Wang, Torkhani, Montanvert, "A fast roughness-based
@@ -78,9 +78,8 @@ def masking(original: Original) -> Float[Array, " points"]:
     points = welded_mesh(original.mesh, original.weld)
     positions = jnp.asarray(original.positions, original.signal.dtype)
     rough = distortion.local_roughness(positions, np.asarray(points.faces)).roughness
-    used = jnp.asarray(original.used)
-    hidden = jnp.where(used, jnp.clip(rough, LEAST, MOST) ** POWER, 0)
+    hidden = np.where(original.used, np.clip(np.asarray(rough), LEAST, MOST) ** POWER, 0)
     # Averaged, so that masking does not make high frequencies of low ones.
     average = diffusion(_SCALE + 1, 2**_SCALE + 1)[_SCALE]
-    averaged = jnp.where(used, filter(original.operator, average, hidden), 0)
-    return averaged / jnp.sqrt(jnp.sum(averaged**2) / used.sum().astype(averaged.dtype))
+    averaged = jnp.where(original.moving, filter(original.operator, average, original.traced(hidden)), 0)
+    return averaged / jnp.sqrt(jnp.sum(averaged**2) / int(original.used.sum()))

@@ -63,7 +63,7 @@ assert claims["tuned", "smoothing"]
 # %%
 shift = shown.vertices - mesh.vertices
 percent = 100 * np.linalg.norm(shift, axis=1) / original.diagonal
-hidden = np.asarray(masking(original))[original.weld.point]
+hidden = original.on_host(masking(original))[original.weld.point]
 Path("demo-output").mkdir(exist_ok=True)
 save_views(
     [

@@ -40,7 +40,7 @@ def test_the_eye_sees_high_frequencies_first(half_rough: Mesh):
 @pytest.mark.slow
 def test_rough_regions_are_moved_more(half_rough: Mesh, key: jm.Key):
     original = prepare(half_rough)
-    hidden = np.asarray(masking(original))
+    hidden = original.on_host(masking(original))
     assert np.sqrt(np.mean(hidden**2)) == pytest.approx(1, rel=1e-5)
     x = np.asarray(half_rough.vertices)[:, 0]
     assert hidden[x > 0.3].mean() > 1.2 * hidden[x < -0.3].mean()
