@@ -166,6 +166,7 @@ def test_quantisation_rounds_to_its_grid(cap: Mesh, bits, x64):
     assert (np.abs(rounded - v)[:, :2] <= step[:2] / 2 + 1e-12).all()
 
 
+@pytest.mark.slow
 def test_attacks_are_differentiable(cap: Mesh, x64):
     v = jnp.asarray(cap.vertices)
 
@@ -248,6 +249,7 @@ def marked(key: jm.Key) -> tuple[jm.Marker, Mesh]:
     return marker, marker.embed(b"jaxmark!")[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "strength"),
     [

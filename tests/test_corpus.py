@@ -27,6 +27,7 @@ def lines(output: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in output.read_text().splitlines()]
 
 
+@pytest.mark.slow
 def test_marks_attacks_and_reads(corpus, tmp_path):
     mesh, output = tmp_path / "sphere.ply", tmp_path / "corpus.jsonl"
     jm.save_mesh(bumpy_sphere(4), mesh)

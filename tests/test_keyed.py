@@ -371,6 +371,7 @@ def test_projected_correlations_by_dense_algebra(direction, small: Case, key: jm
     close(projected(carrier, seen, jnp.asarray(beta, dtype)), expected, dtype, factor=100)
 
 
+@pytest.mark.slow
 def test_no_residual_gives_zero_scores_with_finite_gradients(small: Case, key: jm.Key):
     """In float32, where more underflows."""
     x = jnp.asarray(small.x, jnp.float32)

@@ -128,6 +128,7 @@ def test_nuisance_is_nearly_orthonormal(case: Case, dtype):
     np.testing.assert_allclose(products, np.diag(kept.astype(float)), atol=1e-9 if dtype == np.float64 else 0.2)
 
 
+@pytest.mark.slow
 def test_nuisance_by_blocks_is_the_same(case: Case, x64, monkeypatch):
     """With a last block that is not full, and a sample that tells the basis."""
     whole = make(case, np.float64)
