@@ -68,8 +68,8 @@ class Neighbours(NamedTuple):
     empty: Int[Array | np.ndarray, " vertices"]  # how many slots are
     rest: Int[Array | np.ndarray, "rest 3"]  # vertex, neighbour and edge; past the last vertex counts nothing
     edges: Int[Array | np.ndarray, "slots vertices"] | None  # past the last where empty; None if no edge has a weight
-    order: Int[Array | np.ndarray, " vertices"] | None  # the vertex that each row is of; None if its own
-    rank: Int[Array | np.ndarray, " vertices"] | None  # the row of each vertex
+    order: Int[Array | np.ndarray, " vertices"] | None = None  # the vertex that each row is of; None if its own
+    rank: Int[Array | np.ndarray, " vertices"] | None = None  # the row of each vertex
 
 
 class Laplacian(NamedTuple):
@@ -215,7 +215,7 @@ def make_neighbours(
 ) -> Neighbours | None:
     """The table with as many slots as make a product cheapest; none where it does not pay and that is asked."""
     rank = None if order is None else np.argsort(order)
-    graph = _adjacency(pairs if rank is None else rank[pairs], size)
+    graph = adjacency(pairs if rank is None else rank[pairs], size)
     head, edge, valence = graph.indices, graph.data, np.diff(graph.indptr)
     tail = np.repeat(np.arange(size), valence)
     slot = np.arange(len(tail)) - np.repeat(graph.indptr[:-1], valence)
@@ -243,10 +243,10 @@ def make_neighbours(
 
 def cuthill_mckee(pairs: Int[np.ndarray, "edges 2"], size: int) -> Int64[np.ndarray, " vertices"]:
     """Vertices in an order that keeps neighbours near."""
-    return csgraph.reverse_cuthill_mckee(_adjacency(pairs, size), symmetric_mode=True).astype(np.int64)
+    return csgraph.reverse_cuthill_mckee(adjacency(pairs, size), symmetric_mode=True).astype(np.int64)
 
 
-def _adjacency(pairs: Int[np.ndarray, "edges 2"], size: int) -> sparse.csr_array:
+def adjacency(pairs: Int[np.ndarray, "edges 2"], size: int) -> sparse.csr_array:
     """Each vertex's neighbours; the entries are the numbers of the edges."""
     (tail, head), edge = np.concatenate([pairs, pairs[:, ::-1]]).T, np.tile(np.arange(len(pairs)), 2)
     return sparse.csr_array(sparse.coo_array((edge, (tail, head)), shape=(size, size)))

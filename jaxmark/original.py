@@ -9,9 +9,9 @@ from jaxtyping import Array, Bool, Float, Float64, Shaped
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import points_hash
-from jaxmark.laplacian import Laplacian, centre, make_laplacian
+from jaxmark.laplacian import Laplacian, centre
 from jaxmark.mesh import Mesh, Weld, diagonal, host_mesh, same_connectivity, used_vertices, weld, welded_mesh
-from jaxmark.shapes import fill, with_common_shapes, with_common_size
+from jaxmark.shapes import common_laplacian, fill
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ def prepare(mesh: Mesh) -> Original:
     welded = weld(mesh.vertices)
     points = welded_mesh(mesh, welded)
     length, geometry = diagonal(mesh), points_hash(points)
-    operator = with_common_shapes(make_laplacian(with_common_size(points)))
+    operator = common_laplacian(points)
     dtype = jax.dtypes.canonicalize_dtype(np.float64)
     used = used_vertices(points)
     positions = np.asarray(points.vertices, np.float64)

@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float, Float32, Int64
 
 from jaxmark.bands import diffusion
 from jaxmark.chebyshev import band_components
-from jaxmark.laplacian import Laplacian, Weighting, make_laplacian
+from jaxmark.laplacian import Laplacian, Weighting
 from jaxmark.mesh import Mesh, area
 from jaxmark.pose import Points
-from jaxmark.shapes import fill, with_common_shapes, with_common_size
+from jaxmark.shapes import common_laplacian, fill
 from jaxmark.surfaces import Surface, barycentric
 
 _SCALES = 9  # of smoothing, by 1 to 256 steps of half the way
@@ -85,7 +85,7 @@ def replayed_points(
 def _smoothed(mesh: Mesh, weighting: Weighting, signal: Points) -> list[Float32[np.ndarray, "points 3"]]:
     """A signal after smoothing by a mesh's Laplacian, by several amounts."""
     family = diffusion(_SCALES, 4 * 2 ** (_SCALES // 2) + 1)
-    operator = with_common_shapes(make_laplacian(with_common_size(mesh), weighting))
+    operator = common_laplacian(mesh, weighting)
     amounts = band_components(operator, family, jnp.asarray(fill(signal, len(operator.degree)), jnp.float32))
     return list(np.asarray(amounts)[:, : len(signal)])
 

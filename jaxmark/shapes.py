@@ -7,7 +7,7 @@ compile for, stay as they are.
 import numpy as np
 from jaxtyping import Shaped
 
-from jaxmark.laplacian import Laplacian
+from jaxmark.laplacian import Laplacian, Lowering, Weighting, make_laplacian
 from jaxmark.mesh import Mesh
 
 _LEAST, _LARGE = 16, 2**17
@@ -25,26 +25,25 @@ def fill(rows: Shaped[np.ndarray, " rows *columns"], count: int, value: float = 
     return np.concatenate([rows, more])
 
 
-def with_common_size(mesh: Mesh) -> Mesh:
-    """A mesh with as many vertices as others have, those that no face uses at the origin."""
-    vertices = np.asarray(mesh.vertices, np.float64)
-    return mesh._replace(vertices=fill(vertices, common(len(vertices))))
+def common_laplacian(mesh: Mesh, weights: Weighting = "valence", lowering: Lowering = "auto") -> Laplacian:
+    """`make_laplacian` with isolated vertices added, and edges past the last vertex; signals are filled up to its size.
 
-
-def with_common_shapes(operator: Laplacian) -> Laplacian:
-    """An operator of NumPy arrays with as many edges as others have on as many vertices.
-
-    What is filled in is past the last vertex.
+    Raises:
+        JaxmarkError: see `make_laplacian`.
     """
+    vertices = np.asarray(mesh.vertices, np.float64)
+    filled = mesh._replace(vertices=fill(vertices, common(len(vertices))))
+    operator = make_laplacian(filled, weights, lowering=lowering)
     size, edges = len(operator.degree), np.asarray(operator.edges)
     if size > _LARGE:
         return operator
     # A closed surface of triangles has about three edges per vertex.
     count = 3 * size if len(edges) <= 3 * size else common(len(edges))
-    weights = None if operator.weights is None else fill(np.asarray(operator.weights), count)
-    filled = operator._replace(edges=fill(edges, count, size), weights=weights)
-    if (table := operator.neighbours) is None:
-        return filled
-    rest = np.asarray(table.rest)
-    most = max(size // 16, 1 << (len(rest) - 1).bit_length())
-    return filled._replace(neighbours=table._replace(rest=fill(rest, most if len(rest) else 0, size)))
+    values = None if operator.weights is None else fill(np.asarray(operator.weights), count)
+    operator = operator._replace(edges=fill(edges, count, size), weights=values)
+    table = operator.neighbours
+    if table is None or not len(table.rest):
+        return operator
+    # Few meshes have more left over than this.
+    most = max(size // 16, 1 << (len(table.rest) - 1).bit_length())
+    return operator._replace(neighbours=table._replace(rest=fill(np.asarray(table.rest), most, size)))

@@ -303,8 +303,6 @@ def _interior(
             made.empty.reshape(count, rows),
             _grouped(rest, owner, count, rows).astype(np.int32),
             edge,
-            None,
-            None,
         )
     return Laplacian(edges.astype(np.int32), weights, degree, made)
 

@@ -53,13 +53,7 @@ def eigenpairs(operator: Laplacian, count: int | None = None, *, tolerance: floa
     """
     if count is not None and count < 1:
         raise JaxmarkError(f"eigenpairs(count=...) must be at least 1, got {count}.")
-    stiffness, mass = sparse_matrices(operator)
-    degree = mass.diagonal()
-    linked = np.flatnonzero(degree > 0)
-    root = np.sqrt(degree[linked])
-    scaled = sparse.csc_array(
-        sparse.diags_array(1 / root) @ stiffness[linked][:, linked] @ sparse.diags_array(1 / root)
-    )
+    linked, root, scaled = _symmetric(operator)
     size = len(linked)
     null, component = csgraph.connected_components(scaled, directed=False)
     # One more than asked for tells whether the last eigenspace is whole.

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Int, Int64
-from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxmark import alignment
 from jaxmark.alignment import Align, Alignment
 from jaxmark.errors import JaxmarkError
+from jaxmark.laplacian import adjacency
 from jaxmark.marking import Detection, EmbedInfo, Marker, make_marker
 from jaxmark.mesh import Mesh, edges, host_mesh, used_vertices, weld, welded_mesh
 from jaxmark.original import Original, prepare
@@ -129,7 +129,7 @@ def parts(mesh: Mesh, features: Int[np.ndarray, " parts"]) -> Int64[np.ndarray, 
     points = welded.point[features]
     if len(np.unique(points)) < len(points):
         raise JaxmarkError(f"Features must be different points, got {features.tolist()}.")
-    graph = _graph(welded_mesh(mesh, welded))
+    graph = adjacency(edges(welded_mesh(mesh, welded).faces), len(welded.first))
     _, _, nearest = csgraph.dijkstra(graph, indices=points, unweighted=True, min_only=True, return_predecessors=True)
     part = np.full(len(welded.first) + 1, -1)  # one more, for those that nothing reaches
     part[points] = np.arange(len(points))
@@ -152,16 +152,10 @@ def farthest_vertices(mesh: Mesh, count: int) -> Int64[np.ndarray, " parts"]:
     used = used_vertices(points)
     if not 1 <= count <= used.sum():
         raise JaxmarkError(f"This mesh has 1 to {int(used.sum())} feature vertices, not {count}.")
-    graph, position = _graph(points), np.asarray(points.vertices)
+    graph, position = adjacency(edges(points.faces), len(used)), np.asarray(points.vertices)
     off = np.where(used, np.linalg.norm(position - position[used].mean(axis=0), axis=1), -1)
     chosen, hops = [int(np.argmax(off))], np.where(used, np.inf, -1)
     while len(chosen) < count:
         hops = np.minimum(hops, csgraph.dijkstra(graph, indices=chosen[-1], unweighted=True))
         chosen.append(int(np.argmax(hops)))
     return welded.first[chosen]
-
-
-def _graph(mesh: Mesh) -> sparse.csr_array:
-    pairs, size = edges(mesh.faces), len(mesh.vertices)
-    both = np.concatenate([pairs, pairs[:, ::-1]]).T
-    return sparse.csr_array((np.ones(len(both[0])), tuple(both)), shape=(size, size))

@@ -8,7 +8,7 @@ from jaxmark.chebyshev import filter
 from jaxmark.laplacian import make_laplacian
 from jaxmark.mesh import Mesh, make_mesh
 from jaxmark.original import prepare
-from jaxmark.shapes import common, fill, with_common_shapes, with_common_size
+from jaxmark.shapes import common, common_laplacian, fill
 from tests.dense import tolerance
 from tests.samples import bumpy_sphere
 
@@ -32,7 +32,7 @@ def test_common_sizes_are_few_and_not_much_larger():
 @pytest.mark.parametrize("lowering", ["gather", "segments"])
 def test_what_is_filled_in_changes_nothing(hard_graph: Mesh, weights, lowering, dtype):
     plain = make_laplacian(hard_graph, weights, lowering=lowering)
-    filled = with_common_shapes(make_laplacian(with_common_size(hard_graph), weights, lowering=lowering))
+    filled = common_laplacian(hard_graph, weights, lowering)
     x = np.random.default_rng(0).normal(size=(len(hard_graph.vertices), 3)).astype(dtype)
     c = np.random.default_rng(1).normal(size=9).astype(dtype)
     got = filter(filled, c, jnp.asarray(fill(x, len(filled.degree))))
