@@ -188,6 +188,12 @@ def used_vertices(mesh: Mesh) -> Bool[np.ndarray, " vertices"]:
     return used
 
 
+def compacted(mesh: Mesh) -> Mesh:
+    """The mesh without vertices that no face uses; the others in their order."""
+    used = used_vertices(mesh)
+    return Mesh(np.asarray(mesh.vertices)[used], (np.cumsum(used) - 1)[np.asarray(mesh.faces)])
+
+
 def same_connectivity(first: Mesh, second: Mesh) -> bool:
     """Whether two meshes have equally many vertices and the very same faces, index by index."""
     return len(first.vertices) == len(second.vertices) and np.array_equal(

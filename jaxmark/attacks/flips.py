@@ -2,10 +2,10 @@
 
 import math
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, PRNGKeyArray
 
+from jaxmark.attacks.random import generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.mesh import Mesh, edges, sides, unit
 
@@ -36,7 +36,7 @@ def edge_flips(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     if not 0 <= strength <= 1:
         raise JaxmarkError(f"A share of edges to flip is in [0, 1], got {strength:g}.")
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
-    random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    random = generator(key)
     present = _codes(edges(faces), len(vertices))
     total, made = len(present), np.zeros(0, np.int64)
     wanted = round(strength * total)

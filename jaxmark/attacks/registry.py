@@ -1,10 +1,11 @@
-"""The list of attacks, and the host function that puts a mesh of a file through one of them."""
+"""The list of attacks, and the host functions that put a mesh of a file through one of them, or several."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import PRNGKeyArray
 
 from jaxmark.attacks.affine import affine, similarity
 from jaxmark.attacks.flips import edge_flips
@@ -12,25 +13,32 @@ from jaxmark.attacks.noise import diagonal_noise, uniform_noise
 from jaxmark.attacks.quantisation import quantisation
 from jaxmark.attacks.smoothing import laplacian_smoothing
 from jaxmark.errors import JaxmarkError
-from jaxmark.mesh import Mesh, diagonal, host_mesh, used_vertices, weld, welded_mesh
+from jaxmark.mesh import Mesh, compacted, diagonal, host_mesh, same_connectivity, used_vertices, weld, welded_mesh
+
+Step = tuple[str, float]  # a name in `ATTACKS`, and a strength
 
 
 class Attack(NamedTuple):
     """An attack of the library."""
 
-    # (mesh, strength, random key) → mesh: in JAX, or on the host if faces change, of which there are as many then
-    apply: Callable[[Mesh, Any, Any], Mesh]
+    apply: Callable[[Mesh, Any, Any], Mesh]  # (mesh, strength, random key) → mesh
     unit: str  # of its strength
+    strengths: tuple[float, ...]  # a usual range, weak ones first
+    host: bool = False  # NumPy and other programs; else JAX, which is given the mesh near the origin and at unit size
 
 
 ATTACKS: Mapping[str, Attack] = {
-    "noise": Attack(uniform_noise, "half width over the mean distance to the centre"),
-    "diagonal-noise": Attack(diagonal_noise, "half width over the diagonal"),
-    "smoothing": Attack(laplacian_smoothing, "steps of 0.1"),
-    "quantisation": Attack(quantisation, "bits per coordinate"),
-    "similarity": Attack(similarity, "shift over the diagonal, and scale up or down less 1; any rotation"),
-    "affine": Attack(affine, "Frobenius norm of the map less the identity"),
-    "edge-flips": Attack(edge_flips, "share of the edges"),
+    "noise": Attack(
+        uniform_noise, "half width over the mean distance to the centre", (0.0005, 0.001, 0.003, 0.005, 0.01)
+    ),
+    "diagonal-noise": Attack(diagonal_noise, "half width over the diagonal", (0.0002, 0.0005, 0.001, 0.002, 0.005)),
+    "smoothing": Attack(laplacian_smoothing, "steps of 0.1", (5, 10, 30, 50, 100)),
+    "quantisation": Attack(quantisation, "bits per coordinate", (11, 10, 9, 8, 7)),
+    "similarity": Attack(
+        similarity, "shift over the diagonal, and scale up or down less 1; any rotation", (0.1, 0.3, 1, 3, 9)
+    ),
+    "affine": Attack(affine, "Frobenius norm of the map less the identity", (0.02, 0.05, 0.1, 0.2, 0.4)),
+    "edge-flips": Attack(edge_flips, "share of the edges", (0.01, 0.03, 0.1, 0.2, 0.3), host=True),
 }
 
 
@@ -38,7 +46,8 @@ def attack(mesh: Mesh, kind: str, strength: float, *, seed: int) -> Mesh:
     """Put a mesh through an attack as a modelling tool would: on its welded points, copies moving together.
 
     A face that an attack changes refers to the first copy of each of its points: along a seam, where copies differ in
-    what the file says of them, it takes that of the first.
+    what the file says of them, it takes that of the first. An attack that makes a new mesh leaves no copies, and no
+    vertex that no face uses.
 
     Args:
         mesh: any mesh.
@@ -47,25 +56,68 @@ def attack(mesh: Mesh, kind: str, strength: float, *, seed: int) -> Mesh:
         seed: of its randomness, where it has any.
 
     Returns:
-        The attacked mesh, float64 vertices, as many as there were; other faces only from an attack that changes them.
+        The attacked mesh, float64 vertices; as many as there were, in their order, unless the attack makes a new mesh.
 
     Raises:
-        JaxmarkError: if there is no such attack, or its strength is out of range.
+        JaxmarkError: if there is no such attack, its strength is out of range, it cannot do anything with this mesh, or
+            what it needs is not installed.
+    """
+    return chain(mesh, [(kind, strength)], seed=seed)
+
+
+def chain(mesh: Mesh, steps: Sequence[Step], *, seed: int) -> Mesh:
+    """Put a mesh through several attacks, one after the other; see `attack`, which this is for one step.
+
+    Args:
+        mesh: any mesh.
+        steps: names and strengths.
+        seed: of the randomness of all.
+    """
+    for place, (kind, strength) in enumerate(steps):
+        check_step(kind, strength)
+        key = jax.random.key(seed)
+        mesh = _attacked(host_mesh(mesh), kind, strength, jax.random.fold_in(key, place) if place else key)
+    return mesh
+
+
+def check_step(kind: str, strength: float) -> None:
+    """Refuse an attack that there is not, and a strength that none takes.
+
+    Raises:
+        JaxmarkError: so.
     """
     if kind not in ATTACKS:
         raise JaxmarkError(f"There is no attack {kind!r}; there are {', '.join(ATTACKS)}.")
     if not (np.isfinite(strength) and strength >= 0):
         raise JaxmarkError(f"The strength of an attack must be a number, not negative, got {strength}.")
-    mesh = host_mesh(mesh)
+
+
+def _attacked(mesh: Mesh, kind: str, strength: float, key: PRNGKeyArray) -> Mesh:
     welded = weld(mesh.vertices)
-    points = welded_mesh(mesh, welded)
-    # Near the origin and at unit size, float32 keeps its digits.
-    centre, length = points.vertices[used_vertices(points)].mean(axis=0), diagonal(mesh)
-    start = (points.vertices - centre) / length
-    attacked = ATTACKS[kind].apply(Mesh(start, points.faces), strength, jax.random.key(seed))
-    # What the attack left alone stays exactly where it was.
-    still = np.asarray(attacked.vertices) == start.astype(attacked.vertices.dtype)
-    vertices = np.where(still, points.vertices, centre + length * np.asarray(attacked.vertices, np.float64))
-    kept = (attacked.faces == points.faces).all(axis=1)
-    faces = np.where(kept[:, None], mesh.faces, welded.first[attacked.faces])
-    return Mesh(vertices[welded.point], faces)
+    points, entry = welded_mesh(mesh, welded), ATTACKS[kind]
+    found = (entry.apply if entry.host else _at_unit_size(entry.apply))(points, strength, key)
+    found = Mesh(np.asarray(found.vertices, np.float64), np.asarray(found.faces, np.int64))
+    still = found.vertices.shape == points.vertices.shape and np.array_equal(found.vertices, points.vertices)
+    if not (same_connectivity(found, points) or (still and len(found.faces) == len(points.faces))):
+        return compacted(host_mesh(found))
+    kept = (found.faces == points.faces).all(axis=1)
+    faces = np.where(kept[:, None], mesh.faces, welded.first[found.faces])
+    return Mesh(found.vertices[welded.point], faces)
+
+
+def _at_unit_size(apply: Callable[[Mesh, Any, Any], Mesh]) -> Callable[[Mesh, Any, Any], Mesh]:
+    """An attack near the origin and at unit size, where float32 keeps its digits."""
+
+    def applied(points: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+        centre, length = np.asarray(points.vertices)[used_vertices(points)].mean(axis=0), diagonal(points)
+        start = (points.vertices - centre) / length
+        moved = apply(Mesh(start, points.faces), strength, key)
+        found = np.asarray(moved.vertices)
+        there = centre + length * found.astype(np.float64)
+        # What the attack left alone stays exactly where it was.
+        count = min(len(start), len(found))
+        still = found[:count] == start[:count].astype(found.dtype)
+        there[:count] = np.where(still, points.vertices[:count], there[:count])
+        return Mesh(there, np.asarray(moved.faces))
+
+    return applied

@@ -21,10 +21,10 @@ from jaxmark.mesh import (
     Mesh,
     Weld,
     area,
+    compacted,
     diagonal,
     edges,
     host_mesh,
-    make_mesh,
     same_connectivity,
     used_vertices,
     weld,
@@ -155,6 +155,4 @@ def compare(original: Mesh, distorted: Mesh, metrics: Collection[str] = METRICS)
 
 def _plain(mesh: Mesh, welded: Weld) -> Mesh:
     """Distinct points that faces use."""
-    points = welded_mesh(mesh, welded)
-    used = used_vertices(points)
-    return make_mesh(np.asarray(points.vertices)[used], (np.cumsum(used) - 1)[np.asarray(points.faces)])
+    return host_mesh(compacted(welded_mesh(mesh, welded)))
