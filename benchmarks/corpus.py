@@ -6,25 +6,21 @@ run. Where a worker is killed, a new pool goes on with what is left.
 """
 
 import argparse
-import json
 import os
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
 from functools import lru_cache
 from itertools import product
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import jaxmark as jm
+from jaxmark.cells import Cell, Pool, finished, processes, run
 from jaxmark.mesh import Mesh
-
-Cell = tuple[str, int, str]  # mesh, key's number, attack
-_ATTEMPTS = 3  # pools in a row that may break without finishing a cell
 
 
 @lru_cache(maxsize=1)  # cells of one mesh and key come one after another
@@ -35,11 +31,11 @@ def marked(mesh: str, key: int) -> tuple[jm.Marker, Mesh, bytes]:
     return marker, marker.embed(message)[0], message
 
 
-def run_cell(cell: Cell) -> dict[str, Any]:
+def run_cell(cell: Any) -> dict[str, Any]:
     """Mark, attack and read; a refusal is a result too."""
     mesh, key, attack = cell
     start = time.perf_counter()
-    row: dict[str, Any] = {"cell": cell}
+    row: dict[str, Any] = {}
     try:
         marker, mark, message = marked(mesh, key)
         kind, strength = attack.split()
@@ -51,49 +47,17 @@ def run_cell(cell: Cell) -> dict[str, Any]:
     return row | {"seconds": time.perf_counter() - start, "worker": os.getpid()}
 
 
-def finished(output: Path) -> set[Cell]:
-    """Cells that have a line; a last line that a killed run has torn is cut off."""
-    text = output.read_bytes() if output.exists() else b""
-    whole = text[: text.rfind(b"\n") + 1]
-    if whole != text:
-        os.truncate(output, len(whole))
-    return {tuple(json.loads(line)["cell"]) for line in whole.splitlines()}
-
-
-def append(output: Path, row: dict[str, Any]) -> None:
-    """One write for a whole line, on disk before the next."""
-    with output.open("ab", buffering=0) as file:
-        file.write(json.dumps(row).encode() + b"\n")
-        os.fsync(file.fileno())
-
-
-def run(cells: list[Cell], pool: Callable[[], AbstractContextManager[Executor]], output: Path) -> None:
-    """Finish what is left, with a new pool for one that breaks; give up where pools break without a result."""
-    broken = 0
-    while left := [cell for cell in cells if cell not in finished(output)]:
-        try:
-            with pool() as executor:
-                for future in as_completed([executor.submit(run_cell, cell) for cell in left]):
-                    append(output, future.result())
-                    broken = 0
-        except BrokenExecutor as error:
-            broken += 1
-            if broken == _ATTEMPTS:
-                raise
-            print(f"{error} A new pool goes on.", flush=True)
-
-
-def pools(name: str, workers: int) -> Callable[[], AbstractContextManager[Executor]]:
-    """What makes an executor of so many processes; forks of a started JAX would hang, so they are spawned."""
+def pools(name: str, workers: int) -> Pool:
+    """What makes an executor of so many processes, of this machine or Dask's."""
     if name == "processes":
-        return lambda: ProcessPoolExecutor(workers, get_context("spawn"))
+        return processes(workers)
 
     @contextmanager
     def dask() -> Iterator[Executor]:
         from distributed import Client
 
         with Client(n_workers=workers, threads_per_worker=1, dashboard_address=None) as client:
-            yield client.get_executor(retries=_ATTEMPTS)
+            yield client.get_executor(retries=3)
 
     return dask
 
@@ -108,10 +72,10 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     options = parser.parse_args()
     cells: list[Cell] = [*product(options.mesh, range(options.keys), options.attacks)]
-    print(f"{len(cells)} cells, {len(finished(options.output).intersection(cells))} of them finished before")
+    before = {tuple(row["cell"]) for row in finished(options.output)}
+    print(f"{len(cells)} cells, {len(before.intersection(cells))} of them finished before")
     start = time.perf_counter()
-    run(cells, pools(options.executor, options.workers), options.output)
-    rows = [row for line in options.output.open() if tuple((row := json.loads(line))["cell"]) in cells]
+    rows = run(cells, run_cell, pools(options.executor, options.workers), options.output)
     for attack in options.attacks:
         mine = [row for row in rows if row["cell"][2] == attack]
         print(f"{attack:<20} {sum(row.get('reads', False) for row in mine)}/{len(mine)} read")

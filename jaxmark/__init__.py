@@ -36,6 +36,8 @@ from jaxmark.marking import make_marker as make_marker
 from jaxmark.mesh import Mesh as Mesh
 from jaxmark.mesh import make_mesh as make_mesh
 from jaxmark.record import Record as Record
+from jaxmark.robustness import Robustness as Robustness
+from jaxmark.robustness import robustness as robustness
 from jaxmark.tardos import Accusation as Accusation
 from jaxmark.tracing import Tracer as Tracer
 from jaxmark.tracing import fingerprint as fingerprint

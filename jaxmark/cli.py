@@ -18,7 +18,7 @@ import click
 
 from jaxmark import distortion
 from jaxmark.alignment import Align
-from jaxmark.attacks import ATTACKS, attack
+from jaxmark.attacks import ATTACKS, chain, get_attack
 from jaxmark.budget import DEFAULT_LIMITS, make_budget
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
@@ -350,36 +350,48 @@ def identify_command(
     sys.exit(0 if accused else 1)
 
 
-_KINDS = "; ".join(f"{name}: {entry.unit}" for name, entry in ATTACKS.items())
+_KINDS = "\n".join(f"  {name}: {entry.unit}" for name, entry in ATTACKS.items())
 
 
-@cli.command(name="attack", epilog=f"Unit of STRENGTH. {_KINDS}.")
+@cli.command(name="attack", epilog=f"\b\nKINDs, and the units of their STRENGTH:\n{_KINDS}")
 @click.argument("source", metavar="IN", type=_MESH)
 @click.argument("target", metavar="OUT", type=_MESH)
-@click.argument("kind", type=click.Choice(list(ATTACKS)))
-@click.argument("strength", type=float)
+@click.argument("words", metavar="KIND STRENGTH [KIND STRENGTH]...", nargs=-1, required=True)
 @click.option(
     "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of the attack's randomness."
 )
 @_JSON
-def attack_command(source: Path, target: Path, kind: str, strength: float, seed: int, as_json: bool) -> None:
-    """Put a mesh through an attack, to see what a mark survives.
+def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int, as_json: bool) -> None:
+    """Put a mesh through one attack or several, to see what a mark survives.
 
     OUT is the file IN with other positions, or a new file if faces change.
     """
+    steps = _steps(words)
     _check_outputs(source, target)
     _distinct(IN=source, OUT=target)
     mesh = load_mesh(source)
     with _replacing(target) as draft:
-        attacked = attack(mesh, kind, strength, seed=seed)
-        if same_connectivity(mesh, attacked):
-            save_mesh(attacked, draft, like=source)
-            attacked = load_mesh(draft)
-        else:
-            save_mesh(attacked, draft)
-        change = distortion.moved(mesh, attacked._replace(faces=mesh.faces))
-    answer = {"kind": kind, "strength": strength, "seed": seed, "rms": change.rms, "max": change.max}
-    _answer(as_json, answer, f"{kind} {strength:g} → {target}, RMS {change.rms:.3g} of the diagonal")
+        attacked = chain(mesh, steps, seed=seed)
+        same = same_connectivity(mesh, attacked)
+        save_mesh(attacked, draft, like=source if same else None)
+        change = distortion.moved(mesh, load_mesh(draft))._asdict() if same else {"rms": None, "max": None}
+    answer = {"attacks": steps, "seed": seed, "vertices": len(attacked.vertices), "faces": len(attacked.faces)}
+    said = " + ".join(f"{kind} {strength:g}" for kind, strength in steps)
+    how = f"RMS {change['rms']:.3g} of the diagonal" if same else f"{len(attacked.vertices)} vertices, other faces"
+    _answer(as_json, {**answer, **change}, f"{said} → {target}, {how}")
+
+
+def _steps(words: tuple[str, ...]) -> list[tuple[str, float]]:
+    """Names and strengths by turns."""
+    kinds, strengths = words[::2], words[1::2]
+    for kind in kinds:
+        get_attack(kind)
+    if len(kinds) != len(strengths):
+        raise JaxmarkError(f"Give the strength of {kinds[-1]}, too: {get_attack(kinds[-1]).unit}.")
+    try:
+        return [(kind, float(strength)) for kind, strength in zip(kinds, strengths, strict=True)]
+    except ValueError as error:
+        raise JaxmarkError(f"A strength is a number: {error}.") from None
 
 
 @cli.command()

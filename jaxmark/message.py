@@ -4,6 +4,8 @@ The message and its tag are one polar codeword (`jaxmark.polar`). The decoder li
 subkey of its own, says which of them is the message, if any.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 from jaxtyping import Float, Float64
 
@@ -58,14 +60,29 @@ def decode(
         geometry: `geometry_hash` of the original.
         candidates: how many messages may be tried.
     """
-    if not np.any(scores):
-        return None
-    largest = np.abs(scores).max()
-    for word in polar.decode(scores[None] / largest, bits + TAG_BITS, candidates)[0]:
+    for word in _plausible(scores, bits, candidates):
         message = np.packbits(word[:bits]).tobytes()
         if np.array_equal(word[bits:], _tag(message, key, geometry)):
             return message
     return None
+
+
+def guess(scores: Float[np.ndarray, " length"], bits: int) -> bytes | None:
+    """The most plausible message, whatever its tag: what a receiver without one would say. None where nothing is known.
+
+    Args:
+        scores: see `decode`.
+        bits: payload.
+    """
+    word = next(iter(_plausible(scores, bits, CANDIDATES)), None)
+    return None if word is None else np.packbits(word[:bits]).tobytes()
+
+
+def _plausible(scores: Float[np.ndarray, " length"], bits: int, candidates: int) -> Iterable[np.ndarray]:
+    """Messages with their tags, the most plausible first; none where nothing is known."""
+    if not np.any(scores):
+        return ()
+    return polar.decode(scores[None] / np.abs(scores).max(), bits + TAG_BITS, candidates)[0]
 
 
 def _tag(message: bytes, key: bytes, geometry: bytes) -> np.ndarray:

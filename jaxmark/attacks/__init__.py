@@ -13,7 +13,9 @@ from jaxmark.attacks.noise import uniform_noise as uniform_noise
 from jaxmark.attacks.quantisation import quantisation as quantisation
 from jaxmark.attacks.registry import ATTACKS as ATTACKS
 from jaxmark.attacks.registry import Attack as Attack
+from jaxmark.attacks.registry import Kind as Kind
 from jaxmark.attacks.registry import Step as Step
 from jaxmark.attacks.registry import attack as attack
 from jaxmark.attacks.registry import chain as chain
+from jaxmark.attacks.registry import get_attack as get_attack
 from jaxmark.attacks.smoothing import laplacian_smoothing as laplacian_smoothing

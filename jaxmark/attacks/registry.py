@@ -15,11 +15,9 @@ from jaxmark.attacks.smoothing import laplacian_smoothing
 from jaxmark.errors import JaxmarkError
 from jaxmark.mesh import Mesh, compacted, diagonal, host_mesh, same_connectivity, used_vertices, weld, welded_mesh
 
-Step = tuple[str, float]  # a name in `ATTACKS`, and a strength
-
 
 class Attack(NamedTuple):
-    """An attack of the library."""
+    """An attack: one of the library's, or your own."""
 
     apply: Callable[[Mesh, Any, Any], Mesh]  # (mesh, strength, random key) → mesh
     unit: str  # of its strength
@@ -42,7 +40,11 @@ ATTACKS: Mapping[str, Attack] = {
 }
 
 
-def attack(mesh: Mesh, kind: str, strength: float, *, seed: int) -> Mesh:
+Kind = str | Attack  # a name in `ATTACKS`, or an attack of your own
+Step = tuple[Kind, float]  # and its strength
+
+
+def attack(mesh: Mesh, kind: Kind, strength: float, *, seed: int) -> Mesh:
     """Put a mesh through an attack as a modelling tool would: on its welded points, copies moving together.
 
     A face that an attack changes refers to the first copy of each of its points: along a seam, where copies differ in
@@ -51,7 +53,7 @@ def attack(mesh: Mesh, kind: str, strength: float, *, seed: int) -> Mesh:
 
     Args:
         mesh: any mesh.
-        kind: a name in `ATTACKS`.
+        kind: a name in `ATTACKS`, or an `Attack` of your own.
         strength: in the attack's unit.
         seed: of its randomness, where it has any.
 
@@ -70,31 +72,34 @@ def chain(mesh: Mesh, steps: Sequence[Step], *, seed: int) -> Mesh:
 
     Args:
         mesh: any mesh.
-        steps: names and strengths.
+        steps: kinds of attacks and their strengths.
         seed: of the randomness of all.
     """
-    for place, (kind, strength) in enumerate(steps):
-        check_step(kind, strength)
+    entries = [(get_attack(kind), strength) for kind, strength in steps]
+    for place, (entry, strength) in enumerate(entries):
+        if not (np.isfinite(strength) and strength >= 0):
+            raise JaxmarkError(f"The strength of an attack must be a number, not negative, got {strength}.")
         key = jax.random.key(seed)
-        mesh = _attacked(host_mesh(mesh), kind, strength, jax.random.fold_in(key, place) if place else key)
+        mesh = _attacked(host_mesh(mesh), entry, strength, jax.random.fold_in(key, place) if place else key)
     return mesh
 
 
-def check_step(kind: str, strength: float) -> None:
-    """Refuse an attack that there is not, and a strength that none takes.
+def get_attack(kind: Kind) -> Attack:
+    """An attack by its name; an attack itself is returned as it is.
 
     Raises:
-        JaxmarkError: so.
+        JaxmarkError: if there is none of that name.
     """
+    if isinstance(kind, Attack):
+        return kind
     if kind not in ATTACKS:
         raise JaxmarkError(f"There is no attack {kind!r}; there are {', '.join(ATTACKS)}.")
-    if not (np.isfinite(strength) and strength >= 0):
-        raise JaxmarkError(f"The strength of an attack must be a number, not negative, got {strength}.")
+    return ATTACKS[kind]
 
 
-def _attacked(mesh: Mesh, kind: str, strength: float, key: PRNGKeyArray) -> Mesh:
+def _attacked(mesh: Mesh, entry: Attack, strength: float, key: PRNGKeyArray) -> Mesh:
     welded = weld(mesh.vertices)
-    points, entry = welded_mesh(mesh, welded), ATTACKS[kind]
+    points = welded_mesh(mesh, welded)
     found = (entry.apply if entry.host else _at_unit_size(entry.apply))(points, strength, key)
     found = Mesh(np.asarray(found.vertices, np.float64), np.asarray(found.faces, np.int64))
     still = found.vertices.shape == points.vertices.shape and np.array_equal(found.vertices, points.vertices)

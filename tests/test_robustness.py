@@ -1,0 +1,70 @@
+"""Robustness curves against attacks and readings one by one."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmark as jm
+from jaxmark.attacks import Attack
+from jaxmark.mesh import Mesh
+from jaxmark.message import decode, encode, guess
+from tests.samples import bumpy_sphere
+
+MESSAGE = b"ok"
+
+
+@pytest.fixture(scope="module")
+def marked(key: jm.Key) -> tuple[jm.Marker, Mesh]:
+    marker = jm.make_marker(bumpy_sphere(3), key, bits=16)
+    return marker, marker.embed(MESSAGE, 2e-3, noise=0)[0]
+
+
+def test_a_curve_is_what_attack_and_detect_say(marked):
+    marker, mesh = marked
+    found = jm.robustness(marker, mesh, MESSAGE, "noise", [0.002, 0.2], samples=2)
+    np.testing.assert_array_equal(found.strengths, [0.002, 0.2])
+    for place, strength in enumerate((0.002, 0.2)):
+        for seed in range(2):
+            one = marker.detect(jm.attack(mesh, "noise", strength, seed=seed))
+            assert found.success[place, seed] == (one.message == MESSAGE)
+            assert found.log10_p[place, seed] == one.log10_p
+    assert found.success.tolist() == [[True, True], [False, False]]
+    assert (found.bit_errors[0] == 0).all()
+    assert (found.bit_errors[1] > 0).all()
+    assert found.refusals == (("", ""), ("", ""))
+
+
+def test_an_attack_of_ones_own_and_a_refusal(marked):
+    marker, mesh = marked
+
+    def flatten(mesh: Mesh, strength: float, key: jax.Array) -> Mesh:
+        return Mesh(jnp.asarray(mesh.vertices) * jnp.array([1, 1, 1 - strength]), mesh.faces)
+
+    def scatter(mesh: Mesh, strength: float, key: jax.Array) -> Mesh:
+        return Mesh(np.random.default_rng(0).normal(size=(20, 3)), np.arange(18).reshape(6, 3))
+
+    squashed = jm.robustness(marker, mesh, MESSAGE, Attack(flatten, "share of the height", (0.1, 0.4)), samples=1)
+    assert squashed.success.all()
+    np.testing.assert_array_equal(squashed.strengths, [0.1, 0.4])
+    lost = jm.robustness(marker, mesh, MESSAGE, Attack(scatter, "none", (1.0,), host=True), samples=1)
+    assert (lost.success.item(), lost.bit_errors.item(), lost.log10_p.item()) == (False, 0.5, 0)
+    assert "align" in lost.refusals[0][0]
+
+
+def test_the_best_guess_is_the_message_without_its_tag(key: jm.Key):
+    code = encode(b"guess me", key, b"geometry", 256)
+    assert guess(code + 0.3 * np.random.default_rng(0).normal(size=256), 64) == b"guess me"
+    assert guess(np.zeros(256), 64) is None
+    # Under another key the tag fits no more, and the guess is the same.
+    assert decode(code, 64, jm.Key(bytes(32)), b"geometry") is None
+    wrong = guess(np.random.default_rng(1).normal(size=256), 64)
+    assert wrong is not None
+    assert wrong != b"guess me"
+
+
+def test_refusals(marked):
+    with pytest.raises(jm.JaxmarkError, match="a strength and a sample, got 0 and 5"):
+        jm.robustness(*marked, MESSAGE, "noise", [])
+    with pytest.raises(jm.JaxmarkError, match="no attack 'melting'"):
+        jm.robustness(*marked, MESSAGE, "melting")
