@@ -17,3 +17,6 @@ from jaxmark.attacks.registry import Step as Step
 from jaxmark.attacks.registry import attack as attack
 from jaxmark.attacks.registry import chain as chain
 from jaxmark.attacks.smoothing import laplacian_smoothing as laplacian_smoothing
+from jaxmark.attacks.subdivision import loop as loop
+from jaxmark.attacks.subdivision import midpoint as midpoint
+from jaxmark.attacks.subdivision import sqrt3 as sqrt3

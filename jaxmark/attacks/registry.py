@@ -12,6 +12,7 @@ from jaxmark.attacks.flips import edge_flips
 from jaxmark.attacks.noise import diagonal_noise, uniform_noise
 from jaxmark.attacks.quantisation import quantisation
 from jaxmark.attacks.smoothing import laplacian_smoothing
+from jaxmark.attacks.subdivision import loop, midpoint, sqrt3
 from jaxmark.errors import JaxmarkError
 from jaxmark.mesh import Mesh, compacted, diagonal, host_mesh, same_connectivity, used_vertices, weld, welded_mesh
 
@@ -39,6 +40,9 @@ ATTACKS: Mapping[str, Attack] = {
     ),
     "affine": Attack(affine, "Frobenius norm of the map less the identity", (0.02, 0.05, 0.1, 0.2, 0.4)),
     "edge-flips": Attack(edge_flips, "share of the edges", (0.01, 0.03, 0.1, 0.2, 0.3), host=True),
+    "midpoint": Attack(midpoint, "steps", (1, 2, 3)),
+    "sqrt3": Attack(sqrt3, "steps", (1, 2, 3)),
+    "loop": Attack(loop, "steps", (1, 2, 3)),
 }
 
 
