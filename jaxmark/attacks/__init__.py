@@ -16,6 +16,10 @@ from jaxmark.attacks.registry import Attack as Attack
 from jaxmark.attacks.registry import Step as Step
 from jaxmark.attacks.registry import attack as attack
 from jaxmark.attacks.registry import chain as chain
+from jaxmark.attacks.remeshing import iso_surface as iso_surface
+from jaxmark.attacks.remeshing import isotropic as isotropic
+from jaxmark.attacks.remeshing import poisson as poisson
+from jaxmark.attacks.simplification import simplification as simplification
 from jaxmark.attacks.smoothing import laplacian_smoothing as laplacian_smoothing
 from jaxmark.attacks.subdivision import loop as loop
 from jaxmark.attacks.subdivision import midpoint as midpoint

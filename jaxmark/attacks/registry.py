@@ -11,6 +11,8 @@ from jaxmark.attacks.affine import affine, similarity
 from jaxmark.attacks.flips import edge_flips
 from jaxmark.attacks.noise import diagonal_noise, uniform_noise
 from jaxmark.attacks.quantisation import quantisation
+from jaxmark.attacks.remeshing import iso_surface, isotropic, poisson
+from jaxmark.attacks.simplification import simplification
 from jaxmark.attacks.smoothing import laplacian_smoothing
 from jaxmark.attacks.subdivision import loop, midpoint, sqrt3
 from jaxmark.errors import JaxmarkError
@@ -43,6 +45,10 @@ ATTACKS: Mapping[str, Attack] = {
     "midpoint": Attack(midpoint, "steps", (1, 2, 3)),
     "sqrt3": Attack(sqrt3, "steps", (1, 2, 3)),
     "loop": Attack(loop, "steps", (1, 2, 3)),
+    "simplification": Attack(simplification, "share of the edges", (0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.975), host=True),
+    "isotropic": Attack(isotropic, "edge length over the mean one", (0.5, 0.7, 1, 1.4, 2), host=True),
+    "iso-surface": Attack(iso_surface, "cells along the longest side", (200, 150, 100, 70, 50), host=True),
+    "poisson": Attack(poisson, "depth of the octree", (9, 8, 7, 6, 5), host=True),
 }
 
 
