@@ -6,10 +6,16 @@ part of the surface: they neither move nor count.
 
 from jaxmark.attacks.affine import affine as affine
 from jaxmark.attacks.affine import similarity as similarity
+from jaxmark.attacks.cropping import cropping as cropping
+from jaxmark.attacks.cropping import holes as holes
+from jaxmark.attacks.cropping import region_cropping as region_cropping
 from jaxmark.attacks.flips import edge_flips as edge_flips
+from jaxmark.attacks.mosaic import missing_pieces as missing_pieces
+from jaxmark.attacks.mosaic import mosaic as mosaic
 from jaxmark.attacks.noise import diagonal_noise as diagonal_noise
 from jaxmark.attacks.noise import mark_noise as mark_noise
 from jaxmark.attacks.noise import uniform_noise as uniform_noise
+from jaxmark.attacks.ordering import reordering as reordering
 from jaxmark.attacks.quantisation import quantisation as quantisation
 from jaxmark.attacks.registry import ATTACKS as ATTACKS
 from jaxmark.attacks.registry import Attack as Attack
@@ -18,4 +24,12 @@ from jaxmark.attacks.registry import Step as Step
 from jaxmark.attacks.registry import attack as attack
 from jaxmark.attacks.registry import chain as chain
 from jaxmark.attacks.registry import get_attack as get_attack
+from jaxmark.attacks.remeshing import iso_surface as iso_surface
+from jaxmark.attacks.remeshing import isotropic as isotropic
+from jaxmark.attacks.remeshing import poisson as poisson
+from jaxmark.attacks.scene import adding_geometry as adding_geometry
+from jaxmark.attacks.simplification import simplification as simplification
 from jaxmark.attacks.smoothing import laplacian_smoothing as laplacian_smoothing
+from jaxmark.attacks.subdivision import loop as loop
+from jaxmark.attacks.subdivision import midpoint as midpoint
+from jaxmark.attacks.subdivision import sqrt3 as sqrt3

@@ -8,10 +8,17 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from jaxmark.attacks.affine import affine, similarity
+from jaxmark.attacks.cropping import cropping, holes, region_cropping
 from jaxmark.attacks.flips import edge_flips
+from jaxmark.attacks.mosaic import missing_pieces, mosaic
 from jaxmark.attacks.noise import diagonal_noise, uniform_noise
+from jaxmark.attacks.ordering import reordering
 from jaxmark.attacks.quantisation import quantisation
+from jaxmark.attacks.remeshing import iso_surface, isotropic, poisson
+from jaxmark.attacks.scene import adding_geometry
+from jaxmark.attacks.simplification import simplification
 from jaxmark.attacks.smoothing import laplacian_smoothing
+from jaxmark.attacks.subdivision import loop, midpoint, sqrt3
 from jaxmark.errors import JaxmarkError
 from jaxmark.mesh import Mesh, compacted, diagonal, host_mesh, same_connectivity, used_vertices, weld, welded_mesh
 
@@ -37,6 +44,24 @@ ATTACKS: Mapping[str, Attack] = {
     ),
     "affine": Attack(affine, "Frobenius norm of the map less the identity", (0.02, 0.05, 0.1, 0.2, 0.4)),
     "edge-flips": Attack(edge_flips, "share of the edges", (0.01, 0.03, 0.1, 0.2, 0.3), host=True),
+    "midpoint": Attack(midpoint, "steps", (1, 2, 3)),
+    "sqrt3": Attack(sqrt3, "steps", (1, 2, 3)),
+    "loop": Attack(loop, "steps", (1, 2, 3)),
+    "simplification": Attack(simplification, "share of the edges", (0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.975), host=True),
+    "isotropic": Attack(isotropic, "edge length over the mean one", (0.5, 0.7, 1, 1.4, 2), host=True),
+    "iso-surface": Attack(iso_surface, "cells along the longest side", (200, 150, 100, 70, 50), host=True),
+    "poisson": Attack(poisson, "depth of the octree", (9, 8, 7, 6, 5), host=True),
+    "cropping": Attack(cropping, "share of the vertices, beyond a plane", (0.1, 0.3, 0.5, 0.7, 0.8), host=True),
+    "region-cropping": Attack(
+        region_cropping, "share of the vertices, in one region", (0.1, 0.3, 0.5, 0.7, 0.8), host=True
+    ),
+    "holes": Attack(holes, "share of the vertices, in ten regions", (0.02, 0.05, 0.1, 0.2, 0.3), host=True),
+    "reordering": Attack(reordering, "share of the vertices and of the faces", (0.01, 0.1, 0.3, 1), host=True),
+    "added-geometry": Attack(
+        adding_geometry, "size of a ring and of a box over the diagonal", (0.25, 0.5, 1, 2), host=True
+    ),
+    "mosaic": Attack(mosaic, "shift of eight pieces over the diagonal", (0.01, 0.03, 0.1, 0.3, 1), host=True),
+    "missing-pieces": Attack(missing_pieces, "share of eight pieces", (0.125, 0.25, 0.5, 0.75), host=True),
 }
 
 

@@ -1,0 +1,45 @@
+"""Another order of the same mesh."""
+
+import numpy as np
+from jaxtyping import Int64, PRNGKeyArray
+
+from jaxmark.attacks.random import generator
+from jaxmark.errors import JaxmarkError
+from jaxmark.mesh import Mesh, used_vertices
+
+
+def reordering(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+    """Let random vertices change places among themselves, and random faces; on the host.
+
+    The faces that change places also begin with any of their corners; their orientation stays.
+
+    Args:
+        mesh: any mesh, concrete.
+        strength: share of the vertices and share of the faces that change places, in [0, 1]; 1 for all of them.
+        key: a JAX random key.
+
+    Returns:
+        The same surface. A vertex that no face uses keeps its place.
+
+    Raises:
+        JaxmarkError: if the share is outside [0, 1].
+    """
+    if not 0 <= strength <= 1:
+        raise JaxmarkError(f"A share of vertices and faces to reorder is in [0, 1], got {strength:g}.")
+    random, faces = generator(key), np.asarray(mesh.faces, np.int64)
+    here, there = _cycle(np.flatnonzero(used_vertices(mesh)), strength, random)
+    vertices, place = np.array(mesh.vertices), np.arange(len(mesh.vertices))
+    vertices[there], place[here] = vertices[here], there
+    faces = place[faces]
+    here, there = _cycle(np.arange(len(faces)), strength, random)
+    corner = (random.integers(3, size=(len(here), 1)) + np.arange(3)) % 3
+    faces[there] = np.take_along_axis(faces[here], corner, axis=1)
+    return Mesh(vertices, faces)
+
+
+def _cycle(
+    things: Int64[np.ndarray, " things"], share: float, random: np.random.Generator
+) -> tuple[Int64[np.ndarray, " chosen"], Int64[np.ndarray, " chosen"]]:
+    """A share of the things, and for each another of them that takes no other's place."""
+    chosen = random.permutation(things)[: round(share * len(things))]
+    return chosen, np.roll(chosen, 1)

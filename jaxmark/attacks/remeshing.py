@@ -1,0 +1,116 @@
+"""Remeshing: the same surface, or nearly, of other vertices and faces; on the host, by other programs."""
+
+import numpy as np
+from jaxtyping import Float64, Int64, PRNGKeyArray
+
+from jaxmark.attacks.meshlab import filtered, filtered_points
+from jaxmark.attacks.random import generator
+from jaxmark.errors import JaxmarkError
+from jaxmark.extras import require
+from jaxmark.mesh import Mesh, area, compacted, edges
+
+_CELLS = 4, 512  # along the longest side
+_DEPTHS = 1, 12
+_SAMPLES = 30  # for each vertex
+_BLOCK = 4  # cells of a coarse grid that tells where the surface may be
+
+
+def isotropic(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
+    """Remesh with edges of about one length, by MeshLab, whose vertices stay on the surface.
+
+    Args:
+        mesh: any mesh, concrete.
+        strength: the length, over the mean length of the mesh's edges, in [0.1, 100].
+        key: not used; attacks share one signature.
+
+    Returns:
+        A mesh of other vertices and faces.
+
+    Raises:
+        JaxmarkError: if the length is outside that, MeshLab fails, or pymeshlab is missing.
+    """
+    if not 0.1 <= strength <= 100:
+        raise JaxmarkError(f"Remeshing takes an edge length of 0.1 to 100 mean ones, got {strength:g}.")
+    mesh = compacted(mesh)
+    ends = np.asarray(mesh.vertices)[edges(mesh.faces)]
+    mean = float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
+    length = require("pymeshlab", "attacks").PureValue(strength * mean)
+    return filtered("meshing_isotropic_explicit_remeshing", mesh, targetlen=length)
+
+
+def iso_surface(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
+    """Extract the surface again from a grid of signed distances, by libigl and the marching cubes of scikit-image.
+
+    Where a hole leaves inside and outside open, the winding number decides.
+
+    Args:
+        mesh: any mesh, concrete.
+        strength: cells along the longest side of the bounding box, a whole number from 4 to 512.
+        key: not used; attacks share one signature.
+
+    Returns:
+        A mesh of other vertices and faces.
+
+    Raises:
+        JaxmarkError: if there are fewer cells or more, the mesh has no inside, or libigl or scikit-image is missing.
+    """
+    least, most = _CELLS
+    if not least <= strength <= most or strength != int(strength):
+        raise JaxmarkError(f"A grid takes a whole number of {least} to {most} cells a side, got {strength:g}.")
+    measure, mesh = require("skimage.measure", "attacks"), compacted(mesh)
+    low, extent = np.asarray(mesh.vertices).min(axis=0), np.ptp(mesh.vertices, axis=0)
+    cell = float(extent.max()) / strength
+    if cell == 0:
+        raise JaxmarkError("All vertices of the mesh are at one point; there is no surface to extract.")
+    low = low - _BLOCK * cell
+    mesh = mesh._replace(vertices=(mesh.vertices - low) / cell)  # libigl's winding numbers are in single precision
+    coarse = np.ceil(extent / cell / _BLOCK).astype(int) + 3
+    rough = _signed_distance(mesh, _BLOCK * np.argwhere(np.ones(coarse))).reshape(coarse)
+    # The nearest point of the coarse grid tells where the surface may be: a distance changes no faster than a position.
+    near = [(np.arange(_BLOCK * (count - 1) + 1) + _BLOCK // 2) // _BLOCK for count in coarse]
+    values = rough[np.ix_(*near)]
+    close = np.argwhere(np.abs(values) < 1.5 * _BLOCK)
+    values[tuple(close.T)] = _signed_distance(mesh, close)
+    if not values.min() < 0 < values.max():
+        raise JaxmarkError("The mesh has no inside, or none that the grid meets; take more cells, or close its holes.")
+    points, faces = measure.marching_cubes(values, 0, gradient_direction="descent")[:2]
+    return Mesh(low + cell * points.astype(np.float64), faces.astype(np.int64))
+
+
+def poisson(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+    """Reconstruct the surface from 30 random points for each vertex, with normals, by MeshLab.
+
+    It is the screened Poisson reconstruction of Kazhdan and Hoppe, ACM Transactions on Graphics 32(3), 2013; it closes
+    holes.
+
+    Args:
+        mesh: any mesh, concrete.
+        strength: depth of the octree, a whole number from 1 to 12.
+        key: a JAX random key, of the points.
+
+    Returns:
+        A mesh of other vertices and faces.
+
+    Raises:
+        JaxmarkError: if the depth is less or more, the mesh has no area, MeshLab fails, or pymeshlab is missing.
+    """
+    import trimesh  # takes long to import
+
+    least, most = _DEPTHS
+    if not least <= strength <= most or strength != int(strength):
+        raise JaxmarkError(f"An octree has a whole depth from {least} to {most}, got {strength:g}.")
+    mesh = compacted(mesh)
+    if not area(mesh) > 0:
+        raise JaxmarkError("The mesh has no area; there is no surface to reconstruct.")
+    surface = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), process=False)
+    points, face = trimesh.sample.sample_surface(surface, _SAMPLES * len(mesh.vertices), seed=generator(key))[:2]
+    normals = np.asarray(surface.face_normals)[face]
+    name = "generate_surface_reconstruction_screened_poisson"
+    # One thread: those of several add up in any order.
+    return filtered_points(name, np.asarray(points), normals, depth=int(strength), threads=1)
+
+
+def _signed_distance(mesh: Mesh, points: Int64[np.ndarray, "points 3"]) -> Float64[np.ndarray, " points"]:
+    igl = require("igl", "attacks")
+    sign = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
+    return igl.signed_distance(points.astype(np.float64), np.asarray(mesh.vertices), np.asarray(mesh.faces), sign)[0]

@@ -1,0 +1,45 @@
+"""A mesh among other things."""
+
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from jaxmark.attacks.random import generator
+from jaxmark.errors import JaxmarkError
+from jaxmark.mesh import Mesh, diagonal, used_vertices
+
+_GAP = 0.1  # between the spheres around the boxes of things, in diagonals of the mesh
+
+
+def adding_geometry(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+    """Put a ring on one side of the mesh and a box on the other, in a random direction and random poses; on the host.
+
+    Args:
+        mesh: any mesh, concrete.
+        strength: diagonal of the bounding box of either, before it is turned, over that of the mesh; positive.
+        key: a JAX random key.
+
+    Returns:
+        The mesh as it is, first, then the ring of 1,024 vertices and the box of 386. They touch nothing.
+
+    Raises:
+        JaxmarkError: if the size is not positive, or all vertices of the mesh are at one point.
+    """
+    import trimesh  # takes long to import
+
+    if not strength > 0:
+        raise JaxmarkError(f"What is put beside a mesh needs a positive size, got {strength:g}.")
+    random, size = generator(key), diagonal(mesh)
+    surface = np.asarray(mesh.vertices, np.float64)[used_vertices(mesh)]
+    middle = (surface.min(axis=0) + surface.max(axis=0)) / 2
+    step = random.normal(size=3)
+    step *= size * ((1 + strength) / 2 + _GAP) / np.linalg.norm(step)
+    box = trimesh.creation.box((6, 5, 4)).subdivide().subdivide().subdivide()
+    vertices, faces = [np.asarray(mesh.vertices, np.float64)], [np.asarray(mesh.faces, np.int64)]
+    count = len(vertices[0])
+    for thing, place in ((trimesh.creation.torus(3, 1), middle + step), (box, middle - step)):
+        turn = trimesh.transformations.random_rotation_matrix(random.random(3))[:3, :3]
+        scale = strength * size / np.linalg.norm(np.ptp(thing.vertices, axis=0))
+        vertices.append(place + scale * (thing.vertices @ turn.T))
+        faces.append(count + np.asarray(thing.faces, np.int64))
+        count += len(thing.vertices)
+    return Mesh(np.concatenate(vertices), np.concatenate(faces))
