@@ -8,6 +8,7 @@ from jaxmark.attacks.affine import affine as affine
 from jaxmark.attacks.affine import similarity as similarity
 from jaxmark.attacks.flips import edge_flips as edge_flips
 from jaxmark.attacks.noise import diagonal_noise as diagonal_noise
+from jaxmark.attacks.noise import gaussian_noise as gaussian_noise
 from jaxmark.attacks.noise import mark_noise as mark_noise
 from jaxmark.attacks.noise import uniform_noise as uniform_noise
 from jaxmark.attacks.quantisation import quantisation as quantisation

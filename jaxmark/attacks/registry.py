@@ -9,7 +9,7 @@ from jaxtyping import PRNGKeyArray
 
 from jaxmark.attacks.affine import affine, similarity
 from jaxmark.attacks.flips import edge_flips
-from jaxmark.attacks.noise import diagonal_noise, uniform_noise
+from jaxmark.attacks.noise import diagonal_noise, gaussian_noise, uniform_noise
 from jaxmark.attacks.quantisation import quantisation
 from jaxmark.attacks.smoothing import laplacian_smoothing
 from jaxmark.errors import JaxmarkError
@@ -32,6 +32,11 @@ ATTACKS: Mapping[str, Attack] = {
         uniform_noise, "half width over the mean distance to the centre", (0.0005, 0.001, 0.003, 0.005, 0.01)
     ),
     "diagonal-noise": Attack(diagonal_noise, "half width over the diagonal", (0.0002, 0.0005, 0.001, 0.002, 0.005)),
+    "gaussian-noise": Attack(
+        gaussian_noise,
+        "standard deviation of a coordinate over the mean distance to the centre",
+        (0.0003, 0.0006, 0.002, 0.003, 0.006),
+    ),
     "smoothing": Attack(laplacian_smoothing, "steps of 0.1", (5, 10, 30, 50, 100)),
     "quantisation": Attack(quantisation, "bits per coordinate", (11, 10, 9, 8, 7)),
     "similarity": Attack(
