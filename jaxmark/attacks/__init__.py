@@ -6,6 +6,9 @@ part of the surface: they neither move nor count.
 
 from jaxmark.attacks.affine import affine as affine
 from jaxmark.attacks.affine import similarity as similarity
+from jaxmark.attacks.bilateral import bilateral_smoothing as bilateral_smoothing
+from jaxmark.attacks.filtering import band_stop as band_stop
+from jaxmark.attacks.filtering import low_pass as low_pass
 from jaxmark.attacks.flips import edge_flips as edge_flips
 from jaxmark.attacks.noise import diagonal_noise as diagonal_noise
 from jaxmark.attacks.noise import gaussian_noise as gaussian_noise
@@ -17,4 +20,6 @@ from jaxmark.attacks.registry import Attack as Attack
 from jaxmark.attacks.registry import Step as Step
 from jaxmark.attacks.registry import attack as attack
 from jaxmark.attacks.registry import chain as chain
+from jaxmark.attacks.smoothing import cotangent_smoothing as cotangent_smoothing
 from jaxmark.attacks.smoothing import laplacian_smoothing as laplacian_smoothing
+from jaxmark.attacks.smoothing import taubin_smoothing as taubin_smoothing
