@@ -10,6 +10,7 @@ from jaxmark.attacks.bilateral import bilateral_smoothing as bilateral_smoothing
 from jaxmark.attacks.filtering import band_stop as band_stop
 from jaxmark.attacks.filtering import low_pass as low_pass
 from jaxmark.attacks.flips import edge_flips as edge_flips
+from jaxmark.attacks.jamming import jamming as jamming
 from jaxmark.attacks.noise import diagonal_noise as diagonal_noise
 from jaxmark.attacks.noise import gaussian_noise as gaussian_noise
 from jaxmark.attacks.noise import mark_noise as mark_noise
@@ -23,3 +24,6 @@ from jaxmark.attacks.registry import chain as chain
 from jaxmark.attacks.smoothing import cotangent_smoothing as cotangent_smoothing
 from jaxmark.attacks.smoothing import laplacian_smoothing as laplacian_smoothing
 from jaxmark.attacks.smoothing import taubin_smoothing as taubin_smoothing
+from jaxmark.attacks.warping import bending as bending
+from jaxmark.attacks.warping import twisting as twisting
+from jaxmark.attacks.warping import warp as warp

@@ -1,8 +1,9 @@
 """Filters of the spectrum: what somebody does who knows which bands are marked.
 
-Spectra are those of the graph Laplacian, λ in [0, 2]; the polynomials have 64 degrees and Jackson's damping, and so no
-overshoot, and an edge at λ = 1 - cos φ is as wide as about 0.05 in φ. They are 1 at λ = 0: the mean position of each
-component, weighted by valence, stays. All vertices that faces use are filtered, those on a boundary too.
+Spectra are those of the graph Laplacian, λ in [0, 2]. The polynomials are of degree 64 with Jackson's damping: they do
+not overshoot, and blur an edge at λ = 1 - cos φ by about 0.05 in φ; narrower bands are weakened, not removed. They are
+1 at λ = 0: the mean position of each component, weighted by valence, stays. All vertices that faces use are filtered,
+those on a boundary too.
 """
 
 import jax.numpy as jnp
