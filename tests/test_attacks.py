@@ -11,18 +11,23 @@ from jaxmark.attacks import (
     ATTACKS,
     affine,
     diagonal_noise,
+    gaussian_noise,
     laplacian_smoothing,
     mark_noise,
     quantisation,
     similarity,
     uniform_noise,
 )
+from jaxmark.distortion import rms
 from jaxmark.mesh import Mesh, make_mesh
 from tests.samples import bumpy_sphere
 
-# All that move vertices.
+# All that are traced.
 MILD = (
-    *(("noise", 0.01), ("diagonal-noise", 0.01), ("smoothing", 3), ("quantisation", 8)),
+    *(("noise", 0.01), ("diagonal-noise", 0.01), ("gaussian-noise", 0.01), ("smoothing", 3), ("quantisation", 8)),
+    *(("taubin", 3), ("cotangent-smoothing", 0.3), ("bilateral", 1)),
+    *(("low-pass", 0.3), ("band-stop", 0.001)),
+    *(("jamming", 0.002), ("warp", 0.005), ("bending", 2), ("twisting", 2)),
     *(("similarity", 0.3), ("affine", 0.02)),
 )
 
@@ -33,20 +38,34 @@ def cap(sphere: Mesh) -> Mesh:
     return make_mesh(np.vstack([sphere.vertices, [[3.0, 3, 3]]]), sphere.faces[10:])
 
 
-def test_noise_is_uniform_relative_to_the_mean_radius(cap: Mesh, dtype):
+def relative_shift(kind, cap: Mesh, dtype: np.dtype) -> np.ndarray:
+    """How far inner vertices move at a strength of 0.01, in units of it; boundary and isolated ones do not."""
     vertices = jnp.asarray(cap.vertices, dtype)
-    moved = uniform_noise(Mesh(vertices, cap.faces), 0.01, jax.random.key(0)).vertices
+    moved = kind(Mesh(vertices, cap.faces), 0.01, jax.random.key(0)).vertices
     assert moved.dtype == dtype
-    radius = np.linalg.norm(cap.vertices - cap.vertices.mean(axis=0), axis=1).mean()
+    surface = cap.vertices[np.unique(cap.faces)]
+    radius = np.linalg.norm(surface - surface.mean(axis=0), axis=1).mean()
     shift = np.asarray(moved - vertices, np.float64) / (0.01 * radius)
     edge = np.sort(np.concatenate([cap.faces[:, [0, 1]], cap.faces[:, [1, 2]], cap.faces[:, [2, 0]]]), axis=1)
     sides, count = np.unique(edge, axis=0, return_counts=True)
     still = np.append(np.unique(sides[count == 1]), len(shift) - 1)
     np.testing.assert_array_equal(shift[still], 0)
-    free = np.delete(shift, still, axis=0)
+    return np.delete(shift, still, axis=0)
+
+
+def test_noise_is_uniform_relative_to_the_mean_radius(cap: Mesh, dtype):
+    free = relative_shift(uniform_noise, cap, dtype)
     assert np.abs(free).max() <= 1 + 1e-3
     assert np.abs(free).max() > 0.99
     assert free.std() == pytest.approx(1 / np.sqrt(3), rel=0.05)
+
+
+def test_gaussian_noise_is_normal_relative_to_the_mean_radius(cap: Mesh, dtype):
+    free = relative_shift(gaussian_noise, cap, dtype)
+    for column in free.T:
+        assert kstest(column, "norm").pvalue > 1e-3
+    assert free.std() == pytest.approx(1, rel=0.05)
+    assert np.abs(np.corrcoef(free.T) - np.eye(3)).max() < 4 / np.sqrt(len(free))
 
 
 def check_uniform(shift: np.ndarray, width: float, used: np.ndarray) -> None:
@@ -124,12 +143,6 @@ def test_affine_maps_are_as_far_from_the_identity_as_asked(cap: Mesh, x64):
             np.testing.assert_allclose(shift, 0, atol=1e-12)
 
 
-def test_affine_maps_keep_the_dtype(cap: Mesh, dtype):
-    vertices = jnp.asarray(cap.vertices, dtype)
-    for kind in (similarity, affine):
-        assert kind(Mesh(vertices, cap.faces), 0.2, jax.random.key(0)).vertices.dtype == dtype
-
-
 def test_smoothing_by_hand(cap: Mesh, x64):
     neighbours: list[set[int]] = [set() for _ in cap.vertices]
     for a, b, c in cap.faces:
@@ -178,7 +191,9 @@ def test_attacks_are_differentiable(cap: Mesh, x64):
 
     def others(v, strength):
         key = jax.random.key(1)
-        meshes = [kind(Mesh(v, cap.faces), strength, key) for kind in (diagonal_noise, similarity, affine)]
+        meshes = [
+            kind(Mesh(v, cap.faces), strength, key) for kind in (diagonal_noise, gaussian_noise, similarity, affine)
+        ]
         return sum(jnp.sum(jnp.sin(mesh.vertices)) for mesh in [*meshes, mark_noise(meshes[0], cap, strength, key)])
 
     check_grads(jax.jit(noisy), (v, 0.01), order=1, modes=["rev", "fwd"])
@@ -207,7 +222,7 @@ def test_a_stray_vertex_changes_nothing(cap: Mesh):
     for kind, strength in MILD:
         alone, beside = (jm.attack(mesh, kind, strength, seed=0).vertices for mesh in (cap, stray))
         np.testing.assert_array_equal(beside[-1], stray.vertices[-1])
-        if "noise" not in kind:  # whose draws depend on the number of vertices
+        if "noise" not in kind and kind != "jamming":  # whose draws depend on the number of vertices
             np.testing.assert_allclose(beside[:-1], alone, atol=1e-6)
         assert kind == "similarity" or np.abs(beside[:-1] - cap.vertices).max() < 0.05
 
@@ -224,14 +239,55 @@ def test_repeated_smoothing_is_compiled_once(cap: Mesh, caplog: pytest.LogCaptur
     assert not second
 
 
-def test_registry_states_units():
-    assert all(entry.unit and entry.strengths for entry in ATTACKS.values())
+@pytest.mark.parametrize("kind", ATTACKS)
+def test_registry_states_units_and_strengths(kind):
+    entry = ATTACKS[kind]
+    assert entry.unit
+    assert len(entry.strengths) > 1
+    # They go one way: most attacks are the stronger for more, and quantisation for fewer bits.
+    steps = np.diff(entry.strengths)
+    assert (steps > 0).all() or (steps < 0).all()
+
+
+def moved_by(mesh: Mesh, kind: str, strength: float) -> float:
+    return float(rms(jm.attack(mesh, kind, strength, seed=0).vertices - mesh.vertices))
+
+
+@pytest.mark.parametrize("kind", [kind for kind, _ in MILD])
+def test_the_last_usual_strength_moves_vertices_further_than_the_first(kind, cap: Mesh):
+    weakest, *_, strongest = ATTACKS[kind].strengths
+    assert 0 < moved_by(cap, kind, weakest) < moved_by(cap, kind, strongest)
+
+
+def test_all_traced_attacks_are_tested():
+    subdivisions = {"midpoint", "sqrt3", "loop"}  # have a module of their own
+    assert {kind for kind, _ in MILD} | subdivisions == {kind for kind, entry in ATTACKS.items() if not entry.host}
+
+
+@pytest.mark.parametrize(("kind", "strength"), MILD)
+def test_traced_attacks_under_transformations(kind, strength, cap: Mesh):
+    """Compiled, of traced vertices, for several keys at once, an attack does what it does by itself."""
+    apply, keys = ATTACKS[kind].apply, jax.random.split(jax.random.key(0), 2)
+
+    def moved(vertices, key):
+        return apply(Mesh(vertices, cap.faces), strength, key).vertices
+
+    vertices = jnp.asarray(cap.vertices, jnp.float32)
+    together = jax.jit(jax.vmap(moved, (None, 0)))(vertices, keys)
+    np.testing.assert_allclose(together, [moved(vertices, key) for key in keys], atol=1e-5)
+
+
+@pytest.mark.parametrize(("kind", "strength"), MILD)
+def test_traced_attacks_keep_the_dtype(kind, strength, cap: Mesh, dtype):
+    key, vertices = jax.random.key(0), jax.ShapeDtypeStruct(cap.vertices.shape, dtype)
+    moved = jax.eval_shape(lambda v: ATTACKS[kind].apply(Mesh(v, cap.faces), strength, key).vertices, vertices)
+    assert moved.dtype == dtype
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_refusals(cap: Mesh):
     for kind, strength, sentence in [
-        ("melting", 1, "there are noise, .*, edge-flips"),
+        ("melting", 1, "there are noise, .*edge-flips"),
         ("noise", -1, "not negative"),
         ("noise", float("nan"), "must be a number"),
         ("smoothing", 2.5, "whole number"),

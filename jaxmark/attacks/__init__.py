@@ -6,13 +6,18 @@ part of the surface: they neither move nor count.
 
 from jaxmark.attacks.affine import affine as affine
 from jaxmark.attacks.affine import similarity as similarity
+from jaxmark.attacks.bilateral import bilateral_smoothing as bilateral_smoothing
 from jaxmark.attacks.cropping import cropping as cropping
 from jaxmark.attacks.cropping import holes as holes
 from jaxmark.attacks.cropping import region_cropping as region_cropping
+from jaxmark.attacks.filtering import band_stop as band_stop
+from jaxmark.attacks.filtering import low_pass as low_pass
 from jaxmark.attacks.flips import edge_flips as edge_flips
+from jaxmark.attacks.jamming import jamming as jamming
 from jaxmark.attacks.mosaic import missing_pieces as missing_pieces
 from jaxmark.attacks.mosaic import mosaic as mosaic
 from jaxmark.attacks.noise import diagonal_noise as diagonal_noise
+from jaxmark.attacks.noise import gaussian_noise as gaussian_noise
 from jaxmark.attacks.noise import mark_noise as mark_noise
 from jaxmark.attacks.noise import uniform_noise as uniform_noise
 from jaxmark.attacks.ordering import reordering as reordering
@@ -29,7 +34,12 @@ from jaxmark.attacks.remeshing import isotropic as isotropic
 from jaxmark.attacks.remeshing import poisson as poisson
 from jaxmark.attacks.scene import adding_geometry as adding_geometry
 from jaxmark.attacks.simplification import simplification as simplification
+from jaxmark.attacks.smoothing import cotangent_smoothing as cotangent_smoothing
 from jaxmark.attacks.smoothing import laplacian_smoothing as laplacian_smoothing
+from jaxmark.attacks.smoothing import taubin_smoothing as taubin_smoothing
 from jaxmark.attacks.subdivision import loop as loop
 from jaxmark.attacks.subdivision import midpoint as midpoint
 from jaxmark.attacks.subdivision import sqrt3 as sqrt3
+from jaxmark.attacks.warping import bending as bending
+from jaxmark.attacks.warping import twisting as twisting
+from jaxmark.attacks.warping import warp as warp

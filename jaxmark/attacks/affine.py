@@ -2,9 +2,9 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from jaxmark.attacks.extent import diagonal, surface
 from jaxmark.mesh import Mesh, used_vertices
 from jaxmark.precision import matmul
 
@@ -26,8 +26,7 @@ def similarity(mesh: Mesh, strength: float | Float[Array, ""], key: PRNGKeyArray
     turn, stretch, direct = jax.random.split(key, 3)
     scale = jnp.exp(jax.random.uniform(stretch, (), vertices.dtype, -1, 1) * jnp.log1p(most))
     direction = jax.random.normal(direct, (3,), vertices.dtype)
-    surface = vertices[np.flatnonzero(used_vertices(mesh))]
-    shift = most * jnp.linalg.norm(jnp.ptp(surface, axis=0)) * direction / jnp.linalg.norm(direction)
+    shift = most * diagonal(surface(mesh)) * direction / jnp.linalg.norm(direction)
     return _mapped(mesh, scale * _rotation(jax.random.normal(turn, (4,), vertices.dtype)), shift)
 
 
@@ -64,6 +63,6 @@ def _rotation(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
 
 def _mapped(mesh: Mesh, matrix: Float[Array, "3 3"], shift: Float[Array, "3"]) -> Mesh:
     vertices, used = jnp.asarray(mesh.vertices), used_vertices(mesh)
-    middle = vertices[np.flatnonzero(used)].mean(axis=0)
+    middle = surface(mesh).mean(axis=0)
     moved = middle + matmul(vertices - middle, matrix.T) + shift
     return Mesh(jnp.where(used[:, None], moved, vertices), mesh.faces)

@@ -1,10 +1,11 @@
-"""Additive noise: what the SMI 2010 benchmark does, and Sohn et al."""
+"""Additive noise: what the SMI 2010 benchmark does, and Sohn et al.; and its Gaussian kin."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from jaxmark.attacks.extent import diagonal, surface
 from jaxmark.distortion import rms
 from jaxmark.mesh import Mesh, boundary_vertices, used_vertices
 
@@ -21,11 +22,23 @@ def uniform_noise(mesh: Mesh, strength: float | Float[Array, ""], key: PRNGKeyAr
     Returns:
         The noisy mesh. Differentiable with respect to vertices and strength.
     """
-    used = used_vertices(mesh)
-    surface = jnp.asarray(mesh.vertices)[np.flatnonzero(used)]
-    radius = jnp.linalg.norm(surface - surface.mean(axis=0), axis=1).mean()
-    used[boundary_vertices(np.asarray(mesh.faces))] = False
-    return _noisy(mesh, used, strength, radius, key)
+    return _noisy(mesh, _inner(mesh), strength, _radius(mesh), _uniform(mesh, key))
+
+
+def gaussian_noise(mesh: Mesh, strength: float | Float[Array, ""], key: PRNGKeyArray) -> Mesh:
+    """Add independent normal noise to each coordinate, else as `uniform_noise`, of which 1/√3 is the deviation.
+
+    Args:
+        mesh: any mesh, its faces concrete; boundary vertices are left alone.
+        strength: standard deviation of each coordinate, relative to the mean distance of the vertices to their centre.
+        key: a JAX random key.
+
+    Returns:
+        The noisy mesh. Differentiable with respect to vertices and strength.
+    """
+    vertices = jnp.asarray(mesh.vertices)
+    noise = jax.random.normal(key, vertices.shape, vertices.dtype)
+    return _noisy(mesh, _inner(mesh), strength, _radius(mesh), noise)
 
 
 def diagonal_noise(mesh: Mesh, strength: float | Float[Array, ""], key: PRNGKeyArray) -> Mesh:
@@ -40,9 +53,7 @@ def diagonal_noise(mesh: Mesh, strength: float | Float[Array, ""], key: PRNGKeyA
     Returns:
         The noisy mesh. Differentiable with respect to vertices and strength.
     """
-    used = used_vertices(mesh)
-    surface = jnp.asarray(mesh.vertices)[np.flatnonzero(used)]
-    return _noisy(mesh, used, strength, jnp.linalg.norm(jnp.ptp(surface, axis=0)), key)
+    return _noisy(mesh, used_vertices(mesh), strength, diagonal(surface(mesh)), _uniform(mesh, key))
 
 
 def mark_noise(marked: Mesh, original: Mesh, strength: float | Float[Array, ""], key: PRNGKeyArray) -> Mesh:
@@ -62,7 +73,26 @@ def mark_noise(marked: Mesh, original: Mesh, strength: float | Float[Array, ""],
     """
     used = used_vertices(marked)
     mark = jnp.asarray(marked.vertices) - jnp.asarray(original.vertices)
-    return _noisy(marked, used, strength, rms(mark[np.flatnonzero(used)]), key)
+    return _noisy(marked, used, strength, rms(mark[np.flatnonzero(used)]), _uniform(marked, key))
+
+
+def _inner(mesh: Mesh) -> Bool[np.ndarray, " vertices"]:
+    """The vertices that faces use, but for boundaries."""
+    inner = used_vertices(mesh)
+    inner[boundary_vertices(np.asarray(mesh.faces))] = False
+    return inner
+
+
+def _radius(mesh: Mesh) -> Float[Array, ""]:
+    """Mean distance of the vertices to their centre."""
+    points = surface(mesh)
+    return jnp.linalg.norm(points - points.mean(axis=0), axis=1).mean()
+
+
+def _uniform(mesh: Mesh, key: PRNGKeyArray) -> Float[Array, "vertices 3"]:
+    """From -1 to 1: the vertices' root mean square is 1, for 3 · 1/3 = 1."""
+    vertices = jnp.asarray(mesh.vertices)
+    return jax.random.uniform(key, vertices.shape, vertices.dtype, -1, 1)
 
 
 def _noisy(
@@ -70,10 +100,8 @@ def _noisy(
     moving: Bool[np.ndarray, " vertices"],
     strength: float | Float[Array, ""],
     unit: Float[Array | np.ndarray, ""],
-    key: PRNGKeyArray,
+    noise: Float[Array, "vertices 3"],
 ) -> Mesh:
-    """Each coordinate of moving vertices moved by up to so many units: the vertices' RMS, for 3 · 1/3 = 1."""
-    vertices = jnp.asarray(mesh.vertices)
-    noise = jax.random.uniform(key, vertices.shape, vertices.dtype, -1, 1)
-    size = jnp.asarray(strength).astype(vertices.dtype) * unit
-    return Mesh(vertices + jnp.where(moving[:, None], size * noise, 0), mesh.faces)
+    """Moving vertices moved by so many units of the noise."""
+    size = jnp.asarray(strength).astype(noise.dtype) * unit
+    return Mesh(jnp.asarray(mesh.vertices) + jnp.where(moving[:, None], size * noise, 0), mesh.faces)

@@ -8,17 +8,21 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from jaxmark.attacks.affine import affine, similarity
+from jaxmark.attacks.bilateral import bilateral_smoothing
 from jaxmark.attacks.cropping import cropping, holes, region_cropping
+from jaxmark.attacks.filtering import band_stop, low_pass
 from jaxmark.attacks.flips import edge_flips
+from jaxmark.attacks.jamming import jamming
 from jaxmark.attacks.mosaic import missing_pieces, mosaic
-from jaxmark.attacks.noise import diagonal_noise, uniform_noise
+from jaxmark.attacks.noise import diagonal_noise, gaussian_noise, uniform_noise
 from jaxmark.attacks.ordering import reordering
 from jaxmark.attacks.quantisation import quantisation
 from jaxmark.attacks.remeshing import iso_surface, isotropic, poisson
 from jaxmark.attacks.scene import adding_geometry
 from jaxmark.attacks.simplification import simplification
-from jaxmark.attacks.smoothing import laplacian_smoothing
+from jaxmark.attacks.smoothing import cotangent_smoothing, laplacian_smoothing, taubin_smoothing
 from jaxmark.attacks.subdivision import loop, midpoint, sqrt3
+from jaxmark.attacks.warping import bending, twisting, warp
 from jaxmark.errors import JaxmarkError
 from jaxmark.mesh import Mesh, compacted, diagonal, host_mesh, same_connectivity, used_vertices, weld, welded_mesh
 
@@ -37,12 +41,26 @@ ATTACKS: Mapping[str, Attack] = {
         uniform_noise, "half width over the mean distance to the centre", (0.0005, 0.001, 0.003, 0.005, 0.01)
     ),
     "diagonal-noise": Attack(diagonal_noise, "half width over the diagonal", (0.0002, 0.0005, 0.001, 0.002, 0.005)),
+    "gaussian-noise": Attack(
+        gaussian_noise,
+        "standard deviation of a coordinate over the mean distance to the centre",
+        (0.0003, 0.0006, 0.002, 0.003, 0.006),
+    ),
     "smoothing": Attack(laplacian_smoothing, "steps of 0.1", (5, 10, 30, 50, 100)),
+    "taubin": Attack(taubin_smoothing, "pairs of steps 0.5, -0.53", (5, 10, 20, 50, 100)),
+    "cotangent-smoothing": Attack(cotangent_smoothing, "time of diffusion by cotangents", (0.5, 1, 3, 5, 10)),
+    "bilateral": Attack(bilateral_smoothing, "iterations", (1, 2, 5, 10, 20)),
+    "low-pass": Attack(low_pass, "share of the spectrum, removed from the top", (0.3, 0.5, 0.7, 0.8, 0.9)),
+    "band-stop": Attack(band_stop, "width in λ of the band that is removed, from 0.02 up", (0.02, 0.05, 0.1, 0.2, 0.4)),
+    "jamming": Attack(jamming, "RMS over the diagonal", (0.0001, 0.0002, 0.0005, 0.001, 0.002)),
     "quantisation": Attack(quantisation, "bits per coordinate", (11, 10, 9, 8, 7)),
     "similarity": Attack(
         similarity, "shift over the diagonal, and scale up or down less 1; any rotation", (0.1, 0.3, 1, 3, 9)
     ),
     "affine": Attack(affine, "Frobenius norm of the map less the identity", (0.02, 0.05, 0.1, 0.2, 0.4)),
+    "warp": Attack(warp, "RMS over the diagonal", (0.002, 0.005, 0.01, 0.02, 0.04)),
+    "bending": Attack(bending, "degrees", (2, 5, 10, 20, 45)),
+    "twisting": Attack(twisting, "degrees over the whole length", (2, 5, 10, 20, 45)),
     "edge-flips": Attack(edge_flips, "share of the edges", (0.01, 0.03, 0.1, 0.2, 0.3), host=True),
     "midpoint": Attack(midpoint, "steps", (1, 2, 3)),
     "sqrt3": Attack(sqrt3, "steps", (1, 2, 3)),
