@@ -9,6 +9,7 @@ from jaxmark.attacks.affine import similarity as similarity
 from jaxmark.attacks.cropping import cropping as cropping
 from jaxmark.attacks.cropping import holes as holes
 from jaxmark.attacks.cropping import region_cropping as region_cropping
+from jaxmark.attacks.deformation import as_rigid_as_possible as as_rigid_as_possible
 from jaxmark.attacks.flips import edge_flips as edge_flips
 from jaxmark.attacks.mosaic import missing_pieces as missing_pieces
 from jaxmark.attacks.mosaic import mosaic as mosaic
@@ -28,6 +29,9 @@ from jaxmark.attacks.remeshing import poisson as poisson
 from jaxmark.attacks.scene import adding_geometry as adding_geometry
 from jaxmark.attacks.simplification import simplification as simplification
 from jaxmark.attacks.smoothing import laplacian_smoothing as laplacian_smoothing
+from jaxmark.attacks.storage import digits as digits
+from jaxmark.attacks.storage import float_bits as float_bits
+from jaxmark.attacks.storage import soup as soup
 from jaxmark.attacks.subdivision import loop as loop
 from jaxmark.attacks.subdivision import midpoint as midpoint
 from jaxmark.attacks.subdivision import sqrt3 as sqrt3

@@ -9,6 +9,7 @@ from jaxtyping import PRNGKeyArray
 
 from jaxmark.attacks.affine import affine, similarity
 from jaxmark.attacks.cropping import cropping, holes, region_cropping
+from jaxmark.attacks.deformation import as_rigid_as_possible
 from jaxmark.attacks.flips import edge_flips
 from jaxmark.attacks.mosaic import missing_pieces, mosaic
 from jaxmark.attacks.noise import diagonal_noise, uniform_noise
@@ -18,6 +19,7 @@ from jaxmark.attacks.remeshing import iso_surface, isotropic, poisson
 from jaxmark.attacks.scene import adding_geometry
 from jaxmark.attacks.simplification import simplification
 from jaxmark.attacks.smoothing import laplacian_smoothing
+from jaxmark.attacks.storage import digits, float_bits, soup
 from jaxmark.attacks.subdivision import loop, midpoint, sqrt3
 from jaxmark.errors import JaxmarkError
 from jaxmark.mesh import Mesh, compacted, diagonal, host_mesh, same_connectivity, used_vertices, weld, welded_mesh
@@ -64,6 +66,12 @@ ATTACKS: Mapping[str, Attack] = {
     ),
     "mosaic": Attack(mosaic, "shift of eight pieces over the diagonal", (0.01, 0.03, 0.1, 0.3, 1), host=True),
     "missing-pieces": Attack(missing_pieces, "share of eight pieces", (0.125, 0.25, 0.5, 0.75), host=True),
+    "digits": Attack(digits, "significant decimal digits of a coordinate", (7, 6, 5, 4, 3), host=True),
+    "float-bits": Attack(float_bits, "bits of a coordinate, 64, 32 or 16", (64, 32, 16), host=True),
+    "soup": Attack(soup, "times through a binary STL file", (1, 2), host=True),
+    "arap": Attack(
+        as_rigid_as_possible, "drag of one end sideways over the diagonal", (0.02, 0.05, 0.1, 0.2, 0.4), host=True
+    ),
 }
 
 
