@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import click
+import numpy as np
 
 from jaxmark import distortion
 from jaxmark.alignment import Align
@@ -365,21 +366,27 @@ _KINDS = "; ".join(f"{name}: {entry.unit}" for name, entry in ATTACKS.items())
 def attack_command(source: Path, target: Path, kind: str, strength: float, seed: int, as_json: bool) -> None:
     """Put a mesh through an attack, to see what a mark survives.
 
-    OUT is the file IN with other positions, or a new file if faces change.
+    OUT is the file IN with other positions, or a new file if faces change. How far vertices moved is told where they
+    are the same ones.
     """
     _check_outputs(source, target)
     _distinct(IN=source, OUT=target)
     mesh = load_mesh(source)
     with _replacing(target) as draft:
         attacked = attack(mesh, kind, strength, seed=seed)
+        change = None
         if same_connectivity(mesh, attacked):
             save_mesh(attacked, draft, like=source)
-            attacked = load_mesh(draft)
+            change = distortion.moved(mesh, load_mesh(draft))
         else:
             save_mesh(attacked, draft)
-        change = distortion.moved(mesh, attacked._replace(faces=mesh.faces))
-    answer = {"kind": kind, "strength": strength, "seed": seed, "rms": change.rms, "max": change.max}
-    _answer(as_json, answer, f"{kind} {strength:g} → {target}, RMS {change.rms:.3g} of the diagonal")
+            if np.array_equal(mesh.vertices, attacked.vertices):
+                change = distortion.moved(mesh, mesh)
+    rms, most = (change.rms, change.max) if change else (None, None)
+    answer = {"kind": kind, "strength": strength, "seed": seed, "rms": rms, "max": most}
+    size = f"{len(attacked.vertices)} vertices and {len(attacked.faces)} faces"
+    what = f"a mesh of {size}" if rms is None else f"RMS {rms:.3g} of the diagonal"
+    _answer(as_json, answer, f"{kind} {strength:g} → {target}, {what}")
 
 
 @cli.command()
