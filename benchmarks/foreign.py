@@ -25,13 +25,14 @@ import numpy as np
 import trimesh
 from numpy.random import Generator
 from robustness import mark
-from scipy import sparse, stats
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
 from jaxmark.alignment import align
+from jaxmark.attacks.meshlab import filtered
 from jaxmark.marking import NOISE
-from jaxmark.mesh import Mesh, boundary_vertices, diagonal, edges, used_vertices, weld, welded_mesh
+from jaxmark.mesh import Mesh, compacted, diagonal, used_vertices, weld, welded_mesh
 from jaxmark.original import prepare
 from jaxmark.pose import Pose
 from jaxmark.schemes import get_scheme
@@ -41,143 +42,46 @@ LEVEL = -6  # log10 of the false-positive probability that counts in the control
 KEYS = 10  # that each of their suspects is read with
 
 try:
-    names = ("fast_simplification", "igl", "pymeshlab", "skimage.measure")
-    fast_simplification, igl, pymeshlab, measure = map(importlib.import_module, names)
+    names = ("igl", "fast_simplification", "pymeshlab", "skimage")
+    igl, *_ = map(importlib.import_module, names)
 except ImportError as error:
     sys.exit(f"{error}; install what this needs with: pip install 'jaxmark[all]'")
 
 
 def plain(mesh: Mesh) -> Mesh:
     """Distinct points only, and of them those that faces use, as other programs want them."""
-    points = welded_mesh(mesh, weld(mesh.vertices))
-    used = used_vertices(points)
-    return jm.make_mesh(np.asarray(points.vertices)[used], (np.cumsum(used) - 1)[points.faces])
+    return compacted(jm.make_mesh(*welded_mesh(mesh, weld(mesh.vertices))))
 
 
-def left(mesh: Mesh, percent: float) -> int:
-    """How many faces are left when so many percent go."""
-    return round(len(mesh.faces) * (1 - percent / 100))
+def left(mesh: Mesh, share: float) -> int:
+    """How many faces are left when such a share of the edges goes."""
+    return round(len(mesh.faces) * (1 - share))
 
 
-def meshlab(name: str, mesh: Mesh, normals: np.ndarray | None = None, **options: Any) -> Mesh:
-    """What a filter of MeshLab makes of a mesh, or of points with normals."""
-    filters = pymeshlab.MeshSet()
-    given = {"face_matrix": mesh.faces} if normals is None else {"v_normals_matrix": normals}
-    filters.add_mesh(pymeshlab.Mesh(vertex_matrix=mesh.vertices, **given))
-    filters.apply_filter(name, **options)
-    return Mesh(filters.current_mesh().vertex_matrix(), filters.current_mesh().face_matrix())
-
-
-def sqrt3(mesh: Mesh) -> Mesh:
-    """Kobbelt's subdivision (SIGGRAPH 2000), which none of the programs has; boundaries stay."""
-    v, f, size = np.asarray(mesh.vertices), np.asarray(mesh.faces), len(mesh.vertices)
-    i, j = edges(f).T
-    graph = sparse.coo_array((np.ones(2 * len(i)), (np.r_[i, j], np.r_[j, i])), (size, size)).tocsr()
-    degree = graph.sum(axis=1)[:, None]
-    weight = (4 - 2 * np.cos(2 * np.pi / degree)) / 9
-    weight[boundary_vertices(f)] = 0
-    # A side i → j of the face with centroid c, and the other way of the face with d, gives the face i, d, c.
-    start, end, centre = f.T.ravel(), np.roll(f, -1, axis=1).T.ravel(), np.tile(size + np.arange(len(f)), 3)
-    across = dict(zip(zip(end.tolist(), start.tolist(), strict=True), centre.tolist(), strict=True))
-    other = [across.get(side, side[1]) for side in zip(start.tolist(), end.tolist(), strict=True)]
-    moved = (1 - weight) * v + weight * (graph @ v) / degree
-    return Mesh(np.r_[moved, v[f].mean(axis=1)], np.c_[start, other, centre])
-
-
-def remeshed(mesh: Mesh, factor: float) -> Mesh:
-    """Isotropic, edges of so many times the mean length."""
-    i, j = edges(mesh.faces).T
-    length = np.linalg.norm(np.asarray(mesh.vertices)[i] - np.asarray(mesh.vertices)[j], axis=1).mean()
-    return meshlab("meshing_isotropic_explicit_remeshing", mesh, targetlen=pymeshlab.PureValue(factor * length))
-
-
-def extracted(mesh: Mesh, cells: float) -> Mesh:
-    """Marching cubes on the signed distance, so many cells along the longest side of the box."""
-
-    def distance(points: np.ndarray) -> np.ndarray:
-        # The winding number gives a sign where a hole leaves inside and outside open.
-        sign = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
-        return igl.signed_distance(points, np.asarray(mesh.vertices), np.asarray(mesh.faces), sign)[0]
-
-    low, extent = np.asarray(mesh.vertices).min(axis=0), np.ptp(mesh.vertices, axis=0)
-    cell = extent.max() / cells
-    coarse = np.ceil(extent / cell / 4).astype(int) + 3
-    low = low - 4 * cell
-    rough = distance(low + 4 * cell * np.argwhere(np.ones(coarse))).reshape(coarse)
-    # Every fourth point of the grid tells where the surface may be: a distance changes no faster than the position.
-    values = rough[np.ix_(*((np.arange(4 * count - 3) + 2) // 4 for count in coarse))]
-    near = np.argwhere(np.abs(values) < 6 * cell)
-    values[tuple(near.T)] = distance(low + cell * near)
-    found = measure.marching_cubes(values, 0, gradient_direction="descent")
-    return Mesh(low + cell * found[0].astype(float), found[1])
-
-
-def poisson(mesh: Mesh, depth: float, seed: int) -> Mesh:
-    """Screened Poisson reconstruction of 30 points for each vertex, with their faces' normals."""
-    surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    points, face = trimesh.sample.sample_surface(surface, 30 * len(mesh.vertices), seed=seed)[:2]
-    samples, normals = Mesh(np.asarray(points), mesh.faces), np.asarray(surface.face_normals)[face]
-    name = "generate_surface_reconstruction_screened_poisson"
-    return meshlab(name, samples, normals, depth=int(depth), threads=1)  # more of them add up in any order
-
-
-def cropped(mesh: Mesh, percent: float, seed: int) -> Mesh:
-    """Without so many of the vertices, on one side of a plane, and the faces that use them."""
-    side = mesh.vertices @ np.random.default_rng(seed).normal(size=3)
-    kept = side <= np.quantile(side, 1 - percent / 100)
-    return Mesh(mesh.vertices, np.asarray(mesh.faces)[kept[mesh.faces].all(axis=1)])
-
-
-def scene(mesh: Mesh, seed: int) -> Mesh:
-    """Between a ring and a box of about its size."""
-    size, rng = diagonal(mesh), np.random.default_rng(seed)
-    others = [trimesh.creation.torus(0.3, 0.1), trimesh.creation.box((0.6, 0.4, 0.5)).subdivide_to_size(0.1)]
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    for other, side in zip(others, (-1.2, 1.2), strict=True):
-        place = np.asarray(mesh.vertices).mean(axis=0) + size * np.array([side, *rng.uniform(-0.2, 0.2, 2)])
-        faces = np.r_[faces, other.faces + len(vertices)]
-        vertices = np.r_[vertices, place + size * rng.uniform(0.8, 1.2) * other.vertices]
-    return Mesh(vertices, faces)
-
-
-# Mesh, strength, seed → mesh. The strength is: percent of the faces that go, in fast-simplification, MeshLab or libigl;
-# edge length over the mean; cells a side; depth of the octree; percent of the vertices that go.
-KINDS: dict[str, Callable[[Mesh, float, int], Mesh]] = {
-    "none": lambda mesh, *_: mesh,
-    "simplification": lambda mesh, percent, _: Mesh(
-        *fast_simplification.simplify(mesh.vertices, mesh.faces, target_count=left(mesh, percent))
+# Simplifiers of MeshLab and libigl beside the library's: mesh, share of the edges that go → mesh.
+KINDS: dict[str, Callable[[Mesh, float], Mesh]] = {
+    "none": lambda mesh, _: mesh,
+    "collapse": lambda mesh, share: filtered(
+        "meshing_decimation_quadric_edge_collapse", mesh, targetfacenum=left(mesh, share)
     ),
-    "collapse": lambda mesh, percent, _: meshlab(
-        "meshing_decimation_quadric_edge_collapse", mesh, targetfacenum=left(mesh, percent)
-    ),
-    "qslim": lambda mesh, percent, _: Mesh(
-        *igl.qslim(*(np.asfortranarray(array) for array in mesh), left(mesh, percent))[:2]
-    ),
-    "midpoint": lambda mesh, *_: Mesh(*trimesh.remesh.subdivide(*mesh)[:2]),  # pyright: ignore
-    "loop": lambda mesh, *_: meshlab(
-        "meshing_surface_subdivision_loop", mesh, iterations=1, threshold=pymeshlab.PercentageValue(0)
-    ),
-    "sqrt3": lambda mesh, *_: sqrt3(mesh),
-    "isotropic": lambda mesh, factor, _: remeshed(mesh, factor),
-    "iso-surface": lambda mesh, cells, _: extracted(mesh, cells),
-    "poisson": poisson,
-    "crop": cropped,
-    "scene": lambda mesh, _, seed: scene(mesh, seed),
+    "qslim": lambda mesh, share: Mesh(*igl.qslim(*(np.asfortranarray(array) for array in mesh), left(mesh, share))[:2]),
 }
-# Other kinds are those of `jaxmark attack`.
-ATTACKS = """none; simplification 50; simplification 70; simplification 90; simplification 95; simplification 97.5;
-collapse 90; qslim 90; midpoint; loop; sqrt3; isotropic 1; isotropic 0.5; isotropic 2; iso-surface 100; iso-surface 200;
-poisson 8; crop 10; crop 30; crop 50; crop 80; simplification 70 + noise 0.001; crop 30 + quantisation 9;
-simplification 50 + smoothing 50; scene"""
+# Those and, after them or alone, attacks of `jaxmark attack`, with their strengths.
+ATTACKS = """none; simplification 0.5; simplification 0.7; simplification 0.9; simplification 0.95;
+simplification 0.975; collapse 0.9; qslim 0.9; midpoint 1; loop 1; sqrt3 1; isotropic 1; isotropic 0.5; isotropic 2;
+iso-surface 100; iso-surface 200; poisson 8; cropping 0.1; cropping 0.3; cropping 0.5; cropping 0.8;
+simplification 0.7 + noise 0.001; cropping 0.3 + quantisation 9; simplification 0.5 + smoothing 50;
+added-geometry 1"""
 
 
 def attacked(mesh: Mesh, steps: str, seed: int) -> Mesh:
     """A mesh after attacks one by one."""
+    todo = [(kind, float(*strength)) for kind, *strength in (step.split() for step in steps.split(" + "))]
     mesh = plain(mesh)
-    for kind, *strength in (step.split() for step in steps.split(" + ")):
-        size = float(*strength)
-        mesh = plain(KINDS[kind](mesh, size, seed)) if kind in KINDS else jm.attack(mesh, kind, size, seed=seed)
-    return mesh
+    if todo[0][0] in KINDS:
+        kind, strength = todo.pop(0)
+        mesh = plain(KINDS[kind](mesh, strength))
+    return jm.attacks.chain(mesh, todo, seed=seed)
 
 
 def found_again(mesh: Mesh, rng: Generator) -> tuple[Mesh, Pose]:

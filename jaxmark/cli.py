@@ -364,7 +364,8 @@ _KINDS = "\n".join(f"  {name}: {entry.unit}" for name, entry in ATTACKS.items())
 def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int, as_json: bool) -> None:
     """Put a mesh through one attack or several, to see what a mark survives.
 
-    OUT is the file IN with other positions, or a new file if faces change.
+    OUT is the file IN with other positions, or a new file if faces change. How far vertices moved is told where they
+    are the same ones.
     """
     steps = _steps(words)
     _check_outputs(source, target)

@@ -115,6 +115,16 @@ def test_attacks_one_after_the_other(workshop: Workshop):
     assert told["rms"] == pytest.approx(jm.distortion.moved(before, expected).rms, rel=1e-4)
 
 
+@pytest.mark.parametrize(("kind", "strength", "times"), [("midpoint", "1", 4), ("reordering", "1", 1)])
+def test_an_attack_that_makes_other_vertices_tells_no_distance(kind, strength, times, workshop: Workshop):
+    told = workshop.json("attack", "model.ply", "other.ply", kind, strength)
+    assert told["rms"] is told["max"] is None
+    before, after = (trimesh.load(name, process=False) for name in ("model.ply", "other.ply"))
+    assert len(after.faces) == times * len(before.faces)
+    said = workshop("attack", "model.ply", "another.ply", kind, strength)[1]
+    assert f"a mesh of {len(after.vertices)} vertices and {len(after.faces)} faces" in said
+
+
 @pytest.mark.slow
 def test_capacity_is_what_embed_takes(workshop: Workshop):
     budget = ("--budget", "0.0008")

@@ -10,6 +10,7 @@ from jaxmark.attacks.bilateral import bilateral_smoothing as bilateral_smoothing
 from jaxmark.attacks.cropping import cropping as cropping
 from jaxmark.attacks.cropping import holes as holes
 from jaxmark.attacks.cropping import region_cropping as region_cropping
+from jaxmark.attacks.deformation import as_rigid_as_possible as as_rigid_as_possible
 from jaxmark.attacks.filtering import band_stop as band_stop
 from jaxmark.attacks.filtering import low_pass as low_pass
 from jaxmark.attacks.flips import edge_flips as edge_flips
@@ -37,6 +38,9 @@ from jaxmark.attacks.simplification import simplification as simplification
 from jaxmark.attacks.smoothing import cotangent_smoothing as cotangent_smoothing
 from jaxmark.attacks.smoothing import laplacian_smoothing as laplacian_smoothing
 from jaxmark.attacks.smoothing import taubin_smoothing as taubin_smoothing
+from jaxmark.attacks.storage import digits as digits
+from jaxmark.attacks.storage import float_bits as float_bits
+from jaxmark.attacks.storage import soup as soup
 from jaxmark.attacks.subdivision import loop as loop
 from jaxmark.attacks.subdivision import midpoint as midpoint
 from jaxmark.attacks.subdivision import sqrt3 as sqrt3

@@ -10,6 +10,7 @@ from jaxtyping import PRNGKeyArray
 from jaxmark.attacks.affine import affine, similarity
 from jaxmark.attacks.bilateral import bilateral_smoothing
 from jaxmark.attacks.cropping import cropping, holes, region_cropping
+from jaxmark.attacks.deformation import as_rigid_as_possible
 from jaxmark.attacks.filtering import band_stop, low_pass
 from jaxmark.attacks.flips import edge_flips
 from jaxmark.attacks.jamming import jamming
@@ -21,6 +22,7 @@ from jaxmark.attacks.remeshing import iso_surface, isotropic, poisson
 from jaxmark.attacks.scene import adding_geometry
 from jaxmark.attacks.simplification import simplification
 from jaxmark.attacks.smoothing import cotangent_smoothing, laplacian_smoothing, taubin_smoothing
+from jaxmark.attacks.storage import digits, float_bits, soup
 from jaxmark.attacks.subdivision import loop, midpoint, sqrt3
 from jaxmark.attacks.warping import bending, twisting, warp
 from jaxmark.errors import JaxmarkError
@@ -68,7 +70,7 @@ ATTACKS: Mapping[str, Attack] = {
     "simplification": Attack(simplification, "share of the edges", (0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.975), host=True),
     "isotropic": Attack(isotropic, "edge length over the mean one", (0.5, 0.7, 1, 1.4, 2), host=True),
     "iso-surface": Attack(iso_surface, "cells along the longest side", (200, 150, 100, 70, 50), host=True),
-    "poisson": Attack(poisson, "depth of the octree", (9, 8, 7, 6, 5), host=True),
+    "poisson": Attack(poisson, "depth of the octree", (8, 7, 6, 5), host=True),
     "cropping": Attack(cropping, "share of the vertices, beyond a plane", (0.1, 0.3, 0.5, 0.7, 0.8), host=True),
     "region-cropping": Attack(
         region_cropping, "share of the vertices, in one region", (0.1, 0.3, 0.5, 0.7, 0.8), host=True
@@ -80,6 +82,12 @@ ATTACKS: Mapping[str, Attack] = {
     ),
     "mosaic": Attack(mosaic, "shift of eight pieces over the diagonal", (0.01, 0.03, 0.1, 0.3, 1), host=True),
     "missing-pieces": Attack(missing_pieces, "share of eight pieces", (0.125, 0.25, 0.5, 0.75), host=True),
+    "digits": Attack(digits, "significant decimal digits of a coordinate", (7, 6, 5, 4, 3), host=True),
+    "float-bits": Attack(float_bits, "bits of a coordinate, 64, 32 or 16", (32, 16), host=True),
+    "soup": Attack(soup, "times through a binary STL file", (1, 2), host=True),
+    "arap": Attack(
+        as_rigid_as_possible, "drag of one end sideways over the diagonal", (0.02, 0.05, 0.1, 0.2, 0.4), host=True
+    ),
 }
 
 
