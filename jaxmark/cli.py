@@ -350,13 +350,14 @@ def identify_command(
     sys.exit(0 if accused else 1)
 
 
-_KINDS = "; ".join(f"{name}: {entry.unit}" for name, entry in ATTACKS.items())
+# click leaves the lines of a paragraph as they are that starts so.
+_KINDS = "\n".join(["\b", "KIND, and what STRENGTH is:", *(f"{name}: {entry.unit}" for name, entry in ATTACKS.items())])
 
 
-@cli.command(name="attack", epilog=f"Unit of STRENGTH. {_KINDS}.")
+@cli.command(name="attack", epilog=_KINDS)
 @click.argument("source", metavar="IN", type=_MESH)
 @click.argument("target", metavar="OUT", type=_MESH)
-@click.argument("kind", type=click.Choice(list(ATTACKS)))
+@click.argument("kind", metavar="KIND", type=click.Choice(list(ATTACKS)))
 @click.argument("strength", type=float)
 @click.option(
     "--seed", type=click.IntRange(0, 2**31 - 1), default=0, show_default=True, help="Of the attack's randomness."

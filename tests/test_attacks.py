@@ -309,6 +309,9 @@ def marked(key: jm.Key) -> tuple[jm.Marker, Mesh]:
     ("kind", "strength"),
     [
         *(("noise", 0.005), ("diagonal-noise", 0.002), ("smoothing", 30), ("quantisation", 9)),
+        *(("gaussian-noise", 0.003), ("taubin", 50), ("cotangent-smoothing", 3), ("bilateral", 5)),
+        *(("low-pass", 0.8), ("band-stop", 0.1), ("jamming", 0.0002)),
+        *(("warp", 0.01), ("bending", 10), ("twisting", 10)),
         *(("similarity", 0.5), ("affine", 0.3), ("edge-flips", 0.01), ("edge-flips", 0.3)),
     ],
 )
