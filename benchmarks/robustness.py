@@ -34,15 +34,15 @@ Row = dict[str, Any]
 Subject = tuple[jm.Marker, Mesh, bytes, float]  # what reads it, the marked mesh, its message, the noise declared
 
 
-def smooth(points: Mesh, factors: list[float]) -> np.ndarray:
-    """So far towards the mean of the neighbours, step by step; boundary vertices stay, as in `jaxmark.attacks`."""
+def smooth(points: Mesh, steps: int) -> np.ndarray:
+    """Half way to the mean of the neighbours, step by step; boundary vertices stay, as in `jaxmark.attacks`."""
     v, (i, j) = np.array(points.vertices), edges(points.faces).T
     graph = sparse.coo_array((np.ones(2 * len(i)), (np.r_[i, j], np.r_[j, i])), (len(v), len(v))).tocsr()
     degree = graph.sum(axis=1)[:, None]
     moving = degree > 0
     moving[boundary_vertices(points.faces)] = False
-    for factor in factors:
-        v += factor * moving * (graph @ v / np.maximum(degree, 1) - v)
+    for _ in range(steps):
+        v += 0.5 * moving * (graph @ v / np.maximum(degree, 1) - v)
     return v
 
 
@@ -59,18 +59,6 @@ def affine(points: Mesh, most: float, rng: Generator) -> np.ndarray:
     return points.vertices @ (rotation @ shear * scales).T + diagonal(points) * rng.normal(size=3)
 
 
-def warp(points: Mesh, rms: float, rng: Generator) -> np.ndarray:
-    """Four sinusoids of the position, wavelengths of 0.5 to 2 diagonals; RMS over the diagonal, its affine part off."""
-    used = used_vertices(points)
-    x = (points.vertices - points.vertices[used].mean(axis=0)) / diagonal(points)
-    waves = rng.normal(size=(4, 3))
-    waves *= 2 * np.pi / (np.linalg.norm(waves, axis=1) * rng.uniform(0.5, 2, 4))[:, None]
-    shift = np.sin(x @ waves.T + rng.uniform(0, 2 * np.pi, 4)) @ rng.normal(size=(4, 3))
-    maps = np.c_[np.ones(len(x)), x]
-    shift -= maps @ np.linalg.lstsq(maps[used], shift[used], rcond=None)[0]
-    return points.vertices + diagonal(points) * rms * shift / jm.distortion.rms(shift[used])
-
-
 def lost(points: Mesh, share: float, rng: Generator) -> np.ndarray:
     """So many of the vertices, on one side of a plane, moved by Gaussian noise of 2 % RMS of the diagonal."""
     side = points.vertices @ rng.normal(size=3)
@@ -79,9 +67,8 @@ def lost(points: Mesh, share: float, rng: Generator) -> np.ndarray:
 
 
 OWN: dict[str, Callable[[Mesh, float, Generator], Any]] = {
-    "laplace": lambda points, steps, rng: smooth(points, int(steps) * [0.5]),
-    "taubin": lambda points, pairs, rng: smooth(points, int(pairs) * [0.5, -0.53]),  # SIGGRAPH 1995
-    **{"white": white, "affine": affine, "warp": warp, "lost": lost},
+    "laplace": lambda points, steps, rng: smooth(points, int(steps)),
+    **{"white": white, "affine": affine, "lost": lost},
 }
 # As in OWN and `jaxmark attack`: laplace takes steps of 0.5, smoothing of 0.1, lost adds noise of 2 % of the diagonal;
 # the ceiling is the RMS of white noise up to which the keyed scheme should read.

@@ -350,10 +350,11 @@ def identify_command(
     sys.exit(0 if accused else 1)
 
 
-_KINDS = "\n".join(f"  {name}: {entry.unit}" for name, entry in ATTACKS.items())
+# click leaves the lines of a paragraph as they are that starts so.
+_KINDS = "\n".join(["\b", "KIND, and what STRENGTH is:", *(f"{name}: {entry.unit}" for name, entry in ATTACKS.items())])
 
 
-@cli.command(name="attack", epilog=f"\b\nKINDs, and the units of their STRENGTH:\n{_KINDS}")
+@cli.command(name="attack", epilog=_KINDS)
 @click.argument("source", metavar="IN", type=_MESH)
 @click.argument("target", metavar="OUT", type=_MESH)
 @click.argument("words", metavar="KIND STRENGTH [KIND STRENGTH]...", nargs=-1, required=True)

@@ -204,7 +204,9 @@ def test_attacks_are_differentiable(cap: Mesh, x64):
 
 
 def test_host_function_keeps_copies_together_and_digits_far_away(cap: Mesh):
-    soup = make_mesh(cap.vertices[cap.faces].reshape(-1, 3) + 1e6, np.arange(3 * len(cap.faces)).reshape(-1, 3))
+    # With its isolated vertex it has as many points as the cap: what was compiled serves again.
+    corners = np.vstack([cap.vertices[cap.faces].reshape(-1, 3), cap.vertices[-1:]])
+    soup = make_mesh(corners + 1e6, np.arange(3 * len(cap.faces)).reshape(-1, 3))
     for kind, strength in MILD:
         once = jm.attack(soup, kind, strength, seed=3)
         np.testing.assert_array_equal(once.vertices, jm.attack(soup, kind, strength, seed=3).vertices)
@@ -218,13 +220,12 @@ def test_host_function_keeps_copies_together_and_digits_far_away(cap: Mesh):
 
 
 def test_a_stray_vertex_changes_nothing(cap: Mesh):
-    stray = make_mesh(np.vstack([cap.vertices, [[1e9, 0, 0]]]), cap.faces)
+    stray = make_mesh(np.vstack([cap.vertices[:-1], [[1e9, 0, 0]]]), cap.faces)
     for kind, strength in MILD:
         alone, beside = (jm.attack(mesh, kind, strength, seed=0).vertices for mesh in (cap, stray))
         np.testing.assert_array_equal(beside[-1], stray.vertices[-1])
-        if "noise" not in kind and kind != "jamming":  # whose draws depend on the number of vertices
-            np.testing.assert_allclose(beside[:-1], alone, atol=1e-6)
-        assert kind == "similarity" or np.abs(beside[:-1] - cap.vertices).max() < 0.05
+        np.testing.assert_allclose(beside[:-1], alone[:-1], atol=1e-6)
+        assert kind == "similarity" or np.abs(beside[:-1] - cap.vertices[:-1]).max() < 0.05
 
 
 def test_repeated_smoothing_is_compiled_once(cap: Mesh, caplog: pytest.LogCaptureFixture):
@@ -309,6 +310,9 @@ def marked(key: jm.Key) -> tuple[jm.Marker, Mesh]:
     ("kind", "strength"),
     [
         *(("noise", 0.005), ("diagonal-noise", 0.002), ("smoothing", 30), ("quantisation", 9)),
+        *(("gaussian-noise", 0.003), ("taubin", 50), ("cotangent-smoothing", 3), ("bilateral", 5)),
+        *(("low-pass", 0.8), ("band-stop", 0.1), ("jamming", 0.0002)),
+        *(("warp", 0.01), ("bending", 10), ("twisting", 10)),
         *(("similarity", 0.5), ("affine", 0.3), ("edge-flips", 0.01), ("edge-flips", 0.3)),
     ],
 )
