@@ -298,12 +298,14 @@ def main() -> None:
                 print(line, flush=True)
         return
     options.output.mkdir(parents=True, exist_ok=True)
-    # Cells of one marked mesh come one after another; the unmarked one knows no limits.
-    trials = [UNMARKED, *range(options.trials)]
+    # Trial by trial, so that a run that is ended has some of every mesh; the unmarked ones know no limits.
+    trials, meshes = [UNMARKED, *range(options.trials)], map(str, options.mesh)
     cells: list[Cell] = [
-        cell
-        for cell in product(options.methods, options.limits, map(str, options.mesh), trials, options.attacks)
-        if cell[3] != UNMARKED or cell[1] == options.limits[0]
+        (method, limits, mesh, trial, attack)
+        for method, trial, limits, mesh, attack in product(
+            options.methods, trials, options.limits, meshes, options.attacks
+        )
+        if trial != UNMARKED or limits == options.limits[0]
     ]
 
     def say(line: str) -> None:
