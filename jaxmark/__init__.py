@@ -17,6 +17,8 @@ from jaxmark import spectrum as spectrum
 from jaxmark import tuning as tuning
 from jaxmark import visibility as visibility
 from jaxmark import watermark as watermark
+from jaxmark.attacks import ATTACKS as ATTACKS
+from jaxmark.attacks import Attack as Attack
 from jaxmark.attacks import attack as attack
 from jaxmark.distortion import compare as compare
 from jaxmark.errors import JaxmarkError as JaxmarkError
