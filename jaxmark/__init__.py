@@ -39,6 +39,7 @@ from jaxmark.mesh import Mesh as Mesh
 from jaxmark.mesh import make_mesh as make_mesh
 from jaxmark.record import Record as Record
 from jaxmark.robustness import Robustness as Robustness
+from jaxmark.robustness import minimum_distortion as minimum_distortion
 from jaxmark.robustness import robustness as robustness
 from jaxmark.tardos import Accusation as Accusation
 from jaxmark.tracing import Tracer as Tracer

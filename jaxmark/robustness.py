@@ -1,6 +1,8 @@
 """What a mark survives: attacks of rising strength, and what is still read after each."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +10,7 @@ from jaxtyping import Bool, Float64
 
 from jaxmark.alignment import Alignment
 from jaxmark.attacks import Kind, attack, get_attack
+from jaxmark.distortion import Comparison, compare
 from jaxmark.errors import JaxmarkError
 from jaxmark.marking import Marker
 from jaxmark.mesh import Mesh
@@ -31,6 +34,33 @@ class Robustness(NamedTuple):
     bit_errors: Float64[np.ndarray, "epsilons samples"]  # see `Reading`
     log10_p: Float64[np.ndarray, "epsilons samples"]
     refusals: tuple[tuple[str, ...], ...]  # epsilons, samples: the sentence, empty where there is an answer
+
+
+class Trial(NamedTuple):
+    """An attack at one strength."""
+
+    strength: float
+    distortion: Comparison  # of the suspect from the marked mesh
+    log10_p: float  # of a claim of the message; 0 where the suspect is refused
+
+
+class Breaking(NamedTuple):
+    """The least that an attack must do to a mark to succeed."""
+
+    embedding: Comparison  # distortion of the marked mesh from the original
+    weakest: Trial | None  # the weakest attack found that succeeds; None if not even the strongest does
+    curve: tuple[Trial, ...]  # all that was tried, weak ones first
+
+    def cost(self, metric: str) -> float:
+        """The attack's distortion over the mark's own; infinite if it does not succeed, NaN where it has none.
+
+        Args:
+            metric: a field of `Comparison` that was asked for.
+        """
+        if self.weakest is None:
+            return math.inf
+        attacked, marked = (getattr(one, metric) for one in (self.weakest.distortion, self.embedding))
+        return math.nan if attacked is None or not marked else attacked / marked
 
 
 NOTHING = Reading(False, False, 0.5, 0.0)  # read from a suspect that is refused
@@ -87,6 +117,64 @@ def robustness(
 
     refusals = tuple(tuple(sentence for _, sentence in row) for row in rows)
     return Robustness(np.array(strengths, float), column("read"), column("bit_errors"), column("log10_p"), refusals)
+
+
+def minimum_distortion(
+    marker: Marker,
+    marked: Mesh,
+    message: bytes,
+    kind: Kind,
+    *,
+    alpha: float = 1e-6,
+    metrics: Collection[str] = ("rms", "dame", "msdm2"),
+    seed: int = 0,
+    tolerance: float = 0.05,
+) -> Breaking:
+    """Find the least distortion at which an attack brings a mark below detection, by bisection of its strength.
+
+    It succeeds where not even a claim of the message is proven, or the suspect is refused. Between the weakest and the
+    strongest usual strength of the attack, success is taken to rise with strength, which holds for one seed.
+
+    Args:
+        marker: what reads: original, key, payload and scheme.
+        marked: the mesh with the message in it.
+        message: what was written.
+        kind: a name in `ATTACKS`, or an `Attack` of your own, whose strengths bound what is tried.
+        alpha: false-positive probability at which the reader detects, in (0, 1).
+        metrics: of `distortion.METRICS`, by which distortion is measured.
+        seed: of the attack's randomness.
+        tolerance: ratio of strengths, less 1, at which the bisection ends; whole strengths are told apart by 1.
+
+    Raises:
+        JaxmarkError: if there is no such attack or metric, or a number is out of range.
+    """
+    if not (0 < alpha < 1 and tolerance > 0):
+        raise JaxmarkError(f"alpha is in (0, 1) and tolerance positive, got {alpha:g} and {tolerance:g}.")
+    strengths = get_attack(kind).strengths
+    weak, strong = strengths[0], strengths[-1]
+    if not min(weak, strong) > 0:
+        raise JaxmarkError(f"The usual strengths of the attack must be positive to be bisected, got {strengths}.")
+    whole = all(float(one).is_integer() for one in strengths)
+    trials: list[Trial] = []
+
+    def detected(strength: float) -> bool:
+        log10_p, suspect = 0.0, attack(marked, kind, strength, seed=seed)
+        with suppress(JaxmarkError):  # what cannot be aligned is not detected
+            log10_p = marker.detect(suspect, message).log10_p
+        trials.append(Trial(strength, compare(marked, suspect, metrics), log10_p))
+        return log10_p <= math.log10(alpha)
+
+    if not detected(strong) and detected(weak):
+        held, broken = weak, strong
+        while abs(math.log(broken / held)) > math.log1p(tolerance):
+            middle = math.sqrt(held * broken)
+            middle = float(round(middle)) if whole else middle
+            if middle in (held, broken):
+                break
+            held, broken = (middle, broken) if detected(middle) else (held, middle)
+    trials.sort(key=lambda one: one.strength, reverse=strong < weak)
+    weakest = next((one for one in trials if one.log10_p > math.log10(alpha)), None)
+    return Breaking(compare(marker.original.mesh, marked, metrics), weakest, tuple(trials))
 
 
 def _bits(message: bytes) -> np.ndarray:

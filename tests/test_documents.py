@@ -39,6 +39,13 @@ def test_python_blocks_of_the_readme_run(folder: Path, unchecked, capsys):
     assert names["gradient"].shape == names["x"].shape
 
 
+def test_python_block_of_the_page_on_robustness_runs(unchecked, capsys):
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "robustness.md").read_text(), re.DOTALL)
+    names: dict = {"mesh": bumpy_sphere(4), "key": jm.Key(bytes(32))}
+    exec(compile(block, "robustness.md", "exec"), names)
+    assert names["curve"].success.all()
+
+
 def test_shell_lines_of_the_readme_run(folder: Path, unchecked, monkeypatch, capsys):
     lines = re.findall(r"^    (jaxmark .*)$", README, re.MULTILINE)
     assert len(lines) >= 8

@@ -9,6 +9,7 @@ import jaxmark as jm
 from jaxmark.attacks import Attack
 from jaxmark.mesh import Mesh
 from jaxmark.message import decode, encode, guess
+from jaxmark.robustness import minimum_distortion
 from tests.samples import bumpy_sphere
 
 MESSAGE = b"ok"
@@ -68,3 +69,38 @@ def test_refusals(marked):
         jm.robustness(*marked, MESSAGE, "noise", [])
     with pytest.raises(jm.JaxmarkError, match="no attack 'melting'"):
         jm.robustness(*marked, MESSAGE, "melting")
+
+
+def test_the_least_that_breaks_a_mark_lies_between_what_does_and_what_does_not(marked):
+    marker, mesh = marked
+    wide = jm.ATTACKS["noise"]._replace(strengths=(0.001, 0.3))
+    found = minimum_distortion(marker, mesh, MESSAGE, wide, metrics=["rms", "dame"])
+    held = [one for one in found.curve if one.log10_p <= -6]
+    assert found.weakest is not None
+    assert found.weakest.strength == min(one.strength for one in found.curve if one.log10_p > -6)
+    assert max(one.strength for one in held) < found.weakest.strength < 1.06 * max(one.strength for one in held)
+    for one in found.curve:
+        suspect = jm.attack(mesh, "noise", one.strength, seed=0)
+        assert one.log10_p == marker.detect(suspect, MESSAGE).log10_p
+        assert one.distortion.rms == jm.distortion.moved(mesh, suspect).rms
+    own = jm.distortion.moved(marker.original.mesh, mesh).rms
+    assert found.cost("rms") == pytest.approx(found.weakest.distortion.rms / own)
+    assert np.isnan(found.cost("msdm2"))  # not asked for
+
+
+def test_whole_strengths_and_attacks_that_never_or_always_succeed(marked):
+    marker, mesh = marked
+    coarse = minimum_distortion(marker, mesh, MESSAGE, jm.ATTACKS["quantisation"]._replace(strengths=(10, 2)))
+    assert [one.strength for one in coarse.curve] == sorted((one.strength for one in coarse.curve), reverse=True)
+    assert coarse.weakest is not None
+    bits = int(coarse.weakest.strength)
+    assert [one.strength for one in coarse.curve if one.log10_p <= -6][-1] == bits + 1
+    mild = minimum_distortion(
+        marker, mesh, MESSAGE, jm.ATTACKS["noise"]._replace(strengths=(1e-4, 2e-4)), metrics=["rms"]
+    )
+    assert (mild.weakest, mild.cost("rms"), len(mild.curve)) == (None, np.inf, 1)
+    harsh = minimum_distortion(marker, mesh, MESSAGE, noise._replace(strengths=(1, 2)), metrics=["rms"])
+    assert harsh.weakest == harsh.curve[0]
+    assert harsh.weakest.strength == 1
+    with pytest.raises(jm.JaxmarkError, match="positive to be bisected"):
+        minimum_distortion(marker, mesh, MESSAGE, noise._replace(strengths=(0, 2)))
