@@ -95,9 +95,8 @@ def test_whole_strengths_and_attacks_that_never_or_always_succeed(marked):
     assert coarse.weakest is not None
     bits = int(coarse.weakest.strength)
     assert [one.strength for one in coarse.curve if one.log10_p <= -6][-1] == bits + 1
-    mild = minimum_distortion(
-        marker, mesh, MESSAGE, jm.ATTACKS["noise"]._replace(strengths=(1e-4, 2e-4)), metrics=["rms"]
-    )
+    noise = jm.ATTACKS["noise"]
+    mild = minimum_distortion(marker, mesh, MESSAGE, noise._replace(strengths=(1e-4, 2e-4)), metrics=["rms"])
     assert (mild.weakest, mild.cost("rms"), len(mild.curve)) == (None, np.inf, 1)
     harsh = minimum_distortion(marker, mesh, MESSAGE, noise._replace(strengths=(1, 2)), metrics=["rms"])
     assert harsh.weakest == harsh.curve[0]
