@@ -23,6 +23,8 @@ from jaxmark.attacks.noise import mark_noise as mark_noise
 from jaxmark.attacks.noise import uniform_noise as uniform_noise
 from jaxmark.attacks.ordering import reordering as reordering
 from jaxmark.attacks.quantisation import quantisation as quantisation
+from jaxmark.attacks.refitting import plane_fitting as plane_fitting
+from jaxmark.attacks.refitting import primitive_fitting as primitive_fitting
 from jaxmark.attacks.registry import ATTACKS as ATTACKS
 from jaxmark.attacks.registry import Attack as Attack
 from jaxmark.attacks.registry import Kind as Kind
@@ -44,6 +46,8 @@ from jaxmark.attacks.storage import soup as soup
 from jaxmark.attacks.subdivision import loop as loop
 from jaxmark.attacks.subdivision import midpoint as midpoint
 from jaxmark.attacks.subdivision import sqrt3 as sqrt3
+from jaxmark.attacks.symmetry import instance_averaging as instance_averaging
+from jaxmark.attacks.symmetry import mirror_averaging as mirror_averaging
 from jaxmark.attacks.warping import bending as bending
 from jaxmark.attacks.warping import twisting as twisting
 from jaxmark.attacks.warping import warp as warp

@@ -18,12 +18,14 @@ from jaxmark.attacks.mosaic import missing_pieces, mosaic
 from jaxmark.attacks.noise import diagonal_noise, gaussian_noise, uniform_noise
 from jaxmark.attacks.ordering import reordering
 from jaxmark.attacks.quantisation import quantisation
+from jaxmark.attacks.refitting import plane_fitting, primitive_fitting
 from jaxmark.attacks.remeshing import iso_surface, isotropic, poisson
 from jaxmark.attacks.scene import adding_geometry
 from jaxmark.attacks.simplification import simplification
 from jaxmark.attacks.smoothing import cotangent_smoothing, laplacian_smoothing, taubin_smoothing
 from jaxmark.attacks.storage import digits, float_bits, soup
 from jaxmark.attacks.subdivision import loop, midpoint, sqrt3
+from jaxmark.attacks.symmetry import instance_averaging, mirror_averaging
 from jaxmark.attacks.warping import bending, twisting, warp
 from jaxmark.errors import JaxmarkError
 from jaxmark.mesh import Mesh, compacted, diagonal, host_mesh, same_connectivity, used_vertices, weld, welded_mesh
@@ -87,6 +89,16 @@ ATTACKS: Mapping[str, Attack] = {
     "soup": Attack(soup, "times through a binary STL file", (1, 2), host=True),
     "arap": Attack(
         as_rigid_as_possible, "drag of one end sideways over the diagonal", (0.02, 0.05, 0.1, 0.2, 0.4), host=True
+    ),
+    "plane-fitting": Attack(plane_fitting, "degrees between normals of a flat region", (1, 2, 5, 10), host=True),
+    "primitive-fitting": Attack(
+        primitive_fitting, "degrees between normals of a flat region", (1, 2, 5, 10), host=True
+    ),
+    "mirror-averaging": Attack(
+        mirror_averaging, "share of the way to the mean with the mirror image", (0.25, 0.5, 0.75, 1), host=True
+    ),
+    "instance-averaging": Attack(
+        instance_averaging, "share of the way to the mean of all instances", (0.25, 0.5, 0.75, 1), host=True
     ),
 }
 
