@@ -155,22 +155,40 @@ def cylinder() -> Mesh:
     return of(trimesh.creation.revolve(np.array(outline, float), sections=60))
 
 
-def test_a_cylinder_is_round_again_and_its_ends_flat(cylinder: Mesh):
+@pytest.mark.parametrize(("angle", "size"), [(10, NOISE), (5, 0.1 * NOISE), (2.5, 0.1 * NOISE)])
+def test_a_cylinder_is_round_again_and_its_ends_flat(angle, size, cylinder: Mesh):
+    """Also where its facets, 6° apart, are flat regions."""
     along = (cylinder.vertices - [3, 2, 1]) @ TURN
     side = np.linalg.norm(along[:, :2], axis=1) > 1 - 1e-9
-    before = noisy(cylinder)
-    after = primitive_fitting(before, 10)
+    before = noisy(cylinder, size=size)
+    after = primitive_fitting(before, angle)
     for end in (-1, 1):
         ring = np.abs(along[:, 2] - end) < 1e-9
-        assert off_plane(before.vertices[ring]) > 1e-4
+        assert off_plane(before.vertices[ring]) > 1e-5
         assert off_plane(after.vertices[ring]) < 1e-9
-    assert off_round(before.vertices[side], TURN[:, 2])[1] > 1e-3
+    assert off_round(before.vertices[side], TURN[:, 2])[1] > 1e-4
     radius, off = off_round(after.vertices[side], TURN[:, 2])
     assert off < 1e-9
     assert radius == pytest.approx(1, abs=5e-4)
     # Planes alone do not make it round.
-    planes = plane_fitting(before, 10)
-    assert off_round(planes.vertices[side], TURN[:, 2])[1] > 1e-3
+    planes = plane_fitting(before, angle)
+    assert off_round(planes.vertices[side], TURN[:, 2])[1] > 1e-4
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_planes_part_from_what_goes_over_into_them(kind):
+    """A can whose bottom goes over into its side by steps of 3°, less than the angle."""
+    turn = np.radians(np.arange(3, 91, 3))
+    fillet = np.stack([0.7 + 0.3 * np.sin(turn), -0.7 - 0.3 * np.cos(turn)], axis=1)
+    bottom, side = ([[x, -1] for x in np.linspace(0, 0.7, 8)], [[1, y] for y in np.linspace(-0.6, 1, 17)])
+    can = of(trimesh.creation.revolve(np.concatenate([bottom, fillet, side]), sections=120))
+    before = noisy(can, size=1e-5)
+    after = KINDS[kind](before, 5)
+    along = (can.vertices - [3, 2, 1]) @ TURN
+    inside = (np.abs(along[:, 2] + 1) < 1e-9) & (np.linalg.norm(along[:, :2], axis=1) < 0.65)
+    assert inside.sum() == 6 * 120 + 1
+    assert off_plane(before.vertices[inside]) > 1e-6
+    assert off_plane(after.vertices[inside]) < 1e-9
 
 
 def test_organic_shapes_hardly_change(sphere: Mesh):

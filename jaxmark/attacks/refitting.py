@@ -9,13 +9,14 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.mesh import Mesh, diagonal, face_normals, used_vertices
+from jaxmark.mesh import Mesh, boundary_vertices, diagonal, face_normals, used_vertices
 from jaxmark.pose import Points
 
 _MOST = 30.0  # degrees
 _LEAST = 10  # vertices of a region; fewer fit most shapes
 _STRAY = 0.05  # share of a region's area whose normals may be off: noise tilts single faces
 _FIT = 0.005  # the most that is left of a region, RMS over the diagonal of the mesh
+_BROAD = 0.25  # share of the vertices of a broad region that are inside
 _TURN = 3.0  # curved regions may turn by so many times the angle from face to face
 _HALVINGS = 3
 _RANK = 0.2  # planes at less than 2 atan 0.2, 23°, count as one: where they meet says little
@@ -63,6 +64,7 @@ class Region(NamedTuple):
     centroids: Float64[np.ndarray, "faces 3"]
     normals: Float64[np.ndarray, "faces 3"]
     areas: Float64[np.ndarray, " faces"]
+    rim: int  # how many of the vertices are on it
 
 
 class Found(NamedTuple):
@@ -72,7 +74,7 @@ class Found(NamedTuple):
     vertices: Int64[np.ndarray, " vertices"]
 
 
-Fit = Callable[[Region], Shape]
+Fit = Callable[[Region], Shape | None]  # None where it is not to be tried
 
 
 def plane_fitting(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
@@ -105,10 +107,11 @@ def plane_fitting(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) 
 def primitive_fitting(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
     """Make flat what is nearly flat, and round what is nearly a sphere or a circular cylinder.
 
-    As `plane_fitting`; of what is not flat, regions that turn by less than three times the angle from face to face are
-    then fitted by a sphere and a cylinder, of which the closer one counts if it passes as a plane would have to: by
-    its normals at the faces' centroids and by what it leaves. Vertices go to the shape radially, and to all their
-    shapes where regions meet, by Gauss-Newton steps.
+    As `plane_fitting`; but regions that turn by less than three times the angle from face to face, and are not flat,
+    are fitted by a sphere and a cylinder, of which the closer one counts if it passes as a plane has to: by its normals
+    at the faces' centroids and by what it leaves. Facets, flat regions of which less than a fourth of the vertices are
+    inside, are planes only where that fails. Vertices go to the shape radially, and to all their shapes where regions
+    meet, by Gauss-Newton steps.
 
     Args:
         mesh: any mesh, concrete.
@@ -121,7 +124,9 @@ def primitive_fitting(mesh: Mesh, strength: float, key: PRNGKeyArray | None = No
     Raises:
         JaxmarkError: if the angle is outside [0, 30], or all vertices of the mesh are at one point.
     """
-    return _refitted(mesh, strength, ((1.0, (_plane,)), (_TURN, (_sphere, _cylinder))))
+    # The facets of a cylinder are flat too: only what is broad is a plane before it has been tried.
+    kinds = ((1.0, (_broad,)), (_TURN, (_plane,)), (_TURN, (_sphere, _cylinder)), (1.0, (_plane,)))
+    return _refitted(mesh, strength, kinds)
 
 
 def _refitted(mesh: Mesh, strength: float, kinds: Sequence[tuple[float, Sequence[Fit]]]) -> Mesh:
@@ -183,6 +188,8 @@ def _best(
     ends = []
     for fit in fits if len(region.vertices) >= _LEAST else ():
         shape = fit(region)
+        if shape is None:
+            continue
         along = np.abs(np.sum(shape.across(region.centroids)[0] * region.normals, axis=1)) > np.cos(angle)
         left = float(np.sqrt(np.mean(shape.across(region.points)[1] ** 2)))
         if left <= most and region.areas[~along].sum() <= _STRAY * region.areas.sum():
@@ -198,7 +205,7 @@ def _region(mesh: Mesh, normals: Float64[np.ndarray, "faces 3"], faces: Int64[np
     a, b, c = (vertices[corners[:, k]] for k in range(3))
     used = np.unique(corners)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    return Region(used, vertices[used], (a + b + c) / 3, normals[faces], areas)
+    return Region(used, vertices[used], (a + b + c) / 3, normals[faces], areas, len(boundary_vertices(corners)))
 
 
 def _plane(region: Region) -> Plane:
@@ -206,6 +213,11 @@ def _plane(region: Region) -> Plane:
     middle = region.points.mean(axis=0)
     normal = _least(region.points - middle)
     return Plane(normal, float(normal @ middle))
+
+
+def _broad(region: Region) -> Plane | None:
+    """The plane of a region with an inside."""
+    return _plane(region) if len(region.points) - region.rim >= _BROAD * len(region.points) else None
 
 
 def _sphere(region: Region) -> Round:
