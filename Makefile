@@ -18,7 +18,7 @@ types: $(VENV)/.dev
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 tests: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n auto
+	$(BIN)/python -m pytest -q -n auto --durations=20
 
 slow-tests: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -n auto -m slow

@@ -203,6 +203,7 @@ def test_attacks_are_differentiable(cap: Mesh, x64):
     np.testing.assert_array_equal(straight, 2)
 
 
+@pytest.mark.slow
 def test_host_function_keeps_copies_together_and_digits_far_away(cap: Mesh):
     # With its isolated vertex it has as many points as the cap: what was compiled serves again.
     corners = np.vstack([cap.vertices[cap.faces].reshape(-1, 3), cap.vertices[-1:]])
@@ -330,6 +331,7 @@ def test_marks_of_the_default_budget_read(kind, strength, marked: tuple[jm.Marke
     )
 
 
+@pytest.mark.slow
 def test_a_mark_reads_in_noise_of_twice_its_size(marked: tuple[jm.Marker, Mesh]):
     marker, mesh = marked
     noisy = mark_noise(mesh, marker.original.mesh, 2.0, jax.random.key(0))

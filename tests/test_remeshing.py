@@ -88,6 +88,7 @@ def test_iso_surface_is_that_of_the_whole_grid(cells, sphere: Mesh):
     assert cKDTree(expected).query(steps)[0].max() < 2e-3
 
 
+@pytest.mark.slow
 def test_finer_grids_and_deeper_trees_come_nearer(sphere: Mesh):
     off = [apart(sphere, iso_surface(sphere, cells)) for cells in (10, 20, 40)]
     assert off[0] > 1.5 * off[1] > 1.5**2 * off[2]

@@ -36,6 +36,7 @@ def test_a_curve_is_what_attack_and_detect_say(marked):
     assert found.refusals == (("", ""), ("", ""))
 
 
+@pytest.mark.slow
 def test_an_attack_of_ones_own_and_a_refusal(marked):
     marker, mesh = marked
 
@@ -88,6 +89,7 @@ def test_the_least_that_breaks_a_mark_lies_between_what_does_and_what_does_not(m
     assert np.isnan(found.cost("msdm2"))  # not asked for
 
 
+@pytest.mark.slow
 def test_whole_strengths_and_attacks_that_never_or_always_succeed(marked):
     marker, mesh = marked
     coarse = minimum_distortion(marker, mesh, MESSAGE, jm.ATTACKS["quantisation"]._replace(strengths=(10, 2)))
