@@ -379,7 +379,8 @@ def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int
         change = distortion.moved(mesh, load_mesh(draft))._asdict() if same else {"rms": None, "max": None}
     answer = {"attacks": steps, "seed": seed, "vertices": len(attacked.vertices), "faces": len(attacked.faces)}
     said = " + ".join(f"{kind} {strength:g}" for kind, strength in steps)
-    how = f"RMS {change['rms']:.3g} of the diagonal" if same else f"{len(attacked.vertices)} vertices, other faces"
+    size = f"{len(attacked.vertices)} vertices and {len(attacked.faces)} faces"
+    how = f"RMS {change['rms']:.3g} of the diagonal" if same else f"a mesh of {size}"
     _answer(as_json, {**answer, **change}, f"{said} → {target}, {how}")
 
 

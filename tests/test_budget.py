@@ -46,6 +46,7 @@ def test_the_tightest_of_several_bounds_counts(mesh: Mesh, noise: np.ndarray):
     assert (found.msdm or 0) <= 0.9
 
 
+@pytest.mark.slow
 def test_without_a_word_the_mark_stays_below_what_people_notice(mesh: Mesh, key: jm.Key):
     marked, info = jm.embed(mesh, MESSAGE, key, noise=0)
     found = jm.compare(mesh, marked, ["dame", "rms"])

@@ -94,6 +94,7 @@ def test_reverse_mode_agrees_with_dense_jacobians(operator, polynomials, derivat
     np.testing.assert_allclose(c_bar, expected if per_column else expected.sum(1), atol=1e-10)
 
 
+@pytest.mark.slow
 def test_derivatives_by_transformation(operator, x64):
     c = jnp.asarray(random_array(DEGREE + 1))
     x = jnp.asarray(random_array(5, len(operator.degree), seed=1))

@@ -255,6 +255,7 @@ def test_other_connectivity_is_read_where_it_can_be(workshop: Workshop):
     assert "does not share" in workshop.refused("detect", "finer.obj", *DETECT, "--align", "same")
 
 
+@pytest.mark.slow
 def test_what_cannot_be_aligned_is_refused_by_name(workshop: Workshop):
     trimesh.Trimesh(*bumpy_sphere(2), process=False).export("small.ply")
     assert "could not be aligned" in workshop.refused("detect", "small.ply", *DETECT)

@@ -46,6 +46,7 @@ def test_python_block_of_the_page_on_robustness_runs(unchecked, capsys):
     assert names["curve"].success.all()
 
 
+@pytest.mark.slow
 def test_shell_lines_of_the_readme_run(folder: Path, unchecked, monkeypatch, capsys):
     lines = re.findall(r"^    (jaxmark .*)$", README, re.MULTILINE)
     assert len(lines) >= 8

@@ -73,6 +73,7 @@ def test_another_component_is_a_part_or_none():
     assert (parts(two, features[:1]) == -1).sum() == 42
 
 
+@pytest.mark.slow
 def test_each_part_reads_its_own_message(marker, marked: Mesh, sphere: Mesh):
     assert [one.message for one in marker.detect(marked)] == MESSAGES
     # Reassembled: the faces that there were, and no point has moved further than the mark moves it.

@@ -1,0 +1,133 @@
+"""Attacks by somebody who holds original, key and message: the least that takes a claim of the message away.
+
+They bound from below what any attacker must pay, and say whether weaker attackers are weak or just clumsy. Pose and
+correspondence are found on the host; given them, the claim is a differentiable function of the displacement.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxmark.alignment import align
+from jaxmark.attacks.registry import Attack
+from jaxmark.carriers import KeyedCarrier
+from jaxmark.distortion import rms
+from jaxmark.errors import JaxmarkError
+from jaxmark.marking import Marker
+from jaxmark.mesh import Mesh
+from jaxmark.message import encode
+from jaxmark.observation import Observation
+from jaxmark.precision import matmul
+from jaxmark.reception import clean
+
+_UNIT = "RMS over the diagonal"
+_STRENGTHS = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
+
+# The evidence S/‖a‖ of a claim, and a displacement along which it rises.
+Slope = Callable[
+    [KeyedCarrier, Observation, Float[Array, " code"]], tuple[Float[Array, ""], Float[Array, "vertices 3"]]
+]
+
+
+def erasure(marker: Marker, message: bytes) -> Attack:
+    """The displacement that lowers the score of a claim most, in closed form.
+
+    With weights, gains and powers as the receiver finds them in the marked mesh, the score is linear in the
+    displacement, S + ⟨c, d⟩, and d = -ρ c/‖c‖ is the best of its size: ρ = S/‖c‖ takes all of it.
+
+    Args:
+        marker: a keyed one: original, key, payload and scheme.
+        message: what was written.
+
+    Returns:
+        An attack on meshes of the original's connectivity; its strength is the RMS displacement of the vertices that
+        faces use, relative to the diagonal of the original's bounding box.
+
+    Raises:
+        JaxmarkError: if the marker is of a scheme that is not keyed, or the message of another size than its payload.
+    """
+    return _attack(marker, message, _linear_slope, 1)
+
+
+def erasure_by_descent(marker: Marker, message: bytes, *, steps: int = 20) -> Attack:
+    """The same by optimisation through all that the receiver does, so that what weighs the evidence is attacked, too.
+
+    Each step goes some of the way to the displacement of its size that lies against the gradient of S/‖a‖, 2/(k + 2) in
+    step k (Frank, Wolfe, Naval Research Logistics Quarterly 3, 1956); the suspect is aligned anew at each.
+
+    Args:
+        marker: see `erasure`.
+        message: see `erasure`.
+        steps: how many gradients are taken; the best of as many displacements is returned.
+
+    Returns:
+        See `erasure`.
+
+    Raises:
+        JaxmarkError: see `erasure`; or if not even one step is asked for.
+    """
+    if steps < 1:
+        raise JaxmarkError(f"An attack by descent needs at least one step, got {steps}.")
+    return _attack(marker, message, _slope, steps)
+
+
+def _attack(marker: Marker, message: bytes, slopes: Slope, steps: int) -> Attack:
+    original, reader = marker.original, marker.reader
+    if not isinstance(reader, KeyedCarrier):
+        raise JaxmarkError(f"Only keyed marks are erased so, not those of the scheme {marker.scheme.name!r}.")
+    if 8 * len(message) != marker.bits:
+        raise JaxmarkError(f"The message has {8 * len(message)} bits, but the payload is {marker.bits} bits.")
+    codeword = jnp.asarray(encode(message, marker.key, original.geometry, marker.code), original.signal.dtype)
+
+    def apply(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+        start, total = np.asarray(mesh.vertices, np.float64), np.zeros_like(original.positions)
+        moved, tried = mesh, []
+        for step in range(steps if strength > 0 else 0):
+            aligned = align(original, moved, "same")
+            evidence, slope = slopes(reader, marker.observe(aligned), codeword)
+            tried.append((float(evidence), moved))
+            against = -original.on_host(slope)
+            size = float(rms(against[original.used]))
+            if size == 0:
+                break
+            total = total + (2 / (step + 2)) * (strength / size * against - total)
+            there = total * strength / max(float(rms(total[original.used])), 1e-300)
+            back = np.linalg.inv(aligned.pose.matrix)
+            moved = Mesh(start + (original.diagonal * there @ back.T)[original.weld.point], mesh.faces)
+        # Beyond the closed form, the way is not always down: the best of all displacements of this size counts.
+        if len(tried) > 1:
+            last = slopes(reader, marker.observe(align(original, moved, "same")), codeword)[0]
+            moved = min([*tried[1:], (float(last), moved)], key=lambda one: one[0])[1]
+        return moved
+
+    return Attack(apply, _UNIT, _STRENGTHS, host=True)
+
+
+@jax.jit
+def _linear_slope(
+    carrier: KeyedCarrier, seen: Observation, codeword: Float[Array, " code"]
+) -> tuple[Float[Array, ""], Float[Array, "vertices 3"]]:
+    """Of the score alone, with what the receiver learns held fixed."""
+    received = carrier.received(seen)
+
+    def score(residual: Array) -> Array:
+        left = matmul(clean(received.host, received.seen, received.factor, residual), received.axes)
+        shape = carrier.shape(1.0, received.gain / received.power)
+        return jnp.sum(codeword * carrier.correlate(matmul(left, received.axes), shape))
+
+    found, norm = carrier.claim(received, codeword)
+    return found / norm, jax.grad(score)(seen.residual)
+
+
+@jax.jit
+def _slope(
+    carrier: KeyedCarrier, seen: Observation, codeword: Float[Array, " code"]
+) -> tuple[Float[Array, ""], Float[Array, "vertices 3"]]:
+    def evidence(residual: Array) -> Array:
+        score, norm = carrier.claim(seen._replace(residual=residual), codeword)
+        return score / norm
+
+    return jax.value_and_grad(evidence)(seen.residual)
