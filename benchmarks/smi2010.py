@@ -314,8 +314,9 @@ def main() -> None:
     log = options.output / "cells.jsonl"
     rows = run(cells, work, processes(options.workers), log, say)
     (options.output / "smi2010.json").write_text(json.dumps(rows, indent=1))
-    (options.output / "smi2010.md").write_text(report(rows, options))
-    print(report(rows, options))
+    text = report(rows, options)
+    (options.output / "smi2010.md").write_text(text)
+    print(text)
 
 
 if __name__ == "__main__":

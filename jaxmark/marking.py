@@ -94,7 +94,7 @@ class Marker:
 
         Who reads the mark back elsewhere, from the file it went to, can leave that out here.
         """
-        self._check_size(message)
+        self.check_size(message)
         bounds = make_budget(budget, limits)
         if not 0 <= noise < math.inf:
             raise JaxmarkError(f"The noise to survive is a number of at least 0, got {noise}.")
@@ -143,7 +143,7 @@ class Marker:
         One that is read with several keys needs to be aligned only once, by `jaxmark.alignment.align`.
         """
         if message is not None:
-            self._check_size(message)
+            self.check_size(message)
         aligned = suspect if isinstance(suspect, Alignment) else alignment.align(self.original, suspect, align)
         observed = self.observe(aligned, weights)
         if isinstance(self.reader, KeyedCarrier) and self.detector is joint:
@@ -227,7 +227,12 @@ class Marker:
             f" {conditions.budget}, with noise of {conditions.noise:g} and half of it lost, not {self.bits}. {mend}."
         )
 
-    def _check_size(self, message: bytes) -> None:
+    def check_size(self, message: bytes) -> None:
+        """Refuse what is no message of just the payload's size.
+
+        Raises:
+            JaxmarkError: so.
+        """
         if not isinstance(message, bytes):
             raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
         if 8 * len(message) != self.bits:

@@ -78,8 +78,7 @@ def _attack(marker: Marker, message: bytes, slopes: Slope, steps: int) -> Attack
     original, reader = marker.original, marker.reader
     if not isinstance(reader, KeyedCarrier):
         raise JaxmarkError(f"Only keyed marks are erased so, not those of the scheme {marker.scheme.name!r}.")
-    if 8 * len(message) != marker.bits:
-        raise JaxmarkError(f"The message has {8 * len(message)} bits, but the payload is {marker.bits} bits.")
+    marker.check_size(message)
     codeword = jnp.asarray(encode(message, marker.key, original.geometry, marker.code), original.signal.dtype)
 
     def apply(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
