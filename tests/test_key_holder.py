@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.attacks.key_holder import _slope, erasure, erasure_by_descent
+from jaxmark.attacks.adversarial.key_holder import _slope, erasure, erasure_by_descent
 from jaxmark.mesh import Mesh
 from jaxmark.message import encode
 from tests.samples import bumpy_sphere
