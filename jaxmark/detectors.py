@@ -18,7 +18,7 @@ from jaxmark.chebyshev import filter, transpose
 from jaxmark.errors import JaxmarkError
 from jaxmark.observation import Observation
 from jaxmark.precision import matmul
-from jaxmark.reception import Receiver, Reception, clean, make_receiver, normal_factor, whitening
+from jaxmark.reception import Receiver, Reception, clean, even, make_receiver, normal_factor, whitening
 
 Detector = Callable[[Carrier, Observation, Strength], Float[Array, " bits"]]
 
@@ -57,6 +57,23 @@ def projected(carrier: Carrier, seen: Observation, beta: Strength = 1.0) -> Floa
     """
     carrier = _keyed("projected", carrier)
     return _projected(carrier, make_receiver(carrier.host), seen, beta)
+
+
+def claims(
+    carrier: Carrier, seen: Observation | Reception, codeword: Float[Array, " code"]
+) -> tuple[Float[Array, " ways"], Float[Array, " ways"]]:
+    """Score S and norm ‖a‖ of a claimed codeword in each way of weighing a suspect; see `Carrier.claim`.
+
+    A keyed carrier has two: by what the suspect shows of each band, which tells most, and all alike, which costs most
+    to attack. Each is a proof; who takes the best of them pays for both (`evidence.any_of`).
+    """
+    ways: tuple[Observation | Reception, ...] = (seen,)  # pyright: ignore[reportAssignmentType]
+    if isinstance(carrier, KeyedCarrier):
+        received = carrier.received(seen)
+        ways = received, even(received)
+    pairs = [carrier.claim(way, codeword) for way in ways]  # pyright: ignore[reportArgumentType]
+    scores, norms = (jnp.stack(values) for values in zip(*pairs, strict=True))
+    return scores, norms
 
 
 @jax.jit

@@ -15,7 +15,7 @@ from jaxmark import alignment, distortion, evidence
 from jaxmark.alignment import Align, Alignment
 from jaxmark.budget import Budget, make_budget, write
 from jaxmark.carriers import Carrier, KeyedCarrier
-from jaxmark.detectors import Detector, joint, projected
+from jaxmark.detectors import Detector, claims, joint, projected
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import Key, commitment
 from jaxmark.mesh import Mesh
@@ -149,22 +149,25 @@ class Marker:
         if isinstance(self.reader, KeyedCarrier) and self.detector is joint:
             # Reading and claiming begin alike.
             received = self.reader.received(observed)
-            soft, claim = np.asarray(joint(self.reader, received), np.float64), partial(self.reader.claim, received)
+            soft, claim = np.asarray(joint(self.reader, received), np.float64), partial(claims, self.reader, received)
         else:
-            soft, claim = self.soft_values(observed), partial(self.reader.claim, observed)
+            soft, claim = self.soft_values(observed), partial(claims, self.reader, observed)
         found = self._decoded(soft)
         log10_p = fitted = 0.0
         # Another message that reads refutes the claim, however much the two have in common.
         if (chosen := message or found) is not None and found in (None, chosen):
             codeword = encode(chosen, self.key, self.original.geometry, self.code)
-            score, norm = claim(jnp.asarray(codeword, observed.residual.dtype))
+            scores, norms = claim(jnp.asarray(codeword, observed.residual.dtype))
+            ways = list(zip(scores, norms, strict=True))
             if message is not None:
-                log10_p = evidence.log10_p_claimed(score, norm)
+                log10_p = evidence.any_of(*(evidence.log10_p_claimed(score, norm) for score, norm in ways))
             else:
                 log10_p = evidence.any_of(
-                    evidence.log10_p_tag(TAG_BITS, CANDIDATES), evidence.log10_p_read(score, norm, self.bits)
+                    evidence.log10_p_tag(TAG_BITS, CANDIDATES),
+                    *(evidence.log10_p_read(score, norm, self.bits) for score, norm in ways),
                 )
-            fitted = evidence.log10_p_fitted(score, norm, 0 if message is not None else self.bits)
+            unknown = 0 if message is not None else self.bits
+            fitted = evidence.any_of(*(evidence.log10_p_fitted(score, norm, unknown) for score, norm in ways))
         size = np.sqrt(np.mean(soft**2)) or 1.0
         coverage = float(np.mean(self.original.on_host(observed.weights)[self.original.used] > 0))
         return Detection(found, log10_p, fitted, soft / size, coverage, aligned)

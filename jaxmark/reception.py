@@ -226,6 +226,16 @@ def _receive(host: Receiver, seen: Observation) -> tuple[Array, Array, Array, Ar
     return (matmul(residual, axes), jnp.clip(gain, 0, 2), power, axes, seen, factor)
 
 
+def even(received: Reception) -> Reception:
+    """The same with all bands and directions weighed alike.
+
+    Bands are weighed by what little is in them, so who can empty a band, and turn what is left of a mark there, makes
+    it speak for all. With these weights nobody can.
+    """
+    flat = jnp.ones_like(received.power)
+    return received._replace(gain=flat, power=flat, axes=jnp.eye(3, dtype=received.axes.dtype))
+
+
 def whitening(host: Receiver, power: Float[Array, " bands"]) -> Float[Array, " terms"]:
     """Coefficients of the filter that makes all bands equally strong."""
     return matmul(host.coefficients.T, 1 / jnp.sqrt(power))

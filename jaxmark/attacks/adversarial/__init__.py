@@ -4,5 +4,9 @@ Those of `jaxmark.attacks` are what happens to any mesh; these are made for a wa
 which goes wherever a name of `ATTACKS` does.
 """
 
+from jaxmark.attacks.adversarial.blind import descent as descent
+from jaxmark.attacks.adversarial.blind import evolution as evolution
+from jaxmark.attacks.adversarial.blind import remarking as remarking
+from jaxmark.attacks.adversarial.blind import subtraction as subtraction
 from jaxmark.attacks.adversarial.key_holder import erasure as erasure
 from jaxmark.attacks.adversarial.key_holder import erasure_by_descent as erasure_by_descent

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxmark.alignment import align
+from jaxmark.attacks.adversarial.expected import strongest
 from jaxmark.attacks.registry import Attack
 from jaxmark.carriers import KeyedCarrier
 from jaxmark.distortion import rms
@@ -126,7 +127,6 @@ def _slope(
     carrier: KeyedCarrier, seen: Observation, codeword: Float[Array, " code"]
 ) -> tuple[Float[Array, ""], Float[Array, "vertices 3"]]:
     def evidence(residual: Array) -> Array:
-        score, norm = carrier.claim(seen._replace(residual=residual), codeword)
-        return score / norm
+        return strongest(carrier, seen._replace(residual=residual), codeword)
 
     return jax.value_and_grad(evidence)(seen.residual)
