@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.example_libraries import optimizers
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxmark.attacks.adversarial.expected import (
     Surrogate,
@@ -99,7 +99,8 @@ def descent(
     Raises:
         JaxmarkError: if there is no such family, or not one step is asked for.
     """
-    return _sought(family, partial(_descend, steps=steps), scheme, bits, mark, metric, steps)
+    _check(family, steps)
+    return _attack(jax.jit(partial(descended, family=family, steps=steps)), scheme, bits, mark, metric)
 
 
 def evolution(
@@ -128,33 +129,48 @@ def evolution(
     """
     if family == "vertices":
         raise JaxmarkError("All vertices are too many parameters for an evolution; choose 'bands' or 'warps'.")
-    return _sought(family, partial(_evolve, generations=generations), scheme, bits, mark, metric, generations)
+    _check(family, generations)
+    return _attack(jax.jit(partial(evolved, family=family, generations=generations)), scheme, bits, mark, metric)
+
+
+def descended(
+    surrogate: Surrogate, strength: Float[Array, ""], key: PRNGKeyArray, *, family: Family, steps: int
+) -> Displacement:
+    """The displacement that `descent` finds, in diagonals; pure, also under `vmap` over keys (restarts).
+
+    Args:
+        surrogate: from `expected.make_surrogate`.
+        strength: its size.
+        key: a JAX random key.
+        family: see `descent`.
+        steps: see `descent`.
+    """
+    return _sought(surrogate, strength, key, family, partial(_descend, steps=steps))
+
+
+def evolved(
+    surrogate: Surrogate, strength: Float[Array, ""], key: PRNGKeyArray, *, family: Family, generations: int
+) -> Displacement:
+    """The displacement that `evolution` finds; see `descended`."""
+    return _sought(surrogate, strength, key, family, partial(_evolve, generations=generations))
 
 
 def _sought(
-    family: Family,
-    seek: Callable[..., Parameters],
-    scheme: str | Scheme,
-    bits: int,
-    mark: float,
-    metric: str,
-    steps: int,
-) -> Attack:
+    surrogate: Surrogate, strength: Array, key: PRNGKeyArray, family: Family, seek: Callable[..., Parameters]
+) -> Displacement:
+    start, make = _FAMILIES[family](surrogate, jax.random.fold_in(key, 0))
+
+    def loss(parameters: Parameters, key: PRNGKeyArray) -> Array:
+        return evidence(surrogate, sized(surrogate, make(parameters), strength), key)
+
+    return sized(surrogate, make(seek(loss, start, jax.random.fold_in(key, 1))), strength)
+
+
+def _check(family: Family, steps: int) -> None:
     if family not in get_args(Family):
         raise JaxmarkError(f"There is no family of displacements {family!r}; there are {', '.join(get_args(Family))}.")
     if steps < 1:
         raise JaxmarkError(f"An attack by optimisation needs at least one step, got {steps}.")
-
-    @jax.jit
-    def way(surrogate: Surrogate, strength: Array, key: PRNGKeyArray) -> Displacement:
-        start, make = _FAMILIES[family](surrogate, jax.random.fold_in(key, 0))
-
-        def loss(parameters: Parameters, key: PRNGKeyArray) -> Array:
-            return evidence(surrogate, sized(surrogate, make(parameters), strength), key)
-
-        return make(seek(loss, start, jax.random.fold_in(key, 1)))
-
-    return _attack(way, scheme, bits, mark, metric)
 
 
 def _attack(
@@ -181,7 +197,8 @@ def _descend(
 
     def step(state: Any, count: Array) -> tuple[Any, None]:
         slope = jax.grad(loss)(get(state), jax.random.fold_in(key, count))
-        return update(count, slope, state), None  # pyright: ignore[reportArgumentType]
+        # A number of the parameters' own type, for they are not mixed.
+        return update(count.astype(jax.tree.leaves(slope)[0].dtype), slope, state), None  # pyright: ignore
 
     return get(jax.lax.scan(step, init(start), jnp.arange(steps))[0])
 

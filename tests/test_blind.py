@@ -1,0 +1,126 @@
+"""Attackers without the key: sizes, gradients against finite differences, and each against weaker ones."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmark as jm
+from jaxmark.attacks.adversarial import blind
+from jaxmark.attacks.adversarial.expected import evidence, make_surrogate, rms, size, sized
+from jaxmark.detectors import claims
+from jaxmark.distortion import compare
+from jaxmark.mesh import Mesh
+from jaxmark.message import encode
+from tests.samples import bumpy_sphere
+
+MESSAGE, MARK = b"ok", 2e-3
+
+
+@pytest.fixture(scope="module")
+def marked(key: jm.Key) -> tuple[jm.Marker, Mesh]:
+    marker = jm.make_marker(bumpy_sphere(3), key, bits=16)
+    return marker, marker.embed(MESSAGE, MARK, noise=0)[0]
+
+
+def owner_sees(marker: jm.Marker, suspect: Mesh) -> float:
+    """The largest S/‖a‖ of a claim of the message under the owner's key."""
+    code = encode(MESSAGE, marker.key, marker.original.geometry, marker.code)
+    seen = marker.observe(suspect)
+    scores, norms = claims(marker.reader, seen, jnp.asarray(code, seen.residual.dtype))
+    return float(jnp.max(scores / norms))
+
+
+def test_an_attacker_sees_on_average_what_the_owner_sees(marked):
+    marker, mesh = marked
+    surrogate, _ = make_surrogate(mesh, "keyed", 16, MARK)
+    still = jnp.zeros_like(surrogate.signal)
+    found = [float(evidence(surrogate, still, jax.random.key(seed))) for seed in range(4)]
+    assert np.mean(found) == pytest.approx(owner_sees(marker, mesh), rel=0.05)
+
+
+@pytest.mark.parametrize("scheme", ["keyed", "host"])
+def test_gradients_agree_with_finite_differences(scheme, key: jm.Key, x64):
+    marker = jm.make_marker(bumpy_sphere(2), key, bits=8, scheme=scheme)
+    mesh = marker.embed(b"k", 5e-3, noise=0, read_back=False)[0]
+    surrogate, _ = make_surrogate(mesh, scheme, 8, 5e-3)
+    random = np.random.default_rng(0)
+    place, way = (
+        sized(surrogate, jnp.asarray(random.normal(size=surrogate.signal.shape)), jnp.asarray(s)) for s in (5e-3, 1e-6)
+    )
+    value = jax.jit(lambda shift: evidence(surrogate, shift, jax.random.key(1)))
+    slope = jnp.sum(jax.grad(value)(place) * way)
+    wanted = (value(place + way) - value(place - way)) / 2
+    assert float(slope) == pytest.approx(float(wanted), rel=1e-5)
+
+
+def test_sizes(marked):
+    _, mesh = marked
+    surrogate, original = make_surrogate(mesh, "keyed", 16, MARK, "dame")
+    noise = jax.random.normal(jax.random.key(0), surrogate.signal.shape, surrogate.signal.dtype)
+    # The metric, as small displacements make it.
+    shift = sized(surrogate, noise, jnp.asarray(2e-3, noise.dtype))
+    assert float(size(surrogate, shift)) == pytest.approx(2e-3, rel=1e-4)
+    moved = mesh._replace(vertices=mesh.vertices + original.diagonal * original.on_host(shift))
+    assert compare(mesh, moved, ["dame"]).dame == pytest.approx(2e-3, rel=0.15)
+    plain = make_surrogate(mesh, "keyed", 16, MARK)[0]
+    assert float(rms(plain, sized(plain, noise, jnp.asarray(1e-3, noise.dtype)))) == pytest.approx(1e-3, rel=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["keyed", "host", "eigen"])
+def test_who_optimises_does_more_than_who_writes_another_mark(scheme, key: jm.Key):
+    marker = jm.make_marker(bumpy_sphere(3), key, bits=16, scheme=scheme)
+    mesh = marker.embed(MESSAGE, MARK, noise=0)[0]
+    # Where a mark is half gone.
+    strength = 2 * MARK
+    found = {}
+    for name, attack in {
+        "remarking": blind.remarking(scheme=scheme, bits=16),
+        "vertices": blind.descent("vertices", scheme=scheme, bits=16, mark=MARK),
+        "bands": blind.descent("bands", scheme=scheme, bits=16, mark=MARK),
+        "evolution": blind.evolution("bands", scheme=scheme, bits=16, mark=MARK),
+    }.items():
+        suspects = [jm.attack(mesh, attack, strength, seed=seed) for seed in range(2)]
+        for suspect in suspects:
+            assert jm.distortion.moved(mesh, suspect).rms == pytest.approx(strength, rel=1e-3)
+        found[name] = np.mean([owner_sees(marker, suspect) for suspect in suspects])
+    before = owner_sees(marker, mesh)
+    assert found["bands"] < found["remarking"] < before
+    assert found["vertices"] < found["remarking"]
+    assert found["evolution"] < found["remarking"]
+
+
+def test_what_is_subtracted_is_some_of_the_mark(marked):
+    marker, mesh = marked
+    suspect = jm.attack(mesh, blind.subtraction(bits=16, mark=MARK), 1e-4, seed=0)
+    mark = np.asarray(mesh.vertices) - np.asarray(marker.original.mesh.vertices)
+    gone = np.asarray(mesh.vertices) - np.asarray(suspect.vertices)
+    random = np.asarray(jm.attack(mesh, "jamming", 1e-4, seed=0).vertices) - np.asarray(mesh.vertices)
+    assert np.sum(mark * gone) > 3 * abs(np.sum(mark * random)) > 0
+
+
+def test_restarts_by_vmap(marked):
+    _, mesh = marked
+    surrogate, _ = make_surrogate(mesh, "keyed", 16, MARK)
+    strength = jnp.asarray(1e-3, surrogate.signal.dtype)
+    seek = partial(blind.descended, surrogate, strength, family="warps", steps=2)
+    keys = jax.random.split(jax.random.key(0), 2)
+    together = jax.jit(jax.vmap(seek))(keys)
+    assert together.shape == (2, *surrogate.signal.shape)
+    np.testing.assert_allclose(together[1], jax.jit(seek)(keys[1]), atol=2e-6)
+    assert not np.allclose(together[0], together[1], atol=1e-4)
+
+
+def test_refusals(marked):
+    _, mesh = marked
+    with pytest.raises(jm.JaxmarkError, match="no family of displacements 'faces'"):
+        blind.descent("faces")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(jm.JaxmarkError, match="at least one step"):
+        blind.descent(steps=0)
+    with pytest.raises(jm.JaxmarkError, match="too many parameters"):
+        blind.evolution("vertices")
+    with pytest.raises(jm.JaxmarkError, match="no scheme 'none'"):
+        jm.attack(mesh, blind.remarking(scheme="none"), 1e-3, seed=0)
