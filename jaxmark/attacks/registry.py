@@ -202,7 +202,9 @@ def _attacked(mesh: Mesh, entry: Attack, strength: float, key: PRNGKeyArray) -> 
     return _with_copies(mesh, welded, points, found)
 
 
-def _together(meshes: Sequence[Mesh], welded: Weld, entry: Attack, strength: float, keys: Key[Array, " meshes"]) -> list[Mesh]:
+def _together(
+    meshes: Sequence[Mesh], welded: Weld, entry: Attack, strength: float, keys: Key[Array, " meshes"]
+) -> list[Mesh]:
     """A traced attack on meshes of the same faces and welding, all at once."""
     small = [_small(welded_mesh(mesh, welded)) for mesh in meshes]
     faces = small[0].mesh.faces
