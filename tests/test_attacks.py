@@ -339,7 +339,13 @@ def test_a_mark_reads_in_noise_of_twice_its_size(marked: tuple[jm.Marker, Mesh])
     assert marker.detect(noisy).message == b"jaxmark!"
 
 
-@pytest.mark.parametrize(("kind", "strength"), [*MILD, ("midpoint", 1), ("holes", 0.1)])
+@pytest.mark.parametrize(
+    ("kind", "strength"),
+    [
+        *(pytest.param(*one, marks=() if one[0] in ("noise", "smoothing") else pytest.mark.slow) for one in MILD),
+        *(("midpoint", 1), ("holes", 0.1)),
+    ],
+)
 def test_several_meshes_at_once_are_as_one_by_one(cap: Mesh, kind: str, strength: float):
     # With a copy of a vertex, at two sizes and places.
     faces = np.vstack([cap.faces, [[len(cap.vertices), 0, 1]]])
