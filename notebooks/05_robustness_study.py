@@ -17,19 +17,19 @@ study = jm.Study(
     meshes={"model": MESH},
     schemes=["keyed"],
     budgets=[2e-4],  # RMS of the mark over the diagonal: weak, so that there is something to lose
-    attacks={"noise": [0.005, 0.02], "smoothing": [50]},
+    attacks={"noise": [0.005, 0.02], "quantisation": [7]},
     seeds=3,
 )
 results = study.run(FOLDER / "results.jsonl", say=print)
 
 # %% [markdown]
-# Each line of `results.jsonl` is a finished cell. Run the cell above again: nothing is left to do, and it ends at once. Add
-# a strength or a seed, and only that is done. With `workers=2` there are two processes; a script (not Jupyter) then has to
+# Each line of `results.jsonl` is a finished cell. Run the cell above again: nothing is left to do, and it ends at once.
+# Add a strength, and only that is done. With `workers=2` there are two processes; a script (not Jupyter) then has to
 # start them below `if __name__ == "__main__":`.
 #
-# Every seed stands for a trial of its own: another key, another message, another attack. So the trials are independent, and
-# the share that was read has an exact interval (Clopper and Pearson, 1934), which covers the true rate with at least 95 %
-# probability whatever it is. From three trials that all read, it begins at 29 %: few trials prove little.
+# Every seed stands for a trial of its own: another key, another message, another attack. So the trials are independent,
+# and the share that was read has an exact interval (Clopper and Pearson, 1934), which covers the true rate with at
+# least 95 % probability whatever it is. From three trials that all read, it begins at 29 %: few trials prove little.
 
 # %%
 print(results.markdown())
@@ -52,8 +52,9 @@ for rate in results.rates(["control"]):
         assert rate["detected"] == 0
 
 # %% [markdown]
-# The curves: the share of messages read over the strength of each attack, the controls in grey; and the evidence, with the
-# level at which a mark counts as detected. With pandas (extra `study`), `results.frame()` is a table of all readings.
+# The curves: the share of messages read over the strength of each attack, the controls in grey; and the evidence, with
+# the level at which a mark counts as detected. With pandas (extra `study`), `results.frame()` is a table of all
+# readings.
 
 # %%
 results.plot(FOLDER / "read.png")
