@@ -289,6 +289,7 @@ def test_help_teaches_and_units_are_stated(workshop: Workshop):
         ["compare"],
         ["capacity"],
         ["identify"],
+        ["study"],
         ["demo"],
     ):
         code, out, _ = workshop(*command, "--help")
