@@ -1,8 +1,8 @@
 """The command line: files in, files and one answer out.
 
 Exit status 0: done, or detected. 1: `detect` found nothing, `identify` nobody. 2: refused, with one sentence on
-standard error and no output file. With --json, standard output holds exactly one JSON object. Of a folder, each file has
-a line, or such an object; the worst of them is the status.
+standard error and no output file. With --json, standard output holds exactly one JSON object. Of a folder, each file
+has a line, or such an object; the worst of them is the status.
 """
 
 import json
