@@ -41,6 +41,7 @@ from jaxmark.record import Record as Record
 from jaxmark.robustness import Robustness as Robustness
 from jaxmark.robustness import minimum_distortion as minimum_distortion
 from jaxmark.robustness import robustness as robustness
+from jaxmark.study import Study as Study
 from jaxmark.tardos import Accusation as Accusation
 from jaxmark.tracing import Tracer as Tracer
 from jaxmark.tracing import fingerprint as fingerprint

@@ -56,16 +56,15 @@ def run(
         try:
             with pool() as executor:
                 futures = {executor.submit(work, cell): cell for cell in left}
-                for future in as_completed(futures):
-                    try:
-                        row = future.result()
-                    except BaseException:
-                        executor.shutdown(wait=False, cancel_futures=True)
-                        raise
-                    _append(target, {"cell": futures[future], **row})
-                    broken, missing = 0, missing - 1
-                    pace = (time.monotonic() - start) / (count - missing)
-                    say(f"{len(cells) - missing}/{len(cells)}, about {missing * pace / 60:.0f} min left")
+                try:
+                    for future in as_completed(futures):
+                        _append(target, {"cell": futures[future], **future.result()})
+                        broken, missing = 0, missing - 1
+                        pace = (time.monotonic() - start) / (count - missing)
+                        say(f"{len(cells) - missing}/{len(cells)}, about {missing * pace / 60:.0f} min left")
+                except BaseException:  # an interruption, too: what has not begun does not begin
+                    executor.shutdown(wait=False, cancel_futures=True)
+                    raise
         except BrokenExecutor as error:
             broken += 1
             if broken == _ATTEMPTS:

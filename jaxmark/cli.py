@@ -1,36 +1,37 @@
 """The command line: files in, files and one answer out.
 
 Exit status 0: done, or detected. 1: `detect` found nothing, `identify` nobody. 2: refused, with one sentence on
-standard error and no output file. With --json, standard output holds exactly one JSON object.
+standard error and no output file. With --json, standard output holds exactly one JSON object. Of a folder, each file
+has a line, or such an object; the worst of them is the status.
 """
 
 import json
 import math
 import os
 import sys
-import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NoReturn, get_args
 
 import click
 
 from jaxmark import distortion
 from jaxmark.alignment import Align
 from jaxmark.attacks import ATTACKS, chain, get_attack
+from jaxmark.batch import Reader, Told, mark_file, mesh_files
 from jaxmark.budget import DEFAULT_LIMITS, make_budget
 from jaxmark.errors import JaxmarkError
+from jaxmark.extras import require
 from jaxmark.files import load_mesh, save_mesh
-from jaxmark.files.atomic import write_atomically
+from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.keys import commitment, load_key, new_key, save_key
-from jaxmark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity, detect, make_marker
+from jaxmark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity
 from jaxmark.mesh import same_connectivity
-from jaxmark.original import residual
 from jaxmark.record import RECORD_SUFFIX, Record
-from jaxmark.report import save_report
 from jaxmark.schemes import DEFAULT_SCHEME, SCHEMES
-from jaxmark.tracing import identify, make_tracer
+from jaxmark.study_file import load_study
+from jaxmark.tracing import identify
 
 
 class _Hexadecimal(click.ParamType):
@@ -169,58 +170,34 @@ def embed_command(
     record_file: Path | None,
     as_json: bool,
 ) -> None:
-    """Mark ORIGINAL and write MARKED, of the same format.
+    """Mark ORIGINAL and write MARKED, of the same format; or every mesh file of a folder into another folder.
 
     Only positions change (and normals, where the file has them); materials, colours, groups and comments stay byte by
     byte. A record goes beside MARKED: it holds no secret, and with it nothing about the mark needs remembering.
+
+    Of a folder, each file has a line, and one that is refused does not stop the others.
     """
-    record_file = record_file or marked.with_name(marked.name + RECORD_SUFFIX)
-    _check_outputs(original, marked)
-    _distinct(original=original, marked=marked, key=key_file, record=record_file)
-    key = load_key(key_file)
-    mesh = load_mesh(original)
-    if (message is None) == (recipient is None):
-        raise JaxmarkError("Give either --message or --recipient.")
-    marker = None
-    if message is not None:
-        marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
-        result, info = marker.embed(message, budget, limits=dict(limits) or None, noise=noise, read_back=False)
-        prepared = marker.original
-        said, reads = f"{info.record.bits} bits", lambda mesh: marker.reads(mesh, message)
-    else:
-        if scheme != DEFAULT_SCHEME:
-            raise JaxmarkError(f"Fingerprints are carried by the scheme {DEFAULT_SCHEME!r}, not {scheme!r}.")
-        tracer, name = make_tracer(mesh, key), str(recipient)
-        result, info = tracer.fingerprint(name, budget, limits=dict(limits) or None)
-        prepared = tracer.marker.original
-        said, reads = f"fingerprint of {recipient}", lambda mesh: tracer.finds(mesh, name)
-    with _replacing(marked) as draft, _replacing(record_file) as record_draft:
-        save_mesh(result, draft, like=original)
-        # What counts is the file: its numbers are rounded.
-        written = load_mesh(draft)
-        if not reads(written):
-            if marker is not None and message is not None:
-                marker.check(result, message)
-            raise JaxmarkError(
-                f"Rounded to the numbers of {original}, the mark no longer reads; use a larger budget, or a file with"
-                " more digits."
-            )
-        write_atomically(record_draft, info.record.to_json().encode())
-    change = distortion.Moved.of(residual(prepared, written)[prepared.used])
-    answer = {
-        "rms": change.rms,
-        "max": change.max,
-        "bits": info.record.bits,
-        "scheme": info.record.scheme,
-        "content": info.record.content,
-        "record": str(record_file),
-        "marked": str(marked),
-    }
-    _answer(
-        as_json,
-        answer,
-        f"{said} → {marked}, RMS {change.rms:.3g} and max {change.max:.3g} of the diagonal; record → {record_file}",
+    mark = partial(
+        mark_file,
+        message=message,
+        recipient=recipient,
+        budget=budget,
+        limits=dict(limits) or None,
+        noise=noise,
+        scheme=scheme,
     )
+    _distinct(original=original, marked=marked)
+    if not original.is_dir():
+        record_file = record_file or marked.with_name(marked.name + RECORD_SUFFIX)
+        _check_outputs(original, marked)
+        _distinct(original=original, marked=marked, key=key_file, record=record_file)
+        told = mark(original, marked, record_file, key=load_key(key_file))
+        return _answer(as_json, told.answer, told.said)
+    if record_file is not None:
+        raise JaxmarkError("Each file of a folder has a record beside it; leave out --record.")
+    key = load_key(key_file)
+    marked.mkdir(parents=True, exist_ok=True)
+    _each(original, as_json, lambda file: mark(file, marked / file.name, marked / (file.name + RECORD_SUFFIX), key=key))
 
 
 @cli.command(name="detect")
@@ -256,52 +233,29 @@ def detect_command(
     alpha: float,
     as_json: bool,
 ) -> None:
-    """Look for a mark in SUSPECT: any file in any pose, in the original's connectivity or not.
+    """Look for a mark in SUSPECT: any file in any pose, in the original's connectivity or not; or a folder of them.
 
     Exit status 0 if the false-positive probability is at most --alpha, else 1. It holds for any suspect made without
     the key, as long as key, original and a claimed message were fixed before the suspect was seen.
+
+    Of a folder, each file has a line, and the worst of them is the exit status. --original and --record may be folders
+    then, with files of the same names.
     """
-    record = None if record_file is None else Record.load(record_file)
-    if record is not None and scheme not in (None, record.scheme):
-        raise JaxmarkError(f"--scheme {scheme} contradicts the record, which says {record.scheme}.")
-    key = load_key(key_file)
-    mesh, still = load_mesh(suspect), load_mesh(original)
-    found = detect(
-        mesh,
-        original=still,
-        key=key,
-        bits=bits,
-        message=message,
-        record=record,
-        scheme=scheme or DEFAULT_SCHEME,
-        align=how,
-    )
-    aligned = found.alignment
-    if report is not None:
-        save_report(report, still, mesh, aligned)
-    detected = found.detected(alpha)
-    answer = {
-        "detected": detected,
-        "log10_p": found.log10_p,
-        "log10_p_fitted": found.log10_p_fitted,
-        "message": None if found.message is None else found.message.hex(),
-        "scores": [float(score) for score in found.scores],
-        "coverage": found.coverage,
-        "alignment": {
-            "method": aligned.method,
-            "pose": {"matrix": aligned.pose.matrix.tolist(), "shift": aligned.pose.shift.tolist()},
-            "residual": aligned.residual,
-            "seconds": aligned.seconds,
-        },
-    }
-    read = f"message {answer['message']}" if found.message is not None else "no message could be read"
-    _answer(
-        as_json,
-        answer,
-        f"{'detected' if detected else 'nothing detected'}: {read}; false-positive probability at most"
-        f" 10^{found.log10_p:.1f} (--alpha {alpha:g})",
-    )
-    sys.exit(0 if detected else 1)
+    reader = Reader(load_key(key_file), bits, message, scheme, how, alpha)
+    if suspect.is_dir():
+        _each(
+            suspect,
+            as_json,
+            lambda file: reader.read(
+                file,
+                _member(original, file.name),
+                None if record_file is None else _member(record_file, file.name + RECORD_SUFFIX),
+                None if report is None else report / file.name,
+            ),
+        )
+    told = reader.read(suspect, original, record_file, report)
+    _answer(as_json, told.answer, told.said)
+    sys.exit(0 if told.done else 1)
 
 
 @cli.command(name="identify")
@@ -372,7 +326,7 @@ def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int
     _check_outputs(source, target)
     _distinct(IN=source, OUT=target)
     mesh = load_mesh(source)
-    with _replacing(target) as draft:
+    with replacing(target) as draft:
         attacked = chain(mesh, steps, seed=seed)
         same = same_connectivity(mesh, attacked)
         save_mesh(attacked, draft, like=source if same else None)
@@ -453,6 +407,46 @@ def demo(mesh: Path | None, output: Path, as_json: bool) -> None:
         _answer(True, {"output": str(output), "rows": [row._asdict() for row in rows]}, "")
 
 
+@cli.command(name="study")
+@click.argument("file", type=_MESH)
+@click.option(
+    "--output", type=_MESH, default=Path("study-output"), show_default=True, help="Folder for what it leaves."
+)
+@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="How many processes.")
+@_JSON
+def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None:
+    """Run the study that a TOML FILE declares: what marks survive, with intervals and controls.
+
+    \b
+      seeds = 5
+      schemes = ["keyed", "host"]
+      payloads = [64]
+      budgets = [0.0008, {dame = 0.008}]
+      [meshes]
+      model = "model.ply"
+      [attacks]
+      noise = [0.001, 0.005]
+      smoothing = [10, 50]
+
+    Only meshes, from the folder of FILE, and attacks must be there. Leaves results.jsonl, from which the same command
+    goes on where it was ended, results.csv, rates.md and, with the extra `plot`, read.png and log10_p.png.
+    """  # noqa: D301
+    study = load_study(file)
+    output.mkdir(parents=True, exist_ok=True)
+    results = study.run(output / "results.jsonl", workers, _say)
+    results.save_csv(output / "results.csv")
+    table = results.markdown()
+    write_atomically(output / "rates.md", table.encode())
+    try:
+        require("matplotlib", "plot")
+    except JaxmarkError as error:
+        _say(f"No pictures: {error}")
+    else:
+        results.plot(output / "read.png")
+        results.plot(output / "log10_p.png", "log10_p")
+    _answer(as_json, {"output": str(output), "readings": len(results.rows), "rates": results.rates()}, table.rstrip())
+
+
 def main() -> None:
     """Run the command line; refused input ends with status 2 and one sentence."""
     try:
@@ -461,19 +455,48 @@ def main() -> None:
         sys.exit(end.exit_code)
     except click.Abort:
         _refuse("Interrupted.")
-    except click.ClickException as error:
-        _refuse(error.format_message())
-    except JaxmarkError as error:
-        _refuse(str(error))
-    except OSError as error:
-        _refuse(f"{error.filename or 'A file'} cannot be used: {error.strerror or error}.")
     except Exception as error:  # status 1 would say "nothing detected"
-        _refuse(f"Unexpected {type(error).__name__}: {error}. Please report it, with the command and the files.")
+        _refuse(_sentence(error))
 
 
-def _refuse(sentence: str) -> None:
-    click.echo(f"jaxmark: {' '.join(sentence.split())}", err=True)
+def _sentence(error: Exception) -> str:
+    match error:
+        case click.ClickException():
+            said = error.format_message()
+        case JaxmarkError():
+            said = str(error)
+        case OSError():
+            said = f"{error.filename or 'A file'} cannot be used: {error.strerror or error}."
+        case _:
+            said = f"Unexpected {type(error).__name__}: {error}. Please report it, with the command and the files."
+    return " ".join(said.split())
+
+
+def _refuse(sentence: str) -> NoReturn:
+    click.echo(f"jaxmark: {sentence}", err=True)
     sys.exit(2)
+
+
+def _say(line: str) -> None:
+    click.echo(line, err=True)
+
+
+def _each(folder: Path, as_json: bool, work: Callable[[Path], Told]) -> NoReturn:
+    """Work on the mesh files of a folder, a line for each; exit with the worst status."""
+    status = 0
+    for file in mesh_files(folder):
+        try:
+            told = work(file)
+        except Exception as error:
+            told, status = Told({"refused": _sentence(error)}, f"refused. {_sentence(error)}", False), 2
+        status = max(status, 0 if told.done else 1)
+        _answer(as_json, {"file": file.name, **told.answer}, f"{file.name}: {told.said}")
+    sys.exit(status)
+
+
+def _member(path: Path, name: str) -> Path:
+    """A file, or that of a folder."""
+    return path / name if path.is_dir() else path
 
 
 def _answer(as_json: bool, answer: Mapping[str, Any], text: str) -> None:
@@ -507,16 +530,3 @@ def _distinct(**files: Path) -> None:
         other = seen.setdefault(os.path.realpath(path), name)
         if other != name:
             raise JaxmarkError(f"{other} and {name} are the same file, {path}; give another name.")
-
-
-@contextmanager
-def _replacing(target: Path) -> Iterator[Path]:
-    """A draft beside a file, of the same name, that takes its place if all goes well and vanishes if not."""
-    if not target.parent.is_dir():
-        raise JaxmarkError(f"The folder {target.parent} does not exist.")
-    if target.is_dir():
-        raise JaxmarkError(f"{target} is a folder; name a file.")
-    with tempfile.TemporaryDirectory(prefix=".jaxmark-", dir=target.parent) as folder:
-        draft = Path(folder) / target.name
-        yield draft
-        draft.replace(target)

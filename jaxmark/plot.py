@@ -1,8 +1,9 @@
 """Pictures of meshes by matplotlib: headless, deterministic, without OpenGL. Needs the extra `plot`."""
 
+import io
 import os
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -38,9 +39,6 @@ def save_views(
         JaxmarkError: if matplotlib is missing, a mesh is unusable, or the file cannot be written.
     """
     require("matplotlib", "plot")
-    import io
-
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.2 * len(views), 4.4), layout="constrained")
@@ -51,6 +49,17 @@ def save_views(
         panel.set_title(view.title, fontsize=10)
         if drawn is not None:
             figure.colorbar(drawn, ax=panel, label=view.unit, shrink=0.7)
+    save_figure(figure, path)
+
+
+def save_figure(figure: Any, path: str | os.PathLike[str]) -> None:
+    """Draw a figure of matplotlib into a PNG file, written whole or not at all, without a screen.
+
+    Raises:
+        JaxmarkError: if the file cannot be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     buffer = io.BytesIO()
     FigureCanvasAgg(figure).print_figure(buffer, format="png", dpi=130)
     write_atomically(path, buffer.getvalue())

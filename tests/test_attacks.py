@@ -10,6 +10,7 @@ import jaxmark as jm
 from jaxmark.attacks import (
     ATTACKS,
     affine,
+    attack_each,
     diagonal_noise,
     gaussian_noise,
     laplacian_smoothing,
@@ -336,3 +337,32 @@ def test_a_mark_reads_in_noise_of_twice_its_size(marked: tuple[jm.Marker, Mesh])
     marker, mesh = marked
     noisy = mark_noise(mesh, marker.original.mesh, 2.0, jax.random.key(0))
     assert marker.detect(noisy).message == b"jaxmark!"
+
+
+@pytest.mark.parametrize(
+    ("kind", "strength"),
+    [
+        *(pytest.param(*one, marks=() if one[0] in ("noise", "smoothing") else pytest.mark.slow) for one in MILD),
+        *(("midpoint", 1), ("holes", 0.1)),
+    ],
+)
+def test_several_meshes_at_once_are_as_one_by_one(cap: Mesh, kind: str, strength: float):
+    # With a copy of a vertex, at two sizes and places.
+    faces = np.vstack([cap.faces, [[len(cap.vertices), 0, 1]]])
+    vertices = np.vstack([cap.vertices, cap.vertices[300]])
+    meshes = [make_mesh(scale * vertices + 7, faces) for scale in (1.0, 3.0)]
+    found = attack_each(meshes, kind, strength, seeds=[4, 5])
+    for mesh, one, seed in zip(meshes, found, (4, 5), strict=True):
+        alone = jm.attack(mesh, kind, strength, seed=seed)
+        np.testing.assert_array_equal(one.faces, alone.faces)
+        np.testing.assert_allclose(one.vertices, alone.vertices, rtol=0, atol=1e-5)
+        moved = one.vertices.shape != mesh.vertices.shape or np.abs(one.vertices - mesh.vertices).max() > 1e-4
+        assert moved
+
+
+def test_meshes_of_different_faces_are_attacked_each_by_itself(sphere: Mesh, cap: Mesh):
+    found = attack_each([sphere, cap], "noise", 0.01, seeds=[1, 2])
+    for mesh, one, seed in zip((sphere, cap), found, (1, 2), strict=True):
+        np.testing.assert_array_equal(one.vertices, jm.attack(mesh, "noise", 0.01, seed=seed).vertices)
+    with pytest.raises(jm.JaxmarkError, match="strength of an attack"):
+        attack_each([sphere], "noise", -1.0, seeds=[1])

@@ -289,6 +289,7 @@ def test_help_teaches_and_units_are_stated(workshop: Workshop):
         ["compare"],
         ["capacity"],
         ["identify"],
+        ["study"],
         ["demo"],
     ):
         code, out, _ = workshop(*command, "--help")
@@ -322,7 +323,9 @@ def test_a_closed_pipe_does_not_change_the_status(workshop: Workshop):
 
 
 def test_an_interrupted_write_leaves_no_output(workshop: Workshop, monkeypatch):
-    monkeypatch.setattr("jaxmark.cli.write_atomically", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
+    monkeypatch.setattr(
+        "jaxmark.batch.write_atomically", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left"))
+    )
     assert "No space left" in workshop.refused(
         "embed", "model.ply", "out.ply", "--key", "owner.key", "--message", MESSAGE
     )

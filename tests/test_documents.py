@@ -3,6 +3,7 @@
 import pkgutil
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -23,6 +24,9 @@ def folder(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     trimesh.Trimesh(*bumpy_sphere(4), process=False).export("model.ply")
     Path("names.txt").write_text("alice\nbob\n")
+    Path("models").mkdir()
+    shutil.copy("model.ply", "models")
+    Path("study.toml").write_text('seeds = 1\n[meshes]\nmodel = "model.ply"\n[attacks]\nnoise = [0.005]\n')
     return tmp_path
 
 
@@ -36,6 +40,7 @@ def test_python_blocks_of_the_readme_run(folder: Path, unchecked, capsys):
     assert "0123456789abcdef" in capsys.readouterr().out
     assert (names["scores"] > 0).tolist() == [True, False, False, True]
     assert sorted(one.recipient for one in names["accused"] if one.log10_p < -6) == ["alice", "bob"]
+    assert [rate["read"] for rate in names["results"].rates() if rate["control"] == "marked"] == [2, 2]
     assert names["gradient"].shape == names["x"].shape
 
 

@@ -30,6 +30,7 @@ from jaxmark.attacks.registry import Attack as Attack
 from jaxmark.attacks.registry import Kind as Kind
 from jaxmark.attacks.registry import Step as Step
 from jaxmark.attacks.registry import attack as attack
+from jaxmark.attacks.registry import attack_each as attack_each
 from jaxmark.attacks.registry import chain as chain
 from jaxmark.attacks.registry import get_attack as get_attack
 from jaxmark.attacks.remeshing import iso_surface as iso_surface

@@ -4,8 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float64, Key, PRNGKeyArray
 
 from jaxmark.attacks.affine import affine, similarity
 from jaxmark.attacks.bilateral import bilateral_smoothing
@@ -28,7 +29,7 @@ from jaxmark.attacks.subdivision import loop, midpoint, sqrt3
 from jaxmark.attacks.symmetry import instance_averaging, mirror_averaging
 from jaxmark.attacks.warping import bending, twisting, warp
 from jaxmark.errors import JaxmarkError
-from jaxmark.mesh import Mesh, compacted, diagonal, host_mesh, same_connectivity, used_vertices, weld, welded_mesh
+from jaxmark.mesh import Mesh, Weld, compacted, diagonal, host_mesh, same_connectivity, used_vertices, weld, welded_mesh
 
 
 class Attack(NamedTuple):
@@ -140,11 +141,36 @@ def chain(mesh: Mesh, steps: Sequence[Step], *, seed: int) -> Mesh:
     """
     entries = [(get_attack(kind), strength) for kind, strength in steps]
     for place, (entry, strength) in enumerate(entries):
-        if not (np.isfinite(strength) and strength >= 0):
-            raise JaxmarkError(f"The strength of an attack must be a number, not negative, got {strength}.")
+        _check_strength(strength)
         key = jax.random.key(seed)
         mesh = _attacked(host_mesh(mesh), entry, strength, jax.random.fold_in(key, place) if place else key)
     return mesh
+
+
+def attack_each(meshes: Sequence[Mesh], kind: Kind, strength: float, *, seeds: Sequence[int]) -> list[Mesh]:
+    """Put several meshes through one attack, each with randomness of its own; see `attack`, which this is for one mesh.
+
+    A traced attack on meshes of the same faces, such as copies marked differently, is one `jax.vmap`: the same random
+    numbers, and positions that differ by rounding at most.
+
+    Args:
+        meshes: at least one.
+        kind: see `attack`.
+        strength: see `attack`.
+        seeds: for each mesh, of the attack's randomness.
+
+    Raises:
+        JaxmarkError: see `attack`; one for all.
+    """
+    entry, meshes = get_attack(kind), [host_mesh(mesh) for mesh in meshes]
+    _check_strength(strength)
+    welded = weld(meshes[0].vertices)
+    if entry.host or not all(
+        same_connectivity(mesh, meshes[0]) and np.array_equal(weld(mesh.vertices).point, welded.point)
+        for mesh in meshes[1:]
+    ):
+        return [attack(mesh, entry, strength, seed=seed) for mesh, seed in zip(meshes, seeds, strict=True)]
+    return _together(meshes, welded, entry, strength, jnp.stack([jax.random.key(seed) for seed in seeds]))
 
 
 def get_attack(kind: Kind) -> Attack:
@@ -160,10 +186,43 @@ def get_attack(kind: Kind) -> Attack:
     return ATTACKS[kind]
 
 
+def _check_strength(strength: float) -> None:
+    if not (np.isfinite(strength) and strength >= 0):
+        raise JaxmarkError(f"The strength of an attack must be a number, not negative, got {strength}.")
+
+
 def _attacked(mesh: Mesh, entry: Attack, strength: float, key: PRNGKeyArray) -> Mesh:
     welded = weld(mesh.vertices)
     points = welded_mesh(mesh, welded)
-    found = (entry.apply if entry.host else _at_unit_size(entry.apply))(points, strength, key)
+    if entry.host:
+        found = entry.apply(points, strength, key)
+    else:
+        small = _small(points)
+        found = small.back(entry.apply(small.mesh, strength, key))
+    return _with_copies(mesh, welded, points, found)
+
+
+def _together(
+    meshes: Sequence[Mesh], welded: Weld, entry: Attack, strength: float, keys: Key[Array, " meshes"]
+) -> list[Mesh]:
+    """A traced attack on meshes of the same faces and welding, all at once."""
+    small = [_small(welded_mesh(mesh, welded)) for mesh in meshes]
+    faces = small[0].mesh.faces
+
+    def apply(vertices: Array, key: PRNGKeyArray) -> tuple[Array, Array]:
+        moved = entry.apply(Mesh(vertices, faces), strength, key)
+        return jnp.asarray(moved.vertices), jnp.asarray(moved.faces)
+
+    starts = np.stack([one.mesh.vertices for one in small])
+    vertices, faces = jax.vmap(apply, out_axes=(0, None))(jnp.asarray(starts), keys)
+    return [
+        _with_copies(mesh, welded, one.points, one.back(Mesh(moved, faces)))
+        for mesh, one, moved in zip(meshes, small, np.asarray(vertices), strict=True)
+    ]
+
+
+def _with_copies(mesh: Mesh, welded: Weld, points: Mesh, found: Mesh) -> Mesh:
+    """What an attack has made of a mesh's points, as a mesh with its copies, where these can be told."""
     found = Mesh(np.asarray(found.vertices, np.float64), np.asarray(found.faces, np.int64))
     still = found.vertices.shape == points.vertices.shape and np.array_equal(found.vertices, points.vertices)
     if not (same_connectivity(found, points) or (still and len(found.faces) == len(points.faces))):
@@ -173,19 +232,25 @@ def _attacked(mesh: Mesh, entry: Attack, strength: float, key: PRNGKeyArray) -> 
     return Mesh(found.vertices[welded.point], faces)
 
 
-def _at_unit_size(apply: Callable[[Mesh, Any, Any], Mesh]) -> Callable[[Mesh, Any, Any], Mesh]:
-    """An attack near the origin and at unit size, where float32 keeps its digits."""
+class _Small(NamedTuple):
+    """A mesh near the origin and at unit size, where float32 keeps its digits."""
 
-    def applied(points: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
-        centre, length = np.asarray(points.vertices)[used_vertices(points)].mean(axis=0), diagonal(points)
-        start = (points.vertices - centre) / length
-        moved = apply(Mesh(start, points.faces), strength, key)
-        found = np.asarray(moved.vertices)
-        there = centre + length * found.astype(np.float64)
+    points: Mesh  # as it was
+    mesh: Mesh
+    centre: Float64[np.ndarray, "3"]
+    length: float
+
+    def back(self, moved: Mesh) -> Mesh:
+        """What became of it, where it was."""
+        found, start = np.asarray(moved.vertices), np.asarray(self.mesh.vertices)
+        there = self.centre + self.length * found.astype(np.float64)
         # What the attack left alone stays exactly where it was.
         count = min(len(start), len(found))
         still = found[:count] == start[:count].astype(found.dtype)
-        there[:count] = np.where(still, points.vertices[:count], there[:count])
+        there[:count] = np.where(still, self.points.vertices[:count], there[:count])
         return Mesh(there, np.asarray(moved.faces))
 
-    return applied
+
+def _small(points: Mesh) -> _Small:
+    centre, length = np.asarray(points.vertices)[used_vertices(points)].mean(axis=0), diagonal(points)
+    return _Small(points, Mesh((points.vertices - centre) / length, points.faces), centre, length)

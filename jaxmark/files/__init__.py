@@ -12,7 +12,7 @@ from jaxmark.files.atomic import write_atomically
 from jaxmark.files.source import Source
 from jaxmark.mesh import Mesh, host_mesh, make_mesh
 
-__all__ = ["load_mesh", "save_mesh", "write_atomically"]
+__all__ = ["SUFFIXES", "load_mesh", "save_mesh", "write_atomically"]
 
 _FORMATS: dict[str, Callable[[bytes], Source]] = {
     ".obj": obj.parse,
@@ -21,6 +21,7 @@ _FORMATS: dict[str, Callable[[bytes], Source]] = {
     ".stl": stl.parse,
     ".glb": glb.parse,
 }
+SUFFIXES = tuple(_FORMATS)
 # A displacement is kept well enough if it is this many times the spacing of the file's numbers.
 _STEPS = 10
 

@@ -2,6 +2,9 @@
 
 import os
 import secrets
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from jaxmark.errors import JaxmarkError
@@ -46,3 +49,20 @@ def write_atomically(path: str | os.PathLike, data: bytes, *, mode: int | None =
             raise
     except OSError as error:
         raise JaxmarkError(f"Cannot write {os.fspath(path)}: {error.strerror or error}.") from error
+
+
+@contextmanager
+def replacing(target: Path) -> Iterator[Path]:
+    """A draft beside a file, of the same name, that takes its place if all goes well and vanishes if not.
+
+    Raises:
+        JaxmarkError: if there is no such folder, or a folder of that name.
+    """
+    if not target.parent.is_dir():
+        raise JaxmarkError(f"The folder {target.parent} does not exist.")
+    if target.is_dir():
+        raise JaxmarkError(f"{target} is a folder; name a file.")
+    with tempfile.TemporaryDirectory(prefix=".jaxmark-", dir=target.parent) as folder:
+        draft = Path(folder) / target.name
+        yield draft
+        draft.replace(target)
