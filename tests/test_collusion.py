@@ -87,9 +87,9 @@ def test_strength_is_of_the_jamming(copies):
 
 
 def test_refusals(copies, unchecked):
-    mesh, *others = copies.values()
+    _, *others = copies.values()
     with pytest.raises(jm.JaxmarkError, match="not 'mode'"):
-        colluded(others, "mode")
+        colluded(others, "mode")  # pyright: ignore[reportArgumentType]
     with pytest.raises(jm.JaxmarkError, match="share their connectivity"):
         jm.attack(bumpy_sphere(2), colluded(others, "mean"), 1e-3, seed=0)
     with pytest.raises(jm.JaxmarkError, match="these 0 do not"):

@@ -111,7 +111,7 @@ def test_the_nearest_of_two_planes_is_neared(marked):
         return bool(abs(np.sum((suspect.vertices - mesh.vertices) * way)) < np.sum(way**2))
 
     sizes = [
-        jm.distortion.moved(mesh, jm.attack(mesh, boundary(before), queries, seed=0)).rms for queries in (40, 200, 1000)
+        jm.distortion.moved(mesh, jm.attack(mesh, boundary(before), queries, seed=0)).rms for queries in (40, 160, 480)
     ]
     # The least is the way itself; a random start is farther by about √dimensions.
     assert 1e-3 < sizes[2] < sizes[1] < sizes[0]
@@ -134,9 +134,9 @@ def test_defences(marked, key: jm.Key):
 def test_answers_beat_chance(marked, make):
     marker, mesh = marked
     score = score_oracle(marker, MESSAGE)
-    attack = make(score, queries=60)
+    attack = make(score, queries=40)
     chance = min(score(jm.attack(mesh, "jamming", 2e-3, seed=seed)) for seed in range(5))
-    assert score(jm.attack(mesh, attack, 2e-3, seed=0)) < chance - 1
+    assert score(jm.attack(mesh, attack, 2e-3, seed=0)) < chance - 0.5
 
 
 @pytest.mark.slow
@@ -147,12 +147,13 @@ def test_decisions_beat_chance(marked):
     assert oracle.queries == 300
     assert not marker.detect(moved, MESSAGE).detected()
     wide = jm.ATTACKS["jamming"]._replace(strengths=(1e-3, 0.1))
-    jammed = jm.minimum_distortion(marker, mesh, MESSAGE, wide, metrics=("rms",))
-    assert jm.distortion.moved(mesh, moved).rms < jammed.weakest.distortion.rms
+    jammed = jm.minimum_distortion(marker, mesh, MESSAGE, wide, metrics=("rms",)).weakest
+    assert jammed is not None
+    assert jm.distortion.moved(mesh, moved).rms < jammed.strength
 
 
 def test_refusals(marked):
-    marker, mesh = marked
+    marker, _ = marked
     with pytest.raises(jm.JaxmarkError, match="24 bits, but the payload is 16"):
         score_oracle(marker, b"too")
     with pytest.raises(jm.JaxmarkError, match="must be in"):

@@ -33,6 +33,7 @@ _FIRST, _LAST = 1e-4, 0.2  # of jamming that is tried for a start
 _QUERIES = (100, 300, 1000)
 _TOLERANCE = 0.01  # of bisection, over the whole way
 _BATCH = 30  # directions for the first normal
+_AT_ONCE = 32  # directions that are filtered together
 
 Score = Callable[[Mesh], float]
 Decision = Callable[[Mesh], bool]
@@ -287,8 +288,10 @@ class _Space:
 
     def draw(self, count: int, random: np.random.Generator) -> Float64[np.ndarray, "count vertices 3"]:
         """So many that look like marks, each of RMS 1."""
-        noise = jnp.asarray(random.normal(size=(len(self.used), 3 * count)), np.float32)
-        found = np.asarray(through_bands(self.operator, noise), np.float64).reshape(len(self.used), count, 3)
+        batch = min(count, _AT_ONCE)  # all batches of one shape are compiled once
+        batches = [random.normal(size=(len(self.used), 3 * batch)) for _ in range(-(-count // batch))]
+        noise = [np.asarray(through_bands(self.operator, jnp.asarray(one, np.float32))) for one in batches]
+        found = np.concatenate(noise, axis=1)[:, : 3 * count].reshape(len(self.used), count, 3).astype(np.float64)
         ways = np.where(self.used[:, None], np.moveaxis(found, 1, 0), 0)
         return ways / np.sqrt(np.sum(ways**2, axis=(1, 2), keepdims=True) / self.used.sum())
 
