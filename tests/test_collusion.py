@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.attacks.adversarial.collusion import colluded, combined
+from jaxmark.attacks.adversarial.collusion import Rule, colluded, combined
 from jaxmark.attacks.adversarial.oracle import score_oracle
 from jaxmark.mesh import Mesh
 from tests.samples import bumpy_sphere
@@ -58,15 +58,21 @@ def test_the_circumcentre_is_as_far_from_all_copies(copies, marker: jm.Marker):
     assert np.linalg.norm(rest) <= np.linalg.norm(marker.original.mesh.vertices - mean)
 
 
-def test_enough_copies_give_the_original_back():
-    # Points on a sphere, more than dimensions: their circumcentre is its centre, wherever they lie.
-    random = np.random.default_rng(0)
-    centre = random.normal(size=(3, 3))
-    away = random.normal(size=(12, 3, 3))
-    away /= np.linalg.norm(away, axis=(1, 2), keepdims=True)
-    faces = np.array([[0, 1, 2]])
-    found = combined([Mesh(centre + one, faces) for one in away], "circumcentre", RANDOM)
-    np.testing.assert_allclose(found.vertices, centre, atol=1e-6)
+def test_enough_copies_give_the_original_back(key: jm.Key):
+    """Marks of one key lie in a space of as many dimensions as the code has bits: more copies span it."""
+    marker = jm.make_marker(bumpy_sphere(2), key, bits=16)
+    messages = [bytes(one) for one in np.random.default_rng(0).integers(0, 256, (marker.code + 20, 2), np.uint8)]
+    copies = [marker.embed(one, 8e-4, noise=0, read_back=False)[0] for one in messages]
+    original = marker.original.mesh.vertices
+
+    def left(rule: Rule, count: int) -> float:
+        """Of the mark, over that of one copy."""
+        found = combined(copies[:count], rule, RANDOM).vertices
+        return float(np.linalg.norm(found - original) / np.linalg.norm(copies[0].vertices - original))
+
+    assert left("circumcentre", len(copies)) < 1e-4
+    assert left("circumcentre", 20) > 0.1
+    assert left("mean", len(copies)) > 0.01
 
 
 @pytest.mark.parametrize("rule", ["mean", "median", "minimum", "maximum", "mixing", "circumcentre"])

@@ -25,7 +25,7 @@ from jaxmark.mesh import Mesh, diagonal, host_mesh, used_vertices
 from jaxmark.message import encode
 
 _UNIT = "RMS over the diagonal"
-_STRENGTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
+_STRENGTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 _ROUNDS = 4  # of gradients: more are each of fewer directions, and see less of them
 _PROBE = 0.3  # over the displacement, where scores tell
 _NEAR = 0.05  # over the displacement, where decisions tell: the boundary bends
