@@ -18,6 +18,7 @@ from jaxmark.mesh import weld
 
 COALITIONS = (1, 2, 3, 5, 8, 10)
 WAYS: dict[str, Rule] = {"average": "mean", "mixing vertices": "mixing", "median": "median", "minimum": "minimum"}
+ALONE: dict[str, Rule] = {"itself": "mean"}
 
 
 def main() -> None:
@@ -38,7 +39,7 @@ def main() -> None:
     )
     random = np.random.default_rng(0)
     for count in COALITIONS:
-        for way, rule in WAYS.items() if count > 1 else [("itself", "mean")]:
+        for way, rule in (WAYS if count > 1 else ALONE).items():
             suspect = combined(copies[:count], rule, random)
             suspect = jm.attack(suspect, "noise", arguments.noise, seed=count)
             start = time.perf_counter()
