@@ -12,9 +12,13 @@ import time
 import numpy as np
 
 import jaxmark as jm
+from jaxmark.attacks.adversarial import combined
+from jaxmark.attacks.adversarial.collusion import Rule
 from jaxmark.mesh import weld
 
 COALITIONS = (1, 2, 3, 5, 8, 10)
+WAYS: dict[str, Rule] = {"average": "mean", "mixing vertices": "mixing", "median": "median", "minimum": "minimum"}
+ALONE: dict[str, Rule] = {"itself": "mean"}
 
 
 def main() -> None:
@@ -28,24 +32,16 @@ def main() -> None:
     tracer = jm.make_tracer(mesh, jm.Key(bytes(32)))
     names = [f"recipient {i}" for i in range(arguments.recipients)]
     guilty = names[: max(COALITIONS)]
-    copies = np.stack([tracer.fingerprint(name, arguments.budget)[0].vertices for name in guilty])
-    point = weld(mesh.vertices).point  # copies of a point go the same way
-    print(f"{point.max() + 1} points, {tracer.marker.code} slots, {len(names)} recipients")
+    copies = [tracer.fingerprint(name, arguments.budget)[0] for name in guilty]
+    print(f"{len(weld(mesh.vertices).first)} points, {tracer.marker.code} slots, {len(names)} recipients")
     print(
         "| colluders | by | members accused | innocents accused | best log10 p | seconds |\n|---|---|---|---|---|---|"
     )
     random = np.random.default_rng(0)
     for count in COALITIONS:
-        mine = copies[:count]
-        who = random.integers(count, size=point.max() + 1)[point]
-        ways = {
-            "average": mine.mean(axis=0),
-            "mixing vertices": mine[who, np.arange(len(who))],
-            "median": np.median(mine, axis=0),
-            "minimum": mine.min(axis=0),
-        }
-        for way, vertices in ways.items() if count > 1 else [("itself", mine[0])]:
-            suspect = jm.attack(mesh._replace(vertices=vertices), "noise", arguments.noise, seed=count)
+        for way, rule in (WAYS if count > 1 else ALONE).items():
+            suspect = combined(copies[:count], rule, random)
+            suspect = jm.attack(suspect, "noise", arguments.noise, seed=count)
             start = time.perf_counter()
             found = tracer.identify(suspect, names, top=2 * max(COALITIONS))
             seconds = time.perf_counter() - start

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Float64, PRNGKeyArray
 from jaxmark.attacks.extent import displaced_by
 from jaxmark.bands import scaling
 from jaxmark.chebyshev import filter
-from jaxmark.laplacian import make_laplacian
+from jaxmark.laplacian import Operator, make_laplacian
 from jaxmark.mesh import Mesh
 from jaxmark.schemes import DERIVED, KeyedScheme
 
@@ -30,7 +30,17 @@ def jamming(mesh: Mesh, strength: float | Float[Array, ""], key: PRNGKeyArray) -
     """
     vertices = jnp.asarray(mesh.vertices)
     noise = jax.random.normal(key, vertices.shape, vertices.dtype)
-    return displaced_by(mesh, filter(make_laplacian(mesh), _shape().astype(vertices.dtype), noise), strength)
+    return displaced_by(mesh, through_bands(make_laplacian(mesh), noise), strength)
+
+
+def through_bands(operator: Operator, noise: Float[Array, "vertices columns"]) -> Float[Array, "vertices columns"]:
+    """Noise through the bands of the default scheme, in their strengths: what a mark looks like to a stranger.
+
+    Args:
+        operator: the Laplacian of the mesh.
+        noise: any columns; white ones give the covariance of a mark, up to a factor.
+    """
+    return filter(operator, _shape().astype(noise.dtype), noise)
 
 
 def _shape() -> Float64[np.ndarray, " terms"]:
