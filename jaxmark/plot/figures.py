@@ -29,6 +29,7 @@ class Picture(NamedTuple):
         """The picture as a file's bytes; the same each time."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+        self.figure.draw_without_rendering()  # colour bars find their places in the second pass
         buffer = io.BytesIO()
         FigureCanvasAgg(self.figure).print_figure(buffer, format="png", dpi=130)
         return buffer.getvalue()

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.files.atomic import write_atomically
-from jaxmark.mesh import Mesh, host_mesh
+from jaxmark.mesh import Mesh, diagonal, host_mesh
 from jaxmark.plot.figures import FIELD
 
 
@@ -42,7 +42,8 @@ def show(mesh: Mesh, values: Float[np.ndarray, " vertices"] | None = None, unit:
         unit: of the values, for the legend.
 
     Raises:
-        JaxmarkError: if matplotlib is missing, or there is not one finite value for each vertex.
+        JaxmarkError: if matplotlib is missing, or there is not one finite value for each vertex, or see
+            `jaxmark.mesh.diagonal`.
     """
     require("matplotlib", "plot")
     import trimesh  # takes long to import
@@ -58,8 +59,13 @@ def show(mesh: Mesh, values: Float[np.ndarray, " vertices"] | None = None, unit:
         most = max(float(values.max()), 1e-300)
         colours = colormaps[FIELD](np.clip(np.asarray(values, np.float64) / most, 0, 1), bytes=True)
         legend = _legend([colormaps[FIELD](step) for step in np.linspace(0, 1, 9)], most, unit)
-    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
-    return Viewer(scene_to_html(trimesh.Scene(solid)), legend)
+    # At unit size, between the near and the far plane of the viewer's camera.
+    points = (mesh.vertices - np.mean(mesh.vertices, axis=0)) / diagonal(mesh)
+    solid = trimesh.Trimesh(points, mesh.faces, vertex_colors=colours, process=False)
+    # Names, which would be random.
+    scene = trimesh.Scene({"mesh": solid}, camera=trimesh.scene.Camera("camera", fov=(60, 45)))
+    scene.set_camera()
+    return Viewer(scene_to_html(scene), legend)
 
 
 def _legend(colours: list[tuple[float, ...]], most: float, unit: str) -> str:
