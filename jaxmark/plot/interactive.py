@@ -47,6 +47,7 @@ def show(mesh: Mesh, values: Float[np.ndarray, " vertices"] | None = None, unit:
     """
     require("matplotlib", "plot")
     import trimesh  # takes long to import
+    from trimesh.scene import Camera, Scene
     from trimesh.viewer.notebook import scene_to_html
 
     mesh = host_mesh(mesh)
@@ -63,7 +64,7 @@ def show(mesh: Mesh, values: Float[np.ndarray, " vertices"] | None = None, unit:
     points = (mesh.vertices - np.mean(mesh.vertices, axis=0)) / diagonal(mesh)
     solid = trimesh.Trimesh(points, mesh.faces, vertex_colors=colours, process=False)
     # Names, which would be random.
-    scene = trimesh.Scene({"mesh": solid}, camera=trimesh.scene.Camera("camera", fov=(60, 45)))
+    scene = Scene({"mesh": solid}, camera=Camera("camera", fov=(60, 45)))
     scene.set_camera()
     return Viewer(scene_to_html(scene), legend)
 

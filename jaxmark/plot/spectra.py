@@ -10,6 +10,7 @@ from numpy.polynomial import chebyshev
 from jaxmark import visibility
 from jaxmark.bands import nodes, scaling
 from jaxmark.channels import band_energies
+from jaxmark.distortion import Metric, name_of
 from jaxmark.mesh import Mesh
 from jaxmark.original import Original, residual
 from jaxmark.plot.figures import FIELD, Picture, finish, panels, styles
@@ -79,20 +80,20 @@ def mean_squares(
     return np.where(energies > floor, energies, np.nan) / original.used.sum()
 
 
-def band_visibility(original: Original, metrics: Sequence[str], bands: int = 64) -> Picture:
+def band_visibility(original: Original, metrics: Sequence[Metric], bands: int = 64) -> Picture:
     """How far metrics rise for a unit of displacement in each band (`jaxmark.visibility.band_visibility`).
 
     Args:
         original: the original.
-        metrics: names in `jaxmark.distortion.METRICS`.
+        metrics: names in `jaxmark.distortion.METRICS`, or functions of your own.
         bands: how many Jackson-damped scaling functions.
 
     Raises:
-        JaxmarkError: if matplotlib is missing, or see `jaxmark.distortion.compare`.
+        JaxmarkError: if matplotlib is missing, or see `jaxmark.distortion.measure`.
     """
     found = visibility.band_visibility(original, scaling(bands, damping="jackson"), metrics)
     figure, (axes,) = panels(1, 6.5, 4.2)
     for name, row, style in zip(metrics, found, styles(bands), strict=False):
-        axes.plot(nodes(bands), row, label=name, **style)
+        axes.plot(nodes(bands), row, label=name_of(name), **style)
     finish(axes, xlabel=_FREQUENCY, ylabel="metric / (RMS displacement / diagonal)", yscale="log")
     return Picture(figure)
