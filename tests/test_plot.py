@@ -162,7 +162,7 @@ def test_p_values_lie_below_a_bound_that_holds_and_above_one_that_does_not():
     assert (drawn["twice its exponent (2000)"][1] > bound)[(x > -3) & (x < -2.2)].all()
     hits = np.array([np.sum(sound <= at) for at in x])
     check_shade(picture, 0, x, hits, 2000)
-    assert labels(picture) == ("x", "share of suspects with log10 p ≤ x")
+    assert labels(picture) == ("x, a log10 p", "share of suspects with log10 p ≤ x")
 
 
 def check_shade(picture: plot.Picture, place: int, x: np.ndarray, hits: np.ndarray, trials: int) -> None:
