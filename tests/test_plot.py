@@ -86,7 +86,7 @@ def test_spectra_are_sums_over_eigenvectors():
     rng = np.random.default_rng(0)
     shifts = 1e-3 * rng.normal(size=(2, *original.positions.shape))
     marked, suspect = displaced(original, shifts[0]), displaced(original, shifts.sum(axis=0))
-    picture = plot.spectra(original, marked, {"attack": suspect}, 16)
+    picture = plot.spectra(original, {"mark": (original.mesh, marked), "attack": (marked, suspect)}, 16)
     drawn = lines(picture)
     assert list(drawn) == ["host", "mark", "attack"]
     values, vectors, _ = eigenpairs(original.operator)

@@ -58,7 +58,13 @@ def p_values(log10_p: Mapping[str, Float[np.ndarray, " suspects"]], *, confidenc
     figure, (axes,) = panels(1, 6.5, 4.2)
     _frequencies(axes, log10_p, grid, confidence)
     axes.plot(grid, 10**grid, label="the bound, 10^x", **BOUND)
-    finish(axes, xlabel="x, a log10 p", ylabel="share of suspects with log10 p ≤ x", yscale="log", ylim=(0.3 / max(most, 10), 1.5))
+    finish(
+        axes,
+        xlabel="x, a log10 p",
+        ylabel="share of suspects with log10 p ≤ x",
+        yscale="log",
+        ylim=(0.3 / max(most, 10), 1.5),
+    )
     return Picture(figure)
 
 

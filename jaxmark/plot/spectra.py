@@ -42,24 +42,23 @@ def responses(families: Mapping[str, Float[np.ndarray, "bands terms"]], mark: Se
     return Picture(figure)
 
 
-def spectra(original: Original, marked: Mesh, suspects: Mapping[str, Mesh], bands: int = 64) -> Picture:
-    """How much of host, mark and attacks lies in each of some Jackson-damped scaling functions.
+def spectra(original: Original, moves: Mapping[str, tuple[Mesh, Mesh]], bands: int = 64) -> Picture:
+    """How much of the host, and of what moved it, lies in each of some Jackson-damped scaling functions.
 
-    A point is the mean square of a vertex's displacement in the band: of the host from the centre, of the marked mesh
-    from the original, of a suspect from the marked mesh.
+    A point is the mean square of a vertex's displacement in the band; of the host, from its centre.
 
     Args:
         original: the original.
-        marked: the mesh with the mark.
-        suspects: attacked copies, by what was done to them; of the same connectivity, in the original's pose.
+        moves: meshes before and after, by what was done: original and marked one, marked and attacked one. All of the
+            original's connectivity, in its pose.
         bands: how many.
 
     Raises:
         JaxmarkError: if matplotlib is missing, or a connectivity differs.
     """
-    mark = residual(original, marked)
-    signals = {"host": original.on_host(original.signal), "mark": mark}
-    signals |= {name: residual(original, suspect) - mark for name, suspect in suspects.items()}
+    signals = {"host": original.on_host(original.signal)}
+    for name, (before, after) in moves.items():
+        signals[name] = residual(original, after) - residual(original, before)
     figure, (axes,) = panels(1, 6.5, 4.2)
     for (name, signal), style in zip(signals.items(), styles(bands), strict=False):
         axes.plot(nodes(bands), mean_squares(original, signal, bands), label=name, **style)
