@@ -11,7 +11,7 @@ from jaxmark.plot.figures import BOUND, Picture, band, finish, panels, styles
 from jaxmark.robustness import Robustness
 
 _GRID = 241  # values of log10 α on a curve
-_DECADE = 10.0  # strengths that span more are drawn by their logarithms
+_DECADE = 10.0  # strengths that span so much are drawn by their logarithms
 
 
 def roc(
@@ -86,7 +86,7 @@ def success(curves: Mapping[str, Robustness], unit: str, *, confidence: float = 
         rate, interval = read / samples, clopper_pearson(read, samples, confidence)
         bars = np.maximum([rate - interval.low, interval.high - rate], 0)
         axes.errorbar(curve.strengths, rate, bars, label=name, capsize=3, **style)
-    wide = strengths.min() > 0 and strengths.max() > _DECADE * strengths.min()
+    wide = strengths.min() > 0 and strengths.max() >= _DECADE * strengths.min()
     finish(axes, xlabel=f"strength: {unit}", ylabel="share of messages read", xscale="log" if wide else "linear")
     first = next(iter(curves.values())).strengths
     if first[0] > first[-1]:  # fewer bits are a stronger attack: weak ones stay on the left
