@@ -22,7 +22,7 @@ print(f"{len(mesh.vertices)} vertices moved by RMS {info.rms:.4%} of the diagona
 # %%
 original = marker.original
 shown = plot.displacement(original, marked)
-plot.draw([plot.View("original", mesh), plot.View("marked", marked), plot.exaggerated(original, marked), shown])
+plot.draw([plot.View("marked", marked), plot.exaggerated(original, marked), shown])
 
 # %%
 plot.show(shown.mesh, shown.values, shown.unit)

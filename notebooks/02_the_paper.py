@@ -152,10 +152,10 @@ for coherence in (0.0, 0.001, 0.7):
 # %% [markdown]
 # ## Section 2.2: embedding and detection
 #
-# $x^w = x + \sum_j \alpha\beta p_j x_j$: a bit α = ±1, a strength β, keyed signs $p_j$; several bits share the
-# components by orthogonal sequences of signs. The reader has the original, and correlates what was changed with the same
-# components. We mark the bunny by three schemes, equally strongly: as printed; in a form that works (damped, at unit
-# norm, and all bits solved for at once); and by eigenvectors.
+# $x^w = x + \sum_j \alpha\beta p_j x_j$: a bit α = ±1, a strength β, keyed signs $p_j$.
+# Several bits share the components by orthogonal sequences of signs. The reader has the original, and correlates what
+# was changed with the same components. We mark the bunny by three schemes, equally strongly: as printed; in a form that
+# works (damped, at unit norm, and all bits solved for at once); and by eigenvectors.
 
 # %%
 MESSAGE = b"\xa5\x5a"
