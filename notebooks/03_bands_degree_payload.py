@@ -148,11 +148,11 @@ except jm.JaxmarkError as refusal:
 
 # %%
 curves = {}
-for size in (2, 32):
+for size in (2, 16):
     one = jm.make_marker(mesh, jm.Key(bytes(32)), bits=8 * size)
     message = bytes(range(size))
     mesh_with, _ = one.embed(message, 4e-4, noise=0, read_back=False)
-    curves[f"{8 * size} bits"] = jm.robustness(one, mesh_with, message, "noise", [0.004, 0.008, 0.016], samples=2)
+    curves[f"{8 * size} bits"] = jm.robustness(one, mesh_with, message, "noise", [0.004, 0.012], samples=2)
     print(f"{8 * size} bits:", curves[f"{8 * size} bits"].success.mean(axis=1))
 plot.success(curves, jm.ATTACKS["noise"].unit)
 

@@ -23,7 +23,6 @@ for band in (0, 1, 3, 7, 15, 31):
     print(
         f"band {band:2}: DAME {visible[0, band]:8.3f} rad, GL {visible[1, band]:6.3f}, for a unit of RMS displacement"
     )
-plot.band_visibility(original, ["dame", "gl"])
 
 # %% [markdown]
 # Two attacks and one limit. The report says what each attack leaves of the best strengths found, and what no strengths
