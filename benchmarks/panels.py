@@ -4,11 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import numpy as np
+from jaxmark.plot.figures import Picture, finish, panels, styles
 
-from jaxmark.extras import require
-
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of Okabe and Ito
 Curves = dict[str, tuple[list[float], list[float]]]
 
 
@@ -23,19 +20,14 @@ class Panel(NamedTuple):
     title: str = ""
 
 
-def pictures(panels: Sequence[Panel], stem: Path) -> None:
+def pictures(drawn: Sequence[Panel], stem: Path) -> None:
     """One PNG for each figure, its panels side by side."""
-    require("matplotlib", "plot")
-    from matplotlib.figure import Figure
-
-    for number in dict.fromkeys(panel.figure for panel in panels):
-        mine = [panel for panel in panels if panel.figure == number]
-        figure = Figure(figsize=(1.5 + 4.5 * len(mine), 4.5), layout="constrained")
-        for axes, panel in zip(np.atleast_1d(figure.subplots(1, len(mine), sharey=True)), mine, strict=True):
-            for (name, (x, y)), colour, marker in zip(panel.curves.items(), COLOURS, "os^Dvx", strict=False):
-                axes.plot(x, y, color=colour, label=name, marker=marker if len(x) < 100 else "")
-            axes.set(xlabel=panel.x, ylabel=panel.y, title=panel.title)
-            axes.set(xscale=panel.scale.split()[0], yscale="log" if panel.scale == "log" else "linear")
-            axes.grid(alpha=0.3)
-            axes.legend()
-        figure.savefig(stem.with_name(f"{stem.name}-{number}.png"), dpi=150)
+    for number in dict.fromkeys(panel.figure for panel in drawn):
+        mine = [panel for panel in drawn if panel.figure == number]
+        figure, every = panels(len(mine), 5.0, 4.5, sharey=True)
+        for axes, panel in zip(every, mine, strict=True):
+            for (name, (x, y)), style in zip(panel.curves.items(), styles(0), strict=False):
+                axes.plot(x, y, label=name, **style | {"markevery": max(1, len(x) // 12)})
+            x_scale, y_scale = panel.scale.split()[0], "log" if panel.scale == "log" else "linear"
+            finish(axes, xlabel=panel.x, ylabel=panel.y, title=panel.title, xscale=x_scale, yscale=y_scale)
+        Picture(figure).save(stem.with_name(f"{stem.name}-{number}.png"))

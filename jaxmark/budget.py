@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxmark import distortion
+from jaxmark.distortion import Metric, name_of
 from jaxmark.errors import JaxmarkError
 from jaxmark.mesh import Mesh
 from jaxmark.original import Original, displaced, residual
@@ -22,15 +23,20 @@ _EXACT = 0.99  # of a limit is as good as all of it
 _SECANTS = 10  # then halves, which cannot fail
 
 
+Limits = Mapping[str, float] | Mapping[Metric, float]
+
+
 class Budget(NamedTuple):
     """An upper bound on each of these; make one with `make_budget`."""
 
     rms: float | None  # displacement of the welded vertices that faces use, unweighted, over the diagonal
-    limits: Mapping[str, float]  # on metrics, by their names in `distortion.METRICS`
+    limits: Mapping[Metric, float]  # on metrics, by their names in `distortion.METRICS`, or on functions of your own
 
     def __str__(self) -> str:
         parts = [] if self.rms is None else [f"a budget of {self.rms:g}"]
-        return " and ".join(parts + [f"{name} of at most {limit:g}" for name, limit in self.limits.items()])
+        return " and ".join(
+            parts + [f"{name_of(metric)} of at most {limit:g}" for metric, limit in self.limits.items()]
+        )
 
 
 class Written(NamedTuple):
@@ -41,7 +47,7 @@ class Written(NamedTuple):
     moved: distortion.Moved
 
 
-def make_budget(rms: float | None = None, limits: Mapping[str, float] | None = None) -> Budget:
+def make_budget(rms: float | None = None, limits: Limits | None = None) -> Budget:
     """A budget of what is given; of `DEFAULT_LIMITS` if nothing is.
 
     Raises:
@@ -51,14 +57,16 @@ def make_budget(rms: float | None = None, limits: Mapping[str, float] | None = N
         raise JaxmarkError(f"The budget is relative to the bounding box's diagonal and in (0, 1), got {rms}.")
     if limits is None:
         limits = {} if rms is not None else DEFAULT_LIMITS
-    for name, value in limits.items():
-        if name not in distortion.METRICS:
-            raise JaxmarkError(f"There is no metric {name!r} to limit; there are {', '.join(distortion.METRICS)}.")
+    checked: dict[Metric, float] = {}
+    for metric, value in limits.items():
+        if isinstance(metric, str) and metric not in distortion.METRICS:
+            raise JaxmarkError(f"There is no metric {metric!r} to limit; there are {', '.join(distortion.METRICS)}.")
         if not 0 < value < math.inf:
-            raise JaxmarkError(f"The limit of {name} must be a positive number, got {value}.")
+            raise JaxmarkError(f"The limit of {name_of(metric)} must be a positive number, got {value}.")
+        checked[metric] = value
     if rms is None and not limits:
         raise JaxmarkError("A mark needs a budget or at least one limit.")
-    return Budget(rms, dict(limits))
+    return Budget(rms, checked)
 
 
 def write(original: Original, shift: Float64[np.ndarray, "points 3"], budget: Budget) -> Written:
@@ -71,14 +79,14 @@ def write(original: Original, shift: Float64[np.ndarray, "points 3"], budget: Bu
 
     Raises:
         JaxmarkError: if the displacement is lost in rounding; if limits alone do not hold it below an RMS of 0.01; or
-            see `distortion.compare`.
+            see `distortion.measure`.
     """
     size = float(distortion.rms(shift[original.used]))
 
     def within(rms: float) -> float:
         """The largest of the metrics over their limits."""
-        found = distortion.compare(original.mesh, displaced(original, rms / size * shift), budget.limits)._asdict()
-        return max(found[name] / limit for name, limit in budget.limits.items())
+        found = distortion.measure(original.mesh, displaced(original, rms / size * shift), budget.limits.keys())
+        return max((found[metric] or 0.0) / limit for metric, limit in budget.limits.items())
 
     rms = budget.rms or _MOST
     if budget.limits:

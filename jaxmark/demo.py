@@ -19,10 +19,9 @@ from jaxmark.marking import Marker, make_marker
 from jaxmark.mesh import Mesh
 from jaxmark.message import encode
 from jaxmark.original import Original
-from jaxmark.plot import View, save_views
+from jaxmark.plot import View, displacement, exaggerated, save_views, visibility
 from jaxmark.record import RECORD_SUFFIX
 from jaxmark.schemes import DEFAULT_SCHEME, SCHEMES
-from jaxmark.visibility import masking
 
 _ATTACKS = (
     ("noise", 0.001),
@@ -34,7 +33,6 @@ _ATTACKS = (
     ("quantisation", 8),
 )
 _PICTURED = ("noise", 0.005)
-_EXAGGERATION = 10
 
 
 class Row(NamedTuple):
@@ -157,19 +155,13 @@ def _table(rows: list[Row]) -> str:
 
 
 def _pictures(folder: Path, original: Original, marked: Mesh) -> None:
-    mesh = original.mesh
-    shift = marked.vertices - mesh.vertices
-    percent = 100 * np.linalg.norm(shift, axis=1) / original.diagonal
-    hidden = original.on_host(masking(original))[original.weld.point]
-    visible = np.divide(percent, hidden, out=np.zeros_like(percent), where=hidden > 0)
-    exaggerated = mesh._replace(vertices=mesh.vertices + _EXAGGERATION * shift)
     save_views(
         [
-            View("original", mesh),
+            View("original", original.mesh),
             View("marked", marked),
-            View(f"{_EXAGGERATION} × the mark", exaggerated),
-            View("displacement", mesh, percent, "% of diagonal"),
-            View("visibility: displacement over what roughness hides", mesh, visible, "% of diagonal"),
+            exaggerated(original, marked),
+            displacement(original, marked),
+            visibility(original, marked),
         ],
         folder / "mark.png",
     )

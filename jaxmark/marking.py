@@ -1,7 +1,6 @@
 """Marking meshes: messages and keys in, meshes and evidence out."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import NamedTuple
@@ -13,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from jaxmark import alignment, distortion, evidence
 from jaxmark.alignment import Align, Alignment
-from jaxmark.budget import Budget, make_budget, write
+from jaxmark.budget import Budget, Limits, make_budget, write
 from jaxmark.carriers import Carrier, KeyedCarrier
 from jaxmark.detectors import Detector, claims, joint, projected
 from jaxmark.errors import JaxmarkError
@@ -86,7 +85,7 @@ class Marker:
         message: bytes,
         budget: float | None = None,
         *,
-        limits: Mapping[str, float] | None = None,
+        limits: Limits | None = None,
         noise: float = NOISE,
         read_back: bool = True,
     ) -> tuple[Mesh, EmbedInfo]:
@@ -301,7 +300,7 @@ def embed(
     key: bytes,
     *,
     budget: float | None = None,
-    limits: Mapping[str, float] | None = None,
+    limits: Limits | None = None,
     noise: float = NOISE,
     scheme: str | Scheme = DEFAULT_SCHEME,
 ) -> tuple[Mesh, EmbedInfo]:
@@ -317,7 +316,7 @@ def embed(
         budget: RMS displacement of the welded vertices that faces use, unweighted, relative to the diagonal of their
             axis-aligned bounding box: 0.0008 is 0.08 % of it. It is met exactly, unless a limit is reached first.
         limits: the most that metrics of `distortion.METRICS` may reach, by name, in the units of
-            `distortion.Comparison`.
+            `distortion.Comparison`; or metrics of your own, by function (see `distortion.measure`).
         noise: which the message must survive when half of the vertices are lost, see `capacity`; 0 asks only that there
             are dimensions enough. For the keyed scheme only.
         scheme: see `make_marker`.
@@ -339,7 +338,7 @@ def capacity(
     mesh: Mesh,
     budget: float | None = None,
     *,
-    limits: Mapping[str, float] | None = None,
+    limits: Limits | None = None,
     noise: float = NOISE,
     coverage: float = COVERAGE,
     scheme: KeyedScheme | None = None,

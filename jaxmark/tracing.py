@@ -5,10 +5,10 @@ The carrier is that of messages under a subkey of its own; its code bits are the
 copy under the same key is no stranger to the chips.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from jaxmark.budget import make_budget
+from jaxmark.budget import Limits, make_budget
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import KEY_BYTES, Key, commitment, derive
 from jaxmark.marking import EmbedInfo, Marker
@@ -33,7 +33,7 @@ class Tracer:
     commitment: str  # to the owner's key
 
     def fingerprint(
-        self, recipient: str, budget: float | None = None, *, limits: Mapping[str, float] | None = None
+        self, recipient: str, budget: float | None = None, *, limits: Limits | None = None
     ) -> tuple[Mesh, EmbedInfo]:
         """The copy of one recipient; see `fingerprint`."""
         key, geometry = self.marker.key, self.marker.original.geometry
@@ -89,7 +89,7 @@ def fingerprint(
     key: bytes,
     *,
     budget: float | None = None,
-    limits: Mapping[str, float] | None = None,
+    limits: Limits | None = None,
 ) -> tuple[Mesh, EmbedInfo]:
     """Make the copy of a mesh for one recipient.
 

@@ -20,10 +20,11 @@ from scipy import optimize
 from jaxmark.alignment import align, observation
 from jaxmark.attacks import attack
 from jaxmark.bands import scaling
-from jaxmark.budget import Budget, make_budget, write
+from jaxmark.budget import Budget, Limits, make_budget, write
 from jaxmark.carriers.carrier import Displacement
 from jaxmark.channels import Channels, Margin, band_energies, margins, measure
 from jaxmark.chebyshev import filter
+from jaxmark.distortion import name_of
 from jaxmark.errors import JaxmarkError
 from jaxmark.mesh import Mesh
 from jaxmark.original import Original, prepare
@@ -63,7 +64,7 @@ def tune(
     attacks: Sequence[Attacker],
     budget: float | None = None,
     *,
-    limits: Mapping[str, float] | None = None,
+    limits: Limits | None = None,
     key: PRNGKeyArray,
     bits: int = 64,
     scheme: KeyedScheme | None = None,
@@ -369,7 +370,7 @@ def _costs(
 
 
 def _names(bounds: Budget) -> list[str]:
-    return list(bounds.limits) + (["budget"] if bounds.rms is not None else [])
+    return [*map(name_of, bounds.limits)] + (["budget"] if bounds.rms is not None else [])
 
 
 def _profile(beta: Float64[np.ndarray, " bands"]) -> tuple[float, ...]:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Float64
 from jaxmark import distortion
 from jaxmark.bands import diffusion
 from jaxmark.chebyshev import filter
+from jaxmark.distortion import Metric
 from jaxmark.distortion.roughness import LEAST, MOST, POWER
 from jaxmark.mesh import welded_mesh
 from jaxmark.original import Original, displaced
@@ -21,7 +22,7 @@ _SCALE = 5  # roughness is averaged over 2^5 steps of diffusion
 
 
 def band_visibility(
-    original: Original, coefficients: Float64[np.ndarray, "bands terms"], metrics: Sequence[str]
+    original: Original, coefficients: Float64[np.ndarray, "bands terms"], metrics: Sequence[Metric]
 ) -> Float64[np.ndarray, "metrics bands"]:
     """How far metrics rise for each unit of RMS displacement (in diagonals) in each band, by trial with random signs.
 
@@ -30,10 +31,10 @@ def band_visibility(
     Args:
         original: the original.
         coefficients: of the bands.
-        metrics: names in `distortion.METRICS`.
+        metrics: names in `distortion.METRICS`, or functions of your own.
 
     Raises:
-        JaxmarkError: see `distortion.compare`.
+        JaxmarkError: see `distortion.measure`.
     """
     signs = jax.random.rademacher(jax.random.key(4), original.signal.shape, original.signal.dtype)
     signs = signs * original.traced(original.used)[:, None]
@@ -54,12 +55,12 @@ def band_visibility(
     return np.exp(np.array(logs))
 
 
-def _per_rms(original: Original, shift: Float64[np.ndarray, "points 3"], metrics: Sequence[str]) -> list[float]:
+def _per_rms(original: Original, shift: Float64[np.ndarray, "points 3"], metrics: Sequence[Metric]) -> list[float]:
     """Metrics over RMS displacement, small enough that they are proportional to it."""
 
-    def tried(names: Sequence[str], size: float) -> dict[str, float]:
-        found = distortion.compare(original.mesh, displaced(original, size * shift), names)._asdict()
-        return {name: found[name] / size for name in names}
+    def tried(names: Sequence[Metric], size: float) -> dict[Metric, float]:
+        found = distortion.measure(original.mesh, displaced(original, size * shift), names)
+        return {name: (value or 0.0) / size for name, value in found.items()}
 
     values = tried(metrics, _TRIED)
     for name, value in values.items():

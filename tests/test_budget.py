@@ -46,6 +46,27 @@ def test_the_tightest_of_several_bounds_counts(mesh: Mesh, noise: np.ndarray):
     assert (found.msdm or 0) <= 0.9
 
 
+def largest_stretch(original: Mesh, distorted: Mesh) -> float:
+    """Largest relative change of an edge's length."""
+    faces = np.asarray(original.faces)
+    before, after = (
+        np.linalg.norm(np.asarray(one.vertices)[faces] - np.asarray(one.vertices)[np.roll(faces, 1, axis=1)], axis=2)
+        for one in (original, distorted)
+    )
+    return float(np.abs(after / before - 1).max())
+
+
+def test_a_metric_of_ones_own_can_be_limited(mesh: Mesh, noise: np.ndarray, key: jm.Key):
+    budget = make_budget(limits={largest_stretch: 0.02, "max": 0.1})
+    assert str(budget) == "largest_stretch of at most 0.02 and max of at most 0.1"
+    found = largest_stretch(mesh, write(prepare(mesh), noise, budget).mesh)
+    assert 0.98 * 0.02 <= found <= 0.02
+    marked, _ = jm.embed(mesh, MESSAGE, key, limits={largest_stretch: 0.02}, noise=0)
+    assert 0.98 * 0.02 <= largest_stretch(mesh, marked) <= 0.02
+    with pytest.raises(jm.JaxmarkError, match="The limit of largest_stretch must be a positive number"):
+        make_budget(limits={largest_stretch: 0.0})
+
+
 @pytest.mark.slow
 def test_without_a_word_the_mark_stays_below_what_people_notice(mesh: Mesh, key: jm.Key):
     marked, info = jm.embed(mesh, MESSAGE, key, noise=0)

@@ -368,3 +368,28 @@ def test_without_libigl_compare_names_the_extra(pair: tuple[Mesh, Mesh], monkeyp
     with pytest.raises(jm.JaxmarkError, match=r"jaxmark\[align\]"):
         jm.compare(*pair)
     assert jm.distortion.moved(*pair).rms > 0
+
+
+def volume_change(original: Mesh, distorted: Mesh) -> float:
+    """Relative change of the enclosed volume."""
+    before, after = (trimesh.Trimesh(*mesh, process=False).volume for mesh in (original, distorted))
+    return abs(after / before - 1)
+
+
+def test_a_metric_of_ones_own_stands_beside_the_others(pair: tuple[Mesh, Mesh]):
+    found = jm.distortion.measure(*pair, ["gl", volume_change, "rms"])
+    assert list(found) == ["gl", volume_change, "rms"]
+    compared = jm.compare(*pair, ["gl", "rms"])
+    assert (found["gl"], found["rms"]) == (compared.gl, compared.rms)
+    assert found[volume_change] == pytest.approx(volume_change(*pair))
+    larger = pair[0]._replace(vertices=2 * np.asarray(pair[0].vertices))
+    assert jm.distortion.measure(pair[0], larger, [volume_change])[volume_change] == pytest.approx(7)
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
+def test_metrics_that_are_no_distances(pair: tuple[Mesh, Mesh], value: float):
+    def broken(original: Mesh, distorted: Mesh) -> float:
+        return value
+
+    with pytest.raises(jm.JaxmarkError, match="The metric 'broken' must be a finite number, not negative"):
+        jm.distortion.measure(*pair, [broken])

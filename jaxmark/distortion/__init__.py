@@ -2,9 +2,12 @@
 
 from jaxmark.distortion.compare import METRICS as METRICS
 from jaxmark.distortion.compare import Comparison as Comparison
+from jaxmark.distortion.compare import Metric as Metric
 from jaxmark.distortion.compare import Moved as Moved
 from jaxmark.distortion.compare import compare as compare
+from jaxmark.distortion.compare import measure as measure
 from jaxmark.distortion.compare import moved as moved
+from jaxmark.distortion.compare import name_of as name_of
 from jaxmark.distortion.curvature import curvature as curvature
 from jaxmark.distortion.curvature import curvature_tensor as curvature_tensor
 from jaxmark.distortion.curvature import tensor_distance as tensor_distance

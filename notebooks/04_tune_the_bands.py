@@ -2,22 +2,19 @@
 # # Tune the bands under a perceptual budget
 #
 # People tolerate far more displacement at low spatial frequencies than at high ones, and attacks leave more of some
-# bands than of others. `tune` measures both on the mesh, and gives the bands the strengths at which the worst attack
-# is least bad.
+# bands than of others. `tune` measures both on the mesh, and gives the bands the strengths at which the worst attack is
+# least bad.
 
 # %%
-from pathlib import Path
-
 import jax
-import numpy as np
 
 import jaxmark as jm
+from jaxmark import plot
 from jaxmark.bands import scaling
 from jaxmark.demo import sample_mesh
 from jaxmark.original import prepare
-from jaxmark.plot import View, save_views
 from jaxmark.schemes import KeyedScheme
-from jaxmark.visibility import band_visibility, masking
+from jaxmark.visibility import band_visibility
 
 mesh = jm.load_mesh(sample_mesh())
 original = prepare(mesh)
@@ -61,17 +58,11 @@ assert claims["tuned", "smoothing"]
 # The mark, ten times the mark, and where it shows: displacement over what the roughness around it hides.
 
 # %%
-shift = shown.vertices - mesh.vertices
-percent = 100 * np.linalg.norm(shift, axis=1) / original.diagonal
-hidden = original.on_host(masking(original))[original.weld.point]
-Path("demo-output").mkdir(exist_ok=True)
-save_views(
+plot.draw(
     [
-        View("original", mesh),
-        View("marked", shown),
-        View("10 × the mark", mesh._replace(vertices=mesh.vertices + 10 * shift)),
-        View("displacement", mesh, percent, "% of diagonal"),
-        View("visibility: displacement over what roughness hides", mesh, percent / hidden, "% of diagonal"),
-    ],
-    "demo-output/tuned.png",
+        plot.View("original", mesh),
+        plot.exaggerated(original, shown),
+        plot.displacement(original, shown),
+        plot.visibility(original, shown),
+    ]
 )

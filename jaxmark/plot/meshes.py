@@ -1,0 +1,136 @@
+"""Meshes, shaded, with or without values on their vertices: without OpenGL."""
+
+import os
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxmark.mesh import Mesh, host_mesh
+from jaxmark.original import Original, residual
+from jaxmark.plot.figures import FIELD, Picture, panels
+from jaxmark.visibility import masking
+
+
+class View(NamedTuple):
+    """One panel of a picture."""
+
+    title: str
+    mesh: Mesh
+    values: Float[np.ndarray, " vertices"] | None = None  # colours, per vertex; plain shading without
+    unit: str = ""  # of the values, for the colour bar
+
+
+def displacement(original: Original, moved: Mesh, title: str = "displacement") -> View:
+    """How far each vertex was moved, as a heat map.
+
+    Args:
+        original: from where.
+        moved: a mesh of the same connectivity.
+        title: of the panel.
+
+    Raises:
+        JaxmarkError: if the connectivity differs.
+    """
+    return View(title, original.mesh, _percent(original, moved)[original.weld.point], "% of diagonal")
+
+
+def visibility(
+    original: Original, moved: Mesh, title: str = "visibility: displacement over what roughness hides"
+) -> View:
+    """Displacement over `jaxmark.visibility.masking`: the same displacement shows more where the mesh is smooth.
+
+    Args:
+        original: from where.
+        moved: a mesh of the same connectivity.
+        title: of the panel.
+
+    Raises:
+        JaxmarkError: if the connectivity differs.
+    """
+    percent, hidden = _percent(original, moved), original.on_host(masking(original))
+    shown = np.divide(percent, hidden, out=np.zeros_like(percent), where=hidden > 0)
+    return View(title, original.mesh, shown[original.weld.point], "% of diagonal")
+
+
+def exaggerated(original: Original, moved: Mesh, factor: float = 10) -> View:
+    """The original, with each vertex moved so many times as far; `moved` has its vertices in the same order."""
+    vertices = original.mesh.vertices + factor * (moved.vertices - original.mesh.vertices)
+    return View(f"{factor:g} × the displacement", original.mesh._replace(vertices=vertices))
+
+
+def draw(views: Sequence[View], *, elevation: float = 15.0, azimuth: float = 25.0) -> Picture:
+    """Draw meshes side by side, shaded, all from one direction, each as large as fits.
+
+    Values are drawn with a colour bar in their unit, from 0.
+
+    Args:
+        views: the panels, left to right.
+        elevation: of the eye above the horizon, degrees; +y is up.
+        azimuth: of the eye around the vertical, degrees; 0 looks along -z.
+
+    Raises:
+        JaxmarkError: if matplotlib is missing, or a mesh is unusable.
+    """
+    figure, axes = panels(len(views), 4.2, 4.4)
+    turn = _rotation(np.radians(elevation), np.radians(azimuth))
+    for panel, view in zip(axes, views, strict=True):
+        drawn = _paint(panel, view, turn)
+        panel.set_title(view.title, fontsize=10)
+        if drawn is not None:
+            figure.colorbar(drawn, ax=panel, label=view.unit, shrink=0.7)
+    return Picture(figure)
+
+
+def save_views(
+    views: Sequence[View], path: str | os.PathLike[str], *, elevation: float = 15.0, azimuth: float = 25.0
+) -> None:
+    """Write the picture of `draw` to a PNG file, whole or not at all.
+
+    Raises:
+        JaxmarkError: see `draw`; also if the file cannot be written.
+    """
+    draw(views, elevation=elevation, azimuth=azimuth).save(path)
+
+
+def _percent(original: Original, moved: Mesh) -> np.ndarray:
+    """Displacement of each point, in percent of the diagonal."""
+    return 100 * np.linalg.norm(residual(original, moved), axis=1)
+
+
+def _rotation(elevation: float, azimuth: float) -> np.ndarray:
+    around = np.array([[np.cos(azimuth), 0, -np.sin(azimuth)], [0, 1, 0], [np.sin(azimuth), 0, np.cos(azimuth)]])
+    down = np.array([[1, 0, 0], [0, np.cos(elevation), -np.sin(elevation)], [0, np.sin(elevation), np.cos(elevation)]])
+    return down @ around
+
+
+def _paint(axes, view: View, turn: np.ndarray):
+    """Painter's algorithm: faces from back to front, lit from above the eye."""
+    from matplotlib.collections import PolyCollection
+
+    mesh = host_mesh(view.mesh)
+    corners = (np.asarray(mesh.vertices) @ turn.T)[np.asarray(mesh.faces)]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    light = np.array([0.3, 0.5, 0.8]) / np.linalg.norm([0.3, 0.5, 0.8])
+    # Soups and open surfaces have no inside: light both sides.
+    brightness = (0.35 + 0.65 * np.abs(normals @ light))[:, None]
+    order = np.argsort(corners[:, :, 2].mean(axis=1), kind="stable")
+    mappable = None
+    if view.values is None:
+        colours = brightness * np.array([0.80, 0.80, 0.84])
+    else:
+        from matplotlib.cm import ScalarMappable
+        from matplotlib.colors import Normalize
+
+        values = np.asarray(view.values, np.float64)
+        mappable = ScalarMappable(Normalize(0.0, max(float(values.max()), 1e-300)), cmap=FIELD)
+        colours = brightness * mappable.to_rgba(values[mesh.faces].mean(axis=1))[:, :3]
+    faces = PolyCollection(list(corners[order][:, :, :2]), facecolors=colours[order], edgecolors="face", linewidths=0.2)
+    axes.add_collection(faces)
+    axes.set_aspect("equal")
+    axes.autoscale_view()
+    axes.set_axis_off()
+    return mappable
