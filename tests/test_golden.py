@@ -15,6 +15,8 @@ from tests.golden.make import MARKS, MESSAGE, RECIPIENTS
 GOLDEN = Path(__file__).parent / "golden"
 VERSIONS = sorted(folder.name for folder in GOLDEN.iterdir() if folder.name.isdigit())
 
+SLOW = ("normals", "narrow")  # compiled for themselves
+
 
 def files(version: str, name: str) -> tuple[Mesh, Mesh, jm.Key, jm.Record]:
     """A marked mesh, its original, key and record."""
@@ -32,7 +34,9 @@ def test_there_are_files_of_this_version():
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-@pytest.mark.parametrize("name", MARKS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in MARKS]
+)
 def test_old_marks_are_read_to_the_exact_message(version: str, name: str):
     suspect, original, key, record = files(version, name)
     found = jm.detect(suspect, original=original, key=key, record=record)
