@@ -34,9 +34,7 @@ def test_there_are_files_of_this_version():
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in MARKS]
-)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in MARKS])
 def test_old_marks_are_read_to_the_exact_message(version: str, name: str):
     suspect, original, key, record = files(version, name)
     found = jm.detect(suspect, original=original, key=key, record=record)
