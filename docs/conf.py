@@ -23,6 +23,7 @@ extensions = [
 exclude_patterns = ["_build"]
 templates_path = ["_templates"]
 html_theme = "furo"
+smartquotes = False  # two hyphens are an option
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
@@ -88,7 +89,7 @@ def sign_as_written(
             definition.args.args = definition.args.args[1:]
         return f"({ast.unparse(definition.args)})", definition.returns and ast.unparse(definition.returns)
     if isinstance(definition, ast.ClassDef) and (fields := _fields(obj)):
-        return f"({', '.join(fields)})", None
+        return f"({', '.join(name for name, text in fields.items() if 'ClassVar' not in text)})", None
     return signature, returns
 
 

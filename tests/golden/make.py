@@ -40,7 +40,8 @@ def main() -> None:
     shape = rough_sphere(300)
     rounded = np.asarray(shape.vertices, np.float32)
     ply = trimesh.Trimesh(rounded, shape.faces, process=False).export(file_type="ply", vertex_normal=False)
-    (FOLDER / "original.ply").write_bytes(bytes(ply))
+    assert isinstance(ply, bytes)
+    (FOLDER / "original.ply").write_bytes(ply)
     jm.save_key(KEY, FOLDER / "test.key")
     original = jm.load_mesh(FOLDER / "original.ply")
     for name, scheme in MARKS.items():
