@@ -24,7 +24,7 @@ slow-tests: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -n auto -m slow
 
 docs: $(VENV)/.docs  ## all pages, in docs/_build/html
-	$(BIN)/sphinx-build --quiet --nitpicky --fail-on-warning --keep-going docs docs/_build/html
+	$(BIN)/sphinx-build --quiet --fresh-env --nitpicky --fail-on-warning --keep-going docs docs/_build/html
 
 $(VENV)/.%: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
