@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: demo test lint types tests slow-tests clean
+.PHONY: demo test lint types tests slow-tests docs clean
 
 demo: $(VENV)/.all  ## mark, attack and read a mesh: make demo [MESH=file]
 	$(BIN)/jaxmark demo $(MESH) --output demo-output
@@ -23,6 +23,9 @@ tests: $(VENV)/.dev
 slow-tests: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -n auto -m slow
 
+docs: $(VENV)/.docs  ## all pages, in docs/_build/html
+	$(BIN)/sphinx-build --quiet --fresh-env --nitpicky --fail-on-warning --keep-going docs docs/_build/html
+
 $(VENV)/.%: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
@@ -30,4 +33,4 @@ $(VENV)/.%: pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo-output build dist
+	rm -rf $(VENV) demo-output build dist docs/_build docs/reference/api

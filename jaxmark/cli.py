@@ -442,8 +442,8 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
     except JaxmarkError as error:
         _say(f"No pictures: {error}")
     else:
-        results.plot(output / "read.png")
-        results.plot(output / "log10_p.png", "log10_p")
+        results.plot().save(output / "read.png")
+        results.plot("log10_p").save(output / "log10_p.png")
     _answer(as_json, {"output": str(output), "readings": len(results.rows), "rates": results.rates()}, table.rstrip())
 
 

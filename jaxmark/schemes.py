@@ -249,6 +249,7 @@ class EigenScheme:
         return _modulated(self.name, components, self.pairs, original, key, code_bits)
 
 
+#: The schemes that have names.
 SCHEMES: Mapping[str, type[KeyedScheme] | type[HostScheme] | type[EigenScheme]] = {
     scheme.name: scheme for scheme in (KeyedScheme, HostScheme, EigenScheme)
 }

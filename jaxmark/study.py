@@ -22,7 +22,8 @@ from jaxmark.files import load_mesh
 from jaxmark.keys import Key, geometry_hash
 from jaxmark.marking import DEFAULT_BITS, Marker, make_marker
 from jaxmark.mesh import Mesh
-from jaxmark.results import LOG10_LEVEL, Control, Results, Row
+from jaxmark.rates import LOG10_LEVEL, Control, Row
+from jaxmark.results import Results
 from jaxmark.robustness import NOTHING, read
 from jaxmark.schemes import DEFAULT_SCHEME, Scheme, get_scheme, parameters_of
 

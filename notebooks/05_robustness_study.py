@@ -57,7 +57,11 @@ for rate in results.rates(["control"]):
 # readings.
 
 # %%
-results.plot(FOLDER / "read.png")
-results.plot(FOLDER / "log10_p.png", of="log10_p")
+results.plot()
+
+# %%
+results.plot("log10_p")
+
+# %%
 frame = results.frame()
 print(frame.groupby(["attack", "strength", "control"])[["read", "detected", "log10_p", "seconds"]].mean().round(2))

@@ -1,11 +1,15 @@
 """What the documents say is run."""
 
+import doctest
+import importlib
+import os
 import pkgutil
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -17,6 +21,14 @@ from tests.samples import bumpy_sphere
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+PAGES = {
+    str(path.relative_to(ROOT)): path.read_text()
+    for folder in (ROOT, ROOT / "docs", ROOT / "docs" / "how-to", ROOT / "docs" / "reference")
+    for path in sorted(folder.glob("*.md"))
+}
+LONG = ("docs/tutorial.md", "docs/submeshes.md", "docs/how-to/extend.md")  # compiled for themselves
+APART = ("README.md", "docs/robustness.md")  # have tests of their own
+FENCE = re.compile(r"^( *)```(\w+)\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 
 
 @pytest.fixture
@@ -30,12 +42,22 @@ def folder(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
+def blocks(page: str, language: str) -> list[str]:
+    """The blocks of a language, without the indent of a list that they stand in."""
+    return [textwrap.dedent(text) for _, kind, text in FENCE.findall(PAGES[page]) if kind == language]
+
+
+def run(page: str) -> dict:
+    """Run the Python blocks of a page in one namespace, in which a mesh and a key are there."""
+    names: dict = {"mesh": bumpy_sphere(4), "key": jm.Key(bytes(32))}
+    for block in blocks(page, "python"):
+        exec(compile(block, page, "exec"), names)
+    return names
+
+
 def test_python_blocks_of_the_readme_run(folder: Path, unchecked, capsys):
-    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    assert len(blocks) >= 2
-    names: dict = {}
-    for block in blocks:
-        exec(compile(block, "README.md", "exec"), names)
+    assert len(blocks("README.md", "python")) >= 2
+    names = run("README.md")
     assert names["found"].message == bytes.fromhex("0123456789abcdef")
     assert "0123456789abcdef" in capsys.readouterr().out
     assert (names["scores"] > 0).tolist() == [True, False, False, True]
@@ -45,10 +67,32 @@ def test_python_blocks_of_the_readme_run(folder: Path, unchecked, capsys):
 
 
 def test_python_block_of_the_page_on_robustness_runs(unchecked, capsys):
-    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "robustness.md").read_text(), re.DOTALL)
-    names: dict = {"mesh": bumpy_sphere(4), "key": jm.Key(bytes(32))}
-    exec(compile(block, "robustness.md", "exec"), names)
-    assert names["curve"].success.all()
+    assert run("docs/robustness.md")["curve"].success.all()
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=pytest.mark.slow if page in LONG else ())
+        for page in PAGES
+        if blocks(page, "python") and page not in APART
+    ],
+)
+def test_python_blocks_of_other_pages_run(page: str, folder: Path, unchecked, capsys):
+    if page in LONG:
+        pytest.importorskip("igl")
+    run(page)
+
+
+def said(argv: list[str], monkeypatch, capsys) -> str:
+    """What a command says that must end well."""
+    monkeypatch.setattr(sys, "argv", argv)
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        sys.exit(cli.main())
+    found = capsys.readouterr()
+    assert end.value.code in (0, None), (argv, found)
+    return found.out
 
 
 @pytest.mark.slow
@@ -56,31 +100,102 @@ def test_shell_lines_of_the_readme_run(folder: Path, unchecked, monkeypatch, cap
     lines = re.findall(r"^    (jaxmark .*)$", README, re.MULTILINE)
     assert len(lines) >= 8
     for line in lines:
-        monkeypatch.setattr(sys, "argv", shlex.split(line))
-        with pytest.raises(SystemExit) as end:
-            sys.exit(cli.main())
-        assert end.value.code in (0, None), (line, capsys.readouterr())
+        said(shlex.split(line), monkeypatch, capsys)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if "$ jaxmark " in "".join(blocks(page, "console"))])
+def test_shell_lines_of_other_pages_say_what_is_shown(page: str, folder: Path, unchecked, monkeypatch, capsys):
+    """Three dots stand for anything."""
+    for block in blocks(page, "console"):
+        for part in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
+            line, shown = part.split("\n", 1)
+            found = said(shlex.split(line), monkeypatch, capsys)
+            assert doctest.OutputChecker().check_output(shown.rstrip() + "\n", found, doctest.ELLIPSIS), (line, found)
+
+
+def test_consoles_have_nothing_else_than_lines_that_are_run():
+    lines = [line for page in PAGES for block in blocks(page, "console") for line in block.splitlines()]
+    commands = {line.split()[1] for line in lines if line.startswith("$ ")}
+    assert commands == {"jaxmark", "pip"}
+    assert [line for line in lines if line.startswith("$ pip")] == ["$ pip install '.[all]'"]
 
 
 def test_make_targets_of_the_readme_exist():
     targets = set(re.findall(r"^    make (\w+)", README, re.MULTILINE))
     assert targets == {"demo", "test"}
-    for target in targets:
+    for target in (*targets, "docs"):
         subprocess.run(["make", "-n", target], cwd=ROOT, check=True, capture_output=True)
 
 
-def test_tests_that_the_page_on_the_paper_names_exist():
-    named = re.findall(r"`tests/(\w+\.py)::(\w+)`", (ROOT / "docs" / "paper.md").read_text())
+def test_tests_that_pages_name_exist():
+    named = {named for text in PAGES.values() for named in re.findall(r"`tests/(\w+\.py)::(\w+)`", text)}
     assert len(named) >= 20
     for file, test in named:
         assert re.search(rf"^def {test}\(", (ROOT / "tests" / file).read_text(), re.MULTILINE), f"{file}::{test}"
 
 
-def test_names_that_the_page_on_the_paper_gives_exist():
-    named = set(re.findall(r"`(jaxmark(?:\.\w+)+)", (ROOT / "docs" / "paper.md").read_text()))
+def test_names_that_pages_give_exist():
+    named = {name for text in PAGES.values() for name in re.findall(r"`(jaxmark(?:\.\w+)+)", text)}
     assert len(named) >= 20
     for name in named:
         pkgutil.resolve_name(name)
+
+
+def test_programs_that_pages_name_exist():
+    named = {name for text in PAGES.values() for name in re.findall(r"\b(?:benchmarks|tests)/\w+\.py\b", text)}
+    assert len(named) >= 20
+    for name in named:
+        assert (ROOT / name).is_file(), name
+
+
+def anchors(text: str) -> set[str]:
+    """What GitHub and MyST call the headings of a page in links."""
+    headings = re.findall(r"^#+ +(.*)$", FENCE.sub("", text), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def dead_links(pages: dict[str, str]) -> list[str]:
+    """Relative links to files or headings that are not there."""
+    dead = []
+    for page, text in pages.items():
+        for target in re.findall(r"\]\(([^)\s]+)\)", FENCE.sub("", text)):
+            path, _, anchor = target.partition("#")
+            there = (ROOT / page).parent / path if path else ROOT / page
+            if re.match(r"\w+:", target):
+                continue
+            other = pages.get(os.path.relpath(there, ROOT))
+            if not (other or there.exists()) or (anchor and anchor not in anchors(other or "")):
+                dead.append(f"{page}: {target}")
+    return dead
+
+
+def test_no_relative_link_is_dead():
+    assert not dead_links(PAGES)
+    assert sum(text.count("](") for text in PAGES.values()) >= 20
+
+
+def test_a_dead_link_is_seen():
+    text = "# A b, c\n[a](nowhere.md) [b](#a-b-c) [c](#other) [d](README.md#what-a-detection-proves) [e](https://x.y)"
+    assert dead_links({**PAGES, "docs/x.md": text}) == [
+        f"docs/x.md: {at}" for at in ("nowhere.md", "#other", "README.md#what-a-detection-proves")
+    ]
+    assert not dead_links({**PAGES, "docs/x.md": "[d](../README.md#what-a-detection-proves)"})
+
+
+def test_the_reference_lists_all_names_of_the_package():
+    listed = re.findall(r"^ {3}jaxmark(?:\.\w+)*\.(\w+)$", PAGES["docs/reference/index.md"], re.MULTILINE)
+    public = [name for name in vars(jm) if not name.startswith("_") and not hasattr(vars(jm)[name], "__file__")]
+    assert sorted(listed) == sorted(public)
+
+
+def test_published_rates_are_those_of_the_protocol(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    protocol = importlib.import_module("smi2010").PROTOCOL
+    rate = r"([\d.]+) / ([\d.]+)"
+    rows = re.findall(rf"^\| ([\w-]+) \| (\S+) \| {rate} \| {rate} \|$", PAGES["docs/comparison.md"], re.MULTILINE)
+    shown = {f"{kind} {strength}": tuple(map(float, rates)) for kind, strength, *rates in rows}
+    assert shown == {name: (*line.cho, *line.wang) for name, line in protocol.items() if line.cho and line.wang}
 
 
 @pytest.mark.slow

@@ -41,6 +41,7 @@ class Attack(NamedTuple):
     host: bool = False  # NumPy and other programs; else JAX, which is given the mesh near the origin and at unit size
 
 
+#: All attacks of the library, by their names.
 ATTACKS: Mapping[str, Attack] = {
     "noise": Attack(
         uniform_noise, "half width over the mean distance to the centre", (0.0005, 0.001, 0.003, 0.005, 0.01)

@@ -128,6 +128,7 @@ _METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
     "msdm2": lambda pair: msdm2(pair.x, pair.y, pair.views),
     "curvature": _Pair.tensor_distance,
 }
+#: Names of all metrics of `compare`, which limits take, too.
 METRICS = tuple(_METRICS)
 _ANY_CONNECTIVITY = {"mrms", "hausdorff", "fmpd", "msdm2"}
 

@@ -18,3 +18,4 @@ from jaxmark.plot.meshes import visibility as visibility
 from jaxmark.plot.spectra import band_visibility as band_visibility
 from jaxmark.plot.spectra import responses as responses
 from jaxmark.plot.spectra import spectra as spectra
+from jaxmark.plot.studies import curves as curves

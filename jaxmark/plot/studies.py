@@ -1,77 +1,72 @@
-"""Pictures of a study by matplotlib: what is read over the strength of each attack. Needs the extra `plot`."""
+"""Studies: what is read over the strength of each attack."""
 
-import os
 from collections.abc import Sequence
 from typing import Any, Literal
 
 from jaxmark.extras import require
-from jaxmark.plot import save_figure
-from jaxmark.results import LOG10_LEVEL, Results
+from jaxmark.plot.figures import COLOURS, MARKERS, Picture
+from jaxmark.rates import LOG10_LEVEL, Row, rates
 
-# Okabe, Ito, "Color universal design", 2008: told apart by colour-blind readers. Without black, and yellow last.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442")
-_MARKERS = ("o", "s", "^", "D", "v", "P", "*")
 _LINES = ("-", "--", "-.", (0, (3, 1, 1, 1, 1, 1)))
 _CONTROLS = {"unmarked": ("unmarked, detected", ":", "x"), "wrong-key": ("another key, detected", "--", "+")}
 _COLUMNS = 3
 
 
-def save_curves(results: Results, path: str | os.PathLike[str], of: Literal["read", "log10_p"]) -> None:
-    """Draw a panel for each attack, weak strengths on the left, into a PNG file.
+def curves(rows: Sequence[Row], of: Literal["read", "log10_p"] = "read") -> Picture:
+    """A panel for each attack, weak strengths on the left.
 
     Each scheme has a line, or each scheme with payload and budget where these differ; meshes and seeds are pooled. The
     controls are grey, those of all schemes together.
 
     Args:
-        results: of a study.
-        path: of the PNG file, written whole or not at all.
+        rows: of a study.
         of: `"read"`: the share of messages that were read, of controls the share that was detected, with 95 %
             Clopper-Pearson intervals; `"log10_p"`: the median, the bars from the least to the largest, and the level at
             which a mark counts as detected.
 
     Raises:
-        JaxmarkError: if matplotlib is missing, or the file cannot be written.
+        JaxmarkError: if matplotlib is missing.
     """
     require("matplotlib", "plot")
     from matplotlib.figure import Figure
 
-    attacks = list(dict.fromkeys(row.attack for row in results.rows))
+    attacks = list(dict.fromkeys(row.attack for row in rows))
     columns = min(_COLUMNS, len(attacks))
     count = -(-len(attacks) // columns)
     figure = Figure(figsize=(4.2 * columns, 3.2 * count + 0.6), layout="constrained")
     panels = figure.subplots(count, columns, squeeze=False).ravel()
-    names = _names(results)
+    names = _names(rows)
     for panel, attack in zip(panels, attacks, strict=False):
-        _draw(panel, Results(tuple(row for row in results.rows if row.attack == attack)), names, of)
+        _draw(panel, [row for row in rows if row.attack == attack], names, of)
     for panel in panels[len(attacks) :]:
         panel.set_axis_off()
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), _COLUMNS), fontsize=8)
-    save_figure(figure, path)
+    return Picture(figure)
 
 
-def _names(results: Results) -> tuple[str, ...]:
+def _names(rows: Sequence[Row]) -> tuple[str, ...]:
     """The fields that tell lines apart: the scheme, and what else differs."""
-    return ("scheme", *(one for one in ("bits", "budget") if len({getattr(row, one) for row in results.rows}) > 1))
+    return ("scheme", *(one for one in ("bits", "budget") if len({getattr(row, one) for row in rows}) > 1))
 
 
-def _draw(panel: Any, results: Results, names: Sequence[str], of: str) -> None:
-    first = results.rows[0]
-    strengths = list(dict.fromkeys(row.strength for row in results.rows))
+def _draw(panel: Any, rows: Sequence[Row], names: Sequence[str], of: str) -> None:
+    first = rows[0]
+    strengths = list(dict.fromkeys(row.strength for row in rows))
     wide = len(strengths) > 1 and min(strengths) > 0
     for name, (label, line, marker) in _CONTROLS.items():
-        rates = [rate for rate in results.rates(["control", "strength"]) if rate["control"] == name]
+        found = [rate for rate in rates(rows, ["control", "strength"]) if rate["control"] == name]
         style = {"color": "0.6", "linestyle": line, "marker": marker, "zorder": 1}
-        _line(panel, [rate["strength"] for rate in rates], rates, of, "detected", label=label, **style)
+        _line(panel, [rate["strength"] for rate in found], found, of, "detected", label=label, **style)
     groups: dict[str, list[dict[str, Any]]] = {}
-    for rate in results.rates([*names, "control", "strength"]):
+    for rate in rates(rows, [*names, "control", "strength"]):
         if rate["control"] == "marked":
             groups.setdefault(", ".join(_said(name, rate[name]) for name in names), []).append(rate)
-    for place, (label, rates) in enumerate(groups.items()):
+    for place, (label, found) in enumerate(groups.items()):
         # Side by side, so that lines that agree are all seen.
         aside = (max(strengths) / min(strengths)) ** (0.015 * place) if wide else 1.0
-        style = {"color": _pick(_COLOURS, place), "marker": _pick(_MARKERS, place), "linestyle": _pick(_LINES, place)}
-        _line(panel, [aside * rate["strength"] for rate in rates], rates, of, "read", label=label, zorder=2, **style)
+        style = {"color": _pick(COLOURS, place), "marker": _pick(MARKERS, place), "linestyle": _pick(_LINES, place)}
+        _line(panel, [aside * rate["strength"] for rate in found], found, of, "read", label=label, zorder=2, **style)
     if wide:
         panel.set_xscale("log")
     panel.set_xticks(strengths, [f"{strength:g}" for strength in strengths], fontsize=8)

@@ -1,0 +1,125 @@
+"""How `make docs` builds these pages: API from docstrings, links checked, nothing public without a docstring."""
+
+import ast
+import inspect
+import re
+import textwrap
+from typing import Any
+
+from sphinx.application import Sphinx
+from sphinx.util import logging
+
+project = "jaxmark"
+author = "The jaxmark authors"
+html_title = "jaxmark"
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.mathjax",
+    "sphinx_click",
+]
+exclude_patterns = ["_build"]
+templates_path = ["_templates"]
+html_theme = "furo"
+smartquotes = False  # two hyphens are an option
+
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3
+
+autodoc_default_options = {"members": True, "undoc-members": True, "member-order": "bysource", "no-value": True}
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+napoleon_attr_annotations = False  # `add_fields` has them
+python_maximum_signature_line_length = 88
+
+# In docstrings backticks are names, which become links where there is something to link to.
+default_role = "py:obj"
+# Links written in a page and full names must lead somewhere; annotations may name what is documented nowhere.
+nitpicky = True
+nitpick_ignore_regex = [("py:(class|obj|data|exc)", r"(?!jaxmark\.)[\s\S]*")]
+
+_DOCUMENTED = {"module", "class", "exception", "function", "method", "property"}
+_logger = logging.getLogger(__name__)
+
+
+def demand_docstring(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Warn, and so fail the build, where something public has no docstring of its own."""
+    text = "\n".join(lines).strip()
+    made = what == "class" and text.startswith(f"{name.rpartition('.')[2]}(")  # by NamedTuple or dataclass
+    module = getattr(getattr(obj, "fget", obj), "__module__", name)  # of a property, its getter's
+    if what in _DOCUMENTED and (not text or made) and name.startswith(module):
+        _logger.warning("%s %s has no docstring", what, name)
+
+
+def escape_markup(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Take docstrings as plain text in which backticks alone are markup: |x| is an absolute value."""
+    parts = re.split(r"(``[^`]*``|`[^`]*`)", "\n".join(lines))
+    plain = [re.sub(r"([|*]|(?<=\w)_(?!\w))", r"\\\1", part) for part in parts[::2]]
+    # Letters may follow a name without a space.
+    plain = [plain[0], *(re.sub(r"^(?=\w)", r"\\ ", part) for part in plain[1:])]
+    names = [*parts[1::2], ""]
+    lines[:] = "".join(a + b for a, b in zip(plain, names, strict=True)).split("\n")
+
+
+def add_fields(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Document the fields of a class by the comments behind them."""
+    if what != "class" or any(line.startswith("Attributes:") for line in lines):
+        return
+    if described := _fields(obj):
+        lines += ["", "Attributes:", *(f"    {field}: {comment}" for field, comment in described.items()), ""]
+
+
+def skip_fields(app: Sphinx, what: str, name: str, obj: Any, skip: bool, options: Any) -> bool | None:
+    """Fields stand in the description of their class."""
+    described = inspect.isroutine(obj) or inspect.isclass(obj) or inspect.isdatadescriptor(obj)
+    return True if what == "class" and (not described or type(obj).__name__ == "_tuplegetter") else None
+
+
+def sign_as_written(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str | None, returns: str | None
+) -> tuple[str | None, str | None]:
+    """Show signatures as the source has them: an evaluated annotation spells out every alias."""
+    definition = _definition(inspect.unwrap(obj))
+    if isinstance(definition, ast.FunctionDef):
+        if what == "method" and not isinstance(inspect.unwrap(obj), staticmethod):
+            definition.args.args = definition.args.args[1:]
+        return f"({ast.unparse(definition.args)})", definition.returns and ast.unparse(definition.returns)
+    if isinstance(definition, ast.ClassDef) and (fields := _fields(obj)):
+        return f"({', '.join(name for name, text in fields.items() if 'ClassVar' not in text)})", None
+    return signature, returns
+
+
+def _fields(record: type) -> dict[str, str]:
+    """The public fields of a class, each with its type, its default and the comment on its line."""
+    definition, lines = _definition(record), _source(record)
+    found = {}
+    for node in definition.body if isinstance(definition, ast.ClassDef) else []:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.target.id[0] != "_":
+            comment = lines[(node.end_lineno or node.lineno) - 1][node.end_col_offset or 0 :].partition("# ")[2]
+            default = f" = {ast.unparse(node.value)}" if node.value else ""
+            found[node.target.id] = f"``{ast.unparse(node.annotation)}{default}``" + (f"; {comment}" if comment else "")
+    return found
+
+
+def _definition(obj: Any) -> ast.stmt | None:
+    lines = _source(obj)
+    return ast.parse("\n".join(lines)).body[0] if lines else None
+
+
+def _source(obj: Any) -> list[str]:
+    try:
+        return textwrap.dedent(inspect.getsource(obj)).splitlines()
+    except (OSError, TypeError):
+        return []
+
+
+def setup(app: Sphinx) -> None:
+    """Before napoleon (500) turns sections into fields."""
+    for place, hook in enumerate([demand_docstring, add_fields, escape_markup]):
+        app.connect("autodoc-process-docstring", hook, priority=100 + place)
+    app.connect("autodoc-process-signature", sign_as_written)
+    app.connect("autodoc-skip-member", skip_fields)
