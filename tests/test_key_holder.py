@@ -61,6 +61,17 @@ def test_slopes_agree_with_finite_differences(key: jm.Key, x64):
     assert float(found) == pytest.approx(float(wanted), rel=1e-5)
 
 
+def test_copies_of_a_point_move_together(key: jm.Key):
+    points = bumpy_sphere(2)
+    copied = Mesh(
+        np.asarray(points.vertices)[np.asarray(points.faces).ravel()], np.arange(points.faces.size).reshape(-1, 3)
+    )
+    marker = jm.make_marker(copied, key, bits=8)
+    mesh = marker.embed(b"k", 5e-3, noise=0, read_back=False)[0]
+    suspect = jm.attack(mesh, erasure(marker, b"k"), 1e-3, seed=0)
+    assert jm.distortion.moved(mesh, suspect).rms == pytest.approx(1e-3, rel=5e-3)
+
+
 def test_refusals(marked):
     marker, _ = marked
     with pytest.raises(jm.JaxmarkError, match="24 bits, but the payload is 16"):

@@ -88,8 +88,8 @@ def descent(
     """Lower the expected evidence by its gradient, with new random keys at each step (Adam; Kingma, Ba, ICLR 2015).
 
     Args:
-        family: which displacements: all of the `"vertices"`; `"bands"`, the mesh's own with other gains, and noise of
-            any strength in each; `"warps"`, smooth fields of wavelengths from 0.2 diagonals on.
+        family: which displacements: all of the `"vertices"`; `"bands"`, of the mesh with lower gains, and of another
+            mark with any strength in each; `"warps"`, smooth fields of wavelengths from 0.2 diagonals on.
         scheme: see `subtraction`.
         bits: see `subtraction`.
         mark: see `subtraction`.
@@ -232,16 +232,13 @@ def _vertices(surrogate: Surrogate, key: PRNGKeyArray) -> tuple[Parameters, Call
 
 
 def _bands(surrogate: Surrogate, key: PRNGKeyArray) -> tuple[Parameters, Callable[[Parameters], Displacement]]:
-    """The mesh's own bands, less what gains from 0 to 1 leave of them, and noise of any strength in each."""
-    noise = jax.random.normal(key, surrogate.signal.shape, surrogate.signal.dtype)
-    # From a mark's own spectrum on: noise passes a band's filter as its strength, squared.
-    written, white = energies(surrogate, random_mark(surrogate, key)[1]), energies(surrogate, noise)
-    share = written / jnp.maximum(white, jnp.finfo(white.dtype).tiny)
-    start = jnp.full_like(share, -4), jnp.log(jnp.maximum(share, 1e-4 * share.max())) / 2
+    """The mesh's own bands, less what gains from 0 to 1 leave of them, and another mark's, each of any strength."""
+    other = random_mark(surrogate, key)[1]
+    start = jnp.full_like(surrogate.seen, -4), jnp.zeros_like(surrogate.seen)
 
     def make(parameters: tuple[Array, Array]) -> Displacement:
         lost, strengths = jax.nn.sigmoid(parameters[0]), jnp.exp(parameters[1])
-        return band_filter(surrogate, strengths, noise) - band_filter(surrogate, lost, surrogate.signal)
+        return band_filter(surrogate, strengths, other) - band_filter(surrogate, lost, surrogate.signal)
 
     return start, make
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Float64, PRNGKeyArray
 
 from jaxmark.bands import scaling
 from jaxmark.carriers import Carrier, KeyedCarrier, ModulatedCarrier
@@ -38,6 +38,7 @@ class Surrogate(NamedTuple):
     operator: Laplacian
     signal: Float[Array, "rows 3"]
     moving: Float[Array, "rows 1"]  # 1 where a face uses the point
+    pose: Float[Array, "rows columns"]  # an orthonormal basis of the affine functions of the position
     bands: Float[Array, "bands terms"]
     seen: Float[Array, " bands"]  # how visible each band is, relative to its RMS; 1 where RMS is what counts
     carrier: KeyedCarrier | ModulatedCarrier  # of a key that does not matter
@@ -69,12 +70,19 @@ def make_surrogate(
         operator=original.operator,
         signal=original.signal,
         moving=original.traced(original.used)[:, None],
+        pose=original.traced(_affine(original)),
         bands=jnp.asarray(family, dtype),
         seen=jnp.asarray(seen, dtype),
         carrier=marker.reader,
         mark=jnp.asarray(mark, dtype),
     )
     return surrogate, original
+
+
+def _affine(original: Original) -> Float64[np.ndarray, "points columns"]:
+    functions = np.c_[np.ones(len(original.used)), original.positions] * original.used[:, None]
+    vectors, values, _ = np.linalg.svd(functions, full_matrices=False)
+    return vectors * (values > 1e-9 * values[0])  # flat meshes have fewer
 
 
 def rms(surrogate: Surrogate, displacement: Displacement) -> Float[Array, ""]:
@@ -114,9 +122,17 @@ def random_mark(surrogate: Surrogate, key: PRNGKeyArray) -> tuple[KeyedCarrier |
 
 
 def evidence(surrogate: Surrogate, displacement: Displacement, key: PRNGKeyArray) -> Float[Array, ""]:
-    """S/‖a‖ of a claim of a random mark in the mesh with it, once displaced."""
+    """S/‖a‖ of a claim of a random mark in the mesh with it, once displaced: the mean of the mark and its opposite.
+
+    What mark and displacement happen to have in common cancels out, which would be most of the noise. The owner undoes
+    affine maps, so they do not count.
+    """
     carrier, written = random_mark(surrogate, key)
-    return strongest(carrier, observe(written + displacement), _ones(surrogate, carrier))
+    bits = _ones(surrogate, carrier)
+    pose = surrogate.pose
+    moved = displacement - matmul(pose, matmul(pose.T, displacement))
+    both = [strongest(carrier, observe(sign * written + moved), sign * bits) for sign in (1, -1)]
+    return jnp.mean(jnp.stack(both))
 
 
 def strongest(carrier: Carrier, seen: Observation, codeword: Float[Array, " code"]) -> Float[Array, ""]:

@@ -83,8 +83,15 @@ def _attack(marker: Marker, message: bytes, slopes: Slope, steps: int) -> Attack
     codeword = jnp.asarray(encode(message, marker.key, original.geometry, marker.code), original.signal.dtype)
 
     def apply(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
-        start, total = np.asarray(mesh.vertices, np.float64), np.zeros_like(original.positions)
-        moved, tried = mesh, []
+        if len(mesh.vertices) != len(original.positions):
+            raise JaxmarkError(
+                f"The mesh has {len(mesh.vertices)} points, the original {len(original.positions)}; only marks in the"
+                " original's own connectivity are erased so."
+            )
+        # An attack is given each point once, but a suspect has its copies.
+        start = np.asarray(mesh.vertices, np.float64)[original.weld.point]
+        total = np.zeros_like(original.positions)
+        moved, tried = Mesh(start, original.mesh.faces), []
         for step in range(steps if strength > 0 else 0):
             aligned = align(original, moved, "same")
             evidence, slope = slopes(reader, marker.observe(aligned), codeword)
@@ -96,12 +103,12 @@ def _attack(marker: Marker, message: bytes, slopes: Slope, steps: int) -> Attack
             total = total + (2 / (step + 2)) * (strength / size * against - total)
             there = total * strength / max(float(rms(total[original.used])), 1e-300)
             back = np.linalg.inv(aligned.pose.matrix)
-            moved = Mesh(start + (original.diagonal * there @ back.T)[original.weld.point], mesh.faces)
+            moved = Mesh(start + (original.diagonal * there @ back.T)[original.weld.point], moved.faces)
         # Beyond the closed form, the way is not always down: the best of all displacements of this size counts.
         if len(tried) > 1:
             last = slopes(reader, marker.observe(align(original, moved, "same")), codeword)[0]
             moved = min([*tried[1:], (float(last), moved)], key=lambda one: one[0])[1]
-        return moved
+        return mesh._replace(vertices=moved.vertices[original.weld.first])
 
     return Attack(apply, _UNIT, _STRENGTHS, host=True)
 
