@@ -12,6 +12,7 @@ from jaxmark.attacks.adversarial.blind import descent as descent
 from jaxmark.attacks.adversarial.blind import evolution as evolution
 from jaxmark.attacks.adversarial.blind import remarking as remarking
 from jaxmark.attacks.adversarial.blind import subtraction as subtraction
+from jaxmark.attacks.adversarial.collusion import Rule as Rule
 from jaxmark.attacks.adversarial.collusion import colluded as colluded
 from jaxmark.attacks.adversarial.collusion import combined as combined
 from jaxmark.attacks.adversarial.key_holder import erasure as erasure
