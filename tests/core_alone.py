@@ -33,15 +33,13 @@ def check_package() -> None:
 
 
 def check_import(folder: str) -> None:
-    """The package is imported fast, by the median of five fresh processes each."""
-
-    def seconds(statement: str) -> float:
-        timed = f"import time; start = time.perf_counter(); {statement}; print(time.perf_counter() - start)"
-        return statistics.median(float(run(folder, "-c", timed).stdout) for _ in range(5))
-
-    jax, both = seconds("import jax"), seconds("import jax, jaxmark")
-    print(f"import jax: {jax:.2f} s; jaxmark beside it: {both - jax:.2f} s")
-    assert both - jax < LONGEST_IMPORT, f"import jaxmark takes {LONGEST_IMPORT} s or more beside JAX's own"
+    """The package is imported fast, by the medians of five fresh processes."""
+    clock = "time.perf_counter()"
+    timed = f"import time; a = {clock}; import jax; b = {clock}; import jaxmark; print(b - a, {clock} - b)"
+    seconds = [map(float, run(folder, "-c", timed).stdout.split()) for _ in range(5)]
+    jax, beside = map(statistics.median, zip(*seconds, strict=True))
+    print(f"import jax: {jax:.2f} s; jaxmark beside it: {beside:.2f} s")
+    assert beside < LONGEST_IMPORT, f"import jaxmark takes {LONGEST_IMPORT} s or more beside JAX's own"
 
 
 def check_command_line(folder: str) -> None:
