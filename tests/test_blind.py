@@ -102,6 +102,7 @@ def test_what_is_subtracted_is_some_of_the_mark(marked):
     assert np.sum(mark * gone) > 3 * abs(np.sum(mark * random)) > 0
 
 
+@pytest.mark.slow
 def test_restarts_by_vmap(marked):
     _, mesh = marked
     surrogate, _ = make_surrogate(mesh, "keyed", 16, MARK)
