@@ -1,43 +1,128 @@
 """The installed core without any extra: mark and read a mesh, and have what is missing name its extra.
 
-Run by itself in a bare environment; pytest does not collect it.
+Run by itself in a bare environment into which the package was installed; pytest does not collect it.
 """
 
+import importlib.metadata
+import importlib.resources
 import importlib.util
+import platform
+import statistics
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+LONGEST_IMPORT = 1.0  # s, beside JAX's own
+REMESHING = {"simplification": 0.5, "isotropic": 1, "iso-surface": 20, "poisson": 5, "arap": 0.05}
 
-def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """The command line, as a user calls it."""
-    return subprocess.run([sys.executable, "-m", "jaxmark", *arguments], capture_output=True, text=True, check=False)
+
+def run(folder: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Python as a user calls it, from a folder where only the installed package is found."""
+    return subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
+
+
+def check_package() -> None:
+    """What is imported is an installed package with its types, and no extra came with it."""
+    package = importlib.resources.files("jaxmark")
+    assert package.joinpath("py.typed").is_file(), "the wheel has no py.typed"
+    assert not Path(str(package)).is_relative_to(Path(__file__).parents[1] / "jaxmark"), f"{package} is the checkout"
+    for extra in ("matplotlib", "pandas", "pymeshlab", "fast_simplification", "skimage", "igl", "distributed"):
+        assert importlib.util.find_spec(extra) is None, f"{extra} came with the core"
+
+
+def check_import(folder: str) -> None:
+    """The package is imported fast, by the medians of five fresh processes."""
+    clock = "time.perf_counter()"
+    timed = f"import time; a = {clock}; import jax; b = {clock}; import jaxmark; print(b - a, {clock} - b)"
+    seconds = [map(float, run(folder, "-c", timed).stdout.split()) for _ in range(5)]
+    jax, beside = map(statistics.median, zip(*seconds, strict=True))
+    print(f"import jax: {jax:.2f} s; jaxmark beside it: {beside:.2f} s")
+    assert beside < LONGEST_IMPORT, f"import jaxmark takes {LONGEST_IMPORT} s or more beside JAX's own"
+
+
+def check_command_line(folder: str) -> None:
+    """A mesh is marked, attacked and read from the shell."""
+    import trimesh
+
+    solid = trimesh.creation.annulus(1.0, 2.0, 1.0).subdivide_to_size(0.12)
+    solid.vertices += 0.002 * trimesh.unitize(solid.vertices[:, [1, 2, 0]])
+    solid.export(Path(folder, "model.ply"))
+    for line in (
+        "keygen owner.key",
+        "embed model.ply marked.ply --key owner.key --message c0ffee",
+        "attack marked.ply suspect.ply noise 0.001",
+        "detect suspect.ply --original model.ply --key owner.key --bits 24",
+    ):
+        done = run(folder, "-m", "jaxmark", *line.split())
+        assert done.returncode == 0, done.stderr
+    assert "c0ffee" in done.stdout
+    refused = run(folder, "-m", "jaxmark", "demo", "model.ply", "--output", "demo")
+    assert refused.returncode == 2
+    assert "jaxmark[plot]" in refused.stderr, refused.stderr
+
+
+def needing(folder: str) -> Iterator[tuple[str, str, Callable[[], object]]]:
+    """What needs an extra: its name, the extra, and a call of it."""
+    import jaxmark as jm
+    from jaxmark import plot
+    from jaxmark.demo import sample_mesh
+    from jaxmark.results import Results
+    from jaxmark.surfaces import Surface
+
+    mesh = jm.load_mesh(Path(folder, "model.ply"))
+    yield "pictures of meshes", "plot", lambda: plot.draw([plot.View("model", mesh)])
+    yield "the viewer", "plot", lambda: plot.show(mesh)
+    yield "pictures of studies", "plot", lambda: Results(()).plot()
+    yield "tables of studies", "study", lambda: Results(()).frame()
+    yield "closest points", "align", lambda: Surface(mesh).closest(mesh.vertices)
+    yield "the sample mesh", "attacks", sample_mesh
+    for name, strength in REMESHING.items():
+        yield name, "attacks", lambda name=name, strength=strength: jm.attack(mesh, name, strength, seed=0)
+
+
+def refusal(call: Callable[[], object]) -> str:
+    """What is said instead of doing it."""
+    from jaxmark.errors import JaxmarkError
+
+    try:
+        call()
+    except JaxmarkError as error:
+        return str(error)
+    return "nothing was refused"
+
+
+def check_extras(folder: str) -> None:
+    """What lacks an extra is refused with its name."""
+    for name, extra, call in needing(folder):
+        said = refusal(call)
+        assert f"pip install 'jaxmark[{extra}]'" in said, f"{name}: {said}"
+
+
+def check_tuning() -> None:
+    """What only tuning imports is there: of two equal bands, each has half of the budget."""
+    import jax.numpy as jnp
+
+    from jaxmark.channels import Channels
+    from jaxmark.tuning import allocate
+
+    alike = Channels(jnp.ones((1, 2)), jnp.ones((1, 2)), jnp.ones((1, 2)))
+    strengths = allocate(alike, jnp.ones(2))
+    assert abs(strengths**2 - 0.5).max() < 1e-3, strengths
 
 
 def main() -> None:
     """Fail loudly where the core does not stand alone."""
-    for extra in ("matplotlib", "pymeshlab", "igl"):
-        assert importlib.util.find_spec(extra) is None, f"{extra} came with the core"
-    import trimesh
-
+    check_package()
     with tempfile.TemporaryDirectory() as folder:
-        model, marked, key = (str(Path(folder, name)) for name in ("model.ply", "marked.ply", "owner.key"))
-        solid = trimesh.creation.annulus(1.0, 2.0, 1.0).subdivide_to_size(0.12)
-        solid.vertices += 0.002 * trimesh.unitize(solid.vertices[:, [1, 2, 0]])
-        solid.export(model)
-        for arguments in (
-            ("keygen", key),
-            ("embed", model, marked, "--key", key, "--message", "c0ffee"),
-            ("detect", marked, "--original", model, "--key", key, "--bits", "24"),
-        ):
-            done = run(*arguments)
-            assert done.returncode == 0, done.stderr
-        assert "c0ffee" in done.stdout
-        refused = run("demo", model, "--output", folder)
-        assert refused.returncode == 2
-        assert "jaxmark[plot]" in refused.stderr, refused.stderr
-    print("the core stands alone")
+        run(folder, "-c", "import jaxmark")  # compiles it
+        check_import(folder)
+        check_command_line(folder)
+        check_extras(folder)
+    check_tuning()
+    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("jax", "numpy", "trimesh"))
+    print(f"the core stands alone: Python {platform.python_version()}, {versions}")
 
 
 if __name__ == "__main__":

@@ -111,6 +111,7 @@ def test_what_is_subtracted_is_some_of_the_mark(marked):
     assert cosine(gone) > 0.13 > abs(cosine(random))
 
 
+@pytest.mark.slow
 def test_restarts_by_vmap(marked):
     _, mesh = marked
     surrogate, _ = make_surrogate(mesh, "keyed", 16, MARK)

@@ -58,6 +58,7 @@ def test_the_circumcentre_is_as_far_from_all_copies(copies, marker: jm.Marker):
     assert np.linalg.norm(rest) <= np.linalg.norm(marker.original.mesh.vertices - mean)
 
 
+@pytest.mark.slow
 def test_enough_copies_give_the_original_back(key: jm.Key):
     """Marks of one key lie in a space of as many dimensions as the code has bits: more copies span it."""
     marker = jm.make_marker(bumpy_sphere(2), key, bits=16)

@@ -55,6 +55,7 @@ def run(page: str) -> dict:
     return names
 
 
+@pytest.mark.slow
 def test_python_blocks_of_the_readme_run(folder: Path, unchecked, capsys):
     assert len(blocks("README.md", "python")) >= 2
     names = run("README.md")

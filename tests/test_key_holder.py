@@ -44,6 +44,7 @@ def test_the_size_is_met_and_evidence_falls(marked):
     np.testing.assert_array_equal(jm.attack(mesh, erasure(marker, MESSAGE), 0, seed=0).vertices, mesh.vertices)
 
 
+@pytest.mark.slow
 def test_slopes_agree_with_finite_differences(key: jm.Key, x64):
     marker = jm.make_marker(bumpy_sphere(2), key, bits=8)
     mesh = marker.embed(b"k", 5e-3, noise=0, read_back=False)[0]

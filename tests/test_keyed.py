@@ -279,6 +279,7 @@ def test_joint_reads(condition, medium: Case, key: jm.Key):
     check_reading(condition, "coordinates", medium, key, np.float32)
 
 
+@pytest.mark.slow
 def test_joint_reads_in_double_precision(medium: Case, key: jm.Key, x64):
     check_reading("everything", "coordinates", medium, key, np.float64)
 

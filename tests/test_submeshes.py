@@ -95,6 +95,7 @@ def test_parts_read_after_similarity_noise_and_the_loss_of_one(marker, marked: M
     assert [one.detected() for one in found] == [True, False, True]
 
 
+@pytest.mark.slow
 def test_what_is_unmarked_is_not_detected(marker, sphere: Mesh, key: jm.Key, marked: Mesh):
     other = make_part_marker(sphere, jm.new_key(), len(MESSAGES), bits=24)
     for one in [*marker.detect(sphere), *other.detect(marked)]:

@@ -130,6 +130,7 @@ def test_the_other_solver_agrees(x64):
         assert share.max() <= 0.3 * (1 + 1e-9)
 
 
+@pytest.mark.slow
 def test_differentiable_with_respect_to_budget_and_strength(x64):
     """Implicitly, through the solution: what finite differences say, of one strength and of a margin."""
     channels, cost = random_channels(3, 6, seed=2)
