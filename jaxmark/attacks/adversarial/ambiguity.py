@@ -8,6 +8,7 @@ from jaxtyping import Float64
 
 from jaxmark import evidence
 from jaxmark.alignment import align, observation
+from jaxmark.detectors import claims
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import KEY_BYTES, Key
 from jaxmark.marking import make_marker
@@ -76,7 +77,8 @@ def searched_key(
 
     def claimed(key: Key) -> float:
         codeword = jnp.asarray(encode(message, key, ready.geometry, code), ready.signal.dtype)
-        return evidence.log10_p_claimed(*scheme.carrier(ready, key, bits, code).claim(received, codeword))
+        ways = zip(*claims(scheme.carrier(ready, key, bits, code), received, codeword), strict=True)
+        return evidence.any_of(*(evidence.log10_p_claimed(score, norm) for score, norm in ways))
 
     log10_p = np.array([claimed(key) for key in tried])
     return Search(tried[int(log10_p.argmin())], log10_p)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Float64, PRNGKeyArray
 
 from jaxmark.alignment import align
 from jaxmark.attacks.adversarial.expected import strongest
@@ -37,7 +37,8 @@ def erasure(marker: Marker, message: bytes) -> Attack:
     """The displacement that lowers the score of a claim most, in closed form.
 
     With weights, gains and powers as the receiver finds them in the marked mesh, the score is linear in the
-    displacement, S + ⟨c, d⟩, and d = -ρ c/‖c‖ is the best of its size: ρ = S/‖c‖ takes all of it.
+    displacement, S + ⟨c, d⟩, and d = -ρ c/‖c‖ is the best of its size: ρ = S/‖c‖ takes all of it. Or, where that leaves
+    less evidence, the mark itself taken off as far as the size goes, and turned beyond.
 
     Args:
         marker: a keyed one: original, key, payload and scheme.
@@ -56,8 +57,9 @@ def erasure(marker: Marker, message: bytes) -> Attack:
 def erasure_by_descent(marker: Marker, message: bytes, *, steps: int = 20) -> Attack:
     """The same by optimisation through all that the receiver does, so that what weighs the evidence is attacked, too.
 
-    Each step goes some of the way to the displacement of its size that lies against the gradient of S/‖a‖, 2/(k + 2) in
-    step k (Frank, Wolfe, Naval Research Logistics Quarterly 3, 1956); the suspect is aligned anew at each.
+    From the closed form on, each step goes some of the way to the displacement of its size that lies against the
+    gradient of S/‖a‖, 2/(k + 2) in step k (Frank, Wolfe, Naval Research Logistics Quarterly 3, 1956); the suspect is
+    aligned anew at each.
 
     Args:
         marker: see `erasure`.
@@ -89,26 +91,33 @@ def _attack(marker: Marker, message: bytes, slopes: Slope, steps: int) -> Attack
                 " original's own connectivity are erased so."
             )
         # An attack is given each point once, but a suspect has its copies.
+        if strength == 0:
+            return mesh
         start = np.asarray(mesh.vertices, np.float64)[original.weld.point]
-        total = np.zeros_like(original.positions)
-        moved, tried = Mesh(start, original.mesh.faces), []
-        for step in range(steps if strength > 0 else 0):
-            aligned = align(original, moved, "same")
-            evidence, slope = slopes(reader, marker.observe(aligned), codeword)
-            tried.append((float(evidence), moved))
-            against = -original.on_host(slope)
-            size = float(rms(against[original.used]))
-            if size == 0:
-                break
-            total = total + (2 / (step + 2)) * (strength / size * against - total)
-            there = total * strength / max(float(rms(total[original.used])), 1e-300)
-            back = np.linalg.inv(aligned.pose.matrix)
-            moved = Mesh(start + (original.diagonal * there @ back.T)[original.weld.point], moved.faces)
-        # Beyond the closed form, the way is not always down: the best of all displacements of this size counts.
-        if len(tried) > 1:
-            last = slopes(reader, marker.observe(align(original, moved, "same")), codeword)[0]
-            moved = min([*tried[1:], (float(last), moved)], key=lambda one: one[0])[1]
-        return mesh._replace(vertices=moved.vertices[original.weld.first])
+        faces, tried = original.mesh.faces, []
+        given = align(original, Mesh(start, faces), "same")
+        back = np.linalg.inv(given.pose.matrix)
+
+        def looked(suspect: Mesh) -> tuple[float, Float64[np.ndarray, "points 3"]]:
+            evidence, slope = slopes(reader, marker.observe(align(original, suspect, "same")), codeword)
+            return float(evidence), -original.on_host(slope)
+
+        def sized(way: Float64[np.ndarray, "points 3"]) -> Float64[np.ndarray, "points 3"]:
+            return way * strength / max(float(rms(way[original.used])), 1e-300)
+
+        def displaced(way: Float64[np.ndarray, "points 3"]) -> Mesh:
+            return Mesh(start + (original.diagonal * sized(way) @ back.T)[original.weld.point], faces)
+
+        # In closed form: what the score falls by most, and the mark itself; then on from the better of them.
+        homewards = -original.on_host(marker.observe(given).residual)
+        ways = [sized(looked(Mesh(start, faces))[1]), sized(homewards)]
+        tried = [(*looked(displaced(way)), way) for way in ways]
+        for step in range(steps - 1):
+            _, against, way = min(tried, key=lambda one: one[0]) if step == 0 else tried[-1]
+            way = way + (2 / (step + 3)) * (sized(against) - way)
+            tried.append((*looked(displaced(way)), way))
+        # The way is not always down: the best of all displacements of this size counts.
+        return mesh._replace(vertices=displaced(min(tried, key=lambda one: one[0])[2]).vertices[original.weld.first])
 
     return Attack(apply, _UNIT, _STRENGTHS, host=True)
 

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float64, PRNGKeyArray
 from jaxmark.attacks.jamming import through_bands
 from jaxmark.attacks.random import generator
 from jaxmark.attacks.registry import Attack
+from jaxmark.detectors import claims
 from jaxmark.distortion import rms
 from jaxmark.errors import JaxmarkError
 from jaxmark.keys import derive, geometry_hash
@@ -55,7 +56,9 @@ class Counted(Generic[Answer]):
 
 
 def score_oracle(marker: Marker, message: bytes) -> Score:
-    """A detector that tells the evidence S/‖a‖ of a claim, without a floor; 0 for a suspect that it refuses.
+    """A detector that tells the evidence √(-2 ln p) of a claim, without a floor; 0 for a suspect that it refuses.
+
+    That is S/‖a‖ where one way of weighing is tried, and a little less where the better of two is (`detectors.claims`).
 
     Args:
         marker: what reads: original, key, payload and scheme.
@@ -73,8 +76,9 @@ def score_oracle(marker: Marker, message: bytes) -> Score:
             seen = marker.observe(mesh)
         except JaxmarkError:
             return 0.0
-        found, norm = (float(one) for one in reader.claim(seen, codeword))
-        return found / norm if norm > 0 else 0.0
+        scores, norms = (np.asarray(one, np.float64) for one in claims(reader, seen, codeword))
+        best = np.max(np.divide(scores, norms, out=np.zeros_like(scores), where=norms > 0))
+        return math.sqrt(max(float(best) * abs(float(best)) - 2 * math.log(len(scores)), 0.0))
 
     return score
 
@@ -106,8 +110,8 @@ def decided(oracle: Score, alpha: float = 1e-6) -> Decision:
     """The decision by a score: with `randomised`, by a threshold that nobody can tell beforehand.
 
     Args:
-        oracle: of S/‖a‖.
-        alpha: see `decision_oracle`; Hoeffding's bound is below it from S/‖a‖ = √(-2 ln α) on.
+        oracle: of √(-2 ln p), see `score_oracle`.
+        alpha: see `decision_oracle`.
 
     Raises:
         JaxmarkError: if `alpha` is out of range.
