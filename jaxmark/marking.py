@@ -384,10 +384,10 @@ def detect(
     """Read a mark from a suspect, and say what the reading proves.
 
     The suspect is brought back to the original first (`jaxmark.alignment.align`); points that are far off are masked.
-    Without `message`, the message read counts only if its keyed tag fits; two proofs are then tried and paid for: the
-    tag, and the union bound over all messages. With `message`, log10_p is Hoeffding's bound for that message (see
+    Without `message`, the message read counts only if its keyed tag fits; proofs are then tried and paid for: the tag,
+    and the union bound over all messages. With `message`, log10_p is Hoeffding's bound for that message (see
     `evidence.log10_p_claimed`), which can prove a mark whose message no longer reads; a claim is refuted (0) where
-    another message reads.
+    another message reads. Scores are taken in each way of weighing that `detectors.claims` knows, and paid for, too.
 
     Both hold for any suspect independent of the key, provided that key, original and claimed message were fixed before
     the suspect was seen; that weights depend on suspect and original only; and that the score is the plain correlation
