@@ -25,6 +25,7 @@ from jaxmark.mesh import Mesh
 from jaxmark.observation import Observation, observe
 from jaxmark.original import Original
 from jaxmark.precision import matmul
+from jaxmark.reception import Reception
 from jaxmark.schemes import Scheme
 from jaxmark.visibility import band_visibility
 
@@ -135,7 +136,7 @@ def evidence(surrogate: Surrogate, displacement: Displacement, key: PRNGKeyArray
     return jnp.mean(jnp.stack(both))
 
 
-def strongest(carrier: Carrier, seen: Observation, codeword: Float[Array, " code"]) -> Float[Array, ""]:
+def strongest(carrier: Carrier, seen: Observation | Reception, codeword: Float[Array, " code"]) -> Float[Array, ""]:
     """The largest S/‖a‖ of all ways of weighing a suspect, smoothed so that an attack goes against all that are near.
 
     It lies above the largest by at most a quarter of the logarithm of their number.

@@ -25,7 +25,7 @@ from jaxmark.precision import matmul
 from jaxmark.reception import clean
 
 _UNIT = "RMS over the diagonal"
-_STRENGTHS = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
+_STRENGTHS = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
 
 # The evidence S/‖a‖ of a claim, and a displacement along which it rises.
 Slope = Callable[
@@ -126,7 +126,7 @@ def _attack(marker: Marker, message: bytes, slopes: Slope, steps: int) -> Attack
 def _linear_slope(
     carrier: KeyedCarrier, seen: Observation, codeword: Float[Array, " code"]
 ) -> tuple[Float[Array, ""], Float[Array, "vertices 3"]]:
-    """Of the score alone, with what the receiver learns held fixed."""
+    """Of the score alone, with what the receiver learns held fixed; the evidence as it would be found."""
     received = carrier.received(seen)
 
     def score(residual: Array) -> Array:
@@ -134,8 +134,7 @@ def _linear_slope(
         shape = carrier.shape(1.0, received.gain / received.power)
         return jnp.sum(codeword * carrier.correlate(matmul(left, received.axes), shape))
 
-    found, norm = carrier.claim(received, codeword)
-    return found / norm, jax.grad(score)(seen.residual)
+    return strongest(carrier, received, codeword), jax.grad(score)(seen.residual)
 
 
 @jax.jit
