@@ -30,6 +30,7 @@ from jaxmark.attacks import low_pass
 from jaxmark.detectors import claims
 from jaxmark.mesh import Mesh
 from jaxmark.message import encode
+from jaxmark.schemes import Scheme
 
 BITS, BUDGET, ALPHA = 64, 8e-4, 1e-6
 METRICS = ("rms", "dame", "msdm2")
@@ -46,7 +47,11 @@ Subject = tuple[jm.Marker, Mesh, float]  # what reads it, the marked mesh, the l
 
 @lru_cache(maxsize=1)
 def subject(path: str, scheme: str) -> Subject:
-    marker = jm.make_marker(jm.load_mesh(path), KEY, bits=BITS, scheme=scheme)
+    return mark(jm.load_mesh(path), scheme)
+
+
+def mark(mesh: Mesh, scheme: str | Scheme) -> Subject:
+    marker = jm.make_marker(mesh, KEY, bits=BITS, scheme=scheme)
     marked, _ = marker.embed(MESSAGE, BUDGET, noise=0)
     seen = marker.observe(marked)
     code = encode(MESSAGE, KEY, marker.original.geometry, marker.code)
@@ -164,6 +169,10 @@ def report(rows: list[dict], meshes: list[str], schemes: list[str], attackers: l
     return "\n".join(lines).strip() + "\n"
 
 
+def costs(cost: dict[str, float]) -> str:
+    return " / ".join(f"{cost[metric]:.3g}" if metric in cost else "-" for metric in METRICS)
+
+
 def _line(level: str, name: str, rest: list[str]) -> str:
     return f"| {level} | {name} | {' | '.join(rest)} |"
 
@@ -174,7 +183,7 @@ def _least(rows: list[dict], metric: str) -> float:
 
 def _cell(row: dict) -> str:
     if "cost" in row:
-        return " / ".join(f"{row['cost'][metric]:.3g}" if metric in row["cost"] else "-" for metric in METRICS)
+        return costs(row["cost"])
     return f"refused: {row['refused']}" if "refused" in row else f"detected up to {row['not below']:g}"
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Float64, PRNGKeyArray
 from scipy import optimize
 
 from jaxmark.alignment import align, observation
-from jaxmark.attacks import attack
+from jaxmark.attacks import Kind, attack
 from jaxmark.bands import scaling
 from jaxmark.budget import Budget, Limits, make_budget, write
 from jaxmark.carriers.carrier import Displacement
@@ -33,7 +33,7 @@ from jaxmark.schemes import KeyedScheme
 from jaxmark.visibility import band_visibility, masking
 
 Solver = Literal["projected-gradient", "accelerated-gradient"]
-Attacker = tuple[str, float] | Callable[[Mesh, int], Mesh]  # a name in `ATTACKS` and a strength, or (mesh, seed) → mesh
+Attacker = tuple[Kind, float] | Callable[[Mesh, int], Mesh]  # an attack and a strength, or (mesh, seed) → mesh
 
 _ANNEALING = (0.01, 0.1)  # of the final sharpness, in the stages before it
 _BALANCING = 30  # rounds in which several limits are weighed against each other
@@ -82,7 +82,8 @@ def tune(
 
     Args:
         mesh: the original.
-        attacks: what to survive, each a name and a strength or a function of mesh and seed.
+        attacks: what to survive, each a name in `ATTACKS` or an `Attack`, with a strength; or a function of mesh and
+            seed.
         budget: see `embed`.
         limits: see `embed`.
         key: a JAX random key, of the attacks' randomness; no secret.

@@ -8,6 +8,7 @@ from jaxmark.attacks.adversarial.ambiguity import Search as Search
 from jaxmark.attacks.adversarial.ambiguity import forged_original as forged_original
 from jaxmark.attacks.adversarial.ambiguity import searched_key as searched_key
 from jaxmark.attacks.adversarial.ambiguity import transplanted as transplanted
+from jaxmark.attacks.adversarial.blind import Family as Family
 from jaxmark.attacks.adversarial.blind import descent as descent
 from jaxmark.attacks.adversarial.blind import evolution as evolution
 from jaxmark.attacks.adversarial.blind import remarking as remarking
