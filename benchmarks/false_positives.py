@@ -19,13 +19,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
-from scipy import stats
 
 import jaxmark as jm
 from jaxmark.budget import make_budget
 from jaxmark.carriers import KeyedCarrier, make_chips
 from jaxmark.detectors import claims
 from jaxmark.evidence import any_of, log10_p_claimed, log10_p_read
+from jaxmark.intervals import clopper_pearson
 from jaxmark.mesh import Mesh
 from jaxmark.message import encode
 from jaxmark.observation import Observation
@@ -123,13 +123,12 @@ def holds(values: np.ndarray, names: list[str], *, fires: bool, report: bool) ->
     sound = True
     for level in LEVELS:
         hits = np.sum(values <= math.log10(level), axis=0)
-        lower = [stats.beta.ppf(1e-3, hit, len(values) - hit + 1) if hit else 0.0 for hit in hits]
+        lower = clopper_pearson(hits, len(values), 0.998).low
         total, pairs = int(hits.sum()), values.size
-        low = stats.beta.ppf(0.025, total, pairs - total + 1) if total else 0.0
-        high = stats.beta.ppf(0.975, total + 1, pairs - total)
+        low, high = clopper_pearson(total, pairs)
         worst = int(np.argmax(hits))
         least = level * pairs / 30
-        sound &= max(lower) <= level and (not fires or least < ENOUGH or total >= least)
+        sound &= lower.max() <= level and (not fires or least < ENOUGH or total >= least)
         if report:
             print(
                 f"{level:7.0e} {total:8d} of {pairs}: {total / pairs:.2e} [{low:.2e}, {high:.2e}], nominal /"

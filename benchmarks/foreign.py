@@ -25,12 +25,12 @@ import numpy as np
 import trimesh
 from numpy.random import Generator
 from robustness import mark
-from scipy import stats
 from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
 from jaxmark.alignment import align
 from jaxmark.attacks.meshlab import filtered
+from jaxmark.intervals import clopper_pearson
 from jaxmark.marking import NOISE
 from jaxmark.mesh import Mesh, compacted, diagonal, used_vertices, weld, welded_mesh
 from jaxmark.original import prepare
@@ -205,8 +205,7 @@ def summary(rows: list[Row]) -> str:
         mine = [row for row in rows if kind in (row["kind"], "all")]
         values = [row["log10_p"] for row in mine if "log10_p" in row]
         hits = sum(value <= LEVEL for value in values)
-        # Clopper and Pearson, Biometrika 26, 1934; one-sided.
-        most = stats.beta.ppf(0.95, hits + 1, len(values) - hits) if hits < len(values) else 1.0
+        most = clopper_pearson(hits, len(values), 0.9).high if values else 1.0
         text += [f"| {kind} | {len(values)} | {hits} | {most:.2g} | {len(mine) - len(values)} |"]
     notes = Counter(row["note"] for row in rows if "note" in row)
     return "\n".join([*text, "", *(f"- {count} × {note}" for note, count in notes.most_common())])

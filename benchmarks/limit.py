@@ -29,6 +29,7 @@ import jaxmark as jm
 from jaxmark import message, polar
 from jaxmark.budget import make_budget
 from jaxmark.carriers import KeyedCarrier
+from jaxmark.intervals import clopper_pearson
 from jaxmark.marking import Marker, make_marker
 from jaxmark.original import displaced, residual
 from jaxmark.payload import least_energy, room
@@ -84,8 +85,7 @@ def measure(name: str, bits: int, gaps: list[float], trials: int, count: Count) 
         while done < trials and errors < ENOUGH:
             batch = min(128, trials - done)
             errors, done = errors + count(level, batch), done + batch
-        low = stats.beta.ppf(0.025, errors, done - errors + 1) if errors else 0.0
-        high = stats.beta.ppf(0.975, errors + 1, done - errors) if errors < done else 1.0
+        low, high = clopper_pearson(errors, done)
         points.append((gap, errors / done if errors else high, "" if errors else "at most "))
         bare = -math.expm1(bits * stats.norm.logcdf(math.sqrt(2 * level)))
         left = f"{converse + gap:18.2f}  {gap:10.2f}  {errors:7d} / {done:<6d}  {errors / done:7.1e}"

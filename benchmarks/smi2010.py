@@ -24,13 +24,13 @@ import jax
 import numpy as np
 from harmonics import THRESHOLD, HarmonicMark, make_mark
 from scipy.spatial.transform import Rotation
-from scipy.stats import beta
 
 import jaxmark as jm
 from jaxmark.alignment import align
 from jaxmark.attacks import Attack
 from jaxmark.cells import Cell, processes, run
 from jaxmark.errors import JaxmarkError
+from jaxmark.intervals import clopper_pearson
 from jaxmark.mesh import Mesh
 from jaxmark.robustness import NOTHING, read
 
@@ -221,8 +221,8 @@ def controls(rows: list[Row], methods: list[str]) -> Iterator[str]:
                 for one in row.get("readings", [])
                 if one["trial"] != row["cell"][3]
             ]
-            most = beta.ppf(0.95, sum(found) + 1, len(found) - sum(found)) if sum(found) < len(found) else 1.0
-            cells += [f"{sum(found)}/{len(found)}", f"{most:.2g}" if found else "-"]
+            most = f"{clopper_pearson(sum(found), len(found), 0.9).high:.2g}" if found else "-"
+            cells += [f"{sum(found)}/{len(found)}", most]
         yield f"| {' | '.join(cells)} |"
 
 
