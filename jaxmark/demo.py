@@ -35,7 +35,7 @@ _ATTACKS = (
 _PICTURED = ("noise", 0.005)
 
 
-class Row(NamedTuple):
+class Outcome(NamedTuple):
     """One line of the demo's table."""
 
     scheme: str
@@ -61,7 +61,7 @@ def sample_mesh() -> Path:
 
 def run_demo(
     source: str | os.PathLike[str] | None, output: str | os.PathLike[str], say: Callable[[str], None]
-) -> list[Row]:
+) -> list[Outcome]:
     """Mark a mesh with a fresh key and message, attack it, and read it again, by each scheme.
 
     Leaves in the folder `output`: the marked mesh of each scheme with its record, the table `table.md`, and the
@@ -90,7 +90,7 @@ def run_demo(
     key = new_key()
     message = os.urandom(8)
     say(f"message {message.hex()} (64 bits), as strong as the eye allows ({make_budget()})")
-    rows: list[Row] = []
+    rows: list[Outcome] = []
     for scheme in SCHEMES:
         try:
             marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
@@ -117,12 +117,12 @@ def run_demo(
     return rows
 
 
-def _attacked(marker: Marker, marked: Mesh, message: bytes) -> Iterator[Row]:
+def _attacked(marker: Marker, marked: Mesh, message: bytes) -> Iterator[Outcome]:
     sent = encode(message, marker.key, marker.original.geometry, marker.code)
     for kind, strength in (("none", 0.0), *_ATTACKS):
         suspect = marked if kind == "none" else attack(marked, kind, strength, seed=0)
         blind, claimed = marker.detect(suspect), marker.detect(suspect, message)
-        yield Row(
+        yield Outcome(
             marker.scheme.name,
             kind if kind == "none" else f"{kind} {strength:g}",
             distortion.moved(marked, suspect).rms,
@@ -133,7 +133,7 @@ def _attacked(marker: Marker, marked: Mesh, message: bytes) -> Iterator[Row]:
         )
 
 
-def _line(row: Row) -> str:
+def _line(row: Outcome) -> str:
     outcome = "read" if row.message_read else "LOST"
     return (
         f"{row.attack:<16} attack RMS {row.rms:.6f}  {100 * row.wrong:4.1f} % of code bits wrong, message {outcome:<4}"
@@ -141,7 +141,7 @@ def _line(row: Row) -> str:
     )
 
 
-def _table(rows: list[Row]) -> str:
+def _table(rows: list[Outcome]) -> str:
     head = (
         "| scheme | attack | attack RMS / diagonal | wrong code bits | message | log10 p | log10 p, claimed |\n"
         "|---|---|---|---|---|---|---|\n"

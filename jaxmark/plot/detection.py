@@ -73,7 +73,7 @@ def success(curves: Mapping[str, Robustness], unit: str, *, confidence: float = 
 
     Args:
         curves: what `jaxmark.robustness` found, for one attack, by what was marked or how.
-        unit: of the attack's strength, as `jaxmark.ATTACKS` has it.
+        unit: of the attack's strength, as `jm.ATTACKS` has it.
         confidence: of the intervals, at each strength by itself.
 
     Raises:

@@ -84,11 +84,11 @@ def band_visibility(original: Original, metrics: Sequence[Metric], bands: int = 
 
     Args:
         original: the original.
-        metrics: names in `jaxmark.distortion.METRICS`, or functions of your own.
+        metrics: names in `distortion.METRICS`, or functions of your own.
         bands: how many Jackson-damped scaling functions.
 
     Raises:
-        JaxmarkError: if matplotlib is missing, or see `jaxmark.distortion.measure`.
+        JaxmarkError: if matplotlib is missing, or see `distortion.measure`.
     """
     found = visibility.band_visibility(original, scaling(bands, damping="jackson"), metrics)
     figure, (axes,) = panels(1, 6.5, 4.2)
