@@ -40,6 +40,7 @@ def unbound(original: Mesh, geometry: bytes, key: bytes) -> Marker:
     return Marker(ready, jm.Key(key), 16, scheme, scheme.carrier(ready, key, 16, code), code, scheme.detector)
 
 
+@pytest.mark.slow
 def test_inversion_fails_only_by_the_hash(published, forged):
     mesh, _ = published
     assert jm.distortion.moved(forged, mesh).rms == pytest.approx(8e-4, rel=1e-2)

@@ -221,6 +221,7 @@ def test_host_function_keeps_copies_together_and_digits_far_away(cap: Mesh):
     np.testing.assert_array_equal(jm.attack(soup, "noise", 0, seed=0).vertices, soup.vertices)
 
 
+@pytest.mark.slow
 def test_a_stray_vertex_changes_nothing(cap: Mesh):
     stray = make_mesh(np.vstack([cap.vertices[:-1], [[1e9, 0, 0]]]), cap.faces)
     for kind, strength in MILD:

@@ -42,7 +42,7 @@ def test_an_attacker_sees_on_average_what_the_owner_sees(marked):
     assert np.mean(found) == pytest.approx(owner_sees(marker, mesh), rel=0.1)
 
 
-@pytest.mark.parametrize("scheme", ["keyed", "host"])
+@pytest.mark.parametrize("scheme", [pytest.param("keyed", marks=pytest.mark.slow), "host"])
 def test_gradients_agree_with_finite_differences(scheme, key: jm.Key, x64):
     marker = jm.make_marker(bumpy_sphere(2), key, bits=8, scheme=scheme)
     mesh = marker.embed(b"k", 5e-3, noise=0, read_back=False)[0]

@@ -28,6 +28,7 @@ def evidence(marker: jm.Marker, suspect: Mesh) -> float:
     return float(score / norm)
 
 
+@pytest.mark.slow
 def test_the_size_is_met_and_evidence_falls(marked):
     marker, mesh = marked
     before = evidence(marker, mesh)

@@ -259,6 +259,7 @@ def test_what_a_suspect_explains_is_projected_off_too(condition, case: Case, x64
     assert np.abs(receive(wide, seen).residual).max() < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("condition", ["everything", "half", "weights"])
 def test_axes_make_directions_alike(condition, case: Case, x64):
     """The inverse root of the covariance of noise, by SciPy, whatever its colour."""

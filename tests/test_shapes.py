@@ -41,6 +41,7 @@ def test_what_is_filled_in_changes_nothing(hard_graph: Mesh, weights, lowering, 
     np.testing.assert_array_equal(got[len(x) :], 0)
 
 
+@pytest.mark.slow
 def test_programs_serve_meshes_of_other_sizes(key: jm.Key):
     """Where meshes have about as many vertices, and the scheme lays out their bands alike."""
     whole, compiled = bumpy_sphere(4), []

@@ -29,6 +29,7 @@ def start(*arguments: str, devices: int | None = None) -> subprocess.Popen[str]:
     return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=output, stderr=subprocess.STDOUT, text=True)
 
 
+@pytest.mark.slow
 def test_on_four_devices():
     tests = start("-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/on_four_devices.py", devices=4)
     output, _ = tests.communicate(timeout=120)

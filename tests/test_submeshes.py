@@ -84,6 +84,7 @@ def test_each_part_reads_its_own_message(marker, marked: Mesh, sphere: Mesh):
         assert np.sqrt(np.mean(shift[marker.label == part] ** 2)) == pytest.approx(8e-4, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_parts_read_after_similarity_noise_and_the_loss_of_one(marker, marked: Mesh):
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))

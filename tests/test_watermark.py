@@ -73,6 +73,7 @@ def test_the_printed_form_confuses_bits_that_decorrelation_separates(prepared, k
     assert errors["damped"] == 0
 
 
+@pytest.mark.slow
 def test_pure_functions_by_transformation(prepared, key: jm.Key, x64):
     operator, signal = prepared
     x = jnp.asarray(signal)
