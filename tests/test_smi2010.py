@@ -68,7 +68,7 @@ def test_the_carrier_of_the_tool_is_its_formula_and_its_adjoint(harmonics, x64):
 
 
 def test_the_tool_confirms_its_mark_in_noise_and_a_quarter_of_what_is_none(harmonics):
-    mesh = bumpy_sphere(4)
+    mesh = bumpy_sphere(3)
     mark = harmonics.make_mark(mesh, [1])
     marked = mark.embed({"rms": 1e-3})
     expected = jm.distortion.moved(mesh, marked).max
@@ -126,7 +126,7 @@ def test_published_rates_stand_beside_their_attacks(smi2010):
 @pytest.mark.slow
 def test_a_run_from_start_to_end_and_again(tmp_path, smi2010):
     source, output = tmp_path / "ball.ply", tmp_path / "out"
-    mesh = bumpy_sphere(4)
+    mesh = bumpy_sphere(3)
     jm.save_mesh(make_mesh(mesh.vertices, mesh.faces), source)
     options = ["--methods", "keyed", "harmonics", "--limits", "perceptual", "--trials", "1", "--workers", "1"]
     options += ["--attacks", "none", "noise 0.003", "smoothing 10"]
