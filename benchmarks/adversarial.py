@@ -131,6 +131,7 @@ ATTACKERS: dict[tuple[str, str], Callable[..., jm.Attack]] = {
 }
 
 LEVELS = list(dict.fromkeys(level for level, _ in ATTACKERS))
+NAMES = [*LEVELS, THEORY, *(name for _, name in ATTACKERS)]
 
 
 def work(folder: str, steps: int, cell: cells.Cell) -> cells.Row:
@@ -194,13 +195,15 @@ def main() -> None:
     parser.add_argument("--schemes", nargs="+", default=["keyed"])
     parser.add_argument("--steps", type=int, default=30, help="of optimisers")
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--only", nargs="+", choices=LEVELS, default=LEVELS)
+    parser.add_argument("--only", nargs="+", metavar="NAME", default=LEVELS, help="levels, or attackers by name")
     arguments = parser.parse_args()
     folders = {str(Path(mesh).resolve().parent) for mesh in arguments.meshes}
     if len(folders) > 1:
         parser.error("the meshes must be of one folder")
     meshes = [Path(mesh).name for mesh in arguments.meshes]
-    attackers = [one for one in [("program", THEORY), *ATTACKERS] if one[0] in arguments.only]
+    attackers = [one for one in [("program", THEORY), *ATTACKERS] if {*one} & {*arguments.only}]
+    if unknown := {*arguments.only} - {name for one in attackers for name in one}:
+        parser.error(f"there is no level or attacker {', '.join(sorted(unknown))}; there are {', '.join(NAMES)}")
     wanted = [(mesh, scheme, *one) for mesh in meshes for scheme in arguments.schemes for one in attackers]
     arguments.output.mkdir(parents=True, exist_ok=True)
     rows = cells.run(
