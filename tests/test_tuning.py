@@ -250,7 +250,8 @@ def test_any_function_is_an_attack_and_a_start_is_warm(tuned):
         return mesh._replace(vertices=0.5 * np.asarray(mesh.vertices))
 
     first = tune(mesh, [shrink, ("smoothing", 5)], 5e-4, key=jax.random.key(0), bits=16)
-    again = tune(mesh, [shrink, ("smoothing", 5)], 5e-4, key=jax.random.key(0), bits=16, start=first.beta)
+    named = (jm.ATTACKS["smoothing"], 5)
+    again = tune(mesh, [shrink, named], 5e-4, key=jax.random.key(0), bits=16, start=first.beta)
     assert again.report.margins.min() > 0.98 * first.report.margins.min()
 
 
