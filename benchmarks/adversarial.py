@@ -20,16 +20,13 @@ from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
 import jaxmark as jm
 from jaxmark import cells
 from jaxmark.attacks import adversarial as enemies
 from jaxmark.attacks import low_pass
-from jaxmark.detectors import claims
 from jaxmark.mesh import Mesh
-from jaxmark.message import encode
 from jaxmark.schemes import Scheme
 
 BITS, BUDGET, ALPHA = 64, 8e-4, 1e-6
@@ -53,10 +50,7 @@ def subject(path: str, scheme: str) -> Subject:
 def mark(mesh: Mesh, scheme: str | Scheme) -> Subject:
     marker = jm.make_marker(mesh, KEY, bits=BITS, scheme=scheme)
     marked, _ = marker.embed(MESSAGE, BUDGET, noise=0)
-    seen = marker.observe(marked)
-    code = encode(MESSAGE, KEY, marker.original.geometry, marker.code)
-    scores, norms = claims(marker.reader, seen, jnp.asarray(code, seen.residual.dtype))
-    evidence, needed = float(jnp.max(scores / norms)) ** 2 / 2, -math.log(ALPHA)
+    evidence, needed = enemies.score_oracle(marker, MESSAGE)(marked) ** 2 / 2, -math.log(ALPHA)
     return marker, marked, math.sqrt(max(evidence / needed - 1, 0.0))
 
 

@@ -27,6 +27,7 @@ from jaxmark.reception import clean
 _UNIT = "RMS over the diagonal"
 _STRENGTHS = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
 
+_Way = Float64[np.ndarray, "points 3"]
 # The evidence S/‖a‖ of a claim, and a displacement along which it rises.
 Slope = Callable[
     [KeyedCarrier, Observation, Float[Array, " code"]], tuple[Float[Array, ""], Float[Array, "vertices 3"]]
@@ -90,34 +91,36 @@ def _attack(marker: Marker, message: bytes, slopes: Slope, steps: int) -> Attack
                 f"The mesh has {len(mesh.vertices)} points, the original {len(original.positions)}; only marks in the"
                 " original's own connectivity are erased so."
             )
-        # An attack is given each point once, but a suspect has its copies.
         if strength == 0:
             return mesh
+        # An attack is given each point once, but a suspect has its copies.
         start = np.asarray(mesh.vertices, np.float64)[original.weld.point]
-        faces, tried = original.mesh.faces, []
+        faces = original.mesh.faces
         given = align(original, Mesh(start, faces), "same")
-        back = np.linalg.inv(given.pose.matrix)
+        seen, back = marker.observe(given), np.linalg.inv(given.pose.matrix)
 
-        def looked(suspect: Mesh) -> tuple[float, Float64[np.ndarray, "points 3"]]:
-            evidence, slope = slopes(reader, marker.observe(align(original, suspect, "same")), codeword)
+        def looked(seen: Observation) -> tuple[float, _Way]:
+            evidence, slope = slopes(reader, seen, codeword)
             return float(evidence), -original.on_host(slope)
 
-        def sized(way: Float64[np.ndarray, "points 3"]) -> Float64[np.ndarray, "points 3"]:
+        def sized(way: _Way) -> _Way:
             return way * strength / max(float(rms(way[original.used])), 1e-300)
 
-        def displaced(way: Float64[np.ndarray, "points 3"]) -> Mesh:
+        def displaced(way: _Way) -> Mesh:
             return Mesh(start + (original.diagonal * sized(way) @ back.T)[original.weld.point], faces)
 
+        def tried(way: _Way) -> tuple[float, _Way, _Way]:
+            return (*looked(marker.observe(align(original, displaced(way), "same"))), way)
+
         # In closed form: what the score falls by most, and the mark itself; then on from the better of them.
-        homewards = -original.on_host(marker.observe(given).residual)
-        ways = [sized(looked(Mesh(start, faces))[1]), sized(homewards)]
-        tried = [(*looked(displaced(way)), way) for way in ways]
+        homewards = -original.on_host(seen.residual)
+        trials = [tried(sized(way)) for way in (looked(seen)[1], homewards)]
+        _, against, way = min(trials, key=lambda one: one[0])
         for step in range(steps - 1):
-            _, against, way = min(tried, key=lambda one: one[0]) if step == 0 else tried[-1]
-            way = way + (2 / (step + 3)) * (sized(against) - way)
-            tried.append((*looked(displaced(way)), way))
+            trials.append(tried(way + (2 / (step + 3)) * (sized(against) - way)))
+            _, against, way = trials[-1]
         # The way is not always down: the best of all displacements of this size counts.
-        return mesh._replace(vertices=displaced(min(tried, key=lambda one: one[0])[2]).vertices[original.weld.first])
+        return mesh._replace(vertices=displaced(min(trials, key=lambda one: one[0])[2]).vertices[original.weld.first])
 
     return Attack(apply, _UNIT, _STRENGTHS, host=True)
 
