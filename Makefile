@@ -3,25 +3,31 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: demo test lint types tests slow-tests docs clean
+.PHONY: help demo test lint types tests slow-tests coverage docs clean
+
+help:  ## list these commands
+	@awk -F ':.*  ## ' '/^[a-z-]+:.*  ## / {printf "%-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 demo: $(VENV)/.all  ## mark, attack and read a mesh: make demo [MESH=file]
 	$(BIN)/jaxmark demo $(MESH) --output demo-output
 
-test: lint types tests  ## everything that must hold
+test: lint types tests  ## everything that must hold before a change goes in
 
-lint: $(VENV)/.dev
+lint: $(VENV)/.dev  ## ruff: style and formatting
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: $(VENV)/.dev
+types: $(VENV)/.dev  ## pyright: types
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-tests: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n auto --durations=20
+tests: $(VENV)/.dev  ## pytest: all tests but the slow ones
+	$(BIN)/python -m pytest -q -n auto --dist worksteal --durations=20
 
-slow-tests: $(VENV)/.dev
-	$(BIN)/python -m pytest -q -n auto -m slow
+slow-tests: $(VENV)/.dev  ## pytest: the slow ones
+	$(BIN)/python -m pytest -q -n auto --dist worksteal -m slow
+
+coverage: $(VENV)/.dev  ## which lines the tests run; all of it in build/coverage
+	$(BIN)/python -m pytest -q -n auto --cov --cov-report=term:skip-covered --cov-report=html
 
 docs: $(VENV)/.docs  ## all pages, in docs/_build/html
 	$(BIN)/sphinx-build --quiet --fresh-env --nitpicky --fail-on-warning --keep-going docs docs/_build/html
@@ -32,5 +38,5 @@ $(VENV)/.%: pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[$*]'
 	touch $@
 
-clean:
+clean:  ## remove what these commands made
 	rm -rf $(VENV) demo-output build dist docs/_build docs/reference/api

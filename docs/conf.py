@@ -7,6 +7,7 @@ import textwrap
 from typing import Any
 
 from sphinx.application import Sphinx
+from sphinx.pycode import ModuleAnalyzer
 from sphinx.util import logging
 
 project = "jaxmark"
@@ -51,7 +52,7 @@ def demand_docstring(app: Sphinx, what: str, name: str, obj: Any, options: Any, 
     text = "\n".join(lines).strip()
     made = what == "class" and text.startswith(f"{name.rpartition('.')[2]}(")  # by NamedTuple or dataclass
     module = getattr(getattr(obj, "fget", obj), "__module__", name)  # of a property, its getter's
-    if what in _DOCUMENTED and (not text or made) and name.startswith(module):
+    if what in _DOCUMENTED and (not text or made) and name.startswith(_home(module)):
         _logger.warning("%s %s has no docstring", what, name)
 
 
@@ -73,10 +74,28 @@ def add_fields(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines:
         lines += ["", "Attributes:", *(f"    {field}: {comment}" for field, comment in described.items()), ""]
 
 
-def skip_fields(app: Sphinx, what: str, name: str, obj: Any, skip: bool, options: Any) -> bool | None:
-    """Fields stand in the description of their class."""
-    described = inspect.isroutine(obj) or inspect.isclass(obj) or inspect.isdatadescriptor(obj)
-    return True if what == "class" and (not described or type(obj).__name__ == "_tuplegetter") else None
+def list_face(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Let the page of a room begin with what can be imported from it, and where each of that is described."""
+    if what != "module" or not (shown := _face(obj)):
+        return
+    links, data = [], []
+    for shown_name, module in shown.items():
+        value, place = getattr(obj, shown_name), f"{_home(module)}.{shown_name}"
+        comment = ModuleAnalyzer.for_module(module).find_attr_docs().get(("", shown_name))
+        linked = inspect.isclass(value) or inspect.isroutine(value) or inspect.ismodule(value) or comment
+        links.append(f"`~{place}`" if linked else f"``{shown_name}``")
+        if comment and module != _home(module):
+            data += [f".. py:data:: {shown_name}", "", *(f"   {line}" for line in comment), ""]
+    lines += [f"Import from here: {', '.join(links)}.", "", *data]
+
+
+def skip_member(app: Sphinx, what: str, name: str, obj: Any, skip: bool, options: Any) -> bool | None:
+    """A name is described where it is defined, or in the room of its private module; a field, with its class."""
+    described = inspect.isroutine(obj) or inspect.isclass(obj)
+    if what == "module":
+        return True if described and _home(obj.__module__ or "") != app.env.temp_data["autodoc:module"] else None
+    described = described or inspect.isdatadescriptor(obj)
+    return True if not described or type(obj).__name__ == "_tuplegetter" else None
 
 
 def sign_as_written(
@@ -91,6 +110,24 @@ def sign_as_written(
     if isinstance(definition, ast.ClassDef) and (fields := _fields(obj)):
         return f"({', '.join(name for name, text in fields.items() if 'ClassVar' not in text)})", None
     return signature, returns
+
+
+def _home(module: str) -> str:
+    """The public place of what a module defines: a private module's is the room that shows it."""
+    room, _, own = module.rpartition(".")
+    return room if own.startswith("_") else module
+
+
+def _face(package: Any) -> dict[str, str]:
+    """The names that a package shows, each with the module that it imports it from."""
+    tree = ast.parse("\n".join(_source(package))) if hasattr(package, "__path__") else ast.Module([], [])
+    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom) and node.module]
+    return {
+        one.name: node.module or ""
+        for node in imports
+        for one in node.names
+        if one.asname == one.name  # as itself
+    }
 
 
 def _fields(record: type) -> dict[str, str]:
@@ -119,7 +156,7 @@ def _source(obj: Any) -> list[str]:
 
 def setup(app: Sphinx) -> None:
     """Before napoleon (500) turns sections into fields."""
-    for place, hook in enumerate([demand_docstring, add_fields, escape_markup]):
+    for place, hook in enumerate([demand_docstring, add_fields, escape_markup, list_face]):
         app.connect("autodoc-process-docstring", hook, priority=100 + place)
     app.connect("autodoc-process-signature", sign_as_written)
-    app.connect("autodoc-skip-member", skip_fields)
+    app.connect("autodoc-skip-member", skip_member)

@@ -1,50 +1,9 @@
-"""jaxmark: differentiable spectral filtering of polygonal meshes, and the watermarking built on it."""
+"""jaxmark: differentiable spectral filtering of polygonal meshes, and the watermarking built on it.
 
-from jaxmark import attacks as attacks
-from jaxmark import bands as bands
-from jaxmark import carriers as carriers
-from jaxmark import channels as channels
-from jaxmark import chebyshev as chebyshev
-from jaxmark import detectors as detectors
-from jaxmark import distortion as distortion
-from jaxmark import evidence as evidence
-from jaxmark import laplacian as laplacian
-from jaxmark import product as product
-from jaxmark import rational as rational
-from jaxmark import schemes as schemes
-from jaxmark import sharding as sharding
-from jaxmark import spectrum as spectrum
-from jaxmark import tuning as tuning
-from jaxmark import visibility as visibility
-from jaxmark import watermark as watermark
-from jaxmark.attacks import ATTACKS as ATTACKS
-from jaxmark.attacks import Attack as Attack
-from jaxmark.attacks import attack as attack
-from jaxmark.distortion import compare as compare
-from jaxmark.errors import JaxmarkError as JaxmarkError
-from jaxmark.files import load_mesh as load_mesh
-from jaxmark.files import save_mesh as save_mesh
-from jaxmark.keys import Key as Key
-from jaxmark.keys import load_key as load_key
-from jaxmark.keys import new_key as new_key
-from jaxmark.keys import save_key as save_key
-from jaxmark.marking import Detection as Detection
-from jaxmark.marking import EmbedInfo as EmbedInfo
-from jaxmark.marking import Marker as Marker
-from jaxmark.marking import capacity as capacity
-from jaxmark.marking import detect as detect
-from jaxmark.marking import embed as embed
-from jaxmark.marking import make_marker as make_marker
-from jaxmark.mesh import Mesh as Mesh
-from jaxmark.mesh import make_mesh as make_mesh
-from jaxmark.record import Record as Record
-from jaxmark.robustness import Robustness as Robustness
-from jaxmark.robustness import minimum_distortion as minimum_distortion
-from jaxmark.robustness import robustness as robustness
-from jaxmark.study import Study as Study
-from jaxmark.tardos import Accusation as Accusation
-from jaxmark.tracing import Tracer as Tracer
-from jaxmark.tracing import fingerprint as fingerprint
-from jaxmark.tracing import identify as identify
-from jaxmark.tracing import make_tracer as make_tracer
-from jaxmark.tuning import tune as tune
+What is listed in `__init__.pyi` is imported when it is first used, so that a room comes alone: `import
+jaxmark.spectral` loads filters and nothing of the watermark.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,6 +1,6 @@
 """`python -m jaxmark`."""
 
-from jaxmark.cli import main
+from jaxmark.app.cli import main
 
 if __name__ == "__main__":
     main()

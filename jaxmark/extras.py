@@ -1,4 +1,4 @@
-"""Optional dependencies: what is missing names the extra that brings it."""
+"""Import optional dependencies; the error for a missing one names the extra that installs it."""
 
 import importlib
 import importlib.util
@@ -11,8 +11,12 @@ from jaxmark.errors import JaxmarkError
 def require(module: str, extra: str) -> ModuleType:
     """Import an optional dependency.
 
+    Args:
+        module: its dotted name.
+        extra: the extra of jaxmark that installs it.
+
     Raises:
-        JaxmarkError: if it is not installed, naming the extra.
+        JaxmarkError: if it is not installed; the message names the extra.
     """
     try:
         return importlib.import_module(module)
@@ -21,10 +25,10 @@ def require(module: str, extra: str) -> ModuleType:
 
 
 def package_folder(module: str, extra: str) -> Path:
-    """Where an optional package lies, without importing it.
+    """Find the folder of an optional package without importing it.
 
     Raises:
-        JaxmarkError: if it is not installed, naming the extra.
+        JaxmarkError: if it is not installed; the message names the extra.
     """
     spec = importlib.util.find_spec(module)
     if spec is None or spec.origin is None:

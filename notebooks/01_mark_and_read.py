@@ -7,7 +7,7 @@
 # %%
 import jaxmark as jm
 from jaxmark import plot
-from jaxmark.demo import sample_mesh
+from jaxmark.app.demo import sample_mesh
 
 mesh = jm.load_mesh(sample_mesh())
 key = jm.new_key()
@@ -22,7 +22,7 @@ print(f"{len(mesh.vertices)} vertices moved by RMS {info.rms:.4%} of the diagona
 # %%
 original = marker.original
 shown = plot.displacement(original, marked)
-plot.draw([plot.View("marked", marked), plot.exaggerated(original, marked), shown])
+plot.draw([plot.View("marked", marked), plot.exaggerate(original, marked), shown])
 
 # %%
 plot.show(shown.mesh, shown.values, shown.unit)

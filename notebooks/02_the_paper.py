@@ -4,7 +4,7 @@
 # Sohn, Choi, Kim, Kwon, Park, Shin, *A Digital Watermarking Scheme for Polygonal Meshes using Modified Spectral
 # Decomposition*: marks in the spectrum of a mesh, by polynomials of the Laplacian instead of its eigenvectors. This
 # notebook walks through it on a bunny about as large as theirs (1,494 vertices); `docs/paper.md` has all errata with
-# their tests, and `benchmarks/paper.py` all figures at full size.
+# their tests, and `benchmarks/theory/paper.py` all figures at full size.
 
 # %%
 import time
@@ -15,20 +15,27 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark import plot
-from jaxmark.bands import hat, nodes, scaling
-from jaxmark.carriers import host_bands
-from jaxmark.chebyshev import band_components, filter
-from jaxmark.demo import sample_mesh
-from jaxmark.evidence import correlation_bound
-from jaxmark.laplacian import centre, make_laplacian, sparse_matrices
-from jaxmark.original import prepare
-from jaxmark.product import filter as product_filter
-from jaxmark.product import lagrange_factors
-from jaxmark.schemes import EigenScheme, HostScheme
-from jaxmark.spectrum import eigenpairs
+from jaxmark.alignment import make_original
+from jaxmark.app.demo import sample_mesh
+from jaxmark.evaluation import pictures
+from jaxmark.spectral import (
+    band_components,
+    centre,
+    eigenpairs,
+    filter,
+    filter_by_factors,
+    lagrange_factors,
+    make_laplacian,
+)
+from jaxmark.spectral.bands import hat, nodes, scaling
+from jaxmark.spectral.laplacian import sparse_matrices
+from jaxmark.watermark import EigenScheme, HostScheme
+from jaxmark.watermark.carriers import host_bands
+from jaxmark.watermark.detectors import correlate
+from jaxmark.watermark.evidence import correlation_bound
 
 mesh = jm.attack(jm.load_mesh(sample_mesh()), "simplification", 0.9465, seed=0)
-original = prepare(mesh)
+original = make_original(mesh)
 print(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
 
 # %% [markdown]
@@ -102,14 +109,14 @@ signal = jnp.asarray(x, jnp.float32)
 second = filter(operator, scaling(32)[5], signal)
 for order in ("leja", "printed"):
     factors = lagrange_factors(nodes(32), order=order)
-    first = product_filter(operator, jax.tree.map(lambda leaf: leaf[5], factors), signal)
+    first = filter_by_factors(operator, jax.tree.map(lambda leaf: leaf[5], factors), signal)
     off = float(jnp.abs(first - second).max() / jnp.abs(second).max())
     print(f"Method 1, order {order!r}, against Method 2: {off:.0e} of the largest value")
     assert (off < 1e-3) == (order == "leja")
 
 # %% [markdown]
 # Each product looks at every edge once: linear in the mesh. (The paper counts O(nN²), for its matrices are dense; its
-# Figures 12 and 13 are `benchmarks/paper.py --parts time degree`.) Twice, for the first time includes compiling:
+# Figures 12 and 13 are `benchmarks/theory/paper.py --parts time degree`.) Twice, for the first time includes compiling:
 
 # %%
 matrix = jnp.asarray(np.eye(len(x)) - (stiffness / mass.diagonal()[:, None]).toarray(), jnp.float32) * -1
@@ -160,7 +167,7 @@ for coherence in (0.0, 0.001, 0.7):
 # %%
 MESSAGE = b"\xa5\x5a"
 schemes = {
-    "as printed": (HostScheme(64, kernel="printed", damping="none", unit_norm=False), jm.detectors.correlate),
+    "as printed": (HostScheme(64, kernel="printed", damping="none", unit_norm=False), correlate),
     "working form": (HostScheme(64), None),
     "eigenvectors": (EigenScheme(), None),
 }
@@ -184,8 +191,8 @@ plot.spectra(original, {name: (mesh, marked) for name, marked in marks.items()})
 # %% [markdown]
 # ## Figure 14: robustness
 #
-# How often the message is read after uniform noise. (The paper counts single bits, without a code; `benchmarks/paper.py
-# --parts attacks` does, too, for all of its attacks.)
+# How often the message is read after uniform noise. (The paper counts single bits, without a code;
+# `benchmarks/theory/paper.py --parts attacks` does, too, for all of its attacks.)
 
 # %%
 NOISE = [0.001, 0.003, 0.01]
@@ -195,7 +202,7 @@ curves = {
 for name, curve in curves.items():
     print(f"{name:<13} read {curve.success.mean(axis=1).round(2)}, bits wrong {curve.bit_errors.mean(axis=1).round(2)}")
 assert curves["working form"].success[0].all()
-plot.success(curves, jm.ATTACKS["diagonal-noise"].unit)
+pictures.success(curves, jm.attacks.ATTACKS["diagonal-noise"].unit)
 
 # %% [markdown]
 # ## Figures 15 and 16: the Gibbs oscillation

@@ -10,14 +10,14 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark import plot
-from jaxmark.bands import bernstein, hat, nodes, report, scaling
-from jaxmark.demo import sample_mesh
-from jaxmark.laplacian import centre, make_laplacian
-from jaxmark.original import prepare
-from jaxmark.spectrum import quadrature
+from jaxmark.alignment import make_original
+from jaxmark.app.demo import sample_mesh
+from jaxmark.evaluation import pictures
+from jaxmark.spectral import centre, make_laplacian, quadrature
+from jaxmark.spectral.bands import bernstein, hat, nodes, report, scaling
 
 mesh = jm.attack(jm.load_mesh(sample_mesh()), "simplification", 0.9, seed=0)
-original = prepare(mesh)
+original = make_original(mesh)
 print(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
 
 # %% [markdown]
@@ -154,7 +154,7 @@ for size in (2, 16):
     mesh_with, _ = one.embed(message, 4e-4, noise=0, read_back=False)
     curves[f"{8 * size} bits"] = jm.robustness(one, mesh_with, message, "noise", [0.004, 0.012], samples=2)
     print(f"{8 * size} bits:", curves[f"{8 * size} bits"].success.mean(axis=1))
-plot.success(curves, jm.ATTACKS["noise"].unit)
+pictures.success(curves, jm.attacks.ATTACKS["noise"].unit)
 
 # %% [markdown]
 # ## In short

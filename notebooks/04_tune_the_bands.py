@@ -10,14 +10,14 @@ import jax
 
 import jaxmark as jm
 from jaxmark import plot
-from jaxmark.bands import scaling
-from jaxmark.demo import sample_mesh
-from jaxmark.original import prepare
-from jaxmark.schemes import KeyedScheme
-from jaxmark.visibility import band_visibility
+from jaxmark.alignment import make_original
+from jaxmark.app.demo import sample_mesh
+from jaxmark.spectral.bands import scaling
+from jaxmark.watermark import KeyedScheme
+from jaxmark.watermark.visibility import band_visibility
 
 mesh = jm.load_mesh(sample_mesh())
-original = prepare(mesh)
+original = make_original(mesh)
 visible = band_visibility(original, scaling(64, damping="jackson"), ["dame", "gl"])
 for band in (0, 1, 3, 7, 15, 31):
     print(
@@ -61,7 +61,7 @@ assert claims["tuned", "smoothing"]
 plot.draw(
     [
         plot.View("original", mesh),
-        plot.exaggerated(original, shown),
+        plot.exaggerate(original, shown),
         plot.displacement(original, shown),
         plot.visibility(original, shown),
     ]

@@ -7,7 +7,7 @@
 from pathlib import Path
 
 import jaxmark as jm
-from jaxmark.demo import sample_mesh
+from jaxmark.app.demo import sample_mesh
 
 MESH = sample_mesh()  # or: MESH = "my_model.obj"
 FOLDER = Path("demo-output/study")

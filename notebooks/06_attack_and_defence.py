@@ -21,12 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxmark as jm
-from jaxmark.attacks import adversarial as enemies
-from jaxmark.attacks.adversarial.blind import descended
-from jaxmark.attacks.adversarial.expected import evidence, make_surrogate, random_mark, sized
-from jaxmark.demo import sample_mesh
-from jaxmark.detectors import claims
-from jaxmark.message import encode
+from jaxmark import adversaries as enemies
+from jaxmark.adversaries.blind import descend
+from jaxmark.adversaries.expected import evidence, make_surrogate, random_mark, rescale
+from jaxmark.app.demo import sample_mesh
+from jaxmark.watermark.detectors import claims
 
 mesh = jm.load_mesh(sample_mesh())  # or a file of your own
 mesh = jm.attack(mesh, "simplification", 0.9, seed=0)  # a tenth of its edges, so that this takes a minute or two
@@ -45,11 +44,11 @@ print(f"{len(mesh.vertices)} vertices, evidence needed {needed:.2f}")
 # the attacker has to defeat both.
 
 # %%
-word = jnp.asarray(encode(message, key, marker.original.geometry, marker.code), jnp.float32)
+word = jnp.asarray(marker.codeword(message), jnp.float32)
 share = 0.3
 weak = enemies.erasure_by_descent(marker, message, steps=20)
 suspect = jm.attack(marked, weak, share * size, seed=0)
-scores, norms = claims(marker.reader, marker.observe(suspect), word)
+scores, norms = claims(marker.reader, marker.receive(suspect), word)
 by_bands, all_alike = np.asarray(scores / norms)
 print(f"displaced by {share:.0%} of the mark's RMS: {by_bands:.1f} weighed by bands, {all_alike:.1f} all alike")
 print(f"claimed: log10 p {marker.detect(suspect, message).log10_p:.1f}")
@@ -59,7 +58,7 @@ assert marker.detect(suspect, message).detected()
 # What it takes in the end, by bisection. Subtracting the mark itself, which every holder of the key can do, costs 1.
 
 # %%
-broken = jm.minimum_distortion(
+broken = jm.evaluation.minimum_distortion(
     marker, marked, message, weak._replace(strengths=(share * size, 1.2 * size)), metrics=("rms",), tolerance=0.2
 )
 print(f"with the key: {broken.cost('rms'):.2f} of the mark's RMS")
@@ -75,12 +74,12 @@ surrogate, original = make_surrogate(marked, "keyed", 16, size)
 strength = jnp.asarray(4 * size, jnp.float32)
 fresh = jax.random.split(jax.random.key(9), 4)
 expected = jax.jit(lambda shift: jnp.mean(jax.lax.map(lambda one: evidence(surrogate, shift, one), fresh)))
-other = sized(surrogate, random_mark(surrogate, jax.random.key(1))[1], strength)
-seek = jax.jit(lambda one: descended(surrogate, strength, one, family="bands", steps=15))
+other = rescale(surrogate, random_mark(surrogate, jax.random.key(1))[1], strength)
+seek = jax.jit(lambda one: descend(surrogate, strength, one, family="bands", steps=15))
 found = seek(jax.random.key(1))
 print(f"expected evidence at {4 * size:g}: another mark {expected(other):.1f}, optimised {expected(found):.1f}")
 assert expected(found) < expected(other) < expected(jnp.zeros_like(other))
-moved = marked._replace(vertices=marked.vertices + original.diagonal * original.on_host(found))
+moved = marked._replace(vertices=marked.vertices + original.diagonal * original.to_host(found))
 print(f"the owner's claim of it: log10 p {marker.detect(moved, message).log10_p:.1f}")
 
 # %% [markdown]

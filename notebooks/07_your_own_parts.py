@@ -14,14 +14,17 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark import plot
-from jaxmark.carriers import ModulatedCarrier
-from jaxmark.demo import sample_mesh
-from jaxmark.detectors import decorrelate
-from jaxmark.mesh import Mesh, vertex_normals
-from jaxmark.message import code_length
-from jaxmark.original import prepare
-from jaxmark.precision import einsum, matmul
-from jaxmark.sequences import orthogonal_sequences
+from jaxmark.alignment import make_original
+from jaxmark.app.demo import sample_mesh
+from jaxmark.evaluation import pictures
+from jaxmark.geometry import Mesh
+from jaxmark.geometry.mesh import vertex_normals
+from jaxmark.spectral.precision import einsum, matmul
+from jaxmark.watermark.carriers import ModulatedCarrier
+from jaxmark.watermark.coding.message import code_length
+from jaxmark.watermark.coding.sequences import orthogonal_sequences
+from jaxmark.watermark.detectors import Detector, decorrelate
+from jaxmark.watermark.schemes import Scheme
 
 mesh = jm.attack(jm.load_mesh(sample_mesh()), "simplification", 0.9, seed=0)
 key = jm.Key(bytes(range(32)))  # the same each time; real ones are `jm.new_key()`
@@ -44,8 +47,8 @@ def chatter(mesh: Mesh, strength: float, key: jax.Array) -> Mesh:
     return Mesh(mesh.vertices + height[:, None] * jnp.array([0.0, 0.0, 1.0]), mesh.faces)
 
 
-chattering = jm.Attack(chatter, "amplitude over the diagonal", (0.0005, 0.001, 0.002, 0.006))
-original = prepare(mesh)
+chattering = jm.attacks.Attack(chatter, "amplitude over the diagonal", (0.0005, 0.001, 0.002, 0.006))
+original = make_original(mesh)
 chattered = jm.attack(mesh, chattering, 0.005, seed=0)
 plot.draw([plot.View("original", mesh), plot.View("chattered", chattered), plot.displacement(original, chattered)])
 
@@ -126,15 +129,15 @@ class Waves(NamedTuple):
 
 
 # %% [markdown]
-# A scheme is a frozen dataclass that makes the carrier for an original, a key and a payload. Its fields go into the
-# record of a mark. It says which detector reads it: `decorrelate` solves for all bits at once, as the waves are not
-# orthogonal on the surface. Only the signs depend on the key; the waves must not, or the proof of a detection would not
-# hold.
+# A scheme is a frozen dataclass that makes the carrier for an original, a key and a payload, and inherits from `Scheme`
+# what it does not say. Its fields go into the record of a mark. It says which detector reads it: `decorrelate` solves
+# for all bits at once, as the waves are not orthogonal on the surface. Only the signs depend on the key; the waves must
+# not, or the proof of a detection would not hold.
 
 
 # %%
 @dataclass(frozen=True)
-class WaveScheme:
+class WaveScheme(Scheme):
     """Plane waves, each with a keyed sign for each code bit."""
 
     name: ClassVar[str] = "waves"
@@ -142,7 +145,7 @@ class WaveScheme:
     wavelength: float = 0.1  # the shortest, in diagonals
 
     @property
-    def detector(self) -> jm.detectors.Detector:
+    def detector(self) -> Detector:
         """What reads it."""
         return decorrelate
 
@@ -160,7 +163,7 @@ class WaveScheme:
         normals = vertex_normals(Mesh(original.positions, original.weld.point[np.asarray(original.mesh.faces)]))
         signs = orthogonal_sequences(key, original.geometry, code_bits, self.waves, label=self.name)
         used = original.used[:, None]
-        waves = Waves(original.traced(used * heights), original.traced(used * normals))
+        waves = Waves(original.to_traced(used * heights), original.to_traced(used * normals))
         return ModulatedCarrier(waves, signs[:, :, None])
 
 
@@ -168,7 +171,7 @@ scheme = WaveScheme()
 waves = jm.make_marker(mesh, key, bits=16, scheme=scheme)
 waved, record = waves.embed(b"ok", limits={stretch: 0.01})
 print(f"RMS {record.rms:.3%} of the diagonal; read: {waves.detect(waved).message}, {record.record.parameters}")
-plot.draw([plot.exaggerated(original, gentle), plot.exaggerated(original, waved), plot.displacement(original, waved)])
+plot.draw([plot.exaggerate(original, gentle), plot.exaggerate(original, waved), plot.displacement(original, waved)])
 
 # %% [markdown]
 # Everything else is the library's: alignment, tags, evidence, records. A wrong key reads nothing, and the reader asks
@@ -195,4 +198,4 @@ curves = {
 }
 for name, curve in curves.items():
     print(name, curve.success.mean(axis=1), curve.log10_p.max(axis=1).round(1))
-plot.success(curves, chattering.unit)
+pictures.success(curves, chattering.unit)

@@ -14,12 +14,12 @@ import numpy as np
 from scipy.special import ndtr
 
 import jaxmark as jm
-from jaxmark import plot
-from jaxmark.carriers import make_chips
-from jaxmark.demo import sample_mesh
-from jaxmark.evidence import log10_p_claimed, log10_p_fitted
-from jaxmark.intervals import clopper_pearson
-from jaxmark.message import encode
+from jaxmark.app.demo import sample_mesh
+from jaxmark.confidence import clopper_pearson
+from jaxmark.evaluation import pictures
+from jaxmark.watermark.carriers import make_chips
+from jaxmark.watermark.coding.message import encode
+from jaxmark.watermark.evidence import log10_p_claimed, log10_p_fitted
 
 mesh = jm.attack(jm.load_mesh(sample_mesh()), "simplification", 0.95, seed=0)
 MESSAGE = b"jaxmark!"
@@ -52,7 +52,7 @@ print(f"{len(mesh.vertices)} vertices, RMS displacement {info.rms:.3%} of the di
 @jax.jit
 def vector(seen):
     """What the keyed signs multiply; the key is nowhere in it."""
-    return owner.reader.matched(owner.reader.received(seen))
+    return owner.reader.matched_residual(owner.reader.receive(seen))
 
 
 def scores(suspect: jm.Mesh, claims: list[tuple[jm.Key, bytes]]) -> tuple[np.ndarray, float]:
@@ -61,8 +61,8 @@ def scores(suspect: jm.Mesh, claims: list[tuple[jm.Key, bytes]]) -> tuple[np.nda
     a[~original.moving] = 0
     found = []
     for key, message in claims:
-        chips = make_chips(key, original.geometry, original.moving, owner.code)
-        word = encode(message, key, original.geometry, owner.code)
+        chips = make_chips(key, original.geometry, original.moving, owner.code_bits)
+        word = encode(message, key, original.geometry, owner.code_bits)
         found.append(np.sum(chips.signs * word[chips.slots] * a))
     return np.array(found), float(np.linalg.norm(a))
 
@@ -102,7 +102,7 @@ for name, values in proven.items():
         hits = int(np.sum(values <= level))
         print(f"{name}: {hits} of {len(values)} below 10^{level}")
         assert clopper_pearson(hits, len(values), 0.999).low <= 10.0**level
-plot.p_values({**proven, "the Gaussian estimate": fitted})
+pictures.p_values({**proven, "the Gaussian estimate": fitted})
 
 # %% [markdown]
 # Why not use the estimate, then? Because it is none for suspects made to be hard. Let the residual be the same at four
@@ -137,7 +137,7 @@ for seed in range(30):
 print(f"detected at 1e-6: {np.mean(np.array(right) <= -6):.0%} of the right key, {np.mean(np.array(wrong) <= -6):.0%}")
 assert np.median(right) < -5
 assert min(wrong) > -4
-plot.roc({"right key": np.array(right), "wrong key": np.array(wrong)}, lowest=-15)
+pictures.roc({"right key": np.array(right), "wrong key": np.array(wrong)}, lowest=-15)
 
 # %% [markdown]
 # ## Searching
@@ -157,7 +157,7 @@ estimate = fitted.reshape(-1, TRIES).min(axis=1)
 paid = np.minimum(0, best + math.log10(TRIES))
 assert np.mean(best <= -1) > 0.1
 assert clopper_pearson(int(np.sum(paid <= -1)), len(paid), 0.999).low <= 0.1
-plot.p_values({"best of 50 keys": best, "best of 50, Gaussian": estimate, "best of 50, paid for": paid})
+pictures.p_values({"best of 50 keys": best, "best of 50, Gaussian": estimate, "best of 50, paid for": paid})
 
 # %% [markdown]
 # ## Other messages under the same key
@@ -172,7 +172,7 @@ lies = [(key_of(0), random.bytes(8)) for _ in range(2000)]
 same_key = bound(marked, lies)
 print(f"below 1e-3: {np.sum(same_key <= -3)} of {len(same_key)} wrong messages, the smallest 1e{same_key.min():.1f}")
 assert clopper_pearson(int(np.sum(same_key <= -3)), len(same_key), 0.999).low > 1e-3
-plot.p_values({"wrong messages, right key": same_key, "wrong keys": proven["marked with another key"]})
+pictures.p_values({"wrong messages, right key": same_key, "wrong keys": proven["marked with another key"]})
 
 # %% [markdown]
 # The line is crossed: with the same key for several messages, a claim proves that *this key* marked the mesh, not which
@@ -226,4 +226,5 @@ except jm.JaxmarkError as refusal:
 # | with weights, pose and masks from suspect and original | with weights that were chosen by the score |
 # | whatever the residual looks like | for `log10_p_fitted`, an estimate |
 #
-# `python benchmarks/false_positives.py` counts a million pairs of key and suspect, with suspects made to be hard.
+# `python benchmarks/security/false_positives.py` counts a million pairs of key and suspect, with suspects made to be
+# hard.

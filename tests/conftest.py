@@ -1,4 +1,4 @@
-"""Shapes and types of every public function are checked while tests run; dtypes are never promoted silently."""
+"""Fixtures that many tests share; dtypes are never promoted silently."""
 
 from collections.abc import Iterator
 
@@ -6,14 +6,9 @@ import jax
 import jaxtyping
 import numpy as np
 import pytest
-from jaxtyping import install_import_hook
 
-import tests.typecheck  # noqa: F401 (the hook looks it up by name)
-
-with install_import_hook("jaxmark", "tests.typecheck.check"):
-    import jaxmark as jm
-
-from jaxmark.mesh import Mesh, make_mesh
+import jaxmark as jm
+from jaxmark.geometry.mesh import Mesh, make_mesh
 from tests.samples import bumpy_sphere
 
 

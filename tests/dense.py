@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxmark.laplacian import Laplacian, host_edges
+from jaxmark.spectral.laplacian import Laplacian, host_edges
 
 
 def laplacian_matrix(operator: Laplacian) -> np.ndarray:
@@ -24,8 +24,8 @@ def chebyshev_matrices(operator: Laplacian, degree: int) -> np.ndarray:
     """T_k(Δ - I) for k = 0 … degree by eigendecomposition, not by recurrence: `[degree + 1, N, N]`."""
     values, vectors = np.linalg.eig(laplacian_matrix(operator))
     inverse = np.linalg.inv(vectors)
-    angles = np.arccos(np.clip(values.real - 1, -1, 1))
-    return np.stack([(vectors * np.cos(k * angles)) @ inverse for k in range(degree + 1)]).real
+    angles = np.arccos(np.clip(np.real(values) - 1, -1, 1))
+    return np.real(np.stack([(vectors * np.cos(k * angles)) @ inverse for k in range(degree + 1)]))
 
 
 def tolerance(dtype: np.dtype, factor: float = 1.0) -> float:

@@ -1,4 +1,4 @@
-"""What a new user does: install into an empty environment, then run the README, and how long the first mark takes.
+"""What a new user does: install into an empty environment, then run the README and the guides, and time the first mark.
 
 Run by itself from a clone; pytest does not collect it.
 """
@@ -13,10 +13,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 LONGEST = 300.0  # s, to the first mark read back
+GUIDES = ("study", "strength", "recipients", "arrays", "pictures")  # go on with the README's mesh and key
 
 MODEL = """
 import trimesh
-from jaxmark.demo import sample_mesh
+from jaxmark.app.demo import sample_mesh
 
 trimesh.load(sample_mesh(), process=False).export("model.ply")
 """
@@ -32,7 +33,7 @@ assert seconds < {longest}, "the first mark took too long"
 
 
 def python_blocks(page: str) -> list[str]:
-    """The Python blocks of the README."""
+    """The Python blocks of a page."""
     return re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
 
 
@@ -44,24 +45,27 @@ def shell_lines(page: str) -> list[str]:
 
 
 def main() -> None:
-    """Fail where the README does not work in an empty environment, or takes too long."""
+    """Fail where README or guides do not work in an empty environment, or the first mark takes too long."""
     start = time.time()
     page = (ROOT / "README.md").read_text()
+    guides = [(ROOT / "docs" / "how-to" / f"{name}.md").read_text() for name in GUIDES]
+    lines = shell_lines((ROOT / "docs" / "reference" / "command_line.md").read_text())
     assert "`pip install '.[all]'`" in page
+    assert [line for line in lines if line in shell_lines(page)] == shell_lines(page), "the README has other lines"
     with tempfile.TemporaryDirectory() as folder:
         venv.create(Path(folder, "venv"), with_pip=True)
         python, jaxmark = (Path(folder, "venv", "bin", name) for name in ("python", "jaxmark"))
         subprocess.run([python, "-m", "pip", "install", "--quiet", ".[all]"], cwd=ROOT, check=True)
         print(f"installed after {time.time() - start:.0f} s", flush=True)
-        first, *others = python_blocks(page)
-        script = [MODEL, first, FIRST.format(start=start, longest=LONGEST), *others]
-        Path(folder, "readme.py").write_text("\n".join(script))
+        first = [MODEL, *python_blocks(page), FIRST.format(start=start, longest=LONGEST)]
+        others = [block for guide in guides for block in python_blocks(guide)]
+        Path(folder, "readme.py").write_text("\n".join([*first, *others]))
         subprocess.run([python, "readme.py"], cwd=folder, check=True)
-        for line in shell_lines(page):
+        for line in lines:
             _, *arguments = shlex.split(line)
             print(line, flush=True)
             subprocess.run([jaxmark, *arguments], cwd=folder, check=True)
-    print(f"the README was run after {time.time() - start:.0f} s")
+    print(f"README and guides were run after {time.time() - start:.0f} s")
 
 
 if __name__ == "__main__":

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmark import chebyshev, sharding
-from jaxmark.laplacian import make_laplacian
+from jaxmark.spectral import chebyshev, sharding
+from jaxmark.spectral.laplacian import make_laplacian
 from tests.samples import bumpy_sphere
 
 
@@ -29,12 +29,12 @@ def main(index: int, port: str) -> None:
         assert [shard.index[0].start for shard in leaf.addressable_shards] == [2 * index, 2 * index + 1]
 
     def loss(c, x, operator):
-        return jnp.sum(jnp.sin(sharding.filter(operator, c, x)))
+        return jnp.sum(jnp.sin(sharding.filter_sharded(operator, c, x)))
 
     found = jax.jit(jax.grad(loss, (0, 1)))(c, there, sharded)
     expected = jax.grad(lambda c, x: jnp.sum(jnp.sin(chebyshev.filter(operator, c, x))), (0, 1))(c, x)
     pairs = [
-        (sharded.gather(sharding.filter(sharded, c, there)), chebyshev.filter(operator, c, x)),
+        (sharded.gather(sharding.filter_sharded(sharded, c, there)), chebyshev.filter(operator, c, x)),
         (found[0], expected[0]),
         (sharded.gather(found[1]), expected[1]),
     ]

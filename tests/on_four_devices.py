@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmark import chebyshev, sharding
 from jaxmark.errors import JaxmarkError
-from jaxmark.laplacian import make_laplacian
-from jaxmark.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.spectral import chebyshev, sharding
+from jaxmark.spectral.laplacian import make_laplacian
 from tests.dense import laplacian_matrix, tolerance
 
 pytestmark = pytest.mark.skipif("jax.device_count() < 4", reason="needs four devices")
@@ -46,7 +46,7 @@ def test_filter_and_gradients_are_those_of_one_device(sphere: Mesh, along, lower
 
         return jax.grad(loss, (0, 1), has_aux=True)(c, x)
 
-    (c_bar, x_bar), y = derived(sharding.filter, sharded, c, there)
+    (c_bar, x_bar), y = derived(sharding.filter_sharded, sharded, c, there)
     (c_expected, x_expected), expected = derived(chebyshev.filter, operator, c, x)
     assert y.sharding.is_equivalent_to(there.sharding, y.ndim)
     close(sharded.gather(y), expected, dtype)
@@ -61,7 +61,7 @@ def test_parts_of_a_hard_graph(hard_graph: Mesh, dtype):
     for count in (1, 2, 4):
         sharded = sharding.shard(operator, jax.devices()[:count])
         # The series λ = T_1 + T_0 is Δ itself.
-        found = sharded.gather(sharding.filter(sharded, np.ones(2, dtype), sharded.scatter(x)))
+        found = sharded.gather(sharding.filter_sharded(sharded, np.ones(2, dtype), sharded.scatter(x)))
         np.testing.assert_allclose(found, laplacian_matrix(operator) @ x, atol=tolerance(dtype))
 
 
@@ -71,7 +71,7 @@ def test_more_devices_than_some_blocks_have_neighbours(x64):
     operator = make_laplacian(mesh)
     sharded = sharding.shard(operator, jax.devices()[:4])
     assert sharding.traffic(sharded) == (6, 6, 3)
-    found = sharded.gather(sharding.filter(sharded, np.ones(2), sharded.scatter(mesh.vertices)))
+    found = sharded.gather(sharding.filter_sharded(sharded, np.ones(2), sharded.scatter(mesh.vertices)))
     np.testing.assert_allclose(found, laplacian_matrix(operator) @ mesh.vertices, atol=1e-12)
 
 
@@ -86,8 +86,8 @@ def test_what_is_refused(sphere: Mesh, unchecked):
         lambda: parts.scatter(x),
         lambda: sharded.scatter(x[1:]),
         lambda: sharded.gather(jnp.zeros((3, 4))),
-        lambda: sharding.filter(sharded, np.ones(3), jnp.zeros((3, 4))),
-        lambda: sharding.filter(sharded, np.ones((3, 2)), sharded.scatter(x)),
+        lambda: sharding.filter_sharded(sharded, np.ones(3), jnp.zeros((3, 4))),
+        lambda: sharding.filter_sharded(sharded, np.ones((3, 2)), sharded.scatter(x)),
     ):
         with pytest.raises(JaxmarkError):
             refused()

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from jaxmark.laplacian import Laplacian, Weighting, make_laplacian
-from jaxmark.mesh import Mesh, make_mesh
+from jaxmark.geometry.mesh import Mesh, make_mesh
+from jaxmark.spectral.laplacian import Laplacian, Weighting, make_laplacian
 
 
 def bumpy_sphere(level: int, seed: int = 0) -> Mesh:
@@ -54,7 +54,7 @@ def exact_sheet(size: int) -> Mesh:
 def ordered_laplacian(mesh: Mesh, weights: Weighting) -> Laplacian:
     """With rows in an order of its own, as large meshes have them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxmark.laplacian._ORDERED", 0)
+        patch.setattr("jaxmark.spectral.laplacian._MIN_ORDERED_VERTICES", 0)
         made = make_laplacian(mesh, weights)
     assert made.neighbours is not None
     assert not np.array_equal(made.neighbours.order, np.arange(len(made.degree)))

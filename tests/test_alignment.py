@@ -9,17 +9,17 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
-from jaxmark.alignment import align
-from jaxmark.mesh import Mesh, make_mesh, vertex_normals
-from jaxmark.original import Original, prepare
-from jaxmark.pose import Pose
+from jaxmark.alignment.alignment import align
+from jaxmark.alignment.original import Original, make_original
+from jaxmark.geometry.mesh import Mesh, make_mesh, vertex_normals
+from jaxmark.geometry.pose import Pose
 from tests.samples import bumpy_sphere
 
 
 @pytest.fixture(scope="module")
 def original() -> Original:
     """642 vertices."""
-    return prepare(bumpy_sphere(3))
+    return make_original(bumpy_sphere(3))
 
 
 def moved(original: Original, displacement: np.ndarray, matrix=None, shift=0.0) -> Mesh:
@@ -79,7 +79,7 @@ def test_a_mark_along_the_normal_of_a_flat_mesh_survives(seed):
     )
     # Any plane.
     turn = Rotation.random(rng=random).as_matrix()
-    sheet = prepare(make_mesh(np.stack([i, j + 0.0, 0 * i], axis=1) @ turn.T + 5, faces))
+    sheet = make_original(make_mesh(np.stack([i, j + 0.0, 0 * i], axis=1) @ turn.T + 5, faces))
     mark = 1e-3 * random.normal(size=400)
     plane = np.stack([i, j, np.ones(400)], axis=1)
     expected = mark - plane @ np.linalg.lstsq(plane, mark, rcond=None)[0]
@@ -146,7 +146,7 @@ def test_the_same_suspect_gives_the_same_to_the_last_bit(original: Original):
     suspect = moved(
         original, 1e-3 * np.random.default_rng(6).normal(size=(642, 3)), affine_map(np.random.default_rng(7))
     )
-    one, again = align(original, suspect), align(prepare(original.mesh), suspect)
+    one, again = align(original, suspect), align(make_original(original.mesh), suspect)
     np.testing.assert_array_equal(one.displacement, again.displacement)
     np.testing.assert_array_equal(one.weights, again.weights)
     np.testing.assert_array_equal(one.pose.matrix, again.pose.matrix)
@@ -156,7 +156,7 @@ def test_points_that_no_face_uses_do_not_count():
     sphere = bumpy_sphere(2)
     loose = np.array([[1e5, 0.0, 0], [0, 3, 0]])
     mesh = make_mesh(np.vstack([loose[:1], sphere.vertices, loose[1:]]), sphere.faces + 1)
-    original = prepare(mesh)
+    original = make_original(mesh)
     suspect = make_mesh(1.3 * mesh.vertices + 2, mesh.faces)
     suspect.vertices[[0, -1]] = [[-1e7, 4, 5], [0, 0, 0]]
     found, weights, *_ = align(original, suspect)
@@ -286,6 +286,7 @@ def together(one: Mesh, other: Mesh) -> Mesh:
     for mesh in meshes:
         mesh.remove_unreferenced_vertices()
     both = trimesh.util.concatenate(meshes)
+    assert isinstance(both, trimesh.Trimesh)
     return make_mesh(both.vertices, both.faces)
 
 
@@ -327,7 +328,7 @@ def test_an_affine_map_of_a_surface_is_undone_on_request(original: Original):
 
 
 def test_smoothing_of_another_meshing_is_noticed():
-    original = prepare(bumpy_sphere(4))
+    original = make_original(bumpy_sphere(4))
     vertices, faces = trimesh.remesh.subdivide(np.asarray(original.mesh.vertices), np.asarray(original.mesh.faces))
     finer = make_mesh(vertices, faces)
     assert align(original, finer).nuisance is None

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.attacks.adversarial.ambiguity import forged_original, searched_key, transplanted
-from jaxmark.marking import Marker
-from jaxmark.mesh import Mesh
-from jaxmark.original import prepare
-from jaxmark.schemes import KeyedScheme
+from jaxmark.adversaries.ambiguity import forge_original, search_key, transplant
+from jaxmark.alignment.original import make_original
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.marking import Marker
+from jaxmark.watermark.schemes import KeyedScheme
 from tests.samples import bumpy_sphere
 
 MESSAGE, FORGED = b"ok", b"my"
@@ -30,12 +30,12 @@ def published(original: Mesh, key: jm.Key) -> tuple[Mesh, jm.Record]:
 
 @pytest.fixture(scope="module")
 def forged(published: tuple[Mesh, jm.Record]) -> Mesh:
-    return forged_original(published[0], FORGER, FORGED, budget=8e-4)
+    return forge_original(published[0], FORGER, FORGED, budget=8e-4)
 
 
 def unbound(original: Mesh, geometry: bytes, key: bytes) -> Marker:
     """A marker whose choices hang on another mesh's hash: what they would be if they did not depend on the original."""
-    ready, scheme = replace(prepare(original), geometry=geometry), KeyedScheme()
+    ready, scheme = replace(make_original(original), geometry=geometry), KeyedScheme()
     code = scheme.code_length(ready, 16)
     return Marker(ready, jm.Key(key), 16, scheme, scheme.carrier(ready, key, 16, code), code, scheme.detector)
 
@@ -43,9 +43,9 @@ def unbound(original: Mesh, geometry: bytes, key: bytes) -> Marker:
 @pytest.mark.slow
 def test_inversion_fails_only_by_the_hash(published, forged):
     mesh, _ = published
-    assert jm.distortion.moved(forged, mesh).rms == pytest.approx(8e-4, rel=1e-2)
+    assert jm.distortion.displacement_size(forged, mesh).rms == pytest.approx(8e-4, rel=1e-2)
     # Did the choices not depend on the original, the forger would have his claim ...
-    without = unbound(forged, prepare(mesh).geometry, FORGER)
+    without = unbound(forged, make_original(mesh).geometry, FORGER)
     assert without.detect(mesh, FORGED).log10_p < -30
     assert without.detect(mesh).message == FORGED
     # ... and with any luck in the world he does not: 1e-6 is one in a million keys.
@@ -69,7 +69,7 @@ def test_the_owner_has_the_forgers_original_too(original, published, forged, key
     """Whose original holds the other's mark says who was first: the owner's does not hold the forger's."""
     owner = jm.make_marker(original, key, bits=16)
     assert owner.detect(forged, MESSAGE).log10_p < -20
-    forger = unbound(forged, prepare(published[0]).geometry, FORGER)
+    forger = unbound(forged, make_original(published[0]).geometry, FORGER)
     assert forger.detect(original, FORGED).log10_p < -20, "so it does without the hash: the deadlock of the inversion"
     assert jm.detect(original, original=forged, key=FORGER, message=FORGED).log10_p > -6
 
@@ -97,7 +97,7 @@ def test_records_refuse_by_name(original, published, forged, key: jm.Key):
 def test_searching_keys_pays_as_chance_does(original, published):
     """The number of keys with log10 p ≤ -x is at most binomial of probability 10^-x, and as a normal score has it."""
     keys = 300
-    found = searched_key(published[0], original, FORGED, keys, seed=1).log10_p
+    found = search_key(published[0], original, FORGED, keys, seed=1).log10_p
     for x in (0.5, 1.0, 1.5, 2.0):
         bound = keys * 10**-x
         assert np.sum(found <= -x) <= bound + 3 * np.sqrt(bound)
@@ -107,7 +107,7 @@ def test_searching_keys_pays_as_chance_does(original, published):
 
 
 def test_searching_agrees_with_detection(original, published, key: jm.Key):
-    search = searched_key(published[0], original, FORGED, 20, seed=2)
+    search = search_key(published[0], original, FORGED, 20, seed=2)
     again = jm.detect(published[0], original=original, key=search.key, message=FORGED)
     assert search.log10_p.min() == pytest.approx(again.log10_p, rel=1e-4)
     assert len(set(search.log10_p)) > 3  # most prove nothing once both ways of weighing are paid for
@@ -121,18 +121,18 @@ def test_a_mark_moved_elsewhere(original, published, key: jm.Key):
     clean = jm.attack(original, "noise", 2e-4, seed=0)
     assert owner.detect(clean, MESSAGE).log10_p > -6
     # Onto the unmarked original, rough as it came from elsewhere: with the whole mark, the claim goes along.
-    assert owner.detect(transplanted(mesh, original, clean), MESSAGE).log10_p < -20
+    assert owner.detect(transplant(mesh, original, clean), MESSAGE).log10_p < -20
     # Under the same key, on another's mesh of the same connectivity, read with that one's original: nothing.
     target = Mesh(original.vertices * [1.1, 0.9, 1.0] + 0.02 * np.sin(3 * original.vertices), original.faces)
-    moved = transplanted(mesh, original, target)
+    moved = transplant(mesh, original, target)
     assert jm.detect(moved, original=target, key=key, message=MESSAGE).log10_p > -6
     # The control: with choices that do not hang on the original, it would be there.
-    assert unbound(target, prepare(original).geometry, key).detect(moved, MESSAGE).log10_p < -20
+    assert unbound(target, make_original(original).geometry, key).detect(moved, MESSAGE).log10_p < -20
     np.testing.assert_allclose(moved.vertices - target.vertices, mesh.vertices - original.vertices, atol=1e-12)
 
 
 def test_refusals(original, published):
     with pytest.raises(jm.JaxmarkError, match="at least 1 key"):
-        searched_key(published[0], original, FORGED, 0)
+        search_key(published[0], original, FORGED, 0)
     with pytest.raises(jm.JaxmarkError, match="one connectivity"):
-        transplanted(published[0], original, bumpy_sphere(2))
+        transplant(published[0], original, bumpy_sphere(2))

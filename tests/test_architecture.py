@@ -1,76 +1,86 @@
-"""The order of modules that CONTRIBUTING.md gives, and the picture of them, are those of the code."""
+"""The order of rooms that CONTRIBUTING.md gives, and the pictures of them, are those of the code."""
 
-import ast
 import re
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
-from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-PACKAGE = ROOT / "jaxmark"
+import jaxmark as jm
+from tests.architecture import FIGURE, PACKAGE, ROOT, draw, imports, modules, rooms
 
-
-def modules() -> set[str]:
-    """Public modules and subpackages, by name."""
-    files = {path.stem for path in PACKAGE.glob("*.py")}
-    folders = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
-    return {name for name in files | folders if not name.startswith("_")}
+MOST_ROOMS = 16  # at the top of the package
+FILTERING = {"errors", "extras", "geometry", "spectral"}  # what a filter needs
 
 
 def table(text: str) -> list[str]:
-    """The first column of the table of modules, row by row."""
+    """The rooms in the first column of the table, row by row."""
     rows = re.findall(r"^\| (`[^|]*`) \|", text, re.MULTILINE)
     return [name for row in rows for name in re.findall(r"`(\w+)/?`", row)]
-
-
-def imports(source: str) -> Iterator[str]:
-    """Modules right below jaxmark that a source imports, anywhere in it."""
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            dotted = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, "relative imports are not followed here"
-            dotted = [f"{node.module}.{alias.name}" for alias in node.names]
-        else:
-            continue
-        yield from (name.split(".")[1] for name in dotted if name.startswith("jaxmark."))
 
 
 def backward(order: list[str], found: dict[str, set[str]]) -> list[str]:
     """Imports of what stands later in an order."""
     place = {name: number for number, name in enumerate(order)}
     return [
-        f"{module} imports {other}"
-        for module, others in found.items()
-        for other in sorted(others - {module})
-        if place[other] > place[module]
+        f"{room} imports {other}"
+        for room, others in found.items()
+        for other in sorted(others)
+        if place[other] > place[room]
     ]
 
 
-def test_the_table_names_every_module_once():
+def test_the_table_names_every_room_once():
     named = table((ROOT / "CONTRIBUTING.md").read_text())
-    assert sorted(named) == sorted(modules())
+    assert sorted(named) == sorted(rooms())
+    assert len(named) <= MOST_ROOMS
 
 
 def test_imports_flow_down_the_table():
-    found: dict[str, set[str]] = {}
-    for path in PACKAGE.rglob("*.py"):
-        module = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-        if module in modules():
-            found.setdefault(module, set()).update(set(imports(path.read_text())) & modules())
-    assert found["marking"] >= {"alignment", "keys", "schemes"}
+    found = rooms()
+    assert found["evaluation"] >= {"attacks", "watermark", "plot"}
     assert not backward(table((ROOT / "CONTRIBUTING.md").read_text()), found)
 
 
+def test_filtering_knows_nothing_of_the_watermark():
+    assert rooms()["spectral"] | rooms()["geometry"] <= FILTERING
+
+
 def test_an_import_against_the_flow_is_seen():
-    source = "def late():\n    from jaxmark.cli import main\n    from jaxmark import mesh\n"
-    assert set(imports(source)) == {"cli", "mesh"}
-    assert backward(["mesh", "laplacian", "cli"], {"laplacian": set(imports(source))}) == ["laplacian imports cli"]
+    source = "def late():\n    from jaxmark.app.cli import main\n    from jaxmark import geometry\n"
+    assert set(imports(source)) == {"app", "geometry"}
+    assert backward(["geometry", "spectral", "app"], {"spectral": set(imports(source))}) == ["spectral imports app"]
 
 
-def test_modules_in_the_picture_exist():
-    picture = ElementTree.parse(ROOT / "docs" / "architecture.svg")
+def test_filters_come_alone():
+    """Whoever filters loads neither the watermark nor what it needs."""
+    late = "trimesh jaxopt click jaxmark.watermark jaxmark.files jaxmark.alignment"
+    code = f"import sys, jaxmark.spectral; print(*(set({late.split()}) & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
+
+
+def test_the_package_shows_its_rooms_and_what_is_used_every_day():
+    shown = dir(jm)
+    assert {"spectral", "watermark", "attacks", "distortion", "plot", "embed", "detect"} <= set(shown)
+    assert all(hasattr(jm, name) for name in shown)
+    assert len([name for name in shown if name not in rooms()]) <= 24
+
+
+def test_the_figure_is_drawn_from_the_imports():
+    assert FIGURE.read_text() == draw(rooms()), "draw it again: python -m tests.architecture"
+
+
+def test_modules_in_the_picture_of_the_data_exist():
+    picture = ElementTree.parse(ROOT / "docs" / "data_flow.svg")
     texts = [text for text in picture.iter("{http://www.w3.org/2000/svg}text") if text.get("class") == "modules"]
     named = {name for text in texts for name in (text.text or "").split()}
     assert len(named) >= 30
     assert named <= modules()
+
+
+def test_no_module_is_hidden_by_a_function_of_its_name():
+    """A function that a room shows takes the name of a public module from whoever imports the room."""
+    for face in PACKAGE.rglob("__init__.py"):
+        shown = set(re.findall(r"import \w+ as (\w+)$", face.read_text(), re.MULTILINE))
+        public = {path.stem for path in face.parent.glob("*.py")}
+        assert not shown & public, face

@@ -20,17 +20,9 @@ from jaxmark.attacks import (
     uniform_noise,
 )
 from jaxmark.distortion import rms
-from jaxmark.mesh import Mesh, make_mesh
+from jaxmark.geometry.mesh import Mesh, make_mesh
 from tests.samples import bumpy_sphere
-
-# All that are traced.
-MILD = (
-    *(("noise", 0.01), ("diagonal-noise", 0.01), ("gaussian-noise", 0.01), ("smoothing", 3), ("quantisation", 8)),
-    *(("taubin", 3), ("cotangent-smoothing", 0.3), ("bilateral", 1)),
-    *(("low-pass", 0.3), ("band-stop", 0.001)),
-    *(("jamming", 0.002), ("warp", 0.005), ("bending", 2), ("twisting", 2)),
-    *(("similarity", 0.3), ("affine", 0.02)),
-)
+from tests.test_contract import TRACED
 
 
 @pytest.fixture(scope="module")
@@ -204,33 +196,6 @@ def test_attacks_are_differentiable(cap: Mesh, x64):
     np.testing.assert_array_equal(straight, 2)
 
 
-@pytest.mark.slow
-def test_host_function_keeps_copies_together_and_digits_far_away(cap: Mesh):
-    # With its isolated vertex it has as many points as the cap: what was compiled serves again.
-    corners = np.vstack([cap.vertices[cap.faces].reshape(-1, 3), cap.vertices[-1:]])
-    soup = make_mesh(corners + 1e6, np.arange(3 * len(cap.faces)).reshape(-1, 3))
-    for kind, strength in MILD:
-        once = jm.attack(soup, kind, strength, seed=3)
-        np.testing.assert_array_equal(once.vertices, jm.attack(soup, kind, strength, seed=3).vertices)
-        pairs = {(tuple(a), tuple(b)) for a, b in zip(soup.vertices, once.vertices, strict=True)}
-        assert len(pairs) == len({a for a, _ in pairs})
-        near = jm.attack(soup._replace(vertices=soup.vertices - 1e6), kind, strength, seed=3)
-        np.testing.assert_allclose(once.vertices - 1e6, near.vertices, atol=1e-5)
-    noisy = [jm.attack(soup, "noise", 0.01, seed=seed).vertices for seed in (0, 1)]
-    assert (noisy[0] != noisy[1]).any()
-    np.testing.assert_array_equal(jm.attack(soup, "noise", 0, seed=0).vertices, soup.vertices)
-
-
-@pytest.mark.slow
-def test_a_stray_vertex_changes_nothing(cap: Mesh):
-    stray = make_mesh(np.vstack([cap.vertices[:-1], [[1e9, 0, 0]]]), cap.faces)
-    for kind, strength in MILD:
-        alone, beside = (jm.attack(mesh, kind, strength, seed=0).vertices for mesh in (cap, stray))
-        np.testing.assert_array_equal(beside[-1], stray.vertices[-1])
-        np.testing.assert_allclose(beside[:-1], alone[:-1], atol=1e-6)
-        assert kind == "similarity" or np.abs(beside[:-1] - cap.vertices[:-1]).max() < 0.05
-
-
 def test_repeated_smoothing_is_compiled_once(cap: Mesh, caplog: pytest.LogCaptureFixture):
     compiled = []
     for seed in (0, 1):
@@ -257,35 +222,10 @@ def moved_by(mesh: Mesh, kind: str, strength: float) -> float:
     return float(rms(jm.attack(mesh, kind, strength, seed=0).vertices - mesh.vertices))
 
 
-@pytest.mark.parametrize("kind", [kind for kind, _ in MILD])
+@pytest.mark.parametrize("kind", [kind for kind, _ in TRACED])
 def test_the_last_usual_strength_moves_vertices_further_than_the_first(kind, cap: Mesh):
     weakest, *_, strongest = ATTACKS[kind].strengths
     assert 0 < moved_by(cap, kind, weakest) < moved_by(cap, kind, strongest)
-
-
-def test_all_traced_attacks_are_tested():
-    subdivisions = {"midpoint", "sqrt3", "loop"}  # have a module of their own
-    assert {kind for kind, _ in MILD} | subdivisions == {kind for kind, entry in ATTACKS.items() if not entry.host}
-
-
-@pytest.mark.parametrize(("kind", "strength"), MILD)
-def test_traced_attacks_under_transformations(kind, strength, cap: Mesh):
-    """Compiled, of traced vertices, for several keys at once, an attack does what it does by itself."""
-    apply, keys = ATTACKS[kind].apply, jax.random.split(jax.random.key(0), 2)
-
-    def moved(vertices, key):
-        return apply(Mesh(vertices, cap.faces), strength, key).vertices
-
-    vertices = jnp.asarray(cap.vertices, jnp.float32)
-    together = jax.jit(jax.vmap(moved, (None, 0)))(vertices, keys)
-    np.testing.assert_allclose(together, [moved(vertices, key) for key in keys], atol=1e-5)
-
-
-@pytest.mark.parametrize(("kind", "strength"), MILD)
-def test_traced_attacks_keep_the_dtype(kind, strength, cap: Mesh, dtype):
-    key, vertices = jax.random.key(0), jax.ShapeDtypeStruct(cap.vertices.shape, dtype)
-    moved = jax.eval_shape(lambda v: ATTACKS[kind].apply(Mesh(v, cap.faces), strength, key).vertices, vertices)
-    assert moved.dtype == dtype
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -303,7 +243,7 @@ def test_refusals(cap: Mesh):
 
 
 @pytest.fixture(scope="module")
-def marked(key: jm.Key) -> tuple[jm.Marker, Mesh]:
+def marked(key: jm.Key) -> tuple[jm.watermark.Marker, Mesh]:
     marker = jm.make_marker(bumpy_sphere(4), key, bits=64)
     return marker, marker.embed(b"jaxmark!")[0]
 
@@ -319,7 +259,7 @@ def marked(key: jm.Key) -> tuple[jm.Marker, Mesh]:
         *(("similarity", 0.5), ("affine", 0.3), ("edge-flips", 0.01), ("edge-flips", 0.3)),
     ],
 )
-def test_marks_of_the_default_budget_read(kind, strength, marked: tuple[jm.Marker, Mesh]):
+def test_marks_of_the_default_budget_read(kind, strength, marked: tuple[jm.watermark.Marker, Mesh]):
     marker, mesh = marked
     suspect = jm.attack(mesh, kind, strength, seed=1)
     if (kind, strength) == ("edge-flips", 0.3):
@@ -334,7 +274,7 @@ def test_marks_of_the_default_budget_read(kind, strength, marked: tuple[jm.Marke
 
 
 @pytest.mark.slow
-def test_a_mark_reads_in_noise_of_twice_its_size(marked: tuple[jm.Marker, Mesh]):
+def test_a_mark_reads_in_noise_of_twice_its_size(marked: tuple[jm.watermark.Marker, Mesh]):
     marker, mesh = marked
     noisy = mark_noise(mesh, marker.original.mesh, 2.0, jax.random.key(0))
     assert marker.detect(noisy).message == b"jaxmark!"
@@ -343,7 +283,7 @@ def test_a_mark_reads_in_noise_of_twice_its_size(marked: tuple[jm.Marker, Mesh])
 @pytest.mark.parametrize(
     ("kind", "strength"),
     [
-        *(pytest.param(*one, marks=() if one[0] in ("noise", "smoothing") else pytest.mark.slow) for one in MILD),
+        *(pytest.param(*one, marks=() if one[0] in ("noise", "smoothing") else pytest.mark.slow) for one in TRACED),
         *(("midpoint", 1), ("holes", 0.1)),
     ],
 )

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from numpy.polynomial import chebyshev
 from scipy import integrate, optimize, special
 
-from jaxmark.bands import bernstein, equal_edges, hat, intervals, lagrange, minimax, nodes, report, scaling
-from jaxmark.chebyshev import band_components, cross_moments, moments
 from jaxmark.errors import JaxmarkError
-from jaxmark.laplacian import centre, make_laplacian
-from jaxmark.mesh import Mesh, make_mesh
-from jaxmark.spectrum import eigenpairs, quadrature, white
+from jaxmark.geometry.mesh import Mesh, make_mesh
+from jaxmark.spectral.bands import bernstein, equal_edges, hat, intervals, lagrange, minimax, nodes, report, scaling
+from jaxmark.spectral.chebyshev import band_components, cross_moments, moments
+from jaxmark.spectral.laplacian import centre, make_laplacian
+from jaxmark.spectral.spectrum import eigenpairs, quadrature, white_probes
 from tests.dense import laplacian_matrix
 
 KERNELS = ["halved", "printed"]
@@ -172,7 +172,7 @@ def test_intervals_are_damped_projections_of_indicators():
 def test_bands_by_density_hold_equal_counts_of_eigenvalues(sphere: Mesh, x64):
     """Exactly so of the damped estimate; of the eigenvalues themselves within its error: the probes' and the blur's."""
     operator, probes, bands = make_laplacian(sphere), 16, 8
-    signals = jnp.asarray(white(operator, jax.random.key(0), probes))
+    signals = jnp.asarray(white_probes(operator, jax.random.key(0), probes))
     found = np.asarray(moments(operator, signals, degree=100)).sum(axis=1)
     edges = equal_edges(found, bands)
     family = intervals(edges, len(found))

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.attacks.adversarial import blind
-from jaxmark.attacks.adversarial.expected import evidence, make_surrogate, random_mark, rms, size, sized
-from jaxmark.detectors import claims
+from jaxmark.adversaries import blind
+from jaxmark.adversaries.expected import evidence, make_surrogate, random_mark, rescale, rms, size
 from jaxmark.distortion import compare
-from jaxmark.mesh import Mesh
-from jaxmark.message import encode
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.detectors import claims
 from tests.samples import bumpy_sphere
 
 MESSAGE, MARK = b"ok", 2e-3
@@ -21,16 +20,16 @@ SOUGHT = [("bands", 20), ("bands", 40), ("vertices", 20), ("vertices", 40)]
 
 
 @pytest.fixture(scope="module")
-def marked(key: jm.Key) -> tuple[jm.Marker, Mesh]:
+def marked(key: jm.Key) -> tuple[jm.watermark.Marker, Mesh]:
     marker = jm.make_marker(bumpy_sphere(3), key, bits=16)
     return marker, marker.embed(MESSAGE, MARK, noise=0)[0]
 
 
-def owner_sees(marker: jm.Marker, suspect: Mesh) -> float:
+def owner_sees(marker: jm.watermark.Marker, suspect: Mesh) -> float:
     """The largest S/‖a‖ of a claim of the message under the owner's key."""
-    code = encode(MESSAGE, marker.key, marker.original.geometry, marker.code)
-    seen = marker.observe(suspect)
-    scores, norms = claims(marker.reader, seen, jnp.asarray(code, seen.residual.dtype))
+    code = marker.codeword(MESSAGE)
+    received = marker.receive(suspect)
+    scores, norms = claims(marker.reader, received, jnp.asarray(code, received.observed.residual.dtype))
     return float(jnp.max(scores / norms))
 
 
@@ -49,7 +48,8 @@ def test_gradients_agree_with_finite_differences(scheme, key: jm.Key, x64):
     surrogate, _ = make_surrogate(mesh, scheme, 8, 5e-3)
     random = np.random.default_rng(0)
     place, way = (
-        sized(surrogate, jnp.asarray(random.normal(size=surrogate.signal.shape)), jnp.asarray(s)) for s in (5e-3, 1e-6)
+        rescale(surrogate, jnp.asarray(random.normal(size=surrogate.signal.shape)), jnp.asarray(s))
+        for s in (5e-3, 1e-6)
     )
     value = jax.jit(lambda shift: evidence(surrogate, shift, jax.random.key(1)))
     slope = jnp.sum(jax.grad(value)(place) * way)
@@ -62,12 +62,12 @@ def test_sizes(marked):
     surrogate, original = make_surrogate(mesh, "keyed", 16, MARK, "dame")
     noise = jax.random.normal(jax.random.key(0), surrogate.signal.shape, surrogate.signal.dtype)
     # The metric, as small displacements make it.
-    shift = sized(surrogate, noise, jnp.asarray(2e-3, noise.dtype))
+    shift = rescale(surrogate, noise, jnp.asarray(2e-3, noise.dtype))
     assert float(size(surrogate, shift)) == pytest.approx(2e-3, rel=1e-4)
-    moved = mesh._replace(vertices=mesh.vertices + original.diagonal * original.on_host(shift))
+    moved = mesh._replace(vertices=mesh.vertices + original.diagonal * original.to_host(shift))
     assert compare(mesh, moved, ["dame"]).dame == pytest.approx(2e-3, rel=0.15)
     plain = make_surrogate(mesh, "keyed", 16, MARK)[0]
-    assert float(rms(plain, sized(plain, noise, jnp.asarray(1e-3, noise.dtype)))) == pytest.approx(1e-3, rel=1e-5)
+    assert float(rms(plain, rescale(plain, noise, jnp.asarray(1e-3, noise.dtype)))) == pytest.approx(1e-3, rel=1e-5)
 
 
 @pytest.mark.slow
@@ -80,12 +80,12 @@ def test_who_optimises_does_more_than_who_writes_another_mark(scheme, key: jm.Ke
     fresh = jax.random.split(jax.random.key(7), 4)
     expected = jax.jit(lambda shift: jnp.mean(jax.lax.map(lambda one: evidence(surrogate, shift, one), fresh)))
     seek = {
-        **{(family, steps): partial(blind.descended, family=family, steps=steps) for family, steps in SOUGHT},
-        "evolution": partial(blind.evolved, family="bands", generations=10),
+        **{(family, steps): partial(blind.descend, family=family, steps=steps) for family, steps in SOUGHT},
+        "evolution": partial(blind.evolve, family="bands", generations=10),
     }
     shifts = {name: jax.jit(one)(surrogate, strength, jax.random.key(1)) for name, one in seek.items()}
     found = {name: float(expected(shift)) for name, shift in shifts.items()}
-    other = float(expected(sized(surrogate, random_mark(surrogate, jax.random.key(1))[1], strength)))
+    other = float(expected(rescale(surrogate, random_mark(surrogate, jax.random.key(1))[1], strength)))
     assert found["vertices", 40] < 0.97 * other
     if scheme == "keyed":  # whose bands are not equally strong
         assert max(found["bands", 40], found["evolution"]) < 0.97 * other
@@ -93,7 +93,7 @@ def test_who_optimises_does_more_than_who_writes_another_mark(scheme, key: jm.Ke
     for family in ("bands", "vertices"):
         assert found[family, 40] == pytest.approx(found[family, 20], rel=0.06)
     # The owner sees what was expected; by how much it varies is 1 for every key.
-    suspect = mesh._replace(vertices=mesh.vertices + original.diagonal * original.on_host(shifts["bands", 40]))
+    suspect = mesh._replace(vertices=mesh.vertices + original.diagonal * original.to_host(shifts["bands", 40]))
     assert owner_sees(marker, suspect) == pytest.approx(found["bands", 40], abs=3)
 
 
@@ -116,7 +116,7 @@ def test_restarts_by_vmap(marked):
     _, mesh = marked
     surrogate, _ = make_surrogate(mesh, "keyed", 16, MARK)
     strength = jnp.asarray(1e-3, surrogate.signal.dtype)
-    seek = partial(blind.descended, surrogate, strength, family="warps", steps=2)
+    seek = partial(blind.descend, surrogate, strength, family="warps", steps=2)
     keys = jax.random.split(jax.random.key(0), 2)
     together = jax.jit(jax.vmap(seek))(keys)
     assert together.shape == (2, *surrogate.signal.shape)
@@ -124,7 +124,7 @@ def test_restarts_by_vmap(marked):
     assert not np.allclose(together[0], together[1], atol=1e-4)
 
 
-def test_refusals(marked):
+def test_refusals(marked, unchecked):
     _, mesh = marked
     with pytest.raises(jm.JaxmarkError, match="no family of displacements 'faces'"):
         blind.descent("faces")  # pyright: ignore[reportArgumentType]

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark import cli
-from jaxmark.budget import DEFAULT_LIMITS, _largest, make_budget, write
-from jaxmark.mesh import Mesh, make_mesh
-from jaxmark.original import prepare
+from jaxmark.alignment.original import make_original
+from jaxmark.app import cli
+from jaxmark.geometry.mesh import Mesh, make_mesh
+from jaxmark.watermark.budget import DEFAULT_LIMITS, _largest, make_budget, write
 from tests.samples import rough_sphere
 
 MESSAGE = b"\xa5\x5a"
@@ -30,14 +30,14 @@ def noise(mesh: Mesh) -> np.ndarray:
 
 @pytest.mark.parametrize("name", SUBSET)
 def test_a_limit_is_reached_and_never_passed(name, mesh: Mesh, noise: np.ndarray):
-    original = prepare(mesh)
+    original = make_original(mesh)
     goal = 0.02 if name in ("dame", "fmpd", "msdm") else 3e-4
     written = write(original, noise, make_budget(limits={name: goal}))
     assert 0.98 * goal <= jm.compare(mesh, written.mesh)._asdict()[name] <= goal
 
 
 def test_the_tightest_of_several_bounds_counts(mesh: Mesh, noise: np.ndarray):
-    original = prepare(mesh)
+    original = make_original(mesh)
     for budget in (make_budget(1e-4, {"dame": 1.0}), make_budget(1e-4)):
         assert write(original, noise, budget).moved.rms == pytest.approx(1e-4)
     budget = make_budget(0.5, {"dame": 0.01, "msdm": 0.9})
@@ -59,7 +59,7 @@ def largest_stretch(original: Mesh, distorted: Mesh) -> float:
 def test_a_metric_of_ones_own_can_be_limited(mesh: Mesh, noise: np.ndarray, key: jm.Key):
     budget = make_budget(limits={largest_stretch: 0.02, "max": 0.1})
     assert str(budget) == "largest_stretch of at most 0.02 and max of at most 0.1"
-    found = largest_stretch(mesh, write(prepare(mesh), noise, budget).mesh)
+    found = largest_stretch(mesh, write(make_original(mesh), noise, budget).mesh)
     assert 0.98 * 0.02 <= found <= 0.02
     marked, _ = jm.embed(mesh, MESSAGE, key, limits={largest_stretch: 0.02}, noise=0)
     assert 0.98 * 0.02 <= largest_stretch(mesh, marked) <= 0.02
@@ -149,10 +149,10 @@ def test_budgets_out_of_range_are_refused(budget, limits, sentence):
 
 
 def test_limits_that_bind_nothing_are_refused_without_a_budget(mesh: Mesh, noise: np.ndarray):
-    original = prepare(mesh)
+    original = make_original(mesh)
     with pytest.raises(jm.JaxmarkError, match="give a budget"):
         write(original, noise, make_budget(limits={"rms": 0.5}))
     # Three triangles without a common edge have no dihedral angle.
-    loose = prepare(make_mesh(np.random.default_rng(0).normal(size=(9, 3)), np.arange(9).reshape(3, 3)))
+    loose = make_original(make_mesh(np.random.default_rng(0).normal(size=(9, 3)), np.arange(9).reshape(3, 3)))
     with pytest.raises(jm.JaxmarkError, match="give a budget"):
         write(loose, np.ones((9, 3)) * [1, 2, 3], make_budget())

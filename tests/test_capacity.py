@@ -9,13 +9,13 @@ import pytest
 from scipy import integrate, optimize
 
 import jaxmark as jm
-from jaxmark.bands import scaling
-from jaxmark.budget import make_budget
-from jaxmark.mesh import Mesh, make_mesh, vertex_normals
-from jaxmark.original import prepare
-from jaxmark.payload import Capacity, Conditions, least_energy, needed_dimensions, needed_energy, room, worth
-from jaxmark.reception import make_receiver
-from jaxmark.schemes import KeyedScheme
+from jaxmark.alignment.original import make_original
+from jaxmark.geometry.mesh import Mesh, make_mesh, vertex_normals
+from jaxmark.spectral.bands import scaling
+from jaxmark.watermark.budget import make_budget
+from jaxmark.watermark.carriers.reception import make_receiver
+from jaxmark.watermark.payload import Capacity, Conditions, least_energy, needed_dimensions, needed_energy, worth
+from jaxmark.watermark.schemes import KeyedScheme
 from tests.dense import chebyshev_matrices
 from tests.samples import bumpy_sphere, rough_sphere
 
@@ -31,13 +31,13 @@ def thousand() -> Mesh:
 @pytest.fixture(scope="module")
 def known(thousand: Mesh) -> Capacity:
     """Of 1,100 vertices; it remembers what it measured."""
-    return Capacity(prepare(thousand), KeyedScheme())
+    return Capacity(make_original(thousand), KeyedScheme())
 
 
 @pytest.fixture(scope="module")
 def coarse(thousand: Mesh) -> Capacity:
     """With wider bands, and so fewer layouts to measure."""
-    return Capacity(prepare(thousand), KeyedScheme(bands=16))
+    return Capacity(make_original(thousand), KeyedScheme(bands=16))
 
 
 def decibel(value: float) -> float:
@@ -91,15 +91,15 @@ def test_bits_are_noise_to_each_other():
 @pytest.mark.parametrize("passband", ["tapered", "narrow"])
 def test_room_is_what_the_projection_leaves(direction, passband, x64):
     """By dense matrices: of white displacements in each band, and the energy of a mark of unit mean square."""
-    original, scheme = prepare(bumpy_sphere(2)), KeyedScheme(bands=32, direction=direction, passband=passband)
+    original, scheme = make_original(bumpy_sphere(2)), KeyedScheme(bands=32, direction=direction, passband=passband)
     carrier = scheme.carrier(original, bytes(32), 8, 32)
     passing = scheme.layout(original, 8).passing
     count = len(original.used)
     terms = chebyshev_matrices(original.operator, 31)[:, :count, :count]
-    degree = original.on_host(original.operator.degree)
+    degree = original.to_host(original.operator.degree)
     mass = degree / np.mean(degree)
     filters = mass[:, None] * np.einsum("jk,kuv->juv", scaling(32, damping="jackson")[:passing], terms)
-    columns = np.kron(original.on_host(make_receiver(carrier.host).nuisance), np.eye(3))
+    columns = np.kron(original.to_host(make_receiver(carrier.host).nuisance), np.eye(3))
     basis, size, _ = np.linalg.svd(columns, full_matrices=False)
     basis = basis[:, size > 1e-6 * size[0]]
     white = np.eye(3 * len(terms[0]))
@@ -108,7 +108,7 @@ def test_room_is_what_the_projection_leaves(direction, passband, x64):
         white = np.einsum("vc,vu->vcu", normals, np.eye(len(normals))).reshape(-1, len(normals))
     left = white - basis @ (basis.T @ white)
     strengths = np.asarray(carrier.profile)
-    found = room(carrier, original)
+    found = carrier.reader().room(original.to_traced(original.used))
     energy = 0.0
     for band, filter in enumerate(filters):
         # One probe of random signs: its variance is twice the energy off the diagonal.
@@ -123,8 +123,9 @@ def test_room_is_what_the_projection_leaves(direction, passband, x64):
 
 def test_least_budget_by_its_definition(known: Capacity, thousand: Mesh):
     """Energy over noise, with the energy of the vertices that are left and uniform noise of variance ν²/3."""
-    original, scheme = prepare(thousand), KeyedScheme()
-    left = room(scheme.carrier(original, b"k" * 32, 16, scheme.code_length(original, 16)), original)
+    original, scheme = make_original(thousand), KeyedScheme()
+    carrier = scheme.carrier(original, b"k" * 32, 16, scheme.code_length(original, 16))
+    left = carrier.reader().room(original.to_traced(original.used))
     points = thousand.vertices - thousand.vertices.mean(axis=0)
     width = 0.005 * np.linalg.norm(points, axis=1).mean() / np.linalg.norm(np.ptp(thousand.vertices, axis=0))
     budget = known.least_budget(16, USUAL)
@@ -174,7 +175,7 @@ def test_bits_is_the_largest_payload(budget, coarse: Capacity):
 
 
 def test_what_carries_a_payload_carries_a_shorter_one():
-    small = Capacity(prepare(bumpy_sphere(3)), KeyedScheme())
+    small = Capacity(make_original(bumpy_sphere(3)), KeyedScheme())
     assert small.least_budget(8, USUAL) <= small.least_budget(64, USUAL) < math.inf
 
 
@@ -189,7 +190,7 @@ def test_payloads_that_must_not_be_refused(vertices, bits, budget, known: Capaci
         return
     mesh = bumpy_sphere({2562: 4, 10242: 5}[vertices])
     assert len(mesh.vertices) == vertices
-    assert Capacity(prepare(mesh), KeyedScheme()).least_budget(bits, USUAL) <= budget
+    assert Capacity(make_original(mesh), KeyedScheme()).least_budget(bits, USUAL) <= budget
 
 
 @pytest.mark.slow

@@ -7,12 +7,12 @@ import pytest
 from jax.test_util import check_grads
 
 import jaxmark as jm
-from jaxmark.bands import scaling
-from jaxmark.carriers import Carrier, ModulatedCarrier, eigenspaces, host_bands
-from jaxmark.laplacian import Laplacian, centre, make_laplacian
-from jaxmark.observation import observe
-from jaxmark.sequences import orthogonal_sequences
-from jaxmark.spectrum import eigenpairs
+from jaxmark.alignment.observation import observe
+from jaxmark.spectral.bands import scaling
+from jaxmark.spectral.laplacian import Laplacian, centre, make_laplacian
+from jaxmark.spectral.spectrum import eigenpairs
+from jaxmark.watermark.carriers import Carrier, ModulatedCarrier, eigenspaces, host_bands
+from jaxmark.watermark.coding.sequences import orthogonal_sequences
 from tests.dense import chebyshev_matrices
 from tests.samples import bumpy_sphere
 
@@ -49,7 +49,9 @@ def dense_components(kind: str, operator: Laplacian, signal: np.ndarray) -> np.n
     return parts / np.sqrt(np.einsum("v,jvc->jc", operator.degree, parts**2))[:, None]
 
 
-def make_carrier(kind: str, operator: Laplacian, signal: jax.Array, key: bytes, shared: bool = False) -> Carrier:
+def make_carrier(
+    kind: str, operator: Laplacian, signal: jax.Array, key: bytes, shared: bool = False
+) -> ModulatedCarrier:
     columns = 1 if shared else 3
     sequences = orthogonal_sequences(key, b"geometry", BITS, BANDS * columns).reshape(BITS, BANDS, columns)
     if kind == "eigen":
@@ -181,7 +183,7 @@ def test_the_whole_eigenspace_stands_for_a_repeated_eigenvalue(key: jm.Key, x64)
     """The components do not depend on the basis that a solver happened to pick in an eigenspace."""
     import trimesh
 
-    from jaxmark.mesh import make_mesh
+    from jaxmark.geometry.mesh import make_mesh
 
     ball = trimesh.creation.icosahedron()
     mesh = make_mesh(ball.vertices * [1, 1.2, 1.5] + 0.1 * np.cos(3 * ball.vertices[:, [1, 2, 0]] + 1), ball.faces)

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 import jaxmark as jm
-from jaxmark.cells import Cell, finished, run
+from jaxmark.evaluation.cells import Cell, load_finished, run
 from tests.samples import bumpy_sphere
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+SPEED = Path(__file__).parents[1] / "benchmarks" / "speed"
 
 
 def lines(output: Path) -> list[dict[str, Any]]:
@@ -23,7 +23,7 @@ def lines(output: Path) -> list[dict[str, Any]]:
 
 @pytest.mark.slow
 def test_a_corpus_is_marked_attacked_and_read(monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(BENCHMARKS)
+    monkeypatch.syspath_prepend(SPEED)
     corpus = importlib.import_module("corpus")
     mesh, output = tmp_path / "sphere.ply", tmp_path / "corpus.jsonl"
     jm.save_mesh(bumpy_sphere(4), mesh)
@@ -41,7 +41,7 @@ def test_what_is_finished_stays_so(tmp_path):
     # A run that was killed while it wrote a line has torn it.
     whole = output.read_bytes()
     output.write_bytes(whole[:-20])
-    assert [tuple(row["cell"]) for row in finished(output)] == cells[:1]
+    assert [tuple(row["cell"]) for row in load_finished(output)] == cells[:1]
     # Rows come in the order of the cells, whatever was finished before.
     rows = run(cells[::-1], squared, lambda: ThreadPoolExecutor(1), output)
     assert [row["square"] for row in rows] == [9, 4, 1]

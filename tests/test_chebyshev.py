@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
-from jaxmark import chebyshev
-from jaxmark.bands import scaling
 from jaxmark.errors import JaxmarkError
-from jaxmark.laplacian import Laplacian, make_laplacian
-from jaxmark.mesh import Mesh, make_mesh
+from jaxmark.geometry.mesh import Mesh, make_mesh
+from jaxmark.spectral import chebyshev
+from jaxmark.spectral.bands import scaling
+from jaxmark.spectral.laplacian import Laplacian, make_laplacian
 from tests.dense import chebyshev_matrices, tolerance
 from tests.samples import bumpy_sphere, ordered_laplacian
 

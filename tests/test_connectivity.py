@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 import jaxmark as jm
-from jaxmark.connectivity import _LEAST, _Rings, matching_vertices
-from jaxmark.mesh import Mesh, boundary_vertices, edges, make_mesh
+from jaxmark.geometry.connectivity import _MIN_RINGS, _Rings, matching_vertices
+from jaxmark.geometry.mesh import Mesh, boundary_vertices, edges, make_mesh
 from tests.meshes import shared_mesh
 from tests.samples import bumpy_sphere, exact_sheet
 
@@ -89,7 +89,7 @@ def test_colours_tell_apart_what_their_definition_does():
     incident = np.bincount(np.ravel(mesh.faces), minlength=size)
     expected = [(len(near[v]), int(incident[v])) for v in range(size)]
     rings = _Rings(mesh)
-    for _ in range(_LEAST + 2):
+    for _ in range(_MIN_RINGS + 2):
         expected = [(expected[v], tuple(sorted(expected[u] for u in near[v]))) for v in range(size)]
         names = {name: place for place, name in enumerate(dict.fromkeys(expected))}
         expected = [names[name] for name in expected]

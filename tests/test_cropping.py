@@ -11,7 +11,7 @@ from scipy.spatial.distance import pdist
 
 import jaxmark as jm
 from jaxmark.attacks import adding_geometry, cropping, holes, missing_pieces, mosaic, region_cropping, reordering
-from jaxmark.mesh import Mesh, diagonal, edges, make_mesh
+from jaxmark.geometry.mesh import Mesh, diagonal, edges, make_mesh
 from tests.samples import bumpy_sphere
 
 CUTS = {"cropping": cropping, "region-cropping": region_cropping, "holes": holes}

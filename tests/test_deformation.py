@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
 from jaxmark.attacks import as_rigid_as_possible
-from jaxmark.attacks.deformation import _relaxed
-from jaxmark.mesh import Mesh, diagonal, make_mesh
+from jaxmark.attacks.deformation import _relax
+from jaxmark.geometry.mesh import Mesh, diagonal, make_mesh
 from tests.samples import bumpy_sphere, exact_sheet
 
 igl = pytest.importorskip("igl")
@@ -71,7 +71,7 @@ def test_handles_in_rigid_motion_take_the_mesh_along(sphere: Mesh):
     handles = share == 1
     start = there + 0.02 * random.normal(size=there.shape)
     start[handles] = there[handles]
-    found = _relaxed(sphere, start, share)
+    found = _relax(sphere, start, share)
     np.testing.assert_array_equal(found[handles], there[handles])
     np.testing.assert_allclose(found, there, atol=1e-4)  # rotations are in single precision
 

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 import jaxmark as jm
-from jaxmark import cli
+from jaxmark.app import cli
 from jaxmark.distortion import (
     curvature,
     curvature_tensor,
@@ -29,8 +29,8 @@ from jaxmark.distortion import (
     tensor_distance,
 )
 from jaxmark.distortion.neighbourhoods import Neighbourhoods, make_neighbourhoods
-from jaxmark.mesh import Mesh, edges, make_mesh
-from jaxmark.surfaces import Surface
+from jaxmark.geometry.mesh import Mesh, edges, make_mesh
+from jaxmark.geometry.surfaces import Surface
 from tests.meshes import MESHES, shared_mesh
 from tests.samples import rough_sphere
 
@@ -334,7 +334,7 @@ def test_compare_leaves_out_what_needs_the_same_connectivity(pair: tuple[Mesh, M
     mesh, other = pair
     same = jm.compare(mesh, other)
     assert None not in same
-    assert same.rms == pytest.approx(jm.distortion.moved(mesh, other).rms)
+    assert same.rms == pytest.approx(jm.distortion.displacement_size(mesh, other).rms)
     vertices, faces = trimesh.remesh.subdivide(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     finer = jm.compare(mesh, make_mesh(vertices, faces))
     lacking = {name for name, value in finer._asdict().items() if value is None}
@@ -367,7 +367,7 @@ def test_without_libigl_compare_names_the_extra(pair: tuple[Mesh, Mesh], monkeyp
     monkeypatch.setitem(sys.modules, "igl", None)
     with pytest.raises(jm.JaxmarkError, match=r"jaxmark\[align\]"):
         jm.compare(*pair)
-    assert jm.distortion.moved(*pair).rms > 0
+    assert jm.distortion.displacement_size(*pair).rms > 0
 
 
 def volume_change(original: Mesh, distorted: Mesh) -> float:

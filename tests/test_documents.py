@@ -2,6 +2,7 @@
 
 import doctest
 import importlib
+import inspect
 import os
 import pkgutil
 import re
@@ -12,22 +13,27 @@ import sys
 import textwrap
 from pathlib import Path
 
+import numpy as np
 import pytest
 import trimesh
 
 import jaxmark as jm
-from jaxmark import cli
+from jaxmark.app import cli
 from tests.samples import bumpy_sphere
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text()
 PAGES = {
     str(path.relative_to(ROOT)): path.read_text()
     for folder in (ROOT, ROOT / "docs", ROOT / "docs" / "how-to", ROOT / "docs" / "reference")
     for path in sorted(folder.glob("*.md"))
 }
-LONG = ("docs/tutorial.md", "docs/submeshes.md", "docs/how-to/extend.md")  # compiled for themselves
-APART = ("README.md", "docs/robustness.md")  # have tests of their own
+README = PAGES["README.md"]
+LONG = ("docs/tutorial.md", "docs/submeshes.md", "docs/how-to/extend.md")  # compiled for themselves, and need libigl
+SLOW = (*LONG, "docs/filters.md", "docs/how-to/strength.md", "docs/how-to/pictures.md")
+FRONTS = ("README.md", "docs/index.md")
+# These have tests of their own.
+APART = (*FRONTS, "docs/robustness.md", "docs/how-to/arrays.md", "docs/how-to/recipients.md", "docs/how-to/study.md")
+COMMANDS = {"README.md": 4, "docs/reference/command_line.md": 14}
 FENCE = re.compile(r"^( *)```(\w+)\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 
 
@@ -56,15 +62,36 @@ def run(page: str) -> dict:
 
 
 @pytest.mark.slow
-def test_python_blocks_of_the_readme_run(folder: Path, unchecked, capsys):
-    assert len(blocks("README.md", "python")) >= 2
-    names = run("README.md")
-    assert names["found"].message == bytes.fromhex("0123456789abcdef")
-    assert "0123456789abcdef" in capsys.readouterr().out
+@pytest.mark.parametrize("page", FRONTS)
+def test_both_halves_of_a_front_page_run(page: str, folder: Path, unchecked, capsys):
+    assert len(blocks(page, "python")) >= 2
+    names = run(page)
+    message = bytes.fromhex("0123456789abcdef") if page == "README.md" else b"jaxmark!"
+    assert names["found"].message == message
+    assert (message.hex() if page == "README.md" else str(message)) in capsys.readouterr().out
+    # The energy is a quadratic form of the gains: its gradient at some gains, times these, is twice the energy there.
+    gains = names.get("gains", np.ones(16, np.float32))
+    assert names["gradient"].shape == (16,)
+    np.testing.assert_allclose(names["gradient"] @ gains, 2 * names["energy"](gains), rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_python_block_on_arrays_runs(unchecked):
+    names = run("docs/how-to/arrays.md")
     assert (names["scores"] > 0).tolist() == [True, False, False, True]
-    assert sorted(one.recipient for one in names["accused"] if one.log10_p < -6) == ["alice", "bob"]
-    assert [rate["read"] for rate in names["results"].rates() if rate["control"] == "marked"] == [2, 2]
     assert names["gradient"].shape == names["x"].shape
+
+
+@pytest.mark.slow
+def test_python_block_on_recipients_runs(unchecked, capsys):
+    accused = run("docs/how-to/recipients.md")["accused"]
+    assert sorted(one.recipient for one in accused if one.log10_p < -6) == ["alice", "bob"]
+
+
+@pytest.mark.slow
+def test_python_blocks_on_studies_run(folder: Path, unchecked, capsys):
+    names = run("docs/how-to/study.md")
+    assert [rate["read"] for rate in names["results"].rates() if rate["control"] == "marked"] == [2, 2]
 
 
 def test_python_block_of_the_page_on_robustness_runs(unchecked, capsys):
@@ -74,7 +101,7 @@ def test_python_block_of_the_page_on_robustness_runs(unchecked, capsys):
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, marks=pytest.mark.slow if page in LONG else ())
+        pytest.param(page, marks=pytest.mark.slow if page in SLOW else ())
         for page in PAGES
         if blocks(page, "python") and page not in APART
     ],
@@ -97,9 +124,10 @@ def said(argv: list[str], monkeypatch, capsys) -> str:
 
 
 @pytest.mark.slow
-def test_shell_lines_of_the_readme_run(folder: Path, unchecked, monkeypatch, capsys):
-    lines = re.findall(r"^    (jaxmark .*)$", README, re.MULTILINE)
-    assert len(lines) >= 8
+@pytest.mark.parametrize("page", COMMANDS)
+def test_shell_lines_run(page: str, folder: Path, unchecked, monkeypatch, capsys):
+    lines = re.findall(r"^    (jaxmark .*)$", PAGES[page], re.MULTILINE)
+    assert len(lines) >= COMMANDS[page]
     for line in lines:
         said(shlex.split(line), monkeypatch, capsys)
 
@@ -129,6 +157,18 @@ def test_make_targets_of_the_readme_exist():
         subprocess.run(["make", "-n", target], cwd=ROOT, check=True, capture_output=True)
 
 
+def test_make_help_lists_all_targets():
+    (targets,) = re.findall(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    said = subprocess.run(["make", "help"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    assert [line.split()[0] for line in said.splitlines()] == targets.split()
+    assert all(len(line.split()) >= 3 for line in said.splitlines())
+
+
+def test_notebooks_are_listed():
+    listed = re.findall(r"^\| `(\w+\.py)` \|", PAGES["docs/notebooks.md"], re.MULTILINE)
+    assert listed == sorted(path.name for path in (ROOT / "notebooks").glob("*.py"))
+
+
 def test_tests_that_pages_name_exist():
     named = {named for text in PAGES.values() for named in re.findall(r"`tests/(\w+\.py)::(\w+)`", text)}
     assert len(named) >= 20
@@ -137,14 +177,21 @@ def test_tests_that_pages_name_exist():
 
 
 def test_names_that_pages_give_exist():
-    named = {name for text in PAGES.values() for name in re.findall(r"`(jaxmark(?:\.\w+)+)", text)}
+    named = {name for text in PAGES.values() for name in re.findall(r"`((?:jaxmark|jm)(?:\.\w+)+)", text)}
     assert len(named) >= 20
     for name in named:
-        pkgutil.resolve_name(name)
+        pkgutil.resolve_name(re.sub(r"^jm\b", "jaxmark", name))
+
+
+def test_enemies_that_the_page_on_security_names_exist():
+    rows = re.findall(r"^\|.*\|.*\| (`.*) \|$", PAGES["docs/security.md"], re.MULTILINE)
+    named = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+    assert len(named) >= 8
+    assert all(hasattr(jm.adversaries, name) for name in named), named
 
 
 def test_programs_that_pages_name_exist():
-    named = {name for text in PAGES.values() for name in re.findall(r"\b(?:benchmarks|tests)/\w+\.py\b", text)}
+    named = {name for text in PAGES.values() for name in re.findall(r"\b(?:benchmarks|tests)(?:/\w+)+\.py\b", text)}
     assert len(named) >= 20
     for name in named:
         assert (ROOT / name).is_file(), name
@@ -177,21 +224,35 @@ def test_no_relative_link_is_dead():
 
 
 def test_a_dead_link_is_seen():
-    text = "# A b, c\n[a](nowhere.md) [b](#a-b-c) [c](#other) [d](README.md#what-a-detection-proves) [e](https://x.y)"
+    text = "# A b, c\n[a](nowhere.md) [b](#a-b-c) [c](#other) [d](README.md#honest-limits) [e](https://x.y)"
     assert dead_links({**PAGES, "docs/x.md": text}) == [
-        f"docs/x.md: {at}" for at in ("nowhere.md", "#other", "README.md#what-a-detection-proves")
+        f"docs/x.md: {at}" for at in ("nowhere.md", "#other", "README.md#honest-limits")
     ]
-    assert not dead_links({**PAGES, "docs/x.md": "[d](../README.md#what-a-detection-proves)"})
+    assert not dead_links({**PAGES, "docs/x.md": "[d](../README.md#honest-limits)"})
 
 
-def test_the_reference_lists_all_names_of_the_package():
-    listed = re.findall(r"^ {3}jaxmark(?:\.\w+)*\.(\w+)$", PAGES["docs/reference/index.md"], re.MULTILINE)
-    public = [name for name in vars(jm) if not name.startswith("_") and not hasattr(vars(jm)[name], "__file__")]
-    assert sorted(listed) == sorted(public)
+def reference(heading: str) -> set[str]:
+    """What the tables of the reference list below a heading."""
+    _, _, text = PAGES["docs/reference/index.md"].partition(f"\n## {heading}\n")
+    return set(re.findall(r"^ {3}~?(jaxmark\.[\w.]+)$", text.partition("\n## ")[0], re.MULTILINE))
+
+
+@pytest.mark.parametrize(
+    ("heading", "shown"), [("Everyday names", [jm]), ("Filters", [jm.spectral, jm.spectral.bands])]
+)
+def test_the_reference_lists_all_names(heading: str, shown: list):
+    names = {name for room in shown for name, value in inspect.getmembers(room) if not inspect.ismodule(value)}
+    listed = {name.rpartition(".")[2] for name in reference(heading)}
+    assert listed == {name for name in names if name[0] != "_"}
+
+
+def test_the_reference_has_all_rooms():
+    rooms = {f"jaxmark.{room.name}" for room in pkgutil.iter_modules(jm.__path__) if room.name[0] != "_"}
+    assert reference("Rooms") == rooms
 
 
 def test_published_rates_are_those_of_the_protocol(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    monkeypatch.syspath_prepend(ROOT / "benchmarks" / "robustness")
     protocol = importlib.import_module("smi2010").PROTOCOL
     rate = r"([\d.]+) / ([\d.]+)"
     rows = re.findall(rf"^\| ([\w-]+) \| (\S+) \| {rate} \| {rate} \|$", PAGES["docs/comparison.md"], re.MULTILINE)
@@ -200,9 +261,9 @@ def test_published_rates_are_those_of_the_protocol(monkeypatch):
 
 
 @pytest.mark.slow
-def test_payloads_of_the_readme_are_carried():
+def test_payloads_that_are_stated_are_carried():
     mesh, key = bumpy_sphere(4), jm.Key(bytes(32))
     for scheme, bits in (("host", 192), ("eigen", 96)):
-        assert re.search(rf"\b{bits} bits \(`{scheme}`\)", README)
+        assert re.search(rf"\b{bits} bits \(`{scheme}`\)", PAGES["docs/how_it_works.md"])
         marked, _ = jm.embed(mesh, bytes(range(bits // 8)), key, scheme=scheme)
         assert jm.detect(marked, original=mesh, key=key, scheme=scheme, bits=bits).detected()

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from numpy.polynomial import chebyshev
 
-from jaxmark.bands import scaling
-from jaxmark.carriers import ModulatedCarrier, eigenspaces, host_bands
-from jaxmark.chebyshev import filter, transpose
-from jaxmark.detectors import correlate
-from jaxmark.laplacian import centre, make_laplacian
-from jaxmark.mesh import Mesh
-from jaxmark.observation import Observation
-from jaxmark.spectrum import eigenpairs
+from jaxmark.alignment.observation import Observation
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.spectral.bands import scaling
+from jaxmark.spectral.chebyshev import filter, transpose
+from jaxmark.spectral.laplacian import centre, make_laplacian
+from jaxmark.spectral.spectrum import eigenpairs
+from jaxmark.watermark.carriers import ModulatedCarrier, eigenspaces, host_bands
+from jaxmark.watermark.detectors import correlate
 from tests.dense import laplacian_matrix
 from tests.samples import bumpy_sphere
 
@@ -180,7 +180,7 @@ def test_bound_3_needs_the_strength(sphere: Mesh, x64):
     carrier, beta, n = ModulatedCarrier(components, signs), 1e-3, norm.size
     residual = carrier.displacement(jnp.ones(1), beta / norm)
     seen = Observation(residual, jnp.ones(len(residual)))
-    value = float(correlate(carrier, seen, jnp.asarray(1 / norm))[0])
+    value = float(correlate(carrier.reader(), seen, jnp.asarray(1 / norm))[0])
     assert value == pytest.approx(n * beta, rel=1e-9)
     assert value < n / 100
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.evidence import FLOOR, any_of, log10_p_claimed, log10_p_fitted, log10_p_read, log10_p_tag
-from jaxmark.marking import make_marker
+from jaxmark.watermark.evidence import MIN_LOG10_P, any_of, log10_p_claimed, log10_p_fitted, log10_p_read, log10_p_tag
+from jaxmark.watermark.marking import make_marker
 from tests.samples import bumpy_sphere
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+SECURITY = Path(__file__).parents[1] / "benchmarks" / "security"
 
 
 def test_hoeffding_by_hand():
@@ -21,7 +21,7 @@ def test_hoeffding_by_hand():
     for score, norm in [(0, 0), (0, 1), (-5, 1), (math.nan, 1), (1, math.nan), (math.inf, 1), (1, 0)]:
         assert log10_p_claimed(score, norm) == 0.0
         assert log10_p_read(score, norm, 8) == 0.0
-    assert log10_p_claimed(1e9, 1.0) == FLOOR == -77.0
+    assert log10_p_claimed(1e9, 1.0) == MIN_LOG10_P == -77.0
 
 
 def test_hoeffding_bounds_the_exact_distribution():
@@ -36,7 +36,7 @@ def test_hoeffding_bounds_the_exact_distribution():
 
 def test_alternatives_are_paid_for():
     assert log10_p_tag(28, 32) == pytest.approx(math.log10(32 * 2.0**-28))
-    assert log10_p_tag(1000, 1) == FLOOR
+    assert log10_p_tag(1000, 1) == MIN_LOG10_P
     assert log10_p_tag(2, 32) == 0.0
     assert log10_p_read(8.0, 1.0, 16) == pytest.approx(math.log10(2**16 * math.exp(-32)))
     assert log10_p_read(2.0, 1.0, 16) == 0.0
@@ -54,7 +54,7 @@ def test_the_fitted_value_is_the_gaussian_tail():
 @pytest.mark.slow
 def test_false_positive_rates_of_unmarked_suspects():
     """The benchmark in small: nominal against counted, with controls that must fail; it exits 1 if one does not."""
-    command = [sys.executable, BENCHMARKS / "false_positives.py", "--keys", "2500"]
+    command = [sys.executable, SECURITY / "false_positives.py", "--keys", "2500"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stdout + ended.stderr
 

@@ -8,8 +8,8 @@ from jax.test_util import check_grads
 
 import jaxmark as jm
 from jaxmark.attacks import band_stop, low_pass
-from jaxmark.laplacian import make_laplacian
-from jaxmark.mesh import Mesh, make_mesh
+from jaxmark.geometry.mesh import Mesh, make_mesh
+from jaxmark.spectral.laplacian import make_laplacian
 from tests.dense import laplacian_matrix
 from tests.samples import rough_sphere
 

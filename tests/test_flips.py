@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 import jaxmark as jm
 from jaxmark.attacks import edge_flips
-from jaxmark.mesh import Mesh, make_mesh
+from jaxmark.geometry.mesh import Mesh, make_mesh
 from tests.samples import bumpy_sphere, exact_sheet
 
 Side = tuple[int, int]

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.keys import SCHEME_VERSION
-from jaxmark.mesh import Mesh
-from jaxmark.record import RECORD_SUFFIX
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.coding.keys import SCHEME_VERSION
+from jaxmark.watermark.record import RECORD_SUFFIX
 from tests.golden.make import MARKS, MESSAGE, RECIPIENTS
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -46,7 +46,7 @@ def test_old_marks_are_read_to_the_exact_message(version: str, name: str):
 def test_old_fingerprints_accuse_their_recipients(version: str):
     copies = [files(version, name) for name in RECIPIENTS]
     _, original, key, record = copies[0]
-    tracer = jm.make_tracer(original, key, record=record)
+    tracer = jm.watermark.make_tracer(original, key, record=record)
     for (suspect, *_), recipient in zip(copies, RECIPIENTS, strict=True):
         first, second = tracer.identify(suspect, [*RECIPIENTS, "nobody"], top=2)
         assert first.recipient == recipient

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark import cli
+from jaxmark.app import cli
 from tests.meshes import shared_meshes
 
 MESSAGE = "c3"

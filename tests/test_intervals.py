@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import jaxmark as jm
-from jaxmark.intervals import clopper_pearson
+from jaxmark.confidence import clopper_pearson
 
 
 @pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])

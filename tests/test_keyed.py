@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark import detectors
-from jaxmark.bands import scaling
-from jaxmark.carriers import Carrier, KeyedCarrier, ModulatedCarrier, host_bands, make_chips
-from jaxmark.detectors import joint, projected
-from jaxmark.laplacian import centre, make_laplacian
-from jaxmark.mesh import vertex_normals
-from jaxmark.observation import Observation, observe
-from jaxmark.reception import make_host, make_receiver, receive
-from jaxmark.watermark import detect, embed
+from jaxmark.alignment.observation import Observation, observe
+from jaxmark.geometry.mesh import vertex_normals
+from jaxmark.spectral.bands import scaling
+from jaxmark.spectral.laplacian import Laplacian, centre, make_laplacian
+from jaxmark.watermark import detectors
+from jaxmark.watermark.bits import detect_bits, embed_bits
+from jaxmark.watermark.carriers import Carrier, KeyedCarrier, KeyedReader, ModulatedCarrier, host_bands, make_chips
+from jaxmark.watermark.carriers.reception import Reception, make_host, make_receiver, receive
+from jaxmark.watermark.detectors import joint
 from tests.dense import chebyshev_matrices
 from tests.samples import bumpy_sphere
 
@@ -27,7 +27,7 @@ BITS = 5
 
 
 class Case(NamedTuple):
-    operator: object
+    operator: Laplacian
     x: np.ndarray  # centred
     normals: np.ndarray
     moving: np.ndarray
@@ -117,7 +117,7 @@ def test_against_dense_algebra(direction, beta, small: Case, key: jm.Key, dtype)
     chips = random.normal(size=carrier.chips.signs.shape)
     given = jnp.asarray(strength, dtype)
     seen, bits = jnp.asarray(residual, dtype), jnp.asarray(amplitudes, dtype)
-    shape = carrier.shape(given)
+    shape = carrier.coefficients(given)
 
     displacement = carrier.displacement(bits, given)
     assert displacement.dtype == dtype
@@ -126,13 +126,13 @@ def test_against_dense_algebra(direction, beta, small: Case, key: jm.Key, dtype)
     close(carrier.gram(given), columns.T @ (mass[:, None] * columns), dtype)
     close(carrier.modulate(bits, shape), (columns @ amplitudes).reshape(-1, 3), dtype)
     close(carrier.correlate(seen, shape), columns.T @ residual.ravel(), dtype)
-    close(carrier.shaped(jnp.asarray(chips, dtype), shape), (shaped @ chips.ravel()).reshape(-1, 3), dtype)
-    close(carrier.match(seen, shape), (shaped.T @ residual.ravel()).reshape(-1, channels), dtype)
+    close(carrier.filter_chips(jnp.asarray(chips, dtype), shape), (shaped @ chips.ravel()).reshape(-1, 3), dtype)
+    close(carrier.match_chips(seen, shape), (shaped.T @ residual.ravel()).reshape(-1, channels), dtype)
     if beta != "scalar":
         weight = random.uniform(size=bands)
         weighed = shaping(small, weight[:, None] * full, direction)
-        shape = carrier.shape(given, jnp.asarray(weight, dtype))
-        close(carrier.match(seen, shape), (weighed.T @ residual.ravel()).reshape(-1, channels), dtype)
+        shape = carrier.coefficients(given, jnp.asarray(weight, dtype))
+        close(carrier.match_chips(seen, shape), (weighed.T @ residual.ravel()).reshape(-1, channels), dtype)
 
 
 @pytest.mark.parametrize("direction", ["coordinates", "normals"])
@@ -179,7 +179,8 @@ def test_claim_is_a_sum_over_keyed_signs(direction, small: Case, key: jm.Key, dt
     tolerance = 1e-9 if dtype == np.float64 else 1e-3
     assert terms.sum() == pytest.approx(float(score), rel=tolerance, abs=tolerance * float(norm))
     assert np.linalg.norm(terms) == pytest.approx(float(norm), rel=tolerance)
-    matched = np.asarray(carrier.matched(receive(carrier.host, seen)), np.float64)
+    reader = carrier.reader()
+    matched = np.asarray(reader.matched_residual(reader.receive(seen)), np.float64)
     expected = matched * carrier.chips.signs * np.asarray(bits)[carrier.chips.slots]
     np.testing.assert_allclose(terms, expected, atol=tolerance * float(norm))
     assert np.abs(matched[~small.moving]).max() > 0  # and yet it takes no part
@@ -195,7 +196,8 @@ def test_what_signs_multiply_depends_on_no_key(direction, small: Case, key: jm.K
     for secret in (key, jm.Key(bytes(32)), jm.Key(b"z" * 32)):
         carrier = make_carrier(small, secret, np.float64, direction, moving=moving)
         seen = observe(jnp.asarray(residual))
-        vectors.append(np.asarray(carrier.matched(receive(carrier.host, seen))))
+        reader = carrier.reader()
+        vectors.append(np.asarray(reader.matched_residual(reader.receive(seen))))
         score, norm = carrier.claim(seen, jnp.asarray(bits))
         norms.append(float(norm))
         scores.append(float(score))
@@ -295,9 +297,9 @@ def check_reading(condition, direction, case: Case, key: jm.Key, dtype):
     message = np.random.default_rng(6).choice([-1.0, 1.0], bits)
     beta = jnp.asarray(1e-3 * np.linspace(1, 0.5, len(FAMILY)), dtype)
     x = jnp.asarray(case.x, dtype)
-    marked = embed(x, jnp.asarray(message, dtype), carrier, beta)
+    marked = embed_bits(x, jnp.asarray(message, dtype), carrier, beta)
     seen = make_seen(case, condition, np.asarray(marked - x), dtype)
-    soft = detect(x + seen.residual, x, carrier, joint, beta, weights=seen.weights, normals=seen.normals)
+    soft = detect_bits(x + seen.residual, x, carrier, joint, beta, weights=seen.weights, normals=seen.normals)
     assert soft.dtype == dtype
     np.testing.assert_array_equal(np.sign(soft), message)
     if condition == "everything":
@@ -306,12 +308,12 @@ def check_reading(condition, direction, case: Case, key: jm.Key, dtype):
 
 
 @jax.jit
-def solved(carrier: KeyedCarrier, seen: Observation, beta: jax.Array) -> jax.Array:
+def solved(reader: KeyedReader, received: Reception, beta: jax.Array) -> jax.Array:
     """The joint detector, run to the end."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(detectors, "_TOLERANCE", 1e-14)
-        patch.setattr(detectors, "_STEPS", 500)
-        return joint.__wrapped__(carrier, seen, beta)
+        patch.setattr(detectors, "_MAX_ITERATIONS", 500)
+        return joint.__wrapped__(reader, received, beta)  # pyright: ignore[reportFunctionMemberAccess]
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
@@ -325,7 +327,8 @@ def test_joint_is_regularised_least_squares(condition, noise, small: Case, key: 
     residual = np.asarray(carrier.displacement(jnp.asarray(message), jnp.asarray(beta)))
     residual = residual + noise * residual.std() * random.normal(size=residual.shape) @ np.diag([1.0, 4.0, 0.5])
     seen = make_seen(small, condition, 1e-3 * residual, np.float64)
-    soft = np.asarray(solved(carrier, seen, jnp.asarray(beta)))
+    reader = carrier.reader()
+    soft = np.asarray(solved(reader, reader.receive(seen), jnp.asarray(beta)))
 
     products, matched = dense_equations(small, carrier, seen, beta)
     # With one ρ > 0 for all bits, whatever it is.
@@ -337,7 +340,7 @@ def test_joint_is_regularised_least_squares(condition, noise, small: Case, key: 
 
 def dense_equations(case: Case, carrier: KeyedCarrier, seen: Observation, beta) -> tuple[np.ndarray, np.ndarray]:
     """AᵀA and Aᵀy, given what is received."""
-    received = receive(carrier.host, seen)
+    received = receive(make_receiver(carrier.host), seen)
     clean = dense_clean(carrier, received.seen)
     whitening = np.kron(np.einsum("j,juv->uv", 1 / np.sqrt(received.power), case.filters), received.axes)
     model = shaping(case, (np.asarray(received.gain) * beta)[:, None] * np.ones(3), "coordinates")
@@ -369,7 +372,7 @@ def test_projected_correlations_by_dense_algebra(direction, small: Case, key: jm
     beta = random.uniform(size=len(FAMILY))
     mark = shaping(small, beta[:, None] * np.ones(len(carrier.chips.signs[0])), direction) @ spreading(carrier)
     expected = mark.T @ dense_clean(carrier, seen) @ np.asarray(seen.residual, np.float64).ravel()
-    close(projected(carrier, seen, jnp.asarray(beta, dtype)), expected, dtype, factor=100)
+    close(carrier.reader().glance(seen, jnp.asarray(beta, dtype)), expected, dtype, factor=100)
 
 
 @pytest.mark.slow
@@ -380,7 +383,7 @@ def test_no_residual_gives_zero_scores_with_finite_gradients(small: Case, key: j
 
     @jax.jit
     def soft_and_slope(suspect, weights):
-        soft, pull = jax.vjp(lambda s: detect(s, x, carrier, joint, weights=weights), suspect)
+        soft, pull = jax.vjp(lambda s: detect_bits(s, x, carrier, joint, weights=weights), suspect)
         return soft, pull(jnp.ones_like(soft))[0]
 
     for suspect, weights in ((x, jnp.ones(len(x), x.dtype)), (x + 1, jnp.zeros(len(x), x.dtype))):
@@ -394,12 +397,12 @@ def test_pure_functions_by_transformation(medium: Case, key: jm.Key, x64):
     carrier, x = make_carrier(medium, key, np.float64, bits=8), jnp.asarray(medium.x)
     messages = jnp.asarray(np.random.default_rng(8).choice([-1.0, 1.0], (3, 8)))
     beta = jnp.full(len(FAMILY), 1e-3)
-    marked = jax.jit(jax.vmap(embed, (None, 0, None, None)))(x, messages, carrier, beta)
-    scores = jax.jit(jax.vmap(lambda s: detect(s, x, carrier, joint, beta)))(marked)
+    marked = jax.jit(jax.vmap(embed_bits, (None, 0, None, None)))(x, messages, carrier, beta)
+    scores = jax.jit(jax.vmap(lambda s: detect_bits(s, x, carrier, joint, beta)))(marked)
     for suspect, message, soft in zip(marked, messages, scores, strict=True):
-        np.testing.assert_allclose(suspect, embed(x, message, carrier, beta), atol=1e-14)
+        np.testing.assert_allclose(suspect, embed_bits(x, message, carrier, beta), atol=1e-14)
         np.testing.assert_allclose(
-            soft, detect(suspect, x, carrier, joint, beta, weights=jnp.ones(len(x))), rtol=1e-6, atol=1e-6
+            soft, detect_bits(suspect, x, carrier, joint, beta, weights=jnp.ones(len(x))), rtol=1e-6, atol=1e-6
         )
         np.testing.assert_array_equal(np.sign(soft), message)
 
@@ -422,9 +425,11 @@ def test_differentiable_with_respect_to_suspect_original_and_strength(small: Cas
     random = np.random.default_rng(9)
     message = jnp.asarray(random.choice([-1.0, 1.0], BITS))
 
+    untraced = solved.__wrapped__  # pyright: ignore[reportAttributeAccessIssue]
+
     def margin(suspect, original, beta):
         host = make_host(small.operator, original, original, FAMILY, scales=2, degree=1)
-        soft = detect(suspect, original, KeyedCarrier(host, chips), solved.__wrapped__, beta)
+        soft = detect_bits(suspect, original, KeyedCarrier(host, chips), untraced, beta)
         return jnp.sum(jnp.sin(soft * message))
 
     value_and_slopes = jax.jit(jax.value_and_grad(margin, argnums=(0, 1, 2)))
@@ -444,6 +449,5 @@ def test_differentiable_with_respect_to_suspect_original_and_strength(small: Cas
 def test_a_carrier_without_a_host_is_refused_without_a_host(small: Case, x64):
     x = jnp.asarray(small.x)
     carrier = ModulatedCarrier(host_bands(small.operator, x, FAMILY), np.ones((2, len(FAMILY), 3), np.int8))
-    for detector in (projected, joint):
-        with pytest.raises(jm.JaxmarkError, match="keyed carriers, not ModulatedCarrier"):
-            detector(carrier, observe(x))
+    with pytest.raises(jm.JaxmarkError, match="keyed carriers, not ModulatedCarrier"):
+        joint(carrier.reader(), observe(x))

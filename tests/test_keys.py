@@ -7,9 +7,10 @@ import pytest
 
 import jaxmark as jm
 from jaxmark.errors import JaxmarkError
-from jaxmark.keys import commitment, derive, geometry_hash, permutation, signs
-from jaxmark.mesh import make_mesh
-from jaxmark.sequences import orthogonal_sequences
+from jaxmark.geometry import geometry_hash
+from jaxmark.geometry.mesh import make_mesh
+from jaxmark.watermark.coding.keys import commitment, derive, permutation, signs
+from jaxmark.watermark.coding.sequences import orthogonal_sequences
 
 TETRAHEDRON = make_mesh(
     np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])

@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.laplacian import Laplacian, centre, host_edges, make_laplacian, sparse_matrices
-from jaxmark.mesh import Mesh, edges, make_mesh
-from jaxmark.spectrum import eigenpairs
+from jaxmark.geometry.mesh import Mesh, edges, make_mesh
+from jaxmark.spectral.laplacian import Laplacian, centre, host_edges, make_laplacian, sparse_matrices
+from jaxmark.spectral.spectrum import eigenpairs
 from tests.dense import laplacian_matrix, tolerance
 
 WEIGHTINGS = ["valence", "inverse-length", "cotangent"]
@@ -20,7 +20,7 @@ def lowering(request, monkeypatch):
     """Small meshes are not ordered otherwise."""
     if request.param != "ordered":
         return request.param
-    monkeypatch.setattr("jaxmark.laplacian._ORDERED", 0)
+    monkeypatch.setattr("jaxmark.spectral.laplacian._MIN_ORDERED_VERTICES", 0)
     return "gather"
 
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark import distortion, marking
-from jaxmark.mesh import Mesh, make_mesh
-from jaxmark.message import encode
-from jaxmark.original import prepare
-from jaxmark.schemes import EigenScheme, HostScheme, KeyedScheme
+from jaxmark import distortion
+from jaxmark.alignment.original import make_original
+from jaxmark.geometry.mesh import Mesh, make_mesh
+from jaxmark.watermark.carriers import KeyedReader
+from jaxmark.watermark.coding.message import encode
+from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme, get_scheme
 from tests.samples import bumpy_sphere, exact_sheet
 
 MESSAGE = bytes.fromhex("0123456789abcdef")
@@ -35,7 +36,7 @@ def test_round_trip_within_the_budget(sphere: Mesh, key: jm.Key, scheme, dtype):
     assert found.message == MESSAGE
     assert found.detected()
     assert found.coverage == 1.0
-    code = encode(MESSAGE, key, jm.keys.geometry_hash(sphere), len(found.scores))
+    code = encode(MESSAGE, key, jm.geometry.geometry_hash(sphere), len(found.scores))
     assert np.mean(found.scores * code) > 0.85
     claimed = jm.detect(marked, original=sphere, key=key, scheme=scheme, message=MESSAGE)
     assert claimed.log10_p < -6
@@ -67,7 +68,7 @@ def test_reading_back_means_the_message(sphere: Mesh, key: jm.Key, scheme):
 def test_reading_back_decodes_jointly_where_plain_correlations_fail(sphere: Mesh, key: jm.Key, monkeypatch):
     marker = jm.make_marker(sphere, key, bits=64)
     marked, _ = marker.embed(MESSAGE, 8e-4, read_back=False)
-    monkeypatch.setattr(marking, "projected", lambda *_: np.zeros(marker.code))
+    monkeypatch.setattr(KeyedReader, "glance", lambda *_: np.zeros(marker.code_bits))
     assert marker.reads(marked, MESSAGE)
 
 
@@ -191,7 +192,7 @@ def test_vertices_that_no_face_uses_neither_move_nor_count(sphere: Mesh, key: jm
     np.testing.assert_array_equal(shift[2562:], 0)
     assert np.sqrt(np.mean(shift[:2562] ** 2)) == pytest.approx(8e-4, rel=1e-6)
     assert info.rms == pytest.approx(8e-4, rel=1e-9)
-    assert distortion.moved(mesh, marked).rms == pytest.approx(8e-4, rel=1e-9)
+    assert distortion.displacement_size(mesh, marked).rms == pytest.approx(8e-4, rel=1e-9)
     thrown = marked._replace(vertices=np.where(np.arange(len(shift))[:, None] < 2562, marked.vertices, 1e200))
     assert jm.detect(thrown, original=mesh, key=key).message == MESSAGE
 
@@ -294,19 +295,19 @@ def test_refusals(sphere: Mesh, key: jm.Key):
 
 def test_schemes_are_data():
     for scheme in (KeyedScheme(direction="normals"), HostScheme(), EigenScheme(pairs=10)):
-        again = jm.schemes.get_scheme(scheme.name, dataclasses.asdict(scheme))
+        again = get_scheme(scheme.name, dataclasses.asdict(scheme))
         assert again == scheme
     # Records from before pass bands were tapered do not say so.
-    assert jm.schemes.get_scheme("keyed", {"bands": 64}) == KeyedScheme(passband="narrow")
-    assert jm.schemes.get_scheme("keyed") == KeyedScheme(passband="tapered")
+    assert get_scheme("keyed", {"bands": 64}) == KeyedScheme(passband="narrow")
+    assert get_scheme("keyed") == KeyedScheme(passband="tapered")
     for parameters in ({"bands": "many"}, {"colour": 1}):
         with pytest.raises(jm.JaxmarkError, match="takes the parameters bands"):
-            jm.schemes.get_scheme("host", parameters)
+            get_scheme("host", parameters)
 
 
 def test_narrow_bands_stay_where_old_marks_have_them(sphere: Mesh):
     """Also where 31 % of the bands is not 20/64 of them."""
-    original = prepare(sphere)
+    original = make_original(sphere)
     for bands, passing in {32: 10, 64: 20, 256: 79, 400: 124}.items():
         assert KeyedScheme(bands=bands, passband="narrow").layout(original, 8).passing == passing
 
@@ -315,7 +316,7 @@ def test_displacements_are_relative_to_the_diagonal(sphere: Mesh):
     moved = sphere._replace(vertices=sphere.vertices.copy())
     moved.vertices[3] += [0.3, 0.4, 0]
     length = np.linalg.norm(np.ptp(sphere.vertices, axis=0))
-    found = distortion.moved(sphere, moved)
+    found = distortion.displacement_size(sphere, moved)
     assert found.max == pytest.approx(0.5 / length)
     assert found.rms == pytest.approx(0.5 / length / np.sqrt(len(sphere.vertices)))
 

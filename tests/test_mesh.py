@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.mesh import Mesh, boundary_vertices, components, diagonal, edges, make_mesh, weld, welded_mesh
+from jaxmark.geometry.mesh import Mesh, boundary_vertices, components, diagonal, edges, make_mesh, weld, weld_mesh
 
 TRIANGLE = np.array([[0, 1, 2]])
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
@@ -74,7 +74,7 @@ def test_diagonal_ignores_unused_vertices():
 
 def test_welded_mesh_keeps_positions_of_faces():
     soup = make_mesh(np.vstack([CORNERS, CORNERS[[1, 2]], [[1.0, 1, 0]]]), np.array([[0, 1, 2], [4, 3, 5]]))
-    points = welded_mesh(soup, weld(soup.vertices))
+    points = weld_mesh(soup, weld(soup.vertices))
     assert len(points.vertices) == 4
     np.testing.assert_array_equal(points.vertices[points.faces], soup.vertices[soup.faces])
 

@@ -7,9 +7,9 @@ import pytest
 from scipy import stats
 
 import jaxmark as jm
-from jaxmark import polar
-from jaxmark.keys import derive
-from jaxmark.message import CANDIDATES, TAG_BITS, code_length, decode, encode
+from jaxmark.watermark.coding import polar
+from jaxmark.watermark.coding.keys import derive
+from jaxmark.watermark.coding.message import CANDIDATES, TAG_BITS, code_length, decode, encode
 
 MESSAGE = bytes.fromhex("0123456789abcdef")
 
@@ -19,7 +19,7 @@ def test_codeword_is_the_message_and_its_tag(key: jm.Key):
     code = encode(MESSAGE, key, b"mesh", 1024)
     assert set(code) == {-1.0, 1.0}
     inputs = polar.encode((code < 0).astype(int), 1024)
-    fixed = polar.frozen(1024, 64 + TAG_BITS)
+    fixed = polar.frozen_inputs(1024, 64 + TAG_BITS)
     assert not inputs[fixed].any()
     said = "".join(map(str, inputs[~fixed]))
     assert int(said[:64], 2) == int.from_bytes(MESSAGE, "big")
@@ -83,7 +83,7 @@ def test_chance_passes_as_often_as_the_tag_says(
 
     As a control, half or twice as many would be noticed.
     """
-    monkeypatch.setattr("jaxmark.message.TAG_BITS", 8)
+    monkeypatch.setattr("jaxmark.watermark.coding.message.TAG_BITS", 8)
     random = np.random.default_rng(7)
     passed = sum(decode(random.normal(size=32), 8, key, b"", candidates) is not None for _ in range(trials))
     exact = 1 - (1 - 2**-8) ** candidates

@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.attacks.adversarial.oracle import (
+from jaxmark.adversaries.oracle import (
     Counted,
     boundary,
-    decided,
+    decide_by_score,
     decision_oracle,
     estimated_gradient,
-    quantised,
+    quantise_scores,
     random_search,
-    randomised,
+    randomise_scores,
     score_oracle,
 )
-from jaxmark.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh
 from tests.samples import bumpy_sphere
 
 MESSAGE = b"ok"
@@ -23,7 +23,7 @@ SCORED = [estimated_gradient, random_search]
 
 
 @pytest.fixture(scope="module")
-def marked(key: jm.Key) -> tuple[jm.Marker, Mesh]:
+def marked(key: jm.Key) -> tuple[jm.watermark.Marker, Mesh]:
     marker = jm.make_marker(bumpy_sphere(3), key, bits=16)
     return marker, marker.embed(MESSAGE, 8e-4, noise=0)[0]
 
@@ -44,7 +44,7 @@ def test_oracles_say_what_the_detector_says(marked, strength):
     for alpha in (1e-6, 10 ** (found.log10_p + 0.1), 10 ** (found.log10_p - 0.1)):
         wanted = found.detected(alpha)
         assert decision_oracle(marker, MESSAGE, alpha)(suspect) == wanted
-        assert decided(score_oracle(marker, MESSAGE), alpha)(suspect) == wanted
+        assert decide_by_score(score_oracle(marker, MESSAGE), alpha)(suspect) == wanted
 
 
 def test_what_is_refused_is_not_detected(marked):
@@ -60,7 +60,7 @@ def test_copies_of_points_are_attacked_together(marked):
     soup = Mesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(mesh.faces.size).reshape(-1, 3))
     attack = estimated_gradient(score_oracle(marker, MESSAGE), queries=8)
     moved = jm.attack(soup, attack, 1e-3, seed=0)
-    assert jm.distortion.moved(soup, moved).rms == pytest.approx(1e-3, rel=0.5)
+    assert jm.distortion.displacement_size(soup, moved).rms == pytest.approx(1e-3, rel=0.5)
     joined = moved.vertices[np.unique(mesh.faces, return_index=True)[1]]
     np.testing.assert_array_equal(moved.vertices, joined[mesh.faces].reshape(-1, 3))
 
@@ -73,7 +73,7 @@ def test_queries_and_size_are_met(marked, make):
         oracle = along(mesh, way)
         moved = jm.attack(mesh, make(oracle, queries=queries), 1e-3, seed=0)
         assert queries - 8 < oracle.queries <= queries
-        assert jm.distortion.moved(mesh, moved).rms == pytest.approx(1e-3, rel=1e-6)
+        assert jm.distortion.displacement_size(mesh, moved).rms == pytest.approx(1e-3, rel=1e-6)
 
 
 @pytest.mark.parametrize("queries", [0, 1, 5, 17, 60])
@@ -111,7 +111,8 @@ def test_the_nearest_of_two_planes_is_neared(marked):
         return bool(abs(np.sum((suspect.vertices - mesh.vertices) * way)) < np.sum(way**2))
 
     sizes = [
-        jm.distortion.moved(mesh, jm.attack(mesh, boundary(before), queries, seed=0)).rms for queries in (40, 160, 480)
+        jm.distortion.displacement_size(mesh, jm.attack(mesh, boundary(before), queries, seed=0)).rms
+        for queries in (40, 160, 480)
     ]
     # The least is the way itself; a random start is farther by about √dimensions.
     assert 1e-3 < sizes[2] < sizes[1] < sizes[0]
@@ -121,8 +122,8 @@ def test_the_nearest_of_two_planes_is_neared(marked):
 def test_defences(marked, key: jm.Key):
     _, mesh = marked
     other = mesh._replace(vertices=mesh.vertices + 1e-9)
-    assert [quantised(lambda _, value=v: value, 0.5)(mesh) for v in (1.2, 1.3, -0.3)] == [1.0, 1.5, -0.5]
-    noisy = randomised(lambda _: 3.0, 0.1, key)
+    assert [quantise_scores(lambda _, value=v: value, 0.5)(mesh) for v in (1.2, 1.3, -0.3)] == [1.0, 1.5, -0.5]
+    noisy = randomise_scores(lambda _: 3.0, 0.1, key)
     assert noisy(mesh) == noisy(mesh) != noisy(other)
     shifted = [mesh._replace(vertices=mesh.vertices + k) for k in range(300)]
     noise = np.array([noisy(one) - 3 for one in shifted]) / 0.1
@@ -142,14 +143,14 @@ def test_answers_beat_chance(marked, make):
 @pytest.mark.slow
 def test_decisions_beat_chance(marked):
     marker, mesh = marked
-    oracle = Counted(decided(score_oracle(marker, MESSAGE)))
+    oracle = Counted(decide_by_score(score_oracle(marker, MESSAGE)))
     moved = jm.attack(mesh, boundary(oracle), 100, seed=0)
     assert oracle.queries == 100
     assert not marker.detect(moved, MESSAGE).detected()
-    wide = jm.ATTACKS["jamming"]._replace(strengths=(1e-3, 0.1))
-    jammed = jm.minimum_distortion(marker, mesh, MESSAGE, wide, metrics=("rms",)).weakest
+    wide = jm.attacks.ATTACKS["jamming"]._replace(strengths=(1e-3, 0.1))
+    jammed = jm.evaluation.minimum_distortion(marker, mesh, MESSAGE, wide, metrics=("rms",)).weakest
     assert jammed is not None
-    assert jm.distortion.moved(mesh, moved).rms < jammed.strength
+    assert jm.distortion.displacement_size(mesh, moved).rms < jammed.strength
 
 
 def test_refusals(marked):
@@ -163,4 +164,4 @@ def test_refusals(marked):
     with pytest.raises(jm.JaxmarkError, match="at least 1 query"):
         random_search(len, queries=0)
     with pytest.raises(jm.JaxmarkError, match="positive step"):
-        quantised(len, 0.0)
+        quantise_scores(len, 0.0)

@@ -10,7 +10,7 @@ import trimesh
 
 from tests.samples import bumpy_sphere
 
-PAPER = Path(__file__).parents[1] / "benchmarks" / "paper.py"
+PAPER = Path(__file__).parents[1] / "benchmarks" / "theory" / "paper.py"
 
 
 def run(*options: str) -> subprocess.CompletedProcess[str]:

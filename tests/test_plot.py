@@ -12,13 +12,13 @@ from scipy import stats
 
 import jaxmark as jm
 from jaxmark import plot
-from jaxmark.bands import scaling
-from jaxmark.evidence import FLOOR
-from jaxmark.mesh import Mesh
-from jaxmark.original import Original, displaced, prepare
-from jaxmark.robustness import Robustness
-from jaxmark.spectrum import eigenpairs
-from jaxmark.visibility import masking
+from jaxmark.alignment.original import Original, displace, make_original
+from jaxmark.evaluation import Robustness, pictures
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.spectral.bands import scaling
+from jaxmark.spectral.spectrum import eigenpairs
+from jaxmark.watermark.evidence import MIN_LOG10_P, log10_p_claimed
+from jaxmark.watermark.visibility import masking
 from tests.samples import bumpy_sphere
 
 matplotlib = pytest.importorskip("matplotlib")
@@ -29,8 +29,8 @@ PNG = b"\x89PNG\r\n\x1a\n"
 @pytest.fixture(scope="module")
 def pair() -> tuple[Original, Mesh]:
     """An original, and a mesh moved from it."""
-    original = prepare(bumpy_sphere(2))
-    return original, displaced(original, 1e-3 * np.random.default_rng(0).normal(size=original.positions.shape))
+    original = make_original(bumpy_sphere(2))
+    return original, displace(original, 1e-3 * np.random.default_rng(0).normal(size=original.positions.shape))
 
 
 def lines(picture: plot.Picture, panel: int = 0) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -55,7 +55,7 @@ def test_heat_maps_of_displacement_and_visibility(pair):
     seen = plot.visibility(original, moved)
     hidden = np.asarray(masking(original), float)[: len(vertices)]
     np.testing.assert_allclose(seen.values * hidden, expected, rtol=1e-6)
-    far = plot.exaggerated(original, moved, 3)
+    far = plot.exaggerate(original, moved, 3)
     np.testing.assert_allclose(far.mesh.vertices - vertices, 3 * (moved.vertices - vertices), rtol=1e-9)
     picture = plot.draw([view, seen, far])
     assert [axes.get_title() for axes in picture.figure.axes[:3]] == [
@@ -82,10 +82,10 @@ def test_faces_are_painted_from_back_to_front_in_their_colours():
 
 @pytest.mark.usefixtures("x64")
 def test_spectra_are_sums_over_eigenvectors():
-    original = prepare(bumpy_sphere(2))
+    original = make_original(bumpy_sphere(2))
     rng = np.random.default_rng(0)
     shifts = 1e-3 * rng.normal(size=(2, *original.positions.shape))
-    marked, suspect = displaced(original, shifts[0]), displaced(original, shifts.sum(axis=0))
+    marked, suspect = displace(original, shifts[0]), displace(original, shifts.sum(axis=0))
     picture = plot.spectra(original, {"mark": (original.mesh, marked), "attack": (marked, suspect)}, 16)
     drawn = lines(picture)
     assert list(drawn) == ["host", "mark", "attack"]
@@ -134,7 +134,7 @@ def test_band_visibility_of_the_displacement_itself_is_one(pair):
 def test_roc_counts_what_is_below_each_probability():
     rng = np.random.default_rng(0)
     kinds = {"marked": -rng.uniform(0, 12, 40), "wrong key": np.log10(rng.uniform(size=300))}
-    picture = plot.roc(kinds, lowest=-8)
+    picture = pictures.roc(kinds, lowest=-8)
     drawn = lines(picture)
     assert list(drawn) == ["marked (40)", "wrong key (300)", "α itself"]
     for (x, y), values in zip(drawn.values(), kinds.values(), strict=False):
@@ -150,8 +150,8 @@ def test_roc_counts_what_is_below_each_probability():
 def test_p_values_lie_below_a_bound_that_holds_and_above_one_that_does_not():
     rng = np.random.default_rng(1)
     scores = rng.normal(size=2000)
-    sound = np.array([jm.evidence.log10_p_claimed(score, 1.0) for score in scores])
-    picture = plot.p_values({"bound": sound, "twice its exponent": 2 * sound})
+    sound = np.array([log10_p_claimed(score, 1.0) for score in scores])
+    picture = pictures.p_values({"bound": sound, "twice its exponent": 2 * sound})
     drawn = lines(picture)
     x, bound = drawn["the bound, 10^x"]
     np.testing.assert_allclose(bound, 10**x)
@@ -179,8 +179,8 @@ def check_shade(picture: plot.Picture, place: int, x: np.ndarray, hits: np.ndarr
 def test_success_over_strength():
     read = np.array([[True] * 4, [True, True, False, True], [False] * 4])
     bits = np.array([11.0, 9.0, 7.0])
-    curve = Robustness(bits, read, 0.5 - 0.5 * read, FLOOR * read, (("",) * 4,) * 3)
-    picture = plot.success({"one": curve, "two": curve._replace(success=~read)}, "bits per coordinate")
+    curve = Robustness(bits, read, 0.5 - 0.5 * read, MIN_LOG10_P * read, (("",) * 4,) * 3)
+    picture = pictures.success({"one": curve, "two": curve._replace(success=~read)}, "bits per coordinate")
     axes = picture.figure.axes[0]
     drawn = [container.lines for container in axes.containers]
     for (line, _, (bars,)), hits in zip(drawn, ([4, 3, 0], [0, 1, 4]), strict=True):
@@ -194,7 +194,7 @@ def test_success_over_strength():
     assert axes.get_xlabel() == "strength: bits per coordinate"
     assert axes.get_xlim()[0] > axes.get_xlim()[1]  # weak ones, with many bits, on the left
     assert axes.get_xscale() == "linear"
-    wide = plot.success({"one": curve._replace(strengths=np.array([1e-3, 0.01, 0.1]))}, "")
+    wide = pictures.success({"one": curve._replace(strengths=np.array([1e-3, 0.01, 0.1]))}, "")
     assert wide.figure.axes[0].get_xscale() == "log"
     assert wide.figure.axes[0].get_xlim()[0] < wide.figure.axes[0].get_xlim()[1]
 
@@ -205,7 +205,7 @@ def test_files_are_png_and_the_same_each_time(pair, tmp_path):
     def made() -> list[plot.Picture]:
         return [
             plot.draw([plot.View("original", original.mesh), plot.displacement(original, moved)]),
-            plot.roc({"marked": np.linspace(-9, 0, 12)}),
+            pictures.roc({"marked": np.linspace(-9, 0, 12)}),
             plot.responses({"damped": scaling(4, damping="jackson")}),
         ]
 
@@ -253,12 +253,12 @@ def test_refusals(pair, unchecked, monkeypatch):
     with pytest.raises(jm.JaxmarkError, match="finite values, one for each vertex"):
         plot.show(original.mesh, np.zeros(3))
     with pytest.raises(jm.JaxmarkError, match="one log10 p or more"):
-        plot.roc({"nothing": np.zeros(0)})
+        pictures.roc({"nothing": np.zeros(0)})
     with pytest.raises(jm.JaxmarkError, match="lowest is a negative number"):
-        plot.roc({"some": np.zeros(2)}, lowest=0.0)
+        pictures.roc({"some": np.zeros(2)}, lowest=0.0)
     with pytest.raises(jm.JaxmarkError, match="does not share"):
         plot.displacement(original, bumpy_sphere(1))
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    for drawing in (lambda: plot.roc({"some": np.zeros(2)}), lambda: plot.show(original.mesh)):
+    for drawing in (lambda: pictures.roc({"some": np.zeros(2)}), lambda: plot.show(original.mesh)):
         with pytest.raises(jm.JaxmarkError, match=r"jaxmark\[plot\]"):
             drawing()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from jaxmark import polar
+from jaxmark.watermark.coding import polar
 
 LENGTHS = [1 << m for m in range(11)]
 
@@ -55,7 +55,7 @@ def test_frozen_positions(length: int):
     """Of the right number, nested, and those of least weight."""
     before = np.ones(length, bool)
     for information in range(length + 1) if length <= 128 else range(0, length + 1, 64):
-        fixed = polar.frozen(length, information)
+        fixed = polar.frozen_inputs(length, information)
         assert fixed.sum() == length - information
         assert not (fixed & ~before).any()
         np.testing.assert_array_equal(np.flatnonzero(~fixed), positions(length, information))

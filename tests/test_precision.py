@@ -10,19 +10,20 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark import channels, evidence, payload, tuning
-from jaxmark.bands import scaling
-from jaxmark.carriers import Chips, KeyedCarrier
-from jaxmark.chebyshev import gram
-from jaxmark.detectors import decorrelate
-from jaxmark.distortion.msdm import msdm, msdm_views
-from jaxmark.laplacian import Laplacian
-from jaxmark.observation import observe
-from jaxmark.original import Original, prepare
-from jaxmark.precision import compensated_sum, sum_and_norm
-from jaxmark.reception import Receiver, Reception, make_host, make_receiver
-from jaxmark.schemes import EigenScheme, HostScheme, KeyedScheme
-from jaxmark.watermark import detect, embed
+from jaxmark.alignment.observation import observe
+from jaxmark.alignment.original import Original, make_original
+from jaxmark.distortion import msdm, msdm_views
+from jaxmark.evaluation import tuning
+from jaxmark.spectral.bands import scaling
+from jaxmark.spectral.chebyshev import band_energies, gram
+from jaxmark.spectral.laplacian import Laplacian
+from jaxmark.spectral.precision import compensated_sum, sum_and_norm
+from jaxmark.watermark import channels, evidence
+from jaxmark.watermark.bits import detect_bits, embed_bits
+from jaxmark.watermark.carriers import Chips, KeyedCarrier, KeyedReader
+from jaxmark.watermark.carriers.reception import Reception, make_host, make_receiver
+from jaxmark.watermark.detectors import decorrelate
+from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme
 from tests.samples import bumpy_sphere
 
 COUNT = 2**21
@@ -104,14 +105,15 @@ def test_a_claim_of_millions_of_chips():
     signs, slots = random.choice([-1, 1], zeros.shape).astype(np.int8), random.integers(0, code, zeros.shape)
     bits = random.choice([-1.0, 1.0], code)
     terms = rising(zeros.size, np.float32).reshape(zeros.shape)
-    host = Receiver(operator, zeros, jnp.ones((1, 1), jnp.float32), zeros[:, :1])
+    host = make_host(operator, zeros, zeros, np.ones((1, 1)), scales=0, degree=1)
+    chips = Chips(signs, slots.astype(np.int32), np.bincount(slots.ravel(), minlength=code))
+    reader = KeyedReader(KeyedCarrier(host, chips), zeros[:, :1])
     one, seen = jnp.ones(1, jnp.float32), observe(zeros)
     received = Reception(
-        *(host, jnp.asarray(terms * signs * bits[slots], jnp.float32), one, one),
+        *(reader.receiver, seen, jnp.asarray(terms * signs * bits[slots], jnp.float32), one, one),
         *(jnp.eye(3, dtype=jnp.float32), seen, jnp.ones((1, 1), jnp.float32)),
     )
-    carrier = KeyedCarrier(host, Chips(signs, slots.astype(np.int32), np.bincount(slots.ravel(), minlength=code)))
-    score, norm = carrier.claim(received, jnp.asarray(bits, jnp.float32))
+    score, norm = reader.claim(received, jnp.asarray(bits, jnp.float32))
     assert abs(float(score) - math.fsum(terms.astype(np.float64).ravel())) < allowed(terms.ravel())
     assert float(norm) == pytest.approx(np.linalg.norm(terms.astype(np.float64)), rel=3e-7)
 
@@ -148,7 +150,7 @@ def test_the_check_of_products_finds_those_that_are_not_exact():
 
 @pytest.fixture(scope="module")
 def original() -> Original:
-    return prepare(bumpy_sphere(2))
+    return make_original(bumpy_sphere(2))
 
 
 SCHEMES = [KeyedScheme(), KeyedScheme(direction="normals"), HostScheme(bands=32), EigenScheme(pairs=32)]
@@ -160,20 +162,26 @@ def test_products_of_preparing_embedding_and_reading(scheme, original, key: jm.K
 
     def written(x, bits, beta):
         carrier = scheme.carrier(replace(original, signal=x), key, 8, 64)
-        return carrier, embed(x, bits, carrier, beta)
+        return carrier, embed_bits(x, bits, carrier, beta)
 
     def read(x, bits, beta, normals):
         carrier, marked = written(x, bits, beta)
-        soft = detect(jax.lax.stop_gradient(marked), x, carrier, scheme.detector, beta, normals=normals)
+        soft = detect_bits(jax.lax.stop_gradient(marked), x, carrier, scheme.detector, beta, normals=normals)
         return jnp.sum(soft * bits)
 
     def others(x, bits, beta):
         carrier, marked = written(x, bits, beta)
-        more = []
-        if isinstance(carrier, KeyedCarrier):
-            more = [payload._probe(carrier, make_receiver(carrier.host), jnp.ones_like(x[:, 0]))]
-        seen = observe(marked - x)._replace(nuisance=x)
-        return carrier.claim(seen, bits), carrier.adjoint(x, beta), carrier.gram(beta), decorrelate(carrier, seen), more
+        seen, reader = observe(marked - x)._replace(nuisance=x), carrier.reader()
+        received = reader.receive(seen)
+        probe = KeyedReader._probe(reader, jnp.ones_like(x[:, 0])) if scheme.name == "keyed" else None
+        more = probe, reader.linear_score(received, x, bits), reader.glance(seen)
+        return (
+            carrier.claim(seen, bits),
+            carrier.adjoint(x, beta),
+            carrier.gram(beta),
+            decorrelate(reader, received),
+            more,
+        )
 
     inputs = original.signal, jnp.ones(64, jnp.float32), one
     assert check_products(others, *inputs)
@@ -186,7 +194,7 @@ def test_products_of_tuning(original, key: jm.Key):
     host = make_receiver(make_host(original.operator, x, x, family, scales=2, degree=3))
     seen = observe(0.01 * x)
     assert check_products(channels.measure, host, seen, x)
-    assert check_products(jax.grad(lambda x: channels.band_energies(original.operator, family, x, x).sum()), x)
+    assert check_products(jax.grad(lambda x: band_energies(original.operator, family, x, x).sum()), x)
     for method in ("bands", "moments"):
         assert check_products(jax.grad(lambda x, m=method: gram(original.operator, family, x, method=m).sum()), x)
     measured = jax.tree.map(lambda leaf: jnp.ones(leaf.shape), jax.eval_shape(channels.measure, host, seen, x))

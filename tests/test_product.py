@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxmark import product
-from jaxmark.bands import nodes, scaling
-from jaxmark.chebyshev import band_components
 from jaxmark.errors import JaxmarkError
-from jaxmark.laplacian import make_laplacian
-from jaxmark.mesh import Mesh
-from jaxmark.product import Factors, lagrange_factors, leja
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.spectral import product
+from jaxmark.spectral.bands import nodes, scaling
+from jaxmark.spectral.chebyshev import band_components
+from jaxmark.spectral.laplacian import make_laplacian
+from jaxmark.spectral.product import Factors, lagrange_factors, leja
 from tests.dense import laplacian_matrix, tolerance
 from tests.samples import ordered_laplacian
 
-all_bands = jax.jit(jax.vmap(product.filter, (None, 0, None)))
+all_bands = jax.jit(jax.vmap(product.filter_by_factors, (None, 0, None)))
 
 
 @pytest.mark.parametrize("columns", [(), (3,)])
@@ -27,7 +27,7 @@ def test_factors_are_applied_as_the_paper_has_them(hard_graph: Mesh, columns, dt
     expected = x
     for zero, scale in zip(*factors, strict=True):
         expected = scale * (laplacian_matrix(operator) @ expected - zero * expected)
-    found = product.filter(operator, factors, jnp.asarray(x))
+    found = product.filter_by_factors(operator, factors, jnp.asarray(x))
     assert found.dtype == dtype
     np.testing.assert_allclose(found, expected, atol=tolerance(dtype) * np.abs(expected).max())
 
@@ -78,7 +78,7 @@ def test_derivatives(hard_graph: Mesh, x64):
     x = jnp.asarray(random.normal(size=(2, 11)))
 
     def loss(factors, x, weights):
-        return jnp.sum(jnp.sin(product.filter(operator._replace(weights=weights), factors, x)))
+        return jnp.sum(jnp.sin(product.filter_by_factors(operator._replace(weights=weights), factors, x)))
 
     weights = jnp.asarray(operator.weights)
     check_grads(jax.jit(loss), (factors, x[0], weights), order=1, modes=["fwd", "rev"])
@@ -90,9 +90,9 @@ def test_refusals(sphere: Mesh, unchecked):
     operator, x = make_laplacian(sphere), jnp.ones(642)
     factors = lagrange_factors(nodes(4))
     for call in (
-        lambda: product.filter(operator, factors, x),
-        lambda: product.filter(operator, Factors(*(part[0] for part in factors)), x[1:]),
-        lambda: product.filter(operator, Factors(factors.zeros[0], factors.scales[0, :2]), x),
+        lambda: product.filter_by_factors(operator, factors, x),
+        lambda: product.filter_by_factors(operator, Factors(*(part[0] for part in factors)), x[1:]),
+        lambda: product.filter_by_factors(operator, Factors(factors.zeros[0], factors.scales[0, :2]), x),
         lambda: lagrange_factors(np.array([1.0, 1.0])),
         lambda: lagrange_factors(np.array([1.0])),
         lambda: lagrange_factors(nodes(4), order="x"),

@@ -7,11 +7,11 @@ import pytest
 from jax.test_util import check_grads
 from scipy import sparse
 
-from jaxmark import rational
 from jaxmark.errors import JaxmarkError
-from jaxmark.laplacian import Laplacian, make_laplacian, sparse_matrices
-from jaxmark.mesh import Mesh
-from jaxmark.rational import butterworth, response
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.spectral import rational
+from jaxmark.spectral.laplacian import Laplacian, make_laplacian, sparse_matrices
+from jaxmark.spectral.rational import butterworth, response
 from tests.dense import laplacian_matrix, tolerance
 from tests.samples import ordered_laplacian
 
@@ -35,7 +35,7 @@ def dense(operator: Laplacian, sections: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("columns", [(), (3,)])
 def test_filter_is_the_function_of_the_dense_matrix(operator, columns, dtype):
     x = np.random.default_rng(0).normal(size=(11, *columns)).astype(dtype)
-    found = jax.jit(rational.filter)(operator, SECTIONS, jnp.asarray(x))
+    found = jax.jit(rational.filter_rational)(operator, SECTIONS, jnp.asarray(x))
     assert found.dtype == dtype
     np.testing.assert_allclose(found, dense(operator, SECTIONS) @ x, atol=tolerance(dtype, 10))
 
@@ -52,7 +52,7 @@ def test_implicit_smoothing_against_a_direct_solver(sphere: Mesh, x64):
     x = np.asarray(sphere.vertices)
     system = sparse.csc_array(mass + 30 * stiffness)
     expected = sparse.linalg.spsolve(system, mass @ sparse.linalg.spsolve(system, mass @ x))
-    found = rational.filter(operator, np.array([[1.0, 0, 0, 1, 30, 0]] * 2), jnp.asarray(x))
+    found = rational.filter_rational(operator, np.array([[1.0, 0, 0, 1, 30, 0]] * 2), jnp.asarray(x))
     np.testing.assert_allclose(found, expected, atol=1e-11)
 
 
@@ -77,7 +77,7 @@ def test_bands_of_a_bank(sphere: Mesh, dtype):
     operator = make_laplacian(sphere)
     bank = butterworth(1 - np.cos(np.linspace(0, np.pi, 7)), 2)
     x, u = np.random.default_rng(0).normal(size=(2, 642)).astype(dtype)
-    apply = jax.jit(jax.vmap(rational.filter, (None, 0, None)))
+    apply = jax.jit(jax.vmap(rational.filter_rational, (None, 0, None)))
     found = apply(operator, bank, jnp.asarray(x))
     assert found.dtype == dtype
     np.testing.assert_allclose(found.sum(axis=0), x, atol=tolerance(dtype, 10))
@@ -95,7 +95,7 @@ def test_derivatives_against_finite_differences(operator, x64):
     x = jnp.asarray(np.random.default_rng(0).normal(size=(2, 11, 3)))
 
     def loss(sections, x, weights):
-        apply = jax.vmap(lambda one: rational.filter(operator._replace(weights=weights), sections, one))
+        apply = jax.vmap(lambda one: rational.filter_rational(operator._replace(weights=weights), sections, one))
         return jnp.sum(jnp.sin(apply(x)))
 
     inputs = (jnp.asarray(SECTIONS[:2]), x, jnp.asarray(operator.weights))
@@ -105,9 +105,9 @@ def test_derivatives_against_finite_differences(operator, x64):
 def test_refusals(operator, unchecked):
     x = jnp.ones(11)
     for call in (
-        lambda: rational.filter(operator, SECTIONS, x[1:]),
-        lambda: rational.filter(operator, SECTIONS[0], x),
-        lambda: rational.filter(operator, SECTIONS[:, :5], x),
+        lambda: rational.filter_rational(operator, SECTIONS, x[1:]),
+        lambda: rational.filter_rational(operator, SECTIONS[0], x),
+        lambda: rational.filter_rational(operator, SECTIONS[:, :5], x),
         lambda: butterworth(np.array([0.0, 2]), 1),
         lambda: butterworth(np.array([0.0, 1, 0.5]), 1),
         lambda: butterworth(np.array([0.0, 1, 2]), 0),

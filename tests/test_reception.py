@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from jaxmark import reception
-from jaxmark.bands import diffusion, scaling
-from jaxmark.chebyshev import filter
-from jaxmark.laplacian import Laplacian, centre, make_laplacian
-from jaxmark.mesh import vertex_normals
-from jaxmark.observation import Observation, observe
-from jaxmark.reception import Receiver, clean, extended, make_host, make_receiver, receive
+from jaxmark.alignment.observation import Observation, observe
+from jaxmark.geometry.mesh import vertex_normals
+from jaxmark.spectral.bands import diffusion, scaling
+from jaxmark.spectral.chebyshev import filter
+from jaxmark.spectral.laplacian import Laplacian, centre, make_laplacian
+from jaxmark.watermark.carriers import reception
+from jaxmark.watermark.carriers.reception import Receiver, clean, extend, make_host, make_receiver, receive
 from tests.dense import laplacian_matrix
 from tests.samples import bumpy_sphere
 
@@ -135,8 +135,8 @@ def test_nuisance_by_blocks_is_the_same(case: Case, x64, monkeypatch):
     seen = looking(case, "weights", np.random.default_rng(3).normal(size=case.x.shape), np.float64)
     expected = receive(whole, seen)
     jax.clear_caches()
-    monkeypatch.setattr(reception, "_BLOCK", 50)
-    monkeypatch.setattr(reception, "_SAMPLE", 100)
+    monkeypatch.setattr(reception, "_BLOCK_VERTICES", 50)
+    monkeypatch.setattr(reception, "_SAMPLE_VERTICES", 100)
     assert len(case.x) % 50 > 0
     parts = make(case, np.float64)
     found = receive(parts, seen)
@@ -204,7 +204,7 @@ def test_gain_is_the_response_of_a_smoothing(kind, condition, case: Case, dtype)
     if kind == "rough":
         x = centre(case.operator, x + 0.3 * np.random.default_rng(6).normal(size=x.shape))
     signal = jnp.asarray(x, dtype)
-    host = make_host(case.operator, signal, signal, FAMILY, scales=SCALES, degree=DEGREE)
+    host = make_receiver(make_host(case.operator, signal, signal, FAMILY, scales=SCALES, degree=DEGREE))
     family = responses(case)
     spectrum = np.sum((case.vectors.T @ (case.operator.degree[:, None] * x)) ** 2, axis=1)
     energy = family**2 @ spectrum
@@ -230,7 +230,7 @@ def test_power_is_the_spectrum_of_noise(steps, condition, case: Case, x64):
     """White noise is flat, and noise that was filtered shows its filter, within the sampling error."""
     # With little nuisance, or the low bands would be nothing else.
     x, family = jnp.asarray(case.x), responses(case)
-    host = make_host(case.operator, x, x, FAMILY, scales=0, degree=1)
+    host = make_receiver(make_host(case.operator, x, x, FAMILY, scales=0, degree=1))
     response = (1 - case.values / 2) ** steps
     dimensions = 3 * (family**2).sum(axis=1) ** 2 / (family**4).sum(axis=1)
     expected = family**2 @ response**2 / (family**2).sum(axis=1)
@@ -252,9 +252,9 @@ def test_what_a_suspect_explains_is_projected_off_too(condition, case: Case, x64
     host, columns = make(case, np.float64), random.normal(size=(len(case.x), 2))
     both = np.concatenate([columns, columns[:, :1] + np.asarray(host.nuisance)[:, :1]], axis=1)  # one depends on others
     seen = looking(case, condition, columns @ random.normal(size=(2, 3)), np.float64)
-    assert extended(host, seen) is host
+    assert extend(host, seen) is host
     assert np.abs(receive(host, seen).residual).max() > 0.1
-    wide = extended(host, seen._replace(nuisance=jnp.asarray(1e-3 * both)))
+    wide = extend(host, seen._replace(nuisance=jnp.asarray(1e-3 * both)))
     assert np.linalg.matrix_rank(np.asarray(wide.nuisance)) == np.linalg.matrix_rank(np.asarray(host.nuisance)) + 2
     assert np.abs(receive(wide, seen).residual).max() < 1e-6
 
@@ -264,7 +264,7 @@ def test_what_a_suspect_explains_is_projected_off_too(condition, case: Case, x64
 def test_axes_make_directions_alike(condition, case: Case, x64):
     """The inverse root of the covariance of noise, by SciPy, whatever its colour."""
     x, random = jnp.asarray(case.x), np.random.default_rng(6)
-    host = make_host(case.operator, x, x, FAMILY, scales=0, degree=1)
+    host = make_receiver(make_host(case.operator, x, x, FAMILY, scales=0, degree=1))
     stretch = random.normal(size=(3, 3)) + np.diag([4.0, 1.0, 1.0])
     root = np.linalg.inv(linalg.sqrtm(stretch.T @ stretch))
     found = []
@@ -319,7 +319,7 @@ def test_a_host_without_extent_is_finite(case: Case, dtype):
     """A flat host has columns that are zero, or alike: they are dropped."""
     flat = jnp.asarray(case.x * [1, 1, 0], dtype)
     for signal in (flat, 0 * flat):
-        host = make_host(case.operator, signal, signal, FAMILY, scales=SCALES, degree=DEGREE)
+        host = make_receiver(make_host(case.operator, signal, signal, FAMILY, scales=SCALES, degree=DEGREE))
         received = receive(host, observe(jnp.ones_like(signal)))
         for part in jax.tree.leaves(received):
             assert np.isfinite(part).all()
@@ -332,7 +332,7 @@ def test_differentiable_with_respect_to_suspect_and_original(case: Case, x64):
     x = jnp.asarray(case.x)
 
     def loss(suspect, original):
-        host = make_host(case.operator, original, original, FAMILY, scales=SCALES, degree=DEGREE)
+        host = make_receiver(make_host(case.operator, original, original, FAMILY, scales=SCALES, degree=DEGREE))
         received = receive(host, observe(suspect - original))
         return (
             jnp.sum(jnp.sin(20 * received.residual))

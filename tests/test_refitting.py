@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 import jaxmark as jm
 from jaxmark.attacks import plane_fitting, primitive_fitting
 from jaxmark.distortion import rms
-from jaxmark.mesh import Mesh, diagonal, make_mesh
+from jaxmark.geometry.mesh import Mesh, diagonal, make_mesh
 from tests.samples import bumpy_sphere
 
 TURN = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])[:3, :3]

@@ -1,15 +1,17 @@
 """Poses by surfaces: against poses that are known, and closest points against brute force."""
 
+from dataclasses import FrozenInstanceError, replace
+
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from jaxmark.features import descriptors
-from jaxmark.mesh import Mesh, make_mesh, vertex_normals
-from jaxmark.pose import IDENTITY, Pose, affine, similarity
-from jaxmark.registration import refine, register_part, register_whole
-from jaxmark.surfaces import Surface, sample
+from jaxmark.alignment.features import descriptors
+from jaxmark.alignment.registration import SETTINGS, refine, register_part, register_whole
+from jaxmark.geometry.mesh import Mesh, make_mesh, vertex_normals
+from jaxmark.geometry.pose import IDENTITY, Pose, affine, similarity
+from jaxmark.geometry.surfaces import Surface, sample
 from tests.samples import bumpy_sphere
 
 
@@ -153,6 +155,18 @@ def test_the_pose_of_a_part_is_found(share, mesh: Mesh):
     np.testing.assert_array_equal(found.matrix, again.matrix)
     off = found(pose(np.asarray(mesh.vertices))) - mesh.vertices
     assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 1e-3
+
+
+def test_settings_are_frozen_and_reach_what_they_set(mesh: Mesh):
+    """No pose leaves nothing at all, and a part has none if poses by local shape are not tried, or too large for it."""
+    surface, suspect = Surface(mesh), placed(finer(mesh), anywhere(6))
+    assert register_whole(surface, suspect, settings=replace(SETTINGS, whole_distance=0.0)) is None
+    assert register_part(surface, suspect, settings=replace(SETTINGS, feature_poses=0)) is None
+    large = replace(SETTINGS, features=replace(SETTINGS.features, min_side=2.0))
+    assert register_part(surface, suspect, settings=large) is None
+    assert hash(large) != hash(SETTINGS)
+    with pytest.raises(FrozenInstanceError):
+        large.rounds = 1  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_descriptors_do_not_depend_on_pose_and_scale(mesh: Mesh):

@@ -6,12 +6,12 @@ import jax
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 import jaxmark as jm
 from jaxmark.attacks import iso_surface, isotropic, poisson, simplification
-from jaxmark.attacks.meshlab import filtered
-from jaxmark.mesh import Mesh, diagonal, edges, make_mesh
+from jaxmark.attacks.meshlab import apply_filter
+from jaxmark.geometry.mesh import Mesh, diagonal, edges, make_mesh
 from tests.samples import exact_sheet
 
 pytest.importorskip("fast_simplification")
@@ -47,7 +47,7 @@ def test_simplification_leaves_what_is_asked_for_as_near_as_meshlab_does(share, 
     assert len(found.faces) == round((1 - share) * len(sphere.faces))
     assert len(edges(found.faces)) == pytest.approx((1 - share) * len(edges(sphere.faces)), rel=0.01)
     check_closed(found)
-    other = filtered("meshing_decimation_quadric_edge_collapse", sphere, targetfacenum=len(found.faces))
+    other = apply_filter("meshing_decimation_quadric_edge_collapse", sphere, targetfacenum=len(found.faces))
     assert len(other.faces) == len(found.faces)
     assert apart(sphere, found) == pytest.approx(apart(sphere, other), rel=0.1)
 
@@ -85,7 +85,7 @@ def test_iso_surface_is_that_of_the_whole_grid(cells, sphere: Mesh):
     expected = measure.marching_cubes(np.where(inside, -distance, distance).reshape(size), 0)[0]
     assert len(expected) == len(found.vertices)
     # libigl's fast winding numbers are good to 0.3 %, and it multiplies distances with them.
-    assert cKDTree(expected).query(steps)[0].max() < 2e-3
+    assert KDTree(expected).query(steps)[0].max() < 2e-3
 
 
 @pytest.mark.slow
@@ -145,7 +145,7 @@ def test_refusals(sphere: Mesh, monkeypatch: pytest.MonkeyPatch):
         with pytest.raises(jm.JaxmarkError, match=sentence):
             jm.attack(sphere, kind, strength, seed=0)
     with pytest.raises(jm.JaxmarkError, match=r"MeshLab could not .*no_such_filter"):
-        filtered("no_such_filter", sphere)
+        apply_filter("no_such_filter", sphere)
     for module, kind in [
         ("fast_simplification", "simplification"),
         ("pymeshlab", "isotropic"),

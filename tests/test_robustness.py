@@ -7,16 +7,16 @@ import pytest
 
 import jaxmark as jm
 from jaxmark.attacks import Attack
-from jaxmark.mesh import Mesh
-from jaxmark.message import decode, encode, guess
-from jaxmark.robustness import minimum_distortion
+from jaxmark.evaluation import minimum_distortion
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.coding.message import decode, encode, guess
 from tests.samples import bumpy_sphere
 
 MESSAGE = b"ok"
 
 
 @pytest.fixture(scope="module")
-def marked(key: jm.Key) -> tuple[jm.Marker, Mesh]:
+def marked(key: jm.Key) -> tuple[jm.watermark.Marker, Mesh]:
     marker = jm.make_marker(bumpy_sphere(3), key, bits=16)
     return marker, marker.embed(MESSAGE, 2e-3, noise=0)[0]
 
@@ -74,7 +74,7 @@ def test_refusals(marked):
 
 def test_the_least_that_breaks_a_mark_lies_between_what_does_and_what_does_not(marked):
     marker, mesh = marked
-    wide = jm.ATTACKS["noise"]._replace(strengths=(0.001, 0.3))
+    wide = jm.attacks.ATTACKS["noise"]._replace(strengths=(0.001, 0.3))
     found = minimum_distortion(marker, mesh, MESSAGE, wide, metrics=["rms", "dame"])
     held = [one for one in found.curve if one.log10_p <= -6]
     assert found.weakest is not None
@@ -83,8 +83,8 @@ def test_the_least_that_breaks_a_mark_lies_between_what_does_and_what_does_not(m
     for one in found.curve:
         suspect = jm.attack(mesh, "noise", one.strength, seed=0)
         assert one.log10_p == marker.detect(suspect, MESSAGE).log10_p
-        assert one.distortion.rms == jm.distortion.moved(mesh, suspect).rms
-    own = jm.distortion.moved(marker.original.mesh, mesh).rms
+        assert one.distortion.rms == jm.distortion.displacement_size(mesh, suspect).rms
+    own = jm.distortion.displacement_size(marker.original.mesh, mesh).rms
     assert found.cost("rms") == pytest.approx(found.weakest.distortion.rms / own)
     assert np.isnan(found.cost("msdm2"))  # not asked for
 
@@ -92,12 +92,12 @@ def test_the_least_that_breaks_a_mark_lies_between_what_does_and_what_does_not(m
 @pytest.mark.slow
 def test_whole_strengths_and_attacks_that_never_or_always_succeed(marked):
     marker, mesh = marked
-    coarse = minimum_distortion(marker, mesh, MESSAGE, jm.ATTACKS["quantisation"]._replace(strengths=(10, 2)))
+    coarse = minimum_distortion(marker, mesh, MESSAGE, jm.attacks.ATTACKS["quantisation"]._replace(strengths=(10, 2)))
     assert [one.strength for one in coarse.curve] == sorted((one.strength for one in coarse.curve), reverse=True)
     assert coarse.weakest is not None
     bits = int(coarse.weakest.strength)
     assert [one.strength for one in coarse.curve if one.log10_p <= -6][-1] == bits + 1
-    noise = jm.ATTACKS["noise"]
+    noise = jm.attacks.ATTACKS["noise"]
     mild = minimum_distortion(marker, mesh, MESSAGE, noise._replace(strengths=(1e-4, 2e-4)), metrics=["rms"])
     assert (mild.weakest, mild.cost("rms"), len(mild.curve)) == (None, np.inf, 1)
     harsh = minimum_distortion(marker, mesh, MESSAGE, noise._replace(strengths=(1, 2)), metrics=["rms"])

@@ -3,7 +3,7 @@ import pytest
 
 import jaxmark as jm
 from jaxmark.errors import JaxmarkError
-from jaxmark.sequences import hadamard, orthogonal_sequences
+from jaxmark.watermark.coding.sequences import hadamard, orthogonal_sequences
 
 
 @pytest.mark.parametrize("order", [1, 2, 4, 8, 12, 16, 20, 24, 32, 40, 48, 64, 128, 192, 384])

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.chebyshev import filter
-from jaxmark.laplacian import make_laplacian
-from jaxmark.mesh import Mesh, make_mesh
-from jaxmark.original import prepare
-from jaxmark.shapes import common, common_laplacian, fill
+from jaxmark.alignment.original import make_original
+from jaxmark.geometry.mesh import Mesh, make_mesh
+from jaxmark.spectral.chebyshev import filter
+from jaxmark.spectral.laplacian import make_laplacian
+from jaxmark.spectral.shapes import common_laplacian, common_size, pad_rows
 from tests.dense import tolerance
 from tests.samples import bumpy_sphere
 
@@ -20,7 +20,7 @@ def cut(mesh: Mesh, corners: int) -> Mesh:
 
 def test_common_sizes_are_few_and_not_much_larger():
     counts = np.arange(1, 2**17 + 2)
-    sizes = np.array([common(int(count)) for count in counts])
+    sizes = np.array([common_size(int(count)) for count in counts])
     assert (sizes >= counts).all()
     assert (sizes <= np.maximum(1.25 * counts, counts + 15)).all()
     assert sizes[-1] == counts[-1]
@@ -35,7 +35,7 @@ def test_what_is_filled_in_changes_nothing(hard_graph: Mesh, weights, lowering, 
     filled = common_laplacian(hard_graph, weights, lowering)
     x = np.random.default_rng(0).normal(size=(len(hard_graph.vertices), 3)).astype(dtype)
     c = np.random.default_rng(1).normal(size=9).astype(dtype)
-    got = filter(filled, c, jnp.asarray(fill(x, len(filled.degree))))
+    got = filter(filled, c, jnp.asarray(pad_rows(x, len(filled.degree))))
     assert len(got) == 16 == len(filled.degree)
     np.testing.assert_allclose(got[: len(x)], filter(plain, c, jnp.asarray(x)), atol=tolerance(dtype, 10))
     np.testing.assert_array_equal(got[len(x) :], 0)
@@ -56,7 +56,7 @@ def test_programs_serve_meshes_of_other_sizes(key: jm.Key):
             before = len(compiled)
             marked, _ = jm.embed(mesh, b"s", key, budget=8e-4)
             assert jm.detect(marked, original=mesh, key=key, bits=8).message == b"s"
-            assert len(prepare(mesh).signal) == common(len(mesh.vertices)) == 2560
+            assert len(make_original(mesh).signal) == common_size(len(mesh.vertices)) == 2560
             assert index == 0 or len(compiled) == before
     finally:
         jax.monitoring.unregister_event_duration_listener(hear)

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmark import chebyshev, sharding
 from jaxmark.errors import JaxmarkError
-from jaxmark.laplacian import make_laplacian
-from jaxmark.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.spectral import chebyshev, sharding
+from jaxmark.spectral.laplacian import make_laplacian
 from tests.samples import bumpy_sphere
 
 ROOT = Path(__file__).parents[1]
@@ -92,7 +92,7 @@ def test_one_device_in_this_process(sphere: Mesh):
     sharded = sharding.shard(operator, jax.devices()[:1])
     x = np.asarray(sphere.vertices, np.float32)
     c = jnp.asarray([1.0, -2.0, 0.5], jnp.float32)
-    found = sharded.gather(sharding.filter(sharded, c, sharded.scatter(x)))
+    found = sharded.gather(sharding.filter_sharded(sharded, c, sharded.scatter(x)))
     np.testing.assert_allclose(found, chebyshev.filter(operator, c, x), atol=1e-6)
     assert sharding.traffic(sharded) == (0, 0, 0)
     assert sharding.traffic(sharded).per_cut_edge == 0

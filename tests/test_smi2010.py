@@ -12,8 +12,8 @@ import pytest
 from scipy import sparse
 
 import jaxmark as jm
-from jaxmark.mesh import Mesh, edges, make_mesh, vertex_normals
-from jaxmark.pose import similarity
+from jaxmark.geometry.mesh import Mesh, edges, make_mesh, vertex_normals
+from jaxmark.geometry.pose import similarity
 from tests.samples import bumpy_sphere
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -23,11 +23,12 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 def harmonics(monkeypatch) -> ModuleType:
     pytest.importorskip("igl")
     monkeypatch.syspath_prepend(BENCHMARKS)
-    return importlib.import_module("harmonics")
+    return importlib.import_module("common.harmonics")
 
 
 @pytest.fixture
-def smi2010(harmonics) -> ModuleType:
+def smi2010(harmonics, monkeypatch) -> ModuleType:
+    monkeypatch.syspath_prepend(BENCHMARKS / "robustness")
     return importlib.import_module("smi2010")
 
 
@@ -71,7 +72,7 @@ def test_the_tool_confirms_its_mark_in_noise_and_a_quarter_of_what_is_none(harmo
     mesh = bumpy_sphere(3)
     mark = harmonics.make_mark(mesh, [1])
     marked = mark.embed({"rms": 1e-3})
-    expected = jm.distortion.moved(mesh, marked).max
+    expected = jm.distortion.displacement_size(mesh, marked).max
     assert mark.correlation(jm.attack(marked, "noise", 0.002, seed=0), expected) > 0.9
     assert mark.correlation(mesh, expected) == 0  # nothing moved
     assert mark.correlation(bumpy_sphere(3, seed=9), expected) <= 1
@@ -130,7 +131,14 @@ def test_a_run_from_start_to_end_and_again(tmp_path, smi2010):
     jm.save_mesh(make_mesh(mesh.vertices, mesh.faces), source)
     options = ["--methods", "keyed", "harmonics", "--limits", "perceptual", "--trials", "1", "--workers", "1"]
     options += ["--attacks", "none", "noise 0.003", "smoothing 10"]
-    command = [sys.executable, str(BENCHMARKS / "smi2010.py"), str(source), "--output", str(output), *options]
+    command = [
+        sys.executable,
+        str(BENCHMARKS / "robustness" / "smi2010.py"),
+        str(source),
+        "--output",
+        str(output),
+        *options,
+    ]
     first = subprocess.run(command, capture_output=True, text=True)
     assert first.returncode == 0, first.stderr[-2000:]
     table = (output / "smi2010.md").read_text()

@@ -11,8 +11,8 @@ from scipy.sparse.linalg import spsolve
 
 import jaxmark as jm
 from jaxmark.attacks import bilateral_smoothing, cotangent_smoothing, taubin_smoothing
-from jaxmark.laplacian import make_laplacian
-from jaxmark.mesh import Mesh, boundary_vertices, edges, make_mesh, vertex_normals
+from jaxmark.geometry.mesh import Mesh, boundary_vertices, edges, make_mesh, vertex_normals
+from jaxmark.spectral.laplacian import make_laplacian
 from tests.dense import laplacian_matrix
 from tests.samples import exact_sheet, rough_sphere
 

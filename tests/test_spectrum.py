@@ -3,11 +3,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxmark import spectrum
 from jaxmark.errors import JaxmarkError
-from jaxmark.laplacian import centre, make_laplacian
-from jaxmark.mesh import Mesh, make_mesh
-from jaxmark.spectrum import eigenpairs, quadrature, white
+from jaxmark.geometry.mesh import Mesh, make_mesh
+from jaxmark.spectral import spectrum
+from jaxmark.spectral.laplacian import centre, make_laplacian
+from jaxmark.spectral.spectrum import eigenpairs, quadrature, white_probes
 from tests.dense import laplacian_matrix
 
 
@@ -70,7 +70,7 @@ def test_quadrature_is_exact_for_polynomials(hard_graph: Mesh):
 def test_white_signals_estimate_traces(hard_graph: Mesh):
     """Σ f(λ_i) above the null space, within four of Hutchinson's standard deviations; without isolated vertices."""
     operator = make_laplacian(hard_graph, "inverse-length")
-    signals = white(operator, jax.random.key(0), 1000)
+    signals = white_probes(operator, jax.random.key(0), 1000)
     delta, values = laplacian_matrix(operator), eigenpairs(operator).values
     np.testing.assert_array_equal(signals[[5, 10]], 0)
     for power in (0, 1, 3):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-SPEED = Path(__file__).parents[1] / "benchmarks" / "speed.py"
+SPEED = Path(__file__).parents[1] / "benchmarks" / "speed" / "speed.py"
 
 
 def run(*options: str) -> subprocess.CompletedProcess[str]:

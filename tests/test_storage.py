@@ -10,7 +10,7 @@ import trimesh
 
 import jaxmark as jm
 from jaxmark.attacks import digits, float_bits, soup
-from jaxmark.mesh import Mesh, make_mesh
+from jaxmark.geometry.mesh import Mesh, make_mesh
 
 
 @pytest.fixture(scope="module")

@@ -11,12 +11,12 @@ import pytest
 
 import jaxmark as jm
 from jaxmark.attacks import Attack
-from jaxmark.cells import finished
-from jaxmark.intervals import clopper_pearson
-from jaxmark.mesh import Mesh
-from jaxmark.rates import Row
-from jaxmark.results import Results
-from jaxmark.study_file import load_study
+from jaxmark.confidence import clopper_pearson
+from jaxmark.evaluation._rates import Row
+from jaxmark.evaluation.cells import load_finished
+from jaxmark.evaluation.results import Results
+from jaxmark.evaluation.study_file import load_study
+from jaxmark.geometry.mesh import Mesh
 from tests.samples import bumpy_sphere
 from tests.test_cli import Workshop
 
@@ -86,7 +86,7 @@ def test_rows_are_what_marker_attack_and_detect_say(results):
     assert found["stretch", 0.1, 0, "marked"].bit_errors == 0
     assert not found["noise", 0.2, 0, "marked"].read
     assert found["stretch", 0.1, 0, "marked"].unit == "share of the height"
-    assert found["noise", 0.2, 0, "marked"].unit == jm.ATTACKS["noise"].unit
+    assert found["noise", 0.2, 0, "marked"].unit == jm.attacks.ATTACKS["noise"].unit
 
 
 def test_controls_are_always_there_and_never_read(results):
@@ -105,7 +105,7 @@ def test_a_study_that_is_ended_goes_on(results, output, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         study().run(again, say=interrupt)
-    assert len(finished(again)) < 3
+    assert len(load_finished(again)) < 3
     assert without_seconds(study().run(again, say=said.append).rows) == without_seconds(results.rows)
     # What is finished is not done again: the seconds are the same, too.
     assert study().run(again, say=said.append).rows == study().run(again, say=said.append).rows

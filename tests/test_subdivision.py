@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 import jaxmark as jm
 from jaxmark.attacks import loop, midpoint, sqrt3
-from jaxmark.mesh import Mesh, compacted, make_mesh
+from jaxmark.geometry.mesh import Mesh, compact, make_mesh
 from tests.samples import bumpy_sphere, exact_sheet
 
 SCHEMES = {"midpoint": midpoint, "loop": loop, "sqrt3": sqrt3}
@@ -23,7 +23,7 @@ def sheet() -> Mesh:
     """With a boundary all around, and no edge inside from boundary to boundary, of which trimesh knows no better."""
     whole = exact_sheet(8)
     faces = whole.faces[[not set(face) & {0, 63} for face in whole.faces.tolist()]]
-    return compacted(make_mesh(whole.vertices, faces))
+    return compact(make_mesh(whole.vertices, faces))
 
 
 def triangles(vertices: ArrayLike, faces: ArrayLike) -> np.ndarray:

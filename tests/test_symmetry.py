@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import jaxmark as jm
 from jaxmark.attacks import instance_averaging, mirror_averaging
 from jaxmark.distortion import rms
-from jaxmark.mesh import Mesh, diagonal, make_mesh, vertex_normals
+from jaxmark.geometry.mesh import Mesh, diagonal, make_mesh, vertex_normals
 from tests.samples import bumpy_sphere, exact_sheet
 
 TURN = Rotation.from_rotvec([0.4, 1.1, -0.3]).as_matrix()

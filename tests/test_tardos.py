@@ -9,8 +9,8 @@ import pytest
 from scipy import special, stats
 
 import jaxmark as jm
-from jaxmark.evidence import FLOOR
-from jaxmark.tardos import _THRESHOLDS, LEAST, Accusation, biases, codewords, log10_p, rank, scores
+from jaxmark.watermark.evidence import MIN_LOG10_P
+from jaxmark.watermark.tardos import _THRESHOLDS, MIN_BIAS_LEVEL, Accusation, biases, codewords, log10_p, rank, scores
 
 GEOMETRY = b"g" * 32
 NOISE = 0.3
@@ -34,12 +34,12 @@ def test_biases_follow_the_arcsine_law(key: jm.Key):
     """Kolmogorov and Smirnov's distance at the edges between levels, where the quantised law is the exact one."""
     count = 2**18
     levels = 256 * biases(key, GEOMETRY, count)
-    assert LEAST == levels.min() == 256 - levels.max()
-    assert round(256 * special.roots_sh_legendre(5)[0].min()) == LEAST
+    assert MIN_BIAS_LEVEL == levels.min() == 256 - levels.max()
+    assert round(256 * special.roots_sh_legendre(5)[0].min()) == MIN_BIAS_LEVEL
     np.testing.assert_array_equal(levels, np.round(levels))
-    law = stats.arcsine.cdf((np.arange(LEAST - 1, 257 - LEAST) + 0.5) / 256)
+    law = stats.arcsine.cdf((np.arange(MIN_BIAS_LEVEL - 1, 257 - MIN_BIAS_LEVEL) + 0.5) / 256)
     law = (law - law[0]) / (law[-1] - law[0])
-    found = np.cumsum(np.bincount(levels.astype(int), minlength=257))[LEAST - 1 : 257 - LEAST] / count
+    found = np.cumsum(np.bincount(levels.astype(int), minlength=257))[MIN_BIAS_LEVEL - 1 : 257 - MIN_BIAS_LEVEL] / count
     assert np.abs(found - law).max() < 1.95 / math.sqrt(count)  # exceeded once in a thousand
     np.testing.assert_array_equal(_THRESHOLDS, np.round(2**32 * law[1:-1]))
     assert np.abs(2**32 * law[1:-1] % 1 - 0.5).min() > 1e-4
@@ -87,7 +87,7 @@ def test_scores_and_bound_against_all_codewords(key: jm.Key, kind: str):
 def test_bound_is_finite_and_in_range(key: jm.Key):
     p = biases(key, b"", 12)
     found = log10_p(np.array([-1e9, -1.0, 0.0, 1.0, 1e9]), np.ones(12), p)
-    np.testing.assert_array_equal(found[[0, 1, 2, 4]], [0, 0, 0, FLOOR])
+    np.testing.assert_array_equal(found[[0, 1, 2, 4]], [0, 0, 0, MIN_LOG10_P])
     assert -1 < found[3] <= 0
     np.testing.assert_array_equal(log10_p(np.zeros(2), np.zeros(12), p), [0, 0])
 

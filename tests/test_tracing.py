@@ -4,28 +4,28 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh
 from tests.samples import bumpy_sphere
 
 NAMES = [f"recipient {i}" for i in range(2000)]
 
 
 @pytest.fixture(scope="module")
-def tracer(key: jm.Key) -> jm.Tracer:
-    return jm.make_tracer(bumpy_sphere(4), key)
+def tracer(key: jm.Key) -> jm.watermark.Tracer:
+    return jm.watermark.make_tracer(bumpy_sphere(4), key)
 
 
 @pytest.fixture(scope="module")
-def copies(tracer: jm.Tracer) -> np.ndarray:
+def copies(tracer: jm.watermark.Tracer) -> np.ndarray:
     return np.stack([tracer.fingerprint(name, 8e-4)[0].vertices for name in NAMES[:4]])
 
 
-def accused(tracer: jm.Tracer, vertices: np.ndarray) -> set[str]:
+def accused(tracer: jm.watermark.Tracer, vertices: np.ndarray) -> set[str]:
     suspect = tracer.marker.original.mesh._replace(vertices=vertices)
     return {one.recipient for one in tracer.identify(suspect, NAMES) if one.log10_p <= -6}
 
 
-def test_a_copy_names_its_recipient(tracer: jm.Tracer, copies: np.ndarray):
+def test_a_copy_names_its_recipient(tracer: jm.watermark.Tracer, copies: np.ndarray):
     mesh = tracer.marker.original.mesh
     for name, vertices in zip(NAMES, copies, strict=False):
         assert accused(tracer, vertices) == {name}
@@ -37,7 +37,7 @@ def test_a_copy_names_its_recipient(tracer: jm.Tracer, copies: np.ndarray):
 
 @pytest.mark.parametrize("count", [2, 4])
 @pytest.mark.parametrize("kind", ["average", "mix of vertices", "median"])
-def test_colluders_are_found(tracer: jm.Tracer, copies: np.ndarray, count, kind):
+def test_colluders_are_found(tracer: jm.watermark.Tracer, copies: np.ndarray, count, kind):
     mine = copies[:count]
     who = np.random.default_rng(0).integers(count, size=mine.shape[1])
     vertices = {
@@ -50,9 +50,9 @@ def test_colluders_are_found(tracer: jm.Tracer, copies: np.ndarray, count, kind)
     assert found <= set(NAMES[:count])
 
 
-def test_nobody_is_accused_by_strangers(tracer: jm.Tracer, copies: np.ndarray):
+def test_nobody_is_accused_by_strangers(tracer: jm.watermark.Tracer, copies: np.ndarray):
     mesh = tracer.marker.original.mesh
-    other = jm.make_tracer(mesh, jm.new_key())
+    other = jm.watermark.make_tracer(mesh, jm.new_key())
     message, _ = jm.embed(mesh, b"message", tracer.marker.key)
     for vertices in (mesh.vertices, other.fingerprint(NAMES[0])[0].vertices, message.vertices):
         assert accused(tracer, vertices) == set()

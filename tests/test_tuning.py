@@ -10,15 +10,14 @@ import pytest
 from scipy import optimize
 
 import jaxmark as jm
-from jaxmark.bands import scaling
-from jaxmark.channels import Channels, margins, measure, rate
-from jaxmark.chebyshev import filter
-from jaxmark.message import encode
-from jaxmark.observation import observe
-from jaxmark.original import prepare
-from jaxmark.reception import make_host, make_receiver
-from jaxmark.schemes import KeyedScheme
-from jaxmark.tuning import allocate, tune, upper_bound
+from jaxmark.alignment.observation import observe
+from jaxmark.alignment.original import make_original
+from jaxmark.evaluation.tuning import allocate, tune, upper_bound
+from jaxmark.spectral.bands import scaling
+from jaxmark.spectral.chebyshev import filter
+from jaxmark.watermark.carriers.reception import make_host, make_receiver
+from jaxmark.watermark.channels import Channels, margins, measure, rate
+from jaxmark.watermark.schemes import KeyedScheme
 from tests.samples import rough_sphere
 
 
@@ -154,7 +153,7 @@ def test_differentiable_with_respect_to_budget_and_strength(x64):
 def test_jaxopt_is_imported_late_and_without_its_warning():
     code = (
         "import warnings; warnings.simplefilter('error'); import sys, jaxmark, jax.numpy as jnp;"
-        "from jaxmark.tuning import Channels, allocate; assert 'jaxopt' not in sys.modules;"
+        "from jaxmark.evaluation.tuning import Channels, allocate; assert 'jaxopt' not in sys.modules;"
         "one = jnp.ones((1, 3)); print(allocate(Channels(one, one, one), jnp.ones(3), 1.0))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -164,19 +163,19 @@ def test_jaxopt_is_imported_late_and_without_its_warning():
 
 def test_a_channel_is_what_was_done_to_the_bands():
     """A mark weakened by a known filter, in noise of known strength."""
-    original, family = prepare(rough_sphere(2000)), scaling(16, damping="jackson")
+    original, family = make_original(rough_sphere(2000)), scaling(16, damping="jackson")
     host = make_host(
-        *(original.operator, original.signal, original.traced(original.positions), family),
+        *(original.operator, original.signal, original.to_traced(original.positions), family),
         scales=2,
         degree=2,
     )
     receiver = make_receiver(host)
     random = np.random.default_rng(0)
-    signs = original.traced(random.choice([-1.0, 1.0], (2000, 3)))
+    signs = original.to_traced(random.choice([-1.0, 1.0], (2000, 3)))
     response = np.linspace(1, 0.2, 16)
-    noise = original.traced(random.normal(size=(2000, 3)))
+    noise = original.to_traced(random.normal(size=(2000, 3)))
     residual = 1e-3 * filter(original.operator, family.T @ response, signs) + 3e-4 * noise
-    found = measure(receiver, observe(residual, original.traced(original.used)), 1e-3 * signs)
+    found = measure(receiver, observe(residual, original.to_traced(original.used)), 1e-3 * signs)
     counted = np.asarray(found.dimensions[0])
     assert counted.sum() == pytest.approx(3 * (2000 - receiver.nuisance.shape[1]), rel=0.02)
     # The response of a band is its own, averaged with its neighbours'.
@@ -203,11 +202,10 @@ def test_what_was_predicted_is_measured(tuned, key: jm.Key):
     marked, info = marker.embed(b"ok", limits={"dame": 0.02}, noise=0)
     assert 0.98 * 0.02 <= (jm.compare(mesh, marked, ["dame"]).dame or 0) <= 0.02
     assert info.beta * max(found.scheme.profile) == pytest.approx(found.beta.max(), rel=0.05)
-    word = jnp.asarray(encode(b"ok", key, marker.original.geometry, marker.code), jnp.float32)
+    word = jnp.asarray(marker.codeword(b"ok"), jnp.float32)
     predicted = margins(found.channels, jnp.asarray(found.beta**2, jnp.float32), "evidence")
     for one, expected in zip(ATTACKS, predicted, strict=True):
-        seen = marker.observe(jm.attack(marked, *one, seed=11))
-        score, norm = marker.reader.claim(seen, word)
+        score, norm = marker.reader.claim(marker.receive(jm.attack(marked, *one, seed=11)), word)
         # What smoothing leaves of the host is no white noise within a band.
         least = 0.6 if one[0] == "smoothing" else 0.8
         assert least < float(score**2 / (2 * norm**2)) / float(expected) < 1.25
@@ -250,7 +248,7 @@ def test_any_function_is_an_attack_and_a_start_is_warm(tuned):
         return mesh._replace(vertices=0.5 * np.asarray(mesh.vertices))
 
     first = tune(mesh, [shrink, ("smoothing", 5)], 5e-4, key=jax.random.key(0), bits=16)
-    named = (jm.ATTACKS["smoothing"], 5)
+    named = (jm.attacks.ATTACKS["smoothing"], 5)
     again = tune(mesh, [shrink, named], 5e-4, key=jax.random.key(0), bits=16, start=first.beta)
     assert again.report.margins.min() > 0.98 * first.report.margins.min()
 

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.bands import scaling
-from jaxmark.carriers import KeyedCarrier
-from jaxmark.chebyshev import filter
-from jaxmark.mesh import Mesh, make_mesh
-from jaxmark.original import prepare
-from jaxmark.schemes import KeyedScheme, get_scheme, parameters_of
-from jaxmark.visibility import band_visibility, masking
+from jaxmark.alignment.original import make_original
+from jaxmark.geometry.mesh import Mesh, make_mesh
+from jaxmark.spectral.bands import scaling
+from jaxmark.spectral.chebyshev import filter
+from jaxmark.watermark.carriers import KeyedCarrier
+from jaxmark.watermark.schemes import KeyedScheme, get_scheme, parameters_of
+from jaxmark.watermark.visibility import band_visibility, masking
 from tests.samples import rough_sphere
 
 
@@ -27,7 +27,7 @@ def half_rough() -> Mesh:
 def test_the_eye_sees_high_frequencies_first(half_rough: Mesh):
     """RMS sees all alike; bending grows with the frequency, as GL, whose slope is the Laplacian's, does."""
     family = scaling(32, damping="jackson")
-    original = prepare(half_rough)
+    original = make_original(half_rough)
     rms, dame, gl = band_visibility(original, family, ["rms", "dame", "gl"])
     np.testing.assert_allclose(rms, 1, rtol=1e-3)
     assert (np.diff(np.log(dame[2:20])) > -0.05).all()
@@ -39,8 +39,8 @@ def test_the_eye_sees_high_frequencies_first(half_rough: Mesh):
 
 @pytest.mark.slow
 def test_rough_regions_are_moved_more(half_rough: Mesh, key: jm.Key):
-    original = prepare(half_rough)
-    hidden = original.on_host(masking(original))
+    original = make_original(half_rough)
+    hidden = original.to_host(masking(original))
     assert np.sqrt(np.mean(hidden**2)) == pytest.approx(1, rel=1e-5)
     x = np.asarray(half_rough.vertices)[:, 0]
     assert hidden[x > 0.3].mean() > 1.2 * hidden[x < -0.3].mean()
@@ -57,7 +57,7 @@ def test_rough_regions_are_moved_more(half_rough: Mesh, key: jm.Key):
 
 def test_a_profile_is_what_is_written(half_rough: Mesh, key: jm.Key, dtype):
     scheme = KeyedScheme(bands=32, profile=(0.0, 1.0, 0.5, 0.0, 0.25))
-    original = prepare(half_rough)
+    original = make_original(half_rough)
     carrier = scheme.carrier(original, key, 16, 88)
     assert isinstance(carrier, KeyedCarrier)
     assert len(carrier.host.coefficients) == 5

@@ -5,13 +5,13 @@ import pytest
 from jax.test_util import check_grads
 
 import jaxmark as jm
-from jaxmark.bands import scaling
-from jaxmark.carriers import ModulatedCarrier, host_bands
-from jaxmark.detectors import correlate, decorrelate
-from jaxmark.evidence import correlation_bound
-from jaxmark.laplacian import centre, make_laplacian
-from jaxmark.sequences import orthogonal_sequences
-from jaxmark.watermark import detect, embed
+from jaxmark.spectral.bands import scaling
+from jaxmark.spectral.laplacian import centre, make_laplacian
+from jaxmark.watermark.bits import detect_bits, embed_bits
+from jaxmark.watermark.carriers import ModulatedCarrier, host_bands
+from jaxmark.watermark.coding.sequences import orthogonal_sequences
+from jaxmark.watermark.detectors import correlate, decorrelate
+from jaxmark.watermark.evidence import correlation_bound
 from tests.samples import bumpy_sphere
 
 BITS = 8
@@ -36,7 +36,7 @@ def test_least_squares_recovers_the_amplitudes(prepared, key: jm.Key, dtype):
     carrier = carrier_of(operator, x, key)
     bits = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], BITS), dtype)
     beta = jnp.asarray(np.random.default_rng(1).uniform(0.5, 1.5, 16), dtype)
-    scores = detect(embed(x, bits, carrier, beta), x, carrier, decorrelate, beta)
+    scores = detect_bits(embed_bits(x, bits, carrier, beta), x, carrier, decorrelate, beta)
     assert scores.dtype == dtype
     np.testing.assert_allclose(scores, bits, atol=1e-2 if dtype == np.float32 else 1e-6)
 
@@ -49,11 +49,11 @@ def test_detectors_by_their_definitions(prepared, key: jm.Key, x64):
     columns = np.stack([carrier.displacement(jnp.asarray(unit)).ravel() for unit in np.eye(BITS)], axis=1)
     mass = np.repeat(operator.degree, 3)
     np.testing.assert_allclose(
-        detect(x + residual, x, carrier, correlate), columns.T @ (mass * residual.ravel()), rtol=1e-8
+        detect_bits(x + residual, x, carrier, correlate), columns.T @ (mass * residual.ravel()), rtol=1e-8
     )
     root = np.sqrt(mass)
     least_squares = np.linalg.lstsq(root[:, None] * columns, root * residual.ravel(), rcond=None)[0]
-    np.testing.assert_allclose(detect(x + residual, x, carrier, decorrelate), least_squares, rtol=1e-6)
+    np.testing.assert_allclose(detect_bits(x + residual, x, carrier, decorrelate), least_squares, rtol=1e-6)
 
 
 def test_the_printed_form_confuses_bits_that_decorrelation_separates(prepared, key: jm.Key, x64):
@@ -67,7 +67,7 @@ def test_the_printed_form_confuses_bits_that_decorrelation_separates(prepared, k
     for _ in range(50):
         bits = jnp.asarray(random.choice([-1.0, 1.0], BITS))
         for name, carrier, detector in (("printed", printed, correlate), ("damped", damped, decorrelate)):
-            scores = detect(embed(x, bits, carrier, 1e-3), x, carrier, detector)
+            scores = detect_bits(embed_bits(x, bits, carrier, 1e-3), x, carrier, detector)
             errors[name] += int(np.sum(np.sign(scores) != bits))
     assert errors["printed"] > 0.1 * 50 * BITS
     assert errors["damped"] == 0
@@ -79,18 +79,20 @@ def test_pure_functions_by_transformation(prepared, key: jm.Key, x64):
     x = jnp.asarray(signal)
     carrier = carrier_of(operator, x, key)
     messages = jnp.asarray(np.random.default_rng(4).choice([-1.0, 1.0], (3, BITS)))
-    marked = jax.jit(jax.vmap(embed, (None, 0, None, None)))(x, messages, carrier, 0.01)
-    scores = jax.jit(jax.vmap(lambda s: detect(s, x, carrier)))(marked)
+    marked = jax.jit(jax.vmap(embed_bits, (None, 0, None, None)))(x, messages, carrier, 0.01)
+    scores = jax.jit(jax.vmap(lambda s: detect_bits(s, x, carrier)))(marked)
     np.testing.assert_allclose(scores, 0.01 * messages, atol=1e-7)
 
     def margin(suspect, original, beta):
         used = carrier_of(operator, original, key)
-        return jnp.sum(messages[0] * detect(suspect, original, used, decorrelate, beta))
+        return jnp.sum(messages[0] * detect_bits(suspect, original, used, decorrelate, beta))
 
     check_grads(jax.jit(margin), (marked[0], x, jnp.full(16, 0.1)), order=1, modes=["rev"], eps=1e-7, rtol=1e-4)
-    gradients = jax.vmap(jax.grad(lambda s: jnp.sum(detect(s, x, carrier) ** 2)))(marked)
+    gradients = jax.vmap(jax.grad(lambda s: jnp.sum(detect_bits(s, x, carrier) ** 2)))(marked)
     for one, suspect in zip(gradients, marked, strict=True):
-        np.testing.assert_allclose(one, jax.grad(lambda s: jnp.sum(detect(s, x, carrier) ** 2))(suspect), atol=1e-12)
+        np.testing.assert_allclose(
+            one, jax.grad(lambda s: jnp.sum(detect_bits(s, x, carrier) ** 2))(suspect), atol=1e-12
+        )
 
 
 def test_no_residual_gives_zero_scores_with_finite_gradients(prepared, key: jm.Key, x64):
@@ -98,10 +100,10 @@ def test_no_residual_gives_zero_scores_with_finite_gradients(prepared, key: jm.K
     x = jnp.asarray(signal)
     carrier = carrier_of(operator, x, key)
     for detector in (correlate, decorrelate):
-        np.testing.assert_array_equal(detect(x, x, carrier, detector), 0)
-        assert np.isfinite(jax.grad(lambda s, d=detector: jnp.sum(detect(s, x, carrier, d) ** 2))(x)).all()
+        np.testing.assert_array_equal(detect_bits(x, x, carrier, detector), 0)
+        assert np.isfinite(jax.grad(lambda s, d=detector: jnp.sum(detect_bits(s, x, carrier, d) ** 2))(x)).all()
     flat = carrier_of(operator, 0 * x, key)
-    np.testing.assert_array_equal(detect(x, 0 * x, flat, decorrelate), 0)
+    np.testing.assert_array_equal(detect_bits(x, 0 * x, flat, decorrelate), 0)
 
 
 @pytest.mark.parametrize("seed", range(20))

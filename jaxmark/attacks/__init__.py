@@ -1,28 +1,30 @@
-"""Attacks: what may happen to a marked mesh. `ATTACKS` lists them by the names the command line uses.
+"""Attacks: what may happen to a marked mesh, by accident or by a tool.
 
-Under `jit`, `vmap` and `grad`, close over the faces: graphs are prepared on the host. Vertices that no face uses are no
-part of the surface: they neither move nor count.
+`ATTACKS` lists them by the names that the command line uses. Under `jit`, `vmap` and `grad`, close over the faces,
+because graphs are prepared on the host. Vertices that no face uses are not part of the surface: they neither move nor
+count.
 """
 
-from jaxmark.attacks.affine import affine as affine
-from jaxmark.attacks.affine import similarity as similarity
+from jaxmark.attacks._affine import affine as affine
+from jaxmark.attacks._affine import similarity as similarity
+from jaxmark.attacks._cropping import cropping as cropping
+from jaxmark.attacks._cropping import holes as holes
+from jaxmark.attacks._cropping import region_cropping as region_cropping
+from jaxmark.attacks._jamming import jamming as jamming
+from jaxmark.attacks._quantisation import quantisation as quantisation
+from jaxmark.attacks._simplification import simplification as simplification
 from jaxmark.attacks.bilateral import bilateral_smoothing as bilateral_smoothing
-from jaxmark.attacks.cropping import cropping as cropping
-from jaxmark.attacks.cropping import holes as holes
-from jaxmark.attacks.cropping import region_cropping as region_cropping
 from jaxmark.attacks.deformation import as_rigid_as_possible as as_rigid_as_possible
 from jaxmark.attacks.filtering import band_stop as band_stop
 from jaxmark.attacks.filtering import low_pass as low_pass
 from jaxmark.attacks.flips import edge_flips as edge_flips
-from jaxmark.attacks.jamming import jamming as jamming
-from jaxmark.attacks.mosaic import missing_pieces as missing_pieces
-from jaxmark.attacks.mosaic import mosaic as mosaic
 from jaxmark.attacks.noise import diagonal_noise as diagonal_noise
 from jaxmark.attacks.noise import gaussian_noise as gaussian_noise
 from jaxmark.attacks.noise import mark_noise as mark_noise
 from jaxmark.attacks.noise import uniform_noise as uniform_noise
 from jaxmark.attacks.ordering import reordering as reordering
-from jaxmark.attacks.quantisation import quantisation as quantisation
+from jaxmark.attacks.pieces import missing_pieces as missing_pieces
+from jaxmark.attacks.pieces import mosaic as mosaic
 from jaxmark.attacks.refitting import plane_fitting as plane_fitting
 from jaxmark.attacks.refitting import primitive_fitting as primitive_fitting
 from jaxmark.attacks.registry import ATTACKS as ATTACKS
@@ -37,7 +39,6 @@ from jaxmark.attacks.remeshing import iso_surface as iso_surface
 from jaxmark.attacks.remeshing import isotropic as isotropic
 from jaxmark.attacks.remeshing import poisson as poisson
 from jaxmark.attacks.scene import adding_geometry as adding_geometry
-from jaxmark.attacks.simplification import simplification as simplification
 from jaxmark.attacks.smoothing import cotangent_smoothing as cotangent_smoothing
 from jaxmark.attacks.smoothing import laplacian_smoothing as laplacian_smoothing
 from jaxmark.attacks.smoothing import taubin_smoothing as taubin_smoothing

@@ -1,4 +1,4 @@
-"""Smoothing that keeps edges."""
+"""Smoothing that preserves edges: the bilateral filter."""
 
 from functools import partial
 
@@ -9,27 +9,27 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxmark.attacks.smoothing import inner_vertices, whole_steps
 from jaxmark.distortion.roots import root
-from jaxmark.mesh import Mesh, edges
+from jaxmark.geometry.mesh import Mesh, edges
 
 
 def bilateral_smoothing(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
-    """Move each vertex along its normal by a weighted mean of how far its neighbours lie along it.
+    """Move each vertex along its normal by a weighted mean of its neighbours' offsets in that direction.
 
     Fleishman, Drori, Cohen-Or, "Bilateral mesh denoising", SIGGRAPH 2003. With n the normal at v, h = n · (q - v) the
     offset of a neighbour q and r = |q - v|, v moves by n Σ w h / Σ w with w = exp(-r²/2σ_c²) exp(-h²/2σ_s²). Neighbours
-    are those joined by an edge. σ_c is the mean length of the edges, σ_s the root mean square of the offsets, both of
-    the mesh as it comes; normals are those of each iteration, weighted by area. Boundary vertices stay.
+    are joined by an edge. σ_c is the mean edge length and σ_s the root mean square of the offsets, both of the given
+    mesh; normals are weighted by area and computed anew in each iteration. Boundary vertices stay.
 
     Args:
         mesh: any mesh, its faces concrete.
-        strength: how many iterations, a whole number up to 100,000; static.
+        strength: number of iterations, a whole number up to 100,000; static.
         key: not used; attacks share one signature.
 
     Returns:
         The smoothed mesh. Differentiable with respect to vertices.
 
     Raises:
-        JaxmarkError: if the number of iterations is not whole, negative or too large.
+        JaxmarkError: if the number of iterations is not a whole number from 0 to 100,000.
     """
     faces = np.asarray(mesh.faces)
     pairs = edges(faces)
@@ -48,13 +48,13 @@ def _smooth(
     tail, head = pairs[:, 0], pairs[:, 1]
 
     def offsets(v: Array) -> tuple[Array, Array, Array]:
-        """Normals; and for each pair its length, squared, and its offset."""
+        """Vertex normals, squared lengths of the pairs, and offsets of the pairs."""
         normal, side = _vertex_normals(v, faces), v[head] - v[tail]
         return normal, jnp.sum(side**2, axis=1), jnp.sum(normal[tail] * side, axis=1)
 
     _, square, offset = offsets(vertices)
     spatial, spread = 2 * jnp.mean(root(square)) ** 2, 2 * jnp.mean(offset**2)
-    flat = spread <= 0  # then nothing moves
+    flat = spread <= 0  # all offsets are zero, so nothing moves
 
     def step(v: Array, _: None) -> tuple[Array, None]:
         normal, square, offset = offsets(v)
@@ -69,7 +69,7 @@ def _smooth(
 def _vertex_normals(
     v: Float[Array, "vertices 3"], faces: Int[Array | np.ndarray, "faces 3"]
 ) -> Float[Array, "vertices 3"]:
-    """As `jaxmark.mesh.vertex_normals`, traced."""
+    """Unit normals weighted by area, as `jaxmark.geometry.mesh.vertex_normals`, but traceable."""
     a, b, c = (v[faces[:, corner]] for corner in range(3))
     total = jax.ops.segment_sum(jnp.repeat(jnp.cross(b - a, c - a), 3, axis=0), faces.ravel(), len(v))
     length = root(jnp.sum(total**2, axis=1, keepdims=True))

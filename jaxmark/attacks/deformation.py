@@ -1,4 +1,4 @@
-"""Deformation by hand, as a modelling tool does it; on the host."""
+"""Deformation by dragged handles, as in a modelling tool; host side."""
 
 import numpy as np
 from jaxtyping import Float64, PRNGKeyArray
@@ -6,30 +6,32 @@ from jaxtyping import Float64, PRNGKeyArray
 from jaxmark.attacks.random import generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
-from jaxmark.mesh import Mesh, compacted, component_of, diagonal, face_normals, used_vertices
+from jaxmark.geometry.mesh import Mesh, compact, component_of, diagonal, face_normals, used_vertices
 
-_HANDLE = 0.05  # share of the vertices that are held at either end
-_STEPS = 50
+_HANDLE_SHARE = 0.05  # of the vertices, at either end
+_ARAP_STEPS = 50
 
 
 def as_rigid_as_possible(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
-    """Drag one end of the mesh sideways while the other is held; all between follows as rigidly as possible.
+    """Drag one end of the mesh sideways while the other is held; the rest follows as rigidly as possible.
 
-    By libigl's 50 steps of Sorkine and Alexa, "As-rigid-as-possible surface modeling", SGP 2007 (with spokes and rims),
-    from a shear. It fits rotations in single precision, so that some 1e-5 of the diagonal is rounding. The ends are the
-    5 % of the vertices that lie farthest out either way along the axis of the largest spread, and which is dragged is
-    random. A connected part without a vertex of either stays, and so do vertices that only faces without area use.
+    libigl takes 50 steps of Sorkine and Alexa, "As-rigid-as-possible surface modeling", SGP 2007 (with spokes and
+    rims), starting from a shear. It fits rotations in single precision, so that some 1e-5 of the diagonal is rounding.
+    The ends are the 5 % of the vertices that lie farthest out on either side along the axis of largest spread; which
+    end is dragged is random. Connected parts without a vertex at either end stay where they are, and so do vertices
+    that only faces without area use.
 
     Args:
         mesh: any mesh, concrete.
-        strength: how far, in a random direction perpendicular to that axis, over the diagonal of the bounding box.
+        strength: length of the drag, in a random direction perpendicular to that axis, relative to the diagonal of the
+            bounding box.
         key: a JAX random key.
 
     Returns:
         The deformed mesh.
 
     Raises:
-        JaxmarkError: if no face has an area, libigl finds no deformation, or it is missing.
+        JaxmarkError: if no face has an area, libigl finds no deformation, or libigl is missing.
     """
     faces = np.asarray(mesh.faces, np.int64)[face_normals(mesh).any(axis=1)]
     if len(faces) == 0:
@@ -43,37 +45,37 @@ def as_rigid_as_possible(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh
     shift = strength * diagonal(mesh) * direction / np.linalg.norm(direction)
     part = component_of(Mesh(vertices, faces))
     held = np.isin(part, part[used[(share == 0) | (share == 1)]])
-    moving = compacted(Mesh(vertices, faces[held[faces[:, 0]]]))
+    moving = compact(Mesh(vertices, faces[held[faces[:, 0]]]))
     place, share = used[held[used]], share[held[used]]
-    vertices[place] = _relaxed(moving, vertices[place] + share[:, None] * shift, share)
+    vertices[place] = _relax(moving, vertices[place] + share[:, None] * shift, share)
     return Mesh(vertices, mesh.faces)
 
 
 def _ends(
     points: Float64[np.ndarray, "points 3"], random: np.random.Generator
 ) -> tuple[Float64[np.ndarray, " points"], Float64[np.ndarray, "3"]]:
-    """How far points are from one end to the other, 0 to 1, both included; and along which axis."""
+    """Place of each point between the held end, 0, and the dragged end, 1; and the axis from the one to the other."""
     spread = points - points.mean(axis=0)
     axis = np.linalg.eigh(spread.T @ spread)[1][:, 2] * random.choice([-1.0, 1.0])
     along = spread @ axis
-    order, count = np.argsort(along, kind="stable"), max(1, round(_HANDLE * len(points)))
+    order, count = np.argsort(along, kind="stable"), max(1, round(_HANDLE_SHARE * len(points)))
     low, high = along[order[count - 1]], along[order[-count]]
     share = np.clip((along - low) / (high - low), 0, 1) if high > low else np.full(len(points), 0.5)
     share[order[:count]], share[order[-count:]] = 0, 1
     return share, axis
 
 
-def _relaxed(
+def _relax(
     mesh: Mesh, start: Float64[np.ndarray, "vertices 3"], share: Float64[np.ndarray, " vertices"]
 ) -> Float64[np.ndarray, "vertices 3"]:
-    """The deformation of a mesh, from a start; vertices of share 0 or 1 stay where they start."""
+    """Relax a deformation from initial positions; vertices whose share is 0 or 1 are fixed to theirs."""
     igl = require("igl", "attacks")
     handles, data = np.flatnonzero((share == 0) | (share == 1)), igl.ARAPData()
-    data.max_iter = _STEPS
+    data.max_iter = _ARAP_STEPS
     try:
         igl.arap_precomputation(*map(np.asarray, mesh), 3, handles.astype(np.int32), data)
         found = np.asarray(igl.arap_solve(start[handles], data, start))
-    except Exception as error:  # of whatever type the program has for it
+    except Exception as error:  # whatever type libigl raises
         raise JaxmarkError(f"libigl could not deform the mesh: {error}.") from error
     if not np.isfinite(found).all():
         raise JaxmarkError("libigl could not deform the mesh; remove its nearly degenerate faces.")

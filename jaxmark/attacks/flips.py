@@ -1,4 +1,4 @@
-"""Remeshing that keeps the number of edges (Sohn et al.): edges are flipped, vertices stay where they are."""
+"""Edge flips: remeshing that keeps the number of edges and the positions of vertices (Sohn et al.)."""
 
 import math
 
@@ -7,31 +7,32 @@ from jaxtyping import Bool, Float64, Int64, PRNGKeyArray
 
 from jaxmark.attacks.random import generator
 from jaxmark.errors import JaxmarkError
-from jaxmark.mesh import Mesh, edges, sides, unit
+from jaxmark.geometry.mesh import Mesh, edges, sides, unit
 
-_THIN = 0.01  # least height of a new face, over its longest side
+_MIN_HEIGHT_RATIO = 0.01  # height of a new face over its longest side
 Faces = Int64[np.ndarray, "faces 3"]
 Codes = Int64[np.ndarray, " edges"]
 
 
 def edge_flips(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
-    """Put the other diagonal in place of edges between two faces; on the host, in NumPy.
+    """Replace edges between two faces by the other diagonals of their quadrilaterals; on the host, in NumPy.
 
-    An edge is flipped only if it has exactly two faces, of one orientation, and if neither new face is thin (height
-    below 1 % of the longest side) nor turned by 90 degrees or more from the mean of the old ones' unit normals. No flip
-    makes an edge that is or was there, and none that was made is flipped again. So there are as many vertices, edges
-    and faces as before, no edge gets a third face, and just the share of the edges that was asked for is replaced.
+    An edge is flipped only if exactly two faces of consistent orientation share it, and if neither new face is thin
+    (height below 1 % of the longest side) nor turned by 90 degrees or more from the mean of the old faces' unit
+    normals. No flip makes an edge that exists or existed before, and no new edge is flipped again. So the numbers of
+    vertices, edges and faces stay, no edge gets a third face, and exactly the share of the edges that was asked for is
+    replaced.
 
     Args:
         mesh: any mesh, concrete. Vertices are not welded: an edge between two copies of a point has no second face.
-        strength: share of the edges to flip, in [0, 1]. Which, is random.
+        strength: share of the edges to flip, in [0, 1]; which ones is random.
         key: a JAX random key.
 
     Returns:
-        The mesh with other faces, as many, those that did not change in their place.
+        The mesh with as many faces as before; unchanged faces keep their places.
 
     Raises:
-        JaxmarkError: if the share is outside [0, 1], or not so many edges can be flipped.
+        JaxmarkError: if the share is outside [0, 1], or fewer edges than that can be flipped.
     """
     if not 0 <= strength <= 1:
         raise JaxmarkError(f"A share of edges to flip is in [0, 1], got {strength:g}.")
@@ -50,7 +51,7 @@ def edge_flips(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
             )
         a, b, c, d = quads.T
         new = _codes(quads[:, 2:], len(vertices))
-        chosen = _apart(beside, new, len(faces), random)[: wanted - len(made)]
+        chosen = _choose_independent(beside, new, len(faces), random)[: wanted - len(made)]
         faces[beside[chosen, 0]] = np.stack([a, d, c], axis=1)[chosen]
         faces[beside[chosen, 1]] = np.stack([d, b, c], axis=1)[chosen]
         made = np.concatenate([made, new[chosen]])
@@ -58,7 +59,7 @@ def edge_flips(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
 
 
 def _codes(pairs: Int64[np.ndarray, "edges 2"], size: int) -> Codes:
-    """One integer for each pair of vertices, in any order."""
+    """One integer for each pair of vertices, whatever their order in the pair."""
     return pairs.min(axis=1) * size + pairs.max(axis=1)
 
 
@@ -68,7 +69,11 @@ def _flippable(
     taken: Int64[np.ndarray, " taken"],
     made: Int64[np.ndarray, " made"],
 ) -> tuple[Int64[np.ndarray, "edges 4"], Int64[np.ndarray, "edges 2"]]:
-    """Edges that can be flipped each by itself: corners a, b, c, d of faces abc and bad; and the two faces' places."""
+    """Edges that can be flipped, each taken by itself.
+
+    Returns:
+        Corners a, b, c, d of the two faces abc and bad at each edge, and the indices of these faces.
+    """
     corners, apex = sides(faces)
     (tail, head), code = corners.T, _codes(corners, len(vertices))
     order = np.argsort(code, kind="stable")
@@ -86,21 +91,21 @@ def _flippable(
 def _stays_smooth(
     vertices: Float64[np.ndarray, "vertices 3"], quads: Int64[np.ndarray, "edges 4"]
 ) -> Bool[np.ndarray, " edges"]:
-    """Whether no new face would be thin or turned; a face that names a corner twice has no height."""
+    """Whether both new faces are neither thin nor turned; a face that names a corner twice has no height."""
     a, b, c, d = vertices[quads.T]
     normal = unit(np.cross(b - a, c - a)) + unit(np.cross(a - b, d - b))
     good = np.ones(len(quads), bool)
     for i, j, k in ((a, d, c), (d, b, c)):
-        area = np.cross(j - i, k - i)  # doubled
+        area = np.cross(j - i, k - i)  # twice the face's, along its normal
         longest = np.max([np.sum(side**2, axis=1) for side in (j - i, k - j, i - k)], axis=0)
-        good &= (np.sum(area * normal, axis=1) > 0) & (np.linalg.norm(area, axis=1) > _THIN * longest)
+        good &= (np.sum(area * normal, axis=1) > 0) & (np.linalg.norm(area, axis=1) > _MIN_HEIGHT_RATIO * longest)
     return good
 
 
-def _apart(
+def _choose_independent(
     beside: Int64[np.ndarray, "edges 2"], new: Codes, size: int, random: np.random.Generator
 ) -> Int64[np.ndarray, " chosen"]:
-    """Random edges of which no two share a face or would become the same, in random order (Luby, 1986)."""
+    """Choose random edges, no two of which share a face or become the same edge, in random order (Luby, 1986)."""
     rank = random.permutation(len(beside))
     least = np.full(size, len(beside))
     np.minimum.at(least, beside.ravel(), np.repeat(rank, 2))

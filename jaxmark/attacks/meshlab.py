@@ -1,4 +1,4 @@
-"""Filters of MeshLab."""
+"""Filters of MeshLab, called through pymeshlab."""
 
 from typing import Any
 
@@ -7,31 +7,34 @@ from jaxtyping import Float64
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
-from jaxmark.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh
 
 
-def filtered(name: str, mesh: Mesh, **options: Any) -> Mesh:
-    """What a filter makes of a mesh.
+def apply_filter(name: str, mesh: Mesh, **options: Any) -> Mesh:
+    """Apply a filter of MeshLab to a mesh.
 
     Args:
-        name: of the filter, as pymeshlab has it.
-        mesh: of which MeshLab uses all vertices.
-        options: of the filter.
+        name: the filter's name in pymeshlab.
+        mesh: any mesh; MeshLab uses all of its vertices, also those that no face uses.
+        options: the filter's parameters.
+
+    Returns:
+        The mesh that the filter makes.
 
     Raises:
         JaxmarkError: if the filter fails or leaves no face, or pymeshlab is missing.
     """
-    return _applied(name, options, vertex_matrix=np.asarray(mesh.vertices), face_matrix=np.asarray(mesh.faces))
+    return _run_filter(name, options, vertex_matrix=np.asarray(mesh.vertices), face_matrix=np.asarray(mesh.faces))
 
 
-def filtered_points(
+def apply_filter_to_points(
     name: str, points: Float64[np.ndarray, "points 3"], normals: Float64[np.ndarray, "points 3"], **options: Any
 ) -> Mesh:
-    """What a filter makes of points with normals; see `filtered`."""
-    return _applied(name, options, vertex_matrix=points, v_normals_matrix=normals)
+    """Apply a filter of MeshLab to points with normals; see `apply_filter`."""
+    return _run_filter(name, options, vertex_matrix=points, v_normals_matrix=normals)
 
 
-def _applied(name: str, options: dict[str, Any], **arrays: np.ndarray) -> Mesh:
+def _run_filter(name: str, options: dict[str, Any], **arrays: np.ndarray) -> Mesh:
     meshlab = require("pymeshlab", "attacks")
     filters = meshlab.MeshSet()
     filters.add_mesh(meshlab.Mesh(**arrays))
@@ -39,7 +42,7 @@ def _applied(name: str, options: dict[str, Any], **arrays: np.ndarray) -> Mesh:
         filters.apply_filter(name, **options)
         made = filters.current_mesh()
         points, faces = made.vertex_matrix(), made.face_matrix()
-    except Exception as error:  # of whatever type the program has for it
+    except Exception as error:  # whatever type pymeshlab raises
         raise JaxmarkError(
             f"MeshLab could not do this to the mesh ({name}): {' '.join(str(error).split())}."
         ) from error

@@ -1,21 +1,21 @@
-"""Another order of the same mesh."""
+"""Reordering of vertices and faces."""
 
 import numpy as np
 from jaxtyping import Int64, PRNGKeyArray
 
 from jaxmark.attacks.random import generator
 from jaxmark.errors import JaxmarkError
-from jaxmark.mesh import Mesh, used_vertices
+from jaxmark.geometry.mesh import Mesh, used_vertices
 
 
 def reordering(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
-    """Let random vertices change places among themselves, and random faces; on the host.
+    """Permute random vertices among themselves, and random faces among themselves; on the host.
 
-    The faces that change places also begin with any of their corners; their orientation stays.
+    Each of these faces also starts at a random corner; its orientation stays.
 
     Args:
         mesh: any mesh, concrete.
-        strength: share of the vertices and share of the faces that change places, in [0, 1]; 1 for all of them.
+        strength: share of the vertices and of the faces that change places, in [0, 1]; 1 for all of them.
         key: a JAX random key.
 
     Returns:
@@ -38,8 +38,8 @@ def reordering(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
 
 
 def _cycle(
-    things: Int64[np.ndarray, " things"], share: float, random: np.random.Generator
+    indices: Int64[np.ndarray, " indices"], share: float, random: np.random.Generator
 ) -> tuple[Int64[np.ndarray, " chosen"], Int64[np.ndarray, " chosen"]]:
-    """A share of the things, and for each another of them that takes no other's place."""
-    chosen = random.permutation(things)[: round(share * len(things))]
+    """A random share of some indices, and for each the index that it moves to: a cyclic permutation."""
+    chosen = random.permutation(indices)[: round(share * len(indices))]
     return chosen, np.roll(chosen, 1)

@@ -1,4 +1,4 @@
-"""Randomness of attacks on the host."""
+"""Random numbers for attacks on the host."""
 
 import jax
 import numpy as np
@@ -6,5 +6,5 @@ from jaxtyping import PRNGKeyArray
 
 
 def generator(key: PRNGKeyArray) -> np.random.Generator:
-    """NumPy's generator from a JAX random key."""
+    """Make a NumPy generator that a JAX random key seeds."""
     return np.random.default_rng(np.asarray(jax.random.key_data(key)))

@@ -1,4 +1,4 @@
-"""The list of attacks, and the host functions that put a mesh of a file through one of them, or several."""
+"""The list of attacks, and host functions that apply one or several of them to a mesh."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -8,37 +8,47 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float64, Key, PRNGKeyArray
 
-from jaxmark.attacks.affine import affine, similarity
+from jaxmark.attacks._affine import affine, similarity
+from jaxmark.attacks._cropping import cropping, holes, region_cropping
+from jaxmark.attacks._jamming import jamming
+from jaxmark.attacks._quantisation import quantisation
+from jaxmark.attacks._simplification import simplification
 from jaxmark.attacks.bilateral import bilateral_smoothing
-from jaxmark.attacks.cropping import cropping, holes, region_cropping
 from jaxmark.attacks.deformation import as_rigid_as_possible
 from jaxmark.attacks.filtering import band_stop, low_pass
 from jaxmark.attacks.flips import edge_flips
-from jaxmark.attacks.jamming import jamming
-from jaxmark.attacks.mosaic import missing_pieces, mosaic
 from jaxmark.attacks.noise import diagonal_noise, gaussian_noise, uniform_noise
 from jaxmark.attacks.ordering import reordering
-from jaxmark.attacks.quantisation import quantisation
+from jaxmark.attacks.pieces import missing_pieces, mosaic
 from jaxmark.attacks.refitting import plane_fitting, primitive_fitting
 from jaxmark.attacks.remeshing import iso_surface, isotropic, poisson
 from jaxmark.attacks.scene import adding_geometry
-from jaxmark.attacks.simplification import simplification
 from jaxmark.attacks.smoothing import cotangent_smoothing, laplacian_smoothing, taubin_smoothing
 from jaxmark.attacks.storage import digits, float_bits, soup
 from jaxmark.attacks.subdivision import loop, midpoint, sqrt3
 from jaxmark.attacks.symmetry import instance_averaging, mirror_averaging
 from jaxmark.attacks.warping import bending, twisting, warp
 from jaxmark.errors import JaxmarkError
-from jaxmark.mesh import Mesh, Weld, compacted, diagonal, host_mesh, same_connectivity, used_vertices, weld, welded_mesh
+from jaxmark.geometry.mesh import (
+    Mesh,
+    Weld,
+    compact,
+    diagonal,
+    host_mesh,
+    same_connectivity,
+    used_vertices,
+    weld,
+    weld_mesh,
+)
 
 
 class Attack(NamedTuple):
     """An attack: one of the library's, or your own."""
 
     apply: Callable[[Mesh, Any, Any], Mesh]  # (mesh, strength, random key) → mesh
-    unit: str  # of its strength
-    strengths: tuple[float, ...]  # a usual range, weak ones first
-    host: bool = False  # NumPy and other programs; else JAX, which is given the mesh near the origin and at unit size
+    unit: str  # what its strength is, in words
+    strengths: tuple[float, ...]  # usual strengths, weak ones first
+    host: bool = False  # NumPy or another program; else traced, and given the mesh centred and at unit diagonal
 
 
 #: All attacks of the library, by their names.
@@ -106,62 +116,62 @@ ATTACKS: Mapping[str, Attack] = {
 
 
 Kind = str | Attack  # a name in `ATTACKS`, or an attack of your own
-Step = tuple[Kind, float]  # and its strength
+Step = tuple[Kind, float]  # an attack and its strength
 
 
 def attack(mesh: Mesh, kind: Kind, strength: float, *, seed: int) -> Mesh:
-    """Put a mesh through an attack as a modelling tool would: on its welded points, copies moving together.
+    """Apply an attack as a modelling tool would: to the welded points, so that copies of a point move together.
 
-    A face that an attack changes refers to the first copy of each of its points: along a seam, where copies differ in
-    what the file says of them, it takes that of the first. An attack that makes a new mesh leaves no copies, and no
+    A face that an attack changes refers to the first copy of each of its points: along a seam, where copies carry
+    different data in the file, it takes that of the first. An attack that makes a new mesh leaves no copies, and no
     vertex that no face uses.
 
     Args:
         mesh: any mesh.
         kind: a name in `ATTACKS`, or an `Attack` of your own.
-        strength: in the attack's unit.
-        seed: of its randomness, where it has any.
+        strength: how strong the attack is, in its unit.
+        seed: seed of the attack's random choices, where it makes any.
 
     Returns:
-        The attacked mesh, float64 vertices; as many as there were, in their order, unless the attack makes a new mesh.
+        The attacked mesh with float64 vertices, in the same number and order unless the attack makes a new mesh.
 
     Raises:
-        JaxmarkError: if there is no such attack, its strength is out of range, it cannot do anything with this mesh, or
-            what it needs is not installed.
+        JaxmarkError: if there is no such attack, its strength is out of range, it is not possible on this mesh, or a
+            package that it needs is not installed.
     """
     return chain(mesh, [(kind, strength)], seed=seed)
 
 
 def chain(mesh: Mesh, steps: Sequence[Step], *, seed: int) -> Mesh:
-    """Put a mesh through several attacks, one after the other; see `attack`, which this is for one step.
+    """Apply several attacks one after the other; with one step this is `attack`.
 
     Args:
         mesh: any mesh.
-        steps: kinds of attacks and their strengths.
-        seed: of the randomness of all.
+        steps: the attacks and their strengths, in order.
+        seed: seed of all random choices; each step makes its own.
     """
     entries = [(get_attack(kind), strength) for kind, strength in steps]
     for place, (entry, strength) in enumerate(entries):
         _check_strength(strength)
         key = jax.random.key(seed)
-        mesh = _attacked(host_mesh(mesh), entry, strength, jax.random.fold_in(key, place) if place else key)
+        mesh = _apply(host_mesh(mesh), entry, strength, jax.random.fold_in(key, place) if place else key)
     return mesh
 
 
 def attack_each(meshes: Sequence[Mesh], kind: Kind, strength: float, *, seeds: Sequence[int]) -> list[Mesh]:
-    """Put several meshes through one attack, each with randomness of its own; see `attack`, which this is for one mesh.
+    """Apply one attack to several meshes, each with a seed of its own; with one mesh this is `attack`.
 
-    A traced attack on meshes of the same faces, such as copies marked differently, is one `jax.vmap`: the same random
-    numbers, and positions that differ by rounding at most.
+    A traced attack on meshes with the same faces, such as differently marked copies, is one `jax.vmap`: its random
+    numbers are those of `attack`, and its positions differ by rounding at most.
 
     Args:
-        meshes: at least one.
+        meshes: at least one mesh.
         kind: see `attack`.
         strength: see `attack`.
-        seeds: for each mesh, of the attack's randomness.
+        seeds: the seed of the attack's random choices for each mesh.
 
     Raises:
-        JaxmarkError: see `attack`; one for all.
+        JaxmarkError: see `attack`; if one mesh is refused, all are.
     """
     entry, meshes = get_attack(kind), [host_mesh(mesh) for mesh in meshes]
     _check_strength(strength)
@@ -171,14 +181,14 @@ def attack_each(meshes: Sequence[Mesh], kind: Kind, strength: float, *, seeds: S
         for mesh in meshes[1:]
     ):
         return [attack(mesh, entry, strength, seed=seed) for mesh, seed in zip(meshes, seeds, strict=True)]
-    return _together(meshes, welded, entry, strength, jnp.stack([jax.random.key(seed) for seed in seeds]))
+    return _apply_to_all(meshes, welded, entry, strength, jnp.stack([jax.random.key(seed) for seed in seeds]))
 
 
 def get_attack(kind: Kind) -> Attack:
-    """An attack by its name; an attack itself is returned as it is.
+    """Look up an attack by its name; an `Attack` is returned as it is.
 
     Raises:
-        JaxmarkError: if there is none of that name.
+        JaxmarkError: if there is no attack of that name.
     """
     if isinstance(kind, Attack):
         return kind
@@ -192,22 +202,23 @@ def _check_strength(strength: float) -> None:
         raise JaxmarkError(f"The strength of an attack must be a number, not negative, got {strength}.")
 
 
-def _attacked(mesh: Mesh, entry: Attack, strength: float, key: PRNGKeyArray) -> Mesh:
+def _apply(mesh: Mesh, entry: Attack, strength: float, key: PRNGKeyArray) -> Mesh:
+    """Apply an attack to the welded points of a mesh."""
     welded = weld(mesh.vertices)
-    points = welded_mesh(mesh, welded)
+    points = weld_mesh(mesh, welded)
     if entry.host:
         found = entry.apply(points, strength, key)
     else:
-        small = _small(points)
+        small = _normalise(points)
         found = small.back(entry.apply(small.mesh, strength, key))
-    return _with_copies(mesh, welded, points, found)
+    return _restore_copies(mesh, welded, points, found)
 
 
-def _together(
+def _apply_to_all(
     meshes: Sequence[Mesh], welded: Weld, entry: Attack, strength: float, keys: Key[Array, " meshes"]
 ) -> list[Mesh]:
-    """A traced attack on meshes of the same faces and welding, all at once."""
-    small = [_small(welded_mesh(mesh, welded)) for mesh in meshes]
+    """Apply a traced attack to meshes with the same faces and welding, all at once."""
+    small = [_normalise(weld_mesh(mesh, welded)) for mesh in meshes]
     faces = small[0].mesh.faces
 
     def apply(vertices: Array, key: PRNGKeyArray) -> tuple[Array, Array]:
@@ -217,41 +228,41 @@ def _together(
     starts = np.stack([one.mesh.vertices for one in small])
     vertices, faces = jax.vmap(apply, out_axes=(0, None))(jnp.asarray(starts), keys)
     return [
-        _with_copies(mesh, welded, one.points, one.back(Mesh(moved, faces)))
+        _restore_copies(mesh, welded, one.points, one.back(Mesh(moved, faces)))
         for mesh, one, moved in zip(meshes, small, np.asarray(vertices), strict=True)
     ]
 
 
-def _with_copies(mesh: Mesh, welded: Weld, points: Mesh, found: Mesh) -> Mesh:
-    """What an attack has made of a mesh's points, as a mesh with its copies, where these can be told."""
+def _restore_copies(mesh: Mesh, welded: Weld, points: Mesh, found: Mesh) -> Mesh:
+    """Turn an attack's result on welded points into a mesh with its copies, if it still has the same points."""
     found = Mesh(np.asarray(found.vertices, np.float64), np.asarray(found.faces, np.int64))
     still = found.vertices.shape == points.vertices.shape and np.array_equal(found.vertices, points.vertices)
     if not (same_connectivity(found, points) or (still and len(found.faces) == len(points.faces))):
-        return compacted(host_mesh(found))
+        return compact(host_mesh(found))
     kept = (found.faces == points.faces).all(axis=1)
     faces = np.where(kept[:, None], mesh.faces, welded.first[found.faces])
     return Mesh(found.vertices[welded.point], faces)
 
 
-class _Small(NamedTuple):
-    """A mesh near the origin and at unit size, where float32 keeps its digits."""
+class _Normalised(NamedTuple):
+    """A mesh centred and scaled to unit diagonal, where float32 keeps its digits."""
 
-    points: Mesh  # as it was
-    mesh: Mesh
+    points: Mesh  # in its own place and size
+    mesh: Mesh  # centred and scaled
     centre: Float64[np.ndarray, "3"]
     length: float
 
     def back(self, moved: Mesh) -> Mesh:
-        """What became of it, where it was."""
+        """Bring the attacked mesh back to the place and size of `points`."""
         found, start = np.asarray(moved.vertices), np.asarray(self.mesh.vertices)
         there = self.centre + self.length * found.astype(np.float64)
-        # What the attack left alone stays exactly where it was.
+        # Coordinates that the attack left alone stay exactly as they were.
         count = min(len(start), len(found))
         still = found[:count] == start[:count].astype(found.dtype)
         there[:count] = np.where(still, self.points.vertices[:count], there[:count])
         return Mesh(there, np.asarray(moved.faces))
 
 
-def _small(points: Mesh) -> _Small:
+def _normalise(points: Mesh) -> _Normalised:
     centre, length = np.asarray(points.vertices)[used_vertices(points)].mean(axis=0), diagonal(points)
-    return _Small(points, Mesh((points.vertices - centre) / length, points.faces), centre, length)
+    return _Normalised(points, Mesh((points.vertices - centre) / length, points.faces), centre, length)

@@ -1,25 +1,25 @@
-"""A mesh among other things."""
+"""Scenes: a mesh beside other objects."""
 
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from jaxmark.attacks.random import generator
 from jaxmark.errors import JaxmarkError
-from jaxmark.mesh import Mesh, diagonal, used_vertices
+from jaxmark.geometry.mesh import Mesh, diagonal, used_vertices
 
-_GAP = 0.1  # between the spheres around the boxes of things, in diagonals of the mesh
+_GAP_DIAGONALS = 0.1  # between the bounding spheres of the mesh and of each object, in diagonals of the mesh
 
 
 def adding_geometry(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
-    """Put a ring on one side of the mesh and a box on the other, in a random direction and random poses; on the host.
+    """Add a ring on one side of the mesh and a box on the other, in a random direction and poses; on the host.
 
     Args:
         mesh: any mesh, concrete.
-        strength: diagonal of the bounding box of either, before it is turned, over that of the mesh; positive.
+        strength: bounding-box diagonal of each object before it is rotated, relative to that of the mesh; positive.
         key: a JAX random key.
 
     Returns:
-        The mesh as it is, first, then the ring of 1,024 vertices and the box of 386. They touch nothing.
+        The mesh, unchanged and first, then the ring of 1,024 vertices and the box of 386. None of them touch.
 
     Raises:
         JaxmarkError: if the size is not positive, or all vertices of the mesh are at one point.
@@ -32,7 +32,7 @@ def adding_geometry(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     surface = np.asarray(mesh.vertices, np.float64)[used_vertices(mesh)]
     middle = (surface.min(axis=0) + surface.max(axis=0)) / 2
     step = random.normal(size=3)
-    step *= size * ((1 + strength) / 2 + _GAP) / np.linalg.norm(step)
+    step *= size * ((1 + strength) / 2 + _GAP_DIAGONALS) / np.linalg.norm(step)
     box = trimesh.creation.box((6, 5, 4)).subdivide().subdivide().subdivide()
     vertices, faces = [np.asarray(mesh.vertices, np.float64)], [np.asarray(mesh.faces, np.int64)]
     count = len(vertices[0])

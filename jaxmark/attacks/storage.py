@@ -1,4 +1,4 @@
-"""What a file keeps of a mesh; on the host."""
+"""Storage: what file formats lose of a mesh; host side."""
 
 import tempfile
 from pathlib import Path
@@ -8,50 +8,50 @@ from jaxtyping import Float64, PRNGKeyArray
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
-from jaxmark.mesh import Mesh, used_vertices
+from jaxmark.geometry.mesh import Mesh, used_vertices
 
-_DIGITS = 17  # that tell any two float64 apart
-_FLOATS = {64: np.float64, 32: np.float32, 16: np.float16}
-_TRIPS = 10
+_MAX_DIGITS = 17  # enough to tell any two float64 apart
+_FLOAT_TYPES = {64: np.float64, 32: np.float32, 16: np.float16}  # by their bits
+_MAX_ROUND_TRIPS = 10
 
 
 def digits(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
-    """Write coordinates as decimals of so many significant digits, as text files have them.
+    """Round coordinates to a number of significant decimal digits, as text files do.
 
     Args:
         mesh: any mesh, concrete.
-        strength: how many digits, a whole number from 1 to 17, at which nothing changes.
+        strength: number of digits, a whole number from 1 to 17; at 17 nothing changes.
         key: not used; attacks share one signature.
 
     Returns:
-        The mesh of the rounded coordinates.
+        The mesh with rounded coordinates.
 
     Raises:
         JaxmarkError: if the number of digits is not whole, or outside [1, 17].
     """
-    if not 1 <= strength <= _DIGITS or strength != int(strength):
-        raise JaxmarkError(f"A decimal has a whole number of 1 to {_DIGITS} significant digits, got {strength:g}.")
+    if not 1 <= strength <= _MAX_DIGITS or strength != int(strength):
+        raise JaxmarkError(f"A decimal has a whole number of 1 to {_MAX_DIGITS} significant digits, got {strength:g}.")
     vertices = np.asarray(mesh.vertices, np.float64)
-    return _stored(mesh, np.char.mod(f"%.{int(strength) - 1}e", vertices).astype(np.float64))
+    return _replace_used(mesh, np.char.mod(f"%.{int(strength) - 1}e", vertices).astype(np.float64))
 
 
 def float_bits(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
-    """Store coordinates as IEEE 754 binary floats.
+    """Round coordinates to IEEE 754 binary floats of a number of bits.
 
     Args:
         mesh: any mesh, concrete.
-        strength: bits of each: 64, at which nothing changes, 32 or 16.
+        strength: bits per coordinate: 64, at which nothing changes, 32 or 16.
         key: not used; attacks share one signature.
 
     Returns:
-        The mesh of the rounded coordinates.
+        The mesh with rounded coordinates.
 
     Raises:
-        JaxmarkError: if there is no float of so many bits, or a coordinate is too large for it.
+        JaxmarkError: if there is no float of that many bits, or a coordinate is too large for it.
     """
-    if strength not in _FLOATS:
+    if strength not in _FLOAT_TYPES:
         raise JaxmarkError(f"A coordinate is stored as a float of 64, 32 or 16 bits, got {strength:g}.")
-    kind = _FLOATS[int(strength)]
+    kind = _FLOAT_TYPES[int(strength)]
     with np.errstate(over="ignore", under="ignore"):
         rounded = np.asarray(mesh.vertices).astype(kind).astype(np.float64)
     if not np.isfinite(rounded[used_vertices(mesh)]).all():
@@ -59,15 +59,15 @@ def float_bits(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> 
         raise JaxmarkError(
             f"A coordinate exceeds {most:g}, the largest float of {strength:g} bits; scale the mesh down."
         )
-    return _stored(mesh, rounded)
+    return _replace_used(mesh, rounded)
 
 
 def soup(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
-    """Write the mesh to a binary STL file and read it again: single precision, and each face with vertices of its own.
+    """Write the mesh to a binary STL file and read it again: single precision, and no vertices shared by faces.
 
     Args:
         mesh: any mesh, concrete.
-        strength: how many times, a whole number from 1 to 10; the first loses all that can be lost.
+        strength: number of times, a whole number from 1 to 10; the first loses all that can be lost.
         key: not used; attacks share one signature.
 
     Returns:
@@ -77,8 +77,10 @@ def soup(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
         JaxmarkError: if the number of times is not whole, or outside [1, 10], or single precision cannot hold the mesh
             (see `jaxmark.files.save_mesh`).
     """
-    if not 1 <= strength <= _TRIPS or strength != int(strength):
-        raise JaxmarkError(f"A mesh is written and read a whole number of 1 to {_TRIPS} times, got {strength:g}.")
+    if not 1 <= strength <= _MAX_ROUND_TRIPS or strength != int(strength):
+        raise JaxmarkError(
+            f"A mesh is written and read a whole number of 1 to {_MAX_ROUND_TRIPS} times, got {strength:g}."
+        )
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "soup.stl"
         for _ in range(int(strength)):
@@ -87,5 +89,6 @@ def soup(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
     return mesh
 
 
-def _stored(mesh: Mesh, rounded: Float64[np.ndarray, "vertices 3"]) -> Mesh:
+def _replace_used(mesh: Mesh, rounded: Float64[np.ndarray, "vertices 3"]) -> Mesh:
+    """Take the rounded coordinates of the vertices that faces use; keep the others."""
     return Mesh(np.where(used_vertices(mesh)[:, None], rounded, np.asarray(mesh.vertices)), mesh.faces)

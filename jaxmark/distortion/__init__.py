@@ -1,28 +1,32 @@
-"""How far a mesh was moved, and how it looks: metrics, one a module."""
+"""Metrics of how far a mesh was moved, and how visible that is; one metric per module.
 
-from jaxmark.distortion.compare import METRICS as METRICS
-from jaxmark.distortion.compare import Comparison as Comparison
-from jaxmark.distortion.compare import Metric as Metric
-from jaxmark.distortion.compare import Moved as Moved
-from jaxmark.distortion.compare import compare as compare
-from jaxmark.distortion.compare import measure as measure
-from jaxmark.distortion.compare import moved as moved
-from jaxmark.distortion.compare import name_of as name_of
-from jaxmark.distortion.curvature import curvature as curvature
-from jaxmark.distortion.curvature import curvature_tensor as curvature_tensor
-from jaxmark.distortion.curvature import tensor_distance as tensor_distance
+`compare` computes all of them for two meshes on the host; most are also shown as functions of positions that JAX can
+differentiate.
+"""
+
+from jaxmark.distortion._compare import METRICS as METRICS
+from jaxmark.distortion._compare import Comparison as Comparison
+from jaxmark.distortion._compare import DisplacementSize as DisplacementSize
+from jaxmark.distortion._compare import Metric as Metric
+from jaxmark.distortion._compare import compare as compare
+from jaxmark.distortion._compare import displacement_size as displacement_size
+from jaxmark.distortion._compare import measure as measure
+from jaxmark.distortion._compare import name_of as name_of
+from jaxmark.distortion._curvature import curvature as curvature
+from jaxmark.distortion._curvature import curvature_tensor as curvature_tensor
+from jaxmark.distortion._curvature import tensor_distance as tensor_distance
+from jaxmark.distortion._geometric_laplacian import geometric_laplacian as geometric_laplacian
+from jaxmark.distortion._geometric_laplacian import gl as gl
+from jaxmark.distortion._msdm import local_msdm2 as local_msdm2
+from jaxmark.distortion._msdm import msdm as msdm
+from jaxmark.distortion._msdm import msdm2 as msdm2
+from jaxmark.distortion._msdm import msdm2_views as msdm2_views
+from jaxmark.distortion._msdm import msdm_views as msdm_views
 from jaxmark.distortion.dihedral import dame as dame
 from jaxmark.distortion.dihedral import dihedral_angles as dihedral_angles
 from jaxmark.distortion.dihedral import make_hinges as make_hinges
 from jaxmark.distortion.displacement import maximum as maximum
 from jaxmark.distortion.displacement import rms as rms
-from jaxmark.distortion.geometric_laplacian import geometric_laplacian as geometric_laplacian
-from jaxmark.distortion.geometric_laplacian import gl as gl
-from jaxmark.distortion.msdm import local_msdm2 as local_msdm2
-from jaxmark.distortion.msdm import msdm as msdm
-from jaxmark.distortion.msdm import msdm2 as msdm2
-from jaxmark.distortion.msdm import msdm2_views as msdm2_views
-from jaxmark.distortion.msdm import msdm_views as msdm_views
 from jaxmark.distortion.roughness import fmpd as fmpd
 from jaxmark.distortion.roughness import local_roughness as local_roughness
 from jaxmark.distortion.surface import surface_distance as surface_distance

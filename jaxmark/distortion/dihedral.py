@@ -1,7 +1,7 @@
-"""Dihedral angles, and DAME.
+"""Dihedral angles, and the metric DAME.
 
-Váša, Rus, "Dihedral Angle Mesh Error: a fast perception correlated distortion measure for fixed connectivity triangle
-meshes", Computer Graphics Forum 31(5), 2012.
+Reference: Váša, Rus, "Dihedral Angle Mesh Error: a fast perception correlated distortion measure for fixed connectivity
+triangle meshes", Computer Graphics Forum 31(5), 2012.
 """
 
 import math
@@ -13,18 +13,18 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmark.distortion.roots import root
-from jaxmark.mesh import edges
+from jaxmark.geometry.mesh import edges
 
-_LEFT_OF_FOLDED = 0.01  # of an angle's weight, where the surface is folded back onto itself
+_FOLDED_WEIGHT = 0.01  # weight of an angle of π, where the surface is folded back onto itself; an angle of 0 has 1
 
 
 class Hinges(NamedTuple):
-    """Edges with a face on either side; others have corners that coincide, and an angle of 0."""
+    """Edges with the faces on their two sides; the angle is 0 at edges that do not have two faces."""
 
-    edges: Int[Array | np.ndarray, "edges 2"]  # as `jaxmark.mesh.edges`
+    edges: Int[Array | np.ndarray, "edges 2"]  # all edges, as `jaxmark.geometry.mesh.edges`
     left: Int[Array | np.ndarray, " edges"]  # third corner of the face that has the edge in this direction
-    right: Int[Array | np.ndarray, " edges"]  # and of the other
-    inner: Float[Array | np.ndarray, " edges"]  # 1, or 0 where there are not two faces
+    right: Int[Array | np.ndarray, " edges"]  # third corner of the other face
+    inner: Float[Array | np.ndarray, " edges"]  # 1 if the edge has two faces, otherwise 0
 
 
 def make_hinges(faces: Int[Array | np.ndarray, "faces 3"]) -> Hinges:
@@ -35,7 +35,7 @@ def make_hinges(faces: Int[Array | np.ndarray, "faces 3"]) -> Hinges:
     start, end, apex = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel(), np.roll(faces, -2, axis=1).T.ravel()
     which = np.searchsorted(pairs @ [base, 1], np.minimum(start, end) * base + np.maximum(start, end))
     count = np.bincount(which, minlength=len(pairs))
-    order = np.lexsort((start > end, which))  # the face in the edge's own direction first
+    order = np.lexsort((start > end, which))  # the face that has the edge in its own direction comes first
     first = np.cumsum(count) - count
     inner = count == 2
     left, right = pairs[:, 0].copy(), pairs[:, 0].copy()
@@ -46,9 +46,9 @@ def make_hinges(faces: Int[Array | np.ndarray, "faces 3"]) -> Hinges:
 def dihedral_sine_cosine(
     x: Float[Array, "vertices 3"], hinges: Hinges
 ) -> tuple[Float[Array, " edges"], Float[Array, " edges"]]:
-    """Sine and cosine, up to a common factor, of the angle by which the surface turns at each edge; 0 and 1 if none.
+    """Sine and cosine, up to a common factor, of the angle by which the surface turns at each edge.
 
-    Positive where a surface whose faces run counterclockwise is convex.
+    The angle is positive where a surface whose faces run counterclockwise is convex, and 0 where it is not defined.
     """
     tail, head = x[hinges.edges[:, 0]], x[hinges.edges[:, 1]]
     along = head - tail
@@ -64,7 +64,7 @@ def dihedral_sine_cosine(
 
 @jax.jit
 def dihedral_angles(x: Float[Array, "vertices 3"], hinges: Hinges) -> Float[Array, " edges"]:
-    """By how much the surface turns at each edge, in radians from -π to π; 0 where it is flat, or no hinge."""
+    """Angle by which the surface turns at each edge, in radians from -π to π; 0 if it is flat or there is no hinge."""
     return jnp.arctan2(*dihedral_sine_cosine(x, hinges))
 
 
@@ -72,10 +72,10 @@ def dihedral_angles(x: Float[Array, "vertices 3"], hinges: Hinges) -> Float[Arra
 def dame(
     original: Float[Array, "vertices 3"], distorted: Float[Array, "vertices 3"], hinges: Hinges
 ) -> Float[Array, ""]:
-    """Dihedral angle mesh error: mean change of the angle over inner edges, masked where the original is sharp.
+    """Dihedral angle mesh error: mean change of dihedral angles over inner edges, masked where the original is sharp.
 
-    The paper's sum with m = exp((kα)²), k² = ln(0.01)/π², of the original's angle α, and every face visible: its
-    weights by visibility, which need pictures, are 1.
+    This is the paper's sum with masking m = exp((kα)²), k² = ln(0.01)/π², by the original's angle α. The paper's
+    visibility weights, which need rendered images, are 1 here.
 
     Args:
         original: positions.
@@ -83,10 +83,10 @@ def dame(
         hinges: from `make_hinges`.
 
     Returns:
-        In radians; 0 for equal shapes, whatever their scale.
+        The error in radians; 0 for equal shapes, whatever their scale.
     """
     before, after = dihedral_angles(original, hinges), dihedral_angles(distorted, hinges)
-    masking = jnp.exp(math.log(_LEFT_OF_FOLDED) * (before / np.pi) ** 2)
+    masking = jnp.exp(math.log(_FOLDED_WEIGHT) * (before / np.pi) ** 2)
     inner = jnp.asarray(hinges.inner).astype(before.dtype)
     return jnp.sum(inner * masking * jnp.abs(after - before)) / jnp.maximum(inner.sum(), 1)
 

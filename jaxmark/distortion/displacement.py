@@ -1,4 +1,4 @@
-"""Displacement of corresponding vertices: root mean square and maximum of its length."""
+"""Root mean square and maximum of the displacement of corresponding vertices."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,9 +6,9 @@ from jaxtyping import Array, Float
 
 
 def rms(displacement: Float[Array | np.ndarray, "vertices 3"]) -> Float[Array | np.ndarray, ""]:
-    """√(mean over vertices of |d_v|²), unweighted, in the units of `displacement`; gradient 0 where all is 0.
+    """Root mean square √(mean over v of |d_v|²), unweighted, in the units of `displacement`; the gradient at 0 is 0.
 
-    NumPy in, NumPy out: float64 stays float64 on the host.
+    A NumPy array gives a NumPy result, so that float64 stays float64 on the host.
     """
     xp = np if isinstance(displacement, np.ndarray) else jnp
     mean = xp.mean(xp.sum(displacement**2, axis=-1))
@@ -17,7 +17,7 @@ def rms(displacement: Float[Array | np.ndarray, "vertices 3"]) -> Float[Array | 
 
 
 def maximum(displacement: Float[Array | np.ndarray, "vertices 3"]) -> Float[Array | np.ndarray, ""]:
-    """Largest |d_v| over the vertices, in the units of `displacement`; gradient 0 where all is 0."""
+    """Largest |d_v| over the vertices, in the units of `displacement`; the gradient at 0 is 0."""
     xp = np if isinstance(displacement, np.ndarray) else jnp
     largest = xp.max(xp.sum(displacement**2, axis=-1))
     return xp.where(largest > 0, xp.sqrt(xp.where(largest > 0, largest, 1)), 0)

@@ -1,7 +1,7 @@
-"""Which edges lie in balls around vertices, reached from their centres; host side.
+"""Find the edges that lie in balls around vertices and are reached from their centres, on the host.
 
-Found by breadth-first search that only goes outward, as in MEPP's metrics. What depends on positions within a given
-neighbourhood is computed by `jaxmark.distortion.curvature` and `.structure`, in traced code.
+They are found by a breadth-first search that only goes outward, as in MEPP's metrics. What depends on the positions
+within a given neighbourhood is computed in traced code, by `curvature_tensor` and `window_statistics`.
 """
 
 from typing import NamedTuple
@@ -10,23 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxmark.mesh import edges
+from jaxmark.geometry.mesh import edges
 
-_REACHED_AT_ONCE = 2**24  # pairs of a centre and a vertex that one search keeps track of
+_MAX_PAIRS_AT_ONCE = 2**24  # pairs of a centre and a vertex that one search keeps track of, a byte and an int32 each
 
 
 class Neighbourhoods(NamedTuple):
-    """Pieces of edges that run outward in a ball around a vertex, for many balls.
+    """Pieces of edges that run outward in balls around vertices.
 
-    Filled up behind with pieces around no vertex, so that balls of other meshes and sizes often have the same shape,
-    and what was compiled serves again.
+    Padding at the end belongs to no vertex. It lets balls of different meshes and radii often have the same shape, so
+    that compiled code serves again.
     """
 
-    centre: Int[np.ndarray, "*scales pieces"]  # a vertex, in rising order; beyond the last, to fill up
-    tail: Int[np.ndarray, "*scales pieces"]  # inside of the ball
-    head: Int[np.ndarray, "*scales pieces"]  # inside or beyond
-    edge: Int[np.ndarray, "*scales pieces"]  # as `jaxmark.mesh.edges`; -1 for a point
-    radius: float | np.ndarray | Float[Array, "*scales"]
+    centre: Int[np.ndarray, "*scales pieces"]  # the ball's centre vertex, ascending; padding is past the last vertex
+    tail: Int[np.ndarray, "*scales pieces"]  # vertex inside the ball
+    head: Int[np.ndarray, "*scales pieces"]  # vertex inside the ball or beyond
+    edge: Int[np.ndarray, "*scales pieces"]  # index into `jaxmark.geometry.mesh.edges`; -1 for a point
+    radius: float | np.ndarray | Float[Array, "*scales"]  # radius of the balls, in the units of the positions
 
 
 def make_neighbourhoods(
@@ -35,16 +35,16 @@ def make_neighbourhoods(
     radius: float,
     centres: Int[np.ndarray, " centres"] | None = None,
 ) -> tuple[Neighbourhoods, Neighbourhoods]:
-    """The edges in the balls around vertices, and the points in them: vertices inside, and where edges leave.
+    """Find the edges in balls around vertices, and the points in them: vertices inside, and where edges leave.
 
     Args:
         vertices: positions.
         faces: vertex indices.
-        radius: of the balls, in the units of the positions.
-        centres: around which vertices; all unless given.
+        radius: radius of the balls, in the units of the positions.
+        centres: vertices around which the balls lie; all vertices unless given.
 
     Returns:
-        The edges, and the points as edges of which the far end is meant; a vertex is an edge from and to itself.
+        The edges, and the points. A point is stored as an edge that ends at it; a vertex as an edge from and to itself.
     """
     pairs = edges(faces)
     tail, head = np.concatenate([pairs, pairs[:, ::-1]]).T
@@ -52,44 +52,48 @@ def make_neighbourhoods(
     first = np.searchsorted(tail[order], np.arange(len(vertices) + 1))
     graph = _Graph(np.asarray(vertices), first, head[order], np.tile(np.arange(len(pairs)), 2)[order])
     centre = np.arange(len(vertices)) if centres is None else np.sort(centres)
-    blocks = np.array_split(centre, max(1, len(centre) * len(vertices) // _REACHED_AT_ONCE))
-    found, alone = [], []
+    blocks = np.array_split(centre, max(1, len(centre) * len(vertices) // _MAX_PAIRS_AT_ONCE))
+    found, reached = [], []
     for block in blocks:
         pieces, points = _search(graph, block, radius)
         found.append(pieces)
-        alone.append(points)
+        reached.append(points)
     c, p, q, e, inside = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-    centre_of, vertex = (np.concatenate(arrays) for arrays in zip(*alone, strict=True))
+    centre_of, vertex = (np.concatenate(arrays) for arrays in zip(*reached, strict=True))
     vertices_inside = (centre_of, vertex, vertex, np.full(len(vertex), -1))
     c0, p0, q0, e0 = (
-        np.concatenate([one, other[~inside]]) for one, other in zip(vertices_inside, (c, p, q, e), strict=True)
+        np.concatenate([own, leaving[~inside]]) for own, leaving in zip(vertices_inside, (c, p, q, e), strict=True)
     )
     return _sorted(len(vertices), radius, c, p, q, e), _sorted(len(vertices), radius, c0, p0, q0, e0)
 
 
 class _Graph(NamedTuple):
-    """Edges by the vertex that they leave."""
+    """Directed edges, sorted by the vertex that they leave."""
 
-    vertices: np.ndarray
-    first: np.ndarray  # of each vertex's edges
-    head: np.ndarray
-    edge: np.ndarray
+    vertices: np.ndarray  # positions
+    first: np.ndarray  # index of each vertex's first directed edge
+    head: np.ndarray  # the vertex that each directed edge reaches
+    edge: np.ndarray  # index of the undirected edge
 
 
 def _search(graph: _Graph, centres: np.ndarray, radius: float) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-    """Breadth-first from several centres at once: edges (with whether they end inside), and vertices inside."""
+    """Search breadth-first from several centres at once.
+
+    Returns:
+        The edges (centre, tail, head, edge, whether the head is inside), and the vertices inside (centre, vertex).
+    """
     vertices, count = graph.vertices, len(graph.vertices)
     row, at = np.arange(len(centres)), centres
     reached = np.zeros(len(centres) * count, bool)
     reached[row * count + at] = True
-    # Which of several edges to a vertex is the last to write here is taken.
+    # Of several edges that reach a vertex in one step, the last one that is written here is taken.
     last = np.empty(len(reached), np.int32)
     found, points = [], [(centres, centres)]
     while len(row):
         degree = graph.first[at + 1] - graph.first[at]
-        here = np.repeat(np.arange(len(at)), degree)
-        place = np.arange(len(here)) + np.repeat(graph.first[at] - (np.cumsum(degree) - degree), degree)
-        r, p, q, e = row[here], at[here], graph.head[place], graph.edge[place]
+        item = np.repeat(np.arange(len(at)), degree)
+        place = np.arange(len(item)) + np.repeat(graph.first[at] - (np.cumsum(degree) - degree), degree)
+        r, p, q, e = row[item], at[item], graph.head[place], graph.edge[place]
         c = centres[r]
         outward = (p == c) | (np.sum((vertices[q] - vertices[p]) * (vertices[p] - vertices[c]), axis=1) > 0)
         r, c, p, q, e = (array[outward] for array in (r, c, p, q, e))
@@ -112,23 +116,23 @@ def _sorted(count: int, radius: float, *pieces: np.ndarray) -> Neighbourhoods:
 
 
 def filled(balls: Neighbourhoods, pieces: int, count: int) -> Neighbourhoods:
-    """Filled up to a number of pieces, on a mesh of so many vertices."""
-    more = pieces - len(balls.centre)
+    """Pad neighbourhoods to `pieces` pieces, on a mesh of `count` vertices."""
+    padding = pieces - len(balls.centre)
     c, p, q, e = (
-        np.concatenate([array, np.full(more, value, np.int32)])
+        np.concatenate([array, np.full(padding, value, np.int32)])
         for array, value in zip(balls[:4], (count, 0, 0, -1), strict=True)
     )
     return Neighbourhoods(c, p, q, e, balls.radius)
 
 
 def _rounded(size: int) -> int:
-    """Up, to one of four numbers between powers of two."""
+    """Round up to one of four sizes per octave."""
     step = 1 << max(0, size.bit_length() - 3)
     return -(-size // step) * step
 
 
 def share_inside(x: Float[Array, "vertices 3"], pieces: Neighbourhoods) -> Float[Array, " pieces"]:
-    """How much of each edge lies in its ball, 0 to 1, for positions near those of which the neighbourhoods are."""
+    """Share of each edge that lies in its ball, 0 to 1, at positions near those that `pieces` was made for."""
     along, out = x[pieces.head] - x[pieces.tail], x[pieces.tail] - x[pieces.centre]
     a, b, c = (
         jnp.sum(along**2, axis=1),

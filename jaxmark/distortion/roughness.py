@@ -1,7 +1,7 @@
-"""Roughness, and FMPD.
+"""Local roughness, and the metric FMPD.
 
-Wang, Torkhani, Montanvert, "A fast roughness-based approach to the assessment of 3D mesh visual quality", Computers &
-Graphics 36(7), 2012, with the constants of the authors' program.
+Reference: Wang, Torkhani, Montanvert, "A fast roughness-based approach to the assessment of 3D mesh visual quality",
+Computers & Graphics 36(7), 2012, with the constants of the authors' program.
 """
 
 from typing import NamedTuple
@@ -12,19 +12,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmark.distortion.roots import root
-from jaxmark.mesh import boundary_vertices
+from jaxmark.geometry.mesh import boundary_vertices
 
-POWER, _TURN = 0.15, 0.5  # modulation of roughness, and slope of what exceeds the average
-LEAST, MOST, _OF_MEAN = 5e-4, 0.2, 5.0  # roughness that counts; the largest may also be so many times the mean
-_COTANGENTS = (1e-3, 1e3)  # halves of them, clipped
+POWER = 0.15  # exponent by which roughness is modulated
+_SLOPE_ABOVE_MEAN = 0.5  # factor of what of a modulated roughness exceeds that of the mean
+MIN_ROUGHNESS, MAX_ROUGHNESS = 5e-4, 0.2  # roughness is clipped to these, in radians
+_MAX_OVER_MEAN = 5.0  # the upper bound is at least this many times the mean
+_HALF_COTANGENTS = (1e-3, 1e3)  # range to which half cotangents are clipped
 _SCALE = 8.0  # brings the distance into [0, 1]
 
 
 class Rough(NamedTuple):
-    """Where a surface is rough."""
+    """Roughness of a surface at its vertices."""
 
-    roughness: Float[Array, " vertices"]  # local, in radians; see `local_roughness`
-    area: Float[Array, " vertices"]  # a third of the faces around
+    roughness: Float[Array, " vertices"]  # in radians; see `local_roughness`
+    area: Float[Array, " vertices"]  # a third of the area of the faces around
 
 
 def local_roughness(
@@ -32,12 +34,12 @@ def local_roughness(
     faces: Int[Array | np.ndarray, "faces 3"],
     boundary: Bool[np.ndarray, " vertices"] | None = None,
 ) -> Rough:
-    """By how much a vertex's angle defect, without its sign, differs from the cotangent-weighted mean around it.
+    """Difference of each vertex's absolute angle defect from the cotangent-weighted mean of its neighbours'.
 
     Args:
         x: positions.
         faces: vertex indices.
-        boundary: which vertices lie on one, where a flat angle is π; computed unless given.
+        boundary: mask of the boundary vertices, at which flat angles sum to π; computed unless given.
     """
     if boundary is None:
         boundary = np.isin(np.arange(len(x)), boundary_vertices(np.asarray(faces)))
@@ -51,11 +53,11 @@ def _local_roughness(
     corners = x[faces]
     u, v = jnp.roll(corners, -1, axis=1) - corners, jnp.roll(corners, -2, axis=1) - corners
     cosine, cross = jnp.sum(u * v, axis=2), jnp.cross(u[:, 0], v[:, 0])
-    sine = root(jnp.sum(cross**2, axis=1))[:, None]  # of every corner, up to the same factor as its cosine
+    sine = root(jnp.sum(cross**2, axis=1))[:, None]  # each corner's sine, up to the same factor as its cosine
     sound = (sine > 0) | (cosine != 0)
     angle = jnp.arctan2(jnp.where(sound, sine, 0), jnp.where(sound, cosine, 1))
-    half = jnp.clip(cosine / jnp.where(sine > 0, sine, 1) / 2, *_COTANGENTS)
-    half = jnp.where(sine > 0, half, jnp.where(cosine > 0, _COTANGENTS[1], _COTANGENTS[0]))
+    half = jnp.clip(cosine / jnp.where(sine > 0, sine, 1) / 2, *_HALF_COTANGENTS)
+    half = jnp.where(sine > 0, half, jnp.where(cosine > 0, _HALF_COTANGENTS[1], _HALF_COTANGENTS[0]))
 
     zeros = jnp.zeros(len(x), x.dtype)
     defect = jnp.abs(jnp.where(boundary, np.pi, 2 * np.pi).astype(x.dtype) - zeros.at[faces].add(angle))
@@ -69,21 +71,25 @@ def _local_roughness(
 
 @jax.jit
 def fmpd(first: Rough, second: Rough) -> Float[Array, ""]:
-    """Fast mesh perceptual distance, 0 to 1: how much rougher one surface is than another, as a whole.
+    """Fast mesh perceptual distance, 0 to 1: how much rougher one surface is than another as a whole.
 
-    Connectivities may differ. It is nearly blind to slow waves: not to be trusted alone for a mark of low frequencies.
+    Connectivities may differ. The metric is nearly blind to slow waves, so do not rely on it alone for a mark of low
+    frequencies.
 
     Args:
-        first: from `local_roughness`.
-        second: of the other mesh.
+        first: from `local_roughness`, of one mesh.
+        second: likewise, of the other mesh.
     """
     means = jnp.minimum(*(_mean(rough.roughness, rough.area) for rough in (first, second)))
-    floor = LEAST**POWER
-    turn = jnp.maximum(means, LEAST) ** POWER - floor
+    floor = MIN_ROUGHNESS**POWER
+    turn = jnp.maximum(means, MIN_ROUGHNESS) ** POWER - floor
 
     def overall(rough: Rough) -> Array:
-        value = jnp.clip(rough.roughness, LEAST, jnp.maximum(MOST, _OF_MEAN * means)) ** POWER - floor
-        return _mean(jnp.where(value > turn, turn + _TURN * (value - turn), value), rough.area)
+        value = (
+            jnp.clip(rough.roughness, MIN_ROUGHNESS, jnp.maximum(MAX_ROUGHNESS, _MAX_OVER_MEAN * means)) ** POWER
+            - floor
+        )
+        return _mean(jnp.where(value > turn, turn + _SLOPE_ABOVE_MEAN * (value - turn), value), rough.area)
 
     return jnp.minimum(_SCALE * jnp.abs(overall(first) - overall(second)), 1)
 

@@ -1,4 +1,4 @@
-"""Statistics of curvature in windows, which MSDM and MSDM2 compare as SSIM compares pictures."""
+"""Statistics of curvature in windows, which MSDM and MSDM2 compare as SSIM compares images."""
 
 from typing import NamedTuple
 
@@ -12,11 +12,11 @@ from jaxmark.distortion.roots import root
 
 
 class Statistics(NamedTuple):
-    """Of curvature in the window around each vertex, on the original (1) and on the distorted mesh (2)."""
+    """Statistics of curvature in the window around each vertex."""
 
-    mean: tuple[Float[Array, " vertices"], Float[Array, " vertices"]]
-    deviation: tuple[Float[Array, " vertices"], Float[Array, " vertices"]]
-    covariance: Float[Array, " vertices"]
+    mean: tuple[Float[Array, " vertices"], Float[Array, " vertices"]]  # on the original, on the distorted mesh
+    deviation: tuple[Float[Array, " vertices"], Float[Array, " vertices"]]  # standard deviations, likewise
+    covariance: Float[Array, " vertices"]  # covariance of the two meshes' curvatures
 
 
 def window_statistics(
@@ -25,37 +25,37 @@ def window_statistics(
     windows: Neighbourhoods,
     sigma: float | np.ndarray | Float[Array, ""],
 ) -> Statistics:
-    """Means, deviations and covariance, weighed by a Gaussian of the distance from the window's centre.
+    """Compute statistics in windows, weighted by a Gaussian of the distance from the window's centre.
 
     Args:
-        curvatures: of the original and the distorted mesh, at the vertices of the windows' mesh.
-        positions: likewise.
-        windows: the points, from `make_neighbourhoods`, of the distorted mesh.
-        sigma: of the Gaussian, in the units of the positions.
+        curvatures: of the original and of the distorted mesh, both at the distorted mesh's vertices.
+        positions: of both meshes, likewise.
+        windows: points of the distorted mesh, from `make_neighbourhoods`.
+        sigma: width of the Gaussian, in the units of the positions.
     """
     count = len(curvatures[0])
     share = share_inside(positions[1], windows)
 
-    def at(values: Array) -> Array:
+    def at_points(values: Array) -> Array:
         part = share if values.ndim == 1 else share[:, None]
         return (1 - part) * values[windows.tail] + part * values[windows.head]
 
     def total(values: Array) -> Array:
         return jax.ops.segment_sum(values, windows.centre, count, indices_are_sorted=True)
 
-    values = [at(one) for one in curvatures]
-    weights = [jnp.exp(-jnp.sum((at(x) - x[windows.centre]) ** 2, axis=1) / (2 * sigma**2)) for x in positions]
+    values = [at_points(curvature) for curvature in curvatures]
+    weights = [jnp.exp(-jnp.sum((at_points(x) - x[windows.centre]) ** 2, axis=1) / (2 * sigma**2)) for x in positions]
     sums = [jnp.where(whole > 0, whole, 1) for whole in map(total, weights)]
     means = [total(w * v) / s for w, v, s in zip(weights, values, sums, strict=True)]
     off = [v - m[windows.centre] for v, m in zip(values, means, strict=True)]
     deviations = [root(total(w * d**2) / s) for w, d, s in zip(weights, off, sums, strict=True)]
-    # Weights of the one and sum of the other, as in MEPP.
+    # As in MEPP, weights are those of the original, but their sum is that of the distorted mesh.
     covariance = total(weights[0] * off[0] * off[1]) / sums[1]
     return Statistics((means[0], means[1]), (deviations[0], deviations[1]), covariance)
 
 
 def contributions(found: Statistics, offset: float) -> tuple[Array, Array, Array]:
-    """Differences of curvature, contrast and structure, each relative to its size plus an offset (0 if all is 0)."""
+    """Differences of curvature, contrast and structure, each relative to its size plus an offset; 0/0 counts as 0."""
 
     def relative(difference: Array, size: Array) -> Array:
         whole = size + offset
@@ -70,6 +70,6 @@ def contributions(found: Statistics, offset: float) -> tuple[Array, Array, Array
 
 
 def cubic_mean(values: Float[Array, " vertices"]) -> Float[Array, ""]:
-    """(mean of cubes)^(1/3), with slope 0 where all is 0."""
+    """Cubic mean, the cube root of the mean of cubes; the gradient at 0 is 0."""
     mean = jnp.mean(values**3)
     return jnp.where(mean > 0, jnp.cbrt(jnp.where(mean > 0, mean, 1)), 0)

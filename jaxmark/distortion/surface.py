@@ -1,29 +1,31 @@
-"""Distances between surfaces; host side, by exact closest points.
+"""Distances between surfaces by exact closest points, on the host.
 
-Cignoni, Rocchini, Scopigno, "Metro: measuring error on simplified surfaces", Computer Graphics Forum 17(2), 1998.
+Reference: Cignoni, Rocchini, Scopigno, "Metro: measuring error on simplified surfaces", Computer Graphics Forum 17(2),
+1998.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxmark.mesh import Mesh, used_vertices
-from jaxmark.surfaces import Surface, sample
+from jaxmark.geometry.mesh import Mesh, used_vertices
+from jaxmark.geometry.surfaces import Surface, sample
 
-_SAMPLES = 100_000
+_SAMPLED_POINTS = 100_000  # on each surface
 
 
 class SurfaceDistance(NamedTuple):
-    """In the units of the positions."""
+    """Distances between two surfaces, in the units of the positions."""
 
-    mrms: float  # the larger of the two one-sided root mean squares
-    hausdorff: float  # the largest distance of a point of either from the other
+    mrms: float  # the larger of the two one-sided root mean square distances
+    hausdorff: float  # the largest distance of a point on either surface from the other
 
 
 def surface_distance(first: Mesh, second: Mesh) -> SurfaceDistance:
-    """How far two surfaces are apart, each seen from vertices and from 100,000 points spread over the other by area.
+    """Measure how far two surfaces are apart, from the vertices and 100,000 sampled points of each to the other.
 
-    Distances to the surfaces are exact. The mean is over the points spread by area, the largest over both.
+    Distances to the surfaces are exact. Root mean squares are over the points, which are sampled uniformly by area;
+    the largest distance is over points and vertices.
 
     Raises:
         JaxmarkError: if a surface has no area, or libigl is missing.
@@ -33,7 +35,9 @@ def surface_distance(first: Mesh, second: Mesh) -> SurfaceDistance:
 
 
 def _one_sided(mesh: Mesh, other: Surface) -> tuple[float, float]:
-    spread = sample(mesh, _SAMPLES).points
+    sampled = sample(mesh, _SAMPLED_POINTS).points
     vertices = np.asarray(mesh.vertices, np.float64)[used_vertices(mesh)]
-    off, most = (np.linalg.norm(other.closest(points)[0] - points, axis=1) for points in (spread, vertices))
-    return float(np.sqrt(np.mean(off**2))), float(max(off.max(), most.max()))
+    of_points, of_vertices = (
+        np.linalg.norm(other.closest(points)[0] - points, axis=1) for points in (sampled, vertices)
+    )
+    return float(np.sqrt(np.mean(of_points**2))), float(max(of_points.max(), of_vertices.max()))

@@ -1,4 +1,7 @@
-"""Mesh files in and out: OBJ, PLY, OFF, STL and GLB."""
+"""Read and write mesh files: OBJ, PLY, OFF, STL and GLB.
+
+A mesh is saved by patching the file that it was loaded from: whatever is no position or normal stays byte for byte.
+"""
 
 import os
 from collections.abc import Callable
@@ -10,7 +13,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import glb, obj, off, ply, stl
 from jaxmark.files.atomic import write_atomically
 from jaxmark.files.source import Source
-from jaxmark.mesh import Mesh, host_mesh, make_mesh
+from jaxmark.geometry.mesh import Mesh, host_mesh, make_mesh
 
 __all__ = ["SUFFIXES", "load_mesh", "save_mesh", "write_atomically"]
 
@@ -22,16 +25,16 @@ _FORMATS: dict[str, Callable[[bytes], Source]] = {
     ".glb": glb.parse,
 }
 SUFFIXES = tuple(_FORMATS)
-# A displacement is kept well enough if it is this many times the spacing of the file's numbers.
-_STEPS = 10
+# A file's numbers keep a displacement well enough if its RMS is at least this many times their spacing.
+_MIN_SPACINGS = 10
 
 
 def load_mesh(path: str | os.PathLike) -> Mesh:
-    """Read a mesh; the suffix says how.
+    """Read a mesh from a file, in the format that its suffix names.
 
-    Vertices are the file's own, in its order: none merged, none dropped, isolated ones kept. An STL file gives three
-    for each facet. A GLB file gives the local coordinates of its one mesh; transformations of nodes are not applied.
-    Polygons are split into triangles (v0, v1, v2), (v0, v2, v3), … for computing only.
+    Vertices are the file's own, in its order: none are merged or dropped, and isolated ones are kept. An STL file has
+    three vertices of its own for each facet. A GLB file gives the local coordinates of its one mesh; transformations of
+    nodes are not applied. Polygons are split into triangles (v0, v1, v2), (v0, v2, v3), …, for computing only.
 
     Args:
         path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary) or GLB file.
@@ -40,17 +43,17 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
         NumPy arrays: float64 vertices in the file's units, int64 faces.
 
     Raises:
-        JaxmarkError: if the file is missing, of another kind, malformed, or holds no valid mesh (see `make_mesh`).
+        JaxmarkError: if the file is missing, of another format, malformed, or holds no valid mesh (see `make_mesh`).
     """
     return _read(path)[1]
 
 
 def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | None = None) -> None:
-    """Write a mesh; the file appears whole or not at all.
+    """Write a mesh to a file, which appears whole or not at all.
 
     Args:
-        mesh: what to write.
-        path: where to; the suffix says how. It may be the same file as `like`.
+        mesh: the mesh to write.
+        path: the file to write, in the format that its suffix names. It may be the same file as `like`.
         like: the file that the mesh was loaded from. Only the numbers of vertices that moved change, their normals
             follow, and everything else stays byte for byte. Without it a new file is written: exact in OBJ and OFF,
             in single precision in PLY, STL and GLB.
@@ -63,9 +66,9 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | 
     mesh = host_mesh(mesh)
     parse = _parser(path)
     if like is None:
-        from jaxmark.files.fresh import fresh  # trimesh takes long to import, and reading does without
+        from jaxmark.files.fresh import encode_new
 
-        write_atomically(path, fresh(mesh, Path(path).suffix.lower(), parse))
+        write_atomically(path, encode_new(mesh, Path(path).suffix.lower(), parse))
         return
     if Path(path).suffix.lower() != Path(like).suffix.lower():
         raise JaxmarkError(
@@ -81,7 +84,7 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | 
 
 
 def _parser(path: str | os.PathLike) -> Callable[[bytes], Source]:
-    """How files with this suffix are read."""
+    """The parser of the format that a path's suffix names."""
     suffix = Path(path).suffix.lower()
     if suffix not in _FORMATS:
         known = ", ".join(known[1:].upper() for known in _FORMATS)
@@ -90,7 +93,7 @@ def _parser(path: str | os.PathLike) -> Callable[[bytes], Source]:
 
 
 def _read(path: str | os.PathLike) -> tuple[Source, Mesh]:
-    """A file as its source and as a validated mesh."""
+    """Read a file as its source and as a validated mesh."""
     parse = _parser(path)
     try:
         data = Path(path).read_bytes()
@@ -104,7 +107,7 @@ def _read(path: str | os.PathLike) -> tuple[Source, Mesh]:
 
 
 def _patched(source: Source, positions: np.ndarray, name: str) -> bytes:
-    """The source's bytes with new positions, unless its numbers are too coarse for the difference."""
+    """The source's bytes with new positions; refused if its numbers are too coarse for the displacement."""
     with np.errstate(all="ignore"):
         moved = np.abs(positions - source.positions)
         largest = moved.max()
@@ -113,11 +116,11 @@ def _patched(source: Source, positions: np.ndarray, name: str) -> bytes:
         rms = float(largest * np.sqrt(np.square(moved / largest).sum(axis=1).mean()))  # scaled: squares may overflow
     try:
         spacing = source.coordinates.spacing(positions)
-        if not spacing <= rms / _STEPS:
+        if not spacing <= rms / _MIN_SPACINGS:
             raise JaxmarkError(
                 f"The mesh differs from the file by {rms:.3g} (root mean square over the vertices, in file units),"
                 f" but the file's numbers are {spacing:.3g} apart, more than a tenth of that;"
-                f" {source.coordinates.advice(rms / _STEPS)}."
+                f" {source.coordinates.advice(rms / _MIN_SPACINGS)}."
             )
         return source.patch(positions)
     except JaxmarkError as error:

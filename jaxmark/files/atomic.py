@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Write files that appear whole or not at all."""
 
 import os
 import secrets
@@ -13,15 +13,15 @@ from jaxmark.errors import JaxmarkError
 def write_atomically(path: str | os.PathLike, data: bytes, *, mode: int | None = None) -> None:
     """Write a file through a temporary one beside it, so that no reader ever sees half of it.
 
-    Whatever goes wrong, the file that stood there before is still there and no temporary file is left.
+    Whatever goes wrong, a file that was there before is unchanged and no temporary file is left.
 
     Args:
-        path: where to; a symbolic link is followed, and a file that stands there is replaced.
+        path: the file to write; a symbolic link is followed, and an existing file is replaced.
         data: all of the file's bytes.
-        mode: permission bits such as `0o600`; by default those that any new file gets here (the umask's).
+        mode: permission bits such as `0o600`; by default those that the umask gives any new file.
 
     Raises:
-        JaxmarkError: if the folder is missing, something that is no ordinary file stands there, or the system
+        JaxmarkError: if the folder does not exist, the path is something other than an ordinary file, or the system
             refuses to write.
     """
     if "\0" in os.fspath(path):
@@ -53,10 +53,12 @@ def write_atomically(path: str | os.PathLike, data: bytes, *, mode: int | None =
 
 @contextmanager
 def replacing(target: Path) -> Iterator[Path]:
-    """A draft beside a file, of the same name, that takes its place if all goes well and vanishes if not.
+    """Yield the path of a draft that replaces a file if the block succeeds, and is deleted if it fails.
+
+    The draft has the file's name, in a temporary folder beside it.
 
     Raises:
-        JaxmarkError: if there is no such folder, or a folder of that name.
+        JaxmarkError: if the file's folder does not exist, or the target is itself a folder.
     """
     if not target.parent.is_dir():
         raise JaxmarkError(f"The folder {target.parent} does not exist.")

@@ -1,4 +1,4 @@
-"""Numbers in binary files: found by byte offset and written in the file's own type."""
+"""Read numbers of binary files by their byte offsets, and write them in the file's own type."""
 
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
@@ -8,7 +8,7 @@ from jaxmark.files.source import Edits, Overlay, changed
 
 
 def gather(data: bytes, offsets: Int64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.ndarray, "..."]:
-    """The numbers of this type at these byte offsets, which must lie inside the data."""
+    """Read the numbers of a type at byte offsets, which must lie inside the data."""
     raw = np.frombuffer(data, np.uint8)
     rows = np.empty((*offsets.shape, dtype.itemsize), np.uint8)
     for byte in range(dtype.itemsize):
@@ -17,10 +17,10 @@ def gather(data: bytes, offsets: Int64[np.ndarray, "..."], dtype: np.dtype) -> S
 
 
 def encode(values: Float64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.ndarray, "..."]:
-    """Finite numbers in this type, rounded to nearest.
+    """Convert finite numbers to a type, rounded to nearest.
 
     Raises:
-        JaxmarkError: if one is beyond the type's range.
+        JaxmarkError: if a number is beyond the type's range.
     """
     if dtype.kind == "f":
         with np.errstate(over="ignore", under="ignore"):
@@ -37,12 +37,12 @@ def encode(values: Float64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.nda
 
 
 class BinaryNumbers:
-    """Triples of binary numbers; see `Numbers`."""
+    """Triples of numbers in a binary file; see `Numbers`."""
 
     values: Float64[np.ndarray, "rows 3"]
 
     def __init__(self, data: bytes, offsets: Int64[np.ndarray, "rows 3"], types: tuple[np.dtype, ...]) -> None:
-        """Read the numbers at these byte offsets, which must lie inside the data; one type for each column."""
+        """Read the numbers at byte offsets, which must lie inside the data; each column has a type of its own."""
         self._offsets = offsets
         self._types = types
         with np.errstate(invalid="ignore"):  # signalling NaNs
@@ -50,7 +50,7 @@ class BinaryNumbers:
         self.values = np.stack(columns, axis=1)
 
     def edits(self, values: Float64[np.ndarray, "rows 3"]) -> list[Edits | Overlay]:
-        """The bytes of all numbers that changed.
+        """The overlays, one a column, that write all numbers that changed.
 
         Raises:
             JaxmarkError: if a number is beyond the type's range.
@@ -64,7 +64,7 @@ class BinaryNumbers:
         return overlays
 
     def spacing(self, values: Float64[np.ndarray, "rows 3"]) -> float:
-        """The distance from the largest number of each axis to the next, or 1 for integers; the largest of the three.
+        """The distance from the largest number of a column to the next one, 1 for integers; the largest of the columns.
 
         Raises:
             JaxmarkError: if a number is beyond the type's range.
@@ -74,7 +74,7 @@ class BinaryNumbers:
         return max(float(np.spacing(top[0])) if top.dtype.kind == "f" else 1.0 for top in coded)
 
     def advice(self, step: float) -> str:
-        """Which type would do."""
+        """Advise a type that is fine enough."""
         if any(dtype.kind != "f" for dtype in self._types):
             return "declare its coordinates as float or double instead of integers"
         return "centre the mesh on the origin, or use a format with doubles such as PLY with double properties or OBJ"

@@ -1,4 +1,4 @@
-"""Mesh files written from nothing, without a source to patch."""
+"""Write new mesh files, without a source to patch."""
 
 from collections.abc import Callable
 
@@ -7,19 +7,19 @@ import trimesh
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.source import Source
-from jaxmark.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh
 
-# Part of the diagonal: marks move vertices by about ten times that or more.
-_COARSE = 1e-5
+# As a share of the bounding-box diagonal; marks move vertices by about ten times that or more.
+_MAX_ROUNDING = 1e-5
 
 
-def fresh(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> bytes:
-    """The bytes of a new file, read back as a check.
+def encode_new(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> bytes:
+    """Encode a mesh as the bytes of a new file, which are read back as a check.
 
     Args:
         mesh: a validated mesh on the host.
-        suffix: the format, such as `.obj`.
-        parse: how files of this format are read.
+        suffix: the suffix of the format, such as `.obj`.
+        parse: the parser of the format.
 
     Raises:
         JaxmarkError: if the format cannot hold the mesh: single precision would move a coordinate by more than 1e-5
@@ -35,7 +35,7 @@ def fresh(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> bytes:
                 vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
             exact, vertices = vertices, vertices.astype(np.float32).astype(np.float64)
             error = np.abs(exact - vertices).max()
-            if not error <= _COARSE * np.linalg.norm(np.ptp(exact, axis=0)):
+            if not error <= _MAX_ROUNDING * np.linalg.norm(np.ptp(exact, axis=0)):
                 raise JaxmarkError(
                     f"The single precision numbers of {suffix[1:].upper()} files would move vertices by {error:.3g},"
                     " too far for this mesh; centre it on the origin, or use OBJ or OFF, which are written exactly."
@@ -47,7 +47,7 @@ def fresh(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> bytes:
 
 
 def _text(vertices: np.ndarray, faces: np.ndarray, suffix: str) -> bytes:
-    """OBJ or OFF with the shortest digits that give exactly the same float64; trimesh has fixed decimals only."""
+    """Encode OBJ or OFF with the shortest digits that give exactly the same float64; trimesh writes fixed decimals."""
     obj = suffix == ".obj"
     head = [] if obj else ["OFF", f"{len(vertices)} {len(faces)} 0"]
     point = "v {!r} {!r} {!r}" if obj else "{!r} {!r} {!r}"

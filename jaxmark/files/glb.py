@@ -1,4 +1,4 @@
-"""GLB 2.0, the binary form of glTF."""
+"""Parse GLB 2.0, the binary form of glTF."""
 
 import json
 import re
@@ -23,12 +23,12 @@ _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mes
 def parse(data: bytes) -> Source:
     """Read the one mesh of a GLB file.
 
-    The vertices are the mesh's own, local coordinates: the transformations of nodes are not applied. Where several
-    primitives have several POSITION accessors, their vertices follow each other in order of first use.
+    Positions are the mesh's local coordinates: the transformations of nodes are not applied. Where several primitives
+    have several POSITION accessors, their vertices follow each other in order of first use.
 
     Raises:
-        JaxmarkError: if the file cannot be read, or it holds what cannot be marked: several meshes, instances,
-            compressed, sparse or quantised positions, other primitives than triangles, or data in other files.
+        JaxmarkError: if the file cannot be read, or holds what cannot be marked: several meshes, instances,
+            compressed, sparse or quantised positions, primitives other than triangles, or data in other files.
     """
     file = _File(data)
     primitives = _primitives(file)
@@ -52,7 +52,7 @@ def parse(data: bytes) -> Source:
 
 
 class _File:
-    """The chunks of a GLB file, and its JSON with every access checked."""
+    """The chunks of a GLB file; every access to its JSON is checked."""
 
     def __init__(self, data: bytes) -> None:
         if len(data) < 20 or data[:4] != b"glTF":
@@ -86,14 +86,14 @@ class _File:
         return _objects(self.document, kind, "the document")
 
     def item(self, kind: str, index: int) -> dict[str, Any]:
-        """One of them."""
+        """One object of a list at the top of the document."""
         items = self.items(kind)
         if index >= len(items):
             raise JaxmarkError(f"{kind}[{index}] is referred to, but there are {len(items)}.")
         return items[index]
 
     def elements(self, index: int) -> tuple[Int64[np.ndarray, " count"], np.dtype, int]:
-        """Where an accessor's elements begin in the file, the type of their components, and how many there are."""
+        """The byte offsets of an accessor's elements, the type of their components, and how many an element has."""
         where = f"accessors[{index}]"
         accessor = self.item("accessors", index)
         component, width = accessor.get("componentType"), accessor.get("type")
@@ -116,29 +116,29 @@ class _File:
 
 @dataclass
 class _Accessors:
-    """Accessors whose triples follow each other: their indices, and where each one's rows end."""
+    """Accessors of triples, joined one after the other into rows."""
 
-    indices: list[int]
-    ends: list[int]
-    offsets: Int64[np.ndarray, "rows 3"]
+    indices: list[int]  # the accessors' indices in the file
+    ends: list[int]  # the row behind the last one of each accessor
+    offsets: Int64[np.ndarray, "rows 3"]  # byte offset of each number
 
     def first_row(self, index: int) -> int:
         """The row where an accessor begins."""
         return [0, *self.ends][self.indices.index(index)]
 
     def rows(self, index: int) -> int:
-        """How many rows it has."""
+        """The number of rows of an accessor."""
         return self.ends[self.indices.index(index)] - self.first_row(index)
 
 
 class _Primitive(NamedTuple):
     data: dict[str, Any]
-    position: int  # accessors
-    normal: int | None  # None also if they are not plain triples of floats, which are left alone
+    position: int  # index of the accessor
+    normal: int | None  # likewise; None if absent, or not of plain triples of floats: such normals are left alone
 
 
 def _primitives(file: _File) -> list[_Primitive]:
-    """The primitives of the one mesh, once it is known that they are what can be marked."""
+    """The primitives of the one mesh; refused unless they can be marked."""
     meshes = file.items("meshes")
     if len(meshes) != 1:
         raise JaxmarkError(f"The file has {len(meshes)} meshes; only files with one mesh are supported.")
@@ -196,7 +196,7 @@ def _is_plain(file: _File, index: int) -> bool:
 
 
 def _joined(file: _File, indices: list[int]) -> _Accessors:
-    """Distinct accessors of triples of floats, in order of first use."""
+    """Join distinct accessors of triples of floats, in order of first use."""
     distinct = list(dict.fromkeys(indices))
     starts = [file.elements(index)[0] for index in distinct]
     ends = np.cumsum([len(start) for start in starts], dtype=np.int64).tolist()
@@ -205,7 +205,7 @@ def _joined(file: _File, indices: list[int]) -> _Accessors:
 
 
 def _refuse_overlaps(file: _File, patched: list[int]) -> None:
-    """No other accessor may read a byte that is going to change."""
+    """Refuse a file in which another accessor reads a byte that is going to change."""
     taken = np.zeros(len(file.bin), dtype=bool)
     others = [index for index in range(len(file.items("accessors"))) if index not in patched]
     for index in (*patched, *others):
@@ -214,7 +214,7 @@ def _refuse_overlaps(file: _File, patched: list[int]) -> None:
         if index not in patched and (
             view is None or file.item("bufferViews", _whole(accessor, "bufferView", "accessors")).get("buffer") != 0
         ):
-            continue  # it reads nothing of the binary chunk
+            continue  # this accessor reads nothing of the binary chunk
         starts, dtype, width = file.elements(index)
         for byte in range(dtype.itemsize * width):
             place = starts - file.bin.start + byte
@@ -259,7 +259,7 @@ def _whole(parent: dict[str, Any], key: str, where: str, default: int | None = N
 
 @dataclass(kw_only=True)
 class _GlbSource(Source):
-    """A source that also keeps the `min` and `max` of the positions true, as glTF demands."""
+    """A source that also keeps the `min` and `max` of its position accessors true, as glTF demands."""
 
     file: _File
     points: _Accessors
@@ -297,7 +297,7 @@ class _GlbSource(Source):
 
 
 def _same(written: Any, bound: np.ndarray) -> bool:
-    """Whether a bound as written in the JSON already is this one."""
+    """Whether the JSON already states this bound."""
     if not isinstance(written, list) or len(written) != 3:
         return False
     numbers = [item for item in written if isinstance(item, int | float) and abs(item) < 3.4e38]
@@ -305,13 +305,13 @@ def _same(written: Any, bound: np.ndarray) -> bool:
 
 
 def _begin(text: str, at: int = 0) -> int:
-    """The next character that is no white space."""
+    """The index of the next character that is not white space."""
     match = re.compile(r"[ \t\n\r]*").match(text, at)
     return at if match is None else match.end()
 
 
 def _spans(text: str, at: int) -> dict[str | int, tuple[int, int]]:
-    """Where the values of the object or list that begins at `at` stand, by key or number; the JSON must be valid."""
+    """The spans of the values of the object or list that begins at `at`, by key or number; the JSON must be valid."""
     decode = json.JSONDecoder().raw_decode
     keyed = text[at] == "{"
     spans: dict[str | int, tuple[int, int]] = {}

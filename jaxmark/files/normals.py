@@ -1,4 +1,4 @@
-"""Normals that follow the positions, whatever convention the file made them by."""
+"""Update a file's normals as its positions move, whatever convention made them."""
 
 from dataclasses import dataclass
 
@@ -7,34 +7,36 @@ from jaxtyping import Float64, Int64
 
 from jaxmark.files.source import Numbers
 
-# Below this 1 + cos of the turn, the minimal rotation is not defined well enough to be used.
+# Where 1 + cos of a rotation's angle is at most this, the minimal rotation is too ill-defined to be used.
 _ANTIPARALLEL = 1e-6
 
 
 def area_vectors(
     points: Float64[np.ndarray, "points 3"], faces: Int64[np.ndarray, "faces 3"]
 ) -> Float64[np.ndarray, "faces 3"]:
-    """Twice the area of each face along its normal."""
-    with np.errstate(all="ignore"):  # huge coordinates give infinities, which callers leave out
+    """Normals of faces, as long as twice the face's area."""
+    with np.errstate(all="ignore"):  # huge coordinates give infinities, which callers exclude
         first = points[faces[:, 0]]
         return np.cross(points[faces[:, 1]] - first, points[faces[:, 2]] - first)
 
 
 def unit(vectors: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3"]:
-    """The vectors at length 1; NaN where they have none."""
+    """Normalise vectors to length 1; zero becomes NaN."""
     with np.errstate(all="ignore"):
         return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 @dataclass
 class Transported:
-    """Normals turned by the rotation that takes the old mean normal of the faces that use them to the new.
+    """Normals that turn with the faces that use them.
 
-    So smoothing groups, flat normals and any weighting stay what they were, and nothing turns where nothing moved.
+    The mean normal of these faces, weighted by area, turns from its old to its new direction by a minimal rotation; the
+    file's normal turns likewise. So smoothing groups, flat normals and any weighting stay what they were, and nothing
+    turns where nothing moved.
 
     Attributes:
         numbers: the normals in the file.
-        corners: `[F, 3]` which normal each corner of each face uses; -1 for none.
+        corners: `[F, 3]`, the index of the normal that each corner of each face uses; -1 for none.
     """
 
     numbers: Numbers
@@ -61,14 +63,14 @@ class Transported:
         new: Float64[np.ndarray, "points 3"],
         faces: Int64[np.ndarray, "faces 3"],
     ) -> Float64[np.ndarray, "rows 3"]:
-        """The turned normals; those that no face uses, or only faces without area, stay."""
+        """The turned normals; a normal that no face uses, or only faces without area, stays."""
         before, after = self._mean(old, faces), self._mean(new, faces)
         normals = self.numbers.values
         with np.errstate(all="ignore"):
             cosine = np.einsum("ij,ij->i", before, after)
             turns = (before != after).any(axis=1) & (1 + cosine > _ANTIPARALLEL) & np.isfinite(normals).all(axis=1)
         a, b, n = before[turns], after[turns], normals[turns]
-        axis = np.cross(a, b)  # sine times the axis of the rotation
+        axis = np.cross(a, b)  # the axis of the rotation, times the sine of its angle
         along = np.einsum("ij,ij->i", axis, n) / (1 + cosine[turns])
         result = normals.copy()
         result[turns] = n * cosine[turns, None] + np.cross(axis, n) + axis * along[:, None]
@@ -77,7 +79,7 @@ class Transported:
 
 @dataclass
 class PerFace:
-    """One normal for each face, as STL has them."""
+    """One normal for each face, as in STL files."""
 
     numbers: Numbers
 

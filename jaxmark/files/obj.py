@@ -1,4 +1,4 @@
-"""Wavefront OBJ."""
+"""Parse Wavefront OBJ."""
 
 import re
 
@@ -14,11 +14,11 @@ def parse(data: bytes) -> Source:
     """Read the `v`, `vn` and `f` lines of all groups; everything else is left alone.
 
     Raises:
-        JaxmarkError: if a line cannot be read, a face has fewer than three corners or refers to a vertex that is not
-            there; it names the line.
+        JaxmarkError: if a line cannot be read, or a face has fewer than three corners or refers to a vertex that does
+            not exist; the message names the line.
     """
     work = without_comments(unix(data))
-    if b"\\" in work:  # a line that ends with a backslash goes on
+    if b"\\" in work:  # a backslash at the end of a line continues it
         work = re.sub(rb"\\\r?\n", lambda match: b" " * len(match[0]), work)
     text = Text(data, work)
     first, count = text.lines()
@@ -52,16 +52,16 @@ def parse(data: bytes) -> Source:
         named = second < ends
         before = np.repeat(np.searchsorted(normals, lines), sizes)
         used[named] = _absolute(text.ints(second[named], ends[named]), before[named])
-        used[(used < 0) | (used >= len(normals))] = -1  # moves nothing, so it is no reason to refuse the file
+        used[(used < 0) | (used >= len(normals))] = -1  # a wrong index of a normal is no reason to refuse the file
         source.normals = Transported(numbers, used[triangles])
     return source
 
 
 def _keyword(text: Text, first: Int64[np.ndarray, " lines"], word: bytes) -> np.ndarray:
-    """Which lines begin with this word."""
+    """Mask of the lines that begin with a word."""
     match = text.ends[first] - text.starts[first] == len(word)
     for index, char in enumerate(word):
-        # The buffer ends with a line feed, so a shorter last token does not run out of it.
+        # Offsets are clamped, as a last token that is shorter than the word would be read past the buffer's end.
         match &= text.buffer[np.minimum(text.starts[first] + index, len(text.buffer) - 1)] == char
     return match
 
@@ -73,7 +73,7 @@ def _triples(
     count: Int64[np.ndarray, " lines"],
     name: str,
 ) -> TextNumbers:
-    """The three numbers behind the keyword of these lines."""
+    """Read the three numbers after the keyword of each line."""
     short = np.flatnonzero(count[np.searchsorted(first, lines)] < 4)
     if len(short):
         raise text.error(text.starts[lines[short[0]]], f"a {name} needs three numbers")
@@ -83,5 +83,5 @@ def _triples(
 def _absolute(
     index: Int64[np.ndarray, " corners"], before: Int64[np.ndarray, " corners"]
 ) -> Int64[np.ndarray, " corners"]:
-    """Zero-based indices from those that count from 1 or, if negative, back from the line; negative if outside."""
+    """Convert indices, counted from 1 or, if negative, back from their line, to zero-based; negative if outside."""
     return np.where(index < 0, index + before, index - 1)

@@ -1,4 +1,4 @@
-"""Object File Format (OFF), text only."""
+"""Parse the Object File Format (OFF), text only."""
 
 import re
 
@@ -16,8 +16,8 @@ def parse(data: bytes) -> Source:
     """Read OFF, COFF, NOFF, STOFF and their combinations: one vertex or face to a line.
 
     Raises:
-        JaxmarkError: if a line cannot be read or is missing (it names the line), or the file is binary or of another
-            dimension than three.
+        JaxmarkError: if a line cannot be read or is missing (the message names the line), the file is binary, or its
+            vertices do not have three coordinates.
     """
     work = without_comments(unix(data))
     header = _HEADER.match(work)

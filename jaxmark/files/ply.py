@@ -1,4 +1,4 @@
-"""PLY: text, binary little endian and binary big endian."""
+"""Parse PLY: text, binary little endian and binary big endian."""
 
 import re
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 class _Property(NamedTuple):
-    type: np.dtype
+    type: np.dtype  # the type of the scalar, or of the list's items
     length: np.dtype | None  # the type of a list's length; None for a scalar
 
 
@@ -34,14 +34,14 @@ class _Element:
 
 
 class _Column(NamedTuple):
-    """Where the items of a property stand in each row, in the body's units, and how many there are."""
+    """The places of a property's items in the body."""
 
-    starts: Int64[np.ndarray, " rows"]
-    sizes: Int64[np.ndarray, " rows"]
+    starts: Int64[np.ndarray, " rows"]  # place of each row's first item, in the body's units
+    sizes: Int64[np.ndarray, " rows"]  # number of each row's items
 
 
 class _Tokens:
-    """A text body; its units are tokens, from 0 to `end`."""
+    """A text body, whose units are tokens, numbered from 0 to `end`."""
 
     def __init__(self, data: bytes, start: int) -> None:
         self._text = Text(data, b" " * start + unix(data)[start:])
@@ -62,7 +62,7 @@ class _Tokens:
 
 
 class _Bytes:
-    """A binary body, read in the same way; its units are the bytes of the file."""
+    """A binary body with the same methods, whose units are the bytes of the file."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -117,7 +117,7 @@ def parse(data: bytes) -> Source:
     normals = _triples(body, declared, columns, ("nx", "ny", "nz"))
     if normals is None or any(declared["vertex"][axis].type.kind != "f" for axis in ("nx", "ny", "nz")):
         return Source(data, coordinates, faces)
-    outside = (faces < 0) | (faces >= len(coordinates.values))  # refused by make_mesh, which says it better
+    outside = (faces < 0) | (faces >= len(coordinates.values))  # `make_mesh` refuses these with a better message
     return Source(data, coordinates, faces, Transported(normals, np.where(outside, -1, faces)))
 
 
@@ -158,18 +158,18 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
 
 
 def _type(name: str, order: str | None) -> np.dtype:
-    if order is None:  # the format comes first
+    if order is None:  # the line with the format must come first
         raise ValueError
     return np.dtype(order + _TYPES[name])
 
 
 def _locate(body: _Body, element: _Element, at: int) -> tuple[dict[str, _Column], int]:
-    """Where every property of an element stands, and where the next element begins."""
+    """Locate every property of an element, and the place where the next element begins."""
     properties = element.properties
     empty = np.zeros(0, np.int64)
     if element.rows == 0 or not properties:
         return {name: _Column(empty, empty) for name in properties}, at
-    # Nearly always all rows look like the first one.
+    # Nearly always, all rows have lists of the same lengths as the first one.
     offsets, sizes, counts = [], [], []
     end = at
     for name, kind in properties.items():
@@ -198,12 +198,12 @@ def _all_alike(body: _Body, rows: Int64[np.ndarray, " rows"], counts: list[tuple
     """Whether the lists of all rows are as long as the first row's, at these offsets."""
     try:
         return all(bool((body.integers(rows + offset, kind) == size).all()) for offset, kind, size in counts)
-    except JaxmarkError:  # something else stands there
+    except JaxmarkError:  # something other than an integer stands there
         return False
 
 
 def _locate_one_by_one(body: _Body, element: _Element, at: int) -> tuple[dict[str, _Column], int]:
-    """The same where rows differ."""
+    """Locate the properties of an element row by row, where rows differ."""
     starts: dict[str, list[int]] = {name: [] for name in element.properties}
     sizes: dict[str, list[int]] = {name: [] for name in element.properties}
     for row in range(element.rows):
@@ -223,7 +223,7 @@ def _locate_one_by_one(body: _Body, element: _Element, at: int) -> tuple[dict[st
 
 
 def _size(body: _Body, element: _Element, name: str, row: int, at: int) -> int:
-    """The length of a list."""
+    """Read the length of a list."""
     count = element.properties[name].length
     if count is None or at + body.width(count) > body.end:
         raise _ended(element, row)
@@ -245,7 +245,7 @@ def _triples(
     columns: dict[str, dict[str, _Column]],
     names: tuple[str, str, str],
 ) -> TextNumbers | BinaryNumbers | None:
-    """Three scalar properties of the vertices, or None if they are not declared."""
+    """Read three scalar properties of the vertices; None if they are not declared."""
     kinds = [declared.get("vertex", {}).get(name) for name in names]
     types = tuple(kind.type for kind in kinds if kind is not None and kind.length is None)
     if len(types) < 3:
@@ -254,7 +254,7 @@ def _triples(
 
 
 def _faces(body: _Body, kind: _Property, column: _Column) -> Int64[np.ndarray, "faces 3"]:
-    """The fanned triangles of a list of indices."""
+    """Read the faces of a list of indices, split into triangles."""
     if kind.length is None or kind.type.kind == "f":
         raise JaxmarkError("The indices of the element face must be a list of integers.")
     short = np.flatnonzero(column.sizes < 3)

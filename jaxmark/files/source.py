@@ -1,4 +1,4 @@
-"""A parsed mesh file that can be written again with other positions and otherwise the same bytes."""
+"""Parsed mesh files, which can be written again with other positions and otherwise the same bytes."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -9,28 +9,28 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 
 
 class Edits(NamedTuple):
-    """Byte spans of a file and what to put there; the spans do not overlap."""
+    """Byte spans of a file to be replaced by other bytes; the spans do not overlap."""
 
     starts: Int64[np.ndarray, " edits"]
     ends: Int64[np.ndarray, " edits"]
-    tokens: list[bytes]
+    tokens: list[bytes]  # the new bytes of each span, of any length
 
 
 class Overlay(NamedTuple):
-    """Numbers of a fixed size and the byte offsets where they go; a million are written in no time."""
+    """Numbers of a fixed size to be written at byte offsets, all at once, which is fast for a million of them."""
 
     starts: Int64[np.ndarray, " numbers"]
-    bytes: UInt8[np.ndarray, "numbers size"]
+    bytes: UInt8[np.ndarray, "numbers size"]  # the new bytes of each number
 
 
 @runtime_checkable
 class Numbers(Protocol):
-    """Triples of numbers (positions or normals) that stand somewhere in a file."""
+    """Triples of numbers in a file: its positions or normals."""
 
     values: Float64[np.ndarray, "rows 3"]
 
     def edits(self, values: Float64[np.ndarray, "rows 3"]) -> list[Edits | Overlay]:
-        """The edits that turn the old values into the new; numbers that did not change are not touched."""
+        """The edits that write new values; numbers that did not change are not touched."""
         ...
 
     def spacing(self, values: Float64[np.ndarray, "rows 3"]) -> float:
@@ -38,15 +38,15 @@ class Numbers(Protocol):
         ...
 
     def advice(self, step: float) -> str:
-        """What would make the spacing as small as `step`, as half a sentence."""
+        """Advise, as half a sentence, what would make the spacing as small as `step`."""
         ...
 
 
 @runtime_checkable
 class Normals(Protocol):
-    """Normals that stand in a file and follow its positions."""
+    """Normals of a file, which follow its positions."""
 
-    numbers: Numbers
+    numbers: Numbers  # the normals in the file
 
     def moved(
         self,
@@ -64,9 +64,9 @@ class Source:
 
     Attributes:
         data: the file's bytes.
-        coordinates: where the positions stand.
-        faces: `[F, 3]` zero-based indices into the positions; polygons are fanned.
-        normals: the normals to be recomputed, if the file has any.
+        coordinates: the positions in the file.
+        faces: `[F, 3]` zero-based indices into the positions; polygons are split into triangles.
+        normals: the normals that follow the positions, if the file has any.
     """
 
     data: bytes
@@ -80,7 +80,7 @@ class Source:
         return self.coordinates.values
 
     def edits(self, positions: Float64[np.ndarray, "points 3"]) -> list[Edits | Overlay]:
-        """All edits that move the points to `positions`."""
+        """All edits that write these positions and the normals that follow them."""
         edits = self.coordinates.edits(positions)
         if self.normals is not None:
             moved = self.normals.moved(self.positions, positions, self.faces)
@@ -88,7 +88,7 @@ class Source:
         return edits
 
     def patch(self, positions: Float64[np.ndarray, "points 3"]) -> bytes:
-        """The file with these positions: whatever is no coordinate or normal stays byte for byte.
+        """The file's bytes with these positions; whatever is no coordinate or normal stays byte for byte.
 
         Raises:
             JaxmarkError: if a position does not fit the file's number type.
@@ -97,12 +97,12 @@ class Source:
 
 
 def changed(old: Float64[np.ndarray, "rows 3"], new: Float64[np.ndarray, "rows 3"]) -> Bool[np.ndarray, "rows 3"]:
-    """Which numbers are to be written anew; a NaN normal is kept, though it does not equal itself."""
+    """Mask of the numbers to be written anew; a NaN normal is kept, though it does not equal itself."""
     return (old != new) & np.isfinite(new)
 
 
 def splice(data: bytes, changes: Iterable[Edits | Overlay]) -> bytes:
-    """Put in the changes, which may come in any order, and keep all other bytes."""
+    """Apply changes, which may come in any order, and keep all other bytes."""
     out = np.frombuffer(data, np.uint8).copy()
     edits = []
     for change in changes:
@@ -124,7 +124,7 @@ def splice(data: bytes, changes: Iterable[Edits | Overlay]) -> bytes:
 
 
 def ranges(starts: Int64[np.ndarray, " rows"], sizes: Int64[np.ndarray, " rows"]) -> Int64[np.ndarray, " total"]:
-    """The ranges `[start, start + size)` one after the other."""
+    """Concatenate the ranges `[start, start + size)`."""
     before = np.cumsum(sizes) - sizes
     return np.repeat(starts - before, sizes) + np.arange(sizes.sum())
 

@@ -1,4 +1,4 @@
-"""STL, binary and text: a triangle soup with three vertices of its own for every facet."""
+"""Parse STL, binary and text: a triangle soup in which every facet has three vertices of its own."""
 
 import re
 import struct
@@ -17,12 +17,12 @@ _FACET = (b"facet", b"normal", None, None, None, b"outer", b"loop", *_VERTEX * 3
 
 
 def parse(data: bytes) -> Source:
-    """Read a binary STL, known by its size, or else a text one.
+    """Read a binary STL, which is recognised by its size, or else a text one.
 
     Raises:
-        JaxmarkError: if the size fits no binary file and the text cannot be read; it names the line.
+        JaxmarkError: if the size fits no binary file and the text cannot be read; the message names the line.
     """
-    # Binary files may begin with "solid" as well, but a text of just this size is no accident to plan for.
+    # Binary files may begin with "solid", too; a text with just the size of a binary file is too unlikely to matter.
     facets = struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 0
     if len(data) == 84 + 50 * facets and len(data) >= 84:
         return _binary(data, facets)
@@ -43,7 +43,7 @@ def _binary(data: bytes, facets: int) -> Source:
 
 
 def _text(data: bytes) -> Source:
-    # Names may hold any words, so the lines that begin and end a solid are not read at all.
+    # Names of solids may hold any words, so the lines that begin and end a solid are not read at all.
     text = Text(data, blank(rb"(?i)(?<!\S)(?:end)?solid(?!\S)[^\n\r]*", unix(data)))
     facets = len(text) // len(_FACET)
     tokens = np.arange(facets * len(_FACET)).reshape(facets, len(_FACET))

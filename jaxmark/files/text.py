@@ -1,4 +1,4 @@
-"""Numbers in text files: found by byte span, read exactly, and written in the file's own style."""
+"""Read numbers of text files exactly, by their byte spans, and write them in the file's own style."""
 
 import re
 from functools import cached_property
@@ -10,18 +10,18 @@ from jaxtyping import Bool, Float64, Int64
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.source import Edits, Overlay, changed
 
-# What bytes.split() takes for white space.
+# The bytes that bytes.split() takes for white space.
 _SPACE = np.zeros(256, dtype=bool)
 _SPACE[list(b" \t\n\r\v\f")] = True
 
 
 def unix(data: bytes) -> bytes:
-    """A working copy of the same length in which lines end with a line feed, classic Mac files included."""
+    """Convert the line ends of classic Mac files to line feeds, so that byte offsets stay."""
     return data if b"\n" in data else data.replace(b"\r", b"\n")
 
 
 def blank(pattern: bytes, work: bytes) -> bytes:
-    """Overwrite what the pattern matches with as many spaces, so that byte offsets stay."""
+    """Overwrite all matches of a pattern with as many spaces, so that byte offsets stay."""
     return re.sub(pattern, lambda match: b" " * len(match[0]), work)
 
 
@@ -31,7 +31,7 @@ def without_comments(work: bytes) -> bytes:
 
 
 class Text:
-    """A file as tokens between white space.
+    """A text file as tokens between white space.
 
     Attributes:
         starts, ends: the byte span of each token, ascending.
@@ -42,7 +42,7 @@ class Text:
 
         Args:
             data: the file's bytes.
-            work: a copy of the same length, in which what is not to be read is blanked.
+            work: a copy of the same length, in which spaces stand for what is not to be read.
         """
         self._lines = unix(data)
         self.buffer = np.frombuffer(work + b"\n", np.uint8)
@@ -57,7 +57,7 @@ class Text:
         return len(self.starts)
 
     def lines(self) -> tuple[Int64[np.ndarray, " lines"], Int64[np.ndarray, " lines"]]:
-        """The first token of every line that has any, and how many tokens the line has."""
+        """The first token and the number of tokens of every line that has any."""
         line = np.searchsorted(np.flatnonzero(self.buffer == ord("\n")), self.starts)
         first = np.flatnonzero(np.diff(line, prepend=-1))
         return first, np.diff(first, append=len(self))
@@ -67,27 +67,27 @@ class Text:
         return self.buffer[self.starts[index] : self.ends[index]].tobytes()
 
     def error(self, start: SupportsInt, what: str) -> JaxmarkError:
-        """The exception for something wrong at a byte offset, with its line."""
+        """The exception for an error at a byte offset, whose line it names."""
         line = self._lines.count(b"\n", 0, int(start)) + 1
         return JaxmarkError(f"line {line}: {what}.")
 
     def seek(
         self, char: str, starts: Int64[np.ndarray, " spans"], ends: Int64[np.ndarray, " spans"]
     ) -> Int64[np.ndarray, " spans"]:
-        """Where the character, of either case, first stands in each span; the span's end where it does not."""
+        """The offset of a character's first occurrence, in either case, in each span; the span's end if it has none."""
         hits = np.flatnonzero((self.buffer == ord(char.lower())) | (self.buffer == ord(char.upper())))
         found = np.append(hits, len(self.buffer))[np.searchsorted(hits, starts)]
         return np.minimum(found, ends)
 
     def _converted(self, kind: type, starts: Int64[np.ndarray, " spans"], ends: Int64[np.ndarray, " spans"]) -> list:
-        """What `kind` makes of the bytes of each span; the spans ascend."""
+        """Convert the bytes of each span by `kind`; the spans ascend."""
         name = "whole number" if kind is int else "number"
         if len(starts) == 0:
             return []
         if (starts >= ends).any():
             raise self.error(starts[np.argmax(starts >= ends)], f"a {name} is missing")
         low, high = int(starts[0]), int(ends[-1]) + 1
-        # +1 where a span begins and -1 behind the byte that follows it: the sum says which bytes to keep.
+        # With +1 where a span begins and -1 behind the byte that follows it, the running sum marks the bytes to keep.
         steps = np.zeros(high - low + 1, np.int8)
         steps[starts - low] += 1
         steps[ends - low + 1] -= 1
@@ -109,7 +109,7 @@ class Text:
         """The numbers in ascending spans, as Python's `float` reads them.
 
         Raises:
-            JaxmarkError: if a span holds no number; it names the line.
+            JaxmarkError: if a span holds no number; the message names the line.
         """
         return np.array(self._converted(float, starts, ends), dtype=np.float64)
 
@@ -119,7 +119,7 @@ class Text:
         """The whole numbers in ascending spans.
 
         Raises:
-            JaxmarkError: if a span holds no whole number, or one beyond 18 digits; it names the line.
+            JaxmarkError: if a span holds no whole number, or one of more than 18 digits; the message names the line.
         """
         long = np.flatnonzero(ends - starts > 18)
         if len(long):
@@ -128,29 +128,29 @@ class Text:
 
 
 class Style(NamedTuple):
-    """How a file writes its numbers."""
+    """The style in which a file writes its numbers."""
 
     exponent: Bool[np.ndarray, " numbers"]  # whether the old token has an exponent
-    capital: Bool[np.ndarray, " numbers"]  # whether that exponent is written with E
-    decimals: int  # of tokens without exponent
-    mantissa: int  # decimals of tokens with exponent
+    capital: Bool[np.ndarray, " numbers"]  # whether that exponent is written with a capital E
+    decimals: int  # number of decimals of tokens without exponent
+    mantissa: int  # number of decimals of tokens with exponent
 
 
 class TextNumbers:
-    """Triples of numbers written as text; see `Numbers`."""
+    """Triples of numbers in a text file; see `Numbers`."""
 
     values: Float64[np.ndarray, "rows 3"]
 
     def __init__(self, text: Text, tokens: Int64[np.ndarray, "rows 3"], *, whole: bool = False) -> None:
-        """Read the tokens with these indices.
+        """Read tokens as numbers.
 
         Args:
             text: the file.
-            tokens: their indices, in any order.
-            whole: that the file declares them to be integers, so that nothing else may be written.
+            tokens: indices of the tokens, in any order.
+            whole: whether the file declares the numbers to be integers, so that nothing else may be written.
 
         Raises:
-            JaxmarkError: if one is not a number; it names the line.
+            JaxmarkError: if a token is not a number; the message names the line.
         """
         self._text = text
         self._whole = whole
@@ -176,14 +176,14 @@ class TextNumbers:
         decimals = int(after[fixed].max(initial=0))
         mantissa = int(after[exponent].max(initial=0))
         if len(fixed) and exponent.any() and size[fixed].max() > 0:
-            # Writers that mix both (%g) strip trailing zeros: the other tokens tell how many digits were meant.
+            # Programs that write both forms (%g) strip trailing zeros: tokens without exponent tell the digits meant.
             numbers = fixed[size[fixed] > 0]
             mantissa = max(mantissa, int((np.floor(np.log10(size[numbers])) + after[numbers]).max()))
         largest = int(np.floor(np.log10(size.max()))) + 1 if size.max(initial=0) > 0 else 0
         return Style(exponent, capital, max(0, min(decimals, 17 - largest)), min(mantissa, 16))
 
     def edits(self, values: Float64[np.ndarray, "rows 3"]) -> list[Edits | Overlay]:
-        """The tokens whose number changes by enough to be written differently."""
+        """The edits of the tokens whose number changes by enough to be written differently."""
         style = self._style
         moved = np.flatnonzero(changed(self.values, values))
         new = values.reshape(-1)[moved]
@@ -200,7 +200,7 @@ class TextNumbers:
         return [Edits(self._starts[moved[differs]], self._ends[moved[differs]], tokens[differs].tolist())]
 
     def spacing(self, values: Float64[np.ndarray, "rows 3"]) -> float:
-        """The largest step of the digits written for numbers that change, or of double precision if larger."""
+        """The largest step of the last digit of numbers that change, or of double precision if that is larger."""
         style = self._style
         moved = changed(self.values, values).reshape(-1)
         size = np.abs(values.reshape(-1))
@@ -213,7 +213,7 @@ class TextNumbers:
         return max(steps)
 
     def advice(self, step: float) -> str:
-        """How many decimals would do."""
+        """Advise how many decimals are enough."""
         if self._whole:
             return "declare its coordinates as float or double instead of integers"
         if step < np.spacing(np.abs(self.values).max()):
@@ -223,7 +223,7 @@ class TextNumbers:
 
 
 def _written(form: bytes, values: Float64[np.ndarray, " numbers"]) -> list[bytes]:
-    """Each value in this format; one formatting call for all is several times faster than one each."""
+    """Format each value; one call for all of them is several times faster than one call each."""
     return (form * len(values) % tuple(values.tolist())).split()
 
 
@@ -232,4 +232,4 @@ def _is_numeral(kind: type, token: bytes) -> bool:
         kind(token)
     except ValueError:
         return False
-    return b"_" not in token  # Python's own digit grouping, which no file format has
+    return b"_" not in token  # Python groups digits by underscores, no file format does

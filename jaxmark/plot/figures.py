@@ -1,4 +1,4 @@
-"""What all pictures share: a figure without a screen, styles of lines, and a PNG of it."""
+"""What all pictures share: figures that need no screen, styles of lines, and PNG files."""
 
 import io
 import os
@@ -9,24 +9,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxmark.confidence import Interval
 from jaxmark.extras import require
 from jaxmark.files.atomic import write_atomically
-from jaxmark.intervals import Interval
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of Okabe and Ito
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # the palette of Okabe and Ito
 MARKERS = "os^Dvx"
-BOUND = {"color": "black", "linestyle": "--"}  # of what is proven, not counted
+BOUND = {"color": "black", "linestyle": "--"}  # the line of a bound that is proven, not counted
 FIELD = "cividis"  # the colour map of values on meshes
-_MARKED = 12  # places on a line that a marker tells apart
+_MARKERS_PER_LINE = 12
 
 
 class Picture(NamedTuple):
-    """A figure; the last expression of a notebook's cell is shown."""
+    """A figure, which a notebook shows if it is the last expression of a cell."""
 
     figure: Any  # `matplotlib.figure.Figure`, for changes of your own
 
     def png(self) -> bytes:
-        """The picture as a file's bytes; the same each time."""
+        """The picture as the bytes of a PNG file, the same each time."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         self.figure.draw_without_rendering()  # colour bars find their places in the second pass
@@ -47,7 +47,16 @@ class Picture(NamedTuple):
 
 
 def panels(count: int, width: float, height: float, **options: Any) -> tuple[Any, Iterable[Any]]:
-    """A figure of panels side by side, each of a width and height in inches, and their axes.
+    """Make a figure of panels side by side.
+
+    Args:
+        count: number of panels.
+        width: width of each panel, in inches.
+        height: height of each panel, in inches.
+        options: options of matplotlib's `Figure.subplots`.
+
+    Returns:
+        The figure, and the axes of its panels.
 
     Raises:
         JaxmarkError: if matplotlib is missing.
@@ -60,18 +69,18 @@ def panels(count: int, width: float, height: float, **options: Any) -> tuple[Any
 
 
 def styles(points: int) -> Iterator[dict[str, Any]]:
-    """Colours and markers of lines, one after the other; of long lines a dozen points are marked."""
+    """Yield colours and markers for one line after the other; on a long line about a dozen points are marked."""
     for colour, marker in cycle(zip(COLOURS, MARKERS, strict=True)):
-        yield {"color": colour, "marker": marker, "markevery": max(1, points // _MARKED), "markersize": 5}
+        yield {"color": colour, "marker": marker, "markevery": max(1, points // _MARKERS_PER_LINE), "markersize": 5}
 
 
 def band(axes: Any, x: Float[np.ndarray, " points"], interval: Interval, colour: str) -> None:
-    """Shade an interval of confidence about a line."""
+    """Shade a confidence interval about a line."""
     axes.fill_between(x, interval.low, interval.high, color=colour, alpha=0.2, linewidth=0)
 
 
 def finish(axes: Any, **labels: Any) -> None:
-    """Axes, grid and, where lines have names, a legend."""
+    """Label the axes; add a grid and, if lines have names, a legend."""
     axes.set(**labels)
     axes.grid(alpha=0.3)
     if axes.get_legend_handles_labels()[1]:

@@ -1,4 +1,4 @@
-"""A mesh to turn and zoom in a notebook: trimesh's viewer, a page that holds three.js and needs no network."""
+"""Interactive views of meshes: trimesh's viewer, an HTML page that contains three.js and needs no network."""
 
 import html
 import os
@@ -10,15 +10,15 @@ from jaxtyping import Float
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.files.atomic import write_atomically
-from jaxmark.mesh import Mesh, diagonal, host_mesh
+from jaxmark.geometry.mesh import Mesh, diagonal, host_mesh
 from jaxmark.plot.figures import FIELD
 
 
 class Viewer(NamedTuple):
-    """A page with a mesh to turn; the last expression of a notebook's cell is shown."""
+    """An interactive view of a mesh, which a notebook shows if it is the last expression of a cell."""
 
-    page: str  # HTML, complete in itself
-    legend: str  # HTML, beneath it
+    page: str  # HTML with nothing loaded from outside
+    legend: str  # HTML of the colour scale beneath the page
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an HTML file for any browser, whole or not at all.
@@ -34,16 +34,16 @@ class Viewer(NamedTuple):
 
 
 def show(mesh: Mesh, values: Float[np.ndarray, " vertices"] | None = None, unit: str = "") -> Viewer:
-    """A viewer to turn a mesh in, which a notebook shows and any browser can, without network.
+    """Make an interactive view of a mesh, which notebooks and browsers show without network.
 
     Args:
         mesh: any mesh.
-        values: for each vertex, its colour, from 0 to the largest; plain without.
-        unit: of the values, for the legend.
+        values: one number for each vertex, shown as colours from 0 to the largest; without them the mesh is plain.
+        unit: unit of the values, for the legend.
 
     Raises:
-        JaxmarkError: if matplotlib is missing, or there is not one finite value for each vertex, or see
-            `jaxmark.mesh.diagonal`.
+        JaxmarkError: if matplotlib is missing, there is not one finite value for each vertex, or the mesh has no extent
+            (see `jaxmark.geometry.mesh.diagonal`).
     """
     require("matplotlib", "plot")
     import trimesh  # takes long to import
@@ -60,10 +60,10 @@ def show(mesh: Mesh, values: Float[np.ndarray, " vertices"] | None = None, unit:
         most = max(float(values.max()), 1e-300)
         colours = colormaps[FIELD](np.clip(np.asarray(values, np.float64) / most, 0, 1), bytes=True)
         legend = _legend([colormaps[FIELD](step) for step in np.linspace(0, 1, 9)], most, unit)
-    # At unit size, between the near and the far plane of the viewer's camera.
+    # A mesh of unit size lies between the near and the far plane of the viewer's camera.
     points = (mesh.vertices - np.mean(mesh.vertices, axis=0)) / diagonal(mesh)
     solid = trimesh.Trimesh(points, mesh.faces, vertex_colors=colours, process=False)
-    # Names, which would be random.
+    # Without names of our own, trimesh would choose random ones.
     scene = Scene({"mesh": solid}, camera=Camera("camera", fov=(60, 45)))
     scene.set_camera()
     return Viewer(scene_to_html(scene), legend)

@@ -1,4 +1,4 @@
-"""Meshes, shaded, with or without values on their vertices: without OpenGL."""
+"""Shaded pictures of meshes, with or without values on their vertices; without OpenGL."""
 
 import os
 from collections.abc import Sequence
@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxmark.mesh import Mesh, host_mesh
-from jaxmark.original import Original, residual
+from jaxmark.alignment.original import Original, residual
+from jaxmark.geometry.mesh import Mesh, host_mesh
 from jaxmark.plot.figures import FIELD, Picture, panels
-from jaxmark.visibility import masking
+from jaxmark.watermark.visibility import masking
 
 
 class View(NamedTuple):
@@ -18,17 +18,17 @@ class View(NamedTuple):
 
     title: str
     mesh: Mesh
-    values: Float[np.ndarray, " vertices"] | None = None  # colours, per vertex; plain shading without
-    unit: str = ""  # of the values, for the colour bar
+    values: Float[np.ndarray, " vertices"] | None = None  # shown as colours; plain shading without them
+    unit: str = ""  # unit of the values, for the colour bar
 
 
 def displacement(original: Original, moved: Mesh, title: str = "displacement") -> View:
-    """How far each vertex was moved, as a heat map.
+    """Make a heat map of how far each vertex was moved.
 
     Args:
-        original: from where.
+        original: the original, not moved.
         moved: a mesh of the same connectivity.
-        title: of the panel.
+        title: title of the panel.
 
     Raises:
         JaxmarkError: if the connectivity differs.
@@ -39,23 +39,25 @@ def displacement(original: Original, moved: Mesh, title: str = "displacement") -
 def visibility(
     original: Original, moved: Mesh, title: str = "visibility: displacement over what roughness hides"
 ) -> View:
-    """Displacement over `jaxmark.visibility.masking`: the same displacement shows more where the mesh is smooth.
+    """Make a heat map of displacement over what roughness hides.
+
+    The same displacement shows more where the mesh is smooth; see `jaxmark.watermark.visibility.masking`.
 
     Args:
-        original: from where.
+        original: the original, not moved.
         moved: a mesh of the same connectivity.
-        title: of the panel.
+        title: title of the panel.
 
     Raises:
         JaxmarkError: if the connectivity differs.
     """
-    percent, hidden = _percent(original, moved), original.on_host(masking(original))
+    percent, hidden = _percent(original, moved), original.to_host(masking(original))
     shown = np.divide(percent, hidden, out=np.zeros_like(percent), where=hidden > 0)
     return View(title, original.mesh, shown[original.weld.point], "% of diagonal")
 
 
-def exaggerated(original: Original, moved: Mesh, factor: float = 10) -> View:
-    """The original, with each vertex moved so many times as far; `moved` has its vertices in the same order."""
+def exaggerate(original: Original, moved: Mesh, factor: float = 10) -> View:
+    """Multiply the displacement of each vertex by a factor; `moved` has the original's vertices in their order."""
     vertices = original.mesh.vertices + factor * (moved.vertices - original.mesh.vertices)
     return View(f"{factor:g} × the displacement", original.mesh._replace(vertices=vertices))
 
@@ -67,8 +69,8 @@ def draw(views: Sequence[View], *, elevation: float = 15.0, azimuth: float = 25.
 
     Args:
         views: the panels, left to right.
-        elevation: of the eye above the horizon, degrees; +y is up.
-        azimuth: of the eye around the vertical, degrees; 0 looks along -z.
+        elevation: elevation of the eye above the horizon, in degrees; +y is up.
+        azimuth: azimuth of the eye around the vertical, in degrees; 0 looks along -z.
 
     Raises:
         JaxmarkError: if matplotlib is missing, or a mesh is unusable.
@@ -100,13 +102,14 @@ def _percent(original: Original, moved: Mesh) -> np.ndarray:
 
 
 def _rotation(elevation: float, azimuth: float) -> np.ndarray:
+    """Matrix that turns the direction of the eye, given in radians, to +z."""
     around = np.array([[np.cos(azimuth), 0, -np.sin(azimuth)], [0, 1, 0], [np.sin(azimuth), 0, np.cos(azimuth)]])
     down = np.array([[1, 0, 0], [0, np.cos(elevation), -np.sin(elevation)], [0, np.sin(elevation), np.cos(elevation)]])
     return down @ around
 
 
 def _paint(axes, view: View, turn: np.ndarray):
-    """Painter's algorithm: faces from back to front, lit from above the eye."""
+    """Draw a mesh by the painter's algorithm: faces from back to front, lit from above the eye."""
     from matplotlib.collections import PolyCollection
 
     mesh = host_mesh(view.mesh)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxmark.files import load_mesh, save_mesh
-from jaxmark.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh
 
 
 def written(folder: Path, name: str, data: bytes) -> Path:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
-from jaxmark.mesh import Mesh, make_mesh
+from jaxmark.geometry.mesh import Mesh, make_mesh
 from tests.files.helpers import noisy, shifted, written
 
 SUFFIXES = [".obj", ".off", ".ply", ".stl", ".glb"]

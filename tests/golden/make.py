@@ -9,9 +9,9 @@ import numpy as np
 import trimesh
 
 import jaxmark as jm
-from jaxmark.keys import SCHEME_VERSION
-from jaxmark.record import RECORD_SUFFIX
-from jaxmark.schemes import EigenScheme, HostScheme, KeyedScheme, Scheme
+from jaxmark.watermark.coding.keys import SCHEME_VERSION
+from jaxmark.watermark.record import RECORD_SUFFIX
+from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme, Scheme
 from tests.samples import rough_sphere
 
 FOLDER = Path(__file__).parent / str(SCHEME_VERSION)
@@ -28,7 +28,7 @@ MARKS: dict[str, Scheme] = {
 }
 
 
-def save(mesh: jm.Mesh, info: jm.EmbedInfo, name: str) -> None:
+def save(mesh: jm.Mesh, info: jm.watermark.EmbedInfo, name: str) -> None:
     """The marked file and its record."""
     jm.save_mesh(mesh, FOLDER / f"{name}.ply", like=FOLDER / "original.ply")
     (FOLDER / f"{name}.ply{RECORD_SUFFIX}").write_text(info.record.to_json())

@@ -1,0 +1,33 @@
+"""What the programs' command lines have in common."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import jaxmark as jm
+
+
+def make_parser(description: str | None) -> argparse.ArgumentParser:
+    """A parser whose help shows the program's docstring as it is laid out."""
+    return argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
+def add_meshes(parser: argparse.ArgumentParser, **options: Any) -> None:
+    """Any number of mesh files, at least one by default."""
+    parser.add_argument("meshes", **{"nargs": "+", "type": Path, "metavar": "MESH"} | options)
+
+
+def load(parser: argparse.ArgumentParser, path: str | Path) -> jm.Mesh:
+    """Load a mesh; a file that cannot be read ends the program like any other wrong argument."""
+    try:
+        return jm.load_mesh(path)
+    except jm.JaxmarkError as refusal:
+        parser.error(str(refusal))
+
+
+def json_file(text: str) -> Path:
+    """The type of an argument that names a JSON file to write, refused before hours of work rather than after."""
+    path = Path(text)
+    if path.suffix != ".json" or not path.parent.is_dir():
+        raise argparse.ArgumentTypeError(f"{path} cannot be written: it must end in .json, in a folder that exists")
+    return path

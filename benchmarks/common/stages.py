@@ -1,0 +1,149 @@
+"""The stages that `speed.py` measures, each in a fresh process: python stages.py STAGE FOLDER REPEAT.
+
+The folder has the mesh, `mesh.ply`; what is measured is printed as JSON. A stage is a function that makes from the
+folder, uncounted, the call that counts. It is no program of its own: `apart` runs this file.
+"""
+
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+
+import jaxmark as jm
+from jaxmark.alignment.alignment import align
+from jaxmark.alignment.original import make_original
+from jaxmark.spectral.chebyshev import filter
+from jaxmark.spectral.laplacian import Laplacian
+from jaxmark.watermark.budget import make_budget
+from jaxmark.watermark.schemes import EigenScheme, Scheme
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from common.filters import DEGREE, coefficients, reordered
+from common.marks import BUDGET, KEY, MESSAGE, write
+from common.tables import Row
+from common.timing import Call, median_time, timed
+
+COMPILING = ("/jax/core/compile/jaxpr_to_mlir_module_duration", "/jax/core/compile/backend_compile_duration")
+
+
+def with_gradients(operator: Laplacian, c: Any, x: Any) -> Any:
+    """The sum of the squares of f(Δ)x, and its gradients to coefficients and signal."""
+    return jax.value_and_grad(lambda c, x: jnp.sum(filter(operator, c, x) ** 2), (0, 1))(c, x)
+
+
+def filtering(folder: Path, function: Callable[..., Any]) -> Call:
+    """A function of operator, coefficients and signal, compiled beforehand."""
+    original = make_original(jm.load_mesh(folder / "mesh.ply"))
+    inputs = (original.operator, coefficients(DEGREE), original.signal)
+    return partial(jax.jit(function).lower(*inputs).compile(), *inputs)
+
+
+def embedding(folder: Path, **options: Any) -> Call:
+    return partial(jm.embed, jm.load_mesh(folder / "mesh.ply"), MESSAGE, KEY, **options)
+
+
+def writing(folder: Path, scheme: str | Scheme) -> Call:
+    """Embedding without reading back."""
+    mesh, budget = jm.load_mesh(folder / "mesh.ply"), make_budget(BUDGET)
+    return lambda: write(jm.make_marker(mesh, KEY, bits=8 * len(MESSAGE), scheme=scheme), MESSAGE, budget)
+
+
+def detecting(folder: Path) -> Call:
+    return partial(jm.detect, jm.load_mesh(folder / "marked.ply"), original=jm.load_mesh(folder / "mesh.ply"), key=KEY)
+
+
+def aligning(folder: Path, by_surface: bool) -> Call:
+    original, suspect = make_original(jm.load_mesh(folder / "mesh.ply")), jm.load_mesh(folder / "marked.ply")
+    return (
+        partial(align, original, suspect, "similarity") if by_surface else partial(align, original, reordered(suspect))
+    )
+
+
+def tuning(folder: Path) -> Call:
+    attacks = [("noise", 0.005), ("smoothing", 10)]
+    return partial(jm.tune, jm.load_mesh(folder / "mesh.ply"), attacks, BUDGET, key=jax.random.key(0))
+
+
+STAGES: Mapping[str, Callable[[Path], Call]] = {
+    "load": lambda folder: partial(jm.load_mesh, folder / "mesh.ply"),
+    "prepare": lambda folder: partial(make_original, jm.load_mesh(folder / "mesh.ply")),
+    "embed": partial(embedding, budget=BUDGET),  # leaves the marked mesh for those below
+    "embed, limits": embedding,
+    "embed, eigenvectors": partial(embedding, budget=BUDGET, scheme=EigenScheme()),
+    "write": partial(writing, scheme="keyed"),
+    "write, eigenvectors": partial(writing, scheme=EigenScheme()),
+    "detect": detecting,
+    "align, reordered": partial(aligning, by_surface=False),
+    "align, surfaces": partial(aligning, by_surface=True),
+    "tune, two attacks": tuning,
+    "filter": partial(filtering, function=filter),
+    "gradients": partial(filtering, function=with_gradients),
+}
+
+FILTERS = ("filter", "gradients")  # of the stages, those that are one function of arrays
+
+
+def work(stage: str, folder: Path, repeat: int) -> Row:
+    """Measure a stage in this process, which is a fresh one."""
+    compiling: list[float] = []
+
+    def hear(event: str, duration_secs: float, **_: str | int) -> None:
+        if event in COMPILING:
+            compiling.append(duration_secs)
+
+    jax.monitoring.register_event_duration_secs_listener(hear)
+    try:
+        call = STAGES[stage](folder)
+        compiling.clear()
+        with suppress(OSError):
+            Path("/proc/self/clear_refs").write_text("5")  # on Linux: the peak counts from here
+        held, start = resident("VmRSS"), time.perf_counter()
+        result: Any = jax.block_until_ready(call())
+    except jm.JaxmarkError as refusal:
+        return {"note": str(refusal)}
+    row: Row = {"first call, s": time.perf_counter() - start, "compiling, s": sum(compiling)}
+    row |= {"held, GB": held / 1e9, "peak, GB": resident("VmHWM") / 1e9}
+    if stats := jax.devices()[0].memory_stats():
+        row["device peak, GB"] = stats["peak_bytes_in_use"] / 1e9
+    if stage == "embed":
+        jm.save_mesh(result[0], folder / "marked.ply")
+    return row | ({"later calls, s": median_time(call, repeat, counted=True)} if repeat else {})
+
+
+def resident(field: Literal["VmRSS", "VmHWM"]) -> int:
+    """Bytes of memory held now or at most; `ru_maxrss`, if need be, also counts what started this process."""
+    try:
+        return 1024 * int(Path("/proc/self/status").read_text().split(field + ":")[1].split()[0])
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def apart(mesh: jm.Mesh, stages: Sequence[str], repeat: int = 0) -> Iterator[Row]:
+    """Measure stages one by one in processes of their own."""
+    with tempfile.TemporaryDirectory() as folder:
+        jm.save_mesh(mesh, Path(folder) / "mesh.ply")
+        for stage in stages:
+            command = [sys.executable, __file__, stage, folder, str(repeat)]
+            run, seconds = timed(subprocess.run, command, capture_output=True, text=True)
+            lost = {"note": f"ended with status {run.returncode}: {run.stderr.strip()[-200:]}"}
+            found = json.loads(run.stdout.splitlines()[-1]) if run.returncode == 0 else lost
+            yield {"vertices": len(mesh.vertices), "stage": stage} | found | {"process, s": seconds}
+
+
+def main() -> None:
+    stage, folder, repeat = sys.argv[1:]
+    print(json.dumps(work(stage, Path(folder), int(repeat))))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,31 @@
+"""Seconds of calls."""
+
+import statistics
+import time
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import jax
+
+P = ParamSpec("P")
+Result = TypeVar("Result")
+Call = Callable[[], object]
+PATIENCE = 60.0  # seconds, after which a call is not repeated
+
+
+def timed(call: Callable[P, Result], *args: P.args, **kwargs: P.kwargs) -> tuple[Result, float]:
+    """What a call returns, and its seconds."""
+    start = time.perf_counter()
+    return call(*args, **kwargs), time.perf_counter() - start
+
+
+def median_time(call: Call, repeat: int, *, counted: bool = False, patience: float = PATIENCE) -> float:
+    """Median seconds of a call, after one that does not count unless that has been; at least one."""
+    times: list[float] = []
+    for turn in range(counted, repeat + 1):
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        times.append(time.perf_counter() - start)
+        if turn and sum(times) > patience:
+            break
+    return statistics.median(times[not counted :])

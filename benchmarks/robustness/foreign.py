@@ -1,0 +1,272 @@
+"""Marks in what other programs make of them: python benchmarks/robustness/foreign.py MESH... [--case 64:8e-4 ...].
+
+Each suspect is a marked mesh after ATTACKS, turned, shifted, scaled by 0.01 to 100 and shuffled, written to a file and
+read by a process, `jaxmark detect`. Printed are whether the message is exact, what its reading proves, or how many
+bits, with their tag, such a suspect could carry at most where it does not read, and how far the pose found is from the
+true one. With --controls, also how often something is detected in suspects without this mark.
+"""
+
+import argparse
+import json
+import sys
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.random import Generator
+from scipy.spatial.transform import Rotation
+
+import jaxmark as jm
+from jaxmark.alignment.alignment import align
+from jaxmark.alignment.original import make_original
+from jaxmark.attacks import Attack
+from jaxmark.attacks.meshlab import apply_filter
+from jaxmark.confidence import clopper_pearson
+from jaxmark.extras import require
+from jaxmark.geometry.mesh import Mesh, compact, diagonal, used_vertices, weld, weld_mesh
+from jaxmark.geometry.pose import Pose
+from jaxmark.watermark.schemes import get_scheme
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from common.arguments import add_meshes, make_parser
+from common.attacks import parse
+from common.detection import compilation_cache, detect
+from common.marks import Case, add_schemes, mark, parse_case
+from common.tables import Row, head, line, save, say
+
+LEVEL = -6  # log10 of the false-positive probability that counts in the controls
+KEYS = 10  # that each of their suspects is read with
+NEEDED = ("igl", "fast_simplification", "pymeshlab", "skimage")
+
+
+def plain(mesh: Mesh) -> Mesh:
+    """Distinct points only, and of them those that faces use, as other programs want them."""
+    return compact(jm.make_mesh(*weld_mesh(mesh, weld(mesh.vertices))))
+
+
+def left(mesh: Mesh, share: float) -> int:
+    """How many faces are left when such a share of the edges goes."""
+    return round(len(mesh.faces) * (1 - share))
+
+
+def collapse(mesh: Mesh, share: float, _: Any) -> Mesh:
+    return plain(apply_filter("meshing_decimation_quadric_edge_collapse", mesh, targetfacenum=left(mesh, share)))
+
+
+def qslim(mesh: Mesh, share: float, _: Any) -> Mesh:
+    arrays = (np.asfortranarray(array) for array in mesh)
+    return plain(Mesh(*require("igl", "attacks").qslim(*arrays, left(mesh, share))[:2]))
+
+
+# Simplifiers of MeshLab and libigl beside the library's.
+KINDS = {
+    "none": Attack(lambda mesh, *_: mesh, "none", (0,), host=True),
+    "collapse": Attack(collapse, "share of the edges", (0.9,), host=True),
+    "qslim": Attack(qslim, "share of the edges", (0.9,), host=True),
+}
+# Those, and attacks of `jaxmark attack`, with their strengths.
+ATTACKS = """none; simplification 0.5; simplification 0.7; simplification 0.9; simplification 0.95;
+simplification 0.975; collapse 0.9; qslim 0.9; midpoint 1; loop 1; sqrt3 1; isotropic 1; isotropic 0.5; isotropic 2;
+iso-surface 100; iso-surface 200; poisson 8; cropping 0.1; cropping 0.3; cropping 0.5; cropping 0.8;
+simplification 0.7 + noise 0.001; cropping 0.3 + quantisation 9; simplification 0.5 + smoothing 50;
+added-geometry 1"""
+
+
+def attacked(mesh: Mesh, steps: str, seed: int) -> Mesh:
+    """A mesh after attacks one by one."""
+    return jm.attacks.chain(plain(mesh), [(KINDS.get(kind, kind), size) for kind, size in parse(steps)], seed=seed)
+
+
+def found_again(mesh: Mesh, rng: Generator) -> tuple[Mesh, Pose]:
+    """A mesh in any pose and scale, vertices and faces in any order; and the pose."""
+    scale = 10 ** rng.uniform(-2, 2)
+    pose = Pose(scale * Rotation.random(rng=rng).as_matrix(), scale * diagonal(mesh) * rng.normal(size=3))
+    order = rng.permutation(len(mesh.vertices))
+    faces = np.argsort(order)[mesh.faces]
+    return Mesh(pose(np.asarray(mesh.vertices))[order], rng.permutation(faces)), pose
+
+
+def pose_error(original: Mesh, true: Pose, found: Pose) -> float:
+    """RMS distance of the original's vertices from where the two poses, there and back, bring them; in diagonals."""
+    points = np.asarray(original.vertices)[used_vertices(original)]
+    return float(jm.distortion.rms(found(true(points)) - points)) / diagonal(original)
+
+
+def read(marker: jm.watermark.Marker, suspect: Mesh, source: Path, suffix: str, claim: bytes | None = None) -> Row:
+    """What a process of `jaxmark detect` says of a suspect's file, with a claimed message or without."""
+    run, seconds = detect(marker, suspect, source, suffix, claim=claim)
+    row: Row = {"seconds": seconds}
+    if run.returncode in (0, 1) and run.stdout:  # a process that cannot start ends with 1, too
+        return row | json.loads(run.stdout)
+    said = " ".join(run.stderr.split()[-60:]).removeprefix("jaxmark: ")
+    return row | {"note": ("refused: " if run.returncode == 2 else f"exit status {run.returncode}: ") + said}
+
+
+def failed(error: Exception) -> Row:
+    """A row for whatever another program raised."""
+    return {"note": f"attack failed: {type(error).__name__}: {' '.join(str(error).split())}"}
+
+
+def tried(marker: jm.watermark.Marker, marked: Mesh, message: bytes, source: Path, steps: str, seed: int) -> Row:
+    """One suspect, made and read."""
+    rng = np.random.default_rng([zlib.crc32(steps.encode()), seed])
+    try:
+        suspect, true = found_again(attacked(marked, steps, seed), rng)
+    except Exception as error:
+        return failed(error)
+    suffix = str(rng.choice([".ply", ".obj"]))
+    answer = read(marker, suspect, source, suffix)
+    alignment = answer.get("alignment") or {}
+    row = {"vertices": len(suspect.vertices), "faces": len(suspect.faces), "file": suffix}
+    row |= {name: answer.get(name) for name in ("log10_p", "coverage", "seconds", "note")}
+    row |= {name: alignment.get(name) for name in ("method", "residual", "pose")}
+    if row["pose"]:
+        found = Pose(*(np.array(row["pose"][name]) for name in Pose._fields))
+        row["pose_error"] = pose_error(marker.original.mesh, true, found)
+    if "message" in answer:
+        right = answer["message"] == message.hex()
+        row["message"] = "yes" if right else "WRONG" if answer["message"] else "no"
+        if not right:
+            # What a claim proves of the true message, exp(-SNR/2), is also a bound on what such a suspect could carry:
+            # the capacity of a Gaussian channel is at most SNR/2 nats, in however many dimensions.
+            claimed = read(marker, suspect, source, suffix, message).get("log10_p")
+            row["most_bits"] = None if claimed is None else float(np.floor(-claimed * np.log2(10)))
+    return row
+
+
+def measured(source: Path, scheme: str, wanted: Case, options: argparse.Namespace) -> Iterator[Row]:
+    """All rows of one mesh and case."""
+    for seed in range(options.seeds):
+        row: Row = {"seed": seed, "attack": "all"}
+        try:
+            made = mark(jm.load_mesh(source), get_scheme(scheme), wanted.bits, wanted.budget, options.noise, seed)
+        except jm.JaxmarkError as error:
+            yield row | {"note": f"not marked: {error}"}
+            continue
+        for steps in options.attacks:
+            yield row | {"attack": steps, "declared_noise": made.noise} | tried(*made[:3], source, steps, seed)
+
+
+def controls(sources: list[Path], scheme: str, wanted: Case, options: argparse.Namespace, trial: int) -> Iterator[Row]:
+    """One suspect, aligned once, that knows nothing of the keys it is read with."""
+    rng = np.random.default_rng([trial, 1])
+    source = sources[trial % len(sources)]
+    kind = ("unmarked", "other key", "other object")[trial // len(sources) % 3]
+    original, steps = jm.load_mesh(source), str(rng.choice(options.attacks))
+    row = {"mesh": source.name, "kind": kind, "attack": steps}
+    suspect = original
+    try:
+        if kind == "other key":
+            suspect = mark(original, get_scheme(scheme), wanted.bits, wanted.budget, options.noise, trial).marked
+        elif kind == "other object":
+            ball = trimesh.creation.icosphere(subdivisions=4)
+            rough = Mesh(ball.vertices * (1 + 0.05 * rng.normal(size=(len(ball.vertices), 1))), ball.faces)
+            others = [other for other in sources if other != source]
+            suspect = jm.load_mesh(others[rng.integers(len(others))]) if others else rough
+        suspect = found_again(attacked(suspect, steps, trial), rng)[0]
+    except Exception as error:
+        yield row | failed(error)
+        return
+    try:
+        aligned = align(make_original(original), suspect)
+    except jm.JaxmarkError as error:
+        yield row | {"note": f"refused: {error}"}
+        return
+    for _ in range(KEYS):
+        found = jm.make_marker(original, rng.bytes(32), bits=wanted.bits, scheme=scheme).detect(aligned)
+        yield row | {"log10_p": found.log10_p, "coverage": found.coverage}
+
+
+def summary(rows: list[Row]) -> str:
+    """How many of the controls count as detected, and how many would at most in the long run."""
+    text = [
+        "## Controls",
+        "",
+        head("suspects", "readings", f"log10 p ≤ {LEVEL}", "rate at most (95 %)", "no answer"),
+    ]
+    for kind in (*dict.fromkeys(row["kind"] for row in rows), "all"):
+        mine = [row for row in rows if kind in (row["kind"], "all")]
+        values = [row["log10_p"] for row in mine if "log10_p" in row]
+        hits = sum(value <= LEVEL for value in values)
+        most = clopper_pearson(hits, len(values), 0.9).high if values else 1.0
+        text += [line(kind, len(values), hits, f"{most:.2g}", len(mine) - len(values))]
+    notes = Counter(row["note"] for row in rows if "note" in row)
+    return "\n".join([*text, "", *(f"- {count} × {note}" for note, count in notes.most_common())])
+
+
+def tables(rows: list[Row]) -> str:
+    """A Markdown table for each case."""
+
+    def cell(value: Any) -> str:
+        text = "" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+        return text.replace("|", "\\|")
+
+    columns = ["mesh", "attack", "seed", "vertices", "message", "log10_p", "most_bits", "coverage", "method"]
+    columns += ["pose_error", "residual", "seconds", "note"]
+    text = []
+    for case in dict.fromkeys(row["case"] for row in rows):
+        mine = [row for row in rows if row["case"] == case]
+        text += [f"## {case}", "", head(*(column.replace("_", " ") for column in columns))]
+        text += [line(*(cell(row.get(column)) for column in columns)) for row in mine]
+        reads = Counter(row.get("message") for row in mine)
+        text += ["", f"Of {len(mine)} rows, {reads['yes']} read exactly and {reads['WRONG']} wrongly.", ""]
+    return "\n".join(text)
+
+
+def main() -> None:
+    parser = make_parser(__doc__)
+    add_meshes(parser)
+    parser.add_argument(
+        "--case",
+        nargs="+",
+        type=parse_case,
+        metavar="BITS:BUDGET",
+        default=[parse_case("64:8e-4"), parse_case("64:2e-4")],
+    )
+    add_schemes(parser, noise=0.0)
+    parser.add_argument("--attacks", nargs="+", default=[""], metavar="NAME", help="only those whose names have it")
+    parser.add_argument("--seeds", type=int, default=1, help="keys, messages, poses and random seeds")
+    parser.add_argument(
+        "--controls", type=int, default=0, help="how many other suspects, of the first case, each with 10 keys"
+    )
+    parser.add_argument("--output", type=Path, help="for foreign.md and .json, rewritten after each mesh and case")
+    options = parser.parse_args()
+    known = " ".join(ATTACKS.split()).split("; ")
+    options.attacks = [steps for steps in known if any(name in steps for name in options.attacks)]
+    if not options.attacks:
+        parser.error(f"No attack is named so; there are {', '.join(known)}.")
+    try:
+        for package in NEEDED:
+            require(package, "all")
+    except jm.JaxmarkError as missing:
+        sys.exit(str(missing))
+    cases = list(product(options.schemes, options.case))
+    rows: list[Row] = []
+    trials: list[Row] = []
+
+    def report() -> str:
+        text = tables(rows) + (f"\n{summary(trials)}\n" if trials else "")
+        if options.output:
+            save(options.output, "foreign", text, {"rows": rows, "controls": trials})
+        return text
+
+    with compilation_cache():
+        for source, (scheme, wanted) in product(options.meshes, cases):
+            for row in measured(source, scheme, wanted, options):
+                rows.append({"mesh": source.name, "case": f"{scheme}, {wanted.name}"} | row)
+                say(*rows[-1].values(), sep=", ")
+            report()
+    for trial in range(options.controls):
+        for row in controls(options.meshes, *cases[0], options, trial):
+            trials.append(row)
+            say(*row.values(), sep=", ")
+    print(report())
+
+
+if __name__ == "__main__":
+    main()

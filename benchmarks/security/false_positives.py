@@ -1,0 +1,174 @@
+"""How often a claimed message is "detected" where there is no mark: nominal probabilities against counted ones.
+
+For many keys and hard suspects, through `Marker.observe`, `detectors.claims` and `evidence.log10_p_claimed`, which
+`jaxmark.detect` calls. Every rate must not exceed its level (Clopper-Pearson, one-sided, 99.9 %), for each suspect, and
+the rate over all must be at least a thirtieth of it, at levels where that makes 10 hits or more (down to 1e-3 with the
+default number of keys): a bound that never fires proves nothing. As a control, the same checks of a bound with the
+exponent doubled must fail. The same for a message that was read: the best of all, paid for by the union bound, and
+without it as a control. Exit status 1 if a check does not end so.
+
+    python benchmarks/security/false_positives.py [--keys N] [--mesh FILE]
+"""
+
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+
+import jaxmark as jm
+from jaxmark.alignment.observation import Observation
+from jaxmark.confidence import clopper_pearson
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.budget import make_budget
+from jaxmark.watermark.carriers import make_chips
+from jaxmark.watermark.coding.message import encode
+from jaxmark.watermark.detectors import claims
+from jaxmark.watermark.evidence import any_of, log10_p_claimed, log10_p_read
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from common.arguments import load, make_parser
+from common.marks import BUDGET, write
+
+LEVELS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
+MESSAGE = b"m"
+BATCH = 500
+ENOUGH = 10  # hits
+
+
+def sample() -> Mesh:
+    """A rough sphere of 162 points."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    return jm.make_mesh(ball.vertices * (1 + 0.05 * np.random.default_rng(0).normal(size=(162, 1))), ball.faces)
+
+
+def suspects(marker: jm.watermark.Marker) -> dict[str, Observation]:
+    """What `detect` sees of meshes that know nothing of the keys tried."""
+    mesh, random = marker.original.mesh, np.random.default_rng(1)
+    vertices, size = mesh.vertices, marker.original.diagonal
+
+    def marked(seed: int, budget: float = BUDGET) -> Mesh:
+        other = jm.make_marker(mesh, jm.Key(bytes([seed] * 32)), bits=marker.bits, scheme=marker.scheme)
+        return write(other, MESSAGE, make_budget(budget))
+
+    half = (vertices[:, 0] > np.median(vertices[:, 0]))[:, None]
+    spike = np.zeros_like(vertices)
+    spike[7, 1] = 0.004 * size
+    two = np.zeros_like(vertices)
+    two[[3, 50], [0, 2]] = 0.004 * size
+    meshes = {
+        "noise": jm.attack(mesh, "noise", 0.005, seed=1),
+        "smoothed": jm.attack(mesh, "smoothing", 5, seed=0),
+        "smoothed, noised": jm.attack(jm.attack(mesh, "smoothing", 5, seed=0), "noise", 0.01, seed=2),
+        "quantised": jm.attack(mesh, "quantisation", 6, seed=0),
+        "other shape": mesh._replace(vertices=vertices * (1 + 0.1 * random.normal(size=(len(vertices), 1)))),
+        "marked under another key": marked(200),
+        "marked under two other keys": mesh._replace(vertices=(marked(201).vertices + marked(202).vertices) / 2),
+        "marked strongly, noised": jm.attack(marked(203, 8e-3), "noise", 0.005, seed=3),
+        "half lost": mesh._replace(vertices=vertices + half * size * random.normal(size=vertices.shape)),
+        "one vertex moved": mesh._replace(vertices=vertices + spike),
+        "two vertices moved": mesh._replace(vertices=vertices + two),
+        "moved along one axis": mesh._replace(
+            vertices=vertices + 1e-3 * size * np.sin(9 * vertices[:, [1]]) * [0, 0, 1]
+        ),
+        "heavy tails": mesh._replace(vertices=vertices + 1e-4 * size * random.standard_cauchy(vertices.shape)),
+        "affine": mesh._replace(vertices=vertices @ np.diag([1, 1.1, 0.9]) + 3),
+        "sign of the position": mesh._replace(vertices=vertices + 1e-3 * size * np.sign(vertices)),
+    }
+    seen = {name: marker.observe(suspect) for name, suspect in meshes.items()}
+    # As many columns for each, so that they stack; those of zeros are dropped.
+    columns = [one.nuisance for one in seen.values() if one.nuisance is not None]
+    if not columns:
+        return seen
+    none = jnp.zeros_like(columns[0])
+    return {name: one if one.nuisance is not None else one._replace(nuisance=none) for name, one in seen.items()}
+
+
+def best_claims(
+    marker: jm.watermark.Marker, seen: dict[str, Observation], keys: int, messages: list[bytes]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The best score of several messages, and its norm, `[keys, suspects, ways]`, under fresh keys."""
+    original = marker.original
+    reader: Any = marker.reader  # of a keyed carrier
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen.values())
+
+    @jax.jit
+    def best(chips, codewords):
+        def claim(received, chip, words):
+            other = reader.with_carrier(reader.carrier._replace(chips=chip))
+            score, norm = jax.lax.map(lambda word: claims(other, received, word), words)
+            return score.max(axis=0), norm.max(axis=0)
+
+        def claim_all(one):
+            received = reader.receive(one)
+            return jax.vmap(lambda chip, words: claim(received, chip, words))(chips, codewords)
+
+        return jax.lax.map(claim_all, stacked)
+
+    found = []
+    for start in range(0, keys, BATCH):
+        chips, words = [], []
+        for seed in range(start, start + BATCH):
+            key = jm.Key(seed.to_bytes(32, "little"))
+            chips.append(make_chips(key, original.geometry, original.moving, marker.code_bits))
+            words.append([encode(message, key, original.geometry, marker.code_bits) for message in messages])
+        batch = jax.tree.map(lambda *leaves: np.stack(leaves), *chips)
+        found.append([np.swapaxes(part, 0, 1) for part in best(batch, jnp.asarray(np.array(words), jnp.float32))])
+    scores, norms = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return scores, norms
+
+
+def united(bound: Callable[[float, float], float], scores: np.ndarray, norms: np.ndarray) -> np.ndarray:
+    """log10 p of the best way of weighing, paid for, `[keys, suspects]`."""
+    return np.vectorize(any_of)(*np.moveaxis(np.vectorize(bound)(scores, norms), -1, 0))
+
+
+def holds(values: np.ndarray, names: list[str], *, fires: bool, report: bool) -> bool:
+    """Whether no suspect exceeds a level and, if it must fire, all together come within a thirtieth of it."""
+    sound = True
+    for level in LEVELS:
+        hits = np.sum(values <= math.log10(level), axis=0)
+        lower = clopper_pearson(hits, len(values), 0.998).low
+        total, pairs = int(hits.sum()), values.size
+        low, high = clopper_pearson(total, pairs)
+        worst = int(np.argmax(hits))
+        least = level * pairs / 30
+        sound &= lower.max() <= level and (not fires or least < ENOUGH or total >= least)
+        if report:
+            print(
+                f"{level:7.0e} {total:8d} of {pairs}: {total / pairs:.2e} [{low:.2e}, {high:.2e}], nominal /"
+                f" {level * pairs / max(total, 1):5.1f}; most for {names[worst]!r}: {hits[worst] / len(values):.2e}"
+            )
+    return bool(sound)
+
+
+def main() -> None:
+    parser = make_parser(__doc__)
+    parser.add_argument("--keys", type=int, default=70_000, help="multiple of 500")
+    parser.add_argument("--mesh", help="by default a rough sphere of 162 points")
+    arguments = parser.parse_args()
+    mesh = load(parser, arguments.mesh) if arguments.mesh else sample()
+    marker = jm.make_marker(mesh, jm.Key(bytes([255] * 32)), bits=8 * len(MESSAGE))
+    seen = suspects(marker)
+    names = list(seen)
+    values = united(log10_p_claimed, *best_claims(marker, seen, arguments.keys, [MESSAGE]))
+    print("a message claimed: nominal, counted with 95 % interval")
+    passed = holds(values, names, fires=True, report=True)
+    control = holds(2 * values, names, fires=True, report=False)
+    every = [bytes([byte]) for byte in range(256)]
+    read = best_claims(marker, seen, max(BATCH, arguments.keys // 50 // BATCH * BATCH), every)
+    print("the best of all 256 messages, by the union bound")
+    union = holds(united(lambda s, n: log10_p_read(s, n, 8), *read), names, fires=False, report=True)
+    unpaid = holds(united(log10_p_claimed, *read), names, fires=False, report=False)
+    print(f"the bound {'holds' if passed else 'FAILS'}; with its exponent doubled it {'holds' if control else 'fails'}")
+    print(f"the union bound {'holds' if union else 'FAILS'}; left out, the bound {'holds' if unpaid else 'fails'}")
+    sys.exit(0 if passed and union and not control and not unpaid else 1)
+
+
+if __name__ == "__main__":
+    main()

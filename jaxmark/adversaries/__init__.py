@@ -1,0 +1,29 @@
+"""Attacks on a watermark by adversaries, one module for each kind of knowledge that they have.
+
+Those of `jaxmark.attacks` happen to any mesh; these are made against a watermark. Each attack on a mesh is an `Attack`,
+which can stand wherever a name in `ATTACKS` can; `ambiguity` attacks what a detection proves.
+"""
+
+from jaxmark.adversaries.ambiguity import Search as Search
+from jaxmark.adversaries.ambiguity import forge_original as forge_original
+from jaxmark.adversaries.ambiguity import search_key as search_key
+from jaxmark.adversaries.ambiguity import transplant as transplant
+from jaxmark.adversaries.blind import Family as Family
+from jaxmark.adversaries.blind import descent as descent
+from jaxmark.adversaries.blind import evolution as evolution
+from jaxmark.adversaries.blind import remarking as remarking
+from jaxmark.adversaries.blind import subtraction as subtraction
+from jaxmark.adversaries.collusion import Rule as Rule
+from jaxmark.adversaries.collusion import collude as collude
+from jaxmark.adversaries.collusion import combine as combine
+from jaxmark.adversaries.key_holder import erasure as erasure
+from jaxmark.adversaries.key_holder import erasure_by_descent as erasure_by_descent
+from jaxmark.adversaries.oracle import Counted as Counted
+from jaxmark.adversaries.oracle import boundary as boundary
+from jaxmark.adversaries.oracle import decide_by_score as decide_by_score
+from jaxmark.adversaries.oracle import decision_oracle as decision_oracle
+from jaxmark.adversaries.oracle import estimated_gradient as estimated_gradient
+from jaxmark.adversaries.oracle import quantise_scores as quantise_scores
+from jaxmark.adversaries.oracle import random_search as random_search
+from jaxmark.adversaries.oracle import randomise_scores as randomise_scores
+from jaxmark.adversaries.oracle import score_oracle as score_oracle

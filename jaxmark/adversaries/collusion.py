@@ -1,0 +1,90 @@
+"""Attacks by somebody who holds several copies of one mesh, each with a mark of its own, but not the original."""
+
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Float64, PRNGKeyArray
+
+from jaxmark.attacks.random import generator
+from jaxmark.attacks.registry import Attack, attack
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh, host_mesh, same_connectivity, weld, weld_mesh
+
+Rule = Literal["mean", "median", "minimum", "maximum", "mixing", "circumcentre"]
+
+_STRENGTHS = (1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
+
+
+def collude(others: Sequence[Mesh], rule: Rule) -> Attack:
+    """Combine a mesh with other copies of it, and jam the result.
+
+    Args:
+        others: the other copies, of the attacked mesh's connectivity.
+        rule: see `combine`.
+
+    Returns:
+        An attack; its strength is that of `jamming` after the copies are combined.
+
+    Raises:
+        JaxmarkError: if there is no such rule; when applied, if the mesh is of another connectivity.
+    """
+    _check(rule)
+    points = [weld_mesh(one, weld(one.vertices)) for one in map(host_mesh, others)]
+
+    def apply(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+        random = generator(key)
+        together = combine([mesh, *points], rule, random)
+        return attack(together, "jamming", strength, seed=int(random.integers(2**31)))
+
+    return Attack(apply, "RMS of jamming over the diagonal", _STRENGTHS, host=True)
+
+
+def combine(copies: Sequence[Mesh], rule: Rule, random: np.random.Generator) -> Mesh:
+    """Combine several copies of a mesh into one, which looks like them.
+
+    Args:
+        copies: meshes of one connectivity.
+        rule: the mean, median, minimum or maximum of each coordinate; `"mixing"`, each point from a copy drawn at
+            random; or `"circumcentre"`, the point of the copies' affine hull that is equally far from all of them.
+            Marks of one budget are equally far from the original, so this is the original's projection onto the hull:
+            of all affine combinations of the copies, the one with the least of the marks in it.
+        random: the random generator, which mixing uses.
+
+    Raises:
+        JaxmarkError: if there is no such rule or no copy, or their connectivity differs.
+    """
+    _check(rule)
+    if not copies or not all(same_connectivity(one, copies[0]) for one in copies):
+        raise JaxmarkError(f"Copies are put together if they share their connectivity; these {len(copies)} do not.")
+    stack = np.stack([np.asarray(one.vertices, np.float64) for one in copies])
+    return Mesh(_combine_positions(stack, rule, random), np.asarray(copies[0].faces))
+
+
+def _combine_positions(
+    copies: Float64[np.ndarray, "copies vertices 3"], rule: Rule, random: np.random.Generator
+) -> Float64[np.ndarray, "vertices 3"]:
+    match rule:
+        case "mean":
+            return copies.mean(axis=0)
+        case "median":
+            return np.median(copies, axis=0)
+        case "minimum":
+            return copies.min(axis=0)
+        case "maximum":
+            return copies.max(axis=0)
+        case "mixing":
+            point = weld(copies[0]).point  # all vertices at one point come from the same copy
+            who = random.integers(len(copies), size=point.max() + 1)[point]
+            return copies[who, np.arange(len(who))]
+        case "circumcentre":
+            sides = (copies[1:] - copies[0]).reshape(len(copies) - 1, -1)
+            # As far from each copy as from the first: ⟨e_i, Σ b_j e_j⟩ = ‖e_i‖²/2 for the sides e_i from the first.
+            products = sides @ sides.T
+            shares = np.linalg.lstsq(products, np.diagonal(products) / 2, rcond=1e-9)[0]
+            return copies[0] + (shares @ sides).reshape(copies[0].shape)
+
+
+def _check(rule: str) -> None:
+    if rule not in get_args(Rule):
+        raise JaxmarkError(f"Copies are put together by {', '.join(get_args(Rule))}, not {rule!r}.")

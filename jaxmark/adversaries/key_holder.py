@@ -1,0 +1,144 @@
+"""Attacks by somebody who holds original, key and message: the least displacement that defeats a claim of the message.
+
+They bound from below what any attacker must pay, and show whether attackers who know less fail for lack of knowledge or
+of skill. Pose and correspondence are found on the host; given them, the claim is a differentiable function of the
+displacement.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float64, PRNGKeyArray
+
+from jaxmark.adversaries.expected import strongest_evidence
+from jaxmark.alignment.alignment import align
+from jaxmark.alignment.observation import Observation
+from jaxmark.attacks.registry import Attack
+from jaxmark.distortion import rms
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.carriers.carrier import Reader
+from jaxmark.watermark.marking import Marker
+
+_UNIT = "RMS over the diagonal"
+_STRENGTHS = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
+
+_Way = Float64[np.ndarray, "points 3"]
+# A function that returns the evidence S/‖a‖ of a claim, and a displacement along which it rises.
+Slope = Callable[[Reader, Observation, Float[Array, " code"]], tuple[Float[Array, ""], Float[Array, "vertices 3"]]]
+
+
+def erasure(marker: Marker, message: bytes) -> Attack:
+    """Make an attack with the displacement that lowers the score of a claim most, in closed form.
+
+    With weights, gains and powers as the receiver finds them in the marked mesh, the score is linear in the
+    displacement, S + ⟨c, d⟩, and d = -ρ c/‖c‖ is the best displacement of its size: ρ = S/‖c‖ removes the whole score.
+    If subtracting the mark itself leaves less evidence, the attack does that instead: as far as its size allows, and
+    beyond that it reverses the mark.
+
+    Args:
+        marker: original, key, payload and scheme of the mark.
+        message: the message that was written.
+
+    Returns:
+        An attack on meshes of the original's connectivity; its strength is the RMS displacement of the vertices that
+        faces use, relative to the diagonal of the original's bounding box.
+
+    Raises:
+        JaxmarkError: if the message is of another size than the payload.
+    """
+    return _attack(marker, message, _linear_slope, 1)
+
+
+def erasure_by_descent(marker: Marker, message: bytes, *, steps: int = 20) -> Attack:
+    """Make the attack of `erasure` stronger by optimisation through all that the receiver does.
+
+    It so attacks what weights the evidence, too. It starts from the closed form. Each step moves towards the
+    displacement of the same size that lies against the gradient of S/‖a‖, by a share of 2/(k + 2) in step k (Frank,
+    Wolfe, Naval Research Logistics Quarterly 3, 1956); the suspect is aligned anew in each step.
+
+    Args:
+        marker: original, key, payload and scheme of the mark.
+        message: the message that was written.
+        steps: number of gradients; the best of as many displacements is returned.
+
+    Returns:
+        An attack like that of `erasure`.
+
+    Raises:
+        JaxmarkError: see `erasure`; or if `steps` is below 1.
+    """
+    if steps < 1:
+        raise JaxmarkError(f"An attack by descent needs at least one step, got {steps}.")
+    return _attack(marker, message, _slope, steps)
+
+
+def _attack(marker: Marker, message: bytes, slopes: Slope, steps: int) -> Attack:
+    """Make an attack that goes against a slope of the evidence, with `steps` gradients."""
+    original, reader = marker.original, marker.reader
+    marker.check_size(message)
+    codeword = jnp.asarray(marker.codeword(message), original.signal.dtype)
+
+    def apply(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+        if len(mesh.vertices) != len(original.positions):
+            raise JaxmarkError(
+                f"The mesh has {len(mesh.vertices)} points, the original {len(original.positions)}; only marks in the"
+                " original's own connectivity are erased so."
+            )
+        if strength == 0:
+            return mesh
+        # An attack gets each point only once, but a suspect has all vertices at the point.
+        start = np.asarray(mesh.vertices, np.float64)[original.weld.point]
+        faces = original.mesh.faces
+        given = align(original, Mesh(start, faces), "same")
+        seen, back = marker.observe(given), np.linalg.inv(given.pose.matrix)
+
+        def evaluate(seen: Observation) -> tuple[float, _Way]:
+            evidence, slope = slopes(reader, seen, codeword)
+            return float(evidence), -original.to_host(slope)
+
+        def resize(way: _Way) -> _Way:
+            return way * strength / max(float(rms(way[original.used])), 1e-300)
+
+        def displace(way: _Way) -> Mesh:
+            return Mesh(start + (original.diagonal * resize(way) @ back.T)[original.weld.point], faces)
+
+        def attempt(way: _Way) -> tuple[float, _Way, _Way]:
+            return (*evaluate(marker.observe(align(original, displace(way), "same"))), way)
+
+        # Two displacements in closed form: the one that lowers the score most, and the mark subtracted. The better of
+        # them is the start of the descent.
+        homewards = -original.to_host(seen.residual)
+        trials = [attempt(resize(way)) for way in (evaluate(seen)[1], homewards)]
+        _, against, way = min(trials, key=lambda one: one[0])
+        for step in range(steps - 1):
+            trials.append(attempt(way + (2 / (step + 3)) * (resize(against) - way)))
+            _, against, way = trials[-1]
+        # A step may raise the evidence, so the best of all displacements of this size is returned.
+        return mesh._replace(vertices=displace(min(trials, key=lambda one: one[0])[2]).vertices[original.weld.first])
+
+    return Attack(apply, _UNIT, _STRENGTHS, host=True)
+
+
+@jax.jit
+def _linear_slope(
+    reader: Reader, seen: Observation, codeword: Float[Array, " code"]
+) -> tuple[Float[Array, ""], Float[Array, "vertices 3"]]:
+    """Evidence of a claim, and slope of its score if all that the receiver learns is held fixed."""
+    received = reader.receive(seen)
+    slope = jax.grad(lambda residual: reader.linear_score(received, residual, codeword))(seen.residual)
+    return strongest_evidence(reader, received, codeword), slope
+
+
+@jax.jit
+def _slope(
+    reader: Reader, seen: Observation, codeword: Float[Array, " code"]
+) -> tuple[Float[Array, ""], Float[Array, "vertices 3"]]:
+    """Evidence of a claim, and its slope through all that the receiver does."""
+
+    def evidence(residual: Array) -> Array:
+        return strongest_evidence(reader, reader.receive(seen._replace(residual=residual)), codeword)
+
+    return jax.value_and_grad(evidence)(seen.residual)

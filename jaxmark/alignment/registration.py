@@ -1,0 +1,261 @@
+"""Find the pose of a suspect of foreign connectivity by its surface; on the host, deterministic, without the key.
+
+A whole suspect's principal axes are brought onto the original's in all 24 ways, and each pose is improved by trimmed
+closest points (Chetverikov et al., "Robust Euclidean alignment of 3D point sets: the trimmed iterative closest point
+algorithm", 2005), from either surface to the other, so that the scale is determined. If several poses fit, those by
+local shape (`jaxmark.alignment.features`) are tried, too, and turns about the axis of a round shape. A part is posed by
+local shape only. In both cases, the best pose is refined by distances along normals. trimesh's own registration is no
+alternative, because it compares against an absolute threshold.
+"""
+
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from jaxmark.alignment.features import FEATURE_SETTINGS, FeatureSettings, poses_by_features
+from jaxmark.geometry.mesh import unit, used_vertices, vertex_normals
+from jaxmark.geometry.pose import IDENTITY, Points, Pose, similarity
+from jaxmark.geometry.surfaces import Surface, sample
+
+
+@dataclass(frozen=True)
+class RegistrationSettings:
+    """Settings of registration; lengths are relative to an original that is about 1 in size."""
+
+    samples: int = 20_000  # points sampled on each surface
+    coarse_points: int = 300  # points on each surface by which the 24 first poses are improved and told apart
+    rough_points: int = 500  # vertices of the original by which all candidate poses are refined
+    fine_points: int = 2000  # points by which likely poses are improved, and the best ones refined and compared
+    kept_share: float = 0.8  # share of the closest pairs that a round of trimmed closest points keeps
+    rounds: int = 30  # largest number of rounds of closest points, and of the final refinement
+    comparison_rounds: int = 10  # rounds of refinement before poses are compared: enough to tell which one is the best
+    reach: float = 0.03  # distances up to this count in the first round of refinement, however small the others are
+    lost_distance: float = 0.005  # points that are further off count as this far off when poses are compared
+    likely_ratio: float = 2.0  # poses that leave up to this many times the least distance are pursued
+    whole_distance: float = 0.01  # the most that a whole suspect's pose may leave, several times what sampling leaves
+    distinct_poses: int = 32  # most poses that are pursued, which differ by more than `whole_distance`
+    best_poses: int = 4  # most poses that are refined by the fine points
+    round_ratio: float = 1.1  # a shape with two principal axes of widths within this ratio is round about the third
+    turn: float = 1.0  # in degrees, between the turns about the axis of a round shape
+    turned_poses: int = 100  # most of these turns that are pursued, those that fit best
+    feature_poses: int = 6  # most poses by local shape that are pursued
+    features: FeatureSettings = FEATURE_SETTINGS
+
+
+SETTINGS = RegistrationSettings()
+
+
+def register_whole(original: Surface, suspect: Surface, *, settings: RegistrationSettings = SETTINGS) -> Pose | None:
+    """Find the similarity that brings a suspect's surface onto an original's.
+
+    Args:
+        original: the surface of the welded points, about 1 in size.
+        suspect: in any pose and scale, with an area.
+        settings: see `RegistrationSettings`.
+
+    Returns:
+        The pose; None if much of the original is missing, or much else is beside it.
+
+    Raises:
+        JaxmarkError: if libigl is missing, or a surface has no area.
+    """
+    target, source = (sample(surface.mesh, settings.samples).points for surface in (original, suspect))
+    starts = _coarse(target, source, settings)
+    if not starts:
+        return None
+    used = np.flatnonzero(used_vertices(original.mesh))
+    chosen = used[np.random.default_rng(0).permutation(len(used))[: settings.fine_points]]
+    points, normals = np.asarray(original.mesh.vertices), vertex_normals(original.mesh)
+    if len(starts) > 1:  # the principal axes of a shape that is nearly symmetric leave small features to decide
+        starts += poses_by_features(original.mesh, suspect.mesh, settings.feature_poses, settings=settings.features)
+        starts += _turned(suspect, target, source, starts, settings)
+    for count in (settings.rough_points, settings.fine_points):
+        part, rounds = chosen[:count], settings.comparison_rounds
+        ends = [
+            refine(suspect, points[part], normals[part], start, rounds=rounds, settings=settings) for start in starts
+        ]
+        starts = sorted(ends, key=lambda end: _distance(suspect, points[chosen], end, settings))
+        starts = starts[: settings.best_poses]
+    return refine(suspect, points[used], normals[used], starts[0], settings=settings)
+
+
+def register_part(original: Surface, suspect: Surface, *, settings: RegistrationSettings = SETTINGS) -> Pose | None:
+    """Find the similarity that brings a suspect onto the part of the original that it shows, at least a fifth.
+
+    Args:
+        original: the surface of the welded points, about 1 in size.
+        suspect: in any pose and scale, with an area.
+        settings: see `RegistrationSettings`.
+
+    Returns:
+        The pose; None if local shape suggests none.
+
+    Raises:
+        JaxmarkError: if libigl is missing, or a surface has no area.
+    """
+    points, normals, _ = sample(suspect.mesh, settings.samples)
+    fine, rounds = slice(settings.fine_points), settings.comparison_rounds
+    ends = []
+    for start in poses_by_features(original.mesh, suspect.mesh, settings.feature_poses, settings=settings.features):
+        # Every point of a part has its place on the original, but not the other way round: the original is brought
+        # onto the part, and that map is inverted.
+        posed, along = start(points), unit(normals @ start.matrix.T)
+        back = refine(original, posed[fine], along[fine], IDENTITY, rounds=rounds, settings=settings)
+        ends.append((_distance(original, posed[fine], back, settings), start, back))
+    if not ends:
+        return None
+    _, start, back = min(ends, key=lambda end: end[0])
+    along = unit(normals @ start.matrix.T)
+    return start.then(refine(original, start(points), along, back, settings=settings).inverse())
+
+
+def _distance(surface: Surface, points: Points, pose: Pose, settings: RegistrationSettings) -> float:
+    """Mean distance of points from a surface, where points that are lost count as a bounded distance."""
+    distance = np.linalg.norm(surface.closest(points, pose)[0] - points, axis=1)
+    return float(np.mean(np.minimum(distance, settings.lost_distance)))
+
+
+def refine(
+    surface: Surface,
+    points: Points,
+    normals: Points,
+    pose: Pose,
+    *,
+    by_affine: bool = False,
+    rounds: int | None = None,
+    settings: RegistrationSettings = SETTINGS,
+) -> Pose:
+    """Bring a surface closer to points along their normals, by a similarity or an affine map (Gauss-Newton).
+
+    Args:
+        surface: the surface to be moved.
+        points: the points that it is brought to.
+        normals: unit normals at the points.
+        pose: the surface's pose to begin with.
+        by_affine: whether to fit an affine map instead of a similarity.
+        rounds: largest number of rounds; that of the settings unless given.
+        settings: the reach of the first round, and the number of rounds.
+
+    Returns:
+        The refined pose of the surface.
+    """
+    for number in range(settings.rounds if rounds is None else rounds):
+        closest, _ = surface.closest(points, pose)
+        distance = np.sum(normals * (closest - points), axis=1)
+        # If most of a shape fits in many poses, the rest must decide: in the first rounds nearly all points count.
+        near = np.abs(distance) <= max(4 * np.median(np.abs(distance)), settings.reach * 0.8**number) + 1e-12
+        near &= np.linalg.norm(closest - points, axis=1) <= 2 * np.abs(distance) + 1e-6
+        c, n, d = closest[near], normals[near], distance[near]
+        if by_affine:
+            columns = np.concatenate([(n[:, :, None] * c[:, None, :]).reshape(len(c), 9), n], axis=1)
+        else:
+            columns = np.concatenate([np.cross(c, n), np.sum(n * c, axis=1, keepdims=True), n], axis=1)
+        step = np.linalg.lstsq(columns, -d, rcond=1e-9)[0]
+        if by_affine:
+            change = Pose(np.eye(3) + step[:9].reshape(3, 3), step[9:])
+        else:
+            skew = np.cross(np.eye(3), step[:3])  # skew @ c = step[:3] × c
+            u, _, vt = np.linalg.svd(np.eye(3) + skew)
+            change = Pose((1 + step[3]) * (u @ vt), step[4:])
+        pose = pose.then(change)
+        if np.abs(step).max() < 1e-9:
+            break
+    return pose
+
+
+def _coarse(target: Points, source: Points, settings: RegistrationSettings) -> list[Pose]:
+    """Find the likeliest distinct poses by principal axes and closest points; none if all leave too much."""
+    forward, backward = KDTree(target), KDTree(source)
+    coarse, fine = slice(settings.coarse_points), slice(settings.fine_points)
+    ends = [
+        _closest_points(start, target[coarse], source[coarse], forward, backward, settings)
+        for start in _axes(target, source)
+    ]
+    least = min(off for _, off in ends)
+    improved = [
+        _closest_points(pose, target[fine], source[fine], forward, backward, settings)
+        for pose, off in ends
+        if off <= min(settings.likely_ratio * least, settings.whole_distance)
+    ]
+    distinct: list[Pose] = []
+    for pose, _ in sorted(improved, key=lambda end: end[1]):
+        posed = pose(source[coarse])
+        squares = [np.mean(np.sum((other(source[coarse]) - posed) ** 2, axis=1)) for other in distinct]
+        if all(square > settings.whole_distance**2 for square in squares):
+            distinct.append(pose)
+    return distinct[: settings.distinct_poses]
+
+
+def _axes(target: Points, source: Points) -> list[Pose]:
+    """The poses that bring the source's principal axes onto the target's, in all ways that do not mirror."""
+    (target_mean, wide, onto), (source_mean, size, of) = (_principal(points) for points in (target, source))
+    starts = []
+    for order, signs in product(permutations(range(3)), product([1, -1], repeat=3)):
+        change = np.eye(3)[list(order)] * signs
+        if np.linalg.det(change) > 0:
+            matrix = np.linalg.norm(wide) / np.linalg.norm(size) * onto @ change @ of.T
+            starts.append(Pose(matrix, target_mean - matrix @ source_mean))
+    return starts
+
+
+def _turned(
+    suspect: Surface, target: Points, source: Points, starts: list[Pose], settings: RegistrationSettings
+) -> list[Pose]:
+    """Turn poses about the axis of a round shape, upright and upside down, and keep the turns that fit locally best.
+
+    A wheel with teeth fits in as many poses as it has teeth.
+    """
+    (centre, wide, axes), (_, _, of) = _principal(target), _principal(source)
+    ratio, points = settings.round_ratio, target[: settings.coarse_points]
+    for column, is_round in ((0, wide[2] < ratio * wide[1]), (2, wide[1] < ratio * wide[0])):
+        if not is_round:
+            continue
+        axis = axes[:, column]
+        turns = Rotation.from_rotvec(np.arange(0, 360, settings.turn)[:, None] * axis, degrees=True).as_matrix()
+        ends = []
+        for upright in (True, False):
+            same = [start for start in starts if (axis @ start.matrix @ of[:, column] > 0) == upright]
+            if not same:
+                continue
+            best = min(same, key=lambda pose: _distance(suspect, points, pose, settings))
+            turned = [best.then(Pose(turn, centre - turn @ centre)) for turn in turns]
+            off = np.array([_distance(suspect, points, pose, settings) for pose in turned])
+            least = np.flatnonzero((off <= np.roll(off, 1)) & (off <= np.roll(off, -1)))
+            ends += [(off[place], turned[place]) for place in least]
+        return [pose for _, pose in sorted(ends, key=lambda end: end[0])[: settings.turned_poses]]
+    return []
+
+
+def _principal(points: Points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The mean of points, their widths along the principal axes, ascending, and these axes as columns."""
+    centre = points.mean(axis=0)
+    variance, axes = np.linalg.eigh(np.cov((points - centre).T))
+    return centre, np.sqrt(np.maximum(variance, 0)), axes * [1, 1, np.sign(np.linalg.det(axes))]
+
+
+def _closest_points(
+    pose: Pose, target: Points, source: Points, forward: KDTree, backward: KDTree, settings: RegistrationSettings
+) -> tuple[Pose, float]:
+    """Improve a similarity by trimmed iterative closest points, from source to target and from target to source.
+
+    Returns:
+        The pose, and the root mean square distance of the pairs that were kept in the last round.
+    """
+    off = np.inf
+    for _ in range(settings.rounds):
+        to_target, to_source = forward.query(pose(source)), backward.query(pose.inverse()(target))
+        scale = np.cbrt(abs(np.linalg.det(pose.matrix)))
+        pairs = [
+            (source, forward.data[to_target[1]], to_target[0]),
+            (backward.data[to_source[1]], target, to_source[0] * scale),
+        ]
+        share = settings.kept_share
+        kept = [(s[near], t[near], d[near]) for s, t, d in pairs for near in [d <= np.quantile(d, share)]]
+        before, off = off, float(np.sqrt(np.mean(np.concatenate([d for *_, d in kept]) ** 2)))
+        pose = similarity(np.concatenate([s for s, *_ in kept]), np.concatenate([t for _, t, _ in kept]))
+        if off > 0.99 * before:
+            break
+    return pose, off

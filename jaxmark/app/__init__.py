@@ -1,0 +1,1 @@
+"""Whole jobs on files: the command line, folders of files, the demo."""

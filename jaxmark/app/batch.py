@@ -1,0 +1,181 @@
+"""Mark and read mesh files, one at a time."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jaxmark import distortion
+from jaxmark.alignment.alignment import Align
+from jaxmark.alignment.original import residual
+from jaxmark.app.report import save_report
+from jaxmark.errors import JaxmarkError
+from jaxmark.files import SUFFIXES, load_mesh, save_mesh
+from jaxmark.files.atomic import replacing, write_atomically
+from jaxmark.watermark.coding.keys import Key
+from jaxmark.watermark.marking import Marker, make_marker
+from jaxmark.watermark.record import Record
+from jaxmark.watermark.schemes import DEFAULT_SCHEME
+from jaxmark.watermark.tracing import make_tracer
+
+
+class Told(NamedTuple):
+    """The outcome for one file."""
+
+    answer: dict[str, Any]  # for programs: values for JSON, except that numbers may not be finite
+    said: str  # for people: one sentence
+    done: bool = True  # False if nothing was detected, or the file was refused
+
+
+def mesh_files(folder: Path) -> list[Path]:
+    """List the files of a folder that have a mesh format's suffix, by name; hidden files are left out.
+
+    Raises:
+        JaxmarkError: if there is no such file.
+    """
+    found = sorted(
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")
+    )
+    if not found:
+        raise JaxmarkError(f"The folder {folder} has no mesh file ({', '.join(SUFFIXES)}).")
+    return found
+
+
+def mark_file(
+    original: Path,
+    marked: Path,
+    record: Path,
+    *,
+    key: Key,
+    message: bytes | None = None,
+    recipient: str | None = None,
+    budget: float | None = None,
+    limits: Mapping[str, float] | None = None,
+    noise: float,
+    scheme: str = DEFAULT_SCHEME,
+) -> Told:
+    """Mark a mesh file, and write the marked file and its record, both or neither.
+
+    Args:
+        original: the mesh file to mark.
+        marked: path of the marked file, with the same suffix.
+        record: path of the mark's record.
+        key: the key to mark with.
+        message: the message to write; None if `recipient` is given.
+        recipient: identifier of the recipient of this copy; None if `message` is given.
+        budget: see `embed`.
+        limits: see `embed`.
+        noise: see `embed`.
+        scheme: name of the scheme.
+
+    Raises:
+        JaxmarkError: see `embed`; also if the mark does not read from the written file, whose numbers are rounded.
+    """
+    mesh = load_mesh(original)
+    if (message is None) == (recipient is None):
+        raise JaxmarkError("Give either --message or --recipient.")
+    marker = None
+    if message is not None:
+        marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
+        result, info = marker.embed(message, budget, limits=limits, noise=noise, read_back=False)
+        prepared = marker.original
+        said, reads = f"{info.record.bits} bits", lambda mesh: marker.reads(mesh, message)
+    else:
+        if scheme != DEFAULT_SCHEME:
+            raise JaxmarkError(f"Fingerprints are carried by the scheme {DEFAULT_SCHEME!r}, not {scheme!r}.")
+        tracer, name = make_tracer(mesh, key), str(recipient)
+        result, info = tracer.fingerprint(name, budget, limits=limits)
+        prepared = tracer.marker.original
+        said, reads = f"fingerprint of {recipient}", lambda mesh: tracer.finds(mesh, name)
+    with replacing(marked) as draft, replacing(record) as record_draft:
+        save_mesh(result, draft, like=original)
+        # The mark must read from the written file, whose numbers are rounded.
+        written = load_mesh(draft)
+        if not reads(written):
+            if marker is not None and message is not None:
+                marker.check(result, message)
+            raise JaxmarkError(
+                f"Rounded to the numbers of {original}, the mark no longer reads; use a larger budget, or a file with"
+                " more digits."
+            )
+        write_atomically(record_draft, info.record.to_json().encode())
+    change = distortion.DisplacementSize.of(residual(prepared, written)[prepared.used])
+    answer = {
+        "rms": change.rms,
+        "max": change.max,
+        "bits": info.record.bits,
+        "scheme": info.record.scheme,
+        "content": info.record.content,
+        "record": str(record),
+        "marked": str(marked),
+    }
+    text = f"{said} → {marked}, RMS {change.rms:.3g} and max {change.max:.3g} of the diagonal; record → {record}"
+    return Told(answer, text)
+
+
+@dataclass
+class FileReader:
+    """Reads files as `detect` reads meshes; an original that several suspects share is prepared once."""
+
+    key: Key
+    bits: int | None
+    message: bytes | None
+    scheme: str | None  # name of the scheme for marks without a record
+    how: Align  # see `align`
+    alpha: float  # largest false-positive probability of a detection
+    _last: tuple[tuple[Path, Path | None], Marker] | None = field(default=None, init=False, repr=False)
+
+    def read(self, suspect: Path, original: Path, record: Path | None = None, report: Path | None = None) -> Told:
+        """Read one file.
+
+        Args:
+            suspect: the suspect's mesh file.
+            original: the unmarked mesh's file.
+            record: file of the mark's record.
+            report: folder for a picture of the alignment.
+
+        Raises:
+            JaxmarkError: see `detect`.
+        """
+        mesh = load_mesh(suspect)
+        marker = self._marker(original, record)
+        found = marker.detect(mesh, self.message, align=self.how)
+        aligned = found.alignment
+        if report is not None:
+            save_report(report, marker.original.mesh, mesh, aligned)
+        detected = found.detected(self.alpha)
+        answer = {
+            "detected": detected,
+            "log10_p": found.log10_p,
+            "log10_p_fitted": found.log10_p_fitted,
+            "message": None if found.message is None else found.message.hex(),
+            "scores": [float(score) for score in found.scores],
+            "coverage": found.coverage,
+            "alignment": {
+                "method": aligned.method,
+                "pose": {"matrix": aligned.pose.matrix.tolist(), "shift": aligned.pose.shift.tolist()},
+                "residual": aligned.residual,
+                "seconds": aligned.seconds,
+            },
+        }
+        read = f"message {answer['message']}" if found.message is not None else "no message could be read"
+        said = (
+            f"{'detected' if detected else 'nothing detected'}: {read}; false-positive probability at most"
+            f" 10^{found.log10_p:.1f} (--alpha {self.alpha:g})"
+        )
+        return Told(answer, said, detected)
+
+    def _marker(self, original: Path, record_file: Path | None) -> Marker:
+        if self._last is None or self._last[0] != (original, record_file):
+            record = None if record_file is None else Record.load(record_file)
+            if record is not None and self.scheme not in (None, record.scheme):
+                raise JaxmarkError(f"--scheme {self.scheme} contradicts the record, which says {record.scheme}.")
+            bits = self.bits
+            if bits is None and record is None and self.message is not None:
+                bits = 8 * len(self.message)
+            scheme = self.scheme or DEFAULT_SCHEME
+            marker = make_marker(load_mesh(original), self.key, bits=bits, record=record, scheme=scheme)
+            self._last = (original, record_file), marker
+        return self._last[1]

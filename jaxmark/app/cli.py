@@ -1,0 +1,549 @@
+"""The command line: files in, files and one answer out.
+
+Exit status 0: done, or detected. 1: `detect` found nothing, or `identify` nobody. 2: refused, with one sentence on
+standard error and no output file. With --json, standard output holds exactly one JSON object. For a folder, there is a
+line, or such an object, for each file, and the exit status is the worst of theirs.
+"""
+
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, NoReturn, get_args
+
+import click
+
+from jaxmark import distortion
+from jaxmark.alignment.alignment import Align
+from jaxmark.app.batch import FileReader, Told, mark_file, mesh_files
+from jaxmark.attacks import ATTACKS, chain, get_attack
+from jaxmark.errors import JaxmarkError
+from jaxmark.evaluation.study_file import load_study
+from jaxmark.extras import require
+from jaxmark.files import load_mesh, save_mesh
+from jaxmark.files.atomic import replacing, write_atomically
+from jaxmark.geometry.mesh import same_connectivity
+from jaxmark.watermark.budget import DEFAULT_LIMITS, make_budget
+from jaxmark.watermark.coding.keys import commitment, load_key, new_key, save_key
+from jaxmark.watermark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity
+from jaxmark.watermark.record import RECORD_SUFFIX, Record
+from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES
+from jaxmark.watermark.tracing import identify
+
+
+class _Hexadecimal(click.ParamType):
+    """A message as hexadecimal digits."""
+
+    name = "hex"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> bytes:
+        """Convert hexadecimal digits to bytes."""
+        if isinstance(value, bytes):
+            return value
+        try:
+            message = bytes.fromhex(value)
+        except ValueError:
+            message = b""
+        if not message:
+            self.fail(
+                f"{value!r} is not a message: give an even number of hexadecimal digits, e.g. c0ffee42.", param, ctx
+            )
+        return message
+
+
+class _Limit(click.ParamType):
+    """A metric and its upper limit."""
+
+    name = "name=value"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
+        """Convert `name=value` to the name and the number."""
+        if isinstance(value, tuple):
+            return value
+        name, _, number = value.partition("=")
+        try:
+            return name, float(number)
+        except ValueError:
+            self.fail(f"{value!r} is no limit: give a metric and a number, e.g. dame=0.008.", param, ctx)
+
+
+_MESH = click.Path(path_type=Path)
+_KEY = click.option("--key", "key_file", type=_MESH, required=True, help="Key file, from `jaxmark keygen`.")
+_JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
+_NOISE = click.option(
+    "--noise",
+    type=float,
+    default=NOISE,
+    show_default=True,
+    help="Noise that the message must survive: half width, relative to the mean distance of vertices to the centre.",
+)
+_ALIGN = click.option(
+    "--align",
+    "how",
+    type=click.Choice(get_args(Align)),
+    default="auto",
+    show_default=True,
+    help="same: vertex by vertex in order; similarity, affine: by surface, up to such a map; auto: first that fits.",
+)
+_ALPHA = click.option(
+    "--alpha",
+    type=float,
+    default=1e-6,
+    show_default=True,
+    help="Largest false-positive probability that counts as proof.",
+)
+_BUDGET = click.option(
+    "--budget",
+    type=float,
+    help="RMS displacement of the vertices, relative to the diagonal of the bounding box.",
+)
+_LIMIT = click.option(
+    "--limit",
+    "limits",
+    type=_Limit(),
+    multiple=True,
+    help="Upper limit on a metric of `jaxmark compare`; may be repeated.  [default, without --budget: "
+    + " ".join(f"{name}={value:g}" for name, value in DEFAULT_LIMITS.items())
+    + "]",
+)
+
+
+@click.group(
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Exit status: 0 done or detected, 1 nothing detected, 2 refused.",
+)
+@click.version_option(package_name="jaxmark", prog_name="jaxmark")
+def cli() -> None:
+    """Hide a keyed message in the vertex positions of a mesh, and read it again from a suspect.
+
+    \b
+    A first round:
+      jaxmark keygen owner.key
+      jaxmark embed model.ply marked.ply --key owner.key --message 0123456789abcdef
+      jaxmark attack marked.ply suspect.ply noise 0.001
+      jaxmark detect suspect.ply --original model.ply --key owner.key
+
+    Meshes are OBJ, PLY, OFF, STL or GLB. Keep the key secret, and keep the original: detection needs both.
+    """  # noqa: D301
+
+
+@cli.command()
+@click.argument("keyfile", type=_MESH)
+@_JSON
+def keygen(keyfile: Path, as_json: bool) -> None:
+    """Make a key of 256 random bits in a new file that only you can read.
+
+    The file is never overwritten, and there is no copy: without it a mark can be neither read nor proven.
+    """
+    key = new_key()
+    save_key(key, keyfile)
+    _answer(as_json, {"key_file": str(keyfile), "commitment": commitment(key)}, f"key → {keyfile}")
+
+
+@cli.command(name="embed")
+@click.argument("original", type=_MESH)
+@click.argument("marked", type=_MESH)
+@_KEY
+@click.option("--message", type=_Hexadecimal(), help="Hexadecimal digits; 16 of them are 64 bits.")
+@click.option("--recipient", help="Instead of a message: the recipient of this copy, for `jaxmark identify`.")
+@_BUDGET
+@_LIMIT
+@_NOISE
+@click.option(
+    "--scheme",
+    type=click.Choice(list(SCHEMES)),
+    default=DEFAULT_SCHEME,
+    show_default=True,
+    help="Scheme that carries the bits.",
+)
+@click.option("--record", "record_file", type=_MESH, help=f"File for the record.  [default: MARKED{RECORD_SUFFIX}]")
+@_JSON
+def embed_command(
+    original: Path,
+    marked: Path,
+    key_file: Path,
+    message: bytes | None,
+    recipient: str | None,
+    budget: float | None,
+    limits: tuple[tuple[str, float], ...],
+    noise: float,
+    scheme: str,
+    record_file: Path | None,
+    as_json: bool,
+) -> None:
+    """Mark ORIGINAL and write MARKED, of the same format; or every mesh file of a folder into another folder.
+
+    Only positions change (and normals, where the file has them); materials, colours, groups and comments stay byte by
+    byte. A record is written beside MARKED: it holds no secret, and with it nothing about the mark needs remembering.
+
+    For a folder, each file gets a line of output, and a refused file does not stop the others.
+    """
+    mark = partial(
+        mark_file,
+        message=message,
+        recipient=recipient,
+        budget=budget,
+        limits=dict(limits) or None,
+        noise=noise,
+        scheme=scheme,
+    )
+    _check_distinct(original=original, marked=marked)
+    if not original.is_dir():
+        record_file = record_file or marked.with_name(marked.name + RECORD_SUFFIX)
+        _check_outputs(original, marked)
+        _check_distinct(original=original, marked=marked, key=key_file, record=record_file)
+        told = mark(original, marked, record_file, key=load_key(key_file))
+        return _answer(as_json, told.answer, told.said)
+    if record_file is not None:
+        raise JaxmarkError("Each file of a folder has a record beside it; leave out --record.")
+    key = load_key(key_file)
+    marked.mkdir(parents=True, exist_ok=True)
+    _each(original, as_json, lambda file: mark(file, marked / file.name, marked / (file.name + RECORD_SUFFIX), key=key))
+
+
+@cli.command(name="detect")
+@click.argument("suspect", type=_MESH)
+@click.option("--original", type=_MESH, required=True, help="The unmarked mesh.")
+@_KEY
+@click.option("--bits", type=int, help=f"Payload, a multiple of 8.  [default: the record's, else {DEFAULT_BITS}]")
+@click.option(
+    "--message",
+    type=_Hexadecimal(),
+    help="A message that you claim is there; it can be proven even where it cannot be read.",
+)
+@click.option(
+    "--record",
+    "record_file",
+    type=_MESH,
+    help="The mark's record, which gives scheme and payload, and binds key and original.",
+)
+@click.option(
+    "--scheme",
+    type=click.Choice(list(SCHEMES)),
+    help=f"Without a record: scheme that carries the bits.  [default: {DEFAULT_SCHEME}]",
+)
+@_ALIGN
+@click.option("--report", type=_MESH, help="Folder for a picture of how SUSPECT was aligned (needs the extra `plot`).")
+@_ALPHA
+@_JSON
+def detect_command(
+    suspect: Path,
+    original: Path,
+    key_file: Path,
+    bits: int | None,
+    message: bytes | None,
+    record_file: Path | None,
+    scheme: str | None,
+    how: Align,
+    report: Path | None,
+    alpha: float,
+    as_json: bool,
+) -> None:
+    """Look for a mark in SUSPECT: a file in any pose, with the original's connectivity or not; or a folder of files.
+
+    Exit status 0 if the false-positive probability is at most --alpha, else 1. The probability holds for any suspect
+    made without the key, as long as key, original and a claimed message were fixed before the suspect was seen.
+
+    For a folder, each file gets a line of output, and the exit status is the worst of all. --original and --record may
+    then be folders, too, with files of the same names.
+    """
+    reader = FileReader(load_key(key_file), bits, message, scheme, how, alpha)
+    if suspect.is_dir():
+        _each(
+            suspect,
+            as_json,
+            lambda file: reader.read(
+                file,
+                _member(original, file.name),
+                None if record_file is None else _member(record_file, file.name + RECORD_SUFFIX),
+                None if report is None else report / file.name,
+            ),
+        )
+    told = reader.read(suspect, original, record_file, report)
+    _answer(as_json, told.answer, told.said)
+    sys.exit(0 if told.done else 1)
+
+
+@cli.command(name="identify")
+@click.argument("suspect", type=_MESH)
+@click.option("--original", type=_MESH, required=True, help="The unmarked mesh.")
+@_KEY
+@click.option(
+    "--recipients", type=_MESH, required=True, help="Text file with the recipients of copies, one identifier per line."
+)
+@click.option("--record", "record_file", type=_MESH, help="The record of a copy, which binds key and original.")
+@click.option(
+    "--top", type=click.IntRange(1), default=10, show_default=True, help="Number of recipients in the ranking."
+)
+@_ALPHA
+@_JSON
+def identify_command(
+    suspect: Path,
+    original: Path,
+    key_file: Path,
+    recipients: Path,
+    record_file: Path | None,
+    top: int,
+    alpha: float,
+    as_json: bool,
+) -> None:
+    """Name the recipients whose copies SUSPECT was made from.
+
+    Exit status 0 if somebody is accused: if the probability that any innocent recipient scores so high is at most
+    --alpha; else 1.
+    """
+    if not 0 < alpha < 1:
+        raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
+    try:
+        names = [line for line in recipients.read_text(encoding="utf-8").splitlines() if line]
+    except UnicodeDecodeError:
+        raise JaxmarkError(f"{recipients} is no text in UTF-8; give one identifier a line.") from None
+    if not names:
+        raise JaxmarkError(f"{recipients} names nobody; give one identifier a line.")
+    record = None if record_file is None else Record.load(record_file)
+    key = load_key(key_file)
+    found = identify(load_mesh(suspect), names, original=load_mesh(original), key=key, record=record, top=top)
+    accused = [one for one in found if one.log10_p <= math.log10(alpha)]
+    answer = {
+        "accused": [one.recipient for one in accused],
+        "ranking": [one._asdict() for one in found],
+        "recipients": len(names),
+    }
+    lines = [f"{one.recipient}: score {one.score:.1f}, probability at most 10^{one.log10_p:.1f}" for one in accused]
+    _answer(as_json, answer, "\n".join(lines) or f"nobody of {len(names)} is accused (--alpha {alpha:g})")
+    sys.exit(0 if accused else 1)
+
+
+# click keeps the lines of a paragraph that starts with \b.
+_KINDS = "\n".join(["\b", "KIND, and what STRENGTH is:", *(f"{name}: {entry.unit}" for name, entry in ATTACKS.items())])
+
+
+@cli.command(name="attack", epilog=_KINDS)
+@click.argument("source", metavar="IN", type=_MESH)
+@click.argument("target", metavar="OUT", type=_MESH)
+@click.argument("words", metavar="KIND STRENGTH [KIND STRENGTH]...", nargs=-1, required=True)
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**31 - 1),
+    default=0,
+    show_default=True,
+    help="Seed of the attack's random choices.",
+)
+@_JSON
+def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int, as_json: bool) -> None:
+    """Apply one attack or several to a mesh, to see what a mark survives.
+
+    OUT is the file IN with other positions, or a new file if faces change. The RMS displacement is printed if the
+    connectivity stays.
+    """
+    steps = _steps(words)
+    _check_outputs(source, target)
+    _check_distinct(IN=source, OUT=target)
+    mesh = load_mesh(source)
+    with replacing(target) as draft:
+        attacked = chain(mesh, steps, seed=seed)
+        same = same_connectivity(mesh, attacked)
+        save_mesh(attacked, draft, like=source if same else None)
+        change = distortion.displacement_size(mesh, load_mesh(draft))._asdict() if same else {"rms": None, "max": None}
+    answer = {"attacks": steps, "seed": seed, "vertices": len(attacked.vertices), "faces": len(attacked.faces)}
+    said = " + ".join(f"{kind} {strength:g}" for kind, strength in steps)
+    size = f"{len(attacked.vertices)} vertices and {len(attacked.faces)} faces"
+    how = f"RMS {change['rms']:.3g} of the diagonal" if same else f"a mesh of {size}"
+    _answer(as_json, {**answer, **change}, f"{said} → {target}, {how}")
+
+
+def _steps(words: tuple[str, ...]) -> list[tuple[str, float]]:
+    """Parse alternating names and strengths."""
+    kinds, strengths = words[::2], words[1::2]
+    for kind in kinds:
+        get_attack(kind)
+    if len(kinds) != len(strengths):
+        raise JaxmarkError(f"Give the strength of {kinds[-1]}, too: {get_attack(kinds[-1]).unit}.")
+    try:
+        return [(kind, float(strength)) for kind, strength in zip(kinds, strengths, strict=True)]
+    except ValueError as error:
+        raise JaxmarkError(f"A strength is a number: {error}.") from None
+
+
+@cli.command()
+@click.argument("original", type=_MESH)
+@click.argument("distorted", type=_MESH)
+@_JSON
+def compare(original: Path, distorted: Path, as_json: bool) -> None:
+    """Measure how DISTORTED differs from ORIGINAL, by all metrics.
+
+    rms, max, mrms, hausdorff and gl are relative to the original's bounding-box diagonal, dame is in radians, the
+    others lie between 0 and 1. Needs the extra `align`.
+    """
+    found = distortion.compare(load_mesh(original), load_mesh(distorted))._asdict()
+    lines = [
+        f"{name:<9} {'needs the same connectivity' if value is None else f'{value:.6g}'}"
+        for name, value in found.items()
+    ]
+    _answer(as_json, found, "\n".join(lines))
+
+
+@cli.command(name="capacity")
+@click.argument("mesh", type=_MESH)
+@_BUDGET
+@_LIMIT
+@_NOISE
+@click.option(
+    "--coverage", type=float, default=COVERAGE, show_default=True, help="Share of the vertices that may be left."
+)
+@_JSON
+def capacity_command(
+    mesh: Path,
+    budget: float | None,
+    limits: tuple[tuple[str, float], ...],
+    noise: float,
+    coverage: float,
+    as_json: bool,
+) -> None:
+    """Say how many bits the keyed scheme can hide in MESH so that they survive noise and the loss of vertices."""
+    bounds = make_budget(budget, dict(limits) or None)
+    bits = capacity(load_mesh(mesh), bounds.rms, limits=bounds.limits, noise=noise, coverage=coverage)
+    answer = {"bits": bits, "budget": bounds.rms, "limits": bounds.limits, "noise": noise, "coverage": coverage}
+    _answer(as_json, answer, f"{bits} bits at {bounds}, noise {noise:g}, coverage {coverage:g}")
+
+
+@cli.command()
+@click.argument("mesh", type=_MESH, required=False)
+@click.option("--output", type=_MESH, default=Path("demo-output"), show_default=True, help="Folder for the results.")
+@_JSON
+def demo(mesh: Path | None, output: Path, as_json: bool) -> None:
+    """Mark MESH, attack it, read it again, and write tables and pictures. Without MESH, a sample is used.
+
+    Needs the extra `plot`, and `attacks` for the sample.
+    """
+    from jaxmark.app.demo import run_demo
+
+    rows = run_demo(mesh, output, lambda line: click.echo(line, err=as_json))
+    if as_json:
+        _answer(True, {"output": str(output), "rows": [row._asdict() for row in rows]}, "")
+
+
+@cli.command(name="study")
+@click.argument("file", type=_MESH)
+@click.option("--output", type=_MESH, default=Path("study-output"), show_default=True, help="Folder for the results.")
+@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Number of processes.")
+@_JSON
+def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None:
+    """Run the study that a TOML FILE declares: what marks survive, with intervals and controls.
+
+    \b
+      seeds = 5
+      schemes = ["keyed", "host"]
+      payloads = [64]
+      budgets = [0.0008, {dame = 0.008}]
+      [meshes]
+      model = "model.ply"
+      [attacks]
+      noise = [0.001, 0.005]
+      smoothing = [10, 50]
+
+    Only meshes, with paths relative to the folder of FILE, and attacks are required. The command writes results.jsonl,
+    from which it resumes when run again, results.csv, rates.md and, with the extra `plot`, read.png and log10_p.png.
+    """  # noqa: D301
+    study = load_study(file)
+    output.mkdir(parents=True, exist_ok=True)
+    results = study.run(output / "results.jsonl", workers, _say)
+    results.save_csv(output / "results.csv")
+    table = results.markdown()
+    write_atomically(output / "rates.md", table.encode())
+    try:
+        require("matplotlib", "plot")
+    except JaxmarkError as error:
+        _say(f"No pictures: {error}")
+    else:
+        results.plot().save(output / "read.png")
+        results.plot("log10_p").save(output / "log10_p.png")
+    _answer(as_json, {"output": str(output), "readings": len(results.rows), "rates": results.rates()}, table.rstrip())
+
+
+def main() -> None:
+    """Run the command line; refused input ends with exit status 2 and one sentence."""
+    try:
+        cli(standalone_mode=False)
+    except click.exceptions.Exit as end:
+        sys.exit(end.exit_code)
+    except click.Abort:
+        _refuse("Interrupted.")
+    except Exception as error:  # status 1 would say "nothing detected"
+        _refuse(_sentence(error))
+
+
+def _sentence(error: Exception) -> str:
+    match error:
+        case click.ClickException():
+            said = error.format_message()
+        case JaxmarkError():
+            said = str(error)
+        case OSError():
+            said = f"{error.filename or 'A file'} cannot be used: {error.strerror or error}."
+        case _:
+            said = f"Unexpected {type(error).__name__}: {error}. Please report it, with the command and the files."
+    return " ".join(said.split())
+
+
+def _refuse(sentence: str) -> NoReturn:
+    click.echo(f"jaxmark: {sentence}", err=True)
+    sys.exit(2)
+
+
+def _say(line: str) -> None:
+    click.echo(line, err=True)
+
+
+def _each(folder: Path, as_json: bool, work: Callable[[Path], Told]) -> NoReturn:
+    """Work on the mesh files of a folder, print a line for each, and exit with the worst status."""
+    status = 0
+    for file in mesh_files(folder):
+        try:
+            told = work(file)
+        except Exception as error:
+            told, status = Told({"refused": _sentence(error)}, f"refused. {_sentence(error)}", False), 2
+        status = max(status, 0 if told.done else 1)
+        _answer(as_json, {"file": file.name, **told.answer}, f"{file.name}: {told.said}")
+    sys.exit(status)
+
+
+def _member(path: Path, name: str) -> Path:
+    """The path itself, or the file of that name in it if it is a folder."""
+    return path / name if path.is_dir() else path
+
+
+def _answer(as_json: bool, answer: Mapping[str, Any], text: str) -> None:
+    try:
+        click.echo(json.dumps(_finite(answer), allow_nan=False) if as_json else text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of our output has gone. The work is done, and the exit status still tells its outcome.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _finite(value: Any) -> Any:
+    """Replace numbers that JSON does not have by None."""
+    if isinstance(value, Mapping):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _check_outputs(source: Path, target: Path) -> None:
+    """Refuse, before any work is done, an output of another format than its source."""
+    if source.suffix.lower() != target.suffix.lower():
+        raise JaxmarkError(f"{target} must have the suffix of {source}, whose bytes it takes over.")
+
+
+def _check_distinct(**files: Path) -> None:
+    """Refuse two names for one file, which would write over an input."""
+    seen: dict[str, str] = {}
+    for name, path in files.items():
+        other = seen.setdefault(os.path.realpath(path), name)
+        if other != name:
+            raise JaxmarkError(f"{other} and {name} are the same file, {path}; give another name.")

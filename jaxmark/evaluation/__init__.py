@@ -1,0 +1,17 @@
+"""Evaluation: what a mark survives, by robustness curves and by studies with controls, and how strong it should be.
+
+`pictures` draws their results; `tune` chooses the strengths of the bands for the attacks that a mark must survive.
+"""
+
+from jaxmark.evaluation import pictures as pictures
+from jaxmark.evaluation._rates import Control as Control
+from jaxmark.evaluation._rates import Row as Row
+from jaxmark.evaluation._rates import rates as rates
+from jaxmark.evaluation._robustness import Reading as Reading
+from jaxmark.evaluation._robustness import Robustness as Robustness
+from jaxmark.evaluation._robustness import minimum_distortion as minimum_distortion
+from jaxmark.evaluation._robustness import robustness as robustness
+from jaxmark.evaluation.results import Results as Results
+from jaxmark.evaluation.study import Study as Study
+from jaxmark.evaluation.tuning import Tuned as Tuned
+from jaxmark.evaluation.tuning import tune as tune

@@ -1,0 +1,70 @@
+"""The readings of a study, and the rates at which they succeed."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from jaxmark.confidence import clopper_pearson
+from jaxmark.errors import JaxmarkError
+
+Control = Literal["marked", "unmarked", "wrong-key"]
+LOG10_LEVEL = -6.0  # log10 of the largest false-positive probability of a detection
+POINT = ("mesh", "scheme", "bits", "budget", "attack", "strength")  # the fields that a study varies, except seeds
+
+
+class Row(NamedTuple):
+    """One reading of a suspect."""
+
+    mesh: str
+    scheme: str
+    bits: int  # size of the payload
+    budget: str
+    attack: str
+    strength: float
+    unit: str  # unit of the strength
+    seed: int  # seed of key, message and attack
+    control: Control  # read: the mark with its key, the unmarked mesh with that key, or the mark with another key
+    read: bool  # the exact message was read, and its tag fits
+    wrong: bool  # another message was read, whose tag fits
+    bit_errors: float  # share of the message's bits that are wrong in the best guess; 1/2 if there is no guess
+    log10_p: float  # log10 of a bound on the false-positive probability, with the message unknown
+    detected: bool  # log10_p is at most `LOG10_LEVEL`
+    refusal: str  # a sentence that says why nothing could be read; empty otherwise
+    seconds: float  # duration of the reading, with the alignment unless the row before includes it
+    rms: float  # RMS displacement by the mark over the diagonal; 0 without a mark
+
+
+def rates(rows: Iterable[Row], by: Sequence[str] = (*POINT, "control"), level: float = 0.95) -> list[dict[str, Any]]:
+    """Count how often the message was read and how often a mark was detected, with exact intervals.
+
+    Args:
+        rows: the rows of a study.
+        by: fields of `Row` by which rows are grouped; the others are pooled.
+        level: confidence level of the intervals, in (0, 1); see `clopper_pearson`.
+
+    Returns:
+        For each group its fields of `by`; the number of `trials`; the counts `read` and `detected`, with the bounds
+        `read_low`, `read_high`, `detected_low` and `detected_high` on their rates; the mean of `bit_errors`; the median
+        `log10_p`, with `log10_p_least` and `log10_p_largest`.
+
+    Raises:
+        JaxmarkError: if there is no such field, or the level is out of range.
+    """
+    if unknown := [name for name in by if name not in Row._fields]:
+        raise JaxmarkError(f"A row has no field {unknown[0]!r}; there are {', '.join(Row._fields)}.")
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(getattr(row, name) for name in by), []).append(row)
+    found = []
+    for values, group in groups.items():
+        rate: dict[str, Any] = {**dict(zip(by, values, strict=True)), "trials": len(group)}
+        for name in ("read", "detected"):
+            rate[name] = sum(getattr(row, name) for row in group)
+            interval = clopper_pearson(rate[name], len(group), level)
+            rate[f"{name}_low"], rate[f"{name}_high"] = float(interval.low), float(interval.high)
+        p = [row.log10_p for row in group]
+        rate["bit_errors"] = float(np.mean([row.bit_errors for row in group]))
+        rate |= {"log10_p": float(np.median(p)), "log10_p_least": min(p), "log10_p_largest": max(p)}
+        found.append(rate)
+    return found

@@ -1,0 +1,184 @@
+"""What a mark survives: attacks of rising strength, and what is still read after each."""
+
+import math
+from collections.abc import Collection, Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from jaxmark.alignment.alignment import Alignment
+from jaxmark.attacks import Kind, attack, get_attack
+from jaxmark.distortion import Comparison, compare
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.coding.message import guess
+from jaxmark.watermark.marking import Marker
+
+
+class Reading(NamedTuple):
+    """What is read from one suspect, compared with what was written."""
+
+    read: bool  # the exact message was read, and its tag fits
+    wrong: bool  # another message was read, whose tag fits
+    bit_errors: float  # share of the message's bits that are wrong in the best guess; 1/2 if there is no guess
+    log10_p: float  # log10 of a bound on the false-positive probability, with the message unknown
+
+
+class Robustness(NamedTuple):
+    """What is read in each sample at each strength; a refused suspect counts as not read."""
+
+    strengths: Float64[np.ndarray, " epsilons"]
+    success: Bool[np.ndarray, "epsilons samples"]  # whether the exact message was read
+    bit_errors: Float64[np.ndarray, "epsilons samples"]  # see `Reading`
+    log10_p: Float64[np.ndarray, "epsilons samples"]
+    refusals: tuple[tuple[str, ...], ...]  # `[epsilons][samples]`; a sentence, empty where there is an answer
+
+
+class Trial(NamedTuple):
+    """An attack at one strength."""
+
+    strength: float
+    distortion: Comparison  # distortion of the suspect, relative to the marked mesh
+    log10_p: float  # log10 p of a claim of the message; 0 if the suspect is refused
+
+
+class Breaking(NamedTuple):
+    """The least distortion at which an attack on a mark succeeds."""
+
+    embedding: Comparison  # distortion of the marked mesh, relative to the original
+    weakest: Trial | None  # the weakest attack found that succeeds; None if not even the strongest does
+    curve: tuple[Trial, ...]  # all trials, weak ones first
+
+    def cost(self, metric: str) -> float:
+        """The attack's distortion over the mark's own.
+
+        It is infinite if the attack does not succeed, and NaN if its distortion is unknown or the mark has none.
+
+        Args:
+            metric: a field of `Comparison` that was measured.
+        """
+        if self.weakest is None:
+            return math.inf
+        attacked, marked = (getattr(one, metric) for one in (self.weakest.distortion, self.embedding))
+        return math.nan if attacked is None or not marked else attacked / marked
+
+
+NOTHING = Reading(False, False, 0.5, 0.0)  # the reading of a refused suspect
+
+
+def read(marker: Marker, suspect: Mesh | Alignment, message: bytes) -> Reading:
+    """Read a suspect, and compare what is read with the message.
+
+    Raises:
+        JaxmarkError: if the suspect cannot be aligned.
+    """
+    found = marker.detect(suspect)
+    said = found.message or guess(found.scores, marker.bits)
+    wrong = 0.5 if said is None else float(np.mean(_bits(said) != _bits(message)))
+    return Reading(found.message == message, found.message not in (None, message), wrong, found.log10_p)
+
+
+def robustness(
+    marker: Marker,
+    marked: Mesh,
+    message: bytes,
+    kind: Kind,
+    epsilons: Sequence[float] | None = None,
+    *,
+    samples: int = 5,
+) -> Robustness:
+    """Attack a marked mesh at several strengths, and read each suspect.
+
+    Args:
+        marker: the reader: original, key, payload and scheme.
+        marked: the mesh with the message in it.
+        message: the message that was written.
+        kind: a name in `ATTACKS`, or an `Attack` of your own.
+        epsilons: strengths, in the attack's unit; by default its usual ones.
+        samples: number of attacks at each strength, with the seeds 0, 1, …
+
+    Raises:
+        JaxmarkError: if there is no such attack, no strength, or no sample.
+    """
+    strengths = get_attack(kind).strengths if epsilons is None else tuple(epsilons)
+    if samples < 1 or not strengths:
+        raise JaxmarkError(f"robustness needs a strength and a sample, got {len(strengths)} and {samples}.")
+
+    def try_attack(strength: float, seed: int) -> tuple[Reading, str]:
+        try:
+            return read(marker, attack(marked, kind, strength, seed=seed), message), ""
+        except JaxmarkError as error:
+            return NOTHING, str(error)
+
+    rows = [[try_attack(strength, seed) for seed in range(samples)] for strength in strengths]
+
+    def column(name: str) -> np.ndarray:
+        return np.array([[getattr(reading, name) for reading, _ in row] for row in rows])
+
+    refusals = tuple(tuple(sentence for _, sentence in row) for row in rows)
+    return Robustness(np.array(strengths, float), column("read"), column("bit_errors"), column("log10_p"), refusals)
+
+
+def minimum_distortion(
+    marker: Marker,
+    marked: Mesh,
+    message: bytes,
+    kind: Kind,
+    *,
+    alpha: float = 1e-6,
+    metrics: Collection[str] = ("rms", "dame", "msdm2"),
+    seed: int = 0,
+    tolerance: float = 0.05,
+) -> Breaking:
+    """Find the least distortion at which an attack brings a mark below detection, by bisection of its strength.
+
+    The attack succeeds if not even a claim of the message is proven, or if the suspect is refused. Success is assumed
+    to be monotonic between the weakest and the strongest usual strength, which holds for one seed.
+
+    Args:
+        marker: the reader: original, key, payload and scheme.
+        marked: the mesh with the message in it.
+        message: the message that was written.
+        kind: a name in `ATTACKS`, or an `Attack` of your own; its usual strengths bound the search.
+        alpha: false-positive probability at which the reader detects, in (0, 1).
+        metrics: the metrics of `distortion.METRICS` by which distortion is measured.
+        seed: seed of the attack's random choices.
+        tolerance: ratio of strengths, minus 1, at which the bisection ends; strengths that are whole numbers are
+            bisected to a difference of 1.
+
+    Raises:
+        JaxmarkError: if there is no such attack or metric, or a number is out of range.
+    """
+    if not (0 < alpha < 1 and tolerance > 0):
+        raise JaxmarkError(f"alpha is in (0, 1) and tolerance positive, got {alpha:g} and {tolerance:g}.")
+    strengths = get_attack(kind).strengths
+    weak, strong = strengths[0], strengths[-1]
+    if not min(weak, strong) > 0:
+        raise JaxmarkError(f"The usual strengths of the attack must be positive to be bisected, got {strengths}.")
+    whole = all(float(one).is_integer() for one in strengths)
+    trials: list[Trial] = []
+
+    def detects(strength: float) -> bool:
+        log10_p, suspect = 0.0, attack(marked, kind, strength, seed=seed)
+        with suppress(JaxmarkError):  # what cannot be aligned is not detected
+            log10_p = marker.detect(suspect, message).log10_p
+        trials.append(Trial(strength, compare(marked, suspect, metrics), log10_p))
+        return log10_p <= math.log10(alpha)
+
+    if not detects(strong) and detects(weak):
+        held, broken = weak, strong
+        while abs(math.log(broken / held)) > math.log1p(tolerance):
+            middle = math.sqrt(held * broken)
+            middle = float(round(middle)) if whole else middle
+            if middle in (held, broken):
+                break
+            held, broken = (middle, broken) if detects(middle) else (held, middle)
+    trials.sort(key=lambda one: one.strength, reverse=strong < weak)
+    weakest = next((one for one in trials if one.log10_p > math.log10(alpha)), None)
+    return Breaking(compare(marker.original.mesh, marked, metrics), weakest, tuple(trials))
+
+
+def _bits(message: bytes) -> np.ndarray:
+    return np.unpackbits(np.frombuffer(message, np.uint8))

@@ -1,0 +1,101 @@
+"""Run the cells of a study on many workers; a file gets a line for each finished cell, so that a killed run resumes.
+
+Any `concurrent.futures` executor will do: processes here, or the workers of Dask, Ray or MPI.
+"""
+
+import json
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+from jaxmark.errors import JaxmarkError
+
+Cell = tuple[str | int | float, ...]  # values that JSON keeps as they are
+Row = Mapping[str, Any]
+Pool = Callable[[], AbstractContextManager[Executor]]
+_MAX_BROKEN_POOLS = 3  # in a row, without finishing a cell
+
+
+def processes(workers: int) -> Pool:
+    """Return a maker of pools of processes, which are spawned because forks of a started JAX would hang."""
+    return lambda: ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+
+
+def run(
+    cells: Sequence[Cell],
+    work: Callable[[Cell], Row],
+    pool: Pool,
+    output: str | os.PathLike[str],
+    say: Callable[[str], None] = lambda line: None,
+) -> list[dict[str, Any]]:
+    """Work on the cells that are not finished, with a new pool whenever one breaks.
+
+    Args:
+        cells: the cells, each once; they identify their rows.
+        work: function from a cell to its results, which JSON can hold; at the top level of a module if the workers are
+            processes.
+        pool: function that makes an executor; called again when one breaks, as a pool does when a process is killed.
+        output: file of JSON lines, `{"cell": [...], ...}`, each written to disk at once. It may hold other cells, too.
+        say: function that is called with a line about the progress after each cell.
+
+    Returns:
+        The rows of the cells in their order, including those of earlier runs.
+
+    Raises:
+        JaxmarkError: if three pools in a row break without finishing a cell.
+        Exception: whatever `work` raises; cells that were finished before are kept.
+    """
+    target, broken, start, count = Path(output), 0, time.monotonic(), None
+    while left := _unfinished(cells, target):
+        count = len(left) if count is None else count
+        missing = len(left)
+        try:
+            with pool() as executor:
+                futures = {executor.submit(work, cell): cell for cell in left}
+                try:
+                    for future in as_completed(futures):
+                        _append(target, {"cell": futures[future], **future.result()})
+                        broken, missing = 0, missing - 1
+                        pace = (time.monotonic() - start) / (count - missing)
+                        say(f"{len(cells) - missing}/{len(cells)}, about {missing * pace / 60:.0f} min left")
+                except BaseException:  # an interruption, too: cells that have not begun do not begin
+                    executor.shutdown(wait=False, cancel_futures=True)
+                    raise
+        except BrokenExecutor as error:
+            broken += 1
+            if broken == _MAX_BROKEN_POOLS:
+                raise JaxmarkError(f"{broken} pools of workers broke without finishing a cell: {error}") from None
+            say(f"{error} A new pool goes on.")
+    rows = {_cell(row): row for row in load_finished(target)}
+    return [rows[cell] for cell in cells]
+
+
+def load_finished(output: str | os.PathLike[str]) -> list[dict[str, Any]]:
+    """Load the rows of a file; a last line that a killed run left incomplete is cut off."""
+    path = Path(output)
+    text = path.read_bytes() if path.exists() else b""
+    whole = text[: text.rfind(b"\n") + 1]
+    if whole != text:
+        os.truncate(path, len(whole))
+    return [json.loads(line) for line in whole.splitlines()]
+
+
+def _unfinished(cells: Iterable[Cell], output: Path) -> list[Cell]:
+    there = {_cell(row) for row in load_finished(output)}
+    return [cell for cell in cells if cell not in there]
+
+
+def _cell(row: Row) -> Cell:
+    return tuple(row["cell"])
+
+
+def _append(output: Path, row: Row) -> None:
+    """Append a row by one write, and wait until it is on disk."""
+    with output.open("ab", buffering=0) as file:
+        file.write(json.dumps(row).encode() + b"\n")
+        os.fsync(file.fileno())

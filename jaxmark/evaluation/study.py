@@ -1,0 +1,263 @@
+"""Studies: what marks survive, over a declared grid of meshes, schemes, payloads, budgets, attacks and seeds."""
+
+import hashlib
+import json
+import os
+import pickle
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from jaxmark.alignment.alignment import Alignment, align
+from jaxmark.attacks import Attack, attack_each, get_attack
+from jaxmark.errors import JaxmarkError
+from jaxmark.evaluation._rates import LOG10_LEVEL, Control, Row
+from jaxmark.evaluation._robustness import NOTHING, read
+from jaxmark.evaluation.cells import Cell, Pool, processes, run
+from jaxmark.evaluation.results import Results
+from jaxmark.files import load_mesh
+from jaxmark.geometry.hashing import geometry_hash
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.budget import DEFAULT_LIMITS, Budget, make_budget
+from jaxmark.watermark.coding.keys import Key
+from jaxmark.watermark.marking import DEFAULT_BITS, Marker, make_marker
+from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme, get_scheme, parameters_of
+
+_SEEDS_PER_CELL = 5  # attacked by one call
+
+
+@dataclass(frozen=True)
+class Study:
+    """A grid of readings: every mesh with every scheme, payload and budget, after every attack, for each seed.
+
+    From each seed derive a key, a message and the random choices of the attack. Two controls are always read, too: the
+    same suspects without a mark, and the marked ones with another key.
+    """
+
+    meshes: Mapping[str, str | os.PathLike[str] | Mesh]  # files, or meshes, by their names
+    attacks: Mapping[str, Sequence[float] | Attack]  # strengths by name in `ATTACKS`, or attacks of your own
+    schemes: Sequence[str] | Mapping[str, str | Scheme] = (DEFAULT_SCHEME,)  # names, or schemes of your own by any name
+    payloads: Sequence[int] = (DEFAULT_BITS,)
+    budgets: Sequence[float | Mapping[str, float]] = (DEFAULT_LIMITS,)  # RMS over the diagonal, or limits on metrics
+    seeds: int = 5  # number of seeds: 0, 1, …
+
+    def __post_init__(self) -> None:
+        """Check the fields.
+
+        Raises:
+            JaxmarkError: if an attack, a scheme or a metric does not exist, a payload is no positive multiple of 8
+                bits, or there is nothing to do.
+        """
+        parts = {"mesh": self.meshes, "attack": self.attacks, "scheme": self._schemes, "budget": self._budgets}
+        parts |= {f"strength of {name!r}": self._strengths(name) for name in self.attacks if self._attack(name)}
+        for name, part in {**parts, "payload": self.payloads, "seed": range(self.seeds)}.items():
+            if not part:
+                raise JaxmarkError(f"A study needs at least one {name}.")
+        for bits in self.payloads:
+            if bits < 8 or bits % 8:
+                raise JaxmarkError(f"A payload is a positive multiple of 8 bits, got {bits}.")
+
+    def run(
+        self,
+        output: str | os.PathLike[str],
+        workers: int | Pool = 1,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> Results:
+        """Run the cells that are not finished, and return the results of all.
+
+        Args:
+            output: file of JSON lines, which grows while the study runs. The same study resumes where it was ended, and
+                a wider one takes over the cells that both have. Cells are identified by the content of mesh files and
+                the fields of schemes, but an attack of your own by its name only.
+            workers: number of processes, where 1 is this process; or a function that makes an executor (see
+                `jaxmark.evaluation.cells`). A script that asks for more than one must do so below
+                `if __name__ == "__main__":`, because the processes import it.
+            say: function that is called with a line about the progress after each cell.
+
+        Raises:
+            JaxmarkError: if a mesh cannot be read, or the study cannot be sent to workers. A refused
+                mesh or attack does not end a study: the sentence of the refusal stands in its rows.
+        """
+        cells = list(dict.fromkeys(self._cells()))
+        if isinstance(workers, int):
+            if workers < 1:
+                raise JaxmarkError(f"A study needs at least one worker, got {workers}.")
+            if workers > 1:
+                self._check_picklable()
+            workers = processes(workers) if workers > 1 else partial(ThreadPoolExecutor, 1)
+        try:
+            done = run(cells, partial(work, self), workers, output, say)
+        finally:
+            _marker.cache_clear()
+            _mark.cache_clear()
+        return Results(tuple(row for cell in done for row in self._rows(cell)))
+
+    @property
+    def _schemes(self) -> dict[str, Scheme]:
+        given = self.schemes if isinstance(self.schemes, Mapping) else {name: name for name in self.schemes}
+        return {name: get_scheme(scheme) for name, scheme in given.items()}
+
+    @property
+    def _budgets(self) -> dict[str, Budget]:
+        """Budgets by the names that they have in rows: `0.0008`, or `dame=0.008`."""
+        found = {}
+        for one in self.budgets:
+            if isinstance(one, Mapping):
+                found[" ".join(f"{name}={value}" for name, value in one.items())] = make_budget(limits=one)
+            else:
+                found[str(one)] = make_budget(one)
+        return found
+
+    def _attack(self, name: str) -> Attack:
+        given = self.attacks[name]
+        return given if isinstance(given, Attack) else get_attack(name)
+
+    def _strengths(self, name: str) -> Sequence[float]:
+        given = self.attacks[name]
+        return given.strengths if isinstance(given, Attack) else given
+
+    def _cells(self) -> Iterator[Cell]:
+        """All cells; those with the same marked meshes follow each other, so that each mesh is marked once."""
+        digests = {name: _digest(mesh) for name, mesh in self.meshes.items()}
+        schemes, budgets, count = self._schemes, self._budgets, self.seeds
+        blocks = [(first, min(_SEEDS_PER_CELL, count - first)) for first in range(0, count, _SEEDS_PER_CELL)]
+        for mesh, scheme, bits, budget, block in product(self.meshes, schemes, self.payloads, budgets, blocks):
+            fields = json.dumps([digests[mesh], schemes[scheme].name, parameters_of(schemes[scheme])])
+            digest = hashlib.sha256(fields.encode()).hexdigest()[:16]
+            for name in self.attacks:
+                for strength in self._strengths(name):
+                    yield mesh, scheme, bits, budget, name, float(strength), *block, digest
+
+    def _rows(self, cell: Mapping[str, Any]) -> Iterator[Row]:
+        mesh, scheme, bits, budget, attack, strength, *_ = cell["cell"]
+        unit = self._attack(attack).unit
+        for one in cell["readings"]:
+            detected = one["log10_p"] <= LOG10_LEVEL
+            yield Row(mesh, scheme, bits, budget, attack, strength, unit, detected=detected, **one)
+
+    def _check_picklable(self) -> None:
+        try:
+            pickle.dumps(self)
+        except Exception as error:  # pickle raises many types
+            raise JaxmarkError(
+                f"This study cannot be sent to other processes ({error}); define its attacks and schemes in a module,"
+                " or use one worker."
+            ) from None
+
+
+@dataclass(frozen=True)
+class _Point:
+    """What all cells with the same marked meshes share; seeds give keys and messages."""
+
+    cell: Cell  # identifies the point
+    mesh: str | os.PathLike[str] | Mesh = field(compare=False)
+    scheme: Scheme = field(compare=False)
+    bits: int = field(compare=False)
+    budget: Budget = field(compare=False)
+
+
+def work(study: Study, cell: Cell) -> dict[str, Any]:
+    """Compute a cell: one attack at one strength for a few seeds. At the top level, where workers find it."""
+    mesh, scheme, bits, budget, name, strength, first, count, digest = cell
+    point = _Point(
+        (mesh, scheme, bits, budget, digest),
+        study.meshes[str(mesh)],
+        study._schemes[str(scheme)],
+        int(bits),
+        study._budgets[str(budget)],
+    )
+    seeds = list(range(int(first), int(first) + int(count)))
+    return {"readings": list(_readings(point, study._attack(str(name)), float(strength), seeds))}
+
+
+def _readings(point: _Point, attack: Attack, strength: float, seeds: list[int]) -> Iterator[dict[str, Any]]:
+    """For each seed, read the marked suspect with its key and with another, and the unmarked suspect."""
+    marked = [_mark(point, seed) for seed in seeds]
+    meshes = [mesh for mesh, _ in marked] + [_original_mesh(point, seeds[0])] * len(seeds)
+    suspects = _attack_meshes(meshes, attack, strength, seeds + seeds)
+    for seed, (_, rms), suspect, control in zip(seeds, marked, suspects, suspects[len(seeds) :], strict=False):
+        yield from _read(point, suspect, seed, {"marked": seed, "wrong-key": seed + 1}, rms)
+        yield from _read(point, control, seed, {"unmarked": seed}, 0.0)
+
+
+def _attack_meshes(meshes: list[Mesh | str], attack: Attack, strength: float, seeds: list[int]) -> list[Mesh | str]:
+    """Attack meshes by one call, or one by one if any is refused; a refused mesh is replaced by the sentence."""
+    there = [(mesh, seed) for mesh, seed in zip(meshes, seeds, strict=True) if isinstance(mesh, Mesh)]
+    if not there:
+        return meshes
+    try:
+        found: list[Mesh | str] = [*attack_each([m for m, _ in there], attack, strength, seeds=[s for _, s in there])]
+    except JaxmarkError as error:
+        if len(there) == 1:
+            found = [f"Not attacked: {error}"]
+        else:
+            found = [_attack_meshes([mesh], attack, strength, [seed])[0] for mesh, seed in there]
+    made = iter(found)
+    return [next(made) if isinstance(mesh, Mesh) else mesh for mesh in meshes]
+
+
+def _read(
+    point: _Point, suspect: Mesh | str, seed: int, keys: Mapping[Control, int], rms: float
+) -> Iterator[dict[str, Any]]:
+    """Read a suspect with several keys, aligned once."""
+    found: Mesh | Alignment | str = suspect
+    for control, key in keys.items():
+        start, reading = time.perf_counter(), NOTHING
+        if not isinstance(found, str):
+            try:
+                marker = _marker(point, key)
+                found = align(marker.original, found) if isinstance(found, Mesh) else found
+                reading = read(marker, found, _message(seed, point.bits))
+            except JaxmarkError as error:
+                found = str(error)
+        told = {"refusal": found if isinstance(found, str) else "", "seconds": time.perf_counter() - start}
+        yield {"seed": seed, "control": control, **reading._asdict(), **told, "rms": rms}
+
+
+@lru_cache(maxsize=_SEEDS_PER_CELL + 1)  # the keys that a cell reads with
+def _marker(point: _Point, seed: int) -> Marker:
+    mesh = point.mesh if isinstance(point.mesh, Mesh) else load_mesh(point.mesh)
+    return make_marker(mesh, Key(_derive(seed, "key", 32)), bits=point.bits, scheme=point.scheme)
+
+
+@lru_cache(maxsize=_SEEDS_PER_CELL)
+def _mark(point: _Point, seed: int) -> tuple[Mesh | str, float]:
+    """Mark as strongly as the budget allows, readable or not; return the mesh, or why not, and the mark's RMS."""
+    rms, limits = point.budget
+    try:
+        mesh, info = _marker(point, seed).embed(
+            _message(seed, point.bits), rms, limits=limits or None, noise=0, read_back=False
+        )
+    except JaxmarkError as error:
+        return f"Not marked: {error}", 0.0
+    return mesh, info.rms
+
+
+def _original_mesh(point: _Point, seed: int) -> Mesh | str:
+    try:
+        return _marker(point, seed).original.mesh
+    except JaxmarkError as error:
+        return f"Not marked: {error}"
+
+
+def _message(seed: int, bits: int) -> bytes:
+    return _derive(seed, "message", bits // 8)
+
+
+def _derive(seed: int, label: str, size: int) -> bytes:
+    return hashlib.shake_256(f"jaxmark/study/{label}/{seed}".encode()).digest(size)
+
+
+def _digest(mesh: str | os.PathLike[str] | Mesh) -> str:
+    """Hexadecimal hash of a file's bytes, or of a mesh's geometry."""
+    if isinstance(mesh, Mesh):
+        return geometry_hash(mesh).hex()
+    try:
+        return hashlib.sha256(Path(mesh).read_bytes()).hexdigest()
+    except OSError as error:
+        raise JaxmarkError(f"Cannot read {os.fspath(mesh)}: {error.strerror}.") from None

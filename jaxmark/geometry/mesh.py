@@ -1,0 +1,264 @@
+"""Triangle meshes as arrays, checked once on the host.
+
+A `Mesh` is plain data: it goes through `jit`, `vmap` and `grad`. Everything in this module except the type itself
+runs on the host with NumPy, keeps float64, and says what is wrong before anything is traced.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float64, Int, Int64
+from numpy.typing import ArrayLike
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from jaxmark.errors import JaxmarkError
+
+
+class Mesh(NamedTuple):
+    """A triangle mesh.
+
+    Build one with `make_mesh` or `load_mesh`, which validate; the type itself checks nothing, because transformed
+    code rebuilds it with tracers.
+    """
+
+    vertices: Float[Array | np.ndarray, "vertices 3"]  # in the file's own units and order
+    faces: Int[Array | np.ndarray, "faces 3"]  # zero-based indices into `vertices`
+
+
+class Weld(NamedTuple):
+    """Which vertices are copies of one point (UV seams, triangle soup), and so must move together."""
+
+    point: Int64[np.ndarray, " vertices"]  # the point of each vertex; points are numbered by first occurrence
+    first: Int64[np.ndarray, " points"]  # the first vertex of each point
+
+
+def make_mesh(vertices: ArrayLike, faces: ArrayLike) -> Mesh:
+    """Validate arrays on the host and make a `Mesh` of them.
+
+    Args:
+        vertices: `[N, 3]` finite numbers; kept in float64.
+        faces: `[F, 3]` integers, zero-based, each in `[0, N)`. Degenerate faces, duplicate vertices, isolated
+            vertices, boundaries and non-manifold edges are all accepted.
+
+    Returns:
+        A mesh of NumPy arrays: float64 vertices, int64 faces.
+
+    Raises:
+        JaxmarkError: if a shape is wrong, there is no vertex or no face, a coordinate is not finite, or an index is
+            not an integer or out of range.
+    """
+    points = np.asarray(vertices)
+    triangles = np.asarray(faces)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise JaxmarkError(f"vertices must be an array [N, 3], got shape {points.shape}.")
+    if triangles.size == 0:
+        raise JaxmarkError("The mesh has no faces; a point cloud has no graph to filter on.")
+    if triangles.ndim != 2 or triangles.shape[1] != 3:
+        raise JaxmarkError(f"faces must be an array [F, 3], got shape {triangles.shape}; split polygons first.")
+    if not np.issubdtype(triangles.dtype, np.integer):
+        raise JaxmarkError(f"faces must be integers, got {triangles.dtype}.")
+    if np.iscomplexobj(points) or not np.issubdtype(points.dtype, np.number):
+        raise JaxmarkError(f"vertices must be real numbers, got {points.dtype}.")
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.all():
+        bad = int(np.argmin(finite))
+        raise JaxmarkError(
+            f"Vertex {bad} (zero-based) has a coordinate that is not a finite number: {points[bad].tolist()};"
+            " mend or remove it."
+        )
+    outside = ((triangles < 0) | (triangles >= len(points))).any(axis=1)
+    if outside.any():
+        bad = int(np.argmax(outside))
+        raise JaxmarkError(
+            f"Face {bad} (zero-based) refers to vertices {triangles[bad].tolist()}, but the mesh has"
+            f" {len(points)} vertices, numbered from 0."
+        )
+    return Mesh(points, np.ascontiguousarray(triangles, dtype=np.int64))
+
+
+def host_mesh(mesh: Mesh) -> Mesh:
+    """Convert a mesh of any arrays to validated NumPy arrays; raises as `make_mesh` does."""
+    return make_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def weld(vertices: Float[Array | np.ndarray, "vertices 3"]) -> Weld:
+    """Find the vertices at exactly the same position (-0.0 equals 0.0).
+
+    Args:
+        vertices: `[N, 3]` finite positions.
+
+    Returns:
+        The maps from vertices to points and back; `vertices[weld.first]` are the distinct points.
+    """
+    canonical = np.asarray(vertices, np.float64) + 0.0  # turns -0.0 into 0.0
+    # The sort is stable: the copies of a point stand together, its first vertex first.
+    order = np.lexsort(canonical.T)
+    rows = canonical[order]
+    fresh = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))
+    owner = np.empty_like(order)
+    owner[order] = order[fresh][np.cumsum(fresh) - 1]
+    first = owner == np.arange(len(owner))
+    return Weld((np.cumsum(first) - 1)[owner], np.flatnonzero(first))
+
+
+def weld_mesh(mesh: Mesh, welded: Weld) -> Mesh:
+    """The mesh of the distinct points: the same faces, as indices of points instead of vertices."""
+    return Mesh(np.asarray(mesh.vertices)[welded.first], welded.point[np.asarray(mesh.faces)])
+
+
+def edges(faces: Int[Array | np.ndarray, "faces 3"]) -> Int64[np.ndarray, "edges 2"]:
+    """The undirected edges of the faces, sorted, as `[E, 2]` with the smaller index first.
+
+    An edge counts once, whether one face has it, two, or more. A side of a degenerate face that joins a vertex to
+    itself is no edge.
+    """
+    return _count_sides(faces)[0]
+
+
+def sides(
+    faces: Int[Array | np.ndarray, "faces 3"],
+) -> tuple[Int64[np.ndarray, "sides 2"], Int64[np.ndarray, " sides"]]:
+    """The directed sides of the faces, and the corner opposite to each.
+
+    The first sides of all faces come first, then all second sides, then all third.
+    """
+    faces = np.asarray(faces, np.int64)
+    turned = [faces, faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]]
+    return np.concatenate([face[:, :2] for face in turned]), np.concatenate([face[:, 2] for face in turned])
+
+
+def diagonal(mesh: Mesh) -> float:
+    """Length of the bounding-box diagonal, in the mesh's units; all distortions are relative to it.
+
+    The box is axis-aligned, and contains the vertices that faces use.
+
+    Raises:
+        JaxmarkError: if it is zero, because all these vertices coincide, or not finite.
+    """
+    used = np.asarray(mesh.vertices, np.float64)[used_vertices(mesh)]
+    length = math.hypot(*np.ptp(used, axis=0))
+    if not 0.0 < length < np.inf:
+        raise JaxmarkError(
+            f"The bounding box of the mesh has a diagonal of {length:g}; it must be positive and finite."
+        )
+    return length
+
+
+def vertex_normals(mesh: Mesh) -> Float64[np.ndarray, "vertices 3"]:
+    """Unit normals of vertices: area-weighted means of the face normals; zero where these cancel or have no area."""
+    corner, normals, size = np.ravel(mesh.faces), _area_vectors(mesh), len(mesh.vertices)
+    return unit(np.stack([np.bincount(corner, np.repeat(column, 3), size) for column in normals.T], axis=1))
+
+
+def face_normals(mesh: Mesh) -> Float64[np.ndarray, "faces 3"]:
+    """Unit normals of faces; zero where a face has no area."""
+    return unit(_area_vectors(mesh))
+
+
+def boundary_vertices(faces: Int[Array | np.ndarray, "faces 3"]) -> Int64[np.ndarray, " boundary"]:
+    """Indices of the vertices on edges that only one face has, ascending."""
+    pairs, count = _count_sides(faces)
+    return np.unique(pairs[count == 1])
+
+
+def area(mesh: Mesh) -> float:
+    """Total surface area, in squared units of the mesh."""
+    return float(np.linalg.norm(_area_vectors(mesh), axis=1).sum() / 2)
+
+
+def component_of(mesh: Mesh) -> Int64[np.ndarray, " vertices"]:
+    """Label each vertex with the number of its connected component."""
+    pairs, size = edges(mesh.faces), len(mesh.vertices)
+    graph = sparse.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (size, size))
+    return csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def components(mesh: Mesh) -> list[Mesh]:
+    """Split a mesh into its connected components, the one of most faces first; each keeps all vertices."""
+    faces = np.asarray(mesh.faces)
+    label = component_of(mesh)[faces[:, 0]]
+    largest = np.argsort(-np.bincount(label), kind="stable")
+    return [mesh._replace(faces=faces[label == number]) for number in largest[: len(np.unique(label))]]
+
+
+def used_vertices(mesh: Mesh) -> Bool[np.ndarray, " vertices"]:
+    """Mask of the vertices that faces use; the others are no part of the surface."""
+    used = np.zeros(len(mesh.vertices), bool)
+    used[np.asarray(mesh.faces)] = True
+    return used
+
+
+def compact(mesh: Mesh) -> Mesh:
+    """Remove the vertices that no face uses; the others keep their order."""
+    used = used_vertices(mesh)
+    return Mesh(np.asarray(mesh.vertices)[used], (np.cumsum(used) - 1)[np.asarray(mesh.faces)])
+
+
+def same_connectivity(first: Mesh, second: Mesh) -> bool:
+    """Whether two meshes have the same number of vertices and the same faces, index by index."""
+    return len(first.vertices) == len(second.vertices) and np.array_equal(
+        np.asarray(first.faces), np.asarray(second.faces)
+    )
+
+
+def displacement(mesh: Mesh, suspect: Mesh, welded: Weld, length: float) -> Float64[np.ndarray, "points 3"]:
+    """Displacement of each welded point from a mesh to a suspect, divided by `length`; copies of a point are averaged.
+
+    Points are welded by the mesh, not by the suspect's positions, because quantisation makes other vertices coincide. A
+    point that no face uses is no part of the surface: wherever it went, it counts as unmoved.
+
+    Args:
+        mesh: the original.
+        suspect: a mesh of the same connectivity.
+        welded: from `weld`, of the original's vertices.
+        length: the unit of the result, such as the original's `diagonal`.
+
+    Returns:
+        `[points, 3]`, in units of `length`.
+
+    Raises:
+        JaxmarkError: if the suspect does not share the mesh's connectivity, index by index.
+    """
+    suspect = host_mesh(suspect)
+    if not same_connectivity(suspect, mesh):
+        raise JaxmarkError(
+            f"The suspect ({len(suspect.vertices)} vertices, {len(suspect.faces)} triangles) does not share the"
+            f" connectivity of the original ({len(mesh.vertices)} vertices, {len(mesh.faces)} triangles), in the same"
+            " vertex and face order, as this comparison needs it."
+        )
+    difference = (np.asarray(suspect.vertices) - np.asarray(mesh.vertices)) / length
+    used = used_vertices(mesh)
+    difference[~used] = 0
+    count = len(welded.first)
+    copies = np.bincount(welded.point[used], minlength=count)
+    sums = [np.bincount(welded.point, column, count) for column in difference.T]
+    return np.stack(sums, axis=1) / np.maximum(copies, 1)[:, None]
+
+
+def _area_vectors(mesh: Mesh) -> Float64[np.ndarray, "faces 3"]:
+    """Normals of faces, as long as twice the face's area."""
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return np.cross(b - a, c - a)
+
+
+def unit(x: Float64[np.ndarray, "*rows 3"]) -> Float64[np.ndarray, "*rows 3"]:
+    """Normalise vectors to length 1; zero stays zero."""
+    length = np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.divide(x, length, out=np.zeros_like(x), where=length > 0)
+
+
+def _count_sides(
+    faces: Int[Array | np.ndarray, "faces 3"],
+) -> tuple[Int64[np.ndarray, "edges 2"], Int64[np.ndarray, " edges"]]:
+    """The undirected edges, sorted, and the number of face sides that each stands for."""
+    faces = np.asarray(faces, np.int64)
+    tail, head = np.ravel(faces.T), np.ravel(np.roll(faces, -1, axis=1).T)
+    low, high = np.minimum(tail, head), np.maximum(tail, head)
+    # One integer per pair sorts many times faster than rows do.
+    bits = int(faces.max(initial=0)).bit_length()
+    codes, count = np.unique((low << bits | high)[low != high], return_counts=True)
+    return np.stack([codes >> bits, codes & ((1 << bits) - 1)], axis=1), count

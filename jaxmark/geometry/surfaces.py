@@ -1,0 +1,97 @@
+"""Closest points on the surfaces of meshes, and points sampled from surfaces, on the host.
+
+Closest points come from libigl, which agrees with brute force at any scale of coordinates; trimesh does not.
+"""
+
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.extras import require
+from jaxmark.geometry.mesh import Mesh, area, boundary_vertices, unit, vertex_normals
+from jaxmark.geometry.pose import IDENTITY, Points, Pose
+
+
+class Surface:
+    """A mesh that finds its closest points by a search tree, which is built at the first query."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        self._arrays = np.ascontiguousarray(mesh.vertices, np.float64), np.ascontiguousarray(mesh.faces, np.int64)
+
+    @cached_property
+    def _tree(self) -> Any:
+        tree = require("igl", "align").AABB()
+        tree.init(*self._arrays)
+        return tree
+
+    def closest(self, points: Points, pose: Pose = IDENTITY) -> tuple[Points, Int64[np.ndarray, " points"]]:
+        """Find the closest points on the surface, placed by a pose, and the faces they lie on.
+
+        Args:
+            points: the query points `[P, 3]`.
+            pose: a map of the surface, a similarity or nearly.
+
+        Returns:
+            The closest points `[P, 3]` on the placed surface, and the index of a face for each.
+
+        Raises:
+            JaxmarkError: if libigl is missing.
+        """
+        queries = np.ascontiguousarray(pose.inverse()(points))
+        _, face, closest = self._tree.squared_distance(*self._arrays, queries)
+        return pose(np.asarray(closest).reshape(-1, 3)), np.asarray(face).ravel().astype(np.int64)
+
+
+class Samples(NamedTuple):
+    """Points sampled from a surface."""
+
+    points: Points
+    normals: Points  # at the points, unit length
+    area: float  # the surface's area, in the mesh's units squared
+
+
+def sample(mesh: Mesh, count: int) -> Samples:
+    """Sample points from a surface uniformly by area, with normals interpolated from those of the vertices.
+
+    The sample is the same at every call.
+
+    Raises:
+        JaxmarkError: if the surface has no area.
+    """
+    import trimesh  # it takes long to import, and most suspects need no samples
+
+    size = area(mesh)
+    if not 0 < size < np.inf:
+        raise JaxmarkError(f"A surface has an area of {size:g}; nothing can be aligned with it.")
+    surface = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), process=False)
+    points, face = map(np.asarray, trimesh.sample.sample_surface(surface, count, seed=0)[:2])
+    share = barycentric(mesh, face, points)
+    normals = np.einsum("pk,pkc->pc", share, vertex_normals(mesh)[np.asarray(mesh.faces)[face]])
+    return Samples(points, unit(normals), size)
+
+
+def on_rim(
+    mesh: Mesh, face: Int64[np.ndarray, " points"], closest: Float64[np.ndarray, "points 3"]
+) -> Bool[np.ndarray, " points"]:
+    """Mask of the closest points on the rim of a hole, whose query points may lie beyond the rim."""
+    rim = np.zeros(len(mesh.vertices), bool)
+    rim[boundary_vertices(mesh.faces)] = True
+    if not rim.any():
+        return np.zeros(len(face), bool)
+    inside = barycentric(mesh, face, closest) > 1e-6
+    return np.all(~inside | rim[np.asarray(mesh.faces)[face]], axis=1) & ~np.all(inside, axis=1)
+
+
+def barycentric(
+    mesh: Mesh, face: Int64[np.ndarray, " points"], points: Float64[np.ndarray, "points 3"]
+) -> Float64[np.ndarray, "points 3"]:
+    """Barycentric coordinates of points on faces; zeros on a face without area."""
+    from trimesh import triangles
+
+    with np.errstate(all="ignore"):
+        share = triangles.points_to_barycentric(np.asarray(mesh.vertices)[np.asarray(mesh.faces)[face]], points)
+    return np.nan_to_num(share, nan=0.0, posinf=0.0, neginf=0.0)

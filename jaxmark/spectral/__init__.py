@@ -1,0 +1,31 @@
+"""Differentiable spectral filtering of meshes by polynomials and rational functions of the graph Laplacian.
+
+`make_laplacian` builds the operator of a mesh, `bands` has families of band filters as Chebyshev coefficients, `filter`
+applies one filter to a signal and `band_components` a whole family; `eigenpairs` is the exact reference.
+"""
+
+from jaxmark.spectral import bands as bands
+from jaxmark.spectral.chebyshev import band_components as band_components
+from jaxmark.spectral.chebyshev import cross_moments as cross_moments
+from jaxmark.spectral.chebyshev import filter as filter
+from jaxmark.spectral.chebyshev import gram as gram
+from jaxmark.spectral.chebyshev import moments as moments
+from jaxmark.spectral.chebyshev import transpose as transpose
+from jaxmark.spectral.laplacian import Laplacian as Laplacian
+from jaxmark.spectral.laplacian import Operator as Operator
+from jaxmark.spectral.laplacian import centre as centre
+from jaxmark.spectral.laplacian import make_laplacian as make_laplacian
+from jaxmark.spectral.laplacian import sparse_matrices as sparse_matrices
+from jaxmark.spectral.product import Factors as Factors
+from jaxmark.spectral.product import filter_by_factors as filter_by_factors
+from jaxmark.spectral.product import lagrange_factors as lagrange_factors
+from jaxmark.spectral.rational import butterworth as butterworth
+from jaxmark.spectral.rational import filter_rational as filter_rational
+from jaxmark.spectral.sharding import ShardedLaplacian as ShardedLaplacian
+from jaxmark.spectral.sharding import filter_sharded as filter_sharded
+from jaxmark.spectral.sharding import shard as shard
+from jaxmark.spectral.spectrum import Eigenpairs as Eigenpairs
+from jaxmark.spectral.spectrum import Quadrature as Quadrature
+from jaxmark.spectral.spectrum import eigenpairs as eigenpairs
+from jaxmark.spectral.spectrum import quadrature as quadrature
+from jaxmark.spectral.spectrum import white_probes as white_probes

@@ -1,0 +1,76 @@
+"""Best uniform approximation by polynomials with Remez's exchange algorithm, also of functions with kinks."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from numpy.polynomial import chebyshev
+
+from jaxmark.errors import JaxmarkError
+
+_POINTS_PER_RIPPLE = 32  # grid points, which miss at most 0.1 % of a ripple's height
+_MAX_EXCHANGES = 200
+
+
+class Minimax(NamedTuple):
+    """A best approximation p of a function f on [0, 2]; by Chebyshev's theorem, the alternation of f - p proves it."""
+
+    coefficients: Float64[np.ndarray, " terms"]  # Chebyshev series of p
+    deviation: float  # max |f - p|
+    reference: Float64[np.ndarray, " alternations"]  # degree + 2 points of [0, 2] where f - p is ±deviation alternately
+
+
+def minimax(
+    function: Callable[[np.ndarray], np.ndarray], degree: int, *, kinks: Sequence[float] | np.ndarray = ()
+) -> Minimax:
+    """Find the polynomial of a given degree that deviates least from a continuous function on [0, 2].
+
+    By Remez's second algorithm: on degree + 2 points, the best approximation solves a linear system. The points move to
+    where its error is largest, until the error is nowhere larger than on them. By de la Vallée Poussin's theorem, the
+    error on the points bounds the deviation of any polynomial from below. Reference: Trefethen, "Approximation Theory
+    and Approximation Practice", 2013, ch. 10.
+
+    Args:
+        function: maps λ `[points]` to values `[points]`.
+        degree: degree of the polynomial, at least 0.
+        kinks: points where the function is not smooth; the error may be extremal there, so they belong to the grid.
+
+    Returns:
+        The approximation, which is best on a grid of the kinks and 32 points per ripple.
+
+    Raises:
+        JaxmarkError: if the exchange does not converge.
+    """
+    size = degree + 2
+    grid = np.union1d(1 - np.cos(np.linspace(0, np.pi, _POINTS_PER_RIPPLE * size + 1)), kinks)
+    values, polynomials = function(grid), chebyshev.chebvander(grid - 1, degree)
+    reference = np.searchsorted(grid, 1 - np.cos(np.linspace(0, np.pi, size))).clip(max=len(grid) - 1)
+    smallest = 1e-13 * max(1.0, float(np.abs(values).max()))
+    for _ in range(_MAX_EXCHANGES):
+        system = np.column_stack([polynomials[reference], (-1.0) ** np.arange(size)])
+        *coefficients, level = np.linalg.solve(system, values[reference])
+        error = values - polynomials @ coefficients
+        deviation = float(np.abs(error).max())
+        if deviation <= abs(level) * (1 + 1e-9) + smallest:
+            return Minimax(np.array(coefficients), deviation, grid[reference])
+        reference = _exchange(error, size)
+    raise JaxmarkError(f"minimax did not settle at degree {degree} in {_MAX_EXCHANGES} rounds; take another degree.")
+
+
+def _exchange(error: Float64[np.ndarray, " points"], size: int) -> Int64[np.ndarray, " size"]:
+    """Find the points where the error is largest between its changes of sign, and drop the smallest beyond `size`."""
+    starts = np.flatnonzero(np.diff(np.sign(error), prepend=0))
+    places = [
+        start + int(np.argmax(np.abs(run))) for start, run in zip(starts, np.split(error, starts[1:]), strict=True)
+    ]
+    heights = list(np.abs(error[places]))
+    while len(places) > size:
+        least = int(np.argmin(heights))
+        if least in (0, len(places) - 1) or len(places) == size + 1:
+            drop = [0 if heights[0] < heights[-1] else len(places) - 1]
+        else:  # drop a neighbour, too, so that the signs still alternate
+            drop = [least, least - 1 if heights[least - 1] < heights[least + 1] else least + 1]
+        for place in sorted(drop, reverse=True):
+            del places[place], heights[place]
+    return np.array(places)

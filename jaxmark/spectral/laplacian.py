@@ -1,0 +1,362 @@
+"""The graph Laplacian of a mesh as edge arrays, the operator that all filters are functions of.
+
+Δ = I - D⁻¹W with symmetric non-negative edge weights W and the diagonal D of their row sums (Sohn et al., eq. 4-5; the
+paper prints D = diag(1/d), but its Lemma 3.1 holds for D = diag(d)). The spectrum is real and lies in [0, 2], and Δ is
+self-adjoint in the inner product ⟨x, y⟩_D = xᵀDy.
+"""
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float64, Int, Int64, Num, Shaped
+from numpy.typing import ArrayLike
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh, edges
+
+Weighting = Literal["valence", "inverse-length", "cotangent"]
+Lowering = Literal["auto", "gather", "segments"]
+
+# The cost of adding to a row at any index, in units of reading a row: on processors by measurement, elsewhere assumed,
+# because an atomic addition reads and writes.
+_SCATTER_COST_CPU, _SCATTER_COST_ELSEWHERE = 8, 2
+_SCATTER_COST_PER_VERTEX = 4  # what a pass of such additions costs beside them, however few they are, in the same unit
+_MIN_ORDERED_VERTICES = 2**14  # from here on a signal outgrows the fastest memory, and reordering vertices pays
+
+
+@runtime_checkable
+class Operator(Protocol):
+    """The part of Δ that filters need, D and products: a `Laplacian`, or one device's part of it.
+
+    Products take and give rows in the operator's own order, in which neighbours are near in memory: signals `enter` it
+    before the first product, and results `leave` it after the last.
+    """
+
+    @property
+    def degree(self) -> Float[Array | np.ndarray, " vertices"]:
+        """The diagonal of D; 0 where a vertex is isolated."""
+        ...
+
+    def product(
+        self, like: Shaped[Array, " vertices *columns"]
+    ) -> Callable[[Float[Array, " vertices *columns"]], Float[Array, " vertices *columns"]]:
+        """The map x → Δx in the operator's own order, for signals of the shape and dtype of `like`."""
+        ...
+
+    def enter(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+        """Reorder rows from the vertices' order to the operator's own."""
+        ...
+
+    def leave(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+        """Reorder rows from the operator's own order to the vertices' order."""
+        ...
+
+
+class Neighbours(NamedTuple):
+    """Each vertex's neighbours in a table of few slots; neighbours without a slot are added one by one.
+
+    Reading rows is several times faster than adding to them, and is shared by the cores. Vertices are numbered in the
+    operator's own order here; `order` and `rank` convert from and to the mesh's.
+    """
+
+    vertices: Int[Array | np.ndarray, "slots vertices"]  # neighbour in each slot; the vertex itself if it is empty
+    empty: Int[Array | np.ndarray, " vertices"]  # number of empty slots
+    rest: Int[Array | np.ndarray, "rest 3"]  # vertex, neighbour, edge without a slot; padding is past the last vertex
+    edges: Int[Array | np.ndarray, "slots vertices"] | None  # past the last edge if empty; None without edge weights
+    order: Int[Array | np.ndarray, " vertices"] | None = None  # the vertex of each row; None if the orders are the same
+    rank: Int[Array | np.ndarray, " vertices"] | None = None  # the row of each vertex; None likewise
+
+
+class Laplacian(NamedTuple):
+    """Δ = I - D⁻¹W of a graph with N vertices and E undirected edges, as a pytree of arrays.
+
+    A vertex without edges is an eigenvector of its own, with eigenvalue 0, and has no weight in the inner product.
+    """
+
+    edges: Int[Array | np.ndarray, "edges 2"]  # each once, no vertex joined to itself; padding is past the last vertex
+    weights: Float[Array | np.ndarray, " edges"] | None  # W, symmetric by construction, non-negative; None if all are 1
+    degree: Float[Array | np.ndarray, " vertices"]  # D: the row sums of W, 0 where a vertex is isolated
+    neighbours: Neighbours | None = None  # the edges once more, as a table for products by gathering
+
+    @jax.jit
+    def apply(self, x: Float[Array, " vertices *columns"]) -> Float[Array, " vertices *columns"]:
+        """Δx for one signal `[N]` or several `[N, C]`, in the dtype of `x`.
+
+        Raises:
+            JaxmarkError: if `x` is not floating.
+        """
+        return self.leave(self.product(x)(self.enter(x)))
+
+    def product(
+        self, like: Shaped[Array, " vertices *columns"]
+    ) -> Callable[[Float[Array, " vertices *columns"]], Float[Array, " vertices *columns"]]:
+        """The map x → Δx in the operator's own order, for signals of the shape and dtype of `like`.
+
+        Make it outside of loops, for it computes what all products share.
+
+        Raises:
+            JaxmarkError: if the signal is not floating.
+        """
+        if not jnp.issubdtype(like.dtype, jnp.floating):
+            raise JaxmarkError(f"Laplacian.apply needs a floating-point signal, got {like.dtype}.")
+        degree = per_row(self.enter(jnp.asarray(self.degree)), like)
+        # Select before dividing, so that isolated vertices keep finite gradients.
+        linked = degree > 0
+        inverse = jnp.where(linked, 1 / jnp.where(linked, degree, 1), 0)
+        own = linked.astype(like.dtype)
+        if (table := self._table) is None:
+            total = self._segments(like)
+        elif self.weights is None:
+            # An empty slot adds the vertex's own row, which is made up for here.
+            own, total = own + inverse * per_row(table.empty, like), _gather(table)
+        else:
+            total = _weighted_gather(table, self.weights, like)
+        return lambda x: own * x - inverse * total(x)
+
+    def enter(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+        """Reorder rows to the operator's own order; see `Operator`."""
+        return x if self._table is None or self._table.order is None else x[self._table.order]
+
+    def leave(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+        """Reorder rows to the vertices' order; see `Operator`."""
+        return x if self._table is None or self._table.rank is None else x[self._table.rank]
+
+    @property
+    def _table(self) -> Neighbours | None:
+        """The table; None, for products by segment-sums, if weights were put in later that the table cannot look up."""
+        table = self.neighbours
+        return None if table is None or (self.weights is not None and table.edges is None) else table
+
+    def _segments(self, like: Array) -> Callable[[Array], Array]:
+        """The map x → Wx by two segment-sums over the edges."""
+        tail, head = self.edges[:, 0], self.edges[:, 1]
+        weights = 1 if self.weights is None else per_row(self.weights, like)
+        size = self.degree.shape[0]
+        return lambda x: (
+            jax.ops.segment_sum(weights * x[head], tail, size) + jax.ops.segment_sum(weights * x[tail], head, size)
+        )
+
+    @jax.jit
+    def inner(
+        self, x: Float[Array, " vertices *columns"], y: Float[Array, " vertices *columns"]
+    ) -> Float[Array, " *columns"]:
+        """The inner product ⟨x, y⟩_D = Σ_v D_v x_v y_v, column by column: a scalar for `[N]`, `[C]` for `[N, C]`.
+
+        Raises:
+            JaxmarkError: if the shapes differ.
+        """
+        if x.shape != y.shape:
+            raise JaxmarkError(f"Laplacian.inner needs two signals of one shape, got {x.shape} and {y.shape}.")
+        return jnp.sum(per_row(self.degree, x) * x * y, axis=0)
+
+
+def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence", *, lowering: Lowering = "auto") -> Laplacian:
+    """Build the graph Laplacian of a mesh's edges, on the host.
+
+    Vertices at the same position are *not* merged; see `jaxmark.geometry.mesh.weld`.
+
+    Args:
+        mesh: any mesh; boundary edges, edges of three faces or more, and several components are well defined.
+        weights: `"valence"`, each edge 1, so that w_ij = 1/d(v_i) as in the paper; `"inverse-length"`, 1 over the
+            edge's length; `"cotangent"`, half the sum of the cotangents of the angles opposite the edge, clipped below
+            at 1e-6 of the largest; or an array `[E]` of non-negative weights in the order of
+            `jaxmark.geometry.mesh.edges`.
+        lowering: how products are computed: `"segments"`, by segment-sums over the edges; `"gather"`, by a table of
+            each vertex's neighbours; `"auto"`, by the table unless the valences differ so much that it does not pay on
+            this platform.
+
+    Returns:
+        A `Laplacian` of NumPy arrays in float64; it computes in the dtype of the signal it is applied to. Its `weights`
+        are None if all are 1; to differentiate with respect to them, put an array in by `_replace`.
+
+    Raises:
+        JaxmarkError: if the name of the weights is unknown, an array of them is not `[E]`, finite and non-negative, an
+            edge has length zero under `"inverse-length"`, no edge has a positive weight under `"cotangent"`, or the
+            lowering is unknown.
+    """
+    if lowering not in get_args(Lowering):
+        raise JaxmarkError(f"Products are lowered by {', '.join(get_args(Lowering))}, not {lowering!r}.")
+    pairs = edges(np.asarray(mesh.faces))
+    if isinstance(weights, str):
+        match weights:
+            case "valence":  # needs no positions: they may be traced
+                values = None
+            case "inverse-length":
+                values = _inverse_lengths(np.asarray(mesh.vertices, np.float64), pairs)
+            case "cotangent":
+                values = _cotangents(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces), pairs)
+            case _:
+                raise JaxmarkError(
+                    f"weights must be 'valence', 'inverse-length', 'cotangent' or an array, got {weights!r}."
+                )
+    else:
+        values = np.asarray(weights, np.float64)
+        if values.shape != (len(pairs),):
+            raise JaxmarkError(f"weights must have one value for each of the {len(pairs)} edges, got {values.shape}.")
+        if not (np.isfinite(values) & (values >= 0)).all():
+            raise JaxmarkError("weights must be finite and not negative; otherwise the spectrum leaves [0, 2].")
+    size = len(mesh.vertices)
+    degree = np.bincount(pairs.ravel(), None if values is None else np.repeat(values, 2), size).astype(np.float64)
+    neighbours = None
+    if lowering != "segments":
+        order = cuthill_mckee(pairs, size) if size >= _MIN_ORDERED_VERTICES else None
+        neighbours = make_neighbours(pairs, size, order, weighted=values is not None, if_it_pays=lowering == "auto")
+    return Laplacian(pairs.astype(np.int32), values, degree, neighbours)
+
+
+def make_neighbours(
+    pairs: Int[np.ndarray, "edges 2"],
+    size: int,
+    order: Int[np.ndarray, " vertices"] | None = None,
+    *,
+    weighted: bool,
+    if_it_pays: bool = False,
+) -> Neighbours | None:
+    """Build the table of neighbours, with the number of slots that makes a product cheapest.
+
+    Args:
+        pairs: the edges.
+        size: number of vertices.
+        order: the vertex of each row of the table; the vertices' own order unless given.
+        weighted: whether the edges have weights, which the table then looks up.
+        if_it_pays: whether to return None where segment-sums are cheaper.
+    """
+    rank = None if order is None else np.argsort(order)
+    graph = adjacency(pairs if rank is None else rank[pairs], size)
+    head, edge, valence = graph.indices, graph.data, np.diff(graph.indptr)
+    tail = np.repeat(np.arange(size), valence)
+    slot = np.arange(len(tail)) - np.repeat(graph.indptr[:-1], valence)
+    left = len(tail) - np.cumsum(np.bincount(slot))  # number of neighbours without a slot, for one slot, two, …
+    addition = _SCATTER_COST_CPU if jax.default_backend() == "cpu" else _SCATTER_COST_ELSEWHERE
+    costs = size * np.arange(1, 1 + len(left)) + addition * left + _SCATTER_COST_PER_VERTEX * size * (left > 0)
+    if if_it_pays and (len(left) == 0 or costs.min() > addition * len(tail)):
+        return None
+    # The number is made even, so that more meshes share the shape of their table.
+    slots = 1 + int(np.argmin(costs)) if len(left) else 0
+    slots += slots % 2
+    fits = slot < slots
+    # An empty slot reads the vertex's own row, which is in the cache already.
+    vertices = np.tile(np.arange(size, dtype=np.int32), (slots, 1))
+    vertices[slot[fits], tail[fits]] = head[fits]
+    edges = None
+    if weighted:
+        edges = np.full((slots, size), len(pairs), np.int32)
+        edges[slot[fits], tail[fits]] = edge[fits]
+    rest = np.stack([tail, head, edge], axis=1)[~fits].astype(np.int32)
+    empty = slots - np.minimum(valence, slots)
+    orders = (None, None) if rank is None or order is None else (order.astype(np.int32), rank.astype(np.int32))
+    return Neighbours(vertices, empty.astype(np.int32), rest, edges, *orders)
+
+
+def cuthill_mckee(pairs: Int[np.ndarray, "edges 2"], size: int) -> Int64[np.ndarray, " vertices"]:
+    """Order the vertices so that neighbours are near each other (reverse Cuthill-McKee)."""
+    return csgraph.reverse_cuthill_mckee(adjacency(pairs, size), symmetric_mode=True).astype(np.int64)
+
+
+def adjacency(pairs: Int[np.ndarray, "edges 2"], size: int) -> sparse.csr_array:
+    """The adjacency matrix of the edges, with the numbers of the edges as entries."""
+    (tail, head), edge = np.concatenate([pairs, pairs[:, ::-1]]).T, np.tile(np.arange(len(pairs)), 2)
+    return sparse.csr_array(sparse.coo_array((edge, (tail, head)), shape=(size, size)))
+
+
+def _gather(table: Neighbours) -> Callable[[Array], Array]:
+    """The map x → Wx slot by slot, for edges without weights; each empty slot adds the vertex's own row."""
+    slots, rest = list(table.vertices), jnp.asarray(table.rest)
+    return lambda x: _with_rest(sum((x[vertex] for vertex in slots), jnp.zeros_like(x)), rest, x)
+
+
+def _weighted_gather(table: Neighbours, weights: Array | np.ndarray, like: Array) -> Callable[[Array], Array]:
+    """The map x → Wx slot by slot, for weighted edges."""
+    assert table.edges is not None
+    padded = jnp.append(jnp.asarray(weights).astype(like.dtype), 0)
+    slots = [(per_row(padded[edge], like), vertex) for edge, vertex in zip(table.edges, table.vertices, strict=True)]
+    rest = jnp.asarray(table.rest)
+    factor = per_row(padded[rest[:, 2]], like)
+    return lambda x: _with_rest(sum((w * x[vertex] for w, vertex in slots), jnp.zeros_like(x)), rest, x, factor)
+
+
+def _with_rest(total: Array, rest: Array, x: Array, factor: Array | float = 1.0) -> Array:
+    """Add the neighbours without a slot, one by one."""
+    return total.at[rest[:, 0]].add(factor * x[rest[:, 1]]) if len(rest) else total
+
+
+def per_row(values: Num[Array | np.ndarray, " rows"], x: Array | np.ndarray) -> Array:
+    """Cast one value per row, such as D, to the dtype of `x`, and shape it to broadcast against its columns."""
+    return jnp.asarray(values).astype(x.dtype).reshape(-1, *[1] * (x.ndim - 1))
+
+
+def centre(
+    operator: Laplacian, x: Float[Array | np.ndarray, "vertices columns"]
+) -> Float64[np.ndarray, "vertices columns"]:
+    """Subtract the D-weighted mean of each connected component, on the host in float64.
+
+    The result has no part in the null space of Δ, so that a filtered signal does not depend on where the object, or any
+    piece of it, is placed. Centre before casting to float32, or large offsets eat the digits. An isolated vertex
+    becomes 0.
+    """
+    x = np.asarray(x, np.float64)
+    degree = np.asarray(operator.degree, np.float64)
+    size = len(degree)
+    pairs, weights = host_edges(operator)
+    # An edge of weight zero joins nothing.
+    tail, head = pairs[weights > 0].T
+    graph = sparse.coo_array((np.ones(len(tail)), (tail, head)), shape=(size, size))
+    count, component = csgraph.connected_components(graph, directed=False)
+    mass = np.where(degree > 0, degree, 1.0)
+    total = np.bincount(component, mass, count)
+    means = np.stack([np.bincount(component, mass * column, count) for column in x.T], axis=1) / total[:, None]
+    centred = x - means[component]
+    # A second pass removes the rounding errors that the first leaves at large offsets.
+    rest = np.stack([np.bincount(component, mass * column, count) for column in centred.T], axis=1) / total[:, None]
+    return centred - rest[component]
+
+
+def sparse_matrices(operator: Laplacian) -> tuple[sparse.csr_array, sparse.dia_array]:
+    """(D - W, D) as SciPy sparse matrices in float64, for host-side linear algebra; D⁻¹(D - W) is Δ."""
+    degree = np.asarray(operator.degree, np.float64)
+    pairs, weights = host_edges(operator)
+    adjacency = sparse.coo_array((weights, tuple(pairs.T)), shape=(len(degree), len(degree)))
+    mass = sparse.diags_array(degree)
+    stiffness = sparse.csr_array(mass - adjacency - adjacency.T)
+    stiffness.eliminate_zeros()
+    return stiffness, mass
+
+
+def host_edges(operator: Laplacian) -> tuple[Int[np.ndarray, "edges 2"], Float64[np.ndarray, " edges"]]:
+    """The operator's edges without padding, and their weights, as NumPy arrays; weights are 1 if it has none."""
+    pairs = np.asarray(operator.edges)
+    real = pairs[:, 0] < len(operator.degree)
+    weights = np.ones(len(pairs)) if operator.weights is None else np.asarray(operator.weights, np.float64)
+    return pairs[real], weights[real]
+
+
+def _inverse_lengths(vertices: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    lengths = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
+    if (lengths == 0).any():
+        bad = pairs[int(np.argmin(lengths))]
+        raise JaxmarkError(f"Edge {bad.tolist()} has length zero; weld its vertices or use valence weights.")
+    return 1.0 / lengths
+
+
+def _cotangents(vertices: np.ndarray, faces: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Half the sum of the cotangents opposite each edge, clipped at 1e-6 of the largest to keep W non-negative."""
+    values = np.zeros(len(pairs))
+    base = len(vertices)
+    codes = pairs[:, 0] * base + pairs[:, 1]
+    for corner in range(3):
+        apex, first, second = (faces[:, (corner + shift) % 3] for shift in range(3))
+        u, v = vertices[first] - vertices[apex], vertices[second] - vertices[apex]
+        area = np.linalg.norm(np.cross(u, v), axis=1)
+        sound = area > 0  # a degenerate face has no angles
+        cotangent = np.einsum("ij,ij->i", u, v)[sound] / area[sound]
+        edge = np.minimum(first, second)[sound] * base + np.maximum(first, second)[sound]
+        values += np.bincount(np.searchsorted(codes, edge), 0.5 * cotangent, len(pairs))
+    largest = values.max(initial=0.0)
+    if largest <= 0:
+        raise JaxmarkError("No edge has a positive cotangent weight; use valence weights.")
+    return np.maximum(values, 1e-6 * largest)

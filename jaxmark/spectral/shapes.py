@@ -1,0 +1,55 @@
+"""Pad arrays to shapes that many meshes share, so that code compiled for one mesh serves others.
+
+Padding vertices are isolated: nothing moves them, and they move nothing. Large meshes, which take longer to run than to
+compile for, stay as they are.
+"""
+
+import numpy as np
+from jaxtyping import Shaped
+
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.spectral.laplacian import Laplacian, Lowering, Weighting, make_laplacian
+
+_MIN_STEP = 16  # between two sizes
+_MAX_PADDED_SIZE = 2**17  # beyond this, running takes longer than compiling
+
+
+def common_size(count: int) -> int:
+    """Round a size up to one of four per octave; beyond 2^17, return it as it is.
+
+    From 65 on, at most a fifth of the result is padding.
+    """
+    step = max(_MIN_STEP, 1 << max(count - 1, 1).bit_length() >> 3)
+    return count if count > _MAX_PADDED_SIZE else -(-count // step) * step
+
+
+def pad_rows(rows: Shaped[np.ndarray, " rows *columns"], count: int, value: float = 0) -> Shaped[np.ndarray, "..."]:
+    """Pad with `value` to `count` rows."""
+    padding = np.full((max(count - len(rows), 0), *rows.shape[1:]), value, rows.dtype)
+    return np.concatenate([rows, padding])
+
+
+def common_laplacian(mesh: Mesh, weights: Weighting = "valence", lowering: Lowering = "auto") -> Laplacian:
+    """`make_laplacian`, padded with isolated vertices and with edges past the last vertex.
+
+    Pad signals to the operator's size, such as by `pad_rows`.
+
+    Raises:
+        JaxmarkError: see `make_laplacian`.
+    """
+    vertices = np.asarray(mesh.vertices, np.float64)
+    padded = mesh._replace(vertices=pad_rows(vertices, common_size(len(vertices))))
+    operator = make_laplacian(padded, weights, lowering=lowering)
+    size, edges = len(operator.degree), np.asarray(operator.edges)
+    if size > _MAX_PADDED_SIZE:
+        return operator
+    # A closed surface of triangles has about three edges per vertex.
+    count = 3 * size if len(edges) <= 3 * size else common_size(len(edges))
+    values = None if operator.weights is None else pad_rows(np.asarray(operator.weights), count)
+    operator = operator._replace(edges=pad_rows(edges, count, size), weights=values)
+    table = operator.neighbours
+    if table is None or not len(table.rest):
+        return operator
+    # In most meshes, fewer neighbours than a sixteenth of the vertices have no slot.
+    rest = max(size // 16, 1 << (len(table.rest) - 1).bit_length())
+    return operator._replace(neighbours=table._replace(rest=pad_rows(np.asarray(table.rest), rest, size)))

@@ -1,0 +1,176 @@
+"""The spectrum of the Laplacian: eigenpairs, and the spectral measure of a signal, on the host in float64.
+
+Filters never need it; it is the reference for tests and reports, and what the eigenvector scheme is made of.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float64, Int64, PRNGKeyArray
+from scipy import linalg, sparse
+from scipy.sparse import csgraph
+from scipy.sparse import linalg as sparse_linalg
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.spectral.laplacian import Laplacian, centre, sparse_matrices
+
+# Up to this number of vertices, a dense decomposition is faster than an iterative one, and finds every eigenvalue.
+_DENSE_LIMIT = 2500
+
+
+class Eigenpairs(NamedTuple):
+    """The lowest eigenpairs of Δ on the vertices that have edges, ascending."""
+
+    values: Float64[np.ndarray, " pairs"]  # in [0, 2]
+    vectors: Float64[np.ndarray, "vertices pairs"]  # D-orthonormal; 0 at isolated vertices
+    space: Int64[np.ndarray, " pairs"]  # index of the first pair in the same eigenspace
+
+
+class Quadrature(NamedTuple):
+    """Nodes and weights with ⟨x, f(Δ)x⟩_D = Σ_i weight_i f(node_i) for polynomials f of degree < 2 · nodes."""
+
+    nodes: Float64[np.ndarray, " nodes"]
+    weights: Float64[np.ndarray, " nodes"]
+
+
+def eigenpairs(operator: Laplacian, count: int | None = None, *, tolerance: float = 1e-7) -> Eigenpairs:
+    """Compute eigenpairs of Δ above its null space, D-orthonormal, so that x = Σ_i ⟨x, φ_i⟩_D φ_i for centred x.
+
+    By a dense decomposition (`eigh`) up to 2,500 vertices, beyond by shift-and-invert Lanczos (`eigsh`) from a fixed
+    start.
+
+    Args:
+        operator: the Laplacian, of N vertices.
+        count: largest number of pairs, from the lowest eigenvalue on. None for all.
+        tolerance: eigenvalues closer than this form one eigenspace. Its basis is arbitrary, so that only the projection
+            onto the whole eigenspace is meaningful; an eigenspace that `count` would cut is left out.
+
+    Returns:
+        The pairs, without the null vectors, of which there is one for each connected component.
+
+    Raises:
+        JaxmarkError: if `count` is below 1, or more than a third of all pairs of a mesh of over 2,500 vertices are
+            asked for.
+    """
+    if count is not None and count < 1:
+        raise JaxmarkError(f"eigenpairs(count=...) must be at least 1, got {count}.")
+    linked, root, scaled = _symmetric(operator)
+    size = len(linked)
+    null, component = csgraph.connected_components(scaled, directed=False)
+    # One pair more than asked for tells whether the last eigenspace is complete.
+    wanted = size - null if count is None else min(count + 1, size - null)
+    if wanted == 0:
+        values, vectors = np.zeros(0), np.zeros((size, 0))
+    elif size <= _DENSE_LIMIT:
+        values, vectors = linalg.eigh(scaled.toarray(), subset_by_index=(null, null + wanted - 1))
+    elif 3 * wanted > size:
+        raise JaxmarkError(
+            f"{wanted} eigenvectors of a mesh of {size} vertices are too many to iterate for; ask for fewer, or use"
+            " polynomial bands."
+        )
+    else:
+        values, vectors = _lowest(scaled, root, component, wanted)
+    fresh = np.diff(values, prepend=-np.inf) > tolerance
+    space = np.maximum.accumulate(np.where(fresh, np.arange(len(values)), 0)).astype(np.int64)
+    kept = len(values) if count is None or len(values) <= count else int(space[count])
+    full = np.zeros((len(operator.degree), kept))
+    full[linked] = vectors[:, :kept] / root[:, None]
+    return Eigenpairs(values[:kept], full, space[:kept])
+
+
+def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: int) -> Quadrature:
+    """Gauss quadrature of a signal's spectral measure, by Lanczos iteration with full reorthogonalisation.
+
+    Reference: Golub, Meurant, "Matrices, Moments and Quadrature with Applications", 2010, ch. 6.
+
+    Args:
+        operator: the Laplacian, of N vertices.
+        x: one signal `[N]`, preferably centred.
+        steps: number of nodes; the result has fewer if the signal lies in a smaller invariant subspace.
+
+    Returns:
+        Nodes in [0, 2], and non-negative weights that sum to ⟨x, x⟩_D.
+    """
+    linked, root, scaled = _symmetric(operator)
+    vector = root * x[linked]
+    norm = float(np.linalg.norm(vector))
+    if norm == 0:
+        return Quadrature(np.zeros(0), np.zeros(0))
+    steps = min(steps, len(vector))
+    basis = np.zeros((steps + 1, len(vector)))
+    basis[0] = vector / norm
+    alphas: list[float] = []
+    betas: list[float] = []
+    for k in range(steps):
+        following = scaled @ basis[k]
+        alphas.append(float(following @ basis[k]))
+        for _ in range(2):  # two orthogonalisations are enough (Kahan, Parlett)
+            following -= basis[: k + 1].T @ (basis[: k + 1] @ following)
+        betas.append(float(np.linalg.norm(following)))
+        if betas[-1] < 1e-12:
+            break
+        basis[k + 1] = following / betas[-1]
+    nodes, vectors = linalg.eigh_tridiagonal(alphas, betas[: len(alphas) - 1])
+    return Quadrature(nodes, norm**2 * vectors[0] ** 2)
+
+
+def white_probes(operator: Laplacian, key: PRNGKeyArray, probes: int) -> Float64[np.ndarray, "vertices probes"]:
+    """Random signals whose spectral measures sum, in expectation, to the counting measure of the eigenvalues.
+
+    The signals are random signs over √D, as in Hutchinson's estimator: Σ_p ⟨u_p, f(Δ)u_p⟩_D estimates Σ_i f(λ_i), over
+    eigenvalues above the null space, with a variance of at most 2 Σ_i f(λ_i)²/probes (Avron, Toledo, J. ACM 58, 2011).
+    Their `chebyshev.moments`, summed over the signals, are those of the spectral density.
+
+    Args:
+        operator: the Laplacian, of N vertices.
+        key: any random key but a mark's, because bands must not depend on that one.
+        probes: number of signals.
+
+    Returns:
+        `[N, probes]`, centred, 0 at isolated vertices.
+    """
+    degree = np.asarray(operator.degree, np.float64)
+    signs = np.asarray(jax.random.rademacher(key, (len(degree), probes)), np.float64)
+    scale = np.where(degree > 0, 1 / np.sqrt(np.where(degree > 0, probes * degree, 1)), 0)
+    return centre(operator, scale[:, None] * signs)
+
+
+def _symmetric(operator: Laplacian) -> tuple[Int64[np.ndarray, " linked"], np.ndarray, sparse.csc_array]:
+    """The vertices that have edges, √D on them, and the symmetric form D^-1/2 (D - W) D^-1/2 of Δ on them."""
+    stiffness, mass = sparse_matrices(operator)
+    degree = mass.diagonal()
+    linked = np.flatnonzero(degree > 0)
+    root = np.sqrt(degree[linked])
+    inverse = sparse.diags_array(1 / root)
+    return linked, root, sparse.csc_array(inverse @ stiffness[linked][:, linked] @ inverse)
+
+
+def _lowest(
+    scaled: sparse.csc_array, root: np.ndarray, component: np.ndarray, wanted: int
+) -> tuple[Float64[np.ndarray, " pairs"], Float64[np.ndarray, "vertices pairs"]]:
+    """The lowest eigenpairs above the null space of D^-1/2 (D - W) D^-1/2, by shift-and-invert Lanczos.
+
+    The null vectors, D^1/2 on each component, are known; with them projected out, only wanted pairs are iterated for.
+    """
+    size = len(root)
+    null = sparse.csr_array((root, (np.arange(size), component)))
+    null = null @ sparse.diags_array(1 / np.sqrt(null.multiply(null).sum(axis=0)))
+    shift = 1e-6  # keeps the matrix definite
+    factor = sparse_linalg.splu(
+        scaled + shift * sparse.eye_array(size, format="csc"),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+
+    def inverse(x: np.ndarray) -> np.ndarray:
+        y = factor.solve(x.reshape(-1))
+        return y - null @ (null.T @ y)
+
+    # A fixed start makes the result repeatable.
+    start = inverse(np.cos(np.arange(size, dtype=np.float64)))
+    operator = sparse_linalg.LinearOperator(scaled.shape, matvec=inverse, dtype=np.float64)  # pyright: ignore[reportCallIssue]
+    reciprocals, vectors = sparse_linalg.eigsh(operator, wanted, v0=start)
+    order = np.argsort(-reciprocals)
+    return 1 / reciprocals[order] - shift, vectors[:, order]

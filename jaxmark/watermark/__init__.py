@@ -1,0 +1,30 @@
+"""Watermarks in meshes: how messages and fingerprints are written under a key, read again, and what a reading proves.
+
+`embed`, `detect`, `capacity`, `fingerprint` and `identify` each do one job on a mesh; `make_marker` and `make_tracer`
+prepare an original once for many. A `Scheme` fixes how marks are written and read.
+"""
+
+from jaxmark.watermark.coding.keys import Key as Key
+from jaxmark.watermark.coding.keys import load_key as load_key
+from jaxmark.watermark.coding.keys import new_key as new_key
+from jaxmark.watermark.coding.keys import save_key as save_key
+from jaxmark.watermark.marking import Detection as Detection
+from jaxmark.watermark.marking import EmbedInfo as EmbedInfo
+from jaxmark.watermark.marking import Marker as Marker
+from jaxmark.watermark.marking import capacity as capacity
+from jaxmark.watermark.marking import detect as detect
+from jaxmark.watermark.marking import embed as embed
+from jaxmark.watermark.marking import make_marker as make_marker
+from jaxmark.watermark.record import Record as Record
+from jaxmark.watermark.schemes import SCHEMES as SCHEMES
+from jaxmark.watermark.schemes import EigenScheme as EigenScheme
+from jaxmark.watermark.schemes import HostScheme as HostScheme
+from jaxmark.watermark.schemes import KeyedScheme as KeyedScheme
+from jaxmark.watermark.schemes import Scheme as Scheme
+from jaxmark.watermark.submeshes import PartMarker as PartMarker
+from jaxmark.watermark.submeshes import make_part_marker as make_part_marker
+from jaxmark.watermark.tardos import Accusation as Accusation
+from jaxmark.watermark.tracing import Tracer as Tracer
+from jaxmark.watermark.tracing import fingerprint as fingerprint
+from jaxmark.watermark.tracing import identify as identify
+from jaxmark.watermark.tracing import make_tracer as make_tracer

@@ -1,0 +1,59 @@
+"""Embedding and detection as two pure functions of arrays.
+
+`embed_bits` and `detect_bits` take carrier and detector as arguments, and work under `jit`, `vmap` and `grad`.
+`jaxmark.watermark.marking` does the same for meshes, messages and keys.
+"""
+
+from jaxtyping import Array, Float
+
+from jaxmark.alignment.observation import observe
+from jaxmark.watermark.carriers import Carrier
+from jaxmark.watermark.carriers.carrier import Strength
+from jaxmark.watermark.detectors import Detector, decorrelate
+
+
+def embed_bits(
+    x: Float[Array, "vertices 3"], bits: Float[Array, " bits"], carrier: Carrier, beta: Strength
+) -> Float[Array, "vertices 3"]:
+    """Compute the marked coordinates x + displacement(bits, β) (Sohn et al., 2.2.1).
+
+    Args:
+        x: the original's coordinates `[N, 3]`.
+        bits: -1 or +1, `[k]`; any real amplitudes are allowed.
+        carrier: see `jaxmark.watermark.carriers`.
+        beta: strength: a scalar, or one number per band, or one per band and coordinate. For components of unit norm it
+            is the D-norm that one bit writes in one band, in the units of `x`; for components as printed, it is
+            relative to the host's own component.
+
+    Returns:
+        Marked coordinates `[N, 3]`.
+    """
+    return x + carrier.displacement(bits, beta)
+
+
+def detect_bits(
+    suspect: Float[Array, "vertices 3"],
+    x: Float[Array, "vertices 3"],
+    carrier: Carrier,
+    detector: Detector = decorrelate,
+    beta: Strength = 1.0,
+    *,
+    weights: Float[Array, " vertices"] | None = None,
+    normals: Float[Array, "vertices 3"] | None = None,
+) -> Float[Array, " bits"]:
+    """Compute soft values of the bits in a suspect, given the original; their signs are the bits (Sohn et al., 2.2.2).
+
+    Args:
+        suspect: coordinates `[N, 3]` in the original's vertex order.
+        x: the original's coordinates `[N, 3]`.
+        carrier: the carrier that the bits were embedded with.
+        detector: see `jaxmark.watermark.detectors`.
+        beta: the strengths' profile over the bands, as embedded; a common factor only rescales the result.
+        weights: relative inverse variance of each vertex `[N]`, 0 where nothing is known; by default all are equal.
+        normals: unit vectors `[N, 3]`, if only the displacement along them is known; by default all of it is.
+
+    Returns:
+        Soft values, `[k]`.
+    """
+    reader = carrier.reader()
+    return detector(reader, reader.receive(observe(suspect - x, weights, normals)), beta)

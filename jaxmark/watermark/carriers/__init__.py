@@ -1,0 +1,20 @@
+"""Carriers, which map bits linearly to a displacement of the vertices, with explicit adjoints, and their readers.
+
+`Carrier` and `Reader` are the interfaces; `KeyedCarrier` spreads bits over all vertices by keyed signs,
+`ModulatedCarrier` writes them on components of the host such as `host_bands` and `eigenspaces`.
+"""
+
+from jaxmark.watermark.carriers.carrier import Carrier as Carrier
+from jaxmark.watermark.carriers.carrier import Claim as Claim
+from jaxmark.watermark.carriers.carrier import Reader as Reader
+from jaxmark.watermark.carriers.eigen import Eigenspaces as Eigenspaces
+from jaxmark.watermark.carriers.eigen import eigenspaces as eigenspaces
+from jaxmark.watermark.carriers.host import HostBands as HostBands
+from jaxmark.watermark.carriers.host import host_bands as host_bands
+from jaxmark.watermark.carriers.keyed import Chips as Chips
+from jaxmark.watermark.carriers.keyed import KeyedCarrier as KeyedCarrier
+from jaxmark.watermark.carriers.keyed import KeyedReader as KeyedReader
+from jaxmark.watermark.carriers.keyed import make_chips as make_chips
+from jaxmark.watermark.carriers.modulated import Components as Components
+from jaxmark.watermark.carriers.modulated import ModulatedCarrier as ModulatedCarrier
+from jaxmark.watermark.carriers.modulated import PlainReader as PlainReader

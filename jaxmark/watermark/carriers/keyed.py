@@ -1,0 +1,237 @@
+"""Keyed carriers: a keyed sign for every vertex and coordinate, shaped by band filters (direct-sequence spreading).
+
+w = Σ_j β_j f_j(Δ) r with r[v, c] = s[v, c] · bit[slot(v, c)], where the signs s and the slots come from the key.
+Writing any number of bits takes one filter, and reading them one filter and one segment-sum: time and memory do not
+grow with the payload.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from jaxmark.alignment.observation import Observation, observe
+from jaxmark.spectral.chebyshev import band_energies, filter, transpose
+from jaxmark.spectral.laplacian import per_row
+from jaxmark.spectral.precision import matmul, sum_and_norm
+from jaxmark.watermark.carriers.carrier import Claim, Displacement, Room, Strength
+from jaxmark.watermark.carriers.reception import (
+    Host,
+    Receiver,
+    Reception,
+    clean,
+    normal_factor,
+    nuisance_basis,
+    receive,
+    weigh_evenly,
+)
+from jaxmark.watermark.coding.keys import permutation, signs
+from jaxmark.watermark.probes import probe_signs
+
+
+class Chips(NamedTuple):
+    """The keyed choices of a carrier: three chips per vertex, or one along its normal."""
+
+    signs: Int[Array | np.ndarray, "vertices channels"]  # ±1; 0 on a vertex that does not move
+    slots: Int[Array | np.ndarray, "vertices channels"]  # index of the bit that each chip belongs to
+    population: Int[Array | np.ndarray, " bits"]  # number of chips of each bit
+
+
+def make_chips(
+    key: bytes, geometry: bytes, moving: Bool[np.ndarray, " vertices"], bits: int, *, channels: int = 3
+) -> Chips:
+    """Draw the signs, and assign the chips of all moving vertices to the bits, in numbers that differ by at most one.
+
+    Args:
+        key: 32 bytes.
+        geometry: `geometry_hash` of the original.
+        moving: whether each vertex may move, `[N]`.
+        bits: number of bits to carry.
+        channels: chips per vertex: 3, or 1 along normals.
+    """
+    total = channels * int(moving.sum())
+    sign = np.zeros((len(moving), channels), np.int8)
+    slot = np.zeros((len(moving), channels), np.int32)
+    sign[moving] = signs(key, geometry, f"keyed/{bits}/{channels}/signs", total).reshape(-1, channels)
+    order = permutation(key, geometry, f"keyed/{bits}/{channels}/slots", total)
+    slot[moving] = (order % bits).reshape(-1, channels)
+    return Chips(sign, slot, np.bincount(order % bits, minlength=bits).astype(np.int32))
+
+
+class KeyedCarrier(NamedTuple):
+    """Carries bits by keyed chips that band filters shape; see `Carrier`.
+
+    β is the root mean square of the chips before the filter, one per band.
+    """
+
+    host: Host
+    chips: Chips
+    normals: Float[Array, "vertices 3"] | None = None  # with one chip per vertex, the direction in which it moves
+    profile: Float[Array | np.ndarray, " bands"] | None = None  # factor on β for each band
+    masking: Float[Array | np.ndarray, " vertices"] | None = None  # factor on each vertex's displacement
+
+    @property
+    def code_bits(self) -> int:
+        """See `Carrier`."""
+        return len(self.chips.population)
+
+    @jax.jit
+    def displacement(self, bits: Float[Array, " bits"], beta: Strength = 1.0) -> Displacement:
+        """See `Carrier`; takes one filter, whatever the number of bits."""
+        return self.modulate(bits, self.coefficients(beta))
+
+    def adjoint(self, residual: Displacement, beta: Strength = 1.0) -> Float[Array, " bits"]:
+        """See `Carrier`."""
+        return self.correlate(per_row(self.host.operator.degree, residual) * residual, self.coefficients(beta))
+
+    def gram(self, beta: Strength = 1.0) -> Float[Array, "bits bits"]:
+        """See `Carrier`; takes one filter per bit, so it is for tests and small codes."""
+        unit = jnp.eye(self.code_bits, dtype=self._signs.dtype)
+        return jax.lax.map(lambda bits: self.adjoint(self.displacement(bits, beta), beta), unit)
+
+    def claim(self, seen: Observation, bits: Float[Array, " bits"]) -> Claim:
+        """See `Carrier`, and `KeyedReader.claim`."""
+        reader = self.reader()
+        return reader.claim(reader.receive(seen), bits)
+
+    def redraw(self, key: PRNGKeyArray) -> "KeyedCarrier":
+        """See `Carrier`; the slots stay as they are, and so do signs of 0, on vertices that do not move."""
+        moving = jnp.abs(jnp.asarray(self.chips.signs)).astype(jnp.int8)
+        signs = moving * jax.random.rademacher(key, moving.shape, jnp.int8)
+        return self._replace(chips=self.chips._replace(signs=signs))
+
+    def reader(self) -> "KeyedReader":
+        """See `Carrier`."""
+        return KeyedReader(self, nuisance_basis(self.host))
+
+    def coefficients(
+        self, beta: Strength, weight: Float[Array, " bands"] | None = None
+    ) -> Float[Array, " terms *channels"]:
+        """Chebyshev coefficients of Σ_j weight_j β_j f_j, including the profile."""
+        strength = jnp.asarray(beta).astype(self._signs.dtype)
+        if strength.ndim == 0:
+            strength = jnp.broadcast_to(strength, len(self.host.coefficients))
+        for factor in (weight, self.profile):
+            if factor is not None:
+                strength = per_row(jnp.asarray(factor), strength) * strength
+        return matmul(self.host.coefficients.T, strength)
+
+    def modulate(self, bits: Float[Array, " bits"], coefficients: Float[Array, " terms *channels"]) -> Displacement:
+        """Spread the bits over their chips, and filter these into a displacement."""
+        return self.filter_chips(self.spread(bits), coefficients)
+
+    def correlate(
+        self, residual: Displacement, coefficients: Float[Array, " terms *channels"]
+    ) -> Float[Array, " bits"]:
+        """Apply the plain adjoint of `modulate`: Σ_v ⟨modulate(a)_v, r_v⟩ is the dot product of a and this."""
+        products = self._signs * self.match_chips(residual, coefficients)
+        return jax.ops.segment_sum(products.ravel(), self.chips.slots.ravel(), self.code_bits)
+
+    def filter_chips(
+        self, chips: Float[Array, "vertices channels"], coefficients: Float[Array, " terms *channels"]
+    ) -> Displacement:
+        """Filter any chips into a displacement."""
+        along = filter(self.host.operator, coefficients, chips)
+        if self.masking is not None:
+            along = jnp.asarray(self.masking)[:, None] * along
+        return along if self.normals is None else self.normals * along
+
+    def match_chips(
+        self, residual: Displacement, coefficients: Float[Array, " terms *channels"]
+    ) -> Float[Array, "vertices channels"]:
+        """Apply the plain adjoint of `filter_chips`, which is a matched filter."""
+        along = residual if self.normals is None else jnp.sum(self.normals * residual, axis=1, keepdims=True)
+        if self.masking is not None:
+            along = jnp.asarray(self.masking)[:, None] * along
+        return transpose(self.host.operator, coefficients, along)
+
+    def spread(self, bits: Float[Array, " bits"]) -> Float[Array, "vertices channels"]:
+        """Give each chip its value: its sign times the bit in its slot."""
+        return self._signs * jnp.asarray(bits).astype(self._signs.dtype)[self.chips.slots]
+
+    @property
+    def _signs(self) -> Float[Array, "vertices channels"]:
+        return jnp.asarray(self.chips.signs).astype(self.host.signal.dtype)
+
+
+class KeyedReader(NamedTuple):
+    """Reads keyed carriers: projects off the part of the host and weights the bands; see `Reader`."""
+
+    carrier: KeyedCarrier
+    nuisance: Float[Array, "vertices columns"]  # nearly orthonormal basis of what is projected off each coordinate
+
+    @property
+    def receiver(self) -> Receiver:
+        """The part of the reader that does not depend on the key."""
+        host = self.carrier.host
+        return Receiver(host.operator, host.signal, host.coefficients, self.nuisance)
+
+    def receive(self, seen: Observation) -> Reception:
+        """See `Reader`, and `jaxmark.watermark.carriers.reception.receive`."""
+        return receive(self.receiver, seen)
+
+    def ways(self, received: Reception) -> Sequence[Reception]:
+        """See `Reader`; the bands are weighted by what the suspect shows of them, and then all alike.
+
+        The first way gives the most evidence, the second is the hardest to attack.
+        """
+        return received, weigh_evenly(received)
+
+    @jax.jit
+    def claim(self, received: Reception, bits: Float[Array, " bits"]) -> Claim:
+        """See `Reader`; a is what `matched_residual` returns, up to the signs of the bits.
+
+        As it is computed, including rounding, a does not depend on the keyed signs: only the two sums can be wrong, see
+        `jaxmark.spectral.precision.sum_and_norm`.
+        """
+        return Claim(*sum_and_norm(self.carrier.spread(bits) * self.matched_residual(received)))
+
+    def matched_residual(self, received: Reception) -> Float[Array, "vertices channels"]:
+        """The vector that the keyed signs multiply: the residual after the filter matched to gain and power."""
+        return self.carrier.match_chips(matmul(received.residual, received.axes), self._matched_coefficients(received))
+
+    def linear_score(
+        self, received: Reception, residual: Displacement, bits: Float[Array, " bits"]
+    ) -> Float[Array, ""]:
+        """See `Reader`; weights, gain, power and axes are held fixed."""
+        left = matmul(clean(received.receiver, received.seen, received.factor, residual), received.axes)
+        return jnp.sum(bits * self.carrier.correlate(matmul(left, received.axes), self._matched_coefficients(received)))
+
+    @jax.jit
+    def glance(self, seen: Observation, beta: Strength = 1.0) -> Float[Array, " bits"]:
+        """See `Reader`; plain correlations without the nuisance, in which the bits are noise to each other."""
+        receiver = self.receiver
+        residual = clean(receiver, seen, normal_factor(receiver, seen), seen.residual)
+        return self.carrier.correlate(residual, self.carrier.coefficients(beta))
+
+    def room(self, moving: Float[Array, " vertices"]) -> Room:
+        """See `Reader`; measured with one probe, which has random signs in place of the keyed ones."""
+        whole, left = np.asarray(self._probe(moving), np.float64).clip(0)
+        profile = self.carrier.profile
+        strength = np.ones(len(whole)) if profile is None else np.asarray(profile, np.float64)
+        # A whole band sums over three coordinates of each vertex, or over one along its normal.
+        displaced = whole @ strength**2 / np.count_nonzero(moving)
+        return Room(left * (strength > 0), strength**2 / displaced if displaced > 0 else strength**2)
+
+    def with_carrier(self, carrier: KeyedCarrier) -> "KeyedReader":
+        """See `Reader`."""
+        return self._replace(carrier=carrier)
+
+    def _matched_coefficients(self, received: Reception) -> Float[Array, " terms *channels"]:
+        """Chebyshev coefficients of the filter matched to gain and power."""
+        return self.carrier.coefficients(1.0, received.gain / received.power)
+
+    @jax.jit
+    def _probe(self, moving: Float[Array, " vertices"]) -> Float[Array, "2 bands"]:
+        """Energy of random signs in each band, before and after the nuisance is projected off."""
+        receiver, normals = self.receiver, self.carrier.normals
+        (signs,) = probe_signs("capacity", self.carrier.chips.signs.shape, dtype=moving.dtype)
+        signs = signs * moving[:, None]
+        everything = observe(jnp.zeros_like(receiver.signal), moving)
+        factor = normal_factor(receiver, everything)
+        white = signs if normals is None else normals * signs
+        left = clean(receiver, everything, factor, white)
+        return jnp.stack([band_energies(receiver.operator, receiver.coefficients, x, x) for x in (white, left)])

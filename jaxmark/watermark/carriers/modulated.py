@@ -1,0 +1,132 @@
+"""Carriers that modulate components, which are fixed displacements of the vertices, by keyed sequences of signs."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+from numpy.typing import ArrayLike
+
+from jaxmark.alignment.observation import Observation
+from jaxmark.spectral.precision import einsum, sum_and_norm
+from jaxmark.watermark.carriers.carrier import Claim, Displacement, Strength
+
+
+@runtime_checkable
+class Components(Protocol):
+    """The displacements that a carrier adds up: one vector [N] per band and coordinate.
+
+    They are fixed by the original and must not depend on the key.
+    """
+
+    @property
+    def gram(self) -> Float[Array, "3 bands bands"]:
+        """D inner products of the components, per coordinate."""
+        ...
+
+    def synthesise(self, amplitudes: Float[Array, "bands 3"]) -> Displacement:
+        """Add up the components: Σ_j amplitude_jc · component_jc for each coordinate c."""
+        ...
+
+    def analyse(self, residual: Displacement) -> Float[Array, "bands 3"]:
+        """Apply the D-adjoint of `synthesise`: ⟨residual_c, component_jc⟩_D for each band j and coordinate c."""
+        ...
+
+
+class PlainReader(NamedTuple):
+    """The reader of a carrier that does not know its host: it takes suspects as they are; see `Reader`."""
+
+    carrier: Any  # a `Carrier`
+
+    def receive(self, seen: Observation) -> Observation:
+        """See `Reader`; returns the suspect itself."""
+        return seen
+
+    def ways(self, received: Observation) -> Sequence[Observation]:
+        """See `Reader`; the only way is to take the suspect as it is."""
+        return (received,)
+
+    def claim(self, received: Observation, bits: Float[Array, " bits"]) -> Claim:
+        """See `Reader`; this is `Carrier.claim`."""
+        return self.carrier.claim(received, bits)
+
+    def linear_score(
+        self, received: Observation, residual: Displacement, bits: Float[Array, " bits"]
+    ) -> Float[Array, ""]:
+        """See `Reader`; a plain correlation is linear already."""
+        return self.carrier.claim(received._replace(residual=residual), bits).score
+
+    def glance(self, seen: Observation, beta: Strength = 1.0) -> None:
+        """See `Reader`; there is no shortcut, because reading is fast anyway."""
+        return None
+
+    def room(self, moving: Float[Array, " vertices"]) -> None:
+        """See `Reader`; there is no model of noise."""
+        return None
+
+    def with_carrier(self, carrier: Any) -> "PlainReader":
+        """See `Reader`."""
+        return PlainReader(carrier)
+
+
+class ModulatedCarrier(NamedTuple):
+    """Writes bits on components x_j of the host by sequences p: w = Σ_i bit_i Σ_j β_j p_j^(i) x_j (Sohn et al., 2.2).
+
+    Each bit has a sign per band and coordinate, or one per band that the three coordinates share. With polynomial bands
+    as components this is the paper's scheme, with eigenspaces Ohbuchi's. It computes in the dtype of the components.
+    Polynomial bands have no forward-mode derivatives (see `jaxmark.spectral.chebyshev.filter`).
+    """
+
+    components: Components
+    sequences: Int[Array | np.ndarray, "bits bands 3"] | Int[Array | np.ndarray, "bits bands 1"]  # of ±1
+
+    @property
+    def code_bits(self) -> int:
+        """See `Carrier`."""
+        return len(self.sequences)
+
+    def displacement(self, bits: Float[Array, " bits"], beta: Strength = 1.0) -> Displacement:
+        """See `Carrier`."""
+        amplitudes = einsum("k,kjc->jc", self._as_real(bits), self._sequences)
+        return self.components.synthesise(self._per_band(beta) * amplitudes)
+
+    def adjoint(self, residual: Displacement, beta: Strength = 1.0) -> Float[Array, " bits"]:
+        """See `Carrier`."""
+        found = self._per_band(beta) * self.components.analyse(self._as_real(residual))
+        return einsum("kjc,jc->k", self._sequences, found)
+
+    def gram(self, beta: Strength = 1.0) -> Float[Array, "bits bits"]:
+        """See `Carrier`."""
+        weighted = self._per_band(beta) * self._sequences
+        return einsum("ajc,cjl,blc->ab", weighted, self.components.gram, weighted)
+
+    def claim(self, seen: Observation, bits: Float[Array, " bits"]) -> Claim:
+        """See `Carrier`; the keyed signs are one per band and coordinate, or one per band if coordinates share them."""
+        found = self.components.analyse(self._as_real(seen.weigh(seen.residual)))
+        if self.sequences.shape[-1] == 1:
+            found = found.sum(axis=1, keepdims=True)
+        return Claim(*sum_and_norm(einsum("k,kjc->jc", self._as_real(bits), self._as_real(self.sequences)) * found))
+
+    def redraw(self, key: PRNGKeyArray) -> "ModulatedCarrier":
+        """See `Carrier`."""
+        return self._replace(sequences=jax.random.rademacher(key, jnp.shape(self.sequences), jnp.int8))
+
+    def reader(self) -> PlainReader:
+        """See `Carrier`."""
+        return PlainReader(self)
+
+    @property
+    def _sequences(self) -> Float[Array, "bits bands 3"]:
+        signs = self._as_real(self.sequences)
+        return jnp.broadcast_to(signs, (*signs.shape[:2], 3))
+
+    def _per_band(self, beta: Strength) -> Array:
+        """β in a shape that broadcasts against `[bands, 3]`."""
+        strength = self._as_real(beta)
+        return strength[:, None] if strength.ndim == 1 else strength
+
+    def _as_real(self, values: ArrayLike) -> Array:
+        """Convert to an array in the dtype of the components."""
+        return jnp.asarray(values).astype(self.components.gram.dtype)

@@ -1,0 +1,328 @@
+"""What a receiver learns from a suspect without the key: it projects off the host's part, and weights the bands.
+
+Whatever acts on the *host* as a spectral filter, an affine map or a smooth warp leaves a residual in the span of a few
+diffusion scales of the host and polynomials of the position. Projecting that nuisance off leaves the mark and noise.
+How much of the mark each band still holds is estimated from what the attack did to the host in that band.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxmark.alignment.observation import Observation
+from jaxmark.spectral.bands import diffusion
+from jaxmark.spectral.chebyshev import band_components, filter, gram, over_bands
+from jaxmark.spectral.laplacian import Laplacian, per_row
+from jaxmark.spectral.precision import einsum, matmul
+from jaxmark.watermark.probes import probe_signs
+
+_BLOCK_VERTICES = 2**14  # vertices whose nuisance is formed at a time
+_SAMPLE_VERTICES = 2**13  # vertices that are enough to make a basis nearly orthonormal
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Extent:
+    """The extent of the nuisance, which is projected off."""
+
+    scales: int  # number of diffusion scales of each coordinate, from one smoothing step on
+    degree: int  # total degree of the polynomials of the position, at least 1 (affine maps)
+
+
+class Host(NamedTuple):
+    """An original prepared for writing marks, with the extent of its nuisance; independent of the key."""
+
+    operator: Laplacian
+    signal: Float[Array, "vertices 3"]  # the original's coordinates, centred per connected component
+    coefficients: Float[Array, "bands terms"]  # Chebyshev coefficients of the bands that the mark is written in
+    positions: Float[Array, "vertices 3"]  # the original's coordinates
+    extent: Extent
+
+
+class Receiver(NamedTuple):
+    """An original prepared for reading marks; independent of the key."""
+
+    operator: Laplacian
+    signal: Float[Array, "vertices 3"]  # see `Host`
+    coefficients: Float[Array, "bands terms"]  # see `Host`
+    nuisance: Float[Array, "vertices columns"]  # nearly orthonormal basis of the nuisance of each coordinate
+
+
+class Reception(NamedTuple):
+    """What the receiver learns from a suspect; independent of the key."""
+
+    receiver: Receiver  # its nuisance includes what the suspect shows to have happened to the host
+    observed: Observation  # the suspect as it was given
+    residual: Float[Array, "vertices 3"]  # weighted, without nuisance, and equally strong along all directions
+    gain: Float[Array, " bands"]  # share of the host's amplitude, and so of the mark's, that the attack left
+    power: Float[Array, " bands"]  # residual energy per dimension, relative to the largest
+    axes: Float[Array, "3 3"]  # the symmetric matrix that made the residual equally strong along all directions
+    seen: Observation  # the suspect with lower weights for points that were edited or lost
+    factor: Float[Array, "unknowns unknowns"]  # Cholesky factor of the nuisance's normal equations, with these weights
+
+
+def make_host(
+    operator: Laplacian,
+    signal: Float[Array, "vertices 3"],
+    positions: Float[Array, "vertices 3"],
+    coefficients: Float[Array | np.ndarray, "bands terms"],
+    *,
+    scales: int,
+    degree: int,
+) -> Host:
+    """Prepare an original for writing; `make_receiver` prepares it for reading.
+
+    Args:
+        operator: the Laplacian, of N vertices.
+        signal: the host's coordinates, centred per connected component, `[N, 3]`.
+        positions: the host's coordinates, `[N, 3]`.
+        coefficients: Chebyshev coefficients of the bands that the mark is written in, `[bands, degree + 1]`.
+        scales: number of diffusion scales, see `Extent`.
+        degree: total degree of the polynomials, see `Extent`.
+    """
+    return Host(operator, signal, jnp.asarray(coefficients).astype(signal.dtype), positions, Extent(scales, degree))
+
+
+def make_receiver(host: Host) -> Receiver:
+    """Prepare a host for reading, with a basis of its nuisance; can be traced and differentiated with respect to it."""
+    # This is not compiled, because a compiled function would return copies of the other arrays.
+    return Receiver(host.operator, host.signal, host.coefficients, nuisance_basis(host))
+
+
+@jax.jit
+def nuisance_basis(host: Host) -> Float[Array, "vertices columns"]:
+    """Form a nearly orthonormal basis of what is projected off each coordinate: polynomials and diffusion scales."""
+    low, high = jax.lax.stop_gradient((host.positions.min(axis=0), host.positions.max(axis=0)))
+    inside = (2 * host.positions - (high + low)) / jnp.where(high > low, high - low, 1)
+    smooth = (
+        band_components(host.operator, diffusion(host.extent.scales, host.coefficients.shape[1]), host.signal)
+        if host.extent.scales
+        else jnp.zeros((0, *host.signal.shape), host.signal.dtype)
+    )
+
+    def columns(inside: Array, smooth: Array) -> Array:
+        polynomials = _polynomials(inside, host.extent.degree)
+        return jnp.concatenate([polynomials, smooth.reshape(len(inside), -1)], axis=1)
+
+    return _basis(columns, inside, jnp.moveaxis(smooth, 0, 1))
+
+
+def extend(receiver: Receiver, seen: Observation) -> Receiver:
+    """Add to the receiver's nuisance what the suspect shows to have happened to the host."""
+    if seen.nuisance is None:
+        return receiver
+    return receiver._replace(nuisance=_join_bases(receiver.nuisance, seen.nuisance))
+
+
+@jax.jit
+def _join_bases(first: Array, second: Array) -> Float[Array, "vertices columns"]:
+    return _basis(lambda *both: jnp.concatenate(both, axis=1), first, second)
+
+
+def _basis(columns: Callable[..., Array], *rows: Array) -> Float[Array, "vertices columns"]:
+    """A nearly orthonormal basis of the span of columns(*rows), which are formed block by block, never as a whole."""
+    count = len(rows[0])
+    # Only the span matters, so the change of basis is not differentiated. A QR decomposition of a sample gives a nearly
+    # orthonormal basis, and the normal equations of all rows correct it. A column that depends on those before it is
+    # rounding noise and is dropped.
+    still = jax.lax.stop_gradient(rows)
+    some = np.sort(np.random.default_rng(0).permutation(count)[:_SAMPLE_VERTICES])
+    raw = columns(*(part[some] for part in still))
+    norm = jnp.linalg.norm(raw, axis=0)
+    scale = 1 / jnp.where(norm > 0, norm, 1)
+    triangle = jnp.linalg.qr(raw * scale, mode="r")
+    eye = jnp.eye(len(norm), dtype=raw.dtype)
+    pivot = jnp.zeros_like(norm).at[: len(triangle)].set(jnp.abs(jnp.diagonal(triangle)))
+    sound = pivot > 10 * jnp.finfo(raw.dtype).eps
+    square = jnp.where(sound[:, None], eye.at[: len(triangle)].set(triangle), eye)
+    nearly = scale[:, None] * jsl.solve_triangular(square, jnp.diag(sound.astype(raw.dtype)))
+
+    def products(fresh: Array, *block: Array) -> Array:
+        part = matmul(columns(*block), nearly)
+        return matmul(part.T, fresh[:, None] * part)
+
+    normal = jnp.where(sound[:, None] & sound, _sum_over_blocks(products, *still), eye)
+    change = jsl.solve_triangular(jnp.linalg.cholesky(normal), nearly.T, lower=True).T
+
+    def write(basis: Array, start: Array) -> tuple[Array, None]:
+        place, block = _block(start, rows)
+        part = jax.checkpoint(lambda *block: matmul(columns(*block), change))(*block)
+        return jax.lax.dynamic_update_slice_in_dim(basis, part, place, 0), None
+
+    return jax.lax.scan(write, jnp.zeros((count, len(norm)), raw.dtype), _starts(count))[0]
+
+
+def _starts(count: int) -> Int[Array, " blocks"]:
+    """First row of each block, before the last block is moved back."""
+    return jnp.arange(0, count, min(count, _BLOCK_VERTICES))
+
+
+def _block(start: Array, rows: Sequence[Array]) -> tuple[Array, list[Array]]:
+    """The block of rows from `start` on, and its first row: the last block begins earlier, so that it is full."""
+    size = min(len(rows[0]), _BLOCK_VERTICES)
+    place = jnp.minimum(start, len(rows[0]) - size)
+    return place, [jax.lax.dynamic_slice_in_dim(part, place, size) for part in rows]
+
+
+def _sum_over_blocks(function: Callable[..., Array], *rows: Array) -> Array:
+    """Σ function(fresh, *block) over blocks of rows; fresh is 0 where a row was in the block before, else 1."""
+
+    def block_sum(start: Array) -> Array:
+        place, block = _block(start, rows)
+        fresh = place + jnp.arange(len(block[0])) >= start
+        return function(fresh.astype(rows[0].dtype), *block)
+
+    starts = _starts(len(rows[0]))
+    zero = jnp.zeros_like(jax.eval_shape(block_sum, starts[0]))
+    return jax.lax.scan(lambda total, start: (total + block_sum(start), None), zero, starts)[0]
+
+
+def receive(receiver: Receiver, seen: Observation) -> Reception:
+    """Project the nuisance off a residual, and measure gain and power of each band, and the power along each direction.
+
+    Args:
+        receiver: the original, from `make_receiver`.
+        seen: what the suspect shows of the displacement, in the units of the host.
+    """
+    wider = extend(receiver, seen)
+    # Only `_receive` is compiled, because a compiled function would return copies of its arguments.
+    return Reception(wider, seen, *_receive(wider, seen))
+
+
+@jax.jit
+def _receive(receiver: Receiver, seen: Observation) -> tuple[Array, Array, Array, Array, Observation, Array]:
+    # Points that are still far off without the nuisance were edited or lost, so they get lower weights.
+    strange = _huber_weights(clean(receiver, seen, normal_factor(receiver, seen), seen.residual), seen.weights)
+    seen = seen._replace(weights=seen.weights * strange)
+    factor = normal_factor(receiver, seen)
+    # The nuisance is projected off twice, because the ridge leaves a little of a large nuisance behind.
+    nuisance = _fit_nuisance(receiver, seen, factor, seen.residual)
+    residual = clean(receiver, seen, factor, seen.residual - nuisance)
+    # White noise is the reference for the power of each band.
+    (probe,) = probe_signs("reception", residual.shape, dtype=residual.dtype)
+    pair = jnp.concatenate([residual, clean(receiver, seen, factor, probe)], axis=1)
+    squares = gram(receiver.operator, receiver.coefficients, pair, method="moments")
+    # Rounding may make the energy of a band negative.
+    bands, reference = jnp.maximum(einsum("pcjj->pj", squares.reshape(2, 3, *squares.shape[1:])), 0)
+    tiny = 1e-6
+    power = (bands + tiny * bands.sum()) / (reference + tiny * reference.sum() + jnp.finfo(bands.dtype).tiny)
+    largest = power.max()
+    power = jnp.where(largest > 0, jnp.maximum(power / jnp.where(largest > 0, largest, 1), 1e-9), 1)
+
+    # Where nothing is seen, the host is assumed to have moved with the nuisance, because a hole would leak into every
+    # band. Bands of the host differ by orders of magnitude, which moments cannot resolve, so each band is filtered.
+    mass = per_row(receiver.operator.degree, residual)
+
+    def products(pair: Float[Array, "vertices 6"]) -> tuple[Array, Array]:
+        return jnp.sum(mass * pair[:, 3:] * pair[:, :3]), jnp.sum(mass * pair[:, 3:] ** 2)
+
+    pair = jnp.concatenate([residual + nuisance, receiver.signal], axis=1)
+    change, whole = over_bands(products, receiver.operator, receiver.coefficients, pair)
+    gain = 1 + jnp.where(whole > 0, change / jnp.where(whole > 0, whole, 1), 0)
+    axes = _axes(filter(receiver.operator, whitening(receiver, power), residual), seen)
+    return (matmul(residual, axes), jnp.clip(gain, 0, 2), power, axes, seen, factor)
+
+
+def weigh_evenly(received: Reception) -> Reception:
+    """Weight all bands and directions alike.
+
+    The usual weights grow as the power of a band falls. An attacker who empties a band, and turns what is left of the
+    mark in it, can so make this band outweigh all others. With equal weights nobody can.
+    """
+    flat = jnp.ones_like(received.power)
+    return received._replace(gain=flat, power=flat, axes=jnp.eye(3, dtype=received.axes.dtype))
+
+
+def whitening(receiver: Receiver, power: Float[Array, " bands"]) -> Float[Array, " terms"]:
+    """Chebyshev coefficients of the filter that makes all bands equally strong."""
+    return matmul(receiver.coefficients.T, 1 / jnp.sqrt(power))
+
+
+def _axes(white: Float[Array, "vertices 3"], seen: Observation) -> Float[Array, "3 3"]:
+    """C^-1/2 of the coordinates' covariance C, which an inverted stretch leaves unequal; of mean eigenvalue 1."""
+    if seen.normals is not None:
+        return jnp.eye(3, dtype=white.dtype)
+    products = matmul(white.T, white)
+    total = jnp.trace(products)
+    covariance = products / jnp.where(total > jnp.finfo(white.dtype).tiny, total, 1)
+    # The ridge keeps a direction in which nothing moved from outweighing the others.
+    axes = _inverse_root(covariance + 1e-4 * jnp.eye(3, dtype=white.dtype))
+    return axes / (jnp.trace(axes) / 3)
+
+
+@jax.custom_jvp
+def _inverse_root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """A^-1/2 of a symmetric positive matrix; its derivative (Daleckii, Krein 1965) exists for repeated eigenvalues."""
+    values, vectors = jnp.linalg.eigh(matrix)
+    return matmul(vectors / jnp.sqrt(values), vectors.T)
+
+
+@_inverse_root.defjvp
+def _inverse_root_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    values, vectors = jnp.linalg.eigh(primals[0])
+    root = jnp.sqrt(values)
+    slopes = -1 / (jnp.outer(root, root) * (root[:, None] + root))
+    change = slopes * einsum("ki,kl,lj->ij", vectors, tangents[0], vectors)
+    return matmul(vectors / root, vectors.T), einsum("ik,kl,jl->ij", vectors, change, vectors)
+
+
+def _huber_weights(
+    residual: Float[Array, "vertices 3"], weights: Float[Array, " vertices"]
+) -> Float[Array, " vertices"]:
+    """Huber weights on squared lengths: 1 up to four times their median, which Gaussian noise rarely exceeds."""
+    square = jnp.sum(residual**2, axis=1)
+    limit = 4 * jnp.nanmedian(jnp.where(weights > 0, square, jnp.nan))
+    return jnp.where(square > limit, limit / jnp.where(square > limit, square, 1), 1)
+
+
+def normal_factor(receiver: Receiver, seen: Observation) -> Float[Array, "unknowns unknowns"]:
+    """Cholesky factor of the nuisance's normal equations, with a ridge for columns that coincide where seen."""
+
+    def products(weights: Array) -> Array:
+        return _sum_over_blocks(
+            lambda fresh, rows, weight: matmul(rows.T, (fresh * weight)[:, None] * rows), receiver.nuisance, weights
+        )
+
+    if seen.normals is None:
+        normal = products(seen.weights)
+    else:
+        # The unknowns are each column along each coordinate. Each pair of coordinates has a block of the matrix, which
+        # is the same for a pair and its reverse.
+        pairs, which = np.triu_indices(3), np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+        along = seen.normals.T
+        blocks = jax.lax.map(products, seen.weights * along[pairs[0]] * along[pairs[1]])[which]
+        normal = blocks.transpose(2, 0, 3, 1).reshape(3 * blocks.shape[2], -1)
+    ridge = jnp.finfo(normal.dtype).eps * (jnp.trace(normal) + 1)
+    return jnp.linalg.cholesky(normal + ridge * jnp.eye(len(normal), dtype=normal.dtype))
+
+
+def clean(
+    receiver: Receiver, seen: Observation, factor: Float[Array, "unknowns unknowns"], x: Float[Array, "vertices 3"]
+) -> Float[Array, "vertices 3"]:
+    """ΩPx: project the nuisance off a displacement, and weight the rest; symmetric in the plain inner product."""
+    return seen.weigh(x - _fit_nuisance(receiver, seen, factor, x))
+
+
+def _fit_nuisance(receiver: Receiver, seen: Observation, factor: Array, x: Array) -> Array:
+    """Fit the nuisance to a displacement by least squares, with the weights and normals of the observation."""
+    matched = matmul(receiver.nuisance.T, seen.weigh(x))
+    if seen.normals is None:
+        return matmul(receiver.nuisance, jsl.cho_solve((factor, True), matched))
+    return matmul(receiver.nuisance, jsl.cho_solve((factor, True), matched.ravel()).reshape(-1, 3))
+
+
+def _polynomials(inside: Float[Array, "vertices 3"], degree: int) -> Float[Array, "vertices columns"]:
+    """Products of Chebyshev polynomials of the position in its bounding box, up to a total degree."""
+    powers = [jnp.ones_like(inside), inside]
+    while len(powers) <= degree:
+        powers.append(2 * inside * powers[-1] - powers[-2])
+    power = np.indices([degree + 1] * 3).reshape(3, -1)
+    i, j, k = power[:, power.sum(axis=0) <= degree]
+    x, y, z = jnp.moveaxis(jnp.stack(powers), 2, 0)
+    return (x[i] * y[j] * z[k]).T

@@ -1,0 +1,101 @@
+"""From a message to the code bits that are carried, and back; a keyed tag tells a decoded message from a guess.
+
+The message and its tag are one polar codeword (`jaxmark.watermark.coding.polar`). The decoder lists its best
+candidates; the tag, from a subkey of its own, tells which of them is the message, if any.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.watermark.coding import polar
+from jaxmark.watermark.coding.keys import derive
+
+TAG_BITS = 28
+CANDIDATES = 64  # number of messages whose tags the decoder tries
+
+
+def code_length(bits: int, places: int, spread: int) -> int:
+    """Choose the number of code bits for a payload: the largest power of two that the carrier has room for and needs.
+
+    Args:
+        bits: size of the payload in bits, a positive multiple of 8.
+        places: number of code bits that the carrier has room for.
+        spread: number of code bits for each bit of message and tag, beyond which more are of no use.
+
+    Raises:
+        JaxmarkError: if the payload is no positive multiple of 8, or too large for the places.
+    """
+    if bits <= 0 or bits % 8:
+        raise JaxmarkError(f"The payload must be a positive multiple of 8 bits, got {bits}.")
+    information = bits + TAG_BITS
+    length = 1 << (max(1, min(places, spread * information)).bit_length() - 1)
+    if information > length:
+        raise JaxmarkError(
+            f"{bits} bits and a tag of {TAG_BITS} do not fit: this mesh and scheme have {places} places, and the"
+            f" payload is at most {max(0, length - TAG_BITS) // 8 * 8} bits."
+        )
+    return length
+
+
+def encode(message: bytes, key: bytes, geometry: bytes, length: int) -> Float64[np.ndarray, " length"]:
+    """Encode a message and its keyed tag as a codeword of signs: a code bit 0 is +1, a 1 is -1.
+
+    Args:
+        message: the payload.
+        key: 32 bytes.
+        geometry: `geometry_hash` of the original.
+        length: number of code bits, from `code_length`.
+    """
+    payload = np.unpackbits(np.frombuffer(message, np.uint8))
+    return 1.0 - 2.0 * polar.encode(np.concatenate([payload, _tag(message, key, geometry)]), length)
+
+
+def decode(
+    scores: Float[np.ndarray, " length"], bits: int, key: bytes, geometry: bytes, candidates: int = CANDIDATES
+) -> bytes | None:
+    """Decode the most plausible message whose keyed tag fits; None if there is no such message.
+
+    A suspect that is independent of the key passes with probability at most candidates · 2^-TAG_BITS.
+
+    Args:
+        scores: soft values of the code bits, at any common scale; 0 where nothing is known.
+        bits: size of the payload in bits.
+        key: 32 bytes.
+        geometry: `geometry_hash` of the original.
+        candidates: largest number of messages to try.
+    """
+    for word in _list_candidates(scores, bits, candidates):
+        message = np.packbits(word[:bits]).tobytes()
+        if np.array_equal(word[bits:], _tag(message, key, geometry)):
+            return message
+    return None
+
+
+def guess(scores: Float[np.ndarray, " length"], bits: int) -> bytes | None:
+    """Decode the most plausible message, whatever its tag, as a receiver without tags would.
+
+    Args:
+        scores: soft values, see `decode`.
+        bits: size of the payload in bits.
+
+    Returns:
+        The message; None if all scores are 0.
+    """
+    word = next(iter(_list_candidates(scores, bits, CANDIDATES)), None)
+    return None if word is None else np.packbits(word[:bits]).tobytes()
+
+
+def _list_candidates(scores: Float[np.ndarray, " length"], bits: int, candidates: int) -> Iterable[np.ndarray]:
+    """List messages with their tags, the most plausible first; none if all scores are 0."""
+    if not np.any(scores):
+        return ()
+    return polar.decode(scores[None] / np.abs(scores).max(), bits + TAG_BITS, candidates)[0]
+
+
+def _tag(message: bytes, key: bytes, geometry: bytes) -> np.ndarray:
+    """The keyed tag of a message, as bits 0 or 1."""
+    digest = derive(key, geometry, "tag", -(-TAG_BITS // 8), message)
+    return np.unpackbits(np.frombuffer(digest, np.uint8))[:TAG_BITS]

@@ -1,0 +1,107 @@
+"""Polar codes: from information bits to code bits, and back from soft values to a list of candidates.
+
+Arıkan, "Channel Polarization", IEEE Trans. Inf. Theory 55 (2009); successive cancellation list decoding by Tal and
+Vardy, "List Decoding of Polar Codes", ibid. 61 (2015). Information goes to the positions of largest polarization weight
+(He et al., "β-expansion: A Theoretical Framework for Fast and Recursive Construction of Polar Codes", GLOBECOM 2017,
+with β = 2^¼): these positions are the same for every channel, and nested. Everything runs on the host, in NumPy.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Int8, Integer
+
+
+def frozen_inputs(length: int, information: int) -> Bool[np.ndarray, " length"]:
+    """Choose which inputs of the transform are fixed to 0; the others take the information bits in order.
+
+    Args:
+        length: length of the code, a power of two.
+        information: number of information bits, at most `length`.
+
+    Returns:
+        True for each input that is fixed, `[length]`.
+    """
+    position = np.arange(length)
+    weight = sum(((position >> j) & 1) * 2 ** (j / 4) for j in range(length.bit_length() - 1)) + np.zeros(length)
+    fixed = np.ones(length, bool)
+    fixed[np.argsort(weight)[length - information :]] = False
+    return fixed
+
+
+def encode(bits: Integer[np.ndarray, "*batch information"], length: int) -> Int8[np.ndarray, "*batch length"]:
+    """Encode information bits 0 or 1 as `length` code bits 0 or 1."""
+    inputs = np.zeros((*bits.shape[:-1], length), np.int8)
+    inputs[..., ~frozen_inputs(length, bits.shape[-1])] = bits
+    return _transform(inputs)
+
+
+def decode(
+    soft: Float[np.ndarray, "batch length"], information: int, paths: int
+) -> Int8[np.ndarray, "batch paths information"]:
+    """Decode soft values of code bits to the most plausible information words, best first.
+
+    Check nodes take the smaller magnitude, and a path pays |soft| for every bit that contradicts the sign of its soft
+    value, so that a common factor of the soft values, and with it the noise level, need not be known.
+
+    Args:
+        soft: positive where a code bit is likely 0, negative where it is likely 1, 0 where nothing is known.
+        information: number of information bits that the code carries.
+        paths: number of candidates to keep; fewer are returned if there are fewer words.
+
+    Returns:
+        Information bits 0 or 1.
+    """
+    fixed = frozen_inputs(soft.shape[1], information)
+    start = soft[:, None].astype(np.float32)
+    code, cost, _ = _decode(start, np.zeros(start.shape[:2], np.float32), fixed, paths)
+    order = np.argsort(cost, axis=1, kind="stable")
+    return _transform(_select(code, order))[..., ~fixed]
+
+
+def _transform(bits: Int8[np.ndarray, "*batch length"]) -> Int8[np.ndarray, "*batch length"]:
+    """Apply Arıkan's transform, x = u F^⊗m over GF(2), which is its own inverse."""
+    code = bits.copy()
+    half = 1
+    while half < code.shape[-1]:
+        pairs = code.reshape(*code.shape[:-1], -1, 2, half)
+        pairs[..., 0, :] ^= pairs[..., 1, :]
+        half *= 2
+    return code
+
+
+_Survivors = tuple[
+    Int8[np.ndarray, "batch survivors length"],
+    Float32[np.ndarray, "batch survivors"],
+    Int[np.ndarray, "batch survivors"],
+]
+
+
+def _decode(
+    soft: Float32[np.ndarray, "batch paths length"],
+    cost: Float32[np.ndarray, "batch paths"],
+    fixed: Bool[np.ndarray, " length"],
+    paths: int,
+) -> _Survivors:
+    """Decode one subtree; return the surviving paths' code bits and costs, and the path that each continues."""
+    count = soft.shape[1]
+    if fixed.all():
+        origin = np.broadcast_to(np.arange(count), cost.shape)
+        return np.zeros(soft.shape, np.int8), cost + np.maximum(-soft, 0).sum(axis=-1), origin
+    if len(fixed) == 1:
+        value = soft[..., 0]
+        forks = np.concatenate([cost + np.maximum(-value, 0), cost + np.maximum(value, 0)], axis=1)
+        keep = min(paths, 2 * count)
+        best = np.argpartition(forks, keep - 1, axis=1)[:, :keep]
+        return (best >= count).astype(np.int8)[..., None], np.take_along_axis(forks, best, 1), best % count
+    half = len(fixed) // 2
+    first, second = soft[..., :half], soft[..., half:]
+    check = np.sign(first) * np.sign(second) * np.minimum(np.abs(first), np.abs(second))
+    upper, cost, origin = _decode(check, cost, fixed[:half], paths)
+    first, second = _select(first, origin), _select(second, origin)
+    lower, cost, parent = _decode(second + (1 - 2 * upper) * first, cost, fixed[half:], paths)
+    upper = _select(upper, parent)
+    return np.concatenate([upper ^ lower, lower], axis=-1), cost, np.take_along_axis(origin, parent, 1)
+
+
+def _select(values: np.ndarray, path: Int[np.ndarray, "batch survivors"]) -> np.ndarray:
+    """Take the rows of the given paths."""
+    return np.take_along_axis(values, path[..., None], 1)

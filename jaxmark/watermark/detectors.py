@@ -1,0 +1,136 @@
+"""Detectors, which compute one soft value per bit from what a reader received from a suspect.
+
+`correlate` and `decorrelate` work with any carrier; `joint` needs the reader of a keyed carrier, which knows its host.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+from jax.scipy.sparse.linalg import cg
+from jaxtyping import Array, Float
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.spectral.chebyshev import filter, transpose
+from jaxmark.spectral.precision import matmul
+from jaxmark.watermark.carriers.carrier import Reader, Received, Strength
+from jaxmark.watermark.carriers.keyed import KeyedReader
+from jaxmark.watermark.carriers.reception import Reception, clean, whitening
+from jaxmark.watermark.probes import probe_signs
+
+#: A function of a reader, what it received from a suspect, and the strengths' profile as embedded; returns one soft
+#: value per bit.
+Detector = Callable[[Any, Any, Strength], Float[Array, " bits"]]
+
+# The conjugate gradients of joint decoding stop here: what remains to be gained is below the noise of the soft values.
+_MAX_ITERATIONS = 12
+_TOLERANCE = 1e-2  # relative residual
+_NOISE_RANGE = (0.02, 1e3)  # bounds on the estimated noise, relative to the energy of a bit
+
+
+def correlate(reader: Reader, received: Received, beta: Strength = 1.0) -> Float[Array, " bits"]:
+    """Compute the paper's detection value, W_i = ⟨residual, Σ_j p_j^(i) x_j⟩_D (2.2.2, with the D that it leaves out).
+
+    Its sign is the bit if the components are nearly orthogonal.
+    """
+    seen = received.observed
+    return reader.carrier.adjoint(seen.weigh(seen.residual), beta)
+
+
+def decorrelate(reader: Reader, received: Received, beta: Strength = 1.0) -> Float[Array, " bits"]:
+    """Compute least-squares amplitudes of the bits: correlations without the interference between the bits.
+
+    With the embedding's β they are ±1 for a mark that was not attacked. Directions that the carrier does not span
+    within rounding are held at zero by a ridge of 16 eps times the energy of all bits.
+    """
+    products = reader.carrier.gram(beta)
+    ridge = 16 * jnp.finfo(products.dtype).eps * jnp.trace(products)
+    # A carrier without energy must give zeros, not 0/0.
+    ridge = jnp.where(ridge > 0, ridge, 1)
+    factor = jsl.cho_factor(products + ridge * jnp.eye(len(products), dtype=products.dtype), lower=True)
+    return jsl.cho_solve(factor, correlate(reader, received, beta))
+
+
+def claims(
+    reader: Reader, received: Received, codeword: Float[Array, " code"]
+) -> tuple[Float[Array, " ways"], Float[Array, " ways"]]:
+    """Score S and norm ‖a‖ of a claimed codeword for each way of weighting a suspect; see `Reader.ways`.
+
+    Each way is a proof of its own; to take the best of them, pay for all (`evidence.any_of`).
+    """
+    scores, norms = zip(*(reader.claim(way, codeword) for way in reader.ways(received)), strict=True)
+    return jnp.stack(scores), jnp.stack(norms)
+
+
+def joint(reader: Reader, received: Any, beta: Strength = 1.0) -> Float[Array, " bits"]:
+    """Estimate all bits jointly with least mean square error, by conjugate gradients; no matrix bits x bits is formed.
+
+    The nuisance is projected off and each band is weighted by its power (`jaxmark.watermark.carriers.reception`). The
+    mark is then modelled as the carrier's displacement with each band at the gain that the host has in it. The balance
+    between noise and the interference of the bits is estimated from the energy before and after matched filtering.
+
+    Args:
+        reader: the reader of a keyed carrier.
+        received: what the reader received from the suspect.
+        beta: the strengths' profile over the bands, as embedded.
+
+    Returns:
+        Soft values `[k]`, ±1 on average if the mark was not attacked and β is the embedding's; their signs are the
+        bits.
+
+    Raises:
+        JaxmarkError: if it is not the reader of a keyed carrier.
+    """
+    if not isinstance(reader, KeyedReader):
+        raise JaxmarkError(f"The joint detector reads keyed carriers, not {type(reader.carrier).__name__}.")
+    return _decode_jointly(reader, received, beta, _TOLERANCE, _MAX_ITERATIONS)
+
+
+@partial(jax.jit, static_argnames=("tolerance", "steps"))
+def _decode_jointly(
+    reader: KeyedReader, received: Reception, beta: Strength, tolerance: float, steps: int
+) -> Float[Array, " bits"]:
+    carrier, receiver = reader.carrier, received.receiver
+    model = carrier.coefficients(beta, received.gain)
+    equaliser = whitening(receiver, received.power)
+
+    def forward(bits: Array) -> Array:
+        spread = carrier.modulate(bits, model)
+        return whiten(matmul(clean(receiver, received.seen, received.factor, spread), received.axes))
+
+    def backward(white: Array) -> Array:
+        filtered = matmul(transpose(receiver.operator, equaliser, white), received.axes)
+        return carrier.correlate(clean(receiver, received.seen, received.factor, filtered), model)
+
+    def whiten(x: Array) -> Array:
+        return filter(receiver.operator, equaliser, x)
+
+    observed = whiten(received.residual)
+    # Probes of random signs estimate what one bit of unit amplitude, and noise of unit strength with the residual's
+    # spectrum, contribute to the energy before and after matched filtering.
+    bits, signs = probe_signs("detection", (carrier.code_bits,), observed.shape, dtype=observed.dtype)
+    coloured = filter(receiver.operator, matmul(receiver.coefficients.T, jnp.sqrt(received.power)), signs)
+    noise = whiten(clean(receiver, received.seen, received.factor, coloured))
+    # The three run one after the other, so that there is less to compile.
+    matched, response, after = jax.lax.map(backward, jnp.stack([observed, forward(bits), noise]))
+    ridge = _noise_to_signal(
+        jnp.stack([jnp.sum(observed**2), jnp.sum(matched**2)]),
+        jnp.stack([jnp.sum(bits * response), jnp.sum(response**2)]),
+        jnp.stack([jnp.sum(noise**2), jnp.sum(after**2)]),
+    )
+    energy = jnp.sum(bits * response) / len(bits)
+    ridge = jax.lax.stop_gradient(jnp.where(energy > 0, energy * jnp.clip(ridge / energy, *_NOISE_RANGE), 1))
+    return cg(lambda bits: backward(forward(bits)) + ridge * bits, matched, tol=tolerance, maxiter=steps)[0]
+
+
+def _noise_to_signal(
+    energy: Float[Array, " 2"], of_signal: Float[Array, " 2"], of_noise: Float[Array, " 2"]
+) -> Float[Array, ""]:
+    """Solve the two equations energy = A² of_signal + σ² of_noise for σ²/A²; infinite if A² is not positive."""
+    determinant = of_signal[1] * of_noise[0] - of_signal[0] * of_noise[1]
+    signal = (energy[1] * of_noise[0] - energy[0] * of_noise[1]) * jnp.sign(determinant)
+    noise = (energy[0] * of_signal[1] - energy[1] * of_signal[0]) * jnp.sign(determinant)
+    return jnp.where(signal > 0, jnp.maximum(noise, 0) / jnp.where(signal > 0, signal, 1), jnp.inf)

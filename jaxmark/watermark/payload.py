@@ -1,0 +1,177 @@
+"""How many bits a mesh can carry, by the room for them in the pass band and by their energy in noise."""
+
+import math
+from collections.abc import Hashable, Mapping
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float64
+from scipy import optimize
+from scipy.special import log_ndtr, ndtri  # scipy.stats takes long to import
+
+from jaxmark.alignment.original import Original
+from jaxmark.errors import JaxmarkError
+from jaxmark.watermark.budget import Budget, write
+from jaxmark.watermark.carriers.carrier import Carrier, Reader, Room
+from jaxmark.watermark.coding.keys import KEY_BYTES
+from jaxmark.watermark.coding.message import TAG_BITS
+from jaxmark.watermark.schemes import Scheme
+
+_MAX_PAYLOAD_BYTES = 2**20  # if nothing else bounds the payload
+
+# Energy in decibels that the polar code needs beyond the least, at a message error rate of 1e-3;
+# `benchmarks/theory/limit.py --code-only` measures it.
+_CODE_GAP_DB = 1.0
+
+
+def least_energy(bits: int, error: float = 1e-3) -> float:
+    """Least E/N0 with which any code can carry bits in white noise at a message error rate.
+
+    It is given by the converse 2^-bits = Q(√(2E/N0) + Q⁻¹(1 - error)) of Polyanskiy, Poor, Verdú, "Minimum energy to
+    send k bits through the Gaussian channel with and without feedback", IEEE Trans. Inf. Theory 57, 2011, Theorem 2.
+
+    Args:
+        bits: number of bits.
+        error: message error rate.
+    """
+
+    def excess(root: float) -> float:
+        return float(log_ndtr(-(root + ndtri(error)))) + bits * math.log(2)
+
+    root = optimize.root_scalar(excess, bracket=(0.0, 10.0 + 4.0 * math.sqrt(bits))).root
+    return root**2 / 2
+
+
+def needed_energy(bits: int) -> float:
+    """E/N0 with which a payload of `bits` bits is read in noise alone, except for about one message in a thousand.
+
+    The code needs `_CODE_GAP_DB` more than the least energy for message and tag.
+    """
+    return 10 ** (_CODE_GAP_DB / 10) * least_energy(bits + TAG_BITS)
+
+
+def worth(ratio: Float64[np.ndarray, " bands"], dimensions: Float64[np.ndarray, " bands"]) -> float:
+    """Effective E/N0 where the other bits are noise to each bit: Σ_j n_j x_j/(1 + x_j).
+
+    Joint decoding removes half of that noise.
+
+    Args:
+        ratio: x_j, the E/N0 of each dimension of band j, `[bands]`.
+        dimensions: n_j, the number of dimensions of each band, `[bands]`.
+    """
+    return float(np.sum(dimensions * ratio / (1 + ratio)))
+
+
+def needed_dimensions(bits: int) -> float:
+    """Number of dimensions that a payload needs, to prove its message without a tag and to tell its code bits apart.
+
+    Without noise the squared score over its squared norm is about the number of dimensions n, so that the union bound
+    2^bits exp(-n/2) is at most 1e-6 for n = 1.39 bits + 28. The code needs two dimensions for each bit of message and
+    tag.
+    """
+    return max(2 * math.log(2) * bits + 28, 2.0 * (bits + TAG_BITS))
+
+
+class Conditions(NamedTuple):
+    """The conditions under which a message must still be readable."""
+
+    budget: Budget  # bounds on the distortion by the mark
+    noise: float  # half width of uniform noise over the mean distance of the vertices to their centre
+    coverage: float  # share of the vertices that are left
+
+
+class Capacity:
+    """Computes how many bits an original can carry with a scheme; measures each layout only once.
+
+    If the scheme's reader has no model of noise (see `Reader.room`), only the number of code bits limits the payload.
+    """
+
+    def __init__(self, original: Original, scheme: Scheme, known: Mapping[int, Reader] | None = None) -> None:
+        """Prepare for an original and a scheme.
+
+        Args:
+            original: the mesh to mark.
+            scheme: the scheme to mark it with.
+            known: readers that exist already, by the size of their payload in bits; they are not made again.
+        """
+        self._original, self._scheme = original, scheme
+        self._rooms: dict[Hashable, Room | None] = {
+            scheme.layout(original, bits): self._room(reader) for bits, reader in (known or {}).items()
+        }
+        self._reached: dict[Hashable, float] = {}
+
+    def least_budget(self, bits: int, conditions: Conditions) -> float:
+        """Compute the least RMS displacement, in diagonals, with which a payload is readable.
+
+        N0/2 is the variance ν²/3 of uniform noise of half width ν = noise · radius. The energy is what coverage and
+        projection leave of the mark's energy.
+
+        Args:
+            bits: size of the payload in bits.
+            conditions: the noise and the coverage; the budget does not matter.
+
+        Returns:
+            The displacement; 0 if there is no noise or no model of it, infinite if there are too few dimensions.
+        """
+        original, scheme = self._original, self._scheme
+        try:
+            code = scheme.code_length(original, bits)
+        except JaxmarkError:
+            return math.inf
+        layout = scheme.layout(original, bits)
+        if layout not in self._rooms:
+            self._rooms[layout] = self._room(self._carrier(bits, code).reader())
+        left, needed = self._rooms[layout], needed_energy(bits)
+        if left is None:
+            return 0.0
+        dimensions = conditions.coverage * left.dimensions
+        if dimensions.sum() <= max(needed_dimensions(bits), needed):
+            return math.inf
+        if conditions.noise == 0:
+            return 0.0
+        ratio = left.energy / (2 * (conditions.noise * self._radius()) ** 2 / 3)
+
+        def excess(logarithm: float) -> float:
+            return worth(math.exp(2 * logarithm) * ratio, dimensions) - needed
+
+        return math.exp(optimize.root_scalar(excess, bracket=(-100.0, 100.0)).root)
+
+    def _radius(self) -> float:
+        """Mean distance of the points that faces use to their centre, in diagonals."""
+        points = self._original.positions[self._original.used]
+        return float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean())
+
+    def reach(self, bits: int, budget: Budget) -> float:
+        """RMS displacement, in diagonals, that a budget surely allows a mark with a payload of `bits` bits."""
+        if budget.rms is not None and not budget.limits:
+            return budget.rms
+        layout = self._scheme.layout(self._original, bits)
+        if layout not in self._reached:
+            carrier = self._carrier(bits, self._scheme.code_length(self._original, bits))
+            probe = carrier.displacement(jnp.ones(carrier.code_bits, self._original.signal.dtype))
+            reached = write(self._original, self._original.to_host(probe), budget).moved.rms
+            # Two marks under the same limits differ by about one percent; two are subtracted to be sure.
+            self._reached[layout] = 0.98 * reached
+        return self._reached[layout]
+
+    def _room(self, reader: Reader) -> Room | None:
+        return reader.room(self._original.to_traced(self._original.used))
+
+    def _carrier(self, bits: int, code: int) -> Carrier:
+        return self._scheme.carrier(self._original, bytes(KEY_BYTES), bits, code)
+
+    def bits(self, conditions: Conditions) -> int:
+        """The largest payload, a multiple of 8 bits; 0 if not even 8."""
+
+        def fits(size: int) -> bool:
+            least = self.least_budget(8 * size, conditions)
+            return least == 0 or (math.isfinite(least) and least <= self.reach(8 * size, conditions.budget))
+
+        least, most = 0, 1
+        while fits(most) and most < _MAX_PAYLOAD_BYTES:
+            least, most = most, 2 * most
+        while most - least > 1:
+            middle = (least + most) // 2
+            least, most = (middle, most) if fits(middle) else (least, middle)
+        return 8 * least

@@ -1,0 +1,398 @@
+"""Schemes, which fix everything about a mark except its key, message and strength.
+
+The name of a scheme stands for its default fields. The record of a mark stores the fields, so a mark that was made with
+other fields stays readable.
+"""
+
+import math
+from collections.abc import Hashable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Array, Float, Float64
+
+from jaxmark.alignment.original import Original
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh, vertex_normals
+from jaxmark.spectral.bands import scaling
+from jaxmark.spectral.spectrum import eigenpairs
+from jaxmark.watermark.carriers import Carrier, KeyedCarrier, ModulatedCarrier, eigenspaces, host_bands, make_chips
+from jaxmark.watermark.carriers.modulated import Components
+from jaxmark.watermark.carriers.reception import Host, Receiver, make_host, make_receiver
+from jaxmark.watermark.coding.message import TAG_BITS, code_length
+from jaxmark.watermark.coding.sequences import orthogonal_sequences
+from jaxmark.watermark.detectors import Detector, decorrelate, joint
+from jaxmark.watermark.visibility import masking
+
+# Relative strengths of the lowest 20 of 64 bands: the mean over meshes that were tuned to noise, smoothing and
+# quantisation at the default budget. `benchmarks/robustness/tuning.py --limit dame=0.008 --train blub_7106.obj
+# fertility_12448.obj armadillo_14587.obj kitten.obj` prints them. Marks are read with the same strengths, so other
+# strengths would need a pass band of another name.
+DERIVED = (
+    *(0, 1, 0.93, 0.84, 0.77, 0.7, 0.63, 0.54, 0.47, 0.41),
+    *(0.37, 0.32, 0.28, 0.24, 0.21, 0.18, 0.15, 0.11, 0.07, 0.03),
+)
+
+# Least number of dimensions of the mark for each dimension of the nuisance that is projected off, apart from affine
+# maps; by pass band.
+_DIMENSIONS_PER_NUISANCE = {"tapered": 12, "narrow": 6}
+
+# Largest total degree of the polynomials among the nuisance; by pass band.
+_MAX_NUISANCE_DEGREE = {"tapered": 6, "narrow": 8}
+
+# Values of the fields that are missing from a record because it was written before they existed; by scheme.
+_FIELDS_OF_OLD_RECORDS: Mapping[str, Mapping[str, Any]] = {"keyed": {"passband": "narrow"}}
+
+
+@runtime_checkable
+class Scheme(Protocol):
+    """A dataclass that makes a carrier for an original, a key and a payload; the record of a mark stores its fields.
+
+    A scheme of your own inherits from this class and defines `name`, `detector`, `code_length` and `carrier`; `layout`,
+    `dimensions` and `tunable` have defaults.
+    """
+
+    name: ClassVar[str]  # the scheme's name in records and on the command line
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def detector(self) -> Detector:
+        """The detector that reads marks of this scheme, unless another one is chosen."""
+        ...
+
+    def code_length(self, original: Original, bits: int) -> int:
+        """Choose the number of code bits that carry a payload; see `message.code_length`.
+
+        Args:
+            original: the mesh to mark.
+            bits: size of the payload in bits.
+
+        Raises:
+            JaxmarkError: if the payload is too large for this original, which `capacity` relies on, or is no positive
+                multiple of 8.
+        """
+        ...
+
+    def carrier(self, original: Original, key: bytes, bits: int, code_bits: int) -> Carrier:
+        """Make the carrier of a mark.
+
+        Args:
+            original: the mesh to mark.
+            key: 32 bytes.
+            bits: size of the payload in bits.
+            code_bits: number of code bits to carry: `code_length`, or the number of slots of a fingerprint.
+        """
+        ...
+
+    def layout(self, original: Original, bits: int) -> Hashable:
+        """Name what the room for a payload depends on: payloads of equal layout leave the same room.
+
+        The room (see `Reader.room`) is then measured only once for all of them.
+        """
+        return None
+
+    def dimensions(self, original: Original, bits: int) -> int:
+        """Number of dimensions of the pass band for a payload; 0 if the scheme has none and carries no fingerprints."""
+        return 0
+
+    def tunable(self) -> "TunableScheme":
+        """Return the scheme in the form that `tune` needs.
+
+        Raises:
+            JaxmarkError: if the scheme has no bands whose strengths could be tuned.
+        """
+        raise JaxmarkError(f"The scheme {self.name!r} has no bands whose strengths could be tuned.")
+
+
+class TunableScheme(Scheme, Protocol):
+    """A scheme that writes with a strength of its own in each band of the spectrum."""
+
+    @property
+    def profile(self) -> tuple[float, ...]:
+        """Relative strengths of the lowest bands; empty if the scheme uses its default strengths."""
+        ...
+
+    def family(self) -> Float64[np.ndarray, "bands terms"]:
+        """Chebyshev coefficients of all bands, which are non-negative and add up to 1 over the spectrum."""
+        ...
+
+    def mask(self, original: Original) -> Float[Array, " rows"] | None:
+        """Factor on the displacement of each vertex; None if it is 1 everywhere."""
+        ...
+
+    def receiver(self, original: Original, bits: int) -> Receiver:
+        """Make the receiver of marks with a payload, with all bands of `family`."""
+        ...
+
+    def with_profile(self, profile: tuple[float, ...]) -> "TunableScheme":
+        """Return the scheme with other relative strengths of the lowest bands."""
+        ...
+
+
+class Layout(NamedTuple):
+    """The pass band of a keyed carrier, and the nuisance that its receiver projects off."""
+
+    passing: int  # number of bands in the pass band, from the lowest on
+    scales: int  # number of diffusion scales of the host
+    degree: int  # total degree of the polynomials of the position
+
+
+@dataclass(frozen=True)
+class KeyedScheme(Scheme):
+    """Writes keyed chips in a pass band of low frequencies; the host's part is projected off when reading.
+
+    The default pass band is tapered. It reaches to λ = 0.44 with the strengths of `DERIVED`, but leaves out the lowest
+    bands, of which the nuisance takes most. It is stretched if the payload needs more: 12 dimensions for each bit of
+    message and tag. A narrow pass band is flat, and as narrow as the payload allows: it has 1,024 dimensions and 12
+    more for each bit of message and tag, but ends at λ = 0.44 unless the payload needs more. With a profile, the mark
+    is written in the bands to which the profile gives strengths, whatever the payload.
+
+    Dimensions are counted as on a regular triangle mesh, √3/2π · λ for each coordinate of each vertex. The nuisance
+    that is projected off has at most a twelfth of them, apart from affine maps; with a narrow pass band, a sixth.
+    """
+
+    name: ClassVar[str] = "keyed"
+    bands: int = 64  # number of Jackson-damped scaling functions over the whole spectrum; the lowest pass
+    direction: Literal["coordinates", "normals"] = "coordinates"  # along which vertices are displaced
+    profile: tuple[float, ...] = ()  # relative strengths of the lowest bands, from `tune`; by default by `passband`
+    masking: bool = False  # whether rough regions move more; see `jaxmark.watermark.visibility.masking`
+    passband: Literal["tapered", "narrow"] = "tapered"  # how bands and nuisance are chosen
+
+    @property
+    def detector(self) -> Detector:
+        """See `Scheme`."""
+        return joint
+
+    def code_length(self, original: Original, bits: int) -> int:
+        """See `Scheme`; beyond 12 code bits for each bit of message and tag, the code gains less than 0.1 dB."""
+        return code_length(bits, self.dimensions(original, bits), 12)
+
+    def dimensions(self, original: Original, bits: int) -> int:
+        """Number of dimensions of the pass band for a payload, counted as the class says."""
+        return int(self._written_dimensions(original, self.strengths(original, bits)))
+
+    def layout(self, original: Original, bits: int) -> Layout:
+        """Choose the pass band and the nuisance for a payload, independently of the key."""
+        strengths = self._strengths(original, bits)
+        columns = self._written_dimensions(original, strengths) / self._channels
+        # Affine maps are 4 columns; each diffusion scale has one column for each coordinate.
+        scales = min(9, max(0, int(columns / 3 - 4) // 3))
+        degree = 1
+        while (
+            degree < _MAX_NUISANCE_DEGREE[self.passband]
+            and math.comb(degree + 4, 3) + 3 * scales <= columns / _DIMENSIONS_PER_NUISANCE[self.passband]
+        ):
+            degree += 1
+        return Layout(len(strengths), scales, degree)
+
+    def strengths(self, original: Original, bits: int) -> Float64[np.ndarray, " passing"]:
+        """Relative strengths of the bands of the pass band for a payload."""
+        strengths = self._strengths(original, bits)
+        if self.profile or self.passband == "narrow":
+            return strengths
+        # In a band that is mostly nuisance, a mark is visible but can hardly be read.
+        layout = self.layout(original, bits)
+        nuisance = math.comb(layout.degree + 3, 3) + 3 * layout.scales
+        held = np.array([self._dimensions(original, band + 1) for band in range(len(strengths))]) / self._channels
+        return np.where(held > min(nuisance, held[-1]) / 2, strengths, 0)
+
+    def carrier(self, original: Original, key: bytes, bits: int, code_bits: int) -> KeyedCarrier:
+        """See `Scheme`."""
+        layout, dtype = self.layout(original, bits), original.signal.dtype
+        host = self._host(original, layout, self.family()[: layout.passing])
+        chips = make_chips(key, original.geometry, original.moving, code_bits, channels=self._channels)
+        carrier = KeyedCarrier(host, chips, profile=self.strengths(original, bits).astype(dtype))
+        if self.direction == "normals":
+            normals = vertex_normals(Mesh(original.positions, original.weld.point[np.asarray(original.mesh.faces)]))
+            carrier = carrier._replace(normals=original.to_traced(normals))
+        return carrier._replace(masking=self.mask(original))
+
+    def tunable(self) -> "KeyedScheme":
+        """See `Scheme`."""
+        if self.direction != "coordinates":
+            raise JaxmarkError(f"tune knows marks along coordinates, not along {self.direction}.")
+        return self
+
+    def family(self) -> Float64[np.ndarray, "bands terms"]:
+        """See `TunableScheme`."""
+        return scaling(self.bands, damping="jackson")
+
+    def mask(self, original: Original) -> Float[Array, " rows"] | None:
+        """See `TunableScheme`."""
+        return masking(original) if self.masking else None
+
+    def receiver(self, original: Original, bits: int) -> Receiver:
+        """See `TunableScheme`."""
+        return make_receiver(self._host(original, self.layout(original, bits), self.family()))
+
+    def with_profile(self, profile: tuple[float, ...]) -> "KeyedScheme":
+        """See `TunableScheme`."""
+        return replace(self, profile=profile)
+
+    def _host(self, original: Original, layout: Layout, coefficients: Float64[np.ndarray, "bands terms"]) -> Host:
+        """Prepare the original with bands to write or read in, and with a layout's nuisance."""
+        return make_host(
+            original.operator,
+            original.signal,
+            original.to_traced(original.positions),
+            coefficients,
+            scales=layout.scales,
+            degree=layout.degree,
+        )
+
+    @property
+    def _channels(self) -> int:
+        """Number of chips per vertex."""
+        match self.direction:
+            case "coordinates":
+                return 3
+            case "normals":
+                return 1
+        raise JaxmarkError(f"direction must be 'coordinates' or 'normals', got {self.direction!r}.")
+
+    def _strengths(self, original: Original, bits: int) -> Float64[np.ndarray, " passing"]:
+        """Relative strengths as in `strengths`, but also in bands that are mostly nuisance."""
+        if self.profile:
+            if len(self.profile) > self.bands or not min(self.profile) >= 0 < max(self.profile) < math.inf:
+                raise JaxmarkError(f"A profile is up to {self.bands} numbers, none negative and not all 0.")
+            return np.array(self.profile)
+        information = bits + TAG_BITS
+        usual = round(self.bands * 0.31)
+        match self.passband:
+            case "tapered":
+                passing = self._count_bands(original, 12 * information, usual)
+                places = (np.arange(passing) + 0.5) / passing
+                return np.interp(places, (np.arange(len(DERIVED)) + 0.5) / len(DERIVED), DERIVED)
+            case "narrow":
+                wanted = min(1024 + 12 * information, self._dimensions(original, usual))
+                return np.ones(self._count_bands(original, max(wanted, 6 * information), 0))
+        raise JaxmarkError(f"passband must be 'tapered' or 'narrow', got {self.passband!r}.")
+
+    def _count_bands(self, original: Original, dimensions: float, least: int) -> int:
+        """Number of lowest bands that reach `dimensions`; at least six, because narrower pass bands leak too much."""
+        passing = max(least, min(6, self.bands))
+        while passing < self.bands and self._dimensions(original, passing) < dimensions:
+            passing += 1
+        return passing
+
+    def _written_dimensions(self, original: Original, strengths: Float64[np.ndarray, " passing"]) -> float:
+        """Number of dimensions of the bands that are written in."""
+        each = np.diff([self._dimensions(original, band) for band in range(len(strengths) + 1)])
+        return float(np.sum(each[strengths > 0]))
+
+    def _dimensions(self, original: Original, passing: int) -> float:
+        """Number of dimensions of the lowest `passing` bands."""
+        edge = 1 - math.cos(math.pi * passing / self.bands)
+        share = min(1.0, math.sqrt(3) / (2 * math.pi) * edge)
+        return self._channels * share * int(original.used.sum())
+
+
+@dataclass(frozen=True)
+class HostScheme(Scheme):
+    """The paper's scheme: it writes on polynomial bands of the host, with a keyed sign for each band and coordinate.
+
+    The defaults are the form of it that works: Jackson-damped bands at unit norm. `kernel="printed", damping="none",
+    unit_norm=False` is the form that the paper prints, in which the components of natural meshes are nearly collinear.
+    The signs need a Hadamard matrix of order 3 · bands, which exists if `bands` is a power of two from 4 on, and for
+    some other numbers.
+    """
+
+    name: ClassVar[str] = "host"
+    bands: int = 128  # number of bands
+    kernel: Literal["halved", "printed"] = "halved"  # kernel of the bands, see `jaxmark.spectral.bands`
+    damping: Literal["none", "jackson", "lanczos"] = "jackson"  # damping of the bands
+    unit_norm: bool = True  # whether components are scaled to unit norm
+
+    @property
+    def detector(self) -> Detector:
+        """See `Scheme`."""
+        return decorrelate
+
+    def code_length(self, original: Original, bits: int) -> int:
+        """See `Scheme`; the more code bits share the components, the more they interfere with each other."""
+        return code_length(bits, 3 * self.bands, 2)
+
+    def carrier(self, original: Original, key: bytes, bits: int, code_bits: int) -> Carrier:
+        """See `Scheme`."""
+        family = scaling(self.bands, kernel=self.kernel, damping=self.damping)
+        components = host_bands(original.operator, original.signal, family, unit_norm=self.unit_norm)
+        return _make_modulated(self.name, components, self.bands, original, key, code_bits)
+
+
+@dataclass(frozen=True)
+class EigenScheme(Scheme):
+    """Ohbuchi's scheme: it writes on the lowest eigenpairs of the Laplacian, with a keyed sign for each and coordinate.
+
+    The numbers that `pairs` may be are those of `HostScheme.bands`.
+    """
+
+    name: ClassVar[str] = "eigen"
+    pairs: int = 64  # number of eigenpairs
+
+    @property
+    def detector(self) -> Detector:
+        """See `Scheme`."""
+        return decorrelate
+
+    def code_length(self, original: Original, bits: int) -> int:
+        """See `Scheme`; the more code bits share the components, the more they interfere with each other."""
+        return code_length(bits, 3 * self.pairs, 2)
+
+    def carrier(self, original: Original, key: bytes, bits: int, code_bits: int) -> Carrier:
+        """See `Scheme`."""
+        pairs = eigenpairs(original.operator, self.pairs)
+        components = eigenspaces(original.operator, original.signal, pairs)
+        return _make_modulated(self.name, components, self.pairs, original, key, code_bits)
+
+
+#: The schemes that have names.
+SCHEMES: Mapping[str, type[KeyedScheme] | type[HostScheme] | type[EigenScheme]] = {
+    scheme.name: scheme for scheme in (KeyedScheme, HostScheme, EigenScheme)
+}
+DEFAULT_SCHEME = KeyedScheme.name
+
+
+def get_scheme(scheme: str | Scheme, parameters: Mapping[str, Any] | None = None) -> Scheme:
+    """Make a scheme from its name, with its defaults or the fields in a record; a scheme itself is returned as it is.
+
+    Args:
+        scheme: one of `SCHEMES`, or a scheme.
+        parameters: the fields in a record; None for the defaults.
+
+    Raises:
+        JaxmarkError: if there is no such scheme, or it has no such field.
+    """
+    if not isinstance(scheme, str):
+        return scheme
+    if scheme not in SCHEMES:
+        raise JaxmarkError(f"There is no scheme {scheme!r}; there are {', '.join(SCHEMES)}.")
+    known = {field.name: type(field.default) for field in fields(SCHEMES[scheme])}
+    # JSON stores tuples as lists.
+    given: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in (parameters or {}).items()
+    }
+    if any(
+        name not in known
+        or type(value) is not known[name]
+        or (isinstance(value, tuple) and not all(isinstance(item, float) for item in value))
+        for name, value in given.items()
+    ):
+        raise JaxmarkError(f"The scheme {scheme!r} takes the parameters {', '.join(known)}, not {given}.")
+    before = {} if parameters is None else _FIELDS_OF_OLD_RECORDS.get(scheme, {})
+    return SCHEMES[scheme](**{**before, **given})
+
+
+def parameters_of(scheme: Scheme) -> dict[str, Any]:
+    """The fields of a scheme, as a record stores them."""
+    return asdict(scheme)
+
+
+def _make_modulated(
+    name: str, components: Components, bands: int, original: Original, key: bytes, code_bits: int
+) -> ModulatedCarrier:
+    """Modulate components by one keyed sequence per bit, which runs over all pairs of a band and a coordinate."""
+    slots = 3 * bands
+    sequences = orthogonal_sequences(key, original.geometry, code_bits, slots, label=name).reshape(code_bits, bands, 3)
+    used = components.gram.shape[-1]  # a small mesh has fewer eigenvectors than the layout has places for
+    return ModulatedCarrier(components, np.ascontiguousarray(sequences[:, :used]))
