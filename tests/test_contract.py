@@ -15,6 +15,7 @@ from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral import bands, filter, make_laplacian
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark import SCHEMES
+from jaxmark.watermark.budget import make_budget
 from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme, Scheme
 from tests.samples import bumpy_sphere
 
@@ -163,7 +164,7 @@ def test_marks_move_copies_of_a_point_together(name, small: Mesh, key: jm.Key):
     soup = make_mesh(small.vertices[corners], np.arange(len(corners)).reshape(-1, 3))
     original = make_original(soup)
     marker = jm.make_marker(soup, key, bits=8, scheme=HostScheme(bands=32) if name == "host" else name)
-    marked, _ = marker.write(marker.codeword(b"c"), jm.watermark.budget.make_budget(1e-3))
+    marked, _ = marker.write(marker.codeword(b"c"), make_budget(1e-3))
     moved = np.asarray(marked.vertices) - soup.vertices
     np.testing.assert_array_equal(moved, moved[original.weld.first][original.weld.point])
 
