@@ -159,7 +159,9 @@ def test_make_targets_of_the_readme_exist():
 
 def test_make_help_lists_all_targets():
     (targets,) = re.findall(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    said = subprocess.run(["make", "--no-print-directory", "help"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    said = subprocess.run(
+        ["make", "--no-print-directory", "help"], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout
     assert [line.split()[0] for line in said.splitlines()] == targets.split()
     assert all(len(line.split()) >= 3 for line in said.splitlines())
 
