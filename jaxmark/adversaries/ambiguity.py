@@ -11,10 +11,10 @@ from jaxmark.alignment.original import make_original
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, host_mesh, same_connectivity
 from jaxmark.watermark import evidence
-from jaxmark.watermark.coding.keys import KEY_BYTES, Key
+from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key
 from jaxmark.watermark.coding.message import encode
 from jaxmark.watermark.detectors import claims
-from jaxmark.watermark.marking import make_marker
+from jaxmark.watermark.marking import bind_mark, make_marker
 from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme, get_scheme
 
 
@@ -77,13 +77,17 @@ def search_key(
     bits = 8 * len(message)
     code_bits, tried = maker.code_length(ready, bits), [Key(random.bytes(KEY_BYTES)) for _ in range(keys)]
     seen = observation(ready, align(ready, given))
+
+    def choices(key: Key) -> Choices:
+        return bind_mark(key, ready, maker, bits, "message")
+
     # What a reader forms and receives is free of the key.
-    reader = maker.carrier(ready, tried[0], bits, code_bits).reader()
+    reader = maker.carrier(ready, choices(tried[0]), bits, code_bits).reader()
     received = reader.receive(seen)
 
     def claim_log10_p(key: Key) -> float:
-        codeword = jnp.asarray(encode(message, key, ready.geometry, code_bits), ready.signal.dtype)
-        other = reader.with_carrier(maker.carrier(ready, key, bits, code_bits))
+        codeword = jnp.asarray(encode(message, choices(key), code_bits), ready.signal.dtype)
+        other = reader.with_carrier(maker.carrier(ready, choices(key), bits, code_bits))
         ways = zip(*claims(other, received, codeword), strict=True)
         return evidence.any_of(*(evidence.log10_p_claimed(score, norm) for score, norm in ways))
 

@@ -18,7 +18,7 @@ from jaxmark.alignment.observation import Observation
 from jaxmark.attacks.registry import Attack
 from jaxmark.distortion import rms
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh, weld
 from jaxmark.watermark.carriers.carrier import Reader
 from jaxmark.watermark.marking import Marker
 
@@ -79,18 +79,19 @@ def _attack(marker: Marker, message: bytes, slopes: Slope, steps: int) -> Attack
     """Make an attack that goes against a slope of the evidence, with `steps` gradients."""
     original, reader = marker.original, marker.reader
     marker.check_size(message)
+    copies = weld(original.mesh.vertices)
     codeword = jnp.asarray(marker.codeword(message), original.signal.dtype)
 
     def apply(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
-        if len(mesh.vertices) != len(original.positions):
+        if len(mesh.vertices) != len(copies.first):
             raise JaxmarkError(
-                f"The mesh has {len(mesh.vertices)} points, the original {len(original.positions)}; only marks in the"
+                f"The mesh has {len(mesh.vertices)} points, the original {len(copies.first)}; only marks in the"
                 " original's own connectivity are erased so."
             )
         if strength == 0:
             return mesh
         # An attack gets each point only once, but a suspect has all vertices at the point.
-        start = np.asarray(mesh.vertices, np.float64)[original.weld.point]
+        start = np.asarray(mesh.vertices, np.float64)[copies.point]
         faces = original.mesh.faces
         given = align(original, Mesh(start, faces), "same")
         seen, back = marker.observe(given), np.linalg.inv(given.pose.matrix)
@@ -117,7 +118,7 @@ def _attack(marker: Marker, message: bytes, slopes: Slope, steps: int) -> Attack
             trials.append(attempt(way + (2 / (step + 3)) * (resize(against) - way)))
             _, against, way = trials[-1]
         # A step may raise the evidence, so the best of all displacements of this size is returned.
-        return mesh._replace(vertices=displace(min(trials, key=lambda one: one[0])[2]).vertices[original.weld.first])
+        return mesh._replace(vertices=displace(min(trials, key=lambda one: one[0])[2]).vertices[copies.first])
 
     return Attack(apply, _UNIT, _STRENGTHS, host=True)
 

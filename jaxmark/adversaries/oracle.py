@@ -21,7 +21,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.hashing import geometry_hash
 from jaxmark.geometry.mesh import Mesh, diagonal, host_mesh, used_vertices
 from jaxmark.spectral.laplacian import Laplacian, make_laplacian
-from jaxmark.watermark.coding.keys import derive
+from jaxmark.watermark.coding.keys import Choices, Key
 from jaxmark.watermark.detectors import claims
 from jaxmark.watermark.marking import Marker
 
@@ -146,7 +146,7 @@ def randomise_scores(oracle: Score, spread: float, key: bytes) -> Score:
     """
 
     def score(mesh: Mesh) -> float:
-        seed = int.from_bytes(derive(key, geometry_hash(mesh), "oracle/noise", 16), "little")
+        seed = int.from_bytes(Choices(Key(key), geometry_hash(mesh), 1).derive("oracle/noise", 16), "little")
         return oracle(mesh) + spread * float(np.random.default_rng(seed).normal())
 
     return score

@@ -59,6 +59,7 @@ class Alignment(NamedTuple):
     pose: Pose  # from the suspect's coordinates to the original's, as in their files
     residual: float  # root mean square displacement of the points with weight 1, in diagonals
     seconds: float  # duration of the alignment
+    how: Align = "auto"  # how it was asked for
 
 
 def observation(original: Original, found: Alignment) -> Observation:
@@ -94,7 +95,7 @@ def align(original: Original, suspect: Mesh, how: Align = "auto") -> Alignment:
         raise JaxmarkError(f"A suspect is aligned by {', '.join(get_args(Align))}, not {how!r}.")
     start = time.perf_counter()
     found = _align(original, host_mesh(suspect), how)
-    return found._replace(seconds=time.perf_counter() - start)
+    return found._replace(seconds=time.perf_counter() - start, how=how)
 
 
 def _align(original: Original, suspect: Mesh, how: Align) -> Alignment:
@@ -125,13 +126,12 @@ def _align(original: Original, suspect: Mesh, how: Align) -> Alignment:
 
 def _points(original: Original) -> Mesh:
     """The mesh of the original's points, in the positions in which they are filtered."""
-    return Mesh(original.positions, original.weld.point[np.asarray(original.mesh.faces)])
+    return Mesh(original.positions, original.points.faces)
 
 
 def _file(original: Original) -> Pose:
     """The map from positions in diagonals to coordinates of the original's file."""
-    vertices = np.asarray(original.mesh.vertices)[original.weld.first]
-    return Pose(original.diagonal * np.eye(3), vertices[original.used].mean(axis=0))
+    return Pose(original.diagonal * np.eye(3), np.asarray(original.points.vertices)[original.used].mean(axis=0))
 
 
 def _by_points(

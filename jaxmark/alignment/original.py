@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float64, Shaped
+from jaxtyping import Array, Bool, Float, Float64, Int64, Shaped
 
-from jaxmark.geometry.hashing import points_hash
-from jaxmark.geometry.mesh import Mesh, Weld, diagonal, displacement, host_mesh, used_vertices, weld, weld_mesh
+from jaxmark.geometry.canonical import exact, grid_spacing, rounded
+from jaxmark.geometry.mesh import Mesh, Weld, diagonal, displacement, host_mesh, used_vertices
 from jaxmark.spectral.laplacian import Laplacian, centre
 from jaxmark.spectral.shapes import common_laplacian, pad_rows
 
@@ -20,19 +20,28 @@ class Original:
     Traced arrays are padded with rows of isolated vertices beyond the points: see `jaxmark.spectral.shapes`.
     """
 
-    mesh: Mesh  # as in its file
-    weld: Weld
+    mesh: Mesh  # as in its file; what is displaced
+    grid: float  # spacing of the grid that points are rounded to, in the file's units; 0 if they are exact
+    weld: Weld  # which vertices stand at which point
+    points: Mesh  # the canonical geometry, in the file's units: what suspects are compared with
     used: Bool[np.ndarray, " points"]  # mask of the points that faces use
-    diagonal: float  # in the file's units
+    diagonal: float  # of the points, in the file's units
     geometry: bytes  # hash of the canonical geometry
-    operator: Laplacian  # the Laplacian of the welded points, traced
-    positions: Float64[np.ndarray, "points 3"]  # welded points, centred as a whole, in diagonals
-    signal: Float[Array, "rows 3"]  # welded points, centred per connected component, in diagonals, traced
+    places: Int64[np.ndarray, " points"]  # number of each point among those that faces use in this geometry, or -1
+    count: int  # number of points that faces use in this geometry
+    operator: Laplacian  # the Laplacian of the points, traced
+    positions: Float64[np.ndarray, "points 3"]  # points, centred as a whole, in diagonals
+    signal: Float[Array, "rows 3"]  # points, centred per connected component, in diagonals, traced
 
     @property
     def moving(self) -> Bool[np.ndarray, " rows"]:
         """Mask of the rows of traced arrays that belong to points that faces use."""
         return pad_rows(self.used, len(self.signal))
+
+    @property
+    def chip_places(self) -> Int64[np.ndarray, " rows"]:
+        """`places` for the rows of traced arrays."""
+        return pad_rows(self.places + 1, len(self.signal)) - 1
 
     def to_traced(self, values: Shaped[np.ndarray, " points *columns"]) -> Float[Array, " rows *columns"]:
         """Convert one value per point to a padded array in the dtype of traced code."""
@@ -43,18 +52,23 @@ class Original:
         return np.asarray(values[: len(self.used)], np.float64)
 
 
-def make_original(mesh: Mesh) -> Original:
-    """Weld, hash, centre and scale a mesh, and build its Laplacian.
+def make_original(mesh: Mesh, grid: float | None = None) -> Original:
+    """Round, weld, hash, centre and scale a mesh, and build its Laplacian.
 
     Traced code then computes in float32, or in float64 if JAX has it enabled.
+
+    Args:
+        mesh: any mesh.
+        grid: spacing of the grid that points are rounded to, in the mesh's units; by default that of new marks, see
+            `jaxmark.geometry.canonical`; 0 for the exact points of version 1.
 
     Raises:
         JaxmarkError: see `make_mesh` and `diagonal`.
     """
     mesh = host_mesh(mesh)
-    welded = weld(mesh.vertices)
-    points = weld_mesh(mesh, welded)
-    length, geometry = diagonal(mesh), points_hash(points)
+    spacing = grid_spacing(mesh) if grid is None else grid
+    points, welded, geometry = rounded(mesh, spacing) if spacing else exact(mesh)
+    length = diagonal(points)
     operator = common_laplacian(points)
     dtype = jax.dtypes.canonicalize_dtype(np.float64)
     used = used_vertices(points)
@@ -63,19 +77,43 @@ def make_original(mesh: Mesh) -> Original:
     positions[~used] = 0
     signal = jnp.asarray(centre(operator, pad_rows(positions, len(operator.degree))), dtype)
     traced = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype if leaf.dtype == np.float64 else None), operator)
-    return Original(mesh, welded, used, length, geometry, traced, positions, signal)
+    places = np.where(used, np.cumsum(used) - 1, -1)
+    return Original(
+        mesh,
+        spacing,
+        welded,
+        points,
+        used,
+        length,
+        geometry,
+        places,
+        int(used.sum()),
+        traced,
+        positions,
+        signal,
+    )
 
 
 def displace(original: Original, shift: Float64[np.ndarray, "points 3"]) -> Mesh:
-    """Move the welded points of an original by `shift`, in diagonals; copies of a point move together."""
+    """Move the points of an original by `shift`, in diagonals; copies of a point move together, and are not rounded."""
     moved = original.mesh.vertices + original.diagonal * shift[original.weld.point]
     return Mesh(moved, original.mesh.faces)
 
 
-def residual(original: Original, suspect: Mesh) -> Float64[np.ndarray, "points 3"]:
-    """Displacement of each welded point from the original to a suspect, in diagonals.
+def shift_of(original: Original, displaced: Mesh) -> Float64[np.ndarray, "points 3"]:
+    """How far each point was moved from where it is in the original's file, in diagonals; undoes `displace`.
 
     Raises:
         JaxmarkError: see `jaxmark.geometry.mesh.displacement`.
     """
-    return displacement(original.mesh, suspect, original.weld, original.diagonal)
+    return displacement(original.mesh, displaced, original.weld, original.diagonal)
+
+
+def residual(original: Original, suspect: Mesh) -> Float64[np.ndarray, "points 3"]:
+    """Displacement of each point from the original's canonical geometry to a suspect, in diagonals.
+
+    Raises:
+        JaxmarkError: see `jaxmark.geometry.mesh.displacement`.
+    """
+    canonical = Mesh(original.points.vertices[original.weld.point], original.mesh.faces)
+    return displacement(canonical, suspect, original.weld, original.diagonal)

@@ -1,19 +1,23 @@
 """Mark and read mesh files, one at a time."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxmark import distortion
 from jaxmark.alignment.alignment import Align
-from jaxmark.alignment.original import residual
+from jaxmark.alignment.original import shift_of
+from jaxmark.app.dossier import Case, file_hash, save_dossier
+from jaxmark.app.mistakes import guess_mistakes, is_original
 from jaxmark.app.report import save_report
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import SUFFIXES, load_mesh, save_mesh
 from jaxmark.files.atomic import replacing, write_atomically
+from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.coding.keys import Key
-from jaxmark.watermark.marking import Marker, make_marker
+from jaxmark.watermark.deposit import Deposit
+from jaxmark.watermark.marking import Detection, Marker, detect_any, make_marker, make_markers
 from jaxmark.watermark.record import Record
 from jaxmark.watermark.schemes import DEFAULT_SCHEME
 from jaxmark.watermark.tracing import make_tracer
@@ -101,7 +105,7 @@ def mark_file(
                 " more digits."
             )
         write_atomically(record_draft, info.record.to_json().encode())
-    change = distortion.DisplacementSize.of(residual(prepared, written)[prepared.used])
+    change = distortion.DisplacementSize.of(shift_of(prepared, written)[prepared.used])
     answer = {
         "rms": change.rms,
         "max": change.max,
@@ -125,9 +129,18 @@ class FileReader:
     scheme: str | None  # name of the scheme for marks without a record
     how: Align  # see `align`
     alpha: float  # largest false-positive probability of a detection
-    _last: tuple[tuple[Path, Path | None], Marker] | None = field(default=None, init=False, repr=False)
+    deposit: Deposit | None = None  # that holds the records' digests
+    obtained: str = ""  # when and where the suspects were got
+    _last: tuple[tuple[Path, Path | None], list[Marker]] | None = field(default=None, init=False, repr=False)
 
-    def read(self, suspect: Path, original: Path, record: Path | None = None, report: Path | None = None) -> Told:
+    def read(
+        self,
+        suspect: Path,
+        original: Path,
+        record: Path | None = None,
+        report: Path | None = None,
+        dossier: Path | None = None,
+    ) -> Told:
         """Read one file.
 
         Args:
@@ -135,21 +148,33 @@ class FileReader:
             original: the unmarked mesh's file.
             record: file of the mark's record.
             report: folder for a picture of the alignment.
+            dossier: folder for the dossier of a detection, see `jaxmark.app.dossier`.
 
         Raises:
-            JaxmarkError: see `detect`.
+            JaxmarkError: see `detect`; also if the record is not in the deposit, or a dossier is asked for an estimate.
         """
         mesh = load_mesh(suspect)
-        marker = self._marker(original, record)
-        found = marker.detect(mesh, self.message, align=self.how)
+        markers = self._markers(original, record, mesh)
+        found = detect_any(markers, mesh, self.message, align=self.how)
+        marker = next(marker for marker in markers if marker.choices.version == found.version)
         aligned = found.alignment
         if report is not None:
             save_report(report, marker.original.mesh, mesh, aligned)
         detected = found.detected(self.alpha)
+        remarks = found.remarks
+        if record is None and not detected and not remarks:
+            remarks = guess_mistakes(mesh, marker, self.how)
         answer = {
             "detected": detected,
             "log10_p": found.log10_p,
+            "log10_p_undated": found.log10_p_undated,
             "log10_p_fitted": found.log10_p_fitted,
+            "proof": not found.doubts,
+            "doubts": list(found.doubts),
+            "remarks": list(remarks),
+            "version": found.version,
+            "suspect_sha256": file_hash(suspect),
+            "obtained": self.obtained or None,
             "message": None if found.message is None else found.message.hex(),
             "scores": [float(score) for score in found.scores],
             "coverage": found.coverage,
@@ -160,14 +185,31 @@ class FileReader:
                 "seconds": aligned.seconds,
             },
         }
-        read = f"message {answer['message']}" if found.message is not None else "no message could be read"
-        said = (
-            f"{'detected' if detected else 'nothing detected'}: {read}; false-positive probability at most"
-            f" 10^{found.log10_p:.1f} (--alpha {self.alpha:g})"
-        )
-        return Told(answer, said, detected)
+        dated = None
+        if marker.record is not None:
+            answer["record_digest"] = marker.record.digest()
+            if self.deposit is not None:
+                dated = self.deposit.log10_p(found.log10_p, marker.record, claimed=self.message is not None)
+                answer["log10_p_deposited"] = dated
+        if dossier is not None:
+            save_dossier(
+                dossier,
+                Case(
+                    suspect,
+                    original,
+                    record,
+                    mesh,
+                    marker,
+                    found,
+                    self.message is not None,
+                    self.deposit,
+                    self.obtained,
+                ),
+            )
+            answer["dossier"] = str(dossier)
+        return Told(answer, describe(found, detected, self.alpha, dated, remarks), detected)
 
-    def _marker(self, original: Path, record_file: Path | None) -> Marker:
+    def _markers(self, original: Path, record_file: Path | None, suspect: Mesh) -> list[Marker]:
         if self._last is None or self._last[0] != (original, record_file):
             record = None if record_file is None else Record.load(record_file)
             if record is not None and self.scheme not in (None, record.scheme):
@@ -176,6 +218,28 @@ class FileReader:
             if bits is None and record is None and self.message is not None:
                 bits = 8 * len(self.message)
             scheme = self.scheme or DEFAULT_SCHEME
-            marker = make_marker(load_mesh(original), self.key, bits=bits, record=record, scheme=scheme)
-            self._last = (original, record_file), marker
+            mesh = load_mesh(original)
+            try:
+                markers = make_markers(mesh, self.key, bits=bits, record=record, scheme=scheme)
+            except JaxmarkError as error:
+                if record is not None and is_original(suspect, record, self.key):
+                    raise JaxmarkError(f"{error} The suspect is that mesh: exchange the two files.") from None
+                raise
+            self._last = (original, record_file), markers
         return self._last[1]
+
+
+def describe(found: Detection, detected: bool, alpha: float, dated: float | None, remarks: Sequence[str]) -> str:
+    """What was found, in words."""
+    read = f"message {found.message.hex()}" if found.message is not None else "no message could be read"
+    said = f"{'detected' if detected else 'nothing detected'}: {read}; "
+    if found.doubts:
+        said += f"false-positive probability about 10^{found.log10_p:.1f}, an estimate: {'; '.join(found.doubts)}"
+    else:
+        said += (
+            f"false-positive probability at most 10^{found.log10_p:.1f} if key, original, message and record were fixed"
+            f" before the suspect existed, 10^{found.log10_p_undated:.1f} if nothing dates them"
+        )
+        if dated is not None:
+            said += f", 10^{dated:.1f} if the deposit is older than the suspect"
+    return " ".join([f"{said} (--alpha {alpha:g})", *remarks])

@@ -28,6 +28,7 @@ from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import same_connectivity
 from jaxmark.watermark.budget import DEFAULT_LIMITS, make_budget
 from jaxmark.watermark.coding.keys import commitment, load_key, new_key, save_key
+from jaxmark.watermark.deposit import Deposit, make_deposit
 from jaxmark.watermark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity
 from jaxmark.watermark.record import RECORD_SUFFIX, Record
 from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES
@@ -226,7 +227,10 @@ def embed_command(
     help=f"Without a record: scheme that carries the bits.  [default: {DEFAULT_SCHEME}]",
 )
 @_ALIGN
+@click.option("--deposit", "deposit_file", type=_MESH, help="Deposit that dates the record, from `jaxmark deposit`.")
+@click.option("--obtained", default="", help="When and where SUSPECT was got, for the dossier.")
 @click.option("--report", type=_MESH, help="Folder for a picture of how SUSPECT was aligned (needs the extra `plot`).")
+@click.option("--dossier", type=_MESH, help="Folder for a page that shows a detection to others (extra `plot`).")
 @_ALPHA
 @_JSON
 def detect_command(
@@ -238,19 +242,26 @@ def detect_command(
     record_file: Path | None,
     scheme: str | None,
     how: Align,
+    deposit_file: Path | None,
+    obtained: str,
     report: Path | None,
+    dossier: Path | None,
     alpha: float,
     as_json: bool,
 ) -> None:
     """Look for a mark in SUSPECT: a file in any pose, with the original's connectivity or not; or a folder of files.
 
     Exit status 0 if the false-positive probability is at most --alpha, else 1. The probability holds for any suspect
-    made without the key, as long as key, original and a claimed message were fixed before the suspect was seen.
+    made without the key, as long as key, original, record and a claimed message were fixed before it existed. A second
+    figure is for claims that nothing dates; a deposit dates them.
+
+    With its record, an original will do as you have it now: saved again in another format, rounded, moved, reordered.
 
     For a folder, each file gets a line of output, and the exit status is the worst of all. --original and --record may
     then be folders, too, with files of the same names.
     """
-    reader = FileReader(load_key(key_file), bits, message, scheme, how, alpha)
+    deposit = None if deposit_file is None else Deposit.load(deposit_file)
+    reader = FileReader(load_key(key_file), bits, message, scheme, how, alpha, deposit, obtained)
     if suspect.is_dir():
         _each(
             suspect,
@@ -260,9 +271,10 @@ def detect_command(
                 _member(original, file.name),
                 None if record_file is None else _member(record_file, file.name + RECORD_SUFFIX),
                 None if report is None else report / file.name,
+                None if dossier is None else dossier / file.name,
             ),
         )
-    told = reader.read(suspect, original, record_file, report)
+    told = reader.read(suspect, original, record_file, report, dossier)
     _answer(as_json, told.answer, told.said)
     sys.exit(0 if told.done else 1)
 
@@ -278,6 +290,7 @@ def detect_command(
 @click.option(
     "--top", type=click.IntRange(1), default=10, show_default=True, help="Number of recipients in the ranking."
 )
+@_ALIGN
 @_ALPHA
 @_JSON
 def identify_command(
@@ -287,6 +300,7 @@ def identify_command(
     recipients: Path,
     record_file: Path | None,
     top: int,
+    how: Align,
     alpha: float,
     as_json: bool,
 ) -> None:
@@ -305,7 +319,8 @@ def identify_command(
         raise JaxmarkError(f"{recipients} names nobody; give one identifier a line.")
     record = None if record_file is None else Record.load(record_file)
     key = load_key(key_file)
-    found = identify(load_mesh(suspect), names, original=load_mesh(original), key=key, record=record, top=top)
+    meshes = load_mesh(suspect), load_mesh(original)
+    found = identify(meshes[0], names, original=meshes[1], key=key, record=record, top=top, align=how)
     accused = [one for one in found if one.log10_p <= math.log10(alpha)]
     answer = {
         "accused": [one.recipient for one in accused],
@@ -315,6 +330,26 @@ def identify_command(
     lines = [f"{one.recipient}: score {one.score:.1f}, probability at most 10^{one.log10_p:.1f}" for one in accused]
     _answer(as_json, answer, "\n".join(lines) or f"nobody of {len(names)} is accused (--alpha {alpha:g})")
     sys.exit(0 if accused else 1)
+
+
+@cli.command(name="deposit")
+@click.argument("records", type=_MESH, nargs=-1, required=True)
+@click.option("--output", type=_MESH, required=True, help="File for the deposit; a request to date it goes beside it.")
+@_JSON
+def deposit_command(records: tuple[Path, ...], output: Path, as_json: bool) -> None:
+    """Make a deposit of RECORDS, to be dated before anybody claims anything; it shows nothing of what they commit to.
+
+    Publish its root, sign a commit with it, print it; or send OUTPUT.tsq to a time-stamping authority (RFC 3161) and
+    keep the answer. `jaxmark detect --deposit OUTPUT` then counts a dated claim in full, less log10 of their number.
+    """
+    _check_distinct(output=output, **{f"record {place}": path for place, path in enumerate(records)})
+    found = make_deposit(Record.load(path).digest() for path in records)
+    request = output.with_name(output.name + ".tsq")
+    with replacing(request) as draft:
+        write_atomically(draft, found.timestamp_request())
+        write_atomically(output, found.to_json().encode())
+    answer = {"root": found.root, "records": len(found.digests), "deposit": str(output), "request": str(request)}
+    _answer(as_json, answer, f"{len(found.digests)} records → {output}, root {found.root}, request → {request}")
 
 
 # click keeps the lines of a paragraph that starts with \b.

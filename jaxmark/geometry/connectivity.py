@@ -8,6 +8,7 @@ that were reordered, cropped, merged into a scene or moved are found; those of a
 import numpy as np
 from jaxtyping import Int64, UInt64
 
+from jaxmark.geometry.hashing import mix
 from jaxmark.geometry.mesh import Mesh, edges, sides, used_vertices
 
 _MIN_RINGS, _MAX_RINGS = 3, 40  # narrower neighbourhoods are alike by chance; wider ones tell no more vertices apart
@@ -54,23 +55,15 @@ class _Rings:
         self._start = np.concatenate([[0], np.cumsum(degree[self._linked])[:-1]]).astype(np.int64)
         incident = np.bincount(np.ravel(mesh.faces), minlength=size)
         self.valence = degree + (incident << 20)
-        self._colours = _mix(self.valence.astype(np.uint64))
+        self._colours = mix(self.valence.astype(np.uint64))
 
     def grow(self) -> Colours:
         """Widen the neighbourhoods by one ring and return their colours."""
         around = np.zeros_like(self._colours)
         if len(self._neighbour):
-            around[self._linked] = np.add.reduceat(_mix(self._colours)[self._neighbour], self._start)
-        self._colours = _mix(self._colours * np.uint64(3) + around)
+            around[self._linked] = np.add.reduceat(mix(self._colours)[self._neighbour], self._start)
+        self._colours = mix(self._colours * np.uint64(3) + around)
         return self._colours
-
-
-def _mix(values: Colours) -> Colours:
-    """Hash by a 64-bit finaliser (Steele, Lea, Flood, "Fast splittable pseudorandom number generators", 2014)."""
-    values = values + np.uint64(0x9E3779B97F4A7C15)
-    values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return values ^ (values >> np.uint64(31))
 
 
 def _unique(colours: Colours) -> Int64[np.ndarray, " unique"]:

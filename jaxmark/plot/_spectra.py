@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 from numpy.polynomial import chebyshev
 
-from jaxmark.alignment.original import Original, residual
+from jaxmark.alignment.original import Original, shift_of
 from jaxmark.distortion import Metric, name_of
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.plot.figures import FIELD, Picture, finish, panels, styles
@@ -58,7 +58,7 @@ def spectra(original: Original, moves: Mapping[str, tuple[Mesh, Mesh]], bands: i
     """
     signals = {"host": original.to_host(original.signal)}
     for name, (before, after) in moves.items():
-        signals[name] = residual(original, after) - residual(original, before)
+        signals[name] = shift_of(original, after) - shift_of(original, before)
     figure, (axes,) = panels(1, 6.5, 4.2)
     for (name, signal), style in zip(signals.items(), styles(bands), strict=False):
         axes.plot(nodes(bands), mean_squares(original, signal, bands), label=name, **style)

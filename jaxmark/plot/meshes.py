@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxmark.alignment.original import Original, residual
+from jaxmark.alignment.original import Original, shift_of
 from jaxmark.geometry.mesh import Mesh, host_mesh
 from jaxmark.plot.figures import FIELD, Picture, panels
 from jaxmark.watermark.visibility import masking
@@ -98,7 +98,7 @@ def save_views(
 
 def _percent(original: Original, moved: Mesh) -> np.ndarray:
     """Displacement of each point, in percent of the diagonal."""
-    return 100 * np.linalg.norm(residual(original, moved), axis=1)
+    return 100 * np.linalg.norm(shift_of(original, moved), axis=1)
 
 
 def _rotation(elevation: float, azimuth: float) -> np.ndarray:

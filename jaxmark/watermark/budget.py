@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxmark import distortion
-from jaxmark.alignment.original import Original, displace, residual
+from jaxmark.alignment.original import Original, displace, shift_of
 from jaxmark.distortion import Metric, name_of
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
@@ -100,7 +100,7 @@ def write(original: Original, shift: Float64[np.ndarray, "points 3"], budget: Bu
                 f"Moved by {_MAX_RMS:g} of its diagonal, this mesh still keeps {budget}; give a budget, too."
             )
     marked = displace(original, rms / size * shift)
-    reached = distortion.DisplacementSize.of(residual(original, marked)[original.used])
+    reached = distortion.DisplacementSize.of(shift_of(original, marked)[original.used])
     if abs(reached.rms - rms) > 0.01 * rms:
         raise JaxmarkError(f"A budget of {rms:g} is lost in the rounding of this mesh's coordinates; use a larger one.")
     return Written(marked, rms / size, reached)

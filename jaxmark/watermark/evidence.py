@@ -17,6 +17,7 @@ from scipy.special import log_ndtr  # scipy.stats takes long to import
 from jaxmark.spectral.precision import matmul
 
 MIN_LOG10_P = -77.0
+_LOG10_TRIES = 64 * math.log10(2)
 
 
 def log10_p_claimed(score: ArrayLike, norm: ArrayLike) -> float:
@@ -35,6 +36,44 @@ def log10_p_claimed(score: ArrayLike, norm: ArrayLike) -> float:
         A finite number in [-77, 0]; 0 if the score is not positive or the residual is zero.
     """
     return _clip(_log10_tail(score, norm))
+
+
+def log10_p_fitted_strengths(score: ArrayLike, norm: ArrayLike, strengths: int) -> float:
+    """log10 of a bound on P(S ≥ score) if relative strengths of bands were chosen after the suspect was seen.
+
+    With m strengths, a lies in a space of m dimensions that is free of the key, and the supremum of S/‖a‖ over it is
+    the length of the signs' projection: P(sup ≥ t) ≤ exp(-u²) with u = (√(2t² - m) - √m)/2 for t² ≥ m (Hsu, Kakade,
+    Zhang, "A tail inequality for quadratic forms of subgaussian random vectors", Electronic Communications in
+    Probability 17, 2012, Theorem 2.1).
+
+    Args:
+        score: S, the plain linear correlation of the claimed codeword.
+        norm: ‖a‖ of the same vector a that the signs multiply.
+        strengths: m, the number of strengths that were free.
+
+    Returns:
+        A finite number in [-77, 0].
+    """
+    square = -2 * math.log(10) * _log10_tail(score, norm)
+    if square < strengths:
+        return 0.0
+    return _clip(-(((math.sqrt(2 * square - strengths) - math.sqrt(strengths)) / 2) ** 2) / math.log(10))
+
+
+def undated(log10_p: float) -> float:
+    """log10 of a bound on the probability that any of 2^64 keys, originals, records or messages is so good.
+
+    Whoever makes a claim that nothing dates may have tried as many; 2^64 hashes are about what can be paid for.
+    """
+    return _clip(log10_p + _LOG10_TRIES)
+
+
+def share_of(log10_p: float, share: float) -> float:
+    """log10 of the bound for a proof that has only a share of the probability, as others were possible in its place.
+
+    Proofs whose shares add up to 1 have the stated probability together (a weighted Bonferroni bound).
+    """
+    return _clip(log10_p - math.log10(share))
 
 
 def log10_p_read(score: ArrayLike, norm: ArrayLike, bits: int) -> float:

@@ -1,7 +1,8 @@
 """Marking meshes and reading them: from meshes, messages and keys to marked meshes and evidence."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -16,18 +17,26 @@ from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.canonical import Canonical
+from jaxmark.geometry.imprint import make_imprint, restore
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark import evidence
 from jaxmark.watermark.budget import Budget, Limits, make_budget, write
 from jaxmark.watermark.carriers.carrier import Carrier, Reader, Received
-from jaxmark.watermark.coding.keys import Key, commitment
-from jaxmark.watermark.coding.message import CANDIDATES, TAG_BITS, decode, encode
+from jaxmark.watermark.coding.keys import SCHEME_VERSION, VERSIONS, Choices, Key, bind, commitment
+from jaxmark.watermark.coding.message import TAG_BITS, Decoded, decode, encode
 from jaxmark.watermark.detectors import Detector, claims
 from jaxmark.watermark.payload import Capacity, Conditions
-from jaxmark.watermark.record import Record
+from jaxmark.watermark.record import Content, Record, commit, seal_imprint
 from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES, Scheme, get_scheme, parameters_of
 
 DEFAULT_BITS = 64  # size of the payload
+_MIN_ORIGINAL_SHARE = 0.5  # share of an original's points from which on an edited copy is read with, as an estimate
+_SAME_SHAPE = 0.01  # distance of shapes, over their size, below which an original looks like a marked or edited copy
+# Shares of the probability. Whoever reads may choose how to align, and sees whether the claimed message reads or
+# another one; what is usual keeps nearly all of it.
+ALIGN_SHARES = {"auto": 0.97, "same": 0.01, "similarity": 0.01, "affine": 0.01}
+_CLAIM_SHARE = 0.97
 NOISE = 0.005  # half width over the mean distance to the centre: the strongest noise of the SMI 2010 protocol
 COVERAGE = 0.5  # share of the vertices that may be left
 
@@ -45,14 +54,18 @@ class Detection(NamedTuple):
     """The result of reading a suspect."""
 
     message: bytes | None  # the message that was read; None unless its keyed tag fits
-    log10_p: float  # log10 of a bound on the false-positive probability, in [-77, 0]
+    log10_p: float  # log10 of a bound on the false-positive probability, in [-77, 0], if all that is claimed is dated
+    log10_p_undated: float  # the same if nothing is: if 2^64 keys, originals, records and messages may have been tried
     log10_p_fitted: float  # log10 of that probability if the score were Gaussian: an estimate, which decides nothing
     scores: Float64[np.ndarray, " code"]  # soft values of the code bits, scaled to root mean square 1
     coverage: float  # share of the original's points that the suspect gave evidence for
     alignment: Alignment  # how the suspect was brought back to the original
+    version: int  # version of the keyed choices that were read with
+    doubts: tuple[str, ...] = ()  # why the probabilities are estimates, not proofs; empty if they are proofs
+    remarks: tuple[str, ...] = ()  # what else the suspect looks like
 
     def detected(self, alpha: float = 1e-6) -> bool:
-        """Whether the false-positive probability is at most `alpha`.
+        """Whether the false-positive probability is at most `alpha`, if all that is claimed is dated.
 
         Raises:
             JaxmarkError: if `alpha` is not in (0, 1).
@@ -70,12 +83,20 @@ class Marker:
     """
 
     original: Original
-    key: Key
+    choices: Choices  # what derives from the key
     bits: int  # size of the payload in bits
     scheme: Scheme
     carrier: Carrier
     code_bits: int  # number of code bits that are carried
     detector: Detector
+    content: Content = "message"  # what the code bits say
+    record: Record | None = None  # the record of the mark that is read
+    doubts: tuple[str, ...] = ()  # why what is read is no proof
+
+    @property
+    def key(self) -> Key:
+        """The key."""
+        return self.choices.key
 
     @cached_property
     def reader(self) -> Reader:
@@ -99,7 +120,7 @@ class Marker:
         bounds = make_budget(budget, limits)
         if not 0 <= noise < math.inf:
             raise JaxmarkError(f"The noise to survive is a number of at least 0, got {noise}.")
-        marked, info = self.write(self.codeword(message), bounds)
+        marked, info = self.write(self.codeword(message), bounds, told=message)
         # A budget without limits is met up to rounding, so its own number is used.
         reached = info.rms if bounds.limits else bounds.rms or 0.0
         self._check_capacity(reached, Conditions(bounds, noise, COVERAGE))
@@ -128,10 +149,13 @@ class Marker:
         """
         observed = self.observe(alignment.align(self.original, marked, "same"))
         # `Reader.glance` stands for the scheme's own detector, not for any other.
-        quick = self.reader.glance(observed) if self.detector is self.scheme.detector else None
-        if quick is not None and self._decode(quick) == message:
-            return True
-        return self._decode(self.soft_values(self.reader.receive(observed))) == message
+        quick = self.glance(observed) if self.detector is self.scheme.detector else None
+        return quick == message or self._read(self.soft_values(self.reader.receive(observed))) == message
+
+    def glance(self, seen: Observation) -> bytes | None:
+        """Read what was hardly attacked with little computation, see `Reader.glance`; None if nothing reads so."""
+        quick = self.reader.glance(seen)
+        return self._read(quick if quick is not None else self.soft_values(self.reader.receive(seen)))
 
     def detect(
         self,
@@ -146,36 +170,94 @@ class Marker:
         `jaxmark.alignment.alignment.align` in its place.
         """
         if message is not None:
-            self.check_size(message)
+            self.check_claim(message)
         aligned = suspect if isinstance(suspect, Alignment) else alignment.align(self.original, suspect, align)
         received = self.receive(aligned, weights)
         observed, soft = received.observed, self.soft_values(received)
-        found = self._decode(soft)
-        log10_p = fitted = 0.0
-        # If another message is read, it refutes the claim, however similar the two are.
-        if (chosen := message or found) is not None and found in (None, chosen):
-            codeword = jnp.asarray(self.codeword(chosen), observed.residual.dtype)
-            scores, norms = claims(self.reader, received, codeword)
-            ways = list(zip(scores, norms, strict=True))
-            if message is not None:
-                log10_p = evidence.any_of(*(evidence.log10_p_claimed(score, norm) for score, norm in ways))
-            else:
-                log10_p = evidence.any_of(
-                    evidence.log10_p_tag(TAG_BITS, CANDIDATES),
-                    *(evidence.log10_p_read(score, norm, self.bits) for score, norm in ways),
-                )
-            unknown = 0 if message is not None else self.bits
-            fitted = evidence.any_of(*(evidence.log10_p_fitted(score, norm, unknown) for score, norm in ways))
         size = np.sqrt(np.mean(soft**2)) or 1.0
         coverage = float(np.mean(self.original.to_host(observed.weights)[self.original.used] > 0))
-        return Detection(found, log10_p, fitted, soft / size, coverage, aligned)
+        doubts = self.doubts if weights is None else (*self.doubts, "the weights were chosen by the reader")
+        found = Detection(None, 0.0, 0.0, 0.0, soft / size, coverage, aligned, self.choices.version, doubts)
+        # Rounding moves no coordinate by more than half of the grid's spacing; a mark that can be read moves some.
+        if np.abs(aligned.displacement).max() * self.original.diagonal <= 0.505 * self.original.grid:
+            return found._replace(remarks=("The suspect is the original itself, without a mark.",))
+        return self._weigh(found, received, self._decode(soft), message, ALIGN_SHARES[aligned.how])
 
-    def write(self, amplitudes: Float64[np.ndarray, " code"], budget: Budget) -> tuple[Mesh, EmbedInfo]:
+    def _weigh(
+        self, found: Detection, received: Received, decoded: Decoded | None, claimed: bytes | None, share: float
+    ) -> Detection:
+        """Complete a detection by what was decoded and what was claimed, with a share of the probability."""
+        if decoded is None and claimed is None:
+            return found
+        fixed = claimed
+        if claimed is None and self.record is not None and self.record.told and decoded is not None:
+            # A message that the record commits to was fixed with the record.
+            fixed = decoded.message if self.record.commits_to(decoded.message, self.choices) else b""
+        if fixed is None:
+            return self._with_evidence(found, received, decoded, share=share)
+        if decoded is None or decoded.message == fixed:
+            share *= _CLAIM_SHARE
+            return self._with_evidence(found, received, decoded, fixed=fixed, tagged=claimed is None, share=share)
+        # The claim is refuted, but not that the mark is there: its owner wrote several messages, or means another copy.
+        other = self._with_evidence(found, received, decoded, share=share * (1 - _CLAIM_SHARE))
+        remark = f"Another message of this key reads than the one {'claimed' if claimed else 'in the record'}."
+        if claimed:
+            there = self._fitted_beside(received, claimed, decoded.message)
+            remark += f" That both are there is an estimate: log10 p about {there:.1f} for the one claimed."
+        return other._replace(remarks=(remark,))
+
+    def _fitted_beside(self, received: Received, claimed: bytes, read: bytes) -> float:
+        """Estimate log10 p of a claimed message beside another one that was read: of what their codewords do not share.
+
+        There is no bound without a model: the mean of two copies shows nothing where their codewords differ.
+        """
+        words = [jnp.asarray(self.codeword(one), received.observed.residual.dtype) for one in (claimed, read)]
+        (score, norm), (other, _) = (tuple(part[0] for part in claims(self.reader, received, word)) for word in words)
+        shared = float(jnp.vdot(*words)) / self.code_bits
+        return evidence.log10_p_fitted(score - shared * other, norm * math.sqrt(max(1 - shared**2, 1e-12)))
+
+    def _with_evidence(
+        self,
+        found: Detection,
+        received: Received,
+        decoded: Decoded | None,
+        *,
+        fixed: bytes | None = None,
+        tagged: bool = True,
+        share: float = 1.0,
+    ) -> Detection:
+        """Complete a detection by the evidence for a message that was fixed beforehand, else for the one decoded.
+
+        Its tag is a proof of its own, unless the message was claimed: then there may be none to look at.
+        """
+        message = fixed if fixed is not None else decoded.message if decoded is not None else b""
+        codeword = jnp.asarray(self.codeword(message), received.observed.residual.dtype)
+        ways = list(zip(*claims(self.reader, received, codeword), strict=True))
+        unknown = 0 if fixed is not None else self.bits
+        proofs = [evidence.log10_p_read(*way, unknown) for way in ways]
+        if decoded is not None and tagged:
+            proofs.append(evidence.log10_p_tag(TAG_BITS, decoded.rank))
+        log10_p = evidence.share_of(evidence.any_of(*proofs), share)
+        undated = log10_p
+        if self.choices.version == 1 and (free := self.scheme.free_strengths):
+            fits = [evidence.log10_p_fitted_strengths(*way, free) + unknown * math.log10(2) for way in ways]
+            undated = evidence.share_of(evidence.any_of(*fits), share)
+        return found._replace(
+            message=None if decoded is None else decoded.message,
+            log10_p=log10_p,
+            log10_p_undated=evidence.undated(undated),
+            log10_p_fitted=evidence.any_of(*(evidence.log10_p_fitted(*way, unknown) for way in ways)),
+        )
+
+    def write(
+        self, amplitudes: Float64[np.ndarray, " code"], budget: Budget, *, told: bytes = b""
+    ) -> tuple[Mesh, EmbedInfo]:
         """Displace the original by the carrier, with any amplitudes of the code bits, as far as a budget allows.
 
         Args:
             amplitudes: one number for each code bit, up to a common factor.
             budget: the bounds to keep, see `budget.write`.
+            told: what the amplitudes say, which the record commits to; nothing if it is empty.
 
         Raises:
             JaxmarkError: if the carrier does not displace this mesh at all; or see `budget.write`.
@@ -188,15 +270,30 @@ class Marker:
                 f"The {len(unit)} points of this mesh leave the scheme {self.scheme.name!r} nothing to write in."
             )
         written = write(original, unit, budget)
+        return written.mesh, EmbedInfo(
+            written.moved.rms, written.moved.max, written.scale, self._make_record(written.scale, told)
+        )
+
+    def _make_record(self, beta: float, told: bytes) -> Record:
+        """The record of a mark of this strength."""
+        original = self.original
         record = Record(
             scheme=self.scheme.name,
             bits=self.bits,
-            beta=written.scale,
-            original=original.geometry.hex(),
+            beta=beta,
+            original=self.original.geometry.hex(),
             key=commitment(self.key),
             parameters=parameters_of(self.scheme),
+            content=self.content,
+            version=self.choices.version,
         )
-        return written.mesh, EmbedInfo(written.moved.rms, written.moved.max, written.scale, record)
+        if record.version == 1:
+            return record
+        imprint = make_imprint(Canonical(original.points, original.weld, original.geometry), original.grid)
+        record = replace(
+            record, told=commit(told, self.choices) if told else "", imprint=seal_imprint(imprint, self.key)
+        )
+        return record.sealed(self.key)
 
     def observe(self, suspect: Mesh | Alignment, weights: ArrayLike | None = None) -> Observation:
         """Align a suspect and find what it shows of each point's displacement, in diagonals; independent of the key.
@@ -216,15 +313,19 @@ class Marker:
 
     def codeword(self, message: bytes) -> Float64[np.ndarray, " code"]:
         """The code bits of a message and its keyed tag, each -1 or +1."""
-        return encode(message, self.key, self.original.geometry, self.code_bits)
+        return encode(message, self.choices, self.code_bits)
 
     def soft_values(self, received: Received) -> Float64[np.ndarray, " code"]:
         """Compute one soft value per code bit."""
         return np.asarray(self.detector(self.reader, received, 1.0), np.float64)
 
-    def _decode(self, soft: ArrayLike) -> bytes | None:
+    def _decode(self, soft: ArrayLike) -> Decoded | None:
         """Decode the message whose keyed tag fits, if there is one."""
-        return decode(np.asarray(soft, np.float64), self.bits, self.key, self.original.geometry)
+        return decode(np.asarray(soft, np.float64), self.bits, self.choices)
+
+    def _read(self, soft: ArrayLike) -> bytes | None:
+        decoded = self._decode(soft)
+        return None if decoded is None else decoded.message
 
     def _per_point(self, weights: ArrayLike) -> Float64[np.ndarray, " points"]:
         """Convert weights of vertices to weights of points, each the mean over the vertices at the point."""
@@ -248,6 +349,16 @@ class Marker:
             f" {conditions.budget}, with noise of {conditions.noise:g} and half of it lost, not {self.bits}. {mend}."
         )
 
+    def check_claim(self, message: bytes) -> None:
+        """Check that a message may be claimed: that it has the payload's size, and is the one in the record, if any.
+
+        Raises:
+            JaxmarkError: if not.
+        """
+        self.check_size(message)
+        if self.record is not None and self.record.told and not self.record.commits_to(message, self.choices):
+            raise JaxmarkError("The record commits to another message than the one claimed; claim that, or none.")
+
     def check_size(self, message: bytes) -> None:
         """Check that a message has exactly the payload's size.
 
@@ -268,12 +379,14 @@ def make_marker(
     record: Record | None = None,
     scheme: str | Scheme = DEFAULT_SCHEME,
     detector: Detector | None = None,
+    version: int | None = None,
 ) -> Marker:
     """Prepare an original for marking, or for reading many suspects.
 
     Args:
-        original: the unmarked mesh. Vertices at exactly the same position move together; a vertex that no face uses
-            stays where it is.
+        original: the unmarked mesh. Vertices at the same position, or so near to each other that they round to the same
+            point (see `jaxmark.geometry.canonical`), move together; a vertex that no face uses stays where it is. With
+            a record, a copy that was saved again will do: rounded, reordered, moved or scaled.
         key: 32 bytes, from `new_key`.
         bits: size of the payload in bits, a multiple of 8; by default the record's, else 64.
         record: the record of an earlier mark, which fixes scheme and payload size; original and key must be those that
@@ -281,17 +394,18 @@ def make_marker(
         scheme: a name (`"keyed"`, `"host"`, `"eigen"`), which a record overrides; or a scheme of
             `jaxmark.watermark.schemes` or your own.
         detector: a detector of `jaxmark.watermark.detectors`; by default the scheme's own.
+        version: version of the keyed choices: the record's, else 2; 1 is for marks of that version without a record.
 
     Returns:
         The marker.
 
     Raises:
-        JaxmarkError: if the mesh, key or payload is unusable, or the record is for another original, key or payload.
+        JaxmarkError: if the mesh, key or payload is unusable, or the record was edited or is for another original, key
+            or payload.
     """
     key = Key(key)
-    ready = make_original(original)
     if record is not None:
-        record.check("message", ready.geometry, key)
+        record.check("message", key)
         if bits not in (None, record.bits):
             raise JaxmarkError(f"The payload is {record.bits} bits by the record, not {bits}.")
         bits = record.bits
@@ -301,11 +415,75 @@ def make_marker(
             raise JaxmarkError(
                 f"The record is of the scheme {record.scheme!r} with {dict(record.parameters)}, not {scheme}."
             )
+    used = record.version if record is not None else SCHEME_VERSION if version is None else version
+    ready, doubts = recall(original, key, record, used)
     scheme = get_scheme(scheme)
     payload = DEFAULT_BITS if bits is None else bits
     code_bits = scheme.code_length(ready, payload)
-    carrier = scheme.carrier(ready, key, payload, code_bits)
-    return Marker(ready, key, payload, scheme, carrier, code_bits, detector or scheme.detector)
+    choices = bind_mark(key, ready, scheme, payload, "message", used)
+    carrier = scheme.carrier(ready, choices, payload, code_bits)
+    if not isinstance(scheme, tuple(SCHEMES.values())):
+        doubts += (f"the scheme {scheme.name!r} is not one of this library",)
+    if detector not in (None, scheme.detector):
+        doubts += ("the detector is not the scheme's own",)
+    return Marker(
+        ready, choices, payload, scheme, carrier, code_bits, detector or scheme.detector, record=record, doubts=doubts
+    )
+
+
+def bind_mark(
+    key: bytes, original: Original, scheme: Scheme, bits: int, content: Content, version: int = SCHEME_VERSION
+) -> Choices:
+    """Bind the keyed choices of a mark to its original and to all that reading it uses."""
+    fixed = {"content": content, "scheme": scheme.name, "parameters": parameters_of(scheme), "bits": bits}
+    return bind(key, original.geometry, fixed, version)
+
+
+def recall(original: Mesh, key: bytes, record: Record | None, version: int) -> tuple[Original, tuple[str, ...]]:
+    """Prepare the original of a mark exactly as it was when the mark was made.
+
+    Args:
+        original: the unmarked mesh as its owner has it now.
+        key: 32 bytes.
+        record: the record of the mark, if there is one.
+        version: version of the keyed choices.
+
+    Returns:
+        The original; and why what is read with it is no proof, which is if it was edited since.
+
+    Raises:
+        JaxmarkError: if the mesh is unusable, or not the one that the record was made for.
+    """
+    if record is None:
+        return make_original(original, None if version > 1 else 0.0), ()
+    if version == 1:
+        ready = make_original(original, 0.0)
+        if ready.geometry.hex() != record.original:
+            raise JaxmarkError("The original is not the mesh that the record was made for (its geometry differs).")
+        return ready, ()
+    imprint = record.open_imprint(key)
+    ready = make_original(original, imprint.grid)
+    if ready.geometry == imprint.hash:
+        return ready, ()
+    copy = restore(original, imprint)
+    ready = make_original(copy.mesh, imprint.grid)
+    if copy.exact:
+        return ready, ()
+    if copy.share < _MIN_ORIGINAL_SHARE:
+        said = f"{100 * copy.share:.0f} % of that mesh's points are in it"
+        if copy.distance < _SAME_SHAPE:
+            raise JaxmarkError(
+                f"The original is not the mesh that the record was made for: {said}, though their shapes differ by only"
+                f" {100 * copy.distance:.2g} % of their size. It looks like the marked file, or another edited copy."
+            )
+        raise JaxmarkError(
+            f"The original is not the mesh that the record was made for: {said}, and their shapes differ by"
+            f" {100 * copy.distance:.2g} % of their size."
+        )
+    places = np.full(len(ready.used), -1)
+    places[ready.weld.point] = copy.places
+    ready = replace(ready, geometry=imprint.hash, places=places, count=len(imprint.tags))
+    return ready, (f"the original was edited: {100 * copy.share:.1f} % of its points are left",)
 
 
 def _matches_record(scheme: Scheme, record: Record) -> bool:
@@ -444,5 +622,50 @@ def detect(
     """
     if bits is None and record is None and isinstance(message, bytes):
         bits = 8 * len(message)
-    marker = make_marker(original, key, bits=bits, record=record, scheme=scheme, detector=detector)
-    return marker.detect(suspect, message, weights, align)
+    markers = make_markers(original, key, bits=bits, record=record, scheme=scheme, detector=detector)
+    return detect_any(markers, suspect, message, weights, align)
+
+
+def make_markers(
+    original: Mesh,
+    key: bytes,
+    *,
+    bits: int | None = None,
+    record: Record | None = None,
+    scheme: str | Scheme = DEFAULT_SCHEME,
+    detector: Detector | None = None,
+) -> list[Marker]:
+    """Prepare an original for reading marks of any version: that of the record, or without one each, the newest first.
+
+    Args and raises: see `make_marker`.
+    """
+    versions = VERSIONS if record is None else (record.version,)
+    return [
+        make_marker(original, key, bits=bits, record=record, scheme=scheme, detector=detector, version=version)
+        for version in versions
+    ]
+
+
+def detect_any(
+    markers: Sequence[Marker],
+    suspect: Mesh,
+    message: bytes | None = None,
+    weights: ArrayLike | None = None,
+    align: Align = "auto",
+) -> Detection:
+    """Read a suspect with each marker until one detects its mark, and return the best; all of them are paid for.
+
+    Args and raises: see `detect`.
+    """
+    best, share = None, 1 / len(markers)
+    for marker in markers:
+        found = marker.detect(suspect, message, weights, align)
+        found = found._replace(
+            log10_p=evidence.share_of(found.log10_p, share),
+            log10_p_undated=evidence.share_of(found.log10_p_undated, share),
+        )
+        best = found if best is None else min(best, found, key=lambda one: (one.log10_p, one.message is None))
+        if best.detected():
+            break
+    assert best is not None
+    return best

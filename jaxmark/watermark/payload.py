@@ -14,7 +14,7 @@ from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.budget import Budget, write
 from jaxmark.watermark.carriers.carrier import Carrier, Reader, Room
-from jaxmark.watermark.coding.keys import KEY_BYTES
+from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key
 from jaxmark.watermark.coding.message import TAG_BITS
 from jaxmark.watermark.schemes import Scheme
 
@@ -159,7 +159,7 @@ class Capacity:
         return reader.room(self._original.to_traced(self._original.used))
 
     def _carrier(self, bits: int, code: int) -> Carrier:
-        return self._scheme.carrier(self._original, bytes(KEY_BYTES), bits, code)
+        return self._scheme.carrier(self._original, Choices(Key(bytes(KEY_BYTES)), b""), bits, code)
 
     def bits(self, conditions: Conditions) -> int:
         """The largest payload, a multiple of 8 bits; 0 if not even 8."""

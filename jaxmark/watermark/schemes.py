@@ -20,6 +20,7 @@ from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark.carriers import Carrier, KeyedCarrier, ModulatedCarrier, eigenspaces, host_bands, make_chips
 from jaxmark.watermark.carriers.modulated import Components
 from jaxmark.watermark.carriers.reception import Host, Receiver, make_host, make_receiver
+from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import TAG_BITS, code_length
 from jaxmark.watermark.coding.sequences import orthogonal_sequences
 from jaxmark.watermark.detectors import Detector, decorrelate, joint
@@ -74,12 +75,12 @@ class Scheme(Protocol):
         """
         ...
 
-    def carrier(self, original: Original, key: bytes, bits: int, code_bits: int) -> Carrier:
+    def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> Carrier:
         """Make the carrier of a mark.
 
         Args:
             original: the mesh to mark.
-            key: 32 bytes.
+            choices: the keyed choices of the mark.
             bits: size of the payload in bits.
             code_bits: number of code bits to carry: `code_length`, or the number of slots of a fingerprint.
         """
@@ -94,6 +95,11 @@ class Scheme(Protocol):
 
     def dimensions(self, original: Original, bits: int) -> int:
         """Number of dimensions of the pass band for a payload; 0 if the scheme has none and carries no fingerprints."""
+        return 0
+
+    @property
+    def free_strengths(self) -> int:
+        """Number of relative strengths that reading uses and version 1 of the keyed choices does not bind."""
         return 0
 
     def tunable(self) -> "TunableScheme":
@@ -197,16 +203,21 @@ class KeyedScheme(Scheme):
         held = np.array([self._dimensions(original, band + 1) for band in range(len(strengths))]) / self._channels
         return np.where(held > min(nuisance, held[-1]) / 2, strengths, 0)
 
-    def carrier(self, original: Original, key: bytes, bits: int, code_bits: int) -> KeyedCarrier:
+    def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> KeyedCarrier:
         """See `Scheme`."""
         layout, dtype = self.layout(original, bits), original.signal.dtype
         host = self._host(original, layout, self.family()[: layout.passing])
-        chips = make_chips(key, original.geometry, original.moving, code_bits, channels=self._channels)
+        chips = make_chips(choices, original.chip_places, original.count, code_bits, channels=self._channels)
         carrier = KeyedCarrier(host, chips, profile=self.strengths(original, bits).astype(dtype))
         if self.direction == "normals":
-            normals = vertex_normals(Mesh(original.positions, original.weld.point[np.asarray(original.mesh.faces)]))
+            normals = vertex_normals(Mesh(original.positions, original.points.faces))
             carrier = carrier._replace(normals=original.to_traced(normals))
         return carrier._replace(masking=self.mask(original))
+
+    @property
+    def free_strengths(self) -> int:
+        """See `Scheme`."""
+        return self.bands
 
     def tunable(self) -> "KeyedScheme":
         """See `Scheme`."""
@@ -313,11 +324,11 @@ class HostScheme(Scheme):
         """See `Scheme`; the more code bits share the components, the more they interfere with each other."""
         return code_length(bits, 3 * self.bands, 2)
 
-    def carrier(self, original: Original, key: bytes, bits: int, code_bits: int) -> Carrier:
+    def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> Carrier:
         """See `Scheme`."""
         family = scaling(self.bands, kernel=self.kernel, damping=self.damping)
         components = host_bands(original.operator, original.signal, family, unit_norm=self.unit_norm)
-        return _make_modulated(self.name, components, self.bands, original, key, code_bits)
+        return _make_modulated(self.name, components, self.bands, original, choices, code_bits)
 
 
 @dataclass(frozen=True)
@@ -339,11 +350,11 @@ class EigenScheme(Scheme):
         """See `Scheme`; the more code bits share the components, the more they interfere with each other."""
         return code_length(bits, 3 * self.pairs, 2)
 
-    def carrier(self, original: Original, key: bytes, bits: int, code_bits: int) -> Carrier:
+    def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> Carrier:
         """See `Scheme`."""
         pairs = eigenpairs(original.operator, self.pairs)
         components = eigenspaces(original.operator, original.signal, pairs)
-        return _make_modulated(self.name, components, self.pairs, original, key, code_bits)
+        return _make_modulated(self.name, components, self.pairs, original, choices, code_bits)
 
 
 #: The schemes that have names.
@@ -389,10 +400,10 @@ def parameters_of(scheme: Scheme) -> dict[str, Any]:
 
 
 def _make_modulated(
-    name: str, components: Components, bands: int, original: Original, key: bytes, code_bits: int
+    name: str, components: Components, bands: int, original: Original, choices: Choices, code_bits: int
 ) -> ModulatedCarrier:
     """Modulate components by one keyed sequence per bit, which runs over all pairs of a band and a coordinate."""
     slots = 3 * bands
-    sequences = orthogonal_sequences(key, original.geometry, code_bits, slots, label=name).reshape(code_bits, bands, 3)
+    sequences = orthogonal_sequences(choices, code_bits, slots, label=name).reshape(code_bits, bands, 3)
     used = components.gram.shape[-1]  # a small mesh has fewer eigenvectors than the layout has places for
     return ModulatedCarrier(components, np.ascontiguousarray(sequences[:, :used]))

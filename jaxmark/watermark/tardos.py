@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int8
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.watermark.coding.keys import derive
+from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.evidence import MIN_LOG10_P
 
 Slots = Float[np.ndarray, " slots"]
@@ -42,12 +42,11 @@ class Accusation(NamedTuple):
     log10_p: float  # log10 of a bound on the probability that any innocent among those tried has such a score
 
 
-def biases(key: bytes, geometry: bytes, length: int) -> Float64[np.ndarray, " slots"]:
+def biases(choices: Choices, length: int) -> Float64[np.ndarray, " slots"]:
     """Derive each slot's probability of +1 from the key, by the arcsine law with a cut-off, in multiples of 1/256.
 
     Args:
-        key: 32 bytes.
-        geometry: `geometry_hash` of the original.
+        choices: the keyed choices of the mark.
         length: number of slots; codes of different lengths share nothing.
 
     Returns:
@@ -58,19 +57,16 @@ def biases(key: bytes, geometry: bytes, length: int) -> Float64[np.ndarray, " sl
     """
     if length < 1:
         raise JaxmarkError(f"A fingerprint needs at least one slot, got {length}.")
-    words = np.frombuffer(derive(key, geometry, f"fingerprint/{length}/biases", 4 * length), "<u4")
+    words = np.frombuffer(choices.derive(f"fingerprint/{length}/biases", 4 * length), "<u4")
     return (MIN_BIAS_LEVEL + np.searchsorted(_THRESHOLDS, words, side="right")) / 256
 
 
-def codewords(
-    recipients: Sequence[str], key: bytes, geometry: bytes, biases_: Slots
-) -> Int8[np.ndarray, "recipients slots"]:
+def codewords(recipients: Sequence[str], choices: Choices, biases_: Slots) -> Int8[np.ndarray, "recipients slots"]:
     """Derive the recipients' codewords ±1 from the key: each slot has a keyed byte, and is +1 if that is below 256 p.
 
     Args:
         recipients: identifiers.
-        key: 32 bytes.
-        geometry: `geometry_hash` of the original.
+        choices: the keyed choices of the mark.
         biases_: p, from `biases`, `[slots]`.
 
     Returns:
@@ -82,7 +78,7 @@ def codewords(
     if not all(recipients):
         raise JaxmarkError("A recipient's identifier is empty: give every recipient one.")
     label = f"fingerprint/{len(biases_)}/codeword"
-    stream = b"".join(derive(key, geometry, label, len(biases_), recipient.encode()) for recipient in recipients)
+    stream = b"".join(choices.derive(label, len(biases_), recipient.encode()) for recipient in recipients)
     drawn = np.frombuffer(stream, np.uint8).reshape(len(recipients), len(biases_))
     return 2 * (drawn < (256 * biases_).astype(np.uint8)).view(np.int8) - 1
 
@@ -126,14 +122,13 @@ def log10_p(score: Float[np.ndarray, " scores"], values: Slots, biases_: Slots) 
     return np.clip((logs - np.outer(score / norm, _CHERNOFF_THETAS)).min(1) / math.log(10), MIN_LOG10_P, 0.0)
 
 
-def rank(values: Slots, recipients: Iterable[str], key: bytes, geometry: bytes, *, top: int = 10) -> list[Accusation]:
+def rank(values: Slots, recipients: Iterable[str], choices: Choices, *, top: int = 10) -> list[Accusation]:
     """Find the recipients with the highest scores, and how surely they are not innocent.
 
     Args:
         values: y at any scale, `[slots]`; **independent of the codewords of innocents**.
         recipients: identifiers; one that occurs twice is tried once.
-        key: 32 bytes.
-        geometry: `geometry_hash` of the original.
+        choices: the keyed choices of the mark.
         top: largest number of recipients to return.
 
     Returns:
@@ -145,12 +140,12 @@ def rank(values: Slots, recipients: Iterable[str], key: bytes, geometry: bytes, 
     """
     if not np.isfinite(values).all():
         raise JaxmarkError("A slot's value is not finite: give 0 where nothing is known.")
-    p = biases(key, geometry, len(values))
+    p = biases(choices, len(values))
     y = _remove_trend(np.asarray(values, np.float64), p)
     tried = list(dict.fromkeys(recipients))
     found = np.empty(len(tried))
     for i in range(0, len(tried), _CHUNK_RECIPIENTS):
-        found[i : i + _CHUNK_RECIPIENTS] = scores(y, p, codewords(tried[i : i + _CHUNK_RECIPIENTS], key, geometry, p))
+        found[i : i + _CHUNK_RECIPIENTS] = scores(y, p, codewords(tried[i : i + _CHUNK_RECIPIENTS], choices, p))
     best = np.argsort(-found, kind="stable")[:top]
     bounds = np.minimum(log10_p(found[best], y, p) + math.log10(max(len(tried), 1)), 0.0)
     return [Accusation(tried[i], float(found[i]), float(bound)) for i, bound in zip(best, bounds, strict=True)]

@@ -1,19 +1,21 @@
 """Tracing copies: each recipient's copy carries a fingerprint, which tells whose copies a suspect was made of.
 
-The carrier is the same as for messages, under a subkey of its own; its code bits are the slots of a collusion-resistant
-code (`jaxmark.watermark.tardos`). Accusations rest on the randomness of the recipients' codewords, never on that of the
-chips: another recipient's copy under the same key is not independent of the chips.
+The carrier is the same as for messages, with keyed choices of its own; its code bits are the slots of a code that
+resists collusion (`jaxmark.watermark.tardos`). Accusations rest on the randomness of the recipients' codewords, never
+on that of the chips: another recipient's copy under the same key is not independent of the chips.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from jaxmark.alignment.original import make_original
+from jaxmark.alignment import alignment
+from jaxmark.alignment.alignment import Align
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark import evidence
 from jaxmark.watermark.budget import Limits, make_budget
-from jaxmark.watermark.coding.keys import KEY_BYTES, Key, commitment, derive
-from jaxmark.watermark.marking import EmbedInfo, Marker
+from jaxmark.watermark.coding.keys import KEY_BYTES, SCHEME_VERSION, VERSIONS, Key
+from jaxmark.watermark.marking import ALIGN_SHARES, EmbedInfo, Marker, bind_mark, recall
 from jaxmark.watermark.record import Record
 from jaxmark.watermark.schemes import DEFAULT_SCHEME, get_scheme
 from jaxmark.watermark.tardos import Accusation, biases, codewords, rank
@@ -32,20 +34,18 @@ class Tracer:
     Make one with `make_tracer`.
     """
 
-    marker: Marker  # writes and reads fingerprints, with the subkey
-    commitment: str  # commitment to the owner's key, hexadecimal
+    marker: Marker  # writes and reads fingerprints
 
     def fingerprint(
         self, recipient: str, budget: float | None = None, *, limits: Limits | None = None
     ) -> tuple[Mesh, EmbedInfo]:
         """Make the copy for one recipient; see `fingerprint`."""
-        key, geometry = self.marker.key, self.marker.original.geometry
+        choices = self.marker.choices
         if self.marker.code_bits >= _MIN_SLOTS:
-            word = codewords([recipient], key, geometry, biases(key, geometry, self.marker.code_bits))[0]
-            marked, info = self.marker.write(word.astype(float), make_budget(budget, limits))
+            word = codewords([recipient], choices, biases(choices, self.marker.code_bits))[0]
+            marked, info = self.marker.write(word.astype(float), make_budget(budget, limits), told=recipient.encode())
             if self.finds(marked, recipient):
-                record = replace(info.record, content="fingerprint", key=self.commitment)
-                return marked, info._replace(record=record)
+                return marked, info
         raise JaxmarkError(
             f"This mesh ({int(self.marker.original.used.sum())} points) cannot carry a fingerprint: its own"
             " recipient would not be found, even unattacked. Use a finer or less regular mesh."
@@ -55,38 +55,50 @@ class Tracer:
         """Whether a suspect would accuse a recipient who is the only one tried, at a probability of 1e-6."""
         return self.identify(suspect, [recipient])[0].log10_p <= _MAX_LOG10_P
 
-    def identify(self, suspect: Mesh, recipients: Iterable[str], top: int = 10) -> list[Accusation]:
+    def identify(
+        self, suspect: Mesh, recipients: Iterable[str], top: int = 10, align: Align = "auto"
+    ) -> list[Accusation]:
         """Rank recipients by their scores in a suspect; see `identify`."""
-        soft = self.marker.soft_values(self.marker.receive(suspect))
-        return rank(soft, recipients, self.marker.key, self.marker.original.geometry, top=top)
+        aligned = alignment.align(self.marker.original, suspect, align)
+        soft = self.marker.soft_values(self.marker.receive(aligned))
+        return pay(rank(soft, recipients, self.marker.choices, top=top), ALIGN_SHARES[align])
 
 
-def make_tracer(original: Mesh, key: bytes, *, record: Record | None = None) -> Tracer:
+def pay(ranking: Iterable[Accusation], share: float) -> list[Accusation]:
+    """Accusations that have only a share of the probability, see `evidence.share_of`."""
+    return [one._replace(log10_p=evidence.share_of(one.log10_p, share)) for one in ranking]
+
+
+def make_tracer(original: Mesh, key: bytes, *, record: Record | None = None, version: int | None = None) -> Tracer:
     """Prepare an original for making copies, or for tracing suspects.
 
     Args:
-        original: the unmarked mesh.
+        original: the unmarked mesh; see `make_marker`.
         key: 32 bytes, from `new_key`.
         record: the record of an earlier copy, which fixes the scheme; original and key must be those that it was made
             with.
+        version: version of the keyed choices: the record's, else 2.
 
     Raises:
-        JaxmarkError: if the mesh or key is unusable, or the record is not of a fingerprint or for another original or
-            key.
+        JaxmarkError: if the mesh or key is unusable, or the record is not of a fingerprint, was edited, or is for
+            another original or key.
     """
-    key, ready = Key(key), make_original(original)
-    scheme = get_scheme(DEFAULT_SCHEME)
+    key, scheme = Key(key), get_scheme(DEFAULT_SCHEME)
     if record is not None:
-        record.check("fingerprint", ready.geometry, key)
+        record.check("fingerprint", key)
         scheme = get_scheme(record.scheme, record.parameters)
+    used = record.version if record is not None else SCHEME_VERSION if version is None else version
+    ready, doubts = recall(original, key, record, used)
     dimensions = scheme.dimensions(ready, _PASSBAND_MESSAGE_BITS)
     if not dimensions:
         raise JaxmarkError(f"Fingerprints are carried by the scheme 'keyed', not {scheme.name!r}.")
     # There are at most half as many slots as dimensions, so that slots can be told apart.
     slots = min(_MAX_SLOTS, 1 << (max(2, dimensions) // 2).bit_length() - 1)
-    own = Key(derive(key, ready.geometry, "fingerprint", KEY_BYTES))
-    carrier = scheme.carrier(ready, own, _PASSBAND_MESSAGE_BITS, slots)
-    return Tracer(Marker(ready, own, slots, scheme, carrier, slots, scheme.detector), commitment(key))
+    choices = bind_mark(key, ready, scheme, slots, "fingerprint", used)
+    if used == 1:  # fingerprints had a key of their own, which is all that told them from messages
+        choices = replace(choices, key=Key(choices.derive("fingerprint", KEY_BYTES)))
+    carrier = scheme.carrier(ready, choices, _PASSBAND_MESSAGE_BITS, slots)
+    return Tracer(Marker(ready, choices, slots, scheme, carrier, slots, scheme.detector, "fingerprint", record, doubts))
 
 
 def fingerprint(
@@ -123,6 +135,7 @@ def identify(
     key: bytes,
     record: Record | None = None,
     top: int = 10,
+    align: Align = "auto",
 ) -> list[Accusation]:
     """Find whose copies a suspect was made of, and how surely.
 
@@ -133,6 +146,7 @@ def identify(
         key: 32 bytes.
         record: the record of an earlier copy, see `make_tracer`.
         top: number of recipients to return.
+        align: how the suspect is aligned, see `detect`.
 
     Returns:
         The recipients with the highest scores, the highest first. log10_p bounds the probability that any of the
@@ -142,4 +156,11 @@ def identify(
     Raises:
         JaxmarkError: see `make_tracer`; also if the suspect cannot be aligned, or an identifier is empty.
     """
-    return make_tracer(original, key, record=record).identify(suspect, recipients, top)
+    versions, tried = VERSIONS if record is None else (record.version,), list(recipients)
+    rankings = []
+    for version in versions:
+        tracer = make_tracer(original, key, record=record, version=version)
+        rankings.append(pay(tracer.identify(suspect, tried, top, align), 1 / len(versions)))
+        if rankings[-1] and rankings[-1][0].log10_p <= _MAX_LOG10_P:
+            break
+    return min(rankings, key=lambda ranking: ranking[0].log10_p if ranking else 0.0)

@@ -10,7 +10,6 @@ from jaxmark import distortion
 from jaxmark.alignment.original import Original, displace
 from jaxmark.distortion import Metric
 from jaxmark.distortion.roughness import MAX_ROUGHNESS, MIN_ROUGHNESS, POWER
-from jaxmark.geometry.mesh import weld_mesh
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.watermark.probes import probe_signs
@@ -79,9 +78,8 @@ def masking(original: Original) -> Float[Array, " rows"]:
     Montanvert, "A fast roughness-based approach to the assessment of 3D mesh visual quality", Computers & Graphics
     36(7), 2012): local roughness, clipped to 5e-4 … 0.2, raised to the power 0.15.
     """
-    points = weld_mesh(original.mesh, original.weld)
     positions = jnp.asarray(original.positions, original.signal.dtype)
-    rough = distortion.local_roughness(positions, np.asarray(points.faces)).roughness
+    rough = distortion.local_roughness(positions, np.asarray(original.points.faces)).roughness
     hidden = np.where(original.used, np.clip(np.asarray(rough), MIN_ROUGHNESS, MAX_ROUGHNESS) ** POWER, 0)
     # Roughness is averaged, so that masking does not turn low frequencies of the mark into high ones.
     average = diffusion(_AVERAGING_SCALE + 1, 2**_AVERAGING_SCALE + 1)[_AVERAGING_SCALE]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, Int64, PRNGKeyArray
 
 from jaxmark.alignment.observation import Observation, observe
 from jaxmark.spectral.chebyshev import band_energies, filter, transpose
@@ -28,7 +28,7 @@ from jaxmark.watermark.carriers.reception import (
     receive,
     weigh_evenly,
 )
-from jaxmark.watermark.coding.keys import permutation, signs
+from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.probes import probe_signs
 
 
@@ -41,23 +41,23 @@ class Chips(NamedTuple):
 
 
 def make_chips(
-    key: bytes, geometry: bytes, moving: Bool[np.ndarray, " vertices"], bits: int, *, channels: int = 3
+    choices: Choices, places: Int64[np.ndarray, " vertices"], count: int, bits: int, *, channels: int = 3
 ) -> Chips:
-    """Draw the signs, and assign the chips of all moving vertices to the bits, in numbers that differ by at most one.
+    """Draw the signs, and assign the chips of all moving points to the bits, in numbers that differ by at most one.
 
     Args:
-        key: 32 bytes.
-        geometry: `geometry_hash` of the original.
-        moving: whether each vertex may move, `[N]`.
+        choices: the keyed choices of the mark.
+        places: number of each vertex among the points that may move, or -1 if it is none of them, `[N]`.
+        count: number of these points.
         bits: number of bits to carry.
         channels: chips per vertex: 3, or 1 along normals.
     """
-    total = channels * int(moving.sum())
-    sign = np.zeros((len(moving), channels), np.int8)
-    slot = np.zeros((len(moving), channels), np.int32)
-    sign[moving] = signs(key, geometry, f"keyed/{bits}/{channels}/signs", total).reshape(-1, channels)
-    order = permutation(key, geometry, f"keyed/{bits}/{channels}/slots", total)
-    slot[moving] = (order % bits).reshape(-1, channels)
+    total, here = channels * count, places >= 0
+    sign = np.zeros((len(places), channels), np.int8)
+    slot = np.zeros((len(places), channels), np.int32)
+    sign[here] = choices.signs(f"keyed/{bits}/{channels}/signs", total).reshape(-1, channels)[places[here]]
+    order = choices.permutation(f"keyed/{bits}/{channels}/slots", total)
+    slot[here] = (order % bits).reshape(-1, channels)[places[here]]
     return Chips(sign, slot, np.bincount(order % bits, minlength=bits).astype(np.int32))
 
 

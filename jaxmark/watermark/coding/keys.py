@@ -1,21 +1,26 @@
-"""Keys, and the integer sequences that derive from a key and a label; on the host, and the same in all versions.
+"""Keys, and the integer sequences that derive from a key, a context and a label; on the host.
 
-Every keyed choice is SHAKE-256(key ‖ geometry hash ‖ "jaxmark/1/label"): two meshes marked under one key share nothing,
+Every keyed choice is SHAKE-256(key ‖ context ‖ "jaxmark/version/label"): two meshes marked under one key share nothing,
 and no choice tells anything about another. The results are plain integer arrays, which traced code gets as data,
 because JAX does not promise that its random streams stay the same from version to version.
 """
 
 import hashlib
+import json
 import os
 import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int8, Int64
 
 from jaxmark.errors import JaxmarkError
 
-SCHEME_VERSION = 1  # version of the keyed choices
+SCHEME_VERSION = 2  # version of the keyed choices of new marks
+VERSIONS = (2, 1)  # versions that are read, the newest first
 KEY_BYTES = 32
 
 
@@ -82,32 +87,74 @@ def load_key(path: str | os.PathLike[str]) -> Key:
         raise JaxmarkError(f"{path} is no key file: it should hold {2 * KEY_BYTES} hexadecimal digits.") from None
 
 
-def derive(key: bytes, geometry: bytes, label: str, size: int, data: bytes = b"") -> bytes:
-    """Derive bytes from a key: SHAKE-256(key ‖ geometry hash ‖ "jaxmark/1/label"), with ‖ 0 ‖ data appended if given.
+@dataclass(frozen=True)
+class Choices:
+    """All keyed choices of one mark: what derives from its key, and from what the mark is bound to.
+
+    In version 1 that is the hash of the original's geometry; since version 2 a hash of all that reading uses, see
+    `bind`. Who changes any of it gets other choices, which know nothing of these.
+    """
+
+    key: Key
+    context: bytes  # what the choices are bound to
+    version: int = SCHEME_VERSION  # version of the keyed choices
+
+    def derive(self, label: str, size: int, data: bytes = b"") -> bytes:
+        """Derive bytes: SHAKE-256(key ‖ context ‖ "jaxmark/version/label"), with ‖ 0 ‖ data appended if given.
+
+        Args:
+            label: the purpose of the bytes.
+            size: number of bytes.
+            data: what else the bytes depend on.
+        """
+        message = self.key + self.context + f"jaxmark/{self.version}/{label}".encode()
+        return hashlib.shake_256(message + b"\0" + data if data else message).digest(size)
+
+    def signs(self, label: str, count: int) -> Int8[np.ndarray, " count"]:
+        """Derive `count` independent signs, -1 or +1; see `derive`."""
+        stream = np.frombuffer(self.derive(label, -(-count // 8)), np.uint8)
+        return 1 - 2 * np.unpackbits(stream)[:count].astype(np.int8)
+
+    def permutation(self, label: str, count: int) -> Int64[np.ndarray, " count"]:
+        """Derive a permutation of 0 … count - 1: the order of `count` 64-bit words; see `derive`."""
+        words = np.frombuffer(self.derive(label, 8 * count), "<u8")
+        return np.argsort(words, kind="stable").astype(np.int64)
+
+
+def bind(key: bytes, geometry: bytes, fixed: Mapping[str, Any], version: int = SCHEME_VERSION) -> Choices:
+    """Bind the keyed choices of a mark to its original, and to everything else that reading uses.
 
     Args:
         key: 32 bytes.
-        geometry: `geometry_hash` of the original.
-        label: the purpose of the bytes.
-        size: number of bytes.
-        data: what else the bytes depend on.
+        geometry: hash of the original's geometry.
+        fixed: all else that reading uses, such as scheme and payload: values that JSON has. Version 1 does not bind it.
+        version: version of the keyed choices.
+
+    Raises:
+        JaxmarkError: if there is a value that JSON does not have, or the key is not 32 bytes.
     """
-    message = Key(key) + geometry + f"jaxmark/{SCHEME_VERSION}/{label}".encode()
-    return hashlib.shake_256(message + b"\0" + data if data else message).digest(size)
+    if version == 1:
+        return Choices(Key(key), geometry, version)
+    state = hashlib.sha256(f"jaxmark/{version}/context".encode())
+    state.update(geometry)
+    state.update(canonical_json(fixed))
+    return Choices(Key(key), state.digest(), version)
+
+
+def canonical_json(value: Mapping[str, Any]) -> bytes:
+    """Write a value as JSON in the one way that hashes are taken of: keys in order, no spaces, shortest numbers.
+
+    Raises:
+        JaxmarkError: if there is a value that JSON does not have.
+    """
+    try:
+        return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+    except (TypeError, ValueError) as error:
+        raise JaxmarkError(
+            f"What a mark is bound to must be finite numbers, texts and lists of them: {error}."
+        ) from None
 
 
 def commitment(key: bytes) -> str:
-    """Compute a hash that commits to a key without revealing it, hexadecimal."""
-    return derive(key, b"", "commitment", 32).hex()
-
-
-def signs(key: bytes, geometry: bytes, label: str, count: int) -> Int8[np.ndarray, " count"]:
-    """Derive `count` independent signs, -1 or +1; see `derive`."""
-    stream = np.frombuffer(derive(key, geometry, label, -(-count // 8)), np.uint8)
-    return 1 - 2 * np.unpackbits(stream)[:count].astype(np.int8)
-
-
-def permutation(key: bytes, geometry: bytes, label: str, count: int) -> Int64[np.ndarray, " count"]:
-    """Derive a permutation of 0 … count - 1: the order of `count` 64-bit words; see `derive`."""
-    words = np.frombuffer(derive(key, geometry, label, 8 * count), "<u8")
-    return np.argsort(words, kind="stable").astype(np.int64)
+    """Compute a hash that commits to a key without revealing it, hexadecimal; the same in all versions."""
+    return Choices(Key(key), b"", 1).derive("commitment", 32).hex()

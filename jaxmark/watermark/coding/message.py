@@ -5,13 +5,14 @@ candidates; the tag, from a subkey of its own, tells which of them is the messag
 """
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float64
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.coding import polar
-from jaxmark.watermark.coding.keys import derive
+from jaxmark.watermark.coding.keys import Choices
 
 TAG_BITS = 28
 CANDIDATES = 64  # number of messages whose tags the decoder tries
@@ -40,37 +41,39 @@ def code_length(bits: int, places: int, spread: int) -> int:
     return length
 
 
-def encode(message: bytes, key: bytes, geometry: bytes, length: int) -> Float64[np.ndarray, " length"]:
+def encode(message: bytes, choices: Choices, length: int) -> Float64[np.ndarray, " length"]:
     """Encode a message and its keyed tag as a codeword of signs: a code bit 0 is +1, a 1 is -1.
 
     Args:
         message: the payload.
-        key: 32 bytes.
-        geometry: `geometry_hash` of the original.
+        choices: the keyed choices of the mark.
         length: number of code bits, from `code_length`.
     """
     payload = np.unpackbits(np.frombuffer(message, np.uint8))
-    return 1.0 - 2.0 * polar.encode(np.concatenate([payload, _tag(message, key, geometry)]), length)
+    return 1.0 - 2.0 * polar.encode(np.concatenate([payload, _tag(message, choices)]), length)
 
 
-def decode(
-    scores: Float[np.ndarray, " length"], bits: int, key: bytes, geometry: bytes, candidates: int = CANDIDATES
-) -> bytes | None:
-    """Decode the most plausible message whose keyed tag fits; None if there is no such message.
+class Decoded(NamedTuple):
+    """A message whose keyed tag fits."""
 
-    A suspect that is independent of the key passes with probability at most candidates · 2^-TAG_BITS.
+    message: bytes
+    rank: int  # how many messages were tried, this one included; its tag fits by chance with probability rank · 2^-28
+
+
+def decode(scores: Float[np.ndarray, " length"], bits: int, choices: Choices) -> Decoded | None:
+    """Decode the most plausible message whose keyed tag fits; None if there is none among the first `CANDIDATES`.
+
+    A suspect that is independent of the key passes at a rank of at most r with probability at most r · 2^-TAG_BITS.
 
     Args:
         scores: soft values of the code bits, at any common scale; 0 where nothing is known.
         bits: size of the payload in bits.
-        key: 32 bytes.
-        geometry: `geometry_hash` of the original.
-        candidates: largest number of messages to try.
+        choices: the keyed choices of the mark.
     """
-    for word in _list_candidates(scores, bits, candidates):
+    for rank, word in enumerate(_list_candidates(scores, bits, CANDIDATES), 1):
         message = np.packbits(word[:bits]).tobytes()
-        if np.array_equal(word[bits:], _tag(message, key, geometry)):
-            return message
+        if np.array_equal(word[bits:], _tag(message, choices)):
+            return Decoded(message, rank)
     return None
 
 
@@ -95,7 +98,7 @@ def _list_candidates(scores: Float[np.ndarray, " length"], bits: int, candidates
     return polar.decode(scores[None] / np.abs(scores).max(), bits + TAG_BITS, candidates)[0]
 
 
-def _tag(message: bytes, key: bytes, geometry: bytes) -> np.ndarray:
+def _tag(message: bytes, choices: Choices) -> np.ndarray:
     """The keyed tag of a message, as bits 0 or 1."""
-    digest = derive(key, geometry, "tag", -(-TAG_BITS // 8), message)
+    digest = choices.derive("tag", -(-TAG_BITS // 8), message)
     return np.unpackbits(np.frombuffer(digest, np.uint8))[:TAG_BITS]

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Int8
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.watermark.coding.keys import permutation, signs
+from jaxmark.watermark.coding.keys import Choices
 
 
 def orthogonal_sequences(
-    key: bytes, geometry: bytes, count: int, length: int, *, label: str = "sequences"
+    choices: Choices, count: int, length: int, *, label: str = "sequences"
 ) -> Int8[np.ndarray, "count length"]:
     """Derive mutually orthogonal ±1 sequences: rows of a Hadamard matrix, chosen, permuted and signed by the key.
 
@@ -20,8 +20,7 @@ def orthogonal_sequences(
     on the signs alone. Sequences of different labels or lengths share nothing.
 
     Args:
-        key: 32 bytes.
-        geometry: `geometry_hash` of the original.
+        choices: the keyed choices of the mark.
         count: number of sequences, at most `length`.
         length: 1, 2 or a multiple of 4 that `hadamard` can construct.
         label: purpose of the sequences; the keyed choices have the labels `label/length/rows`, `…/columns` and
@@ -36,9 +35,9 @@ def orthogonal_sequences(
     matrix = hadamard(length)
     if not 0 < count <= length:
         raise JaxmarkError(f"There are {length} mutually orthogonal sequences of length {length}, not {count}.")
-    rows = permutation(key, geometry, f"{label}/{length}/rows", length)[:count]
-    columns = permutation(key, geometry, f"{label}/{length}/columns", length)
-    return matrix[rows][:, columns] * signs(key, geometry, f"{label}/{length}/signs", length)
+    rows = choices.permutation(f"{label}/{length}/rows", length)[:count]
+    columns = choices.permutation(f"{label}/{length}/columns", length)
+    return matrix[rows][:, columns] * choices.signs(f"{label}/{length}/signs", length)
 
 
 def hadamard(order: int) -> Int8[np.ndarray, "order order"]:

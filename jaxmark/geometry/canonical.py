@@ -1,0 +1,84 @@
+"""Canonical geometry: the points that a mark is written in, and a hash of them that tells originals apart.
+
+Version 1 takes a mesh as its file has it, to the last bit and in its order. Version 2 rounds positions to a grid and
+orders points and faces by position, so that the geometry survives what rounds, reorders or splits vertices; see
+`jaxmark.geometry.imprint` for how rounding is repeated exactly.
+"""
+
+import hashlib
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int64
+
+from jaxmark.geometry.hashing import points_hash
+from jaxmark.geometry.mesh import Mesh, Weld, diagonal, used_vertices, weld, weld_mesh
+
+# Six significant digits are off by up to 5e-6 of the largest coordinate, float32 by 6e-8. Both stay below a quarter of
+# the grid's spacing, 1.5e-5 to 3e-5 of the diagonal, where coordinates are no larger than three quarters of the latter.
+_CELLS = 2**15  # in a bounding-box diagonal, at least
+
+
+class Canonical(NamedTuple):
+    """The canonical geometry of a mesh."""
+
+    points: Mesh  # the distinct points, and the mesh's faces as indices of these
+    weld: Weld  # which vertices of the mesh stand at which point
+    hash: bytes  # SHA-256 of what tells this geometry from others
+
+
+def exact(mesh: Mesh) -> Canonical:
+    """The geometry of version 1: points at exactly the same position are one, in order of first occurrence."""
+    welded = weld(mesh.vertices)
+    points = weld_mesh(mesh, welded)
+    return Canonical(points, welded, points_hash(points))
+
+
+def grid_spacing(mesh: Mesh) -> float:
+    """The spacing of the grid for a mesh, in its units: a power of two, so that rounding is exact.
+
+    Raises:
+        JaxmarkError: see `diagonal`.
+    """
+    return 2.0 ** math.floor(math.log2(diagonal(mesh) / _CELLS))
+
+
+def rounded(mesh: Mesh, spacing: float) -> Canonical:
+    """The geometry of version 2: points on a grid, in the order of their coordinates; those that no face uses are last.
+
+    The hash covers the spacing, the points that faces use, and the faces with three different corners, whatever corner
+    comes first; so it survives a file format that has no isolated vertices or no order.
+
+    Args:
+        mesh: any mesh.
+        spacing: distance of the grid's planes, in units of the mesh; a power of two.
+    """
+    cells = np.rint(np.asarray(mesh.vertices, np.float64) / spacing) * spacing + 0.0  # turns -0.0 into 0.0
+    order = np.lexsort(cells.T[::-1])
+    rows = cells[order]
+    fresh = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))
+    point = np.empty_like(order)
+    point[order] = np.cumsum(fresh) - 1
+    used = np.bincount(point[used_vertices(mesh)], minlength=int(fresh.sum())) > 0
+    place = np.empty(len(used), np.int64)
+    place[np.argsort(~used, kind="stable")] = np.arange(len(used))
+    point = place[point]
+    first = np.empty(len(used), np.int64)
+    first[point[::-1]] = np.arange(len(point))[::-1]
+    points = Mesh(cells[first], point[np.asarray(mesh.faces)])
+    state = hashlib.sha256(b"jaxmark/2/geometry")
+    faces = _sorted_faces(np.asarray(points.faces))
+    state.update(np.array([used.sum(), len(faces)], "<i8").tobytes())
+    state.update(np.array(spacing, "<f8").tobytes())
+    state.update(points.vertices[: used.sum()].astype("<f8").tobytes())
+    state.update(faces.astype("<i8").tobytes())
+    return Canonical(points, Weld(point, first), state.digest())
+
+
+def _sorted_faces(faces: Int64[np.ndarray, "faces 3"]) -> Int64[np.ndarray, "sorted 3"]:
+    """The faces with three different corners, each from its lowest corner on, in ascending order."""
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    turned = np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    return turned[np.lexsort(turned.T[::-1])]
