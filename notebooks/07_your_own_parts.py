@@ -21,6 +21,7 @@ from jaxmark.geometry import Mesh
 from jaxmark.geometry.mesh import vertex_normals
 from jaxmark.spectral.precision import einsum, matmul
 from jaxmark.watermark.carriers import ModulatedCarrier
+from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import code_length
 from jaxmark.watermark.coding.sequences import orthogonal_sequences
 from jaxmark.watermark.detectors import Detector, decorrelate
@@ -153,15 +154,15 @@ class WaveScheme(Scheme):
         """How many code bits carry a payload: at most one for two waves."""
         return code_length(bits, self.waves // 2, 4)
 
-    def carrier(self, original, key: bytes, bits: int, code_bits: int) -> ModulatedCarrier:
+    def carrier(self, original, choices: Choices, bits: int, code_bits: int) -> ModulatedCarrier:
         """The waves, and a keyed sequence of signs for each code bit."""
         random = np.random.default_rng(0)  # no secret: the same for every key
         vectors = random.normal(size=(3, self.waves))
         vectors *= 2 * np.pi / self.wavelength * random.uniform(0.3, 1, self.waves) / np.linalg.norm(vectors, axis=0)
         heights = np.cos(original.positions @ vectors + random.uniform(0, 2 * np.pi, self.waves))
         heights /= np.linalg.norm(heights, axis=0)
-        normals = vertex_normals(Mesh(original.positions, original.weld.point[np.asarray(original.mesh.faces)]))
-        signs = orthogonal_sequences(key, original.geometry, code_bits, self.waves, label=self.name)
+        normals = vertex_normals(Mesh(original.positions, original.points.faces))
+        signs = orthogonal_sequences(choices, code_bits, self.waves, label=self.name)
         used = original.used[:, None]
         waves = Waves(original.to_traced(used * heights), original.to_traced(used * normals))
         return ModulatedCarrier(waves, signs[:, :, None])

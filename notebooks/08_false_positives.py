@@ -61,8 +61,9 @@ def scores(suspect: jm.Mesh, claims: list[tuple[jm.Key, bytes]]) -> tuple[np.nda
     a[~original.moving] = 0
     found = []
     for key, message in claims:
-        chips = make_chips(key, original.geometry, original.moving, owner.code_bits)
-        word = encode(message, key, original.geometry, owner.code_bits)
+        choices = owner.choices_of(key)
+        chips = make_chips(choices, original.chip_places, owner.code_bits)
+        word = encode(message, choices, owner.code_bits)
         found.append(np.sum(chips.signs * word[chips.slots] * a))
     return np.array(found), float(np.linalg.norm(a))
 

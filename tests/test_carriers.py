@@ -12,6 +12,7 @@ from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.laplacian import Laplacian, centre, make_laplacian
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark.carriers import Carrier, ModulatedCarrier, eigenspaces, host_bands
+from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.sequences import orthogonal_sequences
 from tests.dense import chebyshev_matrices
 from tests.samples import bumpy_sphere
@@ -53,7 +54,7 @@ def make_carrier(
     kind: str, operator: Laplacian, signal: jax.Array, key: bytes, shared: bool = False
 ) -> ModulatedCarrier:
     columns = 1 if shared else 3
-    sequences = orthogonal_sequences(key, b"geometry", BITS, BANDS * columns).reshape(BITS, BANDS, columns)
+    sequences = orthogonal_sequences(Choices(key, b"geometry", 1), BITS, BANDS * columns).reshape(BITS, BANDS, columns)
     if kind == "eigen":
         return ModulatedCarrier(eigenspaces(operator, signal, eigenpairs(operator, BANDS)), sequences)
     family = scaling(BANDS, damping="jackson")

@@ -16,6 +16,7 @@ from jaxmark.spectral import bands, filter, make_laplacian
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark import SCHEMES
 from jaxmark.watermark.budget import make_budget
+from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme, Scheme
 from tests.samples import bumpy_sphere
 
@@ -143,7 +144,7 @@ def test_carriers_by_transformation(name, small: Mesh, key: jm.Key, dtype):
     """Linear in the bits, back by the adjoint, the dtype kept, the same again, and nothing where no face is."""
     stray = make_mesh(np.vstack([small.vertices, [[9.0, 9, 9]]]), small.faces)
     original = make_original(stray)
-    carrier, again = (SMALL[name].carrier(original, key, 8, 8) for _ in range(2))
+    carrier, again = (SMALL[name].carrier(original, Choices(key, b""), 8, 8) for _ in range(2))
     words = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], (2, 8)), original.signal.dtype)
     if dtype == np.float64:
         agree(carrier.displacement, words, 1e-4)

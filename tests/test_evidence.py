@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.watermark.evidence import MIN_LOG10_P, any_of, log10_p_claimed, log10_p_fitted, log10_p_read, log10_p_tag
+from jaxmark.watermark.evidence import (
+    MIN_LOG10_P,
+    any_of,
+    log10_p_claimed,
+    log10_p_fitted,
+    log10_p_fitted_strengths,
+    log10_p_read,
+    log10_p_tag,
+    share_of,
+    undated,
+)
 from jaxmark.watermark.marking import make_marker
 from tests.samples import bumpy_sphere
 
@@ -81,3 +91,25 @@ def test_both_proofs_of_a_message_read():
     assert claimed.log10_p < found.log10_p
     assert claimed.log10_p_fitted < claimed.log10_p
     assert found.detected(1e-20)
+
+
+def test_fitted_strengths_are_paid_for():
+    """Against the supremum itself, ‖P s‖ over random signs, and against figures that were computed by hand."""
+    score = math.sqrt(2 * 21.5 * math.log(10))
+    assert log10_p_fitted_strengths(score, 1.0, 64) == pytest.approx(-1.4, abs=0.05)
+    assert log10_p_fitted_strengths(math.sqrt(2 * 76.9 * math.log(10)), 1.0, 64) == pytest.approx(-32.8, abs=0.1)
+    assert log10_p_fitted_strengths(7.9, 1.0, 64) == 0.0
+    random = np.random.default_rng(0)
+    basis = np.linalg.qr(random.normal(size=(512, 16)))[0]
+    suprema = np.linalg.norm(random.choice([-1.0, 1.0], (20_000, 512)) @ basis, axis=1)
+    for level in (0.1, 0.01, 0.001):
+        counted = np.mean([10 ** log10_p_fitted_strengths(s, 1.0, 16) <= level for s in suprema])
+        assert counted <= level
+    assert log10_p_fitted_strengths(suprema.max(), 1.0, 16) > log10_p_claimed(suprema.max(), 1.0)
+
+
+def test_shares_and_tries():
+    assert undated(-30.0) == pytest.approx(-30 + 64 * math.log10(2))
+    assert undated(-3.0) == 0.0
+    assert share_of(-3.0, 0.01) == pytest.approx(-1.0)
+    assert share_of(-3.0, 1e-6) == 0.0

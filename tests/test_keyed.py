@@ -17,6 +17,7 @@ from jaxmark.watermark import detectors
 from jaxmark.watermark.bits import detect_bits, embed_bits
 from jaxmark.watermark.carriers import Carrier, KeyedCarrier, KeyedReader, ModulatedCarrier, host_bands, make_chips
 from jaxmark.watermark.carriers.reception import Reception, make_host, make_receiver, receive
+from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.detectors import joint
 from tests.dense import chebyshev_matrices
 from tests.samples import bumpy_sphere
@@ -56,13 +57,17 @@ def medium() -> Case:
     return make_case(2)
 
 
+def places(moving: np.ndarray) -> np.ndarray:
+    """Number of each vertex among those that move, or -1."""
+    return np.where(moving, np.cumsum(moving) - 1, -1)
+
+
 def make_carrier(case: Case, key: bytes, dtype, direction="coordinates", bits=BITS, moving=None) -> KeyedCarrier:
     x = jnp.asarray(case.x, dtype)
     host = make_host(case.operator, x, x, FAMILY, scales=2, degree=1)
     chips = make_chips(
-        key,
-        GEOMETRY,
-        case.moving if moving is None else moving,
+        Choices(jm.Key(key), GEOMETRY, 1),
+        places(case.moving if moving is None else moving),
         bits,
         channels=3 if direction == "coordinates" else 1,
     )
@@ -211,11 +216,11 @@ def test_what_signs_multiply_depends_on_no_key(direction, small: Case, key: jm.K
 def test_golden_chips(key: jm.Key):
     """Held exactly, for ever."""
     moving = np.array([True, True, False, True, True])
-    chips = make_chips(key, GEOMETRY, moving, 5)
+    chips = make_chips(Choices(key, GEOMETRY, 1), places(moving), 5)
     assert chips.signs.tolist() == [[1, -1, 1], [-1, -1, -1], [0, 0, 0], [1, -1, 1], [1, -1, 1]]
     assert chips.slots.tolist() == [[0, 0, 1], [3, 2, 1], [0, 0, 0], [4, 0, 3], [2, 4, 1]]
     assert chips.population.tolist() == [3, 3, 2, 2, 2]
-    along = make_chips(key, GEOMETRY, moving, 2, channels=1)
+    along = make_chips(Choices(key, GEOMETRY, 1), places(moving), 2, channels=1)
     assert along.signs.ravel().tolist() == [1, 1, 0, -1, -1]
     assert along.slots.ravel().tolist() == [1, 0, 0, 0, 1]
 
@@ -224,25 +229,27 @@ def test_golden_chips(key: jm.Key):
 @pytest.mark.parametrize("bits", [1, 7, 64])
 def test_every_bit_has_as_many_chips(bits, channels, key: jm.Key):
     moving = np.random.default_rng(4).uniform(size=201) < 0.8
-    chips = make_chips(key, GEOMETRY, moving, bits, channels=channels)
+    chips = make_chips(Choices(key, GEOMETRY, 1), places(moving), bits, channels=channels)
     total = channels * moving.sum()
     assert chips.population.sum() == total
     assert set(chips.population.tolist()) <= {total // bits, -(-total // bits)}
     np.testing.assert_array_equal(np.bincount(chips.slots[moving].ravel(), minlength=bits), chips.population)
     assert (chips.signs[~moving] == 0).all()
     assert (np.abs(chips.signs[moving]) == 1).all()
-    for one, again in zip(chips, make_chips(key, GEOMETRY, moving, bits, channels=channels), strict=True):
+    for one, again in zip(
+        chips, make_chips(Choices(key, GEOMETRY, 1), places(moving), bits, channels=channels), strict=True
+    ):
         np.testing.assert_array_equal(one, again)
 
 
 def test_keys_meshes_and_layouts_share_nothing(key: jm.Key):
     moving = np.ones(6000, bool)
-    base = make_chips(key, GEOMETRY, moving, 50)
+    base = make_chips(Choices(key, GEOMETRY, 1), places(moving), 50)
     for other in (
-        make_chips(jm.Key(bytes(32)), GEOMETRY, moving, 50),
-        make_chips(key, b"h" * 32, moving, 50),
-        make_chips(key, GEOMETRY, moving, 51),
-        make_chips(key, GEOMETRY, moving, 50, channels=1),
+        make_chips(Choices(jm.Key(bytes(32)), GEOMETRY, 1), places(moving), 50),
+        make_chips(Choices(key, b"h" * 32, 1), places(moving), 50),
+        make_chips(Choices(key, GEOMETRY, 1), places(moving), 51),
+        make_chips(Choices(key, GEOMETRY, 1), places(moving), 50, channels=1),
     ):
         count = other.signs.size
         assert abs(np.vdot(base.signs.ravel()[:count].astype(int), other.signs.ravel())) < 6 * np.sqrt(count)
@@ -421,7 +428,7 @@ def test_differentiable_with_respect_to_suspect_original_and_strength(small: Cas
     """By finite differences. The ridge is not differentiated on purpose; here it is, and all else has to fit."""
     stop = jax.lax.stop_gradient
     monkeypatch.setattr(jax.lax, "stop_gradient", lambda x: x if getattr(x, "ndim", 1) == 0 else stop(x))
-    chips = make_chips(key, GEOMETRY, small.moving, BITS)
+    chips = make_chips(Choices(key, GEOMETRY, 1), places(small.moving), BITS)
     random = np.random.default_rng(9)
     message = jnp.asarray(random.choice([-1.0, 1.0], BITS))
 

@@ -17,7 +17,7 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.laplacian import per_row
 from jaxmark.spectral.precision import matmul, sum_and_norm
 from jaxmark.watermark.carriers import Carrier, Claim, PlainReader, Reader
-from jaxmark.watermark.coding.keys import signs
+from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import code_length
 from jaxmark.watermark.detectors import Detector, claims, correlate
 from jaxmark.watermark.schemes import Scheme
@@ -74,13 +74,13 @@ class PatchScheme(Scheme):
     def code_length(self, original: Original, bits: int) -> int:
         return code_length(bits, len(original.used) // self.size, 2)
 
-    def carrier(self, original: Original, key: bytes, bits: int, code_bits: int) -> Any:
+    def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> Any:
         rows = len(original.signal)
         centres = np.random.default_rng(0).permutation(len(original.used))[: self.size * code_bits]
         patches = jnp.zeros((rows, len(centres)), original.signal.dtype).at[centres, np.arange(len(centres))].set(1)
         for _ in range(2):
             patches -= 0.5 * original.operator.apply(patches)
-        keyed = signs(key, original.geometry, f"{self.name}/{code_bits}", len(centres)).reshape(code_bits, self.size)
+        keyed = choices.signs(f"{self.name}/{code_bits}", len(centres)).reshape(code_bits, self.size)
         return Patches(
             patches.reshape(rows, code_bits, self.size),
             jnp.asarray(original.operator.degree, original.signal.dtype),

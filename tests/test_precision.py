@@ -22,6 +22,7 @@ from jaxmark.watermark import channels, evidence
 from jaxmark.watermark.bits import detect_bits, embed_bits
 from jaxmark.watermark.carriers import Chips, KeyedCarrier, KeyedReader
 from jaxmark.watermark.carriers.reception import Reception, make_host, make_receiver
+from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.detectors import decorrelate
 from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme
 from tests.samples import bumpy_sphere
@@ -161,7 +162,7 @@ def test_products_of_preparing_embedding_and_reading(scheme, original, key: jm.K
     one = jnp.ones(1, jnp.float32)[0]
 
     def written(x, bits, beta):
-        carrier = scheme.carrier(replace(original, signal=x), key, 8, 64)
+        carrier = scheme.carrier(replace(original, signal=x), Choices(key, b""), 8, 64)
         return carrier, embed_bits(x, bits, carrier, beta)
 
     def read(x, bits, beta, normals):

@@ -10,6 +10,7 @@ from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.watermark.carriers import KeyedCarrier
+from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.schemes import KeyedScheme, get_scheme, parameters_of
 from jaxmark.watermark.visibility import band_visibility, masking
 from tests.samples import rough_sphere
@@ -58,7 +59,7 @@ def test_rough_regions_are_moved_more(half_rough: Mesh, key: jm.Key):
 def test_a_profile_is_what_is_written(half_rough: Mesh, key: jm.Key, dtype):
     scheme = KeyedScheme(bands=32, profile=(0.0, 1.0, 0.5, 0.0, 0.25))
     original = make_original(half_rough)
-    carrier = scheme.carrier(original, key, 16, 88)
+    carrier = scheme.carrier(original, Choices(key, b""), 16, 88)
     assert isinstance(carrier, KeyedCarrier)
     assert len(carrier.host.coefficients) == 5
     bits = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], 88), dtype)

@@ -22,7 +22,7 @@ import jaxmark as jm
 from jaxmark import adversaries as enemies
 from jaxmark.alignment.original import make_original
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.coding.keys import derive
+from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.schemes import KeyedScheme, Scheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -51,7 +51,9 @@ def tuned(mesh: Mesh, steps: int, rounds: int) -> Iterator[tuple[str, Scheme, Sc
 
 def jittered(mesh: Mesh) -> tuple[str, KeyedScheme, KeyedScheme]:
     original, known = make_original(mesh), KeyedScheme()
-    random = np.random.default_rng(int.from_bytes(derive(KEY, original.geometry, "benchmark/jitter", 16), "little"))
+    random = np.random.default_rng(
+        int.from_bytes(Choices(KEY, original.geometry).derive("benchmark/jitter", 16), "little")
+    )
     strengths = known.strengths(original, BITS)
     jitter = np.exp(JITTER * random.normal(size=len(strengths)))
     return "jittered strengths", replace(known, profile=tuple(map(float, strengths * jitter))), known

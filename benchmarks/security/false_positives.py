@@ -114,9 +114,9 @@ def best_claims(
     for start in range(0, keys, BATCH):
         chips, words = [], []
         for seed in range(start, start + BATCH):
-            key = jm.Key(seed.to_bytes(32, "little"))
-            chips.append(make_chips(key, original.geometry, original.moving, marker.code_bits))
-            words.append([encode(message, key, original.geometry, marker.code_bits) for message in messages])
+            choices = marker.choices_of(jm.Key(seed.to_bytes(32, "little")))
+            chips.append(make_chips(choices, original.chip_places, marker.code_bits))
+            words.append([encode(message, choices, marker.code_bits) for message in messages])
         batch = jax.tree.map(lambda *leaves: np.stack(leaves), *chips)
         found.append([np.swapaxes(part, 0, 1) for part in best(batch, jnp.asarray(np.array(words), jnp.float32))])
     scores, norms = (np.concatenate(parts) for parts in zip(*found, strict=True))

@@ -28,7 +28,7 @@ import numpy as np
 from scipy import stats
 
 import jaxmark as jm
-from jaxmark.alignment.original import displace, residual
+from jaxmark.alignment.original import displace, shift_of
 from jaxmark.confidence import clopper_pearson
 from jaxmark.watermark.budget import make_budget
 from jaxmark.watermark.coding import message, polar
@@ -114,7 +114,7 @@ def code_alone(bits: int, length: int, random: np.random.Generator, level: float
 def prepare(marker: Marker, text: bytes, random: np.random.Generator) -> Callable[[float], bool]:
     """Write a mark; the result says whether one reading of it fails at an Eb/N0."""
     original = marker.original
-    mark = residual(original, write(marker, text, make_budget(BUDGET)))
+    mark = shift_of(original, write(marker, text, make_budget(BUDGET)))
     left = room(marker)
     assert left is not None
     energy = left.dimensions @ left.energy * np.sum(mark**2) / original.used.sum()
@@ -122,7 +122,7 @@ def prepare(marker: Marker, text: bytes, random: np.random.Generator) -> Callabl
     def fails(level: float) -> bool:
         noise = math.sqrt(energy / (2 * marker.bits * level)) * random.normal(size=mark.shape)
         soft = marker.soft_values(marker.receive(displace(original, mark + noise)))
-        return message.decode(soft, marker.bits, marker.key, original.geometry) != text
+        return marker.decode(soft) != text
 
     return fails
 

@@ -43,6 +43,7 @@ from jaxmark.distortion import rms
 from jaxmark.spectral.bands import hat, nodes, scaling
 from jaxmark.spectral.chebyshev import band_components, filter
 from jaxmark.watermark.carriers import host_bands
+from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.detectors import Detector, correlate, decorrelate
 from jaxmark.watermark.schemes import EigenScheme, HostScheme, Scheme
 
@@ -181,7 +182,10 @@ def errors(
     found: dict[tuple[str, float], list[float]] = {}
     for trial in range(trials):
         rng = np.random.default_rng(trial)
-        carrier, bits = scheme.carrier(original, rng.bytes(32), BITS, BITS), rng.choice([-1.0, 1.0], BITS)
+        carrier, bits = (
+            scheme.carrier(original, Choices(jm.Key(rng.bytes(32)), b""), BITS, BITS),
+            rng.choice([-1.0, 1.0], BITS),
+        )
         reader = carrier.reader()
         unit = original.to_host(carrier.displacement(jnp.asarray(bits, original.signal.dtype)))
         marked = displace(original, BUDGET / float(rms(unit[original.used])) * unit)

@@ -101,12 +101,12 @@ def displace(original: Original, shift: Float64[np.ndarray, "points 3"]) -> Mesh
 
 
 def shift_of(original: Original, displaced: Mesh) -> Float64[np.ndarray, "points 3"]:
-    """How far each point was moved from where it is in the original's file, in diagonals; undoes `displace`.
+    """How far each point was moved from where it is in the original's file, in diagonals of the file's box.
 
     Raises:
         JaxmarkError: see `jaxmark.geometry.mesh.displacement`.
     """
-    return displacement(original.mesh, displaced, original.weld, original.diagonal)
+    return displacement(original.mesh, displaced, original.weld, diagonal(original.mesh))
 
 
 def residual(original: Original, suspect: Mesh) -> Float64[np.ndarray, "points 3"]:

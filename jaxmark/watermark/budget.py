@@ -12,7 +12,7 @@ from jaxmark import distortion
 from jaxmark.alignment.original import Original, displace, shift_of
 from jaxmark.distortion import Metric, name_of
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh, diagonal
 
 # In the Geo-metric study (2022), people notice noise in a face three times in four from a DAME of 0.0092 on, at the
 # spatial frequency at which they see it best; at other frequencies from up to 0.035 on. The default is a little lower.
@@ -85,7 +85,8 @@ def write(original: Original, shift: Float64[np.ndarray, "points 3"], budget: Bu
         JaxmarkError: if the displacement is lost in rounding; if limits alone allow an RMS displacement of 0.01; or see
             `distortion.measure`.
     """
-    size = float(distortion.rms(shift[original.used]))
+    # Budgets are relative to the file's diagonal; the original's points may be rounded.
+    size = float(distortion.rms(shift[original.used])) * original.diagonal / diagonal(original.mesh)
 
     def limit_ratio(rms: float) -> float:
         """The largest ratio of a metric to its limit."""

@@ -98,6 +98,10 @@ class Marker:
         """The key."""
         return self.choices.key
 
+    def choices_of(self, key: bytes) -> Choices:
+        """The keyed choices of the same mark under another key."""
+        return replace(self.choices, key=Key(key))
+
     @cached_property
     def reader(self) -> Reader:
         """The reader of the carrier; made when it is first needed."""
@@ -150,12 +154,12 @@ class Marker:
         observed = self.observe(alignment.align(self.original, marked, "same"))
         # `Reader.glance` stands for the scheme's own detector, not for any other.
         quick = self.glance(observed) if self.detector is self.scheme.detector else None
-        return quick == message or self._read(self.soft_values(self.reader.receive(observed))) == message
+        return quick == message or self.decode(self.soft_values(self.reader.receive(observed))) == message
 
     def glance(self, seen: Observation) -> bytes | None:
         """Read what was hardly attacked with little computation, see `Reader.glance`; None if nothing reads so."""
         quick = self.reader.glance(seen)
-        return self._read(quick if quick is not None else self.soft_values(self.reader.receive(seen)))
+        return self.decode(quick if quick is not None else self.soft_values(self.reader.receive(seen)))
 
     def detect(
         self,
@@ -178,9 +182,11 @@ class Marker:
         coverage = float(np.mean(self.original.to_host(observed.weights)[self.original.used] > 0))
         doubts = self.doubts if weights is None else (*self.doubts, "the weights were chosen by the reader")
         found = Detection(None, 0.0, 0.0, 0.0, soft / size, coverage, aligned, self.choices.version, doubts)
-        # Rounding moves no coordinate by more than half of the grid's spacing; a mark that can be read moves some.
-        if np.abs(aligned.displacement).max() * self.original.diagonal <= 0.505 * self.original.grid:
-            return found._replace(remarks=("The suspect is the original itself, without a mark.",))
+        # Rounding moves no coordinate by more than half of the grid's spacing, and the fit of the pose by little more;
+        # a mark that can be read moves some.
+        if np.abs(aligned.displacement).max() * self.original.diagonal <= 0.75 * self.original.grid:
+            remark = "The suspect is the original itself, without a mark."
+            return found._replace(scores=np.zeros(len(soft)), remarks=(remark,))
         return self._weigh(found, received, self._decode(soft), message, ALIGN_SHARES[aligned.how])
 
     def _weigh(
@@ -323,7 +329,8 @@ class Marker:
         """Decode the message whose keyed tag fits, if there is one."""
         return decode(np.asarray(soft, np.float64), self.bits, self.choices)
 
-    def _read(self, soft: ArrayLike) -> bytes | None:
+    def decode(self, soft: ArrayLike) -> bytes | None:
+        """Decode the message in soft values; None if no message's keyed tag fits."""
         decoded = self._decode(soft)
         return None if decoded is None else decoded.message
 
@@ -420,7 +427,7 @@ def make_marker(
     scheme = get_scheme(scheme)
     payload = DEFAULT_BITS if bits is None else bits
     code_bits = scheme.code_length(ready, payload)
-    choices = bind_mark(key, ready, scheme, payload, "message", used)
+    choices = bind_mark(key, ready, scheme, payload, "message", used, record=record)
     carrier = scheme.carrier(ready, choices, payload, code_bits)
     if not isinstance(scheme, tuple(SCHEMES.values())):
         doubts += (f"the scheme {scheme.name!r} is not one of this library",)
@@ -432,10 +439,21 @@ def make_marker(
 
 
 def bind_mark(
-    key: bytes, original: Original, scheme: Scheme, bits: int, content: Content, version: int = SCHEME_VERSION
+    key: bytes,
+    original: Original,
+    scheme: Scheme,
+    bits: int,
+    content: Content,
+    version: int = SCHEME_VERSION,
+    *,
+    record: Record | None = None,
 ) -> Choices:
-    """Bind the keyed choices of a mark to its original and to all that reading it uses."""
-    fixed = {"content": content, "scheme": scheme.name, "parameters": parameters_of(scheme), "bits": bits}
+    """Bind the keyed choices of a mark to its original and to all that reading it uses.
+
+    The fields of the scheme are those in the record, if there is one: a later jaxmark may know more fields.
+    """
+    parameters = parameters_of(scheme) if record is None else record.parameters
+    fixed = {"content": content, "scheme": scheme.name, "parameters": parameters, "bits": bits}
     return bind(key, original.geometry, fixed, version)
 
 

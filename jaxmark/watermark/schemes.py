@@ -207,7 +207,7 @@ class KeyedScheme(Scheme):
         """See `Scheme`."""
         layout, dtype = self.layout(original, bits), original.signal.dtype
         host = self._host(original, layout, self.family()[: layout.passing])
-        chips = make_chips(choices, original.chip_places, original.count, code_bits, channels=self._channels)
+        chips = make_chips(choices, original.chip_places, code_bits, channels=self._channels, count=original.count)
         carrier = KeyedCarrier(host, chips, profile=self.strengths(original, bits).astype(dtype))
         if self.direction == "normals":
             normals = vertex_normals(Mesh(original.positions, original.points.faces))

@@ -94,7 +94,7 @@ def make_tracer(original: Mesh, key: bytes, *, record: Record | None = None, ver
         raise JaxmarkError(f"Fingerprints are carried by the scheme 'keyed', not {scheme.name!r}.")
     # There are at most half as many slots as dimensions, so that slots can be told apart.
     slots = min(_MAX_SLOTS, 1 << (max(2, dimensions) // 2).bit_length() - 1)
-    choices = bind_mark(key, ready, scheme, slots, "fingerprint", used)
+    choices = bind_mark(key, ready, scheme, slots, "fingerprint", used, record=record)
     if used == 1:  # fingerprints had a key of their own, which is all that told them from messages
         choices = replace(choices, key=Key(choices.derive("fingerprint", KEY_BYTES)))
     carrier = scheme.carrier(ready, choices, _PASSBAND_MESSAGE_BITS, slots)

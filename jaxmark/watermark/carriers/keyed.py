@@ -41,18 +41,24 @@ class Chips(NamedTuple):
 
 
 def make_chips(
-    choices: Choices, places: Int64[np.ndarray, " vertices"], count: int, bits: int, *, channels: int = 3
+    choices: Choices,
+    places: Int64[np.ndarray, " vertices"],
+    bits: int,
+    *,
+    channels: int = 3,
+    count: int | None = None,
 ) -> Chips:
     """Draw the signs, and assign the chips of all moving points to the bits, in numbers that differ by at most one.
 
     Args:
         choices: the keyed choices of the mark.
         places: number of each vertex among the points that may move, or -1 if it is none of them, `[N]`.
-        count: number of these points.
         bits: number of bits to carry.
         channels: chips per vertex: 3, or 1 along normals.
+        count: number of these points; by default, all of them are among the vertices.
     """
-    total, here = channels * count, places >= 0
+    here = places >= 0
+    total = channels * (int(here.sum()) if count is None else count)
     sign = np.zeros((len(places), channels), np.int8)
     slot = np.zeros((len(places), channels), np.int32)
     sign[here] = choices.signs(f"keyed/{bits}/{channels}/signs", total).reshape(-1, channels)[places[here]]
