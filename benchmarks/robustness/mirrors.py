@@ -57,6 +57,7 @@ def main() -> None:
     parser = make_parser(__doc__)
     add_meshes(parser)
     parser.add_argument("--attacks", nargs="+", default=ATTACKS, help='such as "isotropic 1 + cropping 0.3"')
+    parser.add_argument("--budget", type=float, help="RMS displacement over the diagonal; by default as `embed` has it")
     parser.add_argument("--seed", type=int, default=0, help="of key, message, attacks and poses")
     options = parser.parse_args()
     print(head("mesh", "attack", *HANDS))
@@ -65,7 +66,11 @@ def main() -> None:
         rng = np.random.default_rng(options.seed)
         marker = jm.make_marker(load(parser, path), rng.bytes(32))
         message = rng.bytes(marker.bits // 8)
-        marked, _ = marker.embed(message)
+        try:
+            marked, _ = marker.embed(message, options.budget)
+        except jm.JaxmarkError as refusal:
+            print(line(path.name, "not marked", refusal, *[""] * (len(HANDS) - 1)), flush=True)
+            continue
         for steps in options.attacks:
             try:
                 plain = attacked(marked, steps, options.seed)

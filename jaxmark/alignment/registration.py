@@ -1,18 +1,19 @@
 """Find the pose of a suspect of foreign connectivity by its surface; on the host, deterministic, without the key.
 
-A whole suspect's principal axes are brought onto the original's in all 48 ways, of which half mirror, and each pose is
-improved by trimmed closest points (Chetverikov et al., "Robust Euclidean alignment of 3D point sets: the trimmed
-iterative closest point algorithm", 2005), from either surface to the other, so that the scale is determined. If several
-poses of one hand fit, those by local shape (`jaxmark.alignment.features`) are tried, too, and turns about the axis of a
-round shape. A part is posed by local shape only. In both cases, the best pose is refined by distances along normals; a
-pose that mirrors must fit clearly better than the best that does not. trimesh's own registration is no alternative,
-because it compares against an absolute threshold.
+A whole suspect's principal axes are brought onto the original's in all 48 ways, of which half mirror, and what fits by
+far the worst is left out. Each pose is improved by trimmed closest points (Chetverikov et al., "Robust Euclidean
+alignment of 3D point sets: the trimmed iterative closest point algorithm", 2005), from either surface to the other, so
+that the scale is determined. If several poses of one hand fit, those by local shape (`jaxmark.alignment.features`) are
+tried, too, and turns about the axis of a round shape. A part is posed by local shape only. In both cases, the best pose
+is refined by distances along normals; a pose that mirrors must fit clearly better than the best that does not.
+trimesh's own registration is no alternative, because it compares against an absolute threshold.
 """
 
 from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
+from jaxtyping import Float64
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -35,6 +36,7 @@ class RegistrationSettings:
     comparison_rounds: int = 10  # rounds of refinement before poses are compared: enough to tell which one is the best
     reach: float = 0.03  # distances up to this count in the first round of refinement, however small the others are
     lost_distance: float = 0.005  # points that are further off count as this far off when poses are compared
+    first_ratio: float = 12.0  # of the first poses, those that leave up to this many times the least are improved
     likely_ratio: float = 2.0  # poses that leave up to this many times the least distance are pursued
     mirror_ratio: float = 1.05  # a pose that mirrors must leave so many times less than one that does not
     whole_distance: float = 0.01  # the most that a whole suspect's pose may leave, several times what sampling leaves
@@ -197,9 +199,12 @@ def _coarse(target: Points, source: Points, settings: RegistrationSettings) -> l
     """Find the likeliest distinct poses of each hand by principal axes and closest points; none if all fit badly."""
     forward, backward = KDTree(target), KDTree(source)
     coarse, fine = slice(settings.coarse_points), slice(settings.fine_points)
+    starts = _axes(target, source)
+    first = [_closest_pairs(start, target[coarse], source[coarse], forward, backward, settings)[2] for start in starts]
     ends = [
         _closest_points(start, target[coarse], source[coarse], forward, backward, settings)
-        for start in _axes(target, source)
+        for start, off in zip(starts, first, strict=True)
+        if off <= settings.first_ratio * min(first)
     ]
     least = min(off for _, off in ends)
     improved = [
@@ -272,17 +277,29 @@ def _closest_points(
     """
     off = np.inf
     for _ in range(settings.rounds):
-        to_target, to_source = forward.query(pose(source)), backward.query(pose.inverse()(target))
-        scale = np.cbrt(abs(np.linalg.det(pose.matrix)))
-        pairs = [
-            (source, forward.data[to_target[1]], to_target[0]),
-            (backward.data[to_source[1]], target, to_source[0] * scale),
-        ]
-        share = settings.kept_share
-        kept = [(s[near], t[near], d[near]) for s, t, d in pairs for near in [d <= np.quantile(d, share)]]
-        before, off = off, float(np.sqrt(np.mean(np.concatenate([d for *_, d in kept]) ** 2)))
-        points, places = (np.concatenate(ends) for ends in zip(*((s, t) for s, t, _ in kept), strict=True))
+        before = off
+        points, places, off = _closest_pairs(pose, target, source, forward, backward, settings)
         pose = similarity(points, places, pose.mirrors)
         if off > 0.99 * before:
             break
     return pose, off
+
+
+def _closest_pairs(
+    pose: Pose, target: Points, source: Points, forward: KDTree, backward: KDTree, settings: RegistrationSettings
+) -> tuple[Float64[np.ndarray, "pairs 3"], Float64[np.ndarray, "pairs 3"], float]:
+    """Pair points with the closest ones of the other surface, and keep the closest pairs.
+
+    Returns:
+        The points of the source, those of the target, and their root mean square distance in the pose.
+    """
+    to_target, to_source = forward.query(pose(source)), backward.query(pose.inverse()(target))
+    scale = np.cbrt(abs(np.linalg.det(pose.matrix)))
+    pairs = [
+        (source, forward.data[to_target[1]], to_target[0]),
+        (backward.data[to_source[1]], target, to_source[0] * scale),
+    ]
+    share = settings.kept_share
+    kept = [(s[near], t[near], d[near]) for s, t, d in pairs for near in [d <= np.quantile(d, share)]]
+    points, places, distance = (np.concatenate(arrays) for arrays in zip(*kept, strict=True))
+    return points, places, float(np.sqrt(np.mean(distance**2)))
