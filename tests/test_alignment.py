@@ -13,7 +13,7 @@ from jaxmark.alignment.alignment import align
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.geometry.mesh import Mesh, make_mesh, vertex_normals
 from jaxmark.geometry.pose import Pose
-from tests.samples import bumpy_sphere
+from tests.samples import bumpy_sphere, exact_sheet
 
 
 @pytest.fixture(scope="module")
@@ -210,6 +210,35 @@ def test_points_are_found_in_any_order(seed, original: Original):
     np.testing.assert_allclose(again.displacement, straight.displacement, atol=1e-9)
 
 
+@pytest.mark.parametrize("step", [-1, 1], ids=["outside", "inside"])
+def test_points_of_a_mirrored_mesh_are_found(step, original: Original):
+    """With faces turned round, so that normals stay outside, or as they were."""
+    displacement = 1e-3 * np.random.default_rng(0).normal(size=(642, 3))
+    marked = moved(original, displacement)
+    posed, pose = anywhere(marked._replace(vertices=np.asarray(marked.vertices) * [-1, 1, 1]), 0)
+    suspect = make_mesh(posed.vertices, posed.faces[:, ::step])
+    order = np.random.default_rng(1).permutation(642)
+    shuffled = make_mesh(posed.vertices[order], np.argsort(order)[suspect.faces])
+    straight = align(original, marked)
+    for seen, method in ((suspect, "same"), (shuffled, "connectivity")):
+        found = align(original, seen)
+        assert found.method == method
+        assert found.pose.mirrors
+        np.testing.assert_allclose(found.displacement, straight.displacement, atol=1e-9)
+        check_pose(original, found.pose, Pose(pose.matrix * [-1, 1, 1], pose.shift), 3e-3)
+
+
+def test_a_mirrored_relief_is_told_from_one_that_is_turned_over():
+    """It is so flat that no affine map is fitted to its height."""
+    sheet = exact_sheet(30)
+    vertices = np.asarray(sheet.vertices, float)
+    height = 2e-3 * np.sin(vertices @ np.random.default_rng(0).normal(size=(3, 12)) * 30).sum(axis=1)
+    size = np.ptp(vertices, axis=0).max()
+    coin = make_original(make_mesh(vertices / size * [1, 1, 0] + np.outer(height, [0, 0, 1]), sheet.faces))
+    mirrored = make_mesh(np.asarray(coin.mesh.vertices) * [-1, 1, 1], sheet.faces)
+    assert align(coin, anywhere(mirrored, 1)[0]).residual < 1e-9
+
+
 def test_what_was_cut_away_is_masked(original: Original):
     displacement = 1e-3 * np.random.default_rng(3).normal(size=(642, 3))
     posed, pose = anywhere(moved(original, displacement), 3)
@@ -247,6 +276,19 @@ def test_a_surface_shows_displacement_along_its_normals(seed, original: Original
     assert np.corrcoef(along, expected)[0, 1] > 0.9
     # Along other directions a surface shows less.
     assert np.std(along) == pytest.approx(np.std(expected), rel=0.2)
+
+
+@pytest.mark.parametrize("step", [-1, 1], ids=["outside", "inside"])
+def test_a_mirrored_surface_shows_the_same(step, original: Original):
+    amount = 2e-3 * np.sin(20 * original.positions[:, 0])
+    marked = moved(original, amount[:, None] * vertex_normals(original.mesh))
+    vertices, faces = trimesh.remesh.subdivide(np.asarray(marked.vertices), np.asarray(marked.faces))
+    straight = align(original, make_mesh(vertices, faces))
+    found = align(original, anywhere(make_mesh(vertices * [-1, 1, 1], faces[:, ::step]), 2)[0])
+    assert found.method == "surface"
+    assert found.pose.mirrors
+    np.testing.assert_allclose(found.displacement, straight.displacement, atol=1e-6)
+    np.testing.assert_array_equal(found.weights, straight.weights)
 
 
 def test_a_hole_in_a_surface_is_masked(original: Original):

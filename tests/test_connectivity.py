@@ -37,6 +37,14 @@ def test_a_shuffled_mesh_is_recognised_wherever_it_went(seed):
     np.testing.assert_array_equal(matching_vertices(mesh, crumpled), place)
 
 
+def test_a_mesh_whose_faces_are_turned_round_is_recognised():
+    """As after a mirror, by as much as one that is as it was."""
+    for mesh in (bumpy_sphere(4), cropped(bumpy_sphere(3), np.arange(642) % 7 > 0)[0]):
+        other, _ = shuffled(mesh, 3)
+        found = matching_vertices(mesh, other)
+        np.testing.assert_array_equal(matching_vertices(mesh, other._replace(faces=other.faces[:, ::-1])), found)
+
+
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.8])
 def test_what_is_left_of_a_mesh_is_recognised(share):
     mesh = bumpy_sphere(4)

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from jaxmark.alignment.features import descriptors
+from jaxmark.alignment.features import _reflected, descriptors
 from jaxmark.alignment.registration import SETTINGS, refine, register_part, register_whole
 from jaxmark.geometry.mesh import Mesh, make_mesh, vertex_normals
 from jaxmark.geometry.pose import IDENTITY, Pose, affine, similarity
@@ -28,6 +28,16 @@ def anywhere(seed: int) -> Pose:
     random = np.random.default_rng(seed)
     scale = 10 ** random.uniform(-2, 2)
     return Pose(scale * Rotation.random(rng=random).as_matrix(), 3 * scale * random.normal(size=3))
+
+
+def mirrored(pose: Pose) -> Pose:
+    """A pose after a mirror."""
+    return Pose(pose.matrix * [-1, 1, 1], pose.shift)
+
+
+def turned_round(mesh: Mesh) -> Mesh:
+    """With normals on the other side, as a program leaves a mesh that it then mirrors."""
+    return mesh._replace(faces=mesh.faces[:, ::-1])
 
 
 def placed(mesh: Mesh, pose: Pose) -> Surface:
@@ -85,6 +95,59 @@ def test_the_pose_of_another_meshing_is_found(seed, mesh: Mesh):
     again = register_whole(Surface(mesh), placed(other, pose))
     assert again is not None
     np.testing.assert_array_equal(found.matrix, again.matrix)
+
+
+@pytest.mark.parametrize("mirror", [False, True, None], ids=["turning", "mirroring", "either"])
+def test_a_similarity_mirrors_on_request_or_where_that_fits(mirror):
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    for pose in (anywhere(0), mirrored(anywhere(0))):
+        found = similarity(points, pose(points), mirror)
+        assert found.mirrors == (pose.mirrors if mirror is None else mirror)
+        exact = mirror in (None, pose.mirrors)
+        assert np.allclose(found(points), pose(points)) == exact
+        # Otherwise it is the best of its hand: none nearby is better.
+        least = np.sum((found(points) - pose(points)) ** 2)
+        for seed in range(10):
+            turn = Rotation.from_rotvec(1e-3 * np.random.default_rng(seed).normal(size=3)).as_matrix()
+            assert np.sum((points @ (found.matrix @ turn).T + found.shift - pose(points)) ** 2) >= least * (1 - 1e-9)
+
+
+def test_a_similarity_of_a_flat_shape_turns_if_nothing_tells():
+    points = np.random.default_rng(0).normal(size=(50, 3)) * [1, 1, 0]
+    bent = points + 1e-3 * np.random.default_rng(1).normal(size=(50, 1)) * [0, 0, 1]
+    assert not similarity(bent, points, None).mirrors
+
+
+@pytest.mark.parametrize("prepare", [turned_round, lambda mesh: mesh], ids=["outside", "inside"])
+def test_the_pose_of_a_mirrored_meshing_is_found(prepare, mesh: Mesh):
+    pose = mirrored(anywhere(1))
+    found = register_whole(Surface(mesh), placed(prepare(finer(mesh)), pose))
+    assert found is not None
+    assert found.mirrors
+    np.testing.assert_allclose(found(pose(np.asarray(mesh.vertices))), mesh.vertices, atol=1e-7)
+
+
+def face(level: int, one_sided: float) -> Mesh:
+    """Its own mirror image, but for a bump on one side."""
+    ball = trimesh.creation.icosphere(subdivisions=level)
+    points = np.asarray(ball.vertices)
+    bumps = [([0.0, 0.3, 0.95], 0.6), ([0.6, 0.7, 0.4], 0.3), ([-0.6, 0.7, 0.4], 0.3), ([0.6, -0.6, 0.5], one_sided)]
+    grown = sum(size * np.exp(-np.sum((points - place) ** 2, axis=1) / 0.05) for place, size in bumps)
+    points = points * [0.8, 1.3, 1.0] * (1 + grown)[:, None]
+    return make_mesh(points / np.linalg.norm(np.ptp(points, axis=0)), ball.faces)
+
+
+@pytest.mark.parametrize(("one_sided", "mirror"), [(0.02, False), (0.02, True), (0.0, False)])
+def test_a_nearly_symmetric_shape_is_mirrored_only_if_that_fits_clearly_better(one_sided, mirror):
+    """What a mark displaces, a pose of either hand leaves."""
+    mesh, pose = face(3, one_sided), mirrored(anywhere(2)) if mirror else anywhere(2)
+    mark = 2e-4 * np.random.default_rng(5).normal(size=(len(mesh.vertices), 1))
+    marked = mesh._replace(vertices=np.asarray(mesh.vertices) + mark * vertex_normals(mesh))
+    found = register_whole(Surface(mesh), placed(finer(marked), pose))
+    assert found is not None
+    assert found.mirrors == mirror
+    off = found(pose(np.asarray(mesh.vertices))) - mesh.vertices
+    assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 1e-3
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -157,6 +220,16 @@ def test_the_pose_of_a_part_is_found(share, mesh: Mesh):
     assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 1e-3
 
 
+@pytest.mark.parametrize("prepare", [turned_round, lambda mesh: mesh], ids=["outside", "inside"])
+def test_the_pose_of_a_mirrored_part_is_found(prepare, mesh: Mesh):
+    pose = mirrored(anywhere(6))
+    found = register_part(Surface(mesh), placed(prepare(part_of(finer(mesh), 0.5)), pose))
+    assert found is not None
+    assert found.mirrors
+    off = found(pose(np.asarray(mesh.vertices))) - mesh.vertices
+    assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 1e-3
+
+
 def test_settings_are_frozen_and_reach_what_they_set(mesh: Mesh):
     """No pose leaves nothing at all, and a part has none if poses by local shape are not tried, or too large for it."""
     surface, suspect = Surface(mesh), placed(finer(mesh), anywhere(6))
@@ -180,6 +253,15 @@ def test_descriptors_do_not_depend_on_pose_and_scale(mesh: Mesh):
     # Three angles, of the points around a point, and once more of those around its neighbours.
     alone = one.sum(axis=1)
     np.testing.assert_allclose(alone[alone > 0], 6, atol=1e-9)
+
+
+def test_descriptors_of_a_mirrored_surface_are_the_same_in_another_order(mesh: Mesh):
+    points, normals, _ = sample(mesh, 600)
+    mirror = np.array([-1, 1, 1])
+    there = _reflected(descriptors(points, normals, 0.12))
+    for way, expected in zip((1, -1), there, strict=True):
+        found = descriptors(points * mirror, way * normals * mirror, 0.12)
+        assert np.mean(np.abs(found - expected) > 1e-9) < 0.01
 
 
 def test_descriptors_on_a_plane_and_a_sphere_are_what_their_angles_say():

@@ -2,7 +2,8 @@
 
 Vertices are recognised by their order, else by the connectivity around them; else the suspect's surface is brought onto
 the original's. An affine attack moves the mark with the host, so that its map is inverted first, by least squares on
-the points that agree with it. Points that lie far off were cut away, replaced or lost, and are masked.
+the points that agree with it. Points that lie far off were cut away, replaced or lost, and are masked. A suspect that
+was mirrored is read as it was before: any of these maps mirrors where that fits better.
 """
 
 import time
@@ -84,7 +85,7 @@ def align(original: Original, suspect: Mesh, how: Align = "auto") -> Alignment:
         suspect: any mesh.
         how: `"same"` demands the original's vertices and faces in the same order; `"similarity"` and `"affine"` align
             surfaces, up to such a map; `"auto"` takes the first way that works: vertices by their order, vertices by
-            connectivity, surfaces up to a similarity.
+            connectivity, surfaces up to a similarity. Each map may mirror, and faces may be turned round.
 
     Raises:
         JaxmarkError: if the suspect does not share the original's connectivity under `"same"`, cannot be aligned (the
@@ -99,7 +100,7 @@ def align(original: Original, suspect: Mesh, how: Align = "auto") -> Alignment:
 
 
 def _align(original: Original, suspect: Mesh, how: Align) -> Alignment:
-    mesh = _points(original)
+    mesh, suspect = _points(original), _with_faces_of(original.mesh, suspect)
     if how == "same" or (how == "auto" and same_connectivity(suspect, original.mesh)):
         x = np.asarray(original.positions, np.float64)
         y, back = x + residual(original, suspect), _file(original).inverse()
@@ -122,6 +123,17 @@ def _align(original: Original, suspect: Mesh, how: Align) -> Alignment:
                 faces = faces[(faces >= 0).all(axis=1)]
                 return _by_points(original, mesh, scale(y), found, faces, "connectivity", scale)
     return _by_surfaces(original, Surface(mesh), welded, how == "affine")
+
+
+def _with_faces_of(mesh: Mesh, suspect: Mesh) -> Mesh:
+    """A suspect with a mesh's own faces, if its faces are these but for the order of corners.
+
+    Programs that mirror a mesh turn its faces round, so that normals point outwards again.
+    """
+    if len(mesh.vertices) != len(suspect.vertices) or len(mesh.faces) != len(suspect.faces):
+        return suspect
+    mine, theirs = (np.sort(faces, axis=1) for faces in (mesh.faces, suspect.faces))
+    return suspect._replace(faces=mesh.faces) if np.array_equal(mine, theirs) else suspect
 
 
 def _points(original: Original) -> Mesh:
@@ -269,7 +281,7 @@ def _map(
     x: Float64[np.ndarray, "points 3"], y: Float64[np.ndarray, "points 3"], agreeing: Bool[np.ndarray, " points"]
 ) -> Pose:
     """Fit a similarity to the points that agree, and an affine map to what the similarity leaves."""
-    nearly = similarity(y[agreeing], x[agreeing])
+    nearly = similarity(y[agreeing], x[agreeing], mirrored=None)
     return nearly.then(affine(nearly(y[agreeing]), x[agreeing]))
 
 

@@ -3,9 +3,10 @@
 Points are described by how the normals around them turn (Rusu, Blodow, Beetz, "Fast point feature histograms (FPFH) for
 3D registration", ICRA 2009). Points of the two surfaces whose descriptors are nearest to each other are matched. Three
 matches with equal ratios of distances make a pose (Fischler, Bolles, "Random sample consensus", 1981), which other
-matches confirm.
+matches confirm. Descriptors of a mirrored surface are those of the surface in another order.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,30 +38,39 @@ FEATURE_SETTINGS = FeatureSettings()
 
 
 def poses_by_features(
-    original: Mesh, suspect: Mesh, count: int, *, settings: FeatureSettings = FEATURE_SETTINGS
+    original: Mesh,
+    suspect: Mesh,
+    count: int,
+    hands: Sequence[bool] = (False, True),
+    *,
+    settings: FeatureSettings = FEATURE_SETTINGS,
 ) -> list[Pose]:
     """Find the likeliest similarities that bring a suspect, whole or in part, onto an original.
 
     Args:
         original: the original's mesh, about 1 in size.
         suspect: in any pose and scale, with at least a fifth of the original's area.
-        count: largest number of poses.
+        count: largest number of poses for each hand.
+        hands: which poses are looked for: those that mirror (True), those that do not (False), or both.
         settings: see `FeatureSettings`.
 
     Returns:
-        The poses, by descending number of matches that confirm them.
+        The poses, hand by hand, by descending number of matches that confirm them.
     """
     target, source = sample(original, settings.points), sample(suspect, settings.points)
     wanted = descriptors(target.points, target.normals, settings.radius, settings=settings)
-    random, found = np.random.default_rng(0), []
+    random, found = {mirrored: np.random.default_rng(0) for mirrored in hands}, {mirrored: [] for mirrored in hands}
     for share in settings.share_ratio ** np.arange(settings.shares):
         # The number of points makes them as dense as on the original if the suspect has this share of its area.
         points, normals = (array[: int(share * settings.points)] for array in source[:2])
         scale = float(np.sqrt(share * target.area / source.area))
         described = descriptors(points, normals, settings.radius / scale, settings=settings)
-        on_source, on_target = _mutually_nearest(described, wanted)
-        found += _consensus(points[on_source], target.points[on_target], scale, random, count, settings)
-    return [pose for _, pose in sorted(found, key=lambda scored: -scored[0])[:count]]
+        for mirrored in hands:
+            for seen in _reflected(described) if mirrored else (described,):
+                on_source, on_target = _mutually_nearest(seen, wanted)
+                matched = points[on_source], target.points[on_target]
+                found[mirrored] += _consensus(*matched, scale, mirrored, random[mirrored], count, settings)
+    return [pose for poses in found.values() for _, pose in sorted(poses, key=lambda scored: -scored[0])[:count]]
 
 
 def descriptors(
@@ -100,6 +110,19 @@ def descriptors(
     return histogram + np.einsum("pk,pkb->pb", weight, histogram[other])
 
 
+def _reflected(
+    described: Float64[np.ndarray, "points bins"],
+) -> tuple[Float64[np.ndarray, "points bins"], Float64[np.ndarray, "points bins"]]:
+    """Descriptors of the mirrored surface: with its faces turned round, so that normals stay outside, and without.
+
+    The angle out of the plane of normal and neighbour changes its sign by mirroring, the other two by normals that
+    point the other way.
+    """
+    angles = described.reshape(len(described), 3, -1)
+    outside = np.concatenate([angles[:, :1, ::-1], angles[:, 1:]], axis=1)
+    return outside.reshape(described.shape), angles[:, :, ::-1].reshape(described.shape)
+
+
 def _mutually_nearest(
     first: Float64[np.ndarray, "first bins"], second: Float64[np.ndarray, "second bins"]
 ) -> tuple[Int64[np.ndarray, " matches"], Int64[np.ndarray, " matches"]]:
@@ -111,7 +134,13 @@ def _mutually_nearest(
 
 
 def _consensus(
-    source: Points, target: Points, scale: float, random: np.random.Generator, count: int, settings: FeatureSettings
+    source: Points,
+    target: Points,
+    scale: float,
+    mirrored: bool,
+    random: np.random.Generator,
+    count: int,
+    settings: FeatureSettings,
 ) -> list[tuple[int, Pose]]:
     """Find similarities of about a scale that bring many source points near their targets, and count these points."""
     if len(source) < 3:
@@ -122,7 +151,7 @@ def _consensus(
     sound = (sides[0].min(axis=1) > 0) & (sides[1].min(axis=1) > settings.min_side)
     ratio, most = sides[1] / np.where(sides[0] > 0, sides[0], 1), settings.max_side_ratio
     sound &= (ratio.max(axis=1) < most * ratio.min(axis=1)) & (np.abs(ratio.mean(axis=1) / scale - 1) < most - 1)
-    poses = similarity(a[sound], b[sound])
+    poses = similarity(a[sound], b[sound], mirrored)
     near = np.sum(np.sum((poses(source) - target) ** 2, axis=-1) < settings.max_distance**2, axis=-1)
     best = np.argsort(-near, kind="stable")[:count]
     return [(int(near[index]), Pose(poses.matrix[index], poses.shift[index])) for index in best]

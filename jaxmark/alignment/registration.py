@@ -1,17 +1,19 @@
 """Find the pose of a suspect of foreign connectivity by its surface; on the host, deterministic, without the key.
 
-A whole suspect's principal axes are brought onto the original's in all 24 ways, and each pose is improved by trimmed
-closest points (Chetverikov et al., "Robust Euclidean alignment of 3D point sets: the trimmed iterative closest point
-algorithm", 2005), from either surface to the other, so that the scale is determined. If several poses fit, those by
-local shape (`jaxmark.alignment.features`) are tried, too, and turns about the axis of a round shape. A part is posed by
-local shape only. In both cases, the best pose is refined by distances along normals. trimesh's own registration is no
-alternative, because it compares against an absolute threshold.
+A whole suspect's principal axes are brought onto the original's in all 48 ways, of which half mirror, and what fits by
+far the worst is left out. Each pose is improved by trimmed closest points (Chetverikov et al., "Robust Euclidean
+alignment of 3D point sets: the trimmed iterative closest point algorithm", 2005), from either surface to the other, so
+that the scale is determined. If several poses of one hand fit, those by local shape (`jaxmark.alignment.features`) are
+tried, too, and turns about the axis of a round shape. A part is posed by local shape only. In both cases, the best pose
+is refined by distances along normals; a pose that mirrors must fit clearly better than the best that does not.
+trimesh's own registration is no alternative, because it compares against an absolute threshold.
 """
 
 from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
+from jaxtyping import Float64
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -26,7 +28,7 @@ class RegistrationSettings:
     """Settings of registration; lengths are relative to an original that is about 1 in size."""
 
     samples: int = 20_000  # points sampled on each surface
-    coarse_points: int = 300  # points on each surface by which the 24 first poses are improved and told apart
+    coarse_points: int = 300  # points on each surface by which the 48 first poses are improved and told apart
     rough_points: int = 500  # vertices of the original by which all candidate poses are refined
     fine_points: int = 2000  # points by which likely poses are improved, and the best ones refined and compared
     kept_share: float = 0.8  # share of the closest pairs that a round of trimmed closest points keeps
@@ -34,8 +36,11 @@ class RegistrationSettings:
     comparison_rounds: int = 10  # rounds of refinement before poses are compared: enough to tell which one is the best
     reach: float = 0.03  # distances up to this count in the first round of refinement, however small the others are
     lost_distance: float = 0.005  # points that are further off count as this far off when poses are compared
+    first_ratio: float = 12.0  # of the first poses, those that leave up to this many times the least are improved
     likely_ratio: float = 2.0  # poses that leave up to this many times the least distance are pursued
+    mirror_ratio: float = 1.05  # a pose that mirrors must leave so many times less than one that does not
     whole_distance: float = 0.01  # the most that a whole suspect's pose may leave, several times what sampling leaves
+    # Of these, as many again may mirror.
     distinct_poses: int = 32  # most poses that are pursued, which differ by more than `whole_distance`
     best_poses: int = 4  # most poses that are refined by the fine points
     round_ratio: float = 1.1  # a shape with two principal axes of widths within this ratio is round about the third
@@ -69,17 +74,32 @@ def register_whole(original: Surface, suspect: Surface, *, settings: Registratio
     used = np.flatnonzero(used_vertices(original.mesh))
     chosen = used[np.random.default_rng(0).permutation(len(used))[: settings.fine_points]]
     points, normals = np.asarray(original.mesh.vertices), vertex_normals(original.mesh)
-    if len(starts) > 1:  # the principal axes of a shape that is nearly symmetric leave small features to decide
-        starts += poses_by_features(original.mesh, suspect.mesh, settings.feature_poses, settings=settings.features)
-        starts += _turned(suspect, target, source, starts, settings)
+    ends = []
+    for mirrored in (False, True):
+        alike = [start for start in starts if start.mirrors == mirrored]
+        if len(alike) > 1:  # the principal axes of a shape that is nearly symmetric leave small features to decide
+            count, features = settings.feature_poses, settings.features
+            alike += poses_by_features(original.mesh, suspect.mesh, count, [mirrored], settings=features)
+            alike += _turned(suspect, target, source, alike, settings)
+        ends += _best(suspect, points[chosen], normals[chosen], alike, settings)[:1]
+    _, best = min(ends, key=lambda end: _unlikeliness(end[0], end[1], settings))
+    return refine(suspect, points[used], normals[used], best, settings=settings)
+
+
+def _best(
+    surface: Surface, points: Points, normals: Points, starts: list[Pose], settings: RegistrationSettings
+) -> list[tuple[float, Pose]]:
+    """Refine a surface's poses by few points, then the best of them by more; returns the distances that these leave."""
+    ends: list[tuple[float, Pose]] = []
     for count in (settings.rough_points, settings.fine_points):
-        part, rounds = chosen[:count], settings.comparison_rounds
-        ends = [
-            refine(suspect, points[part], normals[part], start, rounds=rounds, settings=settings) for start in starts
+        few, rounds = slice(count), settings.comparison_rounds
+        refined = [
+            refine(surface, points[few], normals[few], start, rounds=rounds, settings=settings) for start in starts
         ]
-        starts = sorted(ends, key=lambda end: _distance(suspect, points[chosen], end, settings))
-        starts = starts[: settings.best_poses]
-    return refine(suspect, points[used], normals[used], starts[0], settings=settings)
+        ends = sorted(((_distance(surface, points, pose, settings), pose) for pose in refined), key=lambda end: end[0])
+        ends = ends[: settings.best_poses]
+        starts = [pose for _, pose in ends]
+    return ends
 
 
 def register_part(original: Surface, suspect: Surface, *, settings: RegistrationSettings = SETTINGS) -> Pose | None:
@@ -107,9 +127,18 @@ def register_part(original: Surface, suspect: Surface, *, settings: Registration
         ends.append((_distance(original, posed[fine], back, settings), start, back))
     if not ends:
         return None
-    _, start, back = min(ends, key=lambda end: end[0])
+    _, start, back = min(ends, key=lambda end: _unlikeliness(end[0], end[1], settings))
     along = unit(normals @ start.matrix.T)
     return start.then(refine(original, start(points), along, back, settings=settings).inverse())
+
+
+def _unlikeliness(distance: float, pose: Pose, settings: RegistrationSettings) -> float:
+    """The distance that a pose leaves, by which poses are compared.
+
+    That of a pose that mirrors counts for more: where a shape is its own mirror image, either hand leaves no more than
+    the mark.
+    """
+    return distance * (settings.mirror_ratio if pose.mirrors else 1)
 
 
 def _distance(surface: Surface, points: Points, pose: Pose, settings: RegistrationSettings) -> float:
@@ -167,12 +196,15 @@ def refine(
 
 
 def _coarse(target: Points, source: Points, settings: RegistrationSettings) -> list[Pose]:
-    """Find the likeliest distinct poses by principal axes and closest points; none if all leave too much."""
+    """Find the likeliest distinct poses of each hand by principal axes and closest points; none if all fit badly."""
     forward, backward = KDTree(target), KDTree(source)
     coarse, fine = slice(settings.coarse_points), slice(settings.fine_points)
+    starts = _axes(target, source)
+    first = [_closest_pairs(start, target[coarse], source[coarse], forward, backward, settings)[2] for start in starts]
     ends = [
         _closest_points(start, target[coarse], source[coarse], forward, backward, settings)
-        for start in _axes(target, source)
+        for start, off in zip(starts, first, strict=True)
+        if off <= settings.first_ratio * min(first)
     ]
     least = min(off for _, off in ends)
     improved = [
@@ -180,24 +212,23 @@ def _coarse(target: Points, source: Points, settings: RegistrationSettings) -> l
         for pose, off in ends
         if off <= min(settings.likely_ratio * least, settings.whole_distance)
     ]
-    distinct: list[Pose] = []
+    distinct: dict[bool, list[Pose]] = {False: [], True: []}
     for pose, _ in sorted(improved, key=lambda end: end[1]):
-        posed = pose(source[coarse])
-        squares = [np.mean(np.sum((other(source[coarse]) - posed) ** 2, axis=1)) for other in distinct]
+        posed, alike = pose(source[coarse]), distinct[pose.mirrors]
+        squares = [np.mean(np.sum((other(source[coarse]) - posed) ** 2, axis=1)) for other in alike]
         if all(square > settings.whole_distance**2 for square in squares):
-            distinct.append(pose)
-    return distinct[: settings.distinct_poses]
+            alike.append(pose)
+    return [pose for alike in distinct.values() for pose in alike[: settings.distinct_poses]]
 
 
 def _axes(target: Points, source: Points) -> list[Pose]:
-    """The poses that bring the source's principal axes onto the target's, in all ways that do not mirror."""
+    """The poses that bring the source's principal axes onto the target's, in all 48 ways, of which half mirror."""
     (target_mean, wide, onto), (source_mean, size, of) = (_principal(points) for points in (target, source))
     starts = []
     for order, signs in product(permutations(range(3)), product([1, -1], repeat=3)):
         change = np.eye(3)[list(order)] * signs
-        if np.linalg.det(change) > 0:
-            matrix = np.linalg.norm(wide) / np.linalg.norm(size) * onto @ change @ of.T
-            starts.append(Pose(matrix, target_mean - matrix @ source_mean))
+        matrix = np.linalg.norm(wide) / np.linalg.norm(size) * onto @ change @ of.T
+        starts.append(Pose(matrix, target_mean - matrix @ source_mean))
     return starts
 
 
@@ -239,23 +270,36 @@ def _principal(points: Points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _closest_points(
     pose: Pose, target: Points, source: Points, forward: KDTree, backward: KDTree, settings: RegistrationSettings
 ) -> tuple[Pose, float]:
-    """Improve a similarity by trimmed iterative closest points, from source to target and from target to source.
+    """Improve a similarity, of either hand, by trimmed iterative closest points, from source to target and back.
 
     Returns:
         The pose, and the root mean square distance of the pairs that were kept in the last round.
     """
     off = np.inf
     for _ in range(settings.rounds):
-        to_target, to_source = forward.query(pose(source)), backward.query(pose.inverse()(target))
-        scale = np.cbrt(abs(np.linalg.det(pose.matrix)))
-        pairs = [
-            (source, forward.data[to_target[1]], to_target[0]),
-            (backward.data[to_source[1]], target, to_source[0] * scale),
-        ]
-        share = settings.kept_share
-        kept = [(s[near], t[near], d[near]) for s, t, d in pairs for near in [d <= np.quantile(d, share)]]
-        before, off = off, float(np.sqrt(np.mean(np.concatenate([d for *_, d in kept]) ** 2)))
-        pose = similarity(np.concatenate([s for s, *_ in kept]), np.concatenate([t for _, t, _ in kept]))
+        before = off
+        points, places, off = _closest_pairs(pose, target, source, forward, backward, settings)
+        pose = similarity(points, places, pose.mirrors)
         if off > 0.99 * before:
             break
     return pose, off
+
+
+def _closest_pairs(
+    pose: Pose, target: Points, source: Points, forward: KDTree, backward: KDTree, settings: RegistrationSettings
+) -> tuple[Float64[np.ndarray, "pairs 3"], Float64[np.ndarray, "pairs 3"], float]:
+    """Pair points with the closest ones of the other surface, and keep the closest pairs.
+
+    Returns:
+        The points of the source, those of the target, and their root mean square distance in the pose.
+    """
+    to_target, to_source = forward.query(pose(source)), backward.query(pose.inverse()(target))
+    scale = np.cbrt(abs(np.linalg.det(pose.matrix)))
+    pairs = [
+        (source, forward.data[to_target[1]], to_target[0]),
+        (backward.data[to_source[1]], target, to_source[0] * scale),
+    ]
+    share = settings.kept_share
+    kept = [(s[near], t[near], d[near]) for s, t, d in pairs for near in [d <= np.quantile(d, share)]]
+    points, places, distance = (np.concatenate(arrays) for arrays in zip(*kept, strict=True))
+    return points, places, float(np.sqrt(np.mean(distance**2)))

@@ -19,8 +19,8 @@ Colours = UInt64[np.ndarray, " vertices"]
 def matching_vertices(mesh: Mesh, other: Mesh) -> Int64[np.ndarray, " vertices"]:
     """Match each vertex of a mesh with the vertex of another mesh that has the same surroundings.
 
-    Matches are one to one; there are none at all if only few surroundings are alike. Mirrored faces are not
-    recognised.
+    Matches are one to one; there are none at all if only few surroundings are alike. The faces of the other mesh may
+    all be turned round, as programs do that mirror a mesh, so that normals point outwards again.
 
     Returns:
         For each vertex of `mesh`, the index of the matching vertex of `other`, or -1.
@@ -40,7 +40,12 @@ def matching_vertices(mesh: Mesh, other: Mesh) -> Int64[np.ndarray, " vertices"]
     if np.sum(found >= 0) < _MIN_MATCHED_SHARE * min(used_vertices(mesh).sum(), used_vertices(other).sum()):
         return np.full_like(found, -1)
     # Only vertices of equal valence match as matches spread, or a few chance matches would flood a regular mesh.
-    return _spread(found, mesh, other, mine.valence, theirs.valence)
+    apexes, (corners, wanted) = _Apexes(other), sides(mesh.faces)
+    as_they_are, turned_round = (
+        np.sum((found[wanted] >= 0) & (apexes(found[way]) == found[wanted])) for way in (corners, corners[:, ::-1])
+    )
+    corners = corners[:, ::-1] if turned_round > as_they_are else corners
+    return _spread(found, corners, wanted, apexes, mine.valence, theirs.valence)
 
 
 class _Rings:
@@ -78,34 +83,55 @@ def _one_to_one(found: Int64[np.ndarray, " vertices"], size: int) -> Int64[np.nd
     return np.where((found >= 0) & (taken[found] == 1), found, -1)
 
 
+class _Apexes:
+    """The corner opposite to each directed side of a mesh, looked up by a code of the side's two vertices."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        corners, apex = sides(mesh.faces)
+        self._size = len(mesh.vertices)
+        codes = corners[:, 0] * self._size + corners[:, 1]
+        order = np.argsort(codes, kind="stable")
+        codes, apex = codes[order], apex[order]
+        # A side that two faces have in the same direction is ambiguous.
+        single = np.r_[True, codes[1:] != codes[:-1]] & np.r_[codes[1:] != codes[:-1], True]
+        self._codes = np.append(codes[single], np.iinfo(np.int64).max)  # the last is no side's
+        self._apex = apex[single]
+
+    def __call__(self, corners: Int64[np.ndarray, "sides 2"]) -> Int64[np.ndarray, " sides"]:
+        """The apex of each side, or -1 where there is none, or no vertex at one of the ends."""
+        apex = np.full(len(corners), -1)
+        known = np.flatnonzero((corners >= 0).all(axis=1))
+        asked = corners[known, 0] * self._size + corners[known, 1]
+        place = np.searchsorted(self._codes, asked)
+        there = self._codes[place] == asked
+        apex[known[there]] = self._apex[place[there]]
+        return apex
+
+
 def _spread(
     found: Int64[np.ndarray, " vertices"],
-    mesh: Mesh,
-    other: Mesh,
+    corners: Int64[np.ndarray, "sides 2"],
+    wanted: Int64[np.ndarray, " sides"],
+    apexes: _Apexes,
     valence: Int64[np.ndarray, " vertices"],
     valence_there: Int64[np.ndarray, " others"],
 ) -> Int64[np.ndarray, " vertices"]:
     """Spread matches over faces: where two corners have matches, the third matches the apex of the side between these.
 
-    Directed sides of the other mesh are looked up by a code of their two vertices.
+    Args:
+        found: the matches to begin with.
+        corners: the directed sides of the faces.
+        wanted: the third corner of the face of each.
+        apexes: those of the other mesh.
+        valence: of each vertex.
+        valence_there: of each vertex of the other mesh.
     """
-    corners, wanted = sides(mesh.faces)
-    sides_there, completes = sides(other.faces)
-    codes = sides_there[:, 0] * len(other.vertices) + sides_there[:, 1]
-    order = np.argsort(codes, kind="stable")
-    codes, completes = codes[order], completes[order]
-    # A side that two faces have in the same direction is ambiguous.
-    single = np.r_[True, codes[1:] != codes[:-1]] & np.r_[codes[1:] != codes[:-1], True]
-    codes, completes = codes[single], completes[single]
-    taken = np.zeros(len(other.vertices), bool)
+    taken = np.zeros(len(valence_there), bool)
     taken[found[found >= 0]] = True
     while True:
         corners, wanted = corners[found[wanted] < 0], wanted[found[wanted] < 0]
-        ready = (found[corners] >= 0).all(axis=1)
-        asked = found[corners[ready, 0]] * len(other.vertices) + found[corners[ready, 1]]
-        place = np.minimum(np.searchsorted(codes, asked), len(codes) - 1)
-        new, match = wanted[ready], completes[place]
-        good = (codes[place] == asked) & ~taken[match] & (valence[new] == valence_there[match])
+        new, match = wanted, apexes(found[corners])
+        good = (match >= 0) & ~taken[match] & (valence[new] == valence_there[match])
         new, match = new[good], match[good]
         if len(new) == 0:
             return found

@@ -8,6 +8,8 @@ from jaxtyping import Float64
 Points = Float64[np.ndarray, "points 3"]
 PointSets = Float64[np.ndarray, "... points 3"]
 
+_FLAT = 1e-8  # a shape whose variances have a smaller ratio is flat
+
 
 class Pose(NamedTuple):
     """The map x ↦ matrix · x + shift; leading axes hold one map for each of several sets of points."""
@@ -28,22 +30,35 @@ class Pose(NamedTuple):
         matrix = np.linalg.inv(self.matrix)
         return Pose(matrix, -matrix @ self.shift)
 
+    @property
+    def mirrors(self) -> bool:
+        """Whether this one map makes left hands of right ones."""
+        return bool(np.linalg.det(self.matrix) < 0)
+
 
 IDENTITY = Pose(np.eye(3), np.zeros(3))
 
 
-def similarity(source: PointSets, target: PointSets) -> Pose:
+def similarity(source: PointSets, target: PointSets, mirrored: bool | None = False) -> Pose:
     """Fit the scale, rotation and shift that bring `source` closest to `target`, point by point.
 
     By least squares (Umeyama, IEEE PAMI 13, 1991, eq. 39-42).
+
+    Args:
+        source: points, or several sets of them.
+        target: as many points.
+        mirrored: whether the map also mirrors; None lets the fit decide, and a flat shape, which does not tell, turn.
     """
     source_mean, target_mean = source.mean(axis=-2, keepdims=True), target.mean(axis=-2, keepdims=True)
     u, size, vt = np.linalg.svd(np.swapaxes(target - target_mean, -1, -2) @ (source - source_mean))
-    proper = np.ones(size.shape)
-    proper[..., 2] = np.sign(np.linalg.det(u @ vt))  # a rotation, not a reflection
+    hand, signs = np.sign(np.linalg.det(u @ vt)), np.ones(size.shape)  # with these signs, u @ vt fits best
+    if mirrored is None:
+        signs[..., 2] = np.where(size[..., 2] > _FLAT * size[..., 0], 1, hand)
+    else:
+        signs[..., 2] = -hand if mirrored else hand
     spread = np.maximum(((source - source_mean) ** 2).sum(axis=(-1, -2)), np.finfo(float).tiny)
-    scale = (size * proper).sum(axis=-1) / spread
-    matrix = scale[..., None, None] * ((u * proper[..., None, :]) @ vt)
+    scale = (size * signs).sum(axis=-1) / spread
+    matrix = scale[..., None, None] * ((u * signs[..., None, :]) @ vt)
     return Pose(matrix, (target_mean - source_mean @ np.swapaxes(matrix, -1, -2))[..., 0, :])
 
 
