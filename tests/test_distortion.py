@@ -20,11 +20,13 @@ from jaxmark.distortion import (
     geometric_laplacian,
     gl,
     local_roughness,
+    make_hiding,
     make_hinges,
     msdm,
     msdm2,
     msdm2_views,
     msdm_views,
+    shading,
     surface_distance,
     tensor_distance,
 )
@@ -256,6 +258,9 @@ def metric(name: str, mesh: Mesh, dtype):
         case "msdm2":
             views = msdm2_views(mesh, mesh)
             return lambda y: msdm2(x, y, views)
+        case "shading":
+            hiding = make_hiding(mesh.vertices, mesh.faces)
+            return lambda y: shading(x, y, hiding)
         case _:
             hinges, balls = (
                 make_hinges(mesh.faces),
@@ -264,7 +269,7 @@ def metric(name: str, mesh: Mesh, dtype):
             return lambda y: tensor_distance(*(curvature_tensor(z, hinges, balls) for z in (x, y)))
 
 
-@pytest.mark.parametrize("name", ["gl", "dame", "fmpd", "msdm", "msdm2", "curvature"])
+@pytest.mark.parametrize("name", ["gl", "dame", "fmpd", "msdm", "msdm2", "curvature", "shading"])
 def test_metrics_are_differentiable_and_batched(name, pair: tuple[Mesh, Mesh], dtype):
     measure = jax.jit(jax.vmap(jax.value_and_grad(metric(name, pair[0], dtype))))
     x, y = (jnp.asarray(mesh.vertices, dtype) for mesh in pair)
@@ -338,7 +343,7 @@ def test_compare_leaves_out_what_needs_the_same_connectivity(pair: tuple[Mesh, M
     vertices, faces = trimesh.remesh.subdivide(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     finer = jm.compare(mesh, make_mesh(vertices, faces))
     lacking = {name for name, value in finer._asdict().items() if value is None}
-    assert lacking == {"rms", "max", "gl", "dame", "msdm", "curvature"}
+    assert lacking == {"rms", "max", "gl", "dame", "msdm", "curvature", "shading"}
     assert finer.hausdorff < 1e-9
     with jax.enable_x64(True):
         np.testing.assert_allclose(jm.compare(mesh, other), same, rtol=1e-4)

@@ -29,4 +29,9 @@ from jaxmark.distortion.displacement import maximum as maximum
 from jaxmark.distortion.displacement import rms as rms
 from jaxmark.distortion.roughness import fmpd as fmpd
 from jaxmark.distortion.roughness import local_roughness as local_roughness
+from jaxmark.distortion._shading import Hiding as Hiding
+from jaxmark.distortion._shading import vertex_means as vertex_means
+from jaxmark.distortion._shading import make_hiding as make_hiding
+from jaxmark.distortion._shading import shading as shading
+from jaxmark.distortion._shading import visible_turn as visible_turn
 from jaxmark.distortion.surface import surface_distance as surface_distance

@@ -15,6 +15,7 @@ from jaxmark.distortion._msdm import Views, msdm, msdm2, msdm2_views, msdm_views
 from jaxmark.distortion.dihedral import Hinges, dame, make_hinges
 from jaxmark.distortion.displacement import maximum, rms
 from jaxmark.distortion.roughness import fmpd, local_roughness
+from jaxmark.distortion._shading import make_hiding, shading
 from jaxmark.distortion.surface import SurfaceDistance, surface_distance
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import (
@@ -62,6 +63,7 @@ class Comparison(NamedTuple):
     msdm: float | None  # difference of structure, 0 to 1 (Lavoué et al. 2006)
     msdm2: float | None  # difference of structure at three scales, 0 to 1 (Lavoué 2011)
     curvature: float | None  # change of curvature tensors, 0 to 1 (in the manner of Torkhani et al.)
+    shading: float | None  # visible turn of normals that 5 % of the area exceed, in just noticeable differences
 
 
 def displacement_size(original: Mesh, distorted: Mesh) -> DisplacementSize:
@@ -129,6 +131,9 @@ _METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
     "msdm": lambda pair: msdm(pair.x, pair.y, msdm_views(*pair.meshes)),
     "msdm2": lambda pair: msdm2(pair.x, pair.y, pair.views),
     "curvature": _Pair.tensor_distance,
+    "shading": lambda pair: shading(
+        pair.x, pair.y, make_hiding(np.asarray(pair.meshes[0].vertices), pair.faces[0])
+    ),
 }
 #: Names of all metrics of `compare`; limits of distortion are stated in them, too.
 METRICS = tuple(_METRICS)
