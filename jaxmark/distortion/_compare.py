@@ -12,10 +12,11 @@ from jaxtyping import Array, Float
 from jaxmark.distortion._curvature import curvature_tensor, tensor_distance
 from jaxmark.distortion._geometric_laplacian import gl
 from jaxmark.distortion._msdm import Views, msdm, msdm2, msdm2_views, msdm_views
+from jaxmark.distortion._shading import make_hiding, shading
 from jaxmark.distortion.dihedral import Hinges, dame, make_hinges
 from jaxmark.distortion.displacement import maximum, rms
+from jaxmark.distortion.rendered import flip, ssim
 from jaxmark.distortion.roughness import fmpd, local_roughness
-from jaxmark.distortion._shading import make_hiding, shading
 from jaxmark.distortion.surface import SurfaceDistance, surface_distance
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import (
@@ -64,6 +65,8 @@ class Comparison(NamedTuple):
     msdm2: float | None  # difference of structure at three scales, 0 to 1 (Lavoué 2011)
     curvature: float | None  # change of curvature tensors, 0 to 1 (in the manner of Torkhani et al.)
     shading: float | None  # visible turn of normals that 5 % of the area exceed, in just noticeable differences
+    flip: float | None = None  # difference of pictures by FLIP that 1 % of their pixels exceed, 0 to 1; see `RENDERED`
+    ssim: float | None = None  # likewise by structural similarity, as 1 - SSIM
 
 
 def displacement_size(original: Mesh, distorted: Mesh) -> DisplacementSize:
@@ -131,16 +134,22 @@ _METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
     "msdm": lambda pair: msdm(pair.x, pair.y, msdm_views(*pair.meshes)),
     "msdm2": lambda pair: msdm2(pair.x, pair.y, pair.views),
     "curvature": _Pair.tensor_distance,
-    "shading": lambda pair: shading(
-        pair.x, pair.y, make_hiding(np.asarray(pair.meshes[0].vertices), pair.faces[0])
-    ),
+    "shading": lambda pair: shading(pair.x, pair.y, make_hiding(np.asarray(pair.meshes[0].vertices), pair.faces[0])),
 }
-#: Names of all metrics of `compare`; limits of distortion are stated in them, too.
+_RENDERED: Mapping[str, Callable[[_Pair], float]] = {
+    "flip": lambda pair: flip(*pair.meshes).high,
+    "ssim": lambda pair: ssim(*pair.meshes).high,
+}
+#: Names of the metrics of `compare`; limits of distortion are stated in them, too.
 METRICS = tuple(_METRICS)
-_ANY_CONNECTIVITY = {"mrms", "hausdorff", "fmpd", "msdm2"}
+#: Names of the metrics of pictures: many seconds each, and so only computed where they are asked for.
+RENDERED = tuple(_RENDERED)
+_ANY_CONNECTIVITY = {"mrms", "hausdorff", "fmpd", "msdm2", *RENDERED}
 
 
-Metric = str | Callable[[Mesh, Mesh], float]  # a name in `METRICS`, or a function of your own: see `measure`
+Metric = (
+    str | Callable[[Mesh, Mesh], float]
+)  # a name in `METRICS` or `RENDERED`, or a function of your own: see `measure`
 
 
 def measure(original: Mesh, distorted: Mesh, metrics: Collection[Metric]) -> dict[Metric, float | None]:
@@ -149,24 +158,25 @@ def measure(original: Mesh, distorted: Mesh, metrics: Collection[Metric]) -> dic
     Args:
         original: any mesh with an area.
         distorted: another mesh with an area.
-        metrics: names in `METRICS`, or functions from (original, distorted) to a number that is 0 for equal meshes and
-            rises with distortion. Functions are called with the meshes as given, in float64.
+        metrics: names in `METRICS` or `RENDERED`, or functions from (original, distorted) to a number that is 0 for
+            equal meshes and rises with distortion. Functions are called with the meshes as given, in float64.
 
     Returns:
-        The value of each metric; None if one of `METRICS` needs meshes of the same connectivity and these differ in it.
+        The value of each metric; None if a named one needs meshes of the same connectivity and these differ in it.
 
     Raises:
         JaxmarkError: see `compare`; also if a function's value is not a finite number of at least 0.
     """
     names = [metric for metric in metrics if isinstance(metric, str)]
-    if unknown := [name for name in names if name not in METRICS]:
-        raise JaxmarkError(f"There is no metric {unknown[0]!r}; there are {', '.join(METRICS)}.")
+    known = {**_METRICS, **_RENDERED}
+    if unknown := [name for name in names if name not in known]:
+        raise JaxmarkError(f"There is no metric {unknown[0]!r}; there are {', '.join(known)}.")
     pair = _Pair(original, distorted)
     wanted = {name for name in names if pair.same or name in _ANY_CONNECTIVITY}
     found: dict[Metric, float | None] = {}
     for metric in metrics:
         if isinstance(metric, str):
-            found[metric] = float(_METRICS[metric](pair)) if metric in wanted else None
+            found[metric] = float(known[metric](pair)) if metric in wanted else None
             continue
         found[metric] = value = float(metric(*pair.given))
         if not 0 <= value < np.inf:
@@ -188,14 +198,15 @@ def compare(original: Mesh, distorted: Mesh, metrics: Collection[str] = METRICS)
     Args:
         original: any mesh with an area.
         distorted: another mesh with an area.
-        metrics: names in `METRICS`; the other metrics are None.
+        metrics: names in `METRICS` or `RENDERED`; the other metrics are None.
 
     Raises:
         JaxmarkError: if there is no such metric, a mesh has no area or is unusable (see `make_mesh`, `diagonal`), or
-            libigl is missing: mrms, hausdorff, msdm2 and curvature need it.
+            libigl is missing: mrms, hausdorff, msdm2 and curvature need it, and so do metrics of pictures, which need
+            the extra `render`.
     """
     found = measure(original, distorted, metrics)
-    return Comparison(*(found.get(name) for name in METRICS))
+    return Comparison(*(found.get(name) for name in Comparison._fields))
 
 
 def _plain(mesh: Mesh, welded: Weld) -> Mesh:

@@ -144,9 +144,7 @@ def shading(
     return values[order[place]]
 
 
-def vertex_means(
-    values: Float[Array, " faces"], hiding: Hiding, count: int
-) -> Float[Array, " vertices"]:
+def vertex_means(values: Float[Array, " faces"], hiding: Hiding, count: int) -> Float[Array, " vertices"]:
     """Means of faces' values around each of `count` vertices, weighted by area, for heat maps; 0 where no face is."""
     area = jnp.asarray(hiding.area).astype(values.dtype)[:, None]
     zeros, corners = jnp.zeros(count, values.dtype), hiding.faces
