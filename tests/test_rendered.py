@@ -18,7 +18,7 @@ pytest.importorskip("igl")
 @pytest.fixture(scope="module")
 def ball() -> Mesh:
     shape = trimesh.creation.icosphere(subdivisions=4)
-    return make_mesh(np.asarray(shape.vertices) + [3.0, 1, 2], shape.faces)
+    return make_mesh(np.asarray(shape.vertices) + np.array([3.0, 1, 2]), shape.faces)
 
 
 def test_a_ball_from_all_sides(ball: Mesh):

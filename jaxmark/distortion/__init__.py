@@ -13,6 +13,7 @@ from jaxmark.distortion._compare import compare as compare
 from jaxmark.distortion._compare import displacement_size as displacement_size
 from jaxmark.distortion._compare import measure as measure
 from jaxmark.distortion._compare import name_of as name_of
+from jaxmark.distortion._compare import shading_at_vertices as shading_at_vertices
 from jaxmark.distortion._curvature import curvature as curvature
 from jaxmark.distortion._curvature import curvature_tensor as curvature_tensor
 from jaxmark.distortion._curvature import tensor_distance as tensor_distance

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxmark.distortion._curvature import curvature_tensor, tensor_distance
 from jaxmark.distortion._geometric_laplacian import gl
 from jaxmark.distortion._msdm import Views, msdm, msdm2, msdm2_views, msdm_views
-from jaxmark.distortion._shading import make_hiding, shading
+from jaxmark.distortion._shading import Hiding, make_hiding, shading, vertex_means, visible_turn
 from jaxmark.distortion.dihedral import Hinges, dame, make_hinges
 from jaxmark.distortion.displacement import maximum, rms
 from jaxmark.distortion.rendered import flip, ssim
@@ -89,11 +89,11 @@ class _Pair:
         first, second = host_mesh(original), host_mesh(distorted)
         self.given = first, second
         self.same = same_connectivity(first, second)
-        length, welded = diagonal(first), weld(first.vertices)
+        length, self.welded = diagonal(first), weld(first.vertices)
         centre = np.asarray(first.vertices, np.float64)[used_vertices(first)].mean(axis=0)
         self.meshes = [
             _plain(mesh._replace(vertices=(np.asarray(mesh.vertices, np.float64) - centre) / length), points)
-            for mesh, points in ((first, welded), (second, welded if self.same else weld(second.vertices)))
+            for mesh, points in ((first, self.welded), (second, self.welded if self.same else weld(second.vertices)))
         ]
         for which, mesh in zip(("original", "distorted mesh"), self.meshes, strict=True):
             if not 0 < area(mesh) < np.inf:
@@ -112,6 +112,10 @@ class _Pair:
     @cached_property
     def hinges(self) -> Hinges:
         return make_hinges(self.faces[0])
+
+    @cached_property
+    def hiding(self) -> Hiding:
+        return make_hiding(np.asarray(self.meshes[0].vertices), self.faces[0])
 
     @cached_property
     def views(self) -> Views:
@@ -134,7 +138,7 @@ _METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
     "msdm": lambda pair: msdm(pair.x, pair.y, msdm_views(*pair.meshes)),
     "msdm2": lambda pair: msdm2(pair.x, pair.y, pair.views),
     "curvature": _Pair.tensor_distance,
-    "shading": lambda pair: shading(pair.x, pair.y, make_hiding(np.asarray(pair.meshes[0].vertices), pair.faces[0])),
+    "shading": lambda pair: shading(pair.x, pair.y, pair.hiding),
 }
 _RENDERED: Mapping[str, Callable[[_Pair], float]] = {
     "flip": lambda pair: flip(*pair.meshes).high,
@@ -147,9 +151,7 @@ RENDERED = tuple(_RENDERED)
 _ANY_CONNECTIVITY = {"mrms", "hausdorff", "fmpd", "msdm2", *RENDERED}
 
 
-Metric = (
-    str | Callable[[Mesh, Mesh], float]
-)  # a name in `METRICS` or `RENDERED`, or a function of your own: see `measure`
+Metric = str | Callable[[Mesh, Mesh], float]  # a name in `METRICS` or `RENDERED`, or a function: see `measure`
 
 
 def measure(original: Mesh, distorted: Mesh, metrics: Collection[Metric]) -> dict[Metric, float | None]:
@@ -207,6 +209,27 @@ def compare(original: Mesh, distorted: Mesh, metrics: Collection[str] = METRICS)
     """
     found = measure(original, distorted, metrics)
     return Comparison(*(found.get(name) for name in Comparison._fields))
+
+
+def shading_at_vertices(original: Mesh, distorted: Mesh) -> Float[np.ndarray, " vertices"]:
+    """How visible the turn of normals is around each vertex, in just noticeable differences, for heat maps.
+
+    Means of `visible_turn` over the faces around, weighted by area; 0 at vertices without faces.
+
+    Args:
+        original: any mesh with an area.
+        distorted: a mesh of the same connectivity.
+
+    Raises:
+        JaxmarkError: if the connectivity differs, or see `compare`.
+    """
+    pair = _Pair(original, distorted)
+    if not pair.same:
+        raise JaxmarkError("The turn of normals is known only between meshes of the same connectivity.")
+    used = used_vertices(weld_mesh(pair.given[0], pair.welded))
+    points = np.zeros(len(used), np.float32)
+    points[used] = vertex_means(visible_turn(pair.x, pair.y, pair.hiding), pair.hiding, len(pair.x))
+    return points[pair.welded.point]
 
 
 def _plain(mesh: Mesh, welded: Weld) -> Mesh:

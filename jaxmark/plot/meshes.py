@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmark.alignment.original import Original, residual
+from jaxmark.distortion import shading_at_vertices
 from jaxmark.geometry.mesh import Mesh, host_mesh
 from jaxmark.plot.figures import FIELD, Picture, panels
 from jaxmark.watermark.visibility import masking
@@ -54,6 +55,22 @@ def visibility(
     percent, hidden = _percent(original, moved), original.to_host(masking(original))
     shown = np.divide(percent, hidden, out=np.zeros_like(percent), where=hidden > 0)
     return View(title, original.mesh, shown[original.weld.point], "% of diagonal")
+
+
+def shading(original: Mesh, moved: Mesh, title: str = "visible turn of normals") -> View:
+    """Make a heat map of how far normals turn, over what the original hides.
+
+    See `jaxmark.distortion.visible_turn`.
+
+    Args:
+        original: the original, not moved.
+        moved: a mesh of the same connectivity.
+        title: title of the panel.
+
+    Raises:
+        JaxmarkError: if the connectivity differs, or a mesh is unusable.
+    """
+    return View(title, original, shading_at_vertices(original, moved), "just noticeable differences")
 
 
 def exaggerate(original: Original, moved: Mesh, factor: float = 10) -> View:
