@@ -93,7 +93,7 @@ def draw(views: Sequence[View], *, elevation: float = 15.0, azimuth: float = 25.
         JaxmarkError: if matplotlib is missing, or a mesh is unusable.
     """
     figure, axes = panels(len(views), 4.2, 4.4)
-    turn = _rotation(np.radians(elevation), np.radians(azimuth))
+    turn = rotation(np.radians(elevation), np.radians(azimuth))
     for panel, view in zip(axes, views, strict=True):
         drawn = _paint(panel, view, turn)
         panel.set_title(view.title, fontsize=10)
@@ -118,7 +118,7 @@ def _percent(original: Original, moved: Mesh) -> np.ndarray:
     return 100 * np.linalg.norm(residual(original, moved), axis=1)
 
 
-def _rotation(elevation: float, azimuth: float) -> np.ndarray:
+def rotation(elevation: float, azimuth: float) -> Float[np.ndarray, "3 3"]:
     """Matrix that turns the direction of the eye, given in radians, to +z."""
     around = np.array([[np.cos(azimuth), 0, -np.sin(azimuth)], [0, 1, 0], [np.sin(azimuth), 0, np.cos(azimuth)]])
     down = np.array([[1, 0, 0], [0, np.cos(elevation), -np.sin(elevation)], [0, np.sin(elevation), np.cos(elevation)]])

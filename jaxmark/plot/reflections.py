@@ -12,6 +12,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, host_mesh
 from jaxmark.geometry.raster import SIDES, Frame, Raster, cast
 from jaxmark.plot.figures import Picture, panels
+from jaxmark.plot.meshes import rotation
 
 Style = Literal["flat", "smooth", "zebra"]
 _STRIPES = 24  # dark ones all around
@@ -26,7 +27,7 @@ class Rendering(NamedTuple):
     title: str
     mesh: Mesh
     style: Style = "smooth"
-    side: str = "front"  # a name in `jaxmark.geometry.raster.SIDES`
+    side: str | tuple[float, float] = "front"  # in `SIDES`, or the eye's elevation and azimuth in degrees, as in `draw`
     frame: Frame | None = None  # share one between meshes to be compared; the mesh's own unless given
 
 
@@ -44,10 +45,8 @@ def render(rendering: Rendering, size: int = 600) -> Float64[np.ndarray, "rows c
     """
     if rendering.style not in get_args(Style):
         raise JaxmarkError(f"Meshes are rendered {', '.join(get_args(Style))}, not {rendering.style!r}.")
-    if rendering.side not in SIDES:
-        raise JaxmarkError(f"There is no side {rendering.side!r}; there are {', '.join(SIDES)}.")
     mesh = host_mesh(rendering.mesh)
-    raster = cast(mesh, SIDES[rendering.side], rendering.frame or Frame.of(mesh), size)
+    raster = cast(mesh, _camera(rendering.side), rendering.frame or Frame.of(mesh), size)
     shade = 0.15 + 0.85 * lambert(raster, _LIGHT, smooth=rendering.style != "flat")
     if rendering.style == "zebra":
         shade = (1 - _GLOSS) * shade + _GLOSS * _stripes(raster)
@@ -81,9 +80,18 @@ def save_renderings(renderings: Sequence[Rendering], path: str | os.PathLike[str
     draw_renderings(renderings, size).save(path)
 
 
+def _camera(side: str | tuple[float, float]) -> Float64[np.ndarray, "3 3"]:
+    if not isinstance(side, str):
+        return rotation(*np.radians(side))
+    if side not in SIDES:
+        raise JaxmarkError(f"There is no side {side!r}; there are {', '.join(SIDES)}.")
+    return SIDES[side]
+
+
 def _stripes(raster: Raster) -> Float64[np.ndarray, "rows columns"]:
     """What a mirror shows of stripes, by the height at which the reflected line of sight ends."""
     normals = raster.normals(smooth=True)
     # The eye is far away at +z: its line of sight is reflected to 2 (n·z) n - z.
     height = np.clip(2 * normals[:, :, 2] * normals[:, :, 1], -1, 1)
-    return 0.5 + 0.5 * np.tanh(np.sin(_STRIPES * np.arccos(height)) / _EDGE)
+    # What faces the eye shows the middle of a stripe, so that a plane is plain.
+    return 0.5 + 0.5 * np.tanh(np.cos(_STRIPES * np.arcsin(height)) / _EDGE)
