@@ -141,8 +141,8 @@ _METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
     "shading": lambda pair: shading(pair.x, pair.y, pair.hiding),
 }
 _RENDERED: Mapping[str, Callable[[_Pair], float]] = {
-    "flip": lambda pair: flip(*pair.meshes).high,
-    "ssim": lambda pair: ssim(*pair.meshes).high,
+    "flip": lambda pair: flip(pair.meshes[0], pair.meshes[1]).high,
+    "ssim": lambda pair: ssim(pair.meshes[0], pair.meshes[1]).high,
 }
 #: Names of the metrics of `compare`; limits of distortion are stated in them, too.
 METRICS = tuple(_METRICS)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, host_mesh
@@ -124,5 +124,10 @@ def _pictures(
 
 def _around(shown: Bool[np.ndarray, "rows columns"]) -> tuple[slice, slice]:
     """The part of a picture that shows something, with a margin for the filters of metrics."""
-    ends = [np.flatnonzero(shown.any(axis=axis))[[0, -1]] if shown.any() else (0, 0) for axis in (1, 0)]
-    return tuple(slice(max(low - _MARGIN, 0), high + _MARGIN + 1) for low, high in ends)
+    rows, columns = (np.flatnonzero(shown.any(axis=axis)) for axis in (1, 0))
+    return _extent(rows), _extent(columns)
+
+
+def _extent(places: Int64[np.ndarray, " places"]) -> slice:
+    first, last = (places[0], places[-1]) if len(places) else (0, 0)
+    return slice(max(int(first) - _MARGIN, 0), int(last) + _MARGIN + 1)

@@ -1,7 +1,7 @@
 """Pictures of meshes and spectra by matplotlib: headless, deterministic, colour-blind safe. Extra `plot`.
 
-`draw`, `draw_renderings` and the functions of spectra return a `Picture`, which notebooks show and `save` writes; `show` returns an
-interactive view of a mesh.
+`draw`, `draw_renderings` and the functions of spectra return a `Picture`, which notebooks show and `save` writes;
+`show` returns an interactive view of a mesh.
 """
 
 from jaxmark.plot._spectra import band_visibility as band_visibility
