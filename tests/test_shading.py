@@ -127,6 +127,13 @@ def test_hard_meshes_have_finite_values_and_gradients(hard_graph: Mesh, dtype):
     assert np.isfinite(shading(jnp.asarray(x, dtype), y, hiding))
 
 
+def test_of_a_mesh_itself_nothing_is_seen():
+    """Not even by rounding, in single precision."""
+    for v, faces in (sheet(7), (rough_sphere(333).vertices, rough_sphere(333).faces)):
+        x = np.asarray(v, np.float32)
+        assert seen(x, x, np.asarray(faces), 1.0) == 0
+
+
 def test_without_faces_nothing_is_seen(x64):
     x = np.zeros((3, 3))
     assert seen(x, x, np.array([[0, 1, 2]])) == 0

@@ -1,7 +1,7 @@
 """What is seen of marks, point by point: python benchmarks/robustness/visibility.py MESH ...
 
-A line for each mesh, of which there may be none, and for each shape that is made on the spot, marked with 64 bits at the
-default strength or within --limit. Columns:
+A line for each mesh, of which there may be none, and for each shape that is made on the spot, marked with 64 bits at
+the default strength or within --limit. Columns:
 
 dame       mean masked change of dihedral angles, in radians
 turn       of face normals, in degrees, that half / 5 % of the area exceed
