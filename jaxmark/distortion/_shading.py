@@ -25,8 +25,8 @@ waves, which gratings do but glossy planes do not; and the least contrast, 0.6 %
 noticeable. It lies between what Barten's formula gives for practised people and plain gratings, 0.17 %, and the 2 % of
 Nader et al. at their best frequency for one moved vertex. `benchmarks/robustness/visibility.py` prints what follows.
 
-What it does not see: waves much longer than 48 edges, which on a mesh of a million points are short; what moves across a
-crease as a whole; silhouettes; and displacements along the surface, which only textures show.
+What it does not see: waves much longer than 48 edges, which on a mesh of a million points are short; sides between
+creases that turn as a whole; silhouettes; and displacements along the surface, which only textures show.
 """
 
 import math
