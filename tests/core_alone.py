@@ -28,7 +28,8 @@ def check_package() -> None:
     package = importlib.resources.files("jaxmark")
     assert package.joinpath("py.typed").is_file(), "the wheel has no py.typed"
     assert not Path(str(package)).is_relative_to(Path(__file__).parents[1] / "jaxmark"), f"{package} is the checkout"
-    for extra in ("matplotlib", "pandas", "pymeshlab", "fast_simplification", "skimage", "igl", "distributed"):
+    others = ("fast_simplification", "skimage", "igl", "flip_evaluator", "distributed")
+    for extra in ("matplotlib", "pandas", "pymeshlab", *others):
         assert importlib.util.find_spec(extra) is None, f"{extra} came with the core"
 
 

@@ -8,7 +8,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 
 from tests.samples import bumpy_sphere
 
@@ -86,6 +88,20 @@ def test_help_is_shown_from_a_copy(program: Path, copy: Path, afresh, monkeypatc
     shown = capsys.readouterr().out
     assert f"python benchmarks/{program.relative_to(BENCHMARKS).as_posix()}" in shown
     assert Path(sys.modules["common"].__file__ or "").parent == copy / "common"
+
+
+def test_shapes_are_closed_and_of_the_size_asked_for(copy: Path, afresh, monkeypatch):
+    monkeypatch.syspath_prepend(copy)
+    shapes = importlib.import_module("common.shapes").SHAPES
+    volumes = {"box": 0.28, "cylinder": np.pi * 0.16, "sphere": np.pi / 6, "torus": 2 * np.pi**2 * 0.4 * 0.15**2}
+    for name, make in shapes.items():
+        surface = trimesh.Trimesh(*make(4_000), process=False)
+        assert len(surface.vertices) == pytest.approx(4_000, rel=0.02), name
+        assert surface.is_winding_consistent, name
+        assert surface.area_faces.min() > 0, name
+        assert surface.is_watertight == (name not in ("corrugated", "body")), name
+        if name in volumes:
+            assert surface.volume == pytest.approx(volumes[name], rel=0.01), name
 
 
 def test_a_stage_is_measured_in_a_process_from_a_copy(copy: Path, afresh, monkeypatch):

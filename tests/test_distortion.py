@@ -12,6 +12,8 @@ import trimesh
 import jaxmark as jm
 from jaxmark.app import cli
 from jaxmark.distortion import (
+    METRICS,
+    RENDERED,
     curvature,
     curvature_tensor,
     dame,
@@ -20,11 +22,13 @@ from jaxmark.distortion import (
     geometric_laplacian,
     gl,
     local_roughness,
+    make_hiding,
     make_hinges,
     msdm,
     msdm2,
     msdm2_views,
     msdm_views,
+    shading,
     surface_distance,
     tensor_distance,
 )
@@ -256,6 +260,9 @@ def metric(name: str, mesh: Mesh, dtype):
         case "msdm2":
             views = msdm2_views(mesh, mesh)
             return lambda y: msdm2(x, y, views)
+        case "shading":
+            hiding = make_hiding(mesh.vertices, mesh.faces)
+            return lambda y: shading(x, y, hiding)
         case _:
             hinges, balls = (
                 make_hinges(mesh.faces),
@@ -264,7 +271,7 @@ def metric(name: str, mesh: Mesh, dtype):
             return lambda y: tensor_distance(*(curvature_tensor(z, hinges, balls) for z in (x, y)))
 
 
-@pytest.mark.parametrize("name", ["gl", "dame", "fmpd", "msdm", "msdm2", "curvature"])
+@pytest.mark.parametrize("name", ["gl", "dame", "fmpd", "msdm", "msdm2", "curvature", "shading"])
 def test_metrics_are_differentiable_and_batched(name, pair: tuple[Mesh, Mesh], dtype):
     measure = jax.jit(jax.vmap(jax.value_and_grad(metric(name, pair[0], dtype))))
     x, y = (jnp.asarray(mesh.vertices, dtype) for mesh in pair)
@@ -332,19 +339,20 @@ def test_severities_of_noise_are_those_published():
 @pytest.mark.slow
 def test_compare_leaves_out_what_needs_the_same_connectivity(pair: tuple[Mesh, Mesh], tmp_path, monkeypatch, capsys):
     mesh, other = pair
-    same = jm.compare(mesh, other)
-    assert None not in same
+    same, count = jm.compare(mesh, other), len(METRICS)
+    assert None not in same[:count]
+    assert same[count:] == (None,) * len(RENDERED)  # not asked for
     assert same.rms == pytest.approx(jm.distortion.displacement_size(mesh, other).rms)
     vertices, faces = trimesh.remesh.subdivide(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     finer = jm.compare(mesh, make_mesh(vertices, faces))
-    lacking = {name for name, value in finer._asdict().items() if value is None}
-    assert lacking == {"rms", "max", "gl", "dame", "msdm", "curvature"}
+    lacking = {name for name in METRICS if getattr(finer, name) is None}
+    assert lacking == {"rms", "max", "gl", "dame", "msdm", "curvature", "shading"}
     assert finer.hausdorff < 1e-9
     with jax.enable_x64(True):
-        np.testing.assert_allclose(jm.compare(mesh, other), same, rtol=1e-4)
+        np.testing.assert_allclose(jm.compare(mesh, other)[:count], same[:count], rtol=1e-4)
     # Size and place do not count.
     again = jm.compare(*(make_mesh(3 * np.asarray(one.vertices) + 5, one.faces) for one in pair))
-    np.testing.assert_allclose(again, same, rtol=1e-3)
+    np.testing.assert_allclose(again[:count], same[:count], rtol=1e-3)
 
     files = [tmp_path / name for name in ("a.ply", "b.ply")]
     for one, file in zip((mesh, make_mesh(vertices, faces)), files, strict=True):
@@ -352,7 +360,7 @@ def test_compare_leaves_out_what_needs_the_same_connectivity(pair: tuple[Mesh, M
     monkeypatch.setattr(sys, "argv", ["jaxmark", "compare", *map(str, files), "--json"])
     cli.main()
     answer = json.loads(capsys.readouterr().out)
-    assert set(answer) == set(jm.distortion.Comparison._fields)
+    assert set(answer) == set(METRICS)
     assert answer["rms"] is None
     assert answer["msdm2"] == pytest.approx(finer.msdm2, rel=1e-3)
 

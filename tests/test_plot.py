@@ -14,7 +14,7 @@ import jaxmark as jm
 from jaxmark import plot
 from jaxmark.alignment.original import Original, displace, make_original
 from jaxmark.evaluation import Robustness, pictures
-from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark.evidence import MIN_LOG10_P, log10_p_claimed
@@ -66,6 +66,41 @@ def test_heat_maps_of_displacement_and_visibility(pair):
     bars = picture.figure.axes[3:]
     assert [bar.get_ylabel() for bar in bars] == ["% of diagonal"] * 2
     assert bars[0].get_ylim() == pytest.approx((0, expected.max()))
+
+
+def test_a_heat_map_of_what_is_seen_of_normals(pair):
+    original, moved = pair[0].mesh, pair[1]
+    view = plot.shading(original, moved)
+    assert view.unit == "just noticeable differences"
+    corners = np.ravel(original.faces)
+    soup, moved_soup = (
+        make_mesh(mesh.vertices[corners], np.arange(len(corners)).reshape(-1, 3)) for mesh in (original, moved)
+    )
+    np.testing.assert_allclose(plot.shading(soup, moved_soup).values, np.asarray(view.values)[corners], rtol=1e-3)
+    stray = [make_mesh(np.vstack([mesh.vertices, [[9.0, 9, 9]]]), mesh.faces) for mesh in (original, moved)]
+    values = np.asarray(view.values)
+    np.testing.assert_allclose(plot.shading(*stray).values, [*values, 0], rtol=1e-3)
+    assert 0 < values.min() < jm.compare(original, moved, ["shading"]).shading < values.max() * 1.5
+    with pytest.raises(jm.JaxmarkError, match="same connectivity"):
+        plot.shading(original, bumpy_sphere(1))
+
+
+def test_stripes_move_by_twice_the_turn_of_a_mirror(tmp_path):
+    """A plane is plain; turned by the width of half a stripe, it shows the next one."""
+    pytest.importorskip("igl")
+    plane = make_mesh([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    found = {}
+    for turn in (0.0, 3.75, 7.5):  # a stripe and the next are 15° long, in a mirror half of that
+        image = plot.render(plot.Rendering("", plane, "zebra", (turn, 0.0)), 24)
+        found[turn] = image[12, 12]
+        np.testing.assert_allclose(image[image < 1], found[turn], atol=1e-6)
+    assert found[3.75] < 0.3 < 0.9 < found[0.0] == pytest.approx(found[7.5], abs=0.05)
+    front, tilted = (plot.render(plot.Rendering("", plane, "flat", side), 24) for side in ("front", (0.0, 0.0)))
+    np.testing.assert_allclose(front, tilted)
+    plot.save_renderings([plot.Rendering("a plane", plane, "zebra")], tmp_path / "zebra.png", 32)
+    assert (tmp_path / "zebra.png").read_bytes().startswith(PNG)
+    with pytest.raises(jm.JaxmarkError, match="no side 'inside'"):
+        plot.render(plot.Rendering("", plane, side="inside"))
 
 
 def test_faces_are_painted_from_back_to_front_in_their_colours():

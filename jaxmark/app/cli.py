@@ -406,14 +406,18 @@ def _steps(words: tuple[str, ...]) -> list[tuple[str, float]]:
 @cli.command()
 @click.argument("original", type=_MESH)
 @click.argument("distorted", type=_MESH)
+@click.option("--pictures", is_flag=True, help="Compare pictures of the meshes, too; takes many seconds.")
 @_JSON
-def compare(original: Path, distorted: Path, as_json: bool) -> None:
+def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> None:
     """Measure how DISTORTED differs from ORIGINAL, by all metrics.
 
-    rms, max, mrms, hausdorff and gl are relative to the original's bounding-box diagonal, dame is in radians, the
-    others lie between 0 and 1. Needs the extra `align`.
+    rms, max, mrms, hausdorff and gl are relative to the original's bounding-box diagonal, dame is in radians, shading
+    in just noticeable differences; the others lie between 0 and 1. flip and ssim compare pictures, which takes many
+    seconds, and are left out without --pictures. Needs the extra `align`, with --pictures `render`.
     """
-    found = distortion.compare(load_mesh(original), load_mesh(distorted))._asdict()
+    metrics = distortion.METRICS + distortion.RENDERED * pictures
+    compared = distortion.compare(load_mesh(original), load_mesh(distorted), metrics)._asdict()
+    found = {name: compared[name] for name in metrics}
     lines = [
         f"{name:<9} {'needs the same connectivity' if value is None else f'{value:.6g}'}"
         for name, value in found.items()

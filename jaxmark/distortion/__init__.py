@@ -5,6 +5,7 @@ differentiate.
 """
 
 from jaxmark.distortion._compare import METRICS as METRICS
+from jaxmark.distortion._compare import RENDERED as RENDERED
 from jaxmark.distortion._compare import Comparison as Comparison
 from jaxmark.distortion._compare import DisplacementSize as DisplacementSize
 from jaxmark.distortion._compare import Metric as Metric
@@ -12,6 +13,7 @@ from jaxmark.distortion._compare import compare as compare
 from jaxmark.distortion._compare import displacement_size as displacement_size
 from jaxmark.distortion._compare import measure as measure
 from jaxmark.distortion._compare import name_of as name_of
+from jaxmark.distortion._compare import shading_at_vertices as shading_at_vertices
 from jaxmark.distortion._curvature import curvature as curvature
 from jaxmark.distortion._curvature import curvature_tensor as curvature_tensor
 from jaxmark.distortion._curvature import tensor_distance as tensor_distance
@@ -22,11 +24,19 @@ from jaxmark.distortion._msdm import msdm as msdm
 from jaxmark.distortion._msdm import msdm2 as msdm2
 from jaxmark.distortion._msdm import msdm2_views as msdm2_views
 from jaxmark.distortion._msdm import msdm_views as msdm_views
+from jaxmark.distortion._shading import Hiding as Hiding
+from jaxmark.distortion._shading import make_hiding as make_hiding
+from jaxmark.distortion._shading import shading as shading
+from jaxmark.distortion._shading import vertex_means as vertex_means
+from jaxmark.distortion._shading import visible_turn as visible_turn
 from jaxmark.distortion.dihedral import dame as dame
 from jaxmark.distortion.dihedral import dihedral_angles as dihedral_angles
 from jaxmark.distortion.dihedral import make_hinges as make_hinges
 from jaxmark.distortion.displacement import maximum as maximum
 from jaxmark.distortion.displacement import rms as rms
+from jaxmark.distortion.rendered import Difference as Difference
+from jaxmark.distortion.rendered import flip as flip
+from jaxmark.distortion.rendered import ssim as ssim
 from jaxmark.distortion.roughness import fmpd as fmpd
 from jaxmark.distortion.roughness import local_roughness as local_roughness
 from jaxmark.distortion.surface import surface_distance as surface_distance

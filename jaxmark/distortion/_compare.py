@@ -12,8 +12,10 @@ from jaxtyping import Array, Float
 from jaxmark.distortion._curvature import curvature_tensor, tensor_distance
 from jaxmark.distortion._geometric_laplacian import gl
 from jaxmark.distortion._msdm import Views, msdm, msdm2, msdm2_views, msdm_views
+from jaxmark.distortion._shading import Hiding, make_hiding, shading, vertex_means, visible_turn
 from jaxmark.distortion.dihedral import Hinges, dame, make_hinges
 from jaxmark.distortion.displacement import maximum, rms
+from jaxmark.distortion.rendered import flip, ssim
 from jaxmark.distortion.roughness import fmpd, local_roughness
 from jaxmark.distortion.surface import SurfaceDistance, surface_distance
 from jaxmark.errors import JaxmarkError
@@ -62,6 +64,9 @@ class Comparison(NamedTuple):
     msdm: float | None  # difference of structure, 0 to 1 (Lavoué et al. 2006)
     msdm2: float | None  # difference of structure at three scales, 0 to 1 (Lavoué 2011)
     curvature: float | None  # change of curvature tensors, 0 to 1 (in the manner of Torkhani et al.)
+    shading: float | None  # visible turn of normals that 5 % of the area exceed, in just noticeable differences
+    flip: float | None = None  # difference of pictures by FLIP that 1 % of their pixels exceed, 0 to 1; see `RENDERED`
+    ssim: float | None = None  # likewise by structural similarity, as 1 - SSIM
 
 
 def displacement_size(original: Mesh, distorted: Mesh) -> DisplacementSize:
@@ -84,11 +89,11 @@ class _Pair:
         first, second = host_mesh(original), host_mesh(distorted)
         self.given = first, second
         self.same = same_connectivity(first, second)
-        length, welded = diagonal(first), weld(first.vertices)
+        length, self.welded = diagonal(first), weld(first.vertices)
         centre = np.asarray(first.vertices, np.float64)[used_vertices(first)].mean(axis=0)
         self.meshes = [
             _plain(mesh._replace(vertices=(np.asarray(mesh.vertices, np.float64) - centre) / length), points)
-            for mesh, points in ((first, welded), (second, welded if self.same else weld(second.vertices)))
+            for mesh, points in ((first, self.welded), (second, self.welded if self.same else weld(second.vertices)))
         ]
         for which, mesh in zip(("original", "distorted mesh"), self.meshes, strict=True):
             if not 0 < area(mesh) < np.inf:
@@ -107,6 +112,10 @@ class _Pair:
     @cached_property
     def hinges(self) -> Hinges:
         return make_hinges(self.faces[0])
+
+    @cached_property
+    def hiding(self) -> Hiding:
+        return make_hiding(np.asarray(self.meshes[0].vertices), self.faces[0])
 
     @cached_property
     def views(self) -> Views:
@@ -129,13 +138,20 @@ _METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
     "msdm": lambda pair: msdm(pair.x, pair.y, msdm_views(*pair.meshes)),
     "msdm2": lambda pair: msdm2(pair.x, pair.y, pair.views),
     "curvature": _Pair.tensor_distance,
+    "shading": lambda pair: shading(pair.x, pair.y, pair.hiding),
 }
-#: Names of all metrics of `compare`; limits of distortion are stated in them, too.
+_RENDERED: Mapping[str, Callable[[_Pair], float]] = {
+    "flip": lambda pair: flip(pair.meshes[0], pair.meshes[1]).high,
+    "ssim": lambda pair: ssim(pair.meshes[0], pair.meshes[1]).high,
+}
+#: Names of the metrics of `compare`; limits of distortion are stated in them, too.
 METRICS = tuple(_METRICS)
-_ANY_CONNECTIVITY = {"mrms", "hausdorff", "fmpd", "msdm2"}
+#: Names of the metrics of pictures: many seconds each, and so only computed where they are asked for.
+RENDERED = tuple(_RENDERED)
+_ANY_CONNECTIVITY = {"mrms", "hausdorff", "fmpd", "msdm2", *RENDERED}
 
 
-Metric = str | Callable[[Mesh, Mesh], float]  # a name in `METRICS`, or a function of your own: see `measure`
+Metric = str | Callable[[Mesh, Mesh], float]  # a name in `METRICS` or `RENDERED`, or a function: see `measure`
 
 
 def measure(original: Mesh, distorted: Mesh, metrics: Collection[Metric]) -> dict[Metric, float | None]:
@@ -144,24 +160,25 @@ def measure(original: Mesh, distorted: Mesh, metrics: Collection[Metric]) -> dic
     Args:
         original: any mesh with an area.
         distorted: another mesh with an area.
-        metrics: names in `METRICS`, or functions from (original, distorted) to a number that is 0 for equal meshes and
-            rises with distortion. Functions are called with the meshes as given, in float64.
+        metrics: names in `METRICS` or `RENDERED`, or functions from (original, distorted) to a number that is 0 for
+            equal meshes and rises with distortion. Functions are called with the meshes as given, in float64.
 
     Returns:
-        The value of each metric; None if one of `METRICS` needs meshes of the same connectivity and these differ in it.
+        The value of each metric; None if a named one needs meshes of the same connectivity and these differ in it.
 
     Raises:
         JaxmarkError: see `compare`; also if a function's value is not a finite number of at least 0.
     """
     names = [metric for metric in metrics if isinstance(metric, str)]
-    if unknown := [name for name in names if name not in METRICS]:
-        raise JaxmarkError(f"There is no metric {unknown[0]!r}; there are {', '.join(METRICS)}.")
+    known = {**_METRICS, **_RENDERED}
+    if unknown := [name for name in names if name not in known]:
+        raise JaxmarkError(f"There is no metric {unknown[0]!r}; there are {', '.join(known)}.")
     pair = _Pair(original, distorted)
     wanted = {name for name in names if pair.same or name in _ANY_CONNECTIVITY}
     found: dict[Metric, float | None] = {}
     for metric in metrics:
         if isinstance(metric, str):
-            found[metric] = float(_METRICS[metric](pair)) if metric in wanted else None
+            found[metric] = float(known[metric](pair)) if metric in wanted else None
             continue
         found[metric] = value = float(metric(*pair.given))
         if not 0 <= value < np.inf:
@@ -183,14 +200,36 @@ def compare(original: Mesh, distorted: Mesh, metrics: Collection[str] = METRICS)
     Args:
         original: any mesh with an area.
         distorted: another mesh with an area.
-        metrics: names in `METRICS`; the other metrics are None.
+        metrics: names in `METRICS` or `RENDERED`; the other metrics are None.
 
     Raises:
         JaxmarkError: if there is no such metric, a mesh has no area or is unusable (see `make_mesh`, `diagonal`), or
-            libigl is missing: mrms, hausdorff, msdm2 and curvature need it.
+            libigl is missing: mrms, hausdorff, msdm2 and curvature need it, and so do metrics of pictures, which need
+            the extra `render`.
     """
     found = measure(original, distorted, metrics)
-    return Comparison(*(found.get(name) for name in METRICS))
+    return Comparison(*(found.get(name) for name in Comparison._fields))
+
+
+def shading_at_vertices(original: Mesh, distorted: Mesh) -> Float[np.ndarray, " vertices"]:
+    """How visible the turn of normals is around each vertex, in just noticeable differences, for heat maps.
+
+    Means of `visible_turn` over the faces around, weighted by area; 0 at vertices without faces.
+
+    Args:
+        original: any mesh with an area.
+        distorted: a mesh of the same connectivity.
+
+    Raises:
+        JaxmarkError: if the connectivity differs, or see `compare`.
+    """
+    pair = _Pair(original, distorted)
+    if not pair.same:
+        raise JaxmarkError("The turn of normals is known only between meshes of the same connectivity.")
+    used = used_vertices(weld_mesh(pair.given[0], pair.welded))
+    points = np.zeros(len(used), np.float32)
+    points[used] = vertex_means(visible_turn(pair.x, pair.y, pair.hiding), pair.hiding, len(pair.x))
+    return points[pair.welded.point]
 
 
 def _plain(mesh: Mesh, welded: Weld) -> Mesh:

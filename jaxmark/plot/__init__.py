@@ -1,7 +1,7 @@
 """Pictures of meshes and spectra by matplotlib: headless, deterministic, colour-blind safe. Extra `plot`.
 
-`draw` and the functions of spectra return a `Picture`, which notebooks show and `save` writes; `show` returns an
-interactive view of a mesh.
+`draw`, `draw_renderings` and the functions of spectra return a `Picture`, which notebooks show and `save` writes;
+`show` returns an interactive view of a mesh.
 """
 
 from jaxmark.plot._spectra import band_visibility as band_visibility
@@ -15,4 +15,9 @@ from jaxmark.plot.meshes import displacement as displacement
 from jaxmark.plot.meshes import draw as draw
 from jaxmark.plot.meshes import exaggerate as exaggerate
 from jaxmark.plot.meshes import save_views as save_views
+from jaxmark.plot.meshes import shading as shading
 from jaxmark.plot.meshes import visibility as visibility
+from jaxmark.plot.reflections import Rendering as Rendering
+from jaxmark.plot.reflections import draw_renderings as draw_renderings
+from jaxmark.plot.reflections import render as render
+from jaxmark.plot.reflections import save_renderings as save_renderings

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmark.alignment.original import Original, shift_of
+from jaxmark.distortion import shading_at_vertices
 from jaxmark.geometry.mesh import Mesh, host_mesh
 from jaxmark.plot.figures import FIELD, Picture, panels
 from jaxmark.watermark.visibility import masking
@@ -56,6 +57,22 @@ def visibility(
     return View(title, original.mesh, shown[original.weld.point], "% of diagonal")
 
 
+def shading(original: Mesh, moved: Mesh, title: str = "visible turn of normals") -> View:
+    """Make a heat map of how far normals turn, over what the original hides.
+
+    See `jaxmark.distortion.visible_turn`.
+
+    Args:
+        original: the original, not moved.
+        moved: a mesh of the same connectivity.
+        title: title of the panel.
+
+    Raises:
+        JaxmarkError: if the connectivity differs, or a mesh is unusable.
+    """
+    return View(title, original, shading_at_vertices(original, moved), "just noticeable differences")
+
+
 def exaggerate(original: Original, moved: Mesh, factor: float = 10) -> View:
     """Multiply the displacement of each vertex by a factor; `moved` has the original's vertices in their order."""
     vertices = original.mesh.vertices + factor * (moved.vertices - original.mesh.vertices)
@@ -76,7 +93,7 @@ def draw(views: Sequence[View], *, elevation: float = 15.0, azimuth: float = 25.
         JaxmarkError: if matplotlib is missing, or a mesh is unusable.
     """
     figure, axes = panels(len(views), 4.2, 4.4)
-    turn = _rotation(np.radians(elevation), np.radians(azimuth))
+    turn = rotation(np.radians(elevation), np.radians(azimuth))
     for panel, view in zip(axes, views, strict=True):
         drawn = _paint(panel, view, turn)
         panel.set_title(view.title, fontsize=10)
@@ -101,7 +118,7 @@ def _percent(original: Original, moved: Mesh) -> np.ndarray:
     return 100 * np.linalg.norm(shift_of(original, moved), axis=1)
 
 
-def _rotation(elevation: float, azimuth: float) -> np.ndarray:
+def rotation(elevation: float, azimuth: float) -> Float[np.ndarray, "3 3"]:
     """Matrix that turns the direction of the eye, given in radians, to +z."""
     around = np.array([[np.cos(azimuth), 0, -np.sin(azimuth)], [0, 1, 0], [np.sin(azimuth), 0, np.cos(azimuth)]])
     down = np.array([[1, 0, 0], [0, np.cos(elevation), -np.sin(elevation)], [0, np.sin(elevation), np.cos(elevation)]])

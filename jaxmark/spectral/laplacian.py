@@ -200,13 +200,30 @@ def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence", *, lo
             raise JaxmarkError(f"weights must have one value for each of the {len(pairs)} edges, got {values.shape}.")
         if not (np.isfinite(values) & (values >= 0)).all():
             raise JaxmarkError("weights must be finite and not negative; otherwise the spectrum leaves [0, 2].")
-    size = len(mesh.vertices)
-    degree = np.bincount(pairs.ravel(), None if values is None else np.repeat(values, 2), size).astype(np.float64)
+    return graph_laplacian(pairs, len(mesh.vertices), values, lowering=lowering)
+
+
+def graph_laplacian(
+    pairs: Int[np.ndarray, "edges 2"],
+    size: int,
+    weights: Float64[np.ndarray, " edges"] | None = None,
+    *,
+    lowering: Lowering = "auto",
+) -> Laplacian:
+    """Build the Laplacian of any graph, such as that of a mesh's faces, on the host.
+
+    Args:
+        pairs: the edges, each once, none from a vertex to itself.
+        size: number of vertices.
+        weights: finite and not negative; all 1 unless given.
+        lowering: see `make_laplacian`.
+    """
+    degree = np.bincount(pairs.ravel(), None if weights is None else np.repeat(weights, 2), size).astype(np.float64)
     neighbours = None
     if lowering != "segments":
         order = cuthill_mckee(pairs, size) if size >= _MIN_ORDERED_VERTICES else None
-        neighbours = make_neighbours(pairs, size, order, weighted=values is not None, if_it_pays=lowering == "auto")
-    return Laplacian(pairs.astype(np.int32), values, degree, neighbours)
+        neighbours = make_neighbours(pairs, size, order, weighted=weights is not None, if_it_pays=lowering == "auto")
+    return Laplacian(pairs.astype(np.int32), weights, degree, neighbours)
 
 
 def make_neighbours(

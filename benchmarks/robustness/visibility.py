@@ -1,0 +1,100 @@
+"""What is seen of marks, point by point: python benchmarks/robustness/visibility.py MESH ...
+
+A line for each mesh, of which there may be none, and for each shape that is made on the spot, marked with 64 bits at
+the default strength or within --limit. Columns:
+
+dame       mean masked change of dihedral angles, in radians
+turn       of face normals, in degrees, that half / 5 % of the area exceed
+shading    visible turn of normals, in just noticeable differences, that half / 5 % / 1 % of the area exceed
+plane      the turn of normals that is just noticed, in degrees, where the original hides least (5 % of the area, the
+           most sensitive band)
+flip, ssim differences of pictures that 1 % of their pixels exceed, with --pictures
+seconds    to prepare the original / to measure / to take the gradient, once compiled
+"""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxmark as jm
+from jaxmark.distortion import RENDERED, make_hiding, shading
+from jaxmark.geometry.mesh import Mesh, compact, diagonal, host_mesh, weld, weld_mesh
+from jaxmark.watermark.budget import Budget, make_budget
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from common.arguments import add_meshes, load, make_parser
+from common.marks import KEY, MESSAGE, write
+from common.shapes import SHAPES
+from common.tables import Row, say, table
+from common.timing import timed
+
+
+def turns(original: Mesh, marked: Mesh, shares: tuple[float, ...]) -> list[float]:
+    """Turn of face normals, in degrees, that is not exceeded on shares of the area."""
+    first, second = (np.asarray(mesh.vertices)[np.asarray(mesh.faces)] for mesh in (original, marked))
+    one, other = (np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) for corner in (first, second))
+    turn = np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other), axis=1), np.sum(one * other, axis=1)))
+    order = np.argsort(turn)
+    share = np.cumsum(np.linalg.norm(one, axis=1)[order])
+    return [float(turn[order][np.searchsorted(share, least * share[-1])]) for least in shares]
+
+
+def again(function: Callable[[], Any]) -> tuple[Any, float]:
+    """The result, and the seconds of a second run."""
+    jax.block_until_ready(function())
+    return timed(lambda: jax.block_until_ready(function()))
+
+
+def row(name: str, mesh: Mesh, budget: Budget, pictures: bool) -> Row:
+    """A line of the table."""
+    mesh = host_mesh(compact(weld_mesh(mesh, weld(mesh.vertices))))
+    marked = write(jm.make_marker(mesh, KEY, bits=8 * len(MESSAGE)), MESSAGE, budget)
+    metrics = ("dame", *(RENDERED if pictures else ()))
+    found = jm.distortion.measure(mesh, marked, metrics)
+    points = [np.asarray(one.vertices, np.float64) / diagonal(mesh) for one in (mesh, marked)]
+    points = [one - points[0].mean(axis=0) for one in points]
+    hiding, prepare = again(lambda: make_hiding(points[0], mesh.faces))
+    x, y = (jnp.asarray(one, jnp.float32) for one in points)
+    seen = [float(shading(x, y, hiding, share)) for share in (0.5, 0.95, 0.99)]
+    _, measure = again(lambda: shading(x, y, hiding))
+    slope = jax.jit(jax.grad(shading, argnums=1))
+    _, differentiate = again(lambda: slope(x, y, hiding))
+    least = np.degrees(np.quantile(hiding.threshold, 0.05, axis=1).min())
+    return {
+        "mesh": name,
+        "points": len(x),
+        **{metric: found[metric] for metric in metrics},
+        "turn": " / ".join(f"{value:.2f}" for value in turns(mesh, marked, (0.5, 0.95))),
+        "shading": " / ".join(f"{value:.2f}" for value in seen),
+        "plane": f"{least:.2f}",
+        "seconds": " / ".join(f"{value:.2f}" for value in (prepare, measure, differentiate)),
+    }
+
+
+def main() -> None:
+    parser = make_parser(__doc__)
+    add_meshes(parser, nargs="*")
+    parser.add_argument("--shapes", nargs="*", default=[], choices=[*SHAPES], metavar="SHAPE", help=", ".join(SHAPES))
+    parser.add_argument("--points", type=int, default=10_000, help="of each shape, about; %(default)s")
+    parser.add_argument("--limit", action="append", metavar="NAME=VALUE", help="instead of the default")
+    parser.add_argument("--pictures", action="store_true", help="compare pictures, too")
+    arguments = parser.parse_args()
+    limits = dict(limit.split("=") for limit in arguments.limit or [])
+    budget = make_budget(limits={name: float(value) for name, value in limits.items()} or None)
+    rows = []
+    for name, mesh in [
+        *((path.stem, load(parser, path)) for path in arguments.meshes),
+        *((name, SHAPES[name](arguments.points)) for name in arguments.shapes),
+    ]:
+        say(name)
+        rows.append(row(name, mesh, budget, arguments.pictures))
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,133 @@
+"""How different two meshes look: pictures of both, compared by metrics of images.
+
+Both are seen from six sides under three lights, one of which grazes what faces the eye, with flat and with smooth
+shading. That is slow, and what is seen depends on sides and lights; it is a check on metrics of the surface.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from jaxmark.extras import require
+from jaxmark.geometry.mesh import Mesh, host_mesh
+from jaxmark.geometry.raster import SIDES, Frame, Raster, cast
+
+SIZE = 384  # pixels on each side of a picture
+_MARGIN = 12  # pixels kept around the object
+_PERCENTILE = 99
+_INCIDENCES, _TURNS = np.radians([30.0, 60.0, 80.0]), np.radians([135.0, 20.0, 250.0])  # of lights, from the eye's axis
+#: Directions of the lights in the camera's: right, up, towards the eye.
+LIGHTS = np.stack(
+    [np.sin(_INCIDENCES) * np.cos(_TURNS), np.sin(_INCIDENCES) * np.sin(_TURNS), np.cos(_INCIDENCES)], axis=1
+)
+
+Gray = Float64[np.ndarray, "rows columns"]
+
+
+class Difference(NamedTuple):
+    """How different pictures are, over all pixels that show the object in either."""
+
+    mean: float
+    high: float  # the 99th percentile
+
+
+def flip(original: Mesh, distorted: Mesh, size: int = SIZE) -> Difference:
+    """Compare pictures by FLIP, 0 to 1: the difference that is seen when they are shown in turn.
+
+    Reference: Andersson, Nilsson, Akenine-Möller, Oskarsson, Åström, Fairchild, "FLIP: a difference evaluator for
+    alternating images", Proceedings of the ACM on Computer Graphics and Interactive Techniques 3(2), 2020, by the
+    authors' program, for 67 pixels per degree.
+
+    Args:
+        original: any mesh.
+        distorted: another mesh, in the same place.
+        size: pixels on each side of a picture.
+
+    Raises:
+        JaxmarkError: if flip-evaluator or libigl is missing.
+    """
+    program = require("flip_evaluator", "render")
+
+    def compared(first: Gray, second: Gray) -> Float32[np.ndarray, "rows columns"]:
+        colours = (np.repeat(picture[:, :, None], 3, axis=2).astype(np.float32) for picture in (first, second))
+        return program.evaluate(*colours, "LDR", applyMagma=False, computeMeanError=False)[0][:, :, 0]
+
+    return _compare(original, distorted, size, compared)
+
+
+def ssim(original: Mesh, distorted: Mesh, size: int = SIZE) -> Difference:
+    """Compare pictures by structural similarity: 1 - SSIM, 0 for equal pictures.
+
+    Reference: Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment: from error visibility to structural
+    similarity", IEEE Transactions on Image Processing 13(4), 2004, with its Gaussian windows, by scikit-image.
+
+    Args:
+        original: any mesh.
+        distorted: another mesh, in the same place.
+        size: pixels on each side of a picture.
+
+    Raises:
+        JaxmarkError: if scikit-image or libigl is missing.
+    """
+    metrics = require("skimage.metrics", "render")
+
+    def compared(first: Gray, second: Gray) -> Gray:
+        _, similar = metrics.structural_similarity(
+            first, second, data_range=1.0, gaussian_weights=True, use_sample_covariance=False, full=True
+        )
+        return 1 - similar
+
+    return _compare(original, distorted, size, compared)
+
+
+def lambert(raster: Raster, light: Float64[np.ndarray, "3"], *, smooth: bool) -> Float64[np.ndarray, "rows columns"]:
+    """Shade a picture by Lambert's law, as values for a screen (sRGB); black where no light falls, or no object is.
+
+    Args:
+        raster: what the pixels show.
+        light: unit vector to the light, in the camera's directions.
+        smooth: whether normals are interpolated between vertices.
+    """
+    linear = np.clip(raster.normals(smooth=smooth) @ light, 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def _compare(original: Mesh, distorted: Mesh, size: int, compared: Callable[[Gray, Gray], np.ndarray]) -> Difference:
+    found = [compared(*pictures)[shown] for shown, *pictures in _pictures(original, distorted, size)]
+    values = np.concatenate(found).astype(np.float64)
+    if not len(values):
+        return Difference(0.0, 0.0)
+    return Difference(float(values.mean()), float(np.percentile(values, _PERCENTILE)))
+
+
+def _pictures(
+    original: Mesh, distorted: Mesh, size: int
+) -> Iterator[tuple[Bool[np.ndarray, "rows columns"], Gray, Gray]]:
+    """Which pixels show the object, and pictures of both meshes, from each side.
+
+    Those by each light, flat and smooth, lie side by side in one, because programs take long to begin with a picture.
+    """
+    meshes = host_mesh(original), host_mesh(distorted)
+    frame = Frame.of(meshes[0])
+    for camera in SIDES.values():
+        rasters = [cast(mesh, camera, frame, size) for mesh in meshes]
+        shown = rasters[0].shown | rasters[1].shown
+        part = _around(shown)
+        ways = [(light, smooth) for light in LIGHTS for smooth in (False, True)]
+        first, second = (
+            np.hstack([lambert(raster, light, smooth=smooth)[part] for light, smooth in ways]) for raster in rasters
+        )
+        yield np.hstack([shown[part]] * len(ways)), first, second
+
+
+def _around(shown: Bool[np.ndarray, "rows columns"]) -> tuple[slice, slice]:
+    """The part of a picture that shows something, with a margin for the filters of metrics."""
+    rows, columns = (np.flatnonzero(shown.any(axis=axis)) for axis in (1, 0))
+    return _extent(rows), _extent(columns)
+
+
+def _extent(places: Int64[np.ndarray, " places"]) -> slice:
+    first, last = (places[0], places[-1]) if len(places) else (0, 0)
+    return slice(max(int(first) - _MARGIN, 0), int(last) + _MARGIN + 1)

@@ -1,0 +1,97 @@
+"""Pictures of meshes pixel by pixel: flat and smooth shading, and the reflection of stripes, which shows every dent."""
+
+import os
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Float64
+
+from jaxmark.distortion.rendered import LIGHTS, lambert
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh, host_mesh
+from jaxmark.geometry.raster import SIDES, Frame, Raster, cast
+from jaxmark.plot.figures import Picture, panels
+from jaxmark.plot.meshes import rotation
+
+Style = Literal["flat", "smooth", "zebra"]
+_STRIPES = 24  # dark ones all around
+_EDGE = 0.15  # width of a stripe's soft edge, over half a stripe
+_GLOSS = 0.75  # share of the stripes in what is seen; the rest is diffuse light
+_LIGHT = LIGHTS[0]
+
+
+class Rendering(NamedTuple):
+    """One panel of a picture that is drawn pixel by pixel."""
+
+    title: str
+    mesh: Mesh
+    style: Style = "smooth"
+    side: str | tuple[float, float] = "front"  # in `SIDES`, or the eye's elevation and azimuth in degrees, as in `draw`
+    frame: Frame | None = None  # share one between meshes to be compared; the mesh's own unless given
+
+
+def render(rendering: Rendering, size: int = 600) -> Float64[np.ndarray, "rows columns"]:
+    """Render a mesh as gray values, 0 to 1, white beside it.
+
+    Args:
+        rendering: what to show. `"flat"` and `"smooth"` are lit from the upper left; `"zebra"` is smooth and glossy and
+            reflects bands of light that run around it, as body shops and designers of surfaces inspect them: where
+            normals turn by an angle, stripes move by twice that angle.
+        size: pixels on each side.
+
+    Raises:
+        JaxmarkError: if libigl is missing, or there is no such style or side.
+    """
+    if rendering.style not in get_args(Style):
+        raise JaxmarkError(f"Meshes are rendered {', '.join(get_args(Style))}, not {rendering.style!r}.")
+    mesh = host_mesh(rendering.mesh)
+    raster = cast(mesh, _camera(rendering.side), rendering.frame or Frame.of(mesh), size)
+    shade = 0.15 + 0.85 * lambert(raster, _LIGHT, smooth=rendering.style != "flat")
+    if rendering.style == "zebra":
+        shade = (1 - _GLOSS) * shade + _GLOSS * _stripes(raster)
+    return np.where(raster.shown, shade, 1.0)
+
+
+def draw_renderings(renderings: Sequence[Rendering], size: int = 600) -> Picture:
+    """Draw renderings side by side.
+
+    Args:
+        renderings: the panels, left to right.
+        size: pixels on each side of a panel.
+
+    Raises:
+        JaxmarkError: if matplotlib is missing; or see `render`.
+    """
+    figure, axes = panels(len(renderings), 4.2, 4.4)
+    for panel, rendering in zip(axes, renderings, strict=True):
+        panel.imshow(render(rendering, size), cmap="gray", vmin=0, vmax=1, interpolation="antialiased")
+        panel.set_title(rendering.title, fontsize=10)
+        panel.set_axis_off()
+    return Picture(figure)
+
+
+def save_renderings(renderings: Sequence[Rendering], path: str | os.PathLike[str], size: int = 600) -> None:
+    """Write the picture of `draw_renderings` to a PNG file, whole or not at all.
+
+    Raises:
+        JaxmarkError: see `draw_renderings`; also if the file cannot be written.
+    """
+    draw_renderings(renderings, size).save(path)
+
+
+def _camera(side: str | tuple[float, float]) -> Float64[np.ndarray, "3 3"]:
+    if not isinstance(side, str):
+        return rotation(*np.radians(side))
+    if side not in SIDES:
+        raise JaxmarkError(f"There is no side {side!r}; there are {', '.join(SIDES)}.")
+    return SIDES[side]
+
+
+def _stripes(raster: Raster) -> Float64[np.ndarray, "rows columns"]:
+    """What a mirror shows of stripes, by the height at which the reflected line of sight ends."""
+    normals = raster.normals(smooth=True)
+    # The eye is far away at +z: its line of sight is reflected to 2 (n·z) n - z.
+    height = np.clip(2 * normals[:, :, 2] * normals[:, :, 1], -1, 1)
+    # What faces the eye shows the middle of a stripe, so that a plane is plain.
+    return 0.5 + 0.5 * np.tanh(np.cos(_STRIPES * np.arcsin(height)) / _EDGE)
