@@ -77,7 +77,7 @@ class KeyedCarrier(NamedTuple):
     chips: Chips
     normals: Float[Array, "vertices 3"] | None = None  # with one chip per vertex, the direction in which it moves
     profile: Float[Array | np.ndarray, " bands"] | None = None  # factor on β for each band
-    masking: Float[Array | np.ndarray, " vertices"] | None = None  # factor on each vertex's displacement
+    masking: Float[Array | np.ndarray, " vertices *axes"] | None = None  # factor on a displacement, or matrix `[3, 3]`
 
     @property
     def code_bits(self) -> int:
@@ -141,22 +141,28 @@ class KeyedCarrier(NamedTuple):
     ) -> Displacement:
         """Filter any chips into a displacement."""
         along = filter(self.host.operator, coefficients, chips)
-        if self.masking is not None:
-            along = jnp.asarray(self.masking)[:, None] * along
-        return along if self.normals is None else self.normals * along
+        return self._mask(along if self.normals is None else self.normals * along)
 
     def match_chips(
         self, residual: Displacement, coefficients: Float[Array, " terms *channels"]
     ) -> Float[Array, "vertices channels"]:
         """Apply the plain adjoint of `filter_chips`, which is a matched filter."""
-        along = residual if self.normals is None else jnp.sum(self.normals * residual, axis=1, keepdims=True)
-        if self.masking is not None:
-            along = jnp.asarray(self.masking)[:, None] * along
+        hidden = self._mask(residual)
+        along = hidden if self.normals is None else jnp.sum(self.normals * hidden, axis=1, keepdims=True)
         return transpose(self.host.operator, coefficients, along)
 
     def spread(self, bits: Float[Array, " bits"]) -> Float[Array, "vertices channels"]:
         """Give each chip its value: its sign times the bit in its slot."""
         return self._signs * jnp.asarray(bits).astype(self._signs.dtype)[self.chips.slots]
+
+    def _mask(self, displacement: Displacement) -> Displacement:
+        """Apply the masking, which is its own adjoint: a factor, or a symmetric matrix."""
+        if self.masking is None:
+            return displacement
+        factor = jnp.asarray(self.masking)
+        if factor.ndim == 1:
+            return factor[:, None] * displacement
+        return matmul(factor, displacement[:, :, None])[:, :, 0]
 
     @property
     def _signs(self) -> Float[Array, "vertices channels"]:
