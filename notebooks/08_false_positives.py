@@ -132,7 +132,7 @@ for k in (1, 4, 9):
 # %%
 right, wrong = [], []
 for seed in range(30):
-    suspect = jm.attack(marked, "noise", 0.03 if seed % 2 else 0.045, seed=seed)
+    suspect = jm.attack(marked, "noise", 0.025 if seed % 2 else 0.04, seed=seed)
     both = bound(suspect, [(key_of(0), MESSAGE), (key_of(2), MESSAGE)])
     right.append(both[0])
     wrong.append(both[1])
