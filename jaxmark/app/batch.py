@@ -162,7 +162,7 @@ class FileReader:
             save_report(report, marker.original, mesh, aligned)
         detected = found.detected(self.alpha)
         remarks = found.remarks
-        if record is None and not detected and not remarks:
+        if record is None and found.message is None and not detected and not remarks:
             remarks = guess_mistakes(mesh, marker, self.how)
         answer = {
             "detected": detected,
