@@ -297,6 +297,7 @@ def test_help_teaches_and_units_are_stated(workshop: Workshop):
         ["compare"],
         ["capacity"],
         ["identify"],
+        ["deposit"],
         ["study"],
         ["demo"],
     ):
