@@ -56,7 +56,8 @@ def test_a_deposit_and_a_request_to_date_it_are_written(workshop: Workshop):
     text = Path("all.json").read_text()
     record = json.loads(Path(RECORD[1]).read_text())
     assert not [name for name in ("key", "original", "told", "code") if record[name] in text]
-    assert deposit.root in workshop("deposit", RECORD[1], "second.json", "--output", "again.json")[1]
+    said = workshop("deposit", RECORD[1], "second.json", "--output", "again.json")[1]
+    assert said == f"2 records → again.json, root {deposit.root}, request → again.json.tsq\n"
     for arguments, sentence in [
         (("model.ply", "--output", "o.json"), "not a record"),
         (("all.json", "--output", "o.json"), "not a record"),
@@ -135,7 +136,11 @@ def test_there_is_no_dossier_of_less_than_a_proof(workshop: Workshop):
 def test_a_claim_against_the_record_is_refused(workshop: Workshop):
     claim = ("detect", "marked.ply", *DETECT, "--message")
     assert "commits to another message" in workshop.refused(*claim, b"no".hex(), *RECORD)
-    told = workshop.json(*claim, b"no".hex())
+    told = workshop.json(*claim, b"no".hex(), "--dossier", "case")
+    facts = json.loads(Path("case/dossier.json").read_text())
+    assert facts["command"].endswith("--bits 16 --scheme keyed --message CLAIMED")
+    assert facts["remarks"] == told["remarks"]
+    assert "in place of CLAIMED" in Path("case/dossier.html").read_text()
     assert told["message"] == b"ok".hex()
     assert "Another message of this key reads" in told["remarks"][0]
     assert told["log10_p"] > workshop.json(*claim, b"ok".hex(), *RECORD)["log10_p"]
