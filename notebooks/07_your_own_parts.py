@@ -132,8 +132,12 @@ class Waves(NamedTuple):
 # %% [markdown]
 # A scheme is a frozen dataclass that makes the carrier for an original, a key and a payload, and inherits from `Scheme`
 # what it does not say. Its fields go into the record of a mark. It says which detector reads it: `decorrelate` solves
-# for all bits at once, as the waves are not orthogonal on the surface. Only the signs depend on the key; the waves must
-# not, or the proof of a detection would not hold.
+# for all bits at once, as the waves are not orthogonal on the surface.
+#
+# `choices` has all that depends on the key: signs, permutations and bytes, by a label of our own. They are bound to
+# the scheme's name and fields, to payload and original: with another wavelength, all signs are others. Only the signs
+# may depend on the key; the waves must not, or the proof of a detection would not hold. Nobody but you can know that,
+# so that what is read with a scheme of your own is called an estimate, and `doubts` says why.
 
 
 # %%
@@ -182,8 +186,10 @@ plot.draw([plot.exaggerate(original, gentle), plot.exaggerate(original, waved), 
 noisy = jm.attack(waved, "noise", 0.002, seed=0)
 found = jm.detect(noisy, original=mesh, key=key, record=record.record, scheme=scheme)
 print(f"read {found.message}, log10 p {found.log10_p:.1f}; claimed {waves.detect(noisy, b'ok').log10_p:.1f}")
+print("an estimate, for", *found.doubts)
 stranger = jm.make_marker(mesh, jm.Key(bytes(32)), bits=16, scheme=scheme)
 assert found.message == b"ok"
+assert found.doubts
 assert stranger.detect(waved).message is None
 
 # %% [markdown]

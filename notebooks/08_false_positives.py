@@ -78,7 +78,8 @@ noisy = jm.attack(marked, "noise", 0.02, seed=0)
 (by_hand,) = bound(noisy, [(key_of(0), MESSAGE)])
 by_library = owner.detect(noisy, MESSAGE).log10_p
 print(f"log10 p by hand {by_hand:.2f}, by the library {by_library:.2f}")
-assert math.isclose(by_hand, by_library, rel_tol=1e-2)
+# The library pays for two ways to weigh the bands, and by 3 % each for other ways to align and for other messages.
+assert math.isclose(by_hand + math.log10(2 / 0.97**2), by_library, rel_tol=1e-2)
 
 # %% [markdown]
 # ## Wrong keys and unmarked meshes
@@ -131,7 +132,7 @@ for k in (1, 4, 9):
 # %%
 right, wrong = [], []
 for seed in range(30):
-    suspect = jm.attack(marked, "noise", 0.03 if seed % 2 else 0.045, seed=seed)
+    suspect = jm.attack(marked, "noise", 0.025 if seed % 2 else 0.04, seed=seed)
     both = bound(suspect, [(key_of(0), MESSAGE), (key_of(2), MESSAGE)])
     right.append(both[0])
     wrong.append(both[1])
@@ -148,8 +149,9 @@ pictures.roc({"right key": np.array(right), "wrong key": np.array(wrong)}, lowes
 # log10 50.
 #
 # The library pays by itself where it searches: a message that is *read*, not claimed, is the best of all, so that its
-# bound counts all of them, and the keyed tag of 28 bits counts the 64 candidates that may try it. What it cannot know
-# is how many suspects, keys or originals *you* went through.
+# bound counts all of them, and the keyed tag of 28 bits counts the candidates that tried it before it fitted, 64 at
+# most. What it cannot know is how many suspects, keys or originals *you* went through. For who does not believe you,
+# there is `log10_p_undated`, which takes it that you tried 2^64.
 
 # %%
 TRIES = 50
@@ -177,14 +179,20 @@ pictures.p_values({"wrong messages, right key": same_key, "wrong keys": proven["
 
 # %% [markdown]
 # The line is crossed: with the same key for several messages, a claim proves that *this key* marked the mesh, not which
-# message it wrote. `detect` refuses such a claim where it can read the true message; beyond that, only a code made for
-# it tells recipients apart (`jm.fingerprint`, `jm.identify`), whose proof rests on other coins.
+# message it wrote. Where `detect` can read the true message, it says so, and log10 p is that of the message that was
+# read. A record commits to its message, and claiming another one is refused. Beyond that, only a code made for it tells
+# recipients apart (`jm.fingerprint`, `jm.identify`), whose proof rests on other coins.
 
 # %%
 lie = lies[int(np.argmin(same_key))][1]
 refuted = owner.detect(marked, lie)
-print(f"claimed {lie.hex()}, but {refuted.message!r} reads: log10 p {refuted.log10_p}")
-assert refuted.log10_p == 0
+print(f"claimed {lie.hex()}, but {refuted.message!r} reads, log10 p {refuted.log10_p:.1f}:", *refuted.remarks)
+assert refuted.message == MESSAGE
+assert "Another message" in refuted.remarks[0]
+try:
+    jm.detect(marked, original=mesh, key=key_of(0), record=info.record, message=lie)
+except jm.JaxmarkError as refusal:
+    print(refusal)
 
 # %% [markdown]
 # ## The right original
@@ -206,7 +214,8 @@ assert owner.detect(marked, MESSAGE).detected()
 # %% [markdown]
 # This makes forging a search, and a search has been dealt with above: it must be paid for. Who may choose original, key
 # and message *after* the suspect was seen can go on searching for as long as they like. That is why all three must be
-# fixed before, say by a dated record (`info.record` binds key and original without showing either).
+# fixed before, by a record that is dated: `info.record` commits to key, original and message without showing any, and
+# `jaxmark deposit` makes of many records one number to publish.
 #
 # A mesh that is no copy of the original at all is not compared in vain, but refused:
 
@@ -223,7 +232,7 @@ except jm.JaxmarkError as refusal:
 # | the bound holds | it does not hold |
 # |---|---|
 # | for any suspect made without the key: attacked, or marked by others | for which message a mark under that key has |
-# | for one key, original and message, fixed before | for the best of many, unless their number is paid for |
+# | for one key, original, message and record, fixed before | for the best of many, unless their number is paid for |
 # | with weights, pose and masks from suspect and original | with weights that were chosen by the score |
 # | whatever the residual looks like | for `log10_p_fitted`, an estimate |
 #

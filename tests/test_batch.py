@@ -41,7 +41,9 @@ def test_a_folder_is_marked_and_read(workshop: Workshop):
     code, found = lines(workshop, "detect", "marked", "--original", "models", *KEY, "--record", "marked")
     assert code == 0
     assert [one["message"] for one in found] == ["c0ff", "c0ff"]
-    alone = workshop.json("detect", "marked/a.ply", "--original", "models/a.ply", *KEY, "--bits", "16")
+    alone = workshop.json(
+        "detect", "marked/a.ply", "--original", "models/a.ply", *KEY, "--record", "marked/a.ply.jaxmark.json"
+    )
     assert alone["log10_p"] == found[0]["log10_p"]
     # Files without a mark: nothing is detected.
     code, out, _ = workshop("detect", "models", "--original", "models", *KEY, "--bits", "16")

@@ -159,10 +159,10 @@ class FileReader:
         marker = next(marker for marker in markers if marker.choices.version == found.version)
         aligned = found.alignment
         if report is not None:
-            save_report(report, marker.original.mesh, mesh, aligned)
+            save_report(report, marker.original, mesh, aligned)
         detected = found.detected(self.alpha)
         remarks = found.remarks
-        if record is None and not detected and not remarks:
+        if record is None and found.message is None and not detected and not remarks:
             remarks = guess_mistakes(mesh, marker, self.how)
         answer = {
             "detected": detected,

@@ -349,7 +349,8 @@ def deposit_command(records: tuple[Path, ...], output: Path, as_json: bool) -> N
         write_atomically(draft, found.timestamp_request())
         write_atomically(output, found.to_json().encode())
     answer = {"root": found.root, "records": len(found.digests), "deposit": str(output), "request": str(request)}
-    _answer(as_json, answer, f"{len(found.digests)} records → {output}, root {found.root}, request → {request}")
+    size = f"{len(found.digests)} record{'s' if len(found.digests) > 1 else ''}"
+    _answer(as_json, answer, f"{size} → {output}, root {found.root}, request → {request}")
 
 
 # click keeps the lines of a paragraph that starts with \b.

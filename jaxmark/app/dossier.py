@@ -141,7 +141,7 @@ def _command(case: Case) -> str:
         words += ["--bits", str(case.marker.bits), "--scheme", case.marker.scheme.name]
     if case.found.alignment.how != "auto":
         words += ["--align", case.found.alignment.how]
-    return shlex.join(words) + (" --message CLAIMED" if case.found.message is None else "")
+    return shlex.join(words) + (" --message CLAIMED" if case.claimed else "")
 
 
 def _draw_sides(case: Case) -> dict[str, str]:

@@ -606,16 +606,19 @@ def detect(
 
     The suspect is first aligned with the original (`jaxmark.alignment.alignment.align`); points that are far off are
     masked. Without `message`, the message that is read counts only if its keyed tag fits. Two kinds of proof are then
-    tried, and each is paid for: the tag, and the union bound over all messages. With `message`, log10_p is Hoeffding's
-    bound for that message (see `evidence.log10_p_claimed`), which can prove a mark whose message can no longer be read;
-    if another message is read, the claim is refuted (log10_p = 0). The score is taken for each way of weighting the
-    suspect (see `detectors.claims`), and each is paid for, too.
+    tried, and each is paid for: the tag, and the union bound over all messages, or over the one that the record commits
+    to. With `message`, log10_p is Hoeffding's bound for that message (see `evidence.log10_p_claimed`), which can prove
+    a mark whose message can no longer be read. If another message is read, the claim is refuted, not the mark: log10_p
+    is that of the message that was read, and a remark says so. The score is taken for each way of weighting the suspect
+    (see `detectors.claims`), and each is paid for, too; so are ways of aligning other than `"auto"`, and, without a
+    record, both versions of the keyed choices.
 
-    Both bounds hold for any suspect independent of the key, provided that key, original and claimed message were fixed
-    before the suspect was seen; that weights depend on suspect and original only; and that the score is the plain
-    correlation of the codeword: joint decoding may choose the codeword, but does not enter the score. A mesh marked
-    under the same key is not independent of it: once its message can no longer be read, a claim of a message that has
-    many bits in common with it may pass.
+    All bounds hold for any suspect independent of the key, provided that key, original, message and record were fixed
+    before the suspect existed (if nothing shows that, log10_p_undated counts); that weights depend on suspect and
+    original only; and that the score is the plain correlation of the codeword: joint decoding may choose the codeword,
+    but does not enter the score. A mesh marked under the same key is not independent of it: once its message can no
+    longer be read, a claim of a message that has many bits in common with it may pass. Where the program cannot vouch
+    for a condition, `doubts` says why, and the figures are estimates.
 
     Args:
         suspect: any mesh: moved, reordered, cropped, remeshed.
@@ -636,7 +639,7 @@ def detect(
 
     Raises:
         JaxmarkError: see `make_marker`; also if the suspect cannot be aligned, or the claimed message has another size
-            than the payload.
+            than the payload, or is not the one that the record commits to.
     """
     if bits is None and record is None and isinstance(message, bytes):
         bits = 8 * len(message)
