@@ -12,6 +12,7 @@ from jaxmark.adversaries import blind
 from jaxmark.adversaries.expected import evidence, make_surrogate, random_mark, rescale, rms, size
 from jaxmark.distortion import compare
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.budget import make_budget
 from jaxmark.watermark.detectors import claims
 from tests.samples import bumpy_sphere
 
@@ -98,17 +99,17 @@ def test_who_optimises_does_more_than_who_writes_another_mark(scheme, key: jm.Ke
 
 
 def test_what_is_subtracted_is_some_of_the_mark(marked):
-    marker, mesh = marked
-    suspect = jm.attack(mesh, blind.subtraction(bits=16, mark=MARK), 1e-4, seed=0)
-    mark = np.asarray(mesh.vertices) - np.asarray(marker.original.mesh.vertices)
-    gone = np.asarray(mesh.vertices) - np.asarray(suspect.vertices)
-    random = np.asarray(jm.attack(mesh, "jamming", 1e-4, seed=0).vertices) - np.asarray(mesh.vertices)
-
-    def cosine(shift: np.ndarray) -> float:
-        return float(np.sum(mark * shift) / np.linalg.norm(mark) / np.linalg.norm(shift))
-
-    # The standard deviation of what random marks have in common with it is about 0.05.
-    assert cosine(gone) > 0.13 > abs(cosine(random))
+    original = marked[0].original.mesh
+    gone, random = [], []
+    for seed in range(6):
+        marker = jm.make_marker(original, jm.Key(bytes([seed] * 32)), bits=16)
+        mesh = marker.write(marker.codeword(b"ok"), make_budget(MARK))[0]
+        mark = np.asarray(mesh.vertices) - np.asarray(original.vertices)
+        for found, attack in ((gone, blind.subtraction(bits=16, mark=MARK)), (random, "jamming")):
+            shift = np.asarray(mesh.vertices) - np.asarray(jm.attack(mesh, attack, 1e-4, seed=seed).vertices)
+            found.append(float(np.sum(mark * shift) / np.linalg.norm(mark) / np.linalg.norm(shift)))
+    # The standard deviation of what random marks have in common with one is about 0.05, and 0.02 for the mean of six.
+    assert np.mean(gone) > 0.07 > abs(np.mean(random))
 
 
 @pytest.mark.slow

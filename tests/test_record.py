@@ -95,6 +95,14 @@ def test_the_owner_gets_other_choices_for_other_parameters(marked, original: Mes
     assert jm.detect(suspect, original=original, key=key, record=edited, message=MESSAGE).log10_p > -6
 
 
+def test_a_record_does_not_decide_how_much_is_computed(original: Mesh, key: jm.Key):
+    record = jm.make_marker(original, key, bits=16, version=1).embed(MESSAGE, 2e-3, noise=0)[1].record
+    for bands in (0, 513, 10**9):
+        huge = dataclasses.replace(record, parameters={**record.parameters, "bands": bands})
+        with pytest.raises(jm.JaxmarkError, match="1 to 512 bands"):
+            jm.make_marker(original, key, record=huge)
+
+
 def test_choices_are_bound_to_everything(key: jm.Key):
     fixed = {"content": "message", "scheme": "keyed", "parameters": {"bands": 64, "profile": (0.5, 1.0)}, "bits": 64}
     base = bind(key, b"g" * 32, fixed).signs("signs", 4096).astype(int)

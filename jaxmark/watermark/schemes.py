@@ -42,6 +42,9 @@ _DIMENSIONS_PER_NUISANCE = {"tapered": 12, "narrow": 6}
 # Largest total degree of the polynomials among the nuisance; by pass band.
 _MAX_NUISANCE_DEGREE = {"tapered": 6, "narrow": 8}
 
+# The most bands or eigenpairs that a record may ask for: no file decides how much memory and time is spent.
+_MAX_COMPONENTS = 512
+
 # Values of the fields that are missing from a record because it was written before they existed; by scheme.
 _FIELDS_OF_OLD_RECORDS: Mapping[str, Mapping[str, Any]] = {"keyed": {"passband": "narrow"}}
 
@@ -390,6 +393,8 @@ def get_scheme(scheme: str | Scheme, parameters: Mapping[str, Any] | None = None
         for name, value in given.items()
     ):
         raise JaxmarkError(f"The scheme {scheme!r} takes the parameters {', '.join(known)}, not {given}.")
+    if any(not 0 < given.get(name, 1) <= _MAX_COMPONENTS for name in ("bands", "pairs")):
+        raise JaxmarkError(f"A record's scheme has 1 to {_MAX_COMPONENTS} bands or pairs, not {given}.")
     before = {} if parameters is None else _FIELDS_OF_OLD_RECORDS.get(scheme, {})
     return SCHEMES[scheme](**{**before, **given})
 
