@@ -54,6 +54,7 @@ SUSPECTS = {
     "quantised": ("quantisation", 10),
     "remeshed": ("midpoint", 1),
 }
+STEPS = 1000  # of projected gradients, which choose the key
 LEAST = 1e-6  # of the fitted strengths, over the largest: a band at 0 would change what is projected off
 SLACK = 2.0  # orders of magnitude below what so many tries explain
 MOVED = (1e-7, 1e-6, 1e-5, 3e-5, 1e-4, 1e-3)  # RMS in diagonals
@@ -63,6 +64,7 @@ PAYLOADS = (64, 128, 256)
 class Fitted(NamedTuple):
     """The profile that the owner would choose, and what its claim would be without a record that forbids it."""
 
+    key: int  # number of the key under which it is best
     profile: tuple[float, ...]
     log10_p: float
 
@@ -100,28 +102,39 @@ def shares(marker: Marker, aligned: Alignment) -> Iterator[np.ndarray]:
         yield np.asarray((way.gain / way.power)[:, None, None] * each, np.float64).reshape(len(way.power), -1)
 
 
-def fit(each: np.ndarray, products: np.ndarray, sign: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Strengths of most score over norm, by non-negative least squares; with score and norm."""
+def roughly(products: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """About the best score over norm that strengths can reach, for each column of scores, by projected gradients."""
     scale = np.sqrt(np.diag(products)) + 1e-300
-    unit = products / np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(unit)
+    unit, along = products / np.outer(scale, scale), along / scale[:, None]
+    step = 1 / np.linalg.eigvalsh(unit)[-1]
+    found = ahead = np.zeros_like(along)
+    for turn in range(STEPS):  # Nesterov's, with the positive part
+        fresh = np.maximum(ahead + step * (along - unit @ ahead), 0)
+        found, ahead = fresh, fresh + turn / (turn + 3) * (fresh - found)
+    return np.sum(found * along, axis=0) / np.sqrt(np.sum(found * (unit @ found), axis=0) + 1e-300)
+
+
+def fit(products: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Strengths of most score over norm, by non-negative least squares."""
+    scale = np.sqrt(np.diag(products)) + 1e-300
+    values, vectors = np.linalg.eigh(products / np.outer(scale, scale))
     root = np.sqrt(np.maximum(values, 1e-9 * values[-1]))
-    along = each @ sign / scale
-    found = nnls(root[:, None] * vectors.T, (vectors.T @ along) / root, maxiter=30 * len(values))[0] / scale
+    target = (vectors.T @ (along / scale)) / root
+    found = nnls(root[:, None] * vectors.T, target, maxiter=30 * len(values))[0] / scale
     found = np.maximum(found, LEAST * found.max()) if found.any() else np.ones(len(found))
-    found /= found.max()
-    mix = found @ each
-    return found, float(mix @ sign), float(np.linalg.norm(mix))
+    return found / found.max()
 
 
-def fitted(ways: Sequence[tuple[np.ndarray, np.ndarray]], sign: np.ndarray, share: float) -> Fitted:
-    """The better of the fits to each way of weighing, as a claim by both."""
-    found = []
-    for each, products in ways:
-        profile, score, norm = fit(each, products, sign)
-        log10_p = evidence.any_of(evidence.log10_p_claimed(score, norm), 0.0)
-        found.append(Fitted(tuple(profile.tolist()), evidence.share_of(log10_p, share)))
-    return min(found, key=lambda one: one.log10_p)
+def fitted(ways: Sequence[np.ndarray], signs: np.ndarray, share: float) -> Fitted:
+    """The best fit to either way of weighing under any of the keys, as a claim by both ways."""
+    parts = [(each @ each.T, each @ signs.T) for each in ways]
+    hopes = [roughly(*part) for part in parts]
+    way, key = np.unravel_index(np.argmax(hopes), (len(parts), len(signs)))
+    products, along = parts[way]
+    profile = fit(products, along[:, key])
+    score, norm = profile @ along[:, key], math.sqrt(profile @ products @ profile)
+    log10_p = evidence.any_of(evidence.log10_p_claimed(score, norm), 0.0)
+    return Fitted(int(key), tuple(profile.tolist()), evidence.share_of(log10_p, share))
 
 
 def record_of(marker: Marker) -> Record:
@@ -144,21 +157,18 @@ def strengths(mesh: Mesh, seen: dict[str, Mesh], keys: int, bands: int, version:
         markers = [jm.make_marker(mesh, key_of(number), scheme=scheme, version=version) for number in range(keys)]
     except jm.JaxmarkError as refusal:
         return {"version": version, "bands": bands, "honest": f"refused: {refusal}"}
-    original, chosen = markers[0].original, [signs(marker) for marker in markers]
+    original, chosen = markers[0].original, np.array([signs(marker) for marker in markers])
     honest, hoped, printed, late = [], [], [], []
     for name, suspect in seen.items():
         aligned = align(original, suspect)
-        ways = [(each, each @ each.T) for each in shares(markers[0], aligned)]
-        share = ALIGN_SHARES[aligned.how]
         honest += [marker.detect(aligned, MESSAGE).log10_p for marker in markers]
-        fits = [fitted(ways, sign, share) for sign in chosen]
-        best = int(np.argmin([one.log10_p for one in fits]))
-        hoped.append(fits[best].log10_p)
-        key, profile = key_of(best), fits[best].profile
+        best = fitted(list(shares(markers[0], aligned)), chosen, ALIGN_SHARES[aligned.how])
+        hoped.append(best.log10_p)
+        key, profile = key_of(best.key), best.profile
         if version == 1:
             forged = jm.make_marker(mesh, key, scheme=dataclasses.replace(scheme, profile=profile), version=1)
         else:
-            forged = jm.make_marker(mesh, key, record=remade(record_of(markers[best]), key, mesh, profile))
+            forged = jm.make_marker(mesh, key, record=remade(record_of(markers[best.key]), key, mesh, profile))
         found = forged.detect(aligned, MESSAGE)
         printed.append(found.log10_p)
         late.append(found.log10_p_undated)
