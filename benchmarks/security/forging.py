@@ -67,6 +67,7 @@ class Fitted(NamedTuple):
     key: int  # number of the key under which it is best
     profile: tuple[float, ...]
     log10_p: float
+    honest: float  # the lowest of all keys with equal strengths
 
 
 def key_of(number: int) -> jm.Key:
@@ -87,8 +88,8 @@ def flat(bands: int) -> KeyedScheme:
 
 def signs(marker: Marker) -> np.ndarray:
     """The signs of the marker's codeword, as they are spread over the points."""
-    reader: Any = marker.reader  # of a keyed carrier
-    return np.asarray(reader.carrier.spread(jnp.asarray(marker.codeword(MESSAGE), jnp.float32)), np.float64).ravel()
+    carrier: Any = marker.carrier  # a keyed one
+    return np.asarray(carrier.spread(jnp.asarray(marker.codeword(MESSAGE), jnp.float32)), np.float64).ravel()
 
 
 def shares(marker: Marker, aligned: Alignment) -> Iterator[np.ndarray]:
@@ -130,11 +131,19 @@ def fitted(ways: Sequence[np.ndarray], signs: np.ndarray, share: float) -> Fitte
     parts = [(each @ each.T, each @ signs.T) for each in ways]
     hopes = [roughly(*part) for part in parts]
     way, key = np.unravel_index(np.argmax(hopes), (len(parts), len(signs)))
-    products, along = parts[way]
-    profile = fit(products, along[:, key])
-    score, norm = profile @ along[:, key], math.sqrt(profile @ products @ profile)
-    log10_p = evidence.any_of(evidence.log10_p_claimed(score, norm), 0.0)
-    return Fitted(int(key), tuple(profile.tolist()), evidence.share_of(log10_p, share))
+    profile = fit(parts[way][0], parts[way][1][:, key])
+    every = np.array(
+        [[claims_of(part, chosen, share) for part in parts] for chosen in (profile, np.ones_like(profile))]
+    )
+    fits, honest = every.min(axis=1) + math.log10(len(parts))
+    return Fitted(int(key), tuple(profile.tolist()), min(0.0, fits[key]), min(0.0, honest.min()))
+
+
+def claims_of(part: tuple[np.ndarray, np.ndarray], profile: np.ndarray, share: float) -> np.ndarray:
+    """log10 p of a claim under each key by one way of weighing, with these strengths."""
+    products, along = part
+    norm = math.sqrt(profile @ products @ profile)
+    return np.array([evidence.share_of(evidence.log10_p_claimed(score, norm), share) for score in profile @ along])
 
 
 def record_of(marker: Marker) -> Record:
@@ -161,8 +170,8 @@ def strengths(mesh: Mesh, seen: dict[str, Mesh], keys: int, bands: int, version:
     honest, hoped, printed, late = [], [], [], []
     for name, suspect in seen.items():
         aligned = align(original, suspect)
-        honest += [marker.detect(aligned, MESSAGE).log10_p for marker in markers]
         best = fitted(list(shares(markers[0], aligned)), chosen, ALIGN_SHARES[aligned.how])
+        honest.append(best.honest)
         hoped.append(best.log10_p)
         key, profile = key_of(best.key), best.profile
         if version == 1:
