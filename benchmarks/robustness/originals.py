@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
+from trimesh.exchange.obj import export_obj
 
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh, diagonal
@@ -44,13 +45,15 @@ def saved(mesh: Mesh, file: Path) -> Mesh:
 def exported(mesh: Mesh, file: Path, digits: int) -> Mesh:
     """As trimesh writes it to an OBJ file, with so many digits after the point."""
     plain = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), process=False)
-    file.write_text(trimesh.exchange.obj.export_obj(plain, digits=digits))
+    file.write_text(export_obj(plain, digits=digits))
     return jm.load_mesh(file)
 
 
-def six_digits(vertices: np.ndarray) -> np.ndarray:
+def six_digits(mesh: Mesh) -> Mesh:
     """Rounded to six significant digits, as many programs write text."""
-    return np.array([float(f"{number:.6g}") for number in vertices.ravel()]).reshape(vertices.shape)
+    vertices = np.asarray(mesh.vertices)
+    rounded = np.array([float(f"{number:.6g}") for number in vertices.ravel()])
+    return jm.make_mesh(rounded.reshape(vertices.shape), mesh.faces)
 
 
 def reordered(mesh: Mesh) -> Mesh:
@@ -68,15 +71,15 @@ def soup(mesh: Mesh) -> Mesh:
 COPIES: dict[str, Callable[[Mesh, Path], Mesh]] = {
     "exact": lambda mesh, stem: mesh,
     "float32": lambda mesh, stem: mesh._replace(vertices=mesh.vertices.astype(np.float32).astype(float)),
-    "six digits": lambda mesh, stem: mesh._replace(vertices=six_digits(mesh.vertices)),
+    "six digits": lambda mesh, stem: six_digits(mesh),
     "STL": lambda mesh, stem: saved(mesh, stem.with_suffix(".stl")),
     "PLY": lambda mesh, stem: saved(mesh, stem.with_suffix(".ply")),
     "GLB": lambda mesh, stem: saved(mesh, stem.with_suffix(".glb")),
     "OBJ, 8 digits": lambda mesh, stem: exported(mesh, stem.with_suffix(".obj"), 8),
-    "a thousand times, moved": lambda mesh, stem: mesh._replace(
-        vertices=six_digits(1000 * (mesh.vertices + 0.3 * diagonal(mesh)))
+    "a thousand times, moved": lambda mesh, stem: six_digits(
+        mesh._replace(vertices=1000 * (mesh.vertices + 0.3 * diagonal(mesh)))
     ),
-    "turned": lambda mesh, stem: mesh._replace(vertices=six_digits(mesh.vertices @ TURN.T)),
+    "turned": lambda mesh, stem: six_digits(mesh._replace(vertices=mesh.vertices @ TURN.T)),
     "reordered": lambda mesh, stem: reordered(mesh),
     "unwelded": lambda mesh, stem: soup(mesh),
     "turned, scaled, reordered, STL": lambda mesh, stem: saved(
@@ -101,11 +104,9 @@ def measured(mesh: Mesh, seed: int) -> tuple[str, dict[str, Row]]:
     """The attack, and what each copy of the original reads after it."""
     marker = jm.make_marker(mesh, KEY)
     marked, info = marker.embed(MESSAGE, BUDGET)
-    for attack in ATTACKS:
-        suspect = attacked(marked, attack, seed)
-        if marker.detect(suspect, MESSAGE).log10_p > FLOOR:
-            break
-    found = {}
+    enough = (steps for steps in ATTACKS if marker.detect(attacked(marked, steps, seed), MESSAGE).log10_p > FLOOR)
+    attack = next(enough, ATTACKS[-1])
+    suspect, found = attacked(marked, attack, seed), {}
     for name, copy in COPIES.items():
         with tempfile.TemporaryDirectory() as folder:
             try:

@@ -54,8 +54,8 @@ SUSPECTS = {
     "quantised": ("quantisation", 10),
     "remeshed": ("midpoint", 1),
 }
-STEPS = 1000  # of projected gradients, which choose the key
-LEAST = 1e-6  # of the fitted strengths, over the largest: a band at 0 would change what is projected off
+STEPS = 300  # of projected gradients, which choose the key
+LEAST = 1e-6  # share of each band in the fit, over the largest: a band at 0 would change what is projected off
 SLACK = 2.0  # orders of magnitude below what so many tries explain
 MOVED = (1e-7, 1e-6, 1e-5, 3e-5, 1e-4, 1e-3)  # RMS in diagonals
 PAYLOADS = (64, 128, 256)
@@ -117,12 +117,13 @@ def roughly(products: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 def fit(products: np.ndarray, along: np.ndarray) -> np.ndarray:
     """Strengths of most score over norm, by non-negative least squares."""
-    scale = np.sqrt(np.diag(products)) + 1e-300
+    scale = np.sqrt(np.diag(products))
+    scale = np.maximum(scale, 1e-9 * scale.max())
     values, vectors = np.linalg.eigh(products / np.outer(scale, scale))
     root = np.sqrt(np.maximum(values, 1e-9 * values[-1]))
     target = (vectors.T @ (along / scale)) / root
-    found = nnls(root[:, None] * vectors.T, target, maxiter=30 * len(values))[0] / scale
-    found = np.maximum(found, LEAST * found.max()) if found.any() else np.ones(len(found))
+    found = nnls(root[:, None] * vectors.T, target, maxiter=30 * len(values))[0]
+    found = np.maximum(found, LEAST * found.max()) / scale if found.any() else np.ones(len(found))
     return found / found.max()
 
 
@@ -196,10 +197,11 @@ def grinding(mesh: Mesh, seen: dict[str, Mesh], tries: int) -> Row:
     """Redraw all chips by the last digits of a strength, and keep the best; what they multiply stays the same."""
     key = key_of(0)
     usual = jm.make_marker(mesh, key)
-    profile = usual.scheme.strengths(usual.original, usual.bits).tolist()
+    profile = KeyedScheme().strengths(usual.original, usual.bits).tolist()
     scheme = KeyedScheme(profile=tuple(profile))
     marker = jm.make_marker(mesh, key, scheme=scheme)
-    original, reader = marker.original, marker.reader
+    original = marker.original
+    reader: Any = marker.reader
     aligned = {name: align(original, suspect) for name, suspect in seen.items()}
     ways = [reader.ways(marker.receive(one)) for one in aligned.values()]
     vectors = np.array([[np.asarray(reader.matched_residual(way)).ravel() for way in both] for both in ways])
