@@ -4,6 +4,7 @@ import ast
 import importlib
 import runpy
 import shutil
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 
+import jaxmark as jm
 from tests.samples import bumpy_sphere
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -109,3 +111,23 @@ def test_a_stage_is_measured_in_a_process_from_a_copy(copy: Path, afresh, monkey
     stages = importlib.import_module("common.stages")
     (row,) = stages.apart(bumpy_sphere(1), ["load"])
     assert row["first call, s"] > 0, row
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "program",
+    [
+        ["security/forging.py", "--keys", "2", "--bands", "64", "--tries", "200"],
+        ["robustness/originals.py"],
+    ],
+    ids=["forging", "originals"],
+)
+def test_a_small_run_ends_well(program: list[str], tmp_path: Path):
+    mesh = tmp_path / "bumpy.obj"
+    jm.save_mesh(bumpy_sphere(4), mesh)
+    command = [sys.executable, BENCHMARKS / program[0], mesh, *program[1:]]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    if program[0].endswith("originals.py"):
+        counts = [row.split(" | ")[1:3] for row in ended.stdout.splitlines()[-12:]]
+        assert counts == [["1/1", "1/1"]] * 12, ended.stdout

@@ -162,6 +162,16 @@ def test_the_record_commits_to_the_message(marked, original: Mesh, key: jm.Key):
     assert commit(b"a", choices) != commit(b"b", choices) != commit(b"b", Choices(key, b"d" * 32))
 
 
+def test_who_dates_nothing_pays_for_all_messages(marked, original: Mesh, key: jm.Key):
+    """The best message can be decoded in one go, however many there are, and a record can be made for it."""
+    suspect, record = marked
+    noisy = jm.attack(suspect, "noise", 0.005, seed=1)
+    for claimed in (MESSAGE, None):
+        found = jm.detect(noisy, original=original, key=key, record=record, message=claimed)
+        assert -70 < found.log10_p < -30
+        assert found.log10_p_undated == pytest.approx(found.log10_p + (16 + 64) * np.log10(2), abs=0.2)
+
+
 def test_weights_detectors_and_schemes_of_ones_own_make_no_proof(marked, original: Mesh, key: jm.Key):
     suspect, record = marked
     weights = np.ones(len(original.vertices))

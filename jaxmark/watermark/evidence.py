@@ -61,9 +61,11 @@ def log10_p_fitted_strengths(score: ArrayLike, norm: ArrayLike, strengths: int) 
 
 
 def undated(log10_p: float) -> float:
-    """log10 of a bound on the probability that any of 2^64 keys, originals, records or messages is so good.
+    """log10 of a bound on the probability that any of 2^64 keys, originals or records is so good.
 
-    Whoever makes a claim that nothing dates may have tried as many; 2^64 hashes are about what can be paid for.
+    Whoever makes a claim that nothing dates may have tried as many; 2^64 hashes are about what can be paid for. What
+    need not be tried one by one is paid for in `log10_p`: all messages, see `log10_p_read`, and in version 1 all
+    strengths, see `log10_p_fitted_strengths`.
     """
     return _clip(log10_p + _LOG10_TRIES)
 

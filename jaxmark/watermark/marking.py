@@ -55,7 +55,7 @@ class Detection(NamedTuple):
 
     message: bytes | None  # the message that was read; None unless its keyed tag fits
     log10_p: float  # log10 of a bound on the false-positive probability, in [-77, 0], if all that is claimed is dated
-    log10_p_undated: float  # the same if nothing is: if 2^64 keys, originals, records and messages may have been tried
+    log10_p_undated: float  # the same if nothing is: for the best message of any of 2^64 keys, originals and records
     log10_p_fitted: float  # log10 of that probability if the score were Gaussian: an estimate, which decides nothing
     scores: Float64[np.ndarray, " code"]  # soft values of the code bits, scaled to root mean square 1
     coverage: float  # share of the original's points that the suspect gave evidence for
@@ -243,15 +243,14 @@ class Marker:
         proofs = [evidence.log10_p_read(*way, unknown) for way in ways]
         if decoded is not None and tagged:
             proofs.append(evidence.log10_p_tag(TAG_BITS, decoded.rank))
-        log10_p = evidence.share_of(evidence.any_of(*proofs), share)
-        undated = log10_p
+        # The best message is not tried out but decoded, so who claims one that nothing dates pays for all of them.
+        late = [evidence.log10_p_read(*way, self.bits) for way in ways]
         if self.choices.version == 1 and (free := self.scheme.free_strengths):
-            fits = [evidence.log10_p_fitted_strengths(*way, free) + unknown * math.log10(2) for way in ways]
-            undated = evidence.share_of(evidence.any_of(*fits), share)
+            late = [evidence.log10_p_fitted_strengths(*way, free) + self.bits * math.log10(2) for way in ways]
         return found._replace(
             message=None if decoded is None else decoded.message,
-            log10_p=log10_p,
-            log10_p_undated=evidence.undated(undated),
+            log10_p=evidence.share_of(evidence.any_of(*proofs), share),
+            log10_p_undated=evidence.undated(evidence.share_of(evidence.any_of(*late), share)),
             log10_p_fitted=evidence.any_of(*(evidence.log10_p_fitted(*way, unknown) for way in ways)),
         )
 

@@ -1,0 +1,325 @@
+"""What the owner of a key could forge, and what it buys: proofs from suspects that know nothing of the key.
+
+For suspects without the owner's mark, five ways to choose afterwards what should have been fixed before:
+
+  strengths, version 1:  a profile of 64 and more bands is fitted to score and norm by non-negative least squares
+  strengths, version 2:  the same with the chips of an honest record, which is then made again with the fitted profile
+  grinding, version 2:   the profile's last entry is moved in its last digits; each time all chips are drawn anew
+  original, version 2:   the original that is presented is moved against the mark, as a whole or only half of it
+  message, version 2:    the message is the one that decodes best, whatever its tag
+
+Printed are log10 p as `jaxmark.detect` prints it, dated and undated; the lowest over keys and suspects, where there are
+several. Exit status 1 if an undated figure, or a figure of version 2 that something dates, is not explained by chance:
+if it is lower than one in so many tries is, by two orders of magnitude. The search for the message stops short of its
+tag, which takes 2^28 hashes; it is judged by what it says would be printed.
+
+    python benchmarks/security/forging.py MESH [--keys N] [--tries N] [--bands N ...]
+"""
+
+import dataclasses
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import nnls
+
+import jaxmark as jm
+from jaxmark.alignment.alignment import Alignment, align
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.spectral.chebyshev import band_components
+from jaxmark.spectral.laplacian import per_row
+from jaxmark.spectral.precision import matmul
+from jaxmark.watermark import evidence
+from jaxmark.watermark.budget import make_budget
+from jaxmark.watermark.carriers import make_chips
+from jaxmark.watermark.coding import polar
+from jaxmark.watermark.coding.keys import bind
+from jaxmark.watermark.coding.message import TAG_BITS, encode
+from jaxmark.watermark.marking import ALIGN_SHARES, Marker
+from jaxmark.watermark.record import Record, commit
+from jaxmark.watermark.schemes import KeyedScheme, parameters_of
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from common.arguments import load, make_parser
+from common.marks import BUDGET, MESSAGE, write
+from common.tables import Row, say, table
+
+SUSPECTS = {
+    "noise 0.1 %": ("noise", 0.001),
+    "smoothed": ("smoothing", 10),
+    "quantised": ("quantisation", 10),
+    "remeshed": ("midpoint", 1),
+}
+STEPS = 300  # of projected gradients, which choose the key
+LEAST = 1e-6  # share of each band in the fit, over the largest: a band at 0 would change what is projected off
+SLACK = 2.0  # orders of magnitude below what so many tries explain
+MOVED = (1e-7, 1e-6, 1e-5, 3e-5, 1e-4, 1e-3)  # RMS in diagonals
+PAYLOADS = (64, 128, 256)
+
+
+class Fitted(NamedTuple):
+    """The profile that the owner would choose, and what its claim would be without a record that forbids it."""
+
+    key: int  # number of the key under which it is best
+    profile: tuple[float, ...]
+    log10_p: float
+    honest: float  # the lowest of all keys with equal strengths
+
+
+def key_of(number: int) -> jm.Key:
+    return jm.Key(bytes(16) + number.to_bytes(16, "big"))
+
+
+def suspects(mesh: Mesh) -> dict[str, Mesh]:
+    """Meshes that know nothing of the keys tried."""
+    rival = jm.make_marker(mesh, jm.Key(bytes([200] * 32)))
+    others = {name: jm.attack(mesh, *how, seed=1) for name, how in SUSPECTS.items()}
+    return {**others, "a rival's mark": write(rival, MESSAGE, make_budget(BUDGET))}
+
+
+def flat(bands: int) -> KeyedScheme:
+    """Any strengths in all bands, which the owner then chooses."""
+    return KeyedScheme(bands=bands, profile=(1.0,) * bands)
+
+
+def signs(marker: Marker) -> np.ndarray:
+    """The signs of the marker's codeword, as they are spread over the points."""
+    carrier: Any = marker.carrier  # a keyed one
+    return np.asarray(carrier.spread(jnp.asarray(marker.codeword(MESSAGE), jnp.float32)), np.float64).ravel()
+
+
+def shares(marker: Marker, aligned: Alignment) -> Iterator[np.ndarray]:
+    """What each band adds to the vector that the signs multiply, `[bands, chips]`, for each way of weighing."""
+    reader: Any = marker.reader
+    for way in reader.ways(marker.receive(aligned)):
+        host = reader.carrier.host
+        mass = per_row(host.operator.degree, way.residual)
+        mass = jnp.where(mass > 0, mass, 1)
+        each = mass * band_components(host.operator, host.coefficients, matmul(way.residual, way.axes) / mass)
+        yield np.asarray((way.gain / way.power)[:, None, None] * each, np.float64).reshape(len(way.power), -1)
+
+
+def roughly(products: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """About the best score over norm that strengths can reach, for each column of scores, by projected gradients."""
+    scale = np.sqrt(np.diag(products)) + 1e-300
+    unit, along = products / np.outer(scale, scale), along / scale[:, None]
+    step = 1 / np.linalg.eigvalsh(unit)[-1]
+    found = ahead = np.zeros_like(along)
+    for turn in range(STEPS):  # Nesterov's, with the positive part
+        fresh = np.maximum(ahead + step * (along - unit @ ahead), 0)
+        found, ahead = fresh, fresh + turn / (turn + 3) * (fresh - found)
+    return np.sum(found * along, axis=0) / np.sqrt(np.sum(found * (unit @ found), axis=0) + 1e-300)
+
+
+def fit(products: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Strengths of most score over norm, by non-negative least squares."""
+    scale = np.sqrt(np.diag(products))
+    scale = np.maximum(scale, 1e-9 * scale.max())
+    values, vectors = np.linalg.eigh(products / np.outer(scale, scale))
+    root = np.sqrt(np.maximum(values, 1e-9 * values[-1]))
+    target = (vectors.T @ (along / scale)) / root
+    found = nnls(root[:, None] * vectors.T, target, maxiter=30 * len(values))[0]
+    found = np.maximum(found, LEAST * found.max()) / scale if found.any() else np.ones(len(found))
+    return found / found.max()
+
+
+def fitted(ways: Sequence[np.ndarray], signs: np.ndarray, share: float) -> Fitted:
+    """The best fit to either way of weighing under any of the keys, as a claim by both ways."""
+    parts = [(each @ each.T, each @ signs.T) for each in ways]
+    hopes = [roughly(*part) for part in parts]
+    way, key = np.unravel_index(np.argmax(hopes), (len(parts), len(signs)))
+    profile = fit(parts[way][0], parts[way][1][:, key])
+    every = np.array(
+        [[claims_of(part, chosen, share) for part in parts] for chosen in (profile, np.ones_like(profile))]
+    )
+    fits, honest = every.min(axis=1) + math.log10(len(parts))
+    return Fitted(int(key), tuple(profile.tolist()), min(0.0, fits[key]), min(0.0, honest.min()))
+
+
+def claims_of(part: tuple[np.ndarray, np.ndarray], profile: np.ndarray, share: float) -> np.ndarray:
+    """log10 p of a claim under each key by one way of weighing, with these strengths."""
+    products, along = part
+    norm = math.sqrt(profile @ products @ profile)
+    return np.array([evidence.share_of(evidence.log10_p_claimed(score, norm), share) for score in profile @ along])
+
+
+def record_of(marker: Marker) -> Record:
+    """The record that the owner would have of this mark."""
+    return marker.write(marker.codeword(MESSAGE), make_budget(BUDGET), told=MESSAGE)[1].record
+
+
+def remade(record: Record, key: jm.Key, mesh: Mesh, profile: Sequence[float]) -> Record:
+    """The owner's record with another profile, whole in every other respect."""
+    parameters = {**record.parameters, "profile": tuple(profile)}
+    fresh = dataclasses.replace(record, parameters=parameters, told="").sealed(key)
+    told = commit(MESSAGE, jm.make_marker(mesh, key, record=fresh).choices)
+    return dataclasses.replace(fresh, told=told).sealed(key)
+
+
+def strengths(mesh: Mesh, seen: dict[str, Mesh], keys: int, bands: int, version: int) -> Row:
+    """Fit a profile to each suspect under each key, and read the best with it as `detect` does."""
+    scheme = flat(bands)
+    try:
+        markers = [jm.make_marker(mesh, key_of(number), scheme=scheme, version=version) for number in range(keys)]
+    except jm.JaxmarkError as refusal:
+        return {"version": version, "bands": bands, "honest": f"refused: {refusal}"}
+    original, chosen = markers[0].original, np.array([signs(marker) for marker in markers])
+    honest, hoped, printed, late = [], [], [], []
+    for name, suspect in seen.items():
+        aligned = align(original, suspect)
+        best = fitted(list(shares(markers[0], aligned)), chosen, ALIGN_SHARES[aligned.how])
+        honest.append(best.honest)
+        hoped.append(best.log10_p)
+        key, profile = key_of(best.key), best.profile
+        if version == 1:
+            forged = jm.make_marker(mesh, key, scheme=dataclasses.replace(scheme, profile=profile), version=1)
+        else:
+            forged = jm.make_marker(mesh, key, record=remade(record_of(markers[best.key]), key, mesh, profile))
+        found = forged.detect(aligned, MESSAGE)
+        printed.append(found.log10_p)
+        late.append(found.log10_p_undated)
+        say(version, bands, name, f"{hoped[-1]:.1f} hoped, {printed[-1]:.1f} printed, undated {late[-1]:.1f}", sep=", ")
+    return {
+        "version": version,
+        "bands": bands,
+        "honest": min(honest),
+        "fitted": min(hoped),
+        "printed": min(printed),
+        "undated": min(late),
+    }
+
+
+def grinding(mesh: Mesh, seen: dict[str, Mesh], tries: int) -> Row:
+    """Redraw all chips by the last digits of a strength, and keep the best; what they multiply stays the same."""
+    key = key_of(0)
+    usual = jm.make_marker(mesh, key)
+    profile = KeyedScheme().strengths(usual.original, usual.bits).tolist()
+    scheme = KeyedScheme(profile=tuple(profile))
+    marker = jm.make_marker(mesh, key, scheme=scheme)
+    original = marker.original
+    reader: Any = marker.reader
+    aligned = {name: align(original, suspect) for name, suspect in seen.items()}
+    ways = [reader.ways(marker.receive(one)) for one in aligned.values()]
+    vectors = np.array([[np.asarray(reader.matched_residual(way)).ravel() for way in both] for both in ways])
+    norms = np.linalg.norm(vectors.astype(np.float64), axis=2)
+    fixed = {"content": "message", "scheme": scheme.name, "parameters": parameters_of(scheme), "bits": marker.bits}
+    scores = np.empty((tries, *norms.shape))
+    last = profile[-1]
+    for attempt in range(tries):
+        fixed["parameters"]["profile"] = (*profile[:-1], last + attempt * math.ulp(last))
+        choices = bind(key, original.geometry, fixed)
+        chips = make_chips(choices, original.chip_places, marker.code_bits)
+        spread = chips.signs * encode(MESSAGE, choices, marker.code_bits)[chips.slots]
+        scores[attempt] = vectors @ spread.ravel().astype(np.float32)
+        if attempt % 10_000 == 0:
+            say(f"{attempt} of {tries} tries")
+    place = np.unravel_index(np.argmax(scores / norms), scores.shape)
+    name = list(seen)[place[1]]
+    record = remade(record_of(marker), key, mesh, (*profile[:-1], last + int(place[0]) * math.ulp(last)))
+    best = jm.make_marker(mesh, key, record=record).detect(aligned[name], MESSAGE)
+    return {
+        "tries": tries * len(seen),
+        "by chance": -math.log10(tries * len(seen)),
+        "best printed": best.log10_p,
+        "undated": best.log10_p_undated,
+        "suspect": name,
+    }
+
+
+def presented(mesh: Mesh) -> list[Row]:
+    """Read with originals that were moved against the mark, from what was never marked."""
+    key = key_of(0)
+    marker = jm.make_marker(mesh, key)
+    marked, info = marker.write(marker.codeword(MESSAGE), make_budget(BUDGET), told=MESSAGE)
+    shift = np.asarray(marked.vertices) - np.asarray(mesh.vertices)
+    shift /= np.sqrt(np.mean(np.sum(shift**2, axis=1)))
+    half = (mesh.vertices[:, 0] > np.median(mesh.vertices[:, 0]))[:, None]
+    copies = {"the original": mesh, "noise 0.1 %": jm.attack(mesh, "noise", 0.001, seed=1)}
+    exact = {name: marker_with(mesh, key, info.record).detect(copy, MESSAGE).log10_p for name, copy in copies.items()}
+    rows = []
+    for part, where in (("whole", np.ones_like(half)), ("half", half)):
+        for size in MOVED:
+            vertices = mesh.vertices - size * marker.original.diagonal * shift * where
+            row: Row = {"moved": part, "RMS, diagonals": f"{size:g}"}
+            try:
+                reading = marker_with(jm.make_mesh(vertices, mesh.faces), key, info.record)
+            except jm.JaxmarkError as refusal:
+                rows.append(row | {"original": "refused: " + str(refusal).partition(": ")[2]})
+                continue
+            row["original"] = reading.doubts[0] if reading.doubts else "recovered exactly"
+            for name, copy in copies.items():
+                found = reading.detect(copy, MESSAGE)
+                kind = "estimate" if found.doubts else "as the exact one" if found.log10_p == exact[name] else "differs"
+                row[f"log10 p from {name}"] = f"{found.log10_p:.2f}, {kind}"
+                row["proof"] = row.get("proof", False) or (found.detected() and not found.doubts)
+            rows.append(row)
+    return rows
+
+
+def marker_with(original: Mesh, key: jm.Key, record: Record) -> Marker:
+    return jm.make_marker(original, key, record=record)
+
+
+def message(mesh: Mesh, seen: dict[str, Mesh], bits: int) -> Row:
+    """The message that decodes best under one key, if 2^28 hashes find one like it whose tag fits."""
+    try:
+        marker = jm.make_marker(mesh, key_of(0), bits=bits)
+    except jm.JaxmarkError as refusal:
+        return {"payload": bits, "suspect": f"refused: {refusal}"}
+    reader: Any = marker.reader
+    chips, best = reader.carrier.chips, (0.0, "none")
+    for name, suspect in seen.items():
+        aligned = align(marker.original, suspect)
+        for way in reader.ways(marker.receive(aligned)):
+            vector = np.asarray(reader.matched_residual(way), np.float64)
+            soft = np.bincount(np.ravel(chips.slots), np.ravel(chips.signs * vector), marker.code_bits)
+            word = polar.decode(soft[None] / np.abs(soft).max(), bits + TAG_BITS, 64)[0][0]
+            score = soft @ (1.0 - 2.0 * polar.encode(word, marker.code_bits))
+            log10_p = evidence.any_of(evidence.log10_p_claimed(score, np.linalg.norm(vector)), 0.0)
+            best = min(best, (evidence.share_of(log10_p, ALIGN_SHARES[aligned.how]), name))
+    paid = min(0.0, best[0] + bits * math.log10(2))
+    return {
+        "payload": bits,
+        "suspect": best[1],
+        "dated": best[0],
+        "undated": evidence.undated(paid),
+        "undated, without paying for messages": evidence.undated(best[0]),
+    }
+
+
+def main() -> None:
+    parser = make_parser(__doc__)
+    parser.add_argument("mesh", metavar="MESH")
+    parser.add_argument("--keys", type=int, default=20, help="keys under which strengths are fitted")
+    parser.add_argument("--bands", type=int, nargs="+", default=[64, 128, 256, 512, 1024], help="numbers of strengths")
+    parser.add_argument("--tries", type=int, default=100_000, help="records that are ground")
+    options = parser.parse_args()
+    mesh = load(parser, options.mesh)
+    seen = suspects(mesh)
+    chance = -math.log10(options.keys * len(seen)) - SLACK
+    fits = [strengths(mesh, seen, options.keys, bands, version) for version in (1, 2) for bands in options.bands]
+    print(f"strengths fitted, lowest of {options.keys} keys and {len(seen)} suspects\n\n{table(fits)}\n")
+    ground = grinding(mesh, seen, options.tries)
+    print(f"chips drawn anew by the last digits of a strength\n\n{table([ground])}\n")
+    moved = presented(mesh)
+    print(f"an original moved against the mark\n\n{table(moved)}\n")
+    chosen = [message(mesh, seen, bits) for bits in PAYLOADS]
+    print(f"the message that decodes best, without its tag\n\n{table(chosen)}\n")
+    checks = {
+        "undated claims by fitted strengths": all(row.get("undated", 0.0) >= chance for row in fits),
+        "dated claims of version 2": all(row.get("printed", 0.0) >= chance for row in fits if row["version"] == 2),
+        "grinding": ground["best printed"] >= ground["by chance"] - SLACK <= ground["undated"],
+        "moved originals": not any(row.get("proof", False) for row in moved),
+        "undated claims of a chosen message": all(row.get("undated", 0.0) >= -SLACK for row in chosen),
+    }
+    for name, holds in checks.items():
+        print(f"{name}: {'no more than chance' if holds else 'FORGED'}")
+    sys.exit(0 if all(checks.values()) else 1)
+
+
+if __name__ == "__main__":
+    main()
