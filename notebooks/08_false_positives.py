@@ -151,7 +151,7 @@ pictures.roc({"right key": np.array(right), "wrong key": np.array(wrong)}, lowes
 # The library pays by itself where it searches: a message that is *read*, not claimed, is the best of all, so that its
 # bound counts all of them, and the keyed tag of 28 bits counts the candidates that tried it before it fitted, 64 at
 # most. What it cannot know is how many suspects, keys or originals *you* went through. For who does not believe you,
-# there is `log10_p_undated`, which takes it that you tried 2^64.
+# there is `log10_p_undated`, which takes it that you tried 2^64, each with all messages.
 
 # %%
 TRIES = 50

@@ -120,6 +120,19 @@ def test_up_to_half_of_the_points_may_be_elsewhere(where, how, share, turned, or
             np.testing.assert_allclose(found[piece], expected, atol=1e-9)
 
 
+def test_a_shuffled_soup_is_not_taken_for_one_in_order(sphere):
+    """All soups of one size have the same faces."""
+
+    def soup(faces):
+        return make_mesh(sphere.vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3))
+
+    original = make_original(soup(sphere.faces), 0.0)
+    assert align(original, soup(sphere.faces)).method == "same"
+    found = align(original, soup(np.random.default_rng(0).permutation(sphere.faces)))
+    assert found.method == "connectivity"
+    assert found.residual < 1e-9
+
+
 @pytest.mark.parametrize("far", [1.0, 1e9, 1e200])
 def test_points_thrown_away_are_masked(far, original: Original):
     displacement = 1e-3 * np.random.default_rng(4).normal(size=(642, 3))

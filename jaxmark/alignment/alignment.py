@@ -42,6 +42,7 @@ _FAR_DISTANCE, _FAR_MULTIPLE = 0.005, 10.0
 _MAX_TRIMMING_ROUNDS = 30  # rounds of fitting a map to the better half of the points
 _MAX_AGREEING_ROUNDS = 10  # rounds of fitting a map to the points that agree with it
 _MAX_FIT_POINTS = 50_000  # random points by which a map is found before all points refine it
+_COPIES_APART = 0.1  # distance of copies of a point, over the size of the suspect, above which its order is another
 _ROUNDING = 1e-12  # error of sums over all points, in diagonals; if no coordinate is off by more, the displacement is 0
 _MAX_COMPONENTS = 4  # largest components of a suspect that are tried one by one
 _MIN_COVERAGE = 0.05  # share of the original that an alignment must show
@@ -101,7 +102,8 @@ def align(original: Original, suspect: Mesh, how: Align = "auto") -> Alignment:
 
 def _align(original: Original, suspect: Mesh, how: Align) -> Alignment:
     mesh, suspect = _points(original), _with_faces_of(original.mesh, suspect)
-    if how == "same" or (how == "auto" and same_connectivity(suspect, original.mesh)):
+    alike = how == "auto" and same_connectivity(suspect, original.mesh) and _has_copies_together(original, suspect)
+    if how == "same" or alike:
         x = np.asarray(original.positions, np.float64)
         y, back = x + residual(original, suspect), _file(original).inverse()
         return _by_points(original, mesh, y, original.used, np.asarray(mesh.faces), "same", back)
@@ -134,6 +136,20 @@ def _with_faces_of(mesh: Mesh, suspect: Mesh) -> Mesh:
         return suspect
     mine, theirs = (np.sort(faces, axis=1) for faces in (mesh.faces, suspect.faces))
     return suspect._replace(faces=mesh.faces) if np.array_equal(mine, theirs) else suspect
+
+
+def _has_copies_together(original: Original, suspect: Mesh) -> bool:
+    """Whether the copies of a point are still near each other in a suspect; of shuffled triangle soup they are not.
+
+    All triangle soups of one size have the same faces, so that their connectivity alone tells nothing of their order.
+    """
+    first = original.weld.first[original.weld.point]
+    copies = np.flatnonzero(first != np.arange(len(first)))
+    vertices = np.asarray(suspect.vertices, np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):  # a vertex may be thrown anywhere
+        apart = np.abs(vertices[copies] - vertices[first[copies]]).max(axis=1)
+        size = np.abs(vertices - np.median(vertices, axis=0)).max(axis=1)
+    return len(copies) == 0 or bool(np.median(apart) <= _COPIES_APART * np.median(size))
 
 
 def _points(original: Original) -> Mesh:

@@ -261,7 +261,9 @@ def detect_command(
     then be folders, too, with files of the same names.
     """
     deposit = None if deposit_file is None else Deposit.load(deposit_file)
-    reader = FileReader(load_key(key_file), bits, message, scheme, how, alpha, deposit, obtained)
+    reader = FileReader(
+        load_key(key_file), bits, message, scheme, how, alpha, deposit, obtained, guesses=not suspect.is_dir()
+    )
     if suspect.is_dir():
         _each(
             suspect,

@@ -30,6 +30,7 @@ creases that turn as a whole; silhouettes; and displacements along the surface, 
 """
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import jax
@@ -60,10 +61,6 @@ _MASKING_SLOPE, _MASKING_BEND = 0.0078 * 88.29, 4.207
 _POOLING = 4  # exponent by which bands are summed
 _MIN_HEIGHT = 1e-5  # of a face over its longest side; flatter ones have no normal
 _MIN_AREA = 1e-3  # of a face over the mean, in its links
-
-
-_DIFFUSIONS = diffusion(_SCALES[-1] + 1, _TERMS)[list(_SCALES)]
-_BANDS = _GAINS[:, None] * (np.vstack([np.eye(1, _TERMS), _DIFFUSIONS[:-1]]) - _DIFFUSIONS)
 
 
 class Hiding(NamedTuple):
@@ -200,16 +197,23 @@ def _normals(x: Array, hiding: Hiding) -> Array:
     return jnp.where(sound, sign * cross / jnp.sqrt(jnp.where(sound, square, 1)), 0)
 
 
+@cache
+def _diffusions() -> Float[np.ndarray, "scales terms"]:
+    """Chebyshev coefficients of the diffusions that divide the bands."""
+    return diffusion(_SCALES[-1] + 1, _TERMS)[list(_SCALES)]
+
+
 def _bands(links: Laplacian, x: Array) -> Array:
     """Split signals of faces into bands, from the shortest waves on; what diffusion leaves is in none of them."""
-    return band_components(links, jnp.asarray(_BANDS, x.dtype), x)
+    bands = _GAINS[:, None] * (np.vstack([np.eye(1, _TERMS), _diffusions()[:-1]]) - _diffusions())
+    return band_components(links, jnp.asarray(bands, x.dtype), x)
 
 
 @jax.jit
 def _hidden(links: Laplacian, normals: Array, length: Array) -> tuple[Array, Array]:
     """Contrast of normals in each band, and the length of edges, both as means around each face."""
     energy = jnp.sum(_bands(links, normals) ** 2, axis=2)
-    diffusions = jnp.asarray(_DIFFUSIONS, energy.dtype)
+    diffusions = jnp.asarray(_diffusions(), energy.dtype)
     around = filter(links, diffusions.T, energy.T).T
     return math.tan(_INCIDENCE) * root(around), band_components(links, diffusions, length)
 
