@@ -4,6 +4,7 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 import jaxmark as jm
 from jaxmark import distortion
@@ -360,3 +361,20 @@ def test_a_record_is_of_the_scheme_that_wrote_it(sphere: Mesh, key: jm.Key, tmp_
     assert make(record=old, scheme=narrow).scheme == make(record=old).scheme == narrow
     with pytest.raises(jm.JaxmarkError, match="record is of the scheme 'keyed'"):
         make(record=old, scheme=scheme)
+
+
+@pytest.mark.slow
+def test_a_remeshed_suspect_of_a_shape_that_is_its_own_mirror_image(key: jm.Key):
+    """Its surface does not tell whether it was mirrored: both ways are read, and paid for."""
+    half = bumpy_sphere(4)
+    radius = np.linalg.norm(half.vertices, axis=1)
+    across = cKDTree(half.vertices / radius[:, None]).query(half.vertices / radius[:, None] * [-1, 1, 1])
+    assert across[0].max() < 1e-6
+    mesh = Mesh(half.vertices * ((radius + radius[across[1]]) / 2 / radius)[:, None], half.faces)
+    marker = jm.make_marker(mesh, key, bits=16)
+    suspect = jm.attack(marker.embed(b"ok", 2e-3)[0], "midpoint", 1, seed=0)
+    mirrored = make_mesh(np.asarray(suspect.vertices) * [-1, 1, 1], np.asarray(suspect.faces)[:, ::-1])
+    plain, other = marker.detect(suspect), marker.detect(mirrored)
+    assert plain.message == other.message == b"ok"
+    assert plain.alignment.pose.mirrors != other.alignment.pose.mirrors
+    assert other.log10_p == pytest.approx(plain.log10_p, rel=0.1)

@@ -7,6 +7,7 @@ was mirrored is read as it was before: any of these maps mirrors where that fits
 """
 
 import time
+from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -14,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Float64, Int64
 
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, residual
-from jaxmark.alignment.registration import refine, register_part, register_whole
+from jaxmark.alignment.registration import BOTH_HANDS, refine, register_part, register_whole
 from jaxmark.alignment.replay import replay_smoothing, replay_smoothing_of_points
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.connectivity import matching_vertices
@@ -78,7 +79,7 @@ def observation(original: Original, found: Alignment) -> Observation:
     )
 
 
-def align(original: Original, suspect: Mesh, how: Align = "auto") -> Alignment:
+def align(original: Original, suspect: Mesh, how: Align = "auto", *, hands: Sequence[bool] = BOTH_HANDS) -> Alignment:
     """Bring a suspect back to the original, and find the displacement of each point that remains.
 
     Args:
@@ -87,6 +88,8 @@ def align(original: Original, suspect: Mesh, how: Align = "auto") -> Alignment:
         how: `"same"` demands the original's vertices and faces in the same order; `"similarity"` and `"affine"` align
             surfaces, up to such a map; `"auto"` takes the first way that works: vertices by their order, vertices by
             connectivity, surfaces up to a similarity. Each map may mirror, and faces may be turned round.
+        hands: whether the pose of a surface may be one that does not mirror, one that mirrors, or either; the surface
+            of a shape that is nearly its own mirror image does not tell.
 
     Raises:
         JaxmarkError: if the suspect does not share the original's connectivity under `"same"`, cannot be aligned (the
@@ -96,11 +99,11 @@ def align(original: Original, suspect: Mesh, how: Align = "auto") -> Alignment:
     if how not in get_args(Align):
         raise JaxmarkError(f"A suspect is aligned by {', '.join(get_args(Align))}, not {how!r}.")
     start = time.perf_counter()
-    found = _align(original, host_mesh(suspect), how)
+    found = _align(original, host_mesh(suspect), how, hands)
     return found._replace(seconds=time.perf_counter() - start, how=how)
 
 
-def _align(original: Original, suspect: Mesh, how: Align) -> Alignment:
+def _align(original: Original, suspect: Mesh, how: Align, hands: Sequence[bool]) -> Alignment:
     mesh, suspect = _points(original), _with_faces_of(original.mesh, suspect)
     alike = how == "auto" and same_connectivity(suspect, original.mesh) and _has_copies_together(original, suspect)
     if how == "same" or alike:
@@ -124,7 +127,7 @@ def _align(original: Original, suspect: Mesh, how: Align) -> Alignment:
                 faces = point[np.asarray(points.faces)]
                 faces = faces[(faces >= 0).all(axis=1)]
                 return _by_points(original, mesh, scale(y), found, faces, "connectivity", scale)
-    return _by_surfaces(original, Surface(mesh), welded, how == "affine")
+    return _by_surfaces(original, Surface(mesh), welded, how == "affine", hands)
 
 
 def _with_faces_of(mesh: Mesh, suspect: Mesh) -> Mesh:
@@ -307,14 +310,16 @@ def _agreeing(
     return error <= max(_FAR_DISTANCE, _FAR_MULTIPLE * np.quantile(error[among], 0.4))
 
 
-def _by_surfaces(original: Original, surface: Surface, suspect: Mesh, by_affine: bool) -> Alignment:
+def _by_surfaces(
+    original: Original, surface: Surface, suspect: Mesh, by_affine: bool, hands: Sequence[bool]
+) -> Alignment:
     """Align a suspect's surface: as the whole of the original, else as a part of it, else one component at a time."""
     whole = Surface(suspect)
     parts = [Surface(part) for part in components(suspect)[:_MAX_COMPONENTS] if area(part) > 0]
     parts = parts if len(parts) > 1 else []
     failed = [(np.inf, 0.0)]
     for part, register in ((whole, register_whole), (whole, register_part), *((p, register_whole) for p in parts)):
-        if (pose := register(surface, part)) is None:
+        if (pose := register(surface, part, hands)) is None:
             continue
         found = _by_surface(original, surface, part, pose, by_affine)
         if (coverage := _coverage(original, found)) >= _MIN_COVERAGE and found.residual <= _FAR_DISTANCE:

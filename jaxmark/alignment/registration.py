@@ -9,6 +9,7 @@ is refined by distances along normals; a pose that mirrors must fit clearly bett
 trimesh's own registration is no alternative, because it compares against an absolute threshold.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import permutations, product
 
@@ -51,14 +52,22 @@ class RegistrationSettings:
 
 
 SETTINGS = RegistrationSettings()
+BOTH_HANDS = (False, True)
 
 
-def register_whole(original: Surface, suspect: Surface, *, settings: RegistrationSettings = SETTINGS) -> Pose | None:
+def register_whole(
+    original: Surface,
+    suspect: Surface,
+    hands: Sequence[bool] = BOTH_HANDS,
+    *,
+    settings: RegistrationSettings = SETTINGS,
+) -> Pose | None:
     """Find the similarity that brings a suspect's surface onto an original's.
 
     Args:
         original: the surface of the welded points, about 1 in size.
         suspect: in any pose and scale, with an area.
+        hands: whether the pose may be one that does not mirror, one that mirrors, or either.
         settings: see `RegistrationSettings`.
 
     Returns:
@@ -75,13 +84,15 @@ def register_whole(original: Surface, suspect: Surface, *, settings: Registratio
     chosen = used[np.random.default_rng(0).permutation(len(used))[: settings.fine_points]]
     points, normals = np.asarray(original.mesh.vertices), vertex_normals(original.mesh)
     ends = []
-    for mirrored in (False, True):
+    for mirrored in hands:
         alike = [start for start in starts if start.mirrors == mirrored]
         if len(alike) > 1:  # the principal axes of a shape that is nearly symmetric leave small features to decide
             count, features = settings.feature_poses, settings.features
             alike += poses_by_features(original.mesh, suspect.mesh, count, [mirrored], settings=features)
             alike += _turned(suspect, target, source, alike, settings)
         ends += _best(suspect, points[chosen], normals[chosen], alike, settings)[:1]
+    if not ends:
+        return None
     _, best = min(ends, key=lambda end: _unlikeliness(end[0], end[1], settings))
     return refine(suspect, points[used], normals[used], best, settings=settings)
 
@@ -102,12 +113,19 @@ def _best(
     return ends
 
 
-def register_part(original: Surface, suspect: Surface, *, settings: RegistrationSettings = SETTINGS) -> Pose | None:
+def register_part(
+    original: Surface,
+    suspect: Surface,
+    hands: Sequence[bool] = BOTH_HANDS,
+    *,
+    settings: RegistrationSettings = SETTINGS,
+) -> Pose | None:
     """Find the similarity that brings a suspect onto the part of the original that it shows, at least a fifth.
 
     Args:
         original: the surface of the welded points, about 1 in size.
         suspect: in any pose and scale, with an area.
+        hands: whether the pose may be one that does not mirror, one that mirrors, or either.
         settings: see `RegistrationSettings`.
 
     Returns:
@@ -119,7 +137,9 @@ def register_part(original: Surface, suspect: Surface, *, settings: Registration
     points, normals, _ = sample(suspect.mesh, settings.samples)
     fine, rounds = slice(settings.fine_points), settings.comparison_rounds
     ends = []
-    for start in poses_by_features(original.mesh, suspect.mesh, settings.feature_poses, settings=settings.features):
+    for start in poses_by_features(
+        original.mesh, suspect.mesh, settings.feature_poses, hands, settings=settings.features
+    ):
         # Every point of a part has its place on the original, but not the other way round: the original is brought
         # onto the part, and that map is inverted.
         posed, along = start(points), unit(normals @ start.matrix.T)

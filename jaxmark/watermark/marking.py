@@ -37,6 +37,7 @@ _SAME_SHAPE = 0.01  # distance of shapes, over their size, below which an origin
 # another one; what is usual keeps nearly all of it.
 ALIGN_SHARES = {"auto": 0.97, "same": 0.01, "similarity": 0.01, "affine": 0.01}
 _CLAIM_SHARE = 0.97
+_HAND_SHARE = 0.97  # of the hand that fits a surface better
 NOISE = 0.005  # half width over the mean distance to the centre: the strongest noise of the SMI 2010 protocol
 COVERAGE = 0.5  # share of the vertices that may be left
 
@@ -175,7 +176,24 @@ class Marker:
         """
         if message is not None:
             self.check_claim(message)
-        aligned = suspect if isinstance(suspect, Alignment) else alignment.align(self.original, suspect, align)
+        if isinstance(suspect, Alignment):
+            return self._detect(suspect, message, weights, 1.0)
+        aligned = alignment.align(self.original, suspect, align)
+        if aligned.method != "surface":
+            return self._detect(aligned, message, weights, 1.0)
+        found = self._detect(aligned, message, weights, _HAND_SHARE)
+        if found.detected():
+            return found
+        # The surface of a shape that is nearly its own mirror image does not tell whether a suspect was mirrored.
+        try:
+            aligned = alignment.align(self.original, suspect, align, hands=(not aligned.pose.mirrors,))
+        except JaxmarkError:
+            return found
+        other = self._detect(aligned, message, weights, 1 - _HAND_SHARE)
+        return min(found, other, key=lambda one: one.log10_p)
+
+    def _detect(self, aligned: Alignment, message: bytes | None, weights: ArrayLike | None, share: float) -> Detection:
+        """Read a suspect as it was aligned, with a share of the probability."""
         received = self.receive(aligned, weights)
         observed, soft = received.observed, self.soft_values(received)
         size = np.sqrt(np.mean(soft**2)) or 1.0
@@ -187,7 +205,7 @@ class Marker:
         if np.abs(aligned.displacement).max() * self.original.diagonal <= 0.75 * self.original.grid:
             remark = "The suspect is the original itself, without a mark."
             return found._replace(scores=np.zeros(len(soft)), remarks=(remark,))
-        return self._weigh(found, received, self._decode(soft), message, ALIGN_SHARES[aligned.how])
+        return self._weigh(found, received, self._decode(soft), message, share * ALIGN_SHARES[aligned.how])
 
     def _weigh(
         self, found: Detection, received: Received, decoded: Decoded | None, claimed: bytes | None, share: float
