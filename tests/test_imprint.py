@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.canonical import grid_spacing, rounded
 from jaxmark.geometry.imprint import Imprint, make_imprint, restore
 from jaxmark.geometry.mesh import Mesh, diagonal, make_mesh
@@ -78,6 +79,17 @@ def test_rounding_is_repeatable_and_the_grid_is_as_stated(mesh: Mesh):
     flipped = np.array(once.points.faces)
     flipped[3] = flipped[3][::-1]
     assert rounded(Mesh(once.points.vertices, flipped), spacing).hash != once.hash
+
+
+def test_degenerate_faces_tell_nothing(mesh: Mesh, imprint: Imprint):
+    """They are in no filter and no hash, so that who adds them changes nothing."""
+    more = make_mesh(mesh.vertices, np.vstack([[[7, 7, 300]], mesh.faces, [[5, 80, 5]]]))
+    found, expected = rounded(more, imprint.grid), rounded(mesh, imprint.grid)
+    assert found.hash == expected.hash
+    np.testing.assert_array_equal(found.points.faces, expected.points.faces)
+    np.testing.assert_array_equal(found.points.vertices, expected.points.vertices)
+    with pytest.raises(JaxmarkError, match="no surface"):
+        rounded(make_mesh(mesh.vertices, [[7, 7, 300]]), imprint.grid)
 
 
 def test_points_that_round_alike_are_one():

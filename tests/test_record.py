@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.watermark.coding.keys import Choices, bind
 from jaxmark.watermark.deposit import Deposit, make_deposit
 from jaxmark.watermark.record import commit
@@ -49,15 +49,16 @@ def edits(record: jm.Record) -> dict[str, jm.Record]:
         "code": "00" * 32,
     }
     changed = {name: dataclasses.replace(record, **{name: value}) for name, value in other.items()}
-    for name in ("centre", "covariance", "tags"):
+    for name in ("centre", "covariance", "order", "tags"):
         value = record.imprint[name][:-4] + "AAA=" if name == "tags" else [0.0] * len(record.imprint[name])
+        value = "00" * 32 if name == "order" else value
         changed[f"imprint/{name}"] = dataclasses.replace(record, imprint={**record.imprint, name: value})
     changed["parameters/unknown"] = dataclasses.replace(record, parameters={**record.parameters, "more": 1})
     return changed
 
 
 FIELDS = ["scheme", "bits", "beta", "original", "parameters", "told", "imprint", "code"]
-FIELDS += ["imprint/centre", "imprint/covariance", "imprint/tags", "parameters/unknown"]
+FIELDS += ["imprint/centre", "imprint/covariance", "imprint/order", "imprint/tags", "parameters/unknown"]
 
 
 @pytest.mark.parametrize("field", FIELDS)
@@ -137,6 +138,29 @@ def test_what_is_presented_is_never_read_with(marked, original: Mesh, key: jm.Ke
     np.testing.assert_array_equal(one.positions, other.positions)
     np.testing.assert_array_equal(one.signal, other.signal)
     assert markers[0].detect(suspect).log10_p == markers[1].detect(suspect).log10_p
+
+
+def test_the_order_of_an_original_is_no_choice(original: Mesh, key: jm.Key):
+    """Whoever could turn the corners of a soup when the suspect is known would choose what is compared with what."""
+    faces = np.asarray(original.faces)
+    corners = np.arange(faces.size).reshape(-1, 3)
+    soup = make_mesh(np.asarray(original.vertices)[faces].reshape(-1, 3), corners)
+    marker = jm.make_marker(soup, key, bits=16)
+    marked, info = marker.embed(MESSAGE, 2e-3, noise=0)
+    best = (corners // 3 * 3 + (np.arange(3) + np.random.default_rng(0).integers(3, size=(len(faces), 1))) % 3).ravel()
+    crafted = make_mesh(np.asarray(soup.vertices)[best], corners)
+    turned = jm.make_marker(crafted, key, record=info.record)
+    np.testing.assert_array_equal(turned.original.positions, marker.original.positions)
+    assert not turned.original.in_order
+    # In whatever order the file is, the same points are compared.
+    found = turned.detect(marked)
+    assert found.message == MESSAGE
+    assert found.alignment.method != "same"
+    with pytest.raises(jm.JaxmarkError, match="another order"):
+        turned.detect(marked, align="same")
+    # Without the record, another order has other choices.
+    assert jm.make_marker(crafted, key, bits=16).choices.context != marker.choices.context
+    assert jm.detect(marked, original=crafted, key=key, message=MESSAGE).log10_p > -6
 
 
 def test_an_edited_original_gives_an_estimate_and_others_are_refused(marked, original: Mesh, key: jm.Key):

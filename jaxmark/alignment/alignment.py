@@ -105,7 +105,13 @@ def align(original: Original, suspect: Mesh, how: Align = "auto", *, hands: Sequ
 
 def _align(original: Original, suspect: Mesh, how: Align, hands: Sequence[bool]) -> Alignment:
     mesh, suspect = _points(original), _with_faces_of(original.mesh, suspect)
-    alike = how == "auto" and same_connectivity(suspect, original.mesh) and _has_copies_together(original, suspect)
+    if how == "same" and not original.in_order:
+        raise JaxmarkError(
+            "The original's file has another order than the one that was marked, so that vertices cannot be compared in"
+            " order; align by 'auto'."
+        )
+    alike = how == "auto" and original.in_order and same_connectivity(suspect, original.mesh)
+    alike = alike and _has_copies_together(original, suspect)
     if how == "same" or alike:
         x = np.asarray(original.positions, np.float64)
         y, back = x + residual(original, suspect), _file(original).inverse()

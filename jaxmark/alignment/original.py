@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int64, Shaped
 
-from jaxmark.geometry.canonical import exact, grid_spacing, rounded
+from jaxmark.geometry.canonical import exact, grid_spacing, order_hash, rounded
 from jaxmark.geometry.mesh import Mesh, Weld, diagonal, displacement, host_mesh, used_vertices
 from jaxmark.spectral.laplacian import Laplacian, centre
 from jaxmark.spectral.shapes import common_laplacian, pad_rows
@@ -27,8 +27,10 @@ class Original:
     used: Bool[np.ndarray, " points"]  # mask of the points that faces use
     diagonal: float  # of the points, in the file's units
     geometry: bytes  # hash of the canonical geometry
+    order: bytes  # hash of the file's order of points and faces, see `jaxmark.geometry.canonical.order_hash`
     places: Int64[np.ndarray, " points"]  # number of each point among those that faces use in this geometry, or -1
     count: int  # number of points that faces use in this geometry
+    in_order: bool  # whether the file has the order that was marked, so that suspects are compared vertex by vertex
     operator: Laplacian  # the Laplacian of the points, traced
     positions: Float64[np.ndarray, "points 3"]  # points, centred as a whole, in diagonals
     signal: Float[Array, "rows 3"]  # points, centred per connected component, in diagonals, traced
@@ -86,8 +88,10 @@ def make_original(mesh: Mesh, grid: float | None = None) -> Original:
         used,
         length,
         geometry,
+        order_hash(mesh, welded),
         places,
         int(used.sum()),
+        True,
         traced,
         positions,
         signal,

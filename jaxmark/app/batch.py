@@ -1,5 +1,6 @@
 """Mark and read mesh files, one at a time."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -230,17 +231,22 @@ class FileReader:
         return self._last[1]
 
 
+def power(log10_p: float) -> str:
+    """A bound as a power of ten, which rounding makes no smaller."""
+    return f"10^{math.ceil(10 * log10_p - 1e-9) / 10 + 0.0:.1f}"
+
+
 def describe(found: Detection, detected: bool, alpha: float, dated: float | None, remarks: Sequence[str]) -> str:
     """What was found, in words."""
     read = f"message {found.message.hex()}" if found.message is not None else "no message could be read"
     said = f"{'detected' if detected else 'nothing detected'}: {read}; "
     if found.doubts:
-        said += f"false-positive probability about 10^{found.log10_p:.1f}, an estimate: {'; '.join(found.doubts)}"
+        said += f"false-positive probability about {power(found.log10_p)}, an estimate: {'; '.join(found.doubts)}"
     else:
         said += (
-            f"false-positive probability at most 10^{found.log10_p:.1f} if key, original, message and record were fixed"
-            f" before the suspect existed, 10^{found.log10_p_undated:.1f} if nothing dates them"
+            f"false-positive probability at most {power(found.log10_p)} if key, original, message and record were fixed"
+            f" before the suspect existed, {power(found.log10_p_undated)} if nothing dates them"
         )
         if dated is not None:
-            said += f", 10^{dated:.1f} if the deposit is older than the suspect"
+            said += f", {power(dated)} if the deposit is older than the suspect"
     return " ".join([f"{said} (--alpha {alpha:g})", *remarks])

@@ -18,7 +18,7 @@ import click
 
 from jaxmark import distortion
 from jaxmark.alignment.alignment import Align
-from jaxmark.app.batch import FileReader, Told, mark_file, mesh_files
+from jaxmark.app.batch import FileReader, Told, mark_file, mesh_files, power
 from jaxmark.attacks import ATTACKS, chain, get_attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.study_file import load_study
@@ -260,6 +260,8 @@ def detect_command(
     For a folder, each file gets a line of output, and the exit status is the worst of all. --original and --record may
     then be folders, too, with files of the same names.
     """
+    if deposit_file is not None and record_file is None:
+        raise JaxmarkError("A deposit dates records: give the --record that is in it, too.")
     deposit = None if deposit_file is None else Deposit.load(deposit_file)
     reader = FileReader(
         load_key(key_file), bits, message, scheme, how, alpha, deposit, obtained, guesses=not suspect.is_dir()
@@ -329,7 +331,12 @@ def identify_command(
         "ranking": [one._asdict() for one in found],
         "recipients": len(names),
     }
-    lines = [f"{one.recipient}: score {one.score:.1f}, probability at most 10^{one.log10_p:.1f}" for one in accused]
+    lines = [
+        f"{one.recipient}: score {one.score:.1f}, probability "
+        + (f"about {power(one.log10_p)}, an estimate: {'; '.join(one.doubts)}" if one.doubts else "")
+        + ("" if one.doubts else f"at most {power(one.log10_p)}")
+        for one in accused
+    ]
     _answer(as_json, answer, "\n".join(lines) or f"nobody of {len(names)} is accused (--alpha {alpha:g})")
     sys.exit(0 if accused else 1)
 

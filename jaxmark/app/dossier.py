@@ -6,6 +6,7 @@ It holds nothing secret: no key, and of the original only pictures. Needs the ex
 import base64
 import hashlib
 import json
+import math
 import platform
 import shlex
 from dataclasses import dataclass
@@ -105,7 +106,7 @@ def _facts(case: Case) -> dict[str, Any]:
         "remarks": list(found.remarks),
         "log10_p": found.log10_p,
         "log10_p_undated": found.log10_p_undated,
-        "chance": _in_words(found.log10_p),
+        "chance": _in_words(found.log10_p_undated if deposited is None else deposited["log10_p"]),
         "deposit": deposited,
         "obtained": case.obtained,
         "coverage": found.coverage,
@@ -128,8 +129,11 @@ def _facts(case: Case) -> dict[str, Any]:
 
 
 def _in_words(log10_p: float) -> str:
-    """A probability for people: 10^-9 is once in 1,000 million cases."""
-    return f"at most once in 10^{-log10_p:.0f} cases" if log10_p < -9 else f"at most once in {10**-log10_p:,.0f} cases"
+    """A bound for people, rounded so that it stays one: 10^-9.7 is at most once in 10^9 cases."""
+    if log10_p > -3:
+        return "with a probability that only a date can bound, see below"
+    cases = math.floor(-log10_p)
+    return f"at most once in 10^{cases} cases" if cases > 9 else f"at most once in {10**cases:,} cases"
 
 
 def _command(case: Case) -> str:

@@ -19,7 +19,11 @@ _MAX_EIGEN_POINTS = 20_000  # more points have eigenpairs that take minutes
 
 def is_original(suspect: Mesh, record: Record, key: bytes) -> bool:
     """Whether a suspect is the original that a record was made for, as some file has it."""
-    return record.version > 1 and restore(suspect, record.open_imprint(key)).exact
+    try:
+        record.check(record.content, key)
+        return record.version > 1 and restore(suspect, record.open_imprint(key)).exact
+    except JaxmarkError:
+        return False
 
 
 def guess_mistakes(suspect: Mesh, marker: Marker, how: Align) -> tuple[str, ...]:
@@ -37,7 +41,7 @@ def guess_mistakes(suspect: Mesh, marker: Marker, how: Align) -> tuple[str, ...]
         too_long = scheme == EigenScheme.name and len(original.vertices) > _MAX_EIGEN_POINTS
         if (scheme, bits) != mine and not too_long and _reads(original, suspect, marker, scheme, bits, how):
             return (f"A message of {bits} bits reads with the scheme {scheme!r}: give these, or the record.",)
-    return ()
+    return ("Without its record, a mark reads only with the original's file as it was marked, or one of its numbers.",)
 
 
 def _reads(original: Mesh, suspect: Mesh, marker: Marker, scheme: str, bits: int, how: Align) -> bool:

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int64
 
+from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.hashing import points_hash
-from jaxmark.geometry.mesh import Mesh, Weld, diagonal, used_vertices, weld, weld_mesh
+from jaxmark.geometry.mesh import Mesh, Weld, diagonal, weld, weld_mesh
 
 # Six significant digits are off by up to 5e-6 of the largest coordinate, float32 by 6e-8. Both stay below a quarter of
 # the grid's spacing, 1.5e-5 to 3e-5 of the diagonal, where coordinates are no larger than three quarters of the latter.
@@ -47,12 +48,16 @@ def grid_spacing(mesh: Mesh) -> float:
 def rounded(mesh: Mesh, spacing: float) -> Canonical:
     """The geometry of version 2: points on a grid, in the order of their coordinates; those that no face uses are last.
 
-    The hash covers the spacing, the points that faces use, and the faces with three different corners, whatever corner
-    comes first; so it survives a file format that has no isolated vertices or no order.
+    Faces begin at their lowest corner and are sorted, and those without three different corners are left out: neither
+    tells anything of the order in a file, nor of what a format leaves out. The hash covers the spacing, the points that
+    faces use, and the faces.
 
     Args:
         mesh: any mesh.
         spacing: distance of the grid's planes, in units of the mesh; a power of two.
+
+    Raises:
+        JaxmarkError: if no face is left.
     """
     cells = np.rint(np.asarray(mesh.vertices, np.float64) / spacing) * spacing + 0.0  # turns -0.0 into 0.0
     order = np.lexsort(cells.T[::-1])
@@ -60,25 +65,43 @@ def rounded(mesh: Mesh, spacing: float) -> Canonical:
     fresh = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))
     point = np.empty_like(order)
     point[order] = np.cumsum(fresh) - 1
-    used = np.bincount(point[used_vertices(mesh)], minlength=int(fresh.sum())) > 0
+    corners = point[np.asarray(mesh.faces)]
+    a, b, c = corners.T
+    corners = corners[(a != b) & (b != c) & (c != a)]
+    if not len(corners):
+        raise JaxmarkError(
+            "No face of the mesh has three corners that differ by more than rounding; it has no surface."
+        )
+    used = np.zeros(int(fresh.sum()), bool)
+    used[corners] = True
     place = np.empty(len(used), np.int64)
     place[np.argsort(~used, kind="stable")] = np.arange(len(used))
     point = place[point]
     first = np.empty(len(used), np.int64)
     first[point[::-1]] = np.arange(len(point))[::-1]
-    points = Mesh(cells[first], point[np.asarray(mesh.faces)])
+    points = Mesh(cells[first], _sorted_faces(place[corners]))
     state = hashlib.sha256(b"jaxmark/2/geometry")
-    faces = _sorted_faces(np.asarray(points.faces))
-    state.update(np.array([used.sum(), len(faces)], "<i8").tobytes())
+    state.update(np.array([used.sum(), len(points.faces)], "<i8").tobytes())
     state.update(np.array(spacing, "<f8").tobytes())
-    state.update(points.vertices[: used.sum()].astype("<f8").tobytes())
-    state.update(faces.astype("<i8").tobytes())
+    state.update(np.asarray(points.vertices)[: used.sum()].astype("<f8").tobytes())
+    state.update(np.asarray(points.faces).astype("<i8").tobytes())
     return Canonical(points, Weld(point, first), state.digest())
 
 
-def _sorted_faces(faces: Int64[np.ndarray, "faces 3"]) -> Int64[np.ndarray, "sorted 3"]:
-    """The faces with three different corners, each from its lowest corner on, in ascending order."""
-    a, b, c = faces.T
-    faces = faces[(a != b) & (b != c) & (c != a)]
+def order_hash(mesh: Mesh, welded: Weld) -> bytes:
+    """SHA-256 of the order in which a file has the canonical points, and of its faces.
+
+    A suspect may be compared vertex by vertex only with an original of this very order: whoever could choose the order
+    when the suspect is known could choose what is compared with what.
+    """
+    state = hashlib.sha256(b"jaxmark/2/order")
+    state.update(np.array([len(welded.point), len(mesh.faces)], "<i8").tobytes())
+    state.update(welded.point.astype("<i8").tobytes())
+    state.update(np.asarray(mesh.faces).astype("<i8").tobytes())
+    return state.digest()
+
+
+def _sorted_faces(faces: Int64[np.ndarray, "faces 3"]) -> Int64[np.ndarray, "faces 3"]:
+    """Faces in ascending order, each from its lowest corner on."""
     turned = np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
     return turned[np.lexsort(turned.T[::-1])]

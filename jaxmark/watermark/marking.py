@@ -18,7 +18,7 @@ from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.canonical import Canonical
-from jaxmark.geometry.imprint import make_imprint, restore
+from jaxmark.geometry.imprint import Imprint, make_imprint, restore
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark import evidence
 from jaxmark.watermark.budget import Budget, Limits, make_budget, write
@@ -312,7 +312,8 @@ class Marker:
         )
         if record.version == 1:
             return record
-        imprint = make_imprint(Canonical(original.points, original.weld, original.geometry), original.grid)
+        canonical = Canonical(original.points, original.weld, original.geometry)
+        imprint = make_imprint(canonical, original.grid, original.order)
         record = replace(
             record, told=commit(told, self.choices) if told else "", imprint=seal_imprint(imprint, self.key)
         )
@@ -471,6 +472,7 @@ def bind_mark(
     """
     parameters = parameters_of(scheme) if record is None else record.parameters
     fixed = {"content": content, "scheme": scheme.name, "parameters": parameters, "bits": bits}
+    fixed["order"] = original.order.hex()
     return bind(key, original.geometry, fixed, version)
 
 
@@ -499,11 +501,11 @@ def recall(original: Mesh, key: bytes, record: Record | None, version: int) -> t
     imprint = record.open_imprint(key)
     ready = make_original(original, imprint.grid)
     if ready.geometry == imprint.hash:
-        return ready, ()
+        return _in_order_of(ready, imprint), ()
     copy = restore(original, imprint)
     ready = make_original(copy.mesh, imprint.grid)
     if copy.exact:
-        return ready, ()
+        return _in_order_of(ready, imprint), ()
     if copy.share < _MIN_ORIGINAL_SHARE:
         said = f"{100 * copy.share:.0f} % of that mesh's points are in it"
         if copy.distance < _SAME_SHAPE:
@@ -518,7 +520,13 @@ def recall(original: Mesh, key: bytes, record: Record | None, version: int) -> t
     places = np.full(len(ready.used), -1)
     places[ready.weld.point] = copy.places
     ready = replace(ready, geometry=imprint.hash, places=places, count=len(imprint.tags))
+    ready = _in_order_of(ready, imprint)
     return ready, (f"the original was edited: {100 * copy.share:.1f} % of its points are left",)
+
+
+def _in_order_of(original: Original, imprint: Imprint) -> Original:
+    """The original, bound to the order that was marked, which its file may have no longer."""
+    return replace(original, order=imprint.order, in_order=original.order == imprint.order)
 
 
 def _matches_record(scheme: Scheme, record: Record) -> bool:

@@ -104,6 +104,7 @@ class Record:
                 np.array(self.imprint["centre"], np.float64).reshape(3),
                 np.array(self.imprint["covariance"], np.float64).reshape(3, 3),
                 tags ^ _stream(key, self.original, len(tags)),
+                bytes.fromhex(self.imprint["order"]),
             )
         except (KeyError, ValueError, TypeError):
             raise JaxmarkError("The record is damaged: its imprint of the original is not whole.") from None
@@ -161,6 +162,7 @@ def seal_imprint(imprint: Imprint, key: bytes) -> dict[str, Any]:
         "grid": imprint.grid,
         "centre": imprint.centre.tolist(),
         "covariance": imprint.covariance.tolist(),
+        "order": imprint.order.hex(),
         "tags": base64.b64encode(tags.astype("<u4").tobytes()).decode(),
     }
 

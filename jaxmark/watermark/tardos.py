@@ -40,6 +40,7 @@ class Accusation(NamedTuple):
     recipient: str  # identifier
     score: float  # of mean 0 and variance 1 for innocents
     log10_p: float  # log10 of a bound on the probability that any innocent among those tried has such a score
+    doubts: tuple[str, ...] = ()  # why the probability is an estimate, not proven; empty if it is
 
 
 def biases(choices: Choices, length: int) -> Float64[np.ndarray, " slots"]:

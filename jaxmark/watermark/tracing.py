@@ -61,7 +61,8 @@ class Tracer:
         """Rank recipients by their scores in a suspect; see `identify`."""
         aligned = alignment.align(self.marker.original, suspect, align)
         soft = self.marker.soft_values(self.marker.receive(aligned))
-        return pay(rank(soft, recipients, self.marker.choices, top=top), ALIGN_SHARES[align])
+        ranked = rank(soft, recipients, self.marker.choices, top=top)
+        return [one._replace(doubts=self.marker.doubts) for one in pay(ranked, ALIGN_SHARES[align])]
 
 
 def pay(ranking: Iterable[Accusation], share: float) -> list[Accusation]:
