@@ -233,7 +233,7 @@ def test_a_vertex_thrown_away_is_masked(sphere: Mesh, key: jm.Key):
 
 
 def test_record_binds_and_remembers(sphere: Mesh, key: jm.Key, tmp_path):
-    scheme = HostScheme(bands=64, damping="lanczos")
+    scheme = HostScheme(bands=128, damping="lanczos")
     marked, info = jm.embed(sphere, b"record", key, scheme=scheme)
     path = tmp_path / "record.json"
     path.write_text(info.record.to_json())

@@ -260,9 +260,9 @@ def detect_command(
     For a folder, each file gets a line of output, and the exit status is the worst of all. --original and --record may
     then be folders, too, with files of the same names.
     """
-    if deposit_file is not None and record_file is None:
-        raise JaxmarkError("A deposit dates records: give the --record that is in it, too.")
     deposit = None if deposit_file is None else Deposit.load(deposit_file)
+    if deposit is not None and record_file is None:
+        raise JaxmarkError("A deposit dates records: give the --record that is in it, too.")
     reader = FileReader(
         load_key(key_file), bits, message, scheme, how, alpha, deposit, obtained, guesses=not suspect.is_dir()
     )
