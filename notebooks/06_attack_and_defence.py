@@ -79,7 +79,7 @@ seek = jax.jit(lambda one: descend(surrogate, strength, one, family="bands", ste
 found = seek(jax.random.key(1))
 print(f"expected evidence at {4 * size:g}: another mark {expected(other):.1f}, optimised {expected(found):.1f}")
 assert expected(found) < expected(other) < expected(jnp.zeros_like(other))
-moved = marked._replace(vertices=marked.vertices + original.diagonal * original.to_host(found))
+moved = marked._replace(vertices=marked.vertices + original.diagonal * original.to_host(found)[original.weld.point])
 print(f"the owner's claim of it: log10 p {marker.detect(moved, message).log10_p:.1f}")
 
 # %% [markdown]

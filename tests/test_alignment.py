@@ -455,7 +455,7 @@ def test_a_suspect_is_aligned_once_for_several_keys(original: Original):
     mesh, message = original.mesh, b"m"
     first, second = (jm.make_marker(mesh, bytes([i]) * 32, bits=8) for i in (1, 2))
     suspect, _ = anywhere(first.embed(message, noise=0)[0], 6)
-    aligned = align(original, suspect)
+    aligned = align(first.original, suspect)
     found, again = first.detect(suspect), first.detect(aligned)
     assert found.message == again.message == message
     assert found.log10_p == again.log10_p
