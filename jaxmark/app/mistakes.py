@@ -41,7 +41,7 @@ def guess_mistakes(suspect: Mesh, marker: Marker, how: Align) -> tuple[str, ...]
         too_long = scheme == EigenScheme.name and len(original.vertices) > _MAX_EIGEN_POINTS
         if (scheme, bits) != mine and not too_long and _reads(original, suspect, marker, scheme, bits, how):
             return (f"A message of {bits} bits reads with the scheme {scheme!r}: give these, or the record.",)
-    return ("Without its record, a mark reads only with the original's file as it was marked, or one of its numbers.",)
+    return ("Without its record, a mark reads only with the original's numbers as they were marked, in their order.",)
 
 
 def _reads(original: Mesh, suspect: Mesh, marker: Marker, scheme: str, bits: int, how: Align) -> bool:

@@ -685,11 +685,15 @@ def make_markers(
 
     Args and raises: see `make_marker`.
     """
-    versions = VERSIONS if record is None else (record.version,)
     return [
         make_marker(original, key, bits=bits, record=record, scheme=scheme, detector=detector, version=version)
-        for version in versions
+        for version in versions_of(record)
     ]
+
+
+def versions_of(record: Record | None) -> tuple[int, ...]:
+    """The versions of the keyed choices to read with: that of the record, or without one all, the newest first."""
+    return VERSIONS if record is None else (record.version,)
 
 
 def detect_any(

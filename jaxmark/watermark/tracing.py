@@ -14,8 +14,8 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark import evidence
 from jaxmark.watermark.budget import Limits, make_budget
-from jaxmark.watermark.coding.keys import KEY_BYTES, SCHEME_VERSION, VERSIONS, Key
-from jaxmark.watermark.marking import ALIGN_SHARES, EmbedInfo, Marker, bind_mark, recall
+from jaxmark.watermark.coding.keys import KEY_BYTES, SCHEME_VERSION, Key
+from jaxmark.watermark.marking import ALIGN_SHARES, EmbedInfo, Marker, bind_mark, recall, versions_of
 from jaxmark.watermark.record import Record
 from jaxmark.watermark.schemes import DEFAULT_SCHEME, get_scheme
 from jaxmark.watermark.tardos import Accusation, biases, codewords, rank
@@ -157,7 +157,7 @@ def identify(
     Raises:
         JaxmarkError: see `make_tracer`; also if the suspect cannot be aligned, or an identifier is empty.
     """
-    versions, tried = VERSIONS if record is None else (record.version,), list(recipients)
+    versions, tried = versions_of(record), list(recipients)
     rankings = []
     for version in versions:
         tracer = make_tracer(original, key, record=record, version=version)
