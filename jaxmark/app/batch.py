@@ -205,6 +205,7 @@ class FileReader:
                     found,
                     self.message is not None,
                     self.deposit,
+                    dated,
                     self.obtained,
                 ),
             )

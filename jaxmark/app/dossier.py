@@ -43,6 +43,7 @@ class Case:
     found: Detection
     claimed: bool  # whether the message was claimed
     deposit: Deposit | None
+    dated: float | None  # log10 of the bound if the deposit is older than the suspect
     obtained: str  # when and where the suspect was got
 
 
@@ -92,11 +93,11 @@ def _facts(case: Case) -> dict[str, Any]:
     ]
     aligned = found.alignment
     deposited = None
-    if deposit is not None and record is not None:
+    if deposit is not None and case.dated is not None:
         deposited = {
             "root": deposit.root,
             "records": len(deposit.digests),
-            "log10_p": deposit.log10_p(found.log10_p, record, claimed=case.claimed),
+            "log10_p": case.dated,
         }
     return {
         "suspect": files[0],
