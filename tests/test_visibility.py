@@ -45,7 +45,7 @@ def test_rough_regions_are_moved_more(half_rough: Mesh, key: jm.Key):
     assert np.sqrt(np.mean(hidden**2)) == pytest.approx(1, rel=1e-5)
     x = np.asarray(half_rough.vertices)[:, 0]
     assert hidden[x > 0.3].mean() > 1.2 * hidden[x < -0.3].mean()
-    scheme = KeyedScheme(masking=True)
+    scheme = KeyedScheme(masking=True, hiding=False)
     marker = jm.make_marker(half_rough, key, bits=16, scheme=scheme)
     marked, info = marker.embed(b"ok", 1e-3, noise=0)
     moved = np.linalg.norm(np.asarray(marked.vertices) - half_rough.vertices, axis=1)
@@ -57,7 +57,7 @@ def test_rough_regions_are_moved_more(half_rough: Mesh, key: jm.Key):
 
 
 def test_a_profile_is_what_is_written(half_rough: Mesh, key: jm.Key, dtype):
-    scheme = KeyedScheme(bands=32, profile=(0.0, 1.0, 0.5, 0.0, 0.25))
+    scheme = KeyedScheme(bands=32, profile=(0.0, 1.0, 0.5, 0.0, 0.25), hiding=False)
     original = make_original(half_rough)
     carrier = scheme.carrier(original, Choices(key, b""), 16, 88)
     assert isinstance(carrier, KeyedCarrier)

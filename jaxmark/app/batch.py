@@ -16,6 +16,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import SUFFIXES, load_mesh, save_mesh
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.budget import Visibility
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.deposit import Deposit
 from jaxmark.watermark.marking import Detection, Marker, detect_any, make_marker, make_markers
@@ -58,6 +59,7 @@ def mark_file(
     recipient: str | None = None,
     budget: float | None = None,
     limits: Mapping[str, float] | None = None,
+    visibility: Visibility | None = None,
     noise: float,
     scheme: str = DEFAULT_SCHEME,
 ) -> Told:
@@ -72,6 +74,7 @@ def mark_file(
         recipient: identifier of the recipient of this copy; None if `message` is given.
         budget: see `embed`.
         limits: see `embed`.
+        visibility: see `embed`.
         noise: see `embed`.
         scheme: name of the scheme.
 
@@ -84,14 +87,14 @@ def mark_file(
     marker = None
     if message is not None:
         marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
-        result, info = marker.embed(message, budget, limits=limits, noise=noise, read_back=False)
+        result, info = marker.embed(message, budget, limits=limits, visibility=visibility, noise=noise, read_back=False)
         prepared = marker.original
         said, reads = f"{info.record.bits} bits", lambda mesh: marker.reads(mesh, message)
     else:
         if scheme != DEFAULT_SCHEME:
             raise JaxmarkError(f"Fingerprints are carried by the scheme {DEFAULT_SCHEME!r}, not {scheme!r}.")
         tracer, name = make_tracer(mesh, key), str(recipient)
-        result, info = tracer.fingerprint(name, budget, limits=limits)
+        result, info = tracer.fingerprint(name, budget, limits=limits, visibility=visibility)
         prepared = tracer.marker.original
         said, reads = f"fingerprint of {recipient}", lambda mesh: tracer.finds(mesh, name)
     with replacing(marked) as draft, replacing(record) as record_draft:

@@ -26,7 +26,7 @@ from jaxmark.extras import require
 from jaxmark.files import load_mesh, save_mesh
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import same_connectivity
-from jaxmark.watermark.budget import DEFAULT_LIMITS, make_budget
+from jaxmark.watermark.budget import VISIBILITY, Visibility, make_budget
 from jaxmark.watermark.coding.keys import commitment, load_key, new_key, save_key
 from jaxmark.watermark.deposit import Deposit, make_deposit
 from jaxmark.watermark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity
@@ -106,9 +106,12 @@ _LIMIT = click.option(
     "limits",
     type=_Limit(),
     multiple=True,
-    help="Upper limit on a metric of `jaxmark compare`; may be repeated.  [default, without --budget: "
-    + " ".join(f"{name}={value:g}" for name, value in DEFAULT_LIMITS.items())
-    + "]",
+    help="Upper limit on a metric of `jaxmark compare`; may be repeated.",
+)
+_VISIBILITY = click.option(
+    "--visibility",
+    type=click.Choice(list(VISIBILITY)),
+    help="How well people may see the mark.  [default, without --budget and --limit: hidden]",
 )
 
 
@@ -152,6 +155,7 @@ def keygen(keyfile: Path, as_json: bool) -> None:
 @click.option("--recipient", help="Instead of a message: the recipient of this copy, for `jaxmark identify`.")
 @_BUDGET
 @_LIMIT
+@_VISIBILITY
 @_NOISE
 @click.option(
     "--scheme",
@@ -170,6 +174,7 @@ def embed_command(
     recipient: str | None,
     budget: float | None,
     limits: tuple[tuple[str, float], ...],
+    visibility: Visibility | None,
     noise: float,
     scheme: str,
     record_file: Path | None,
@@ -188,6 +193,7 @@ def embed_command(
         recipient=recipient,
         budget=budget,
         limits=dict(limits) or None,
+        visibility=visibility,
         noise=noise,
         scheme=scheme,
     )
@@ -439,6 +445,7 @@ def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> N
 @click.argument("mesh", type=_MESH)
 @_BUDGET
 @_LIMIT
+@_VISIBILITY
 @_NOISE
 @click.option(
     "--coverage", type=float, default=COVERAGE, show_default=True, help="Share of the vertices that may be left."
@@ -448,12 +455,13 @@ def capacity_command(
     mesh: Path,
     budget: float | None,
     limits: tuple[tuple[str, float], ...],
+    visibility: Visibility | None,
     noise: float,
     coverage: float,
     as_json: bool,
 ) -> None:
     """Say how many bits the keyed scheme can hide in MESH so that they survive noise and the loss of vertices."""
-    bounds = make_budget(budget, dict(limits) or None)
+    bounds = make_budget(budget, dict(limits) or None, visibility)
     bits = capacity(load_mesh(mesh), bounds.rms, limits=bounds.limits, noise=noise, coverage=coverage)
     answer = {"bits": bits, "budget": bounds.rms, "limits": bounds.limits, "noise": noise, "coverage": coverage}
     _answer(as_json, answer, f"{bits} bits at {bounds}, noise {noise:g}, coverage {coverage:g}")
@@ -487,7 +495,7 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
       seeds = 5
       schemes = ["keyed", "host"]
       payloads = [64]
-      budgets = [0.0008, {dame = 0.008}]
+      budgets = [0.0008, "hidden", {dame = 0.008}]
       [meshes]
       model = "model.ply"
       [attacks]

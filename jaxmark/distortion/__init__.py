@@ -9,6 +9,7 @@ from jaxmark.distortion._compare import RENDERED as RENDERED
 from jaxmark.distortion._compare import Comparison as Comparison
 from jaxmark.distortion._compare import DisplacementSize as DisplacementSize
 from jaxmark.distortion._compare import Metric as Metric
+from jaxmark.distortion._compare import Reference as Reference
 from jaxmark.distortion._compare import compare as compare
 from jaxmark.distortion._compare import displacement_size as displacement_size
 from jaxmark.distortion._compare import measure as measure
@@ -29,6 +30,7 @@ from jaxmark.distortion._shading import make_hiding as make_hiding
 from jaxmark.distortion._shading import shading as shading
 from jaxmark.distortion._shading import vertex_means as vertex_means
 from jaxmark.distortion._shading import visible_turn as visible_turn
+from jaxmark.distortion._stretch import stretch as stretch
 from jaxmark.distortion.dihedral import dame as dame
 from jaxmark.distortion.dihedral import dihedral_angles as dihedral_angles
 from jaxmark.distortion.dihedral import make_hinges as make_hinges

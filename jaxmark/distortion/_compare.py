@@ -13,6 +13,7 @@ from jaxmark.distortion._curvature import curvature_tensor, tensor_distance
 from jaxmark.distortion._geometric_laplacian import gl
 from jaxmark.distortion._msdm import Views, msdm, msdm2, msdm2_views, msdm_views
 from jaxmark.distortion._shading import Hiding, make_hiding, shading, vertex_means, visible_turn
+from jaxmark.distortion._stretch import stretch
 from jaxmark.distortion.dihedral import Hinges, dame, make_hinges
 from jaxmark.distortion.displacement import maximum, rms
 from jaxmark.distortion.rendered import flip, ssim
@@ -33,6 +34,8 @@ from jaxmark.geometry.mesh import (
     weld,
     weld_mesh,
 )
+
+Metric = str | Callable[[Mesh, Mesh], float]  # a name in `METRICS` or `RENDERED`, or a function: see `measure`
 
 
 class DisplacementSize(NamedTuple):
@@ -64,7 +67,8 @@ class Comparison(NamedTuple):
     msdm: float | None  # difference of structure, 0 to 1 (Lavoué et al. 2006)
     msdm2: float | None  # difference of structure at three scales, 0 to 1 (Lavoué 2011)
     curvature: float | None  # change of curvature tensors, 0 to 1 (in the manner of Torkhani et al.)
-    shading: float | None  # visible turn of normals that 5 % of the area exceed, in just noticeable differences
+    stretch: float | None  # change of length that 1 % of the edges exceed, over their lengths
+    shading: float | None  # visible turn of normals that 1 % of the area exceed, in just noticeable differences
     flip: float | None = None  # difference of pictures by FLIP that 1 % of their pixels exceed, 0 to 1; see `RENDERED`
     ssim: float | None = None  # likewise by structural similarity, as 1 - SSIM
 
@@ -82,22 +86,69 @@ def displacement_size(original: Mesh, distorted: Mesh) -> DisplacementSize:
     )
 
 
+class Reference:
+    """An original that any number of meshes are compared with; what metrics need of it is computed once."""
+
+    def __init__(self, original: Mesh) -> None:
+        """Prepare an original.
+
+        Args:
+            original: any mesh with an area.
+
+        Raises:
+            JaxmarkError: see `compare`.
+        """
+        self.given = host_mesh(original)
+        self.length, self.welded = diagonal(self.given), weld(self.given.vertices)
+        self.centre = np.asarray(self.given.vertices, np.float64)[used_vertices(self.given)].mean(axis=0)
+        self.mesh = self.at_unit_size(self.given, self.welded, "original")
+        self.faces = np.asarray(self.mesh.faces)
+
+    def at_unit_size(self, mesh: Mesh, points: Weld, name: str) -> Mesh:
+        """The distinct points of a mesh that faces use, moved and scaled as the original is to unit size."""
+        scaled = mesh._replace(vertices=(np.asarray(mesh.vertices, np.float64) - self.centre) / self.length)
+        scaled = _plain(scaled, points)
+        if not 0 < area(scaled) < np.inf:
+            raise JaxmarkError(f"The {name} has an area of {area(scaled):g}; its shape cannot be compared.")
+        return scaled
+
+    @cached_property
+    def hinges(self) -> Hinges:
+        return make_hinges(self.faces)
+
+    @cached_property
+    def hiding(self) -> Hiding:
+        return make_hiding(np.asarray(self.mesh.vertices), self.faces)
+
+    def measure(self, distorted: Mesh, metrics: Collection[Metric]) -> dict[Metric, float | None]:
+        """Measure how far a mesh was distorted from this original; see `measure`."""
+        names = [metric for metric in metrics if isinstance(metric, str)]
+        known = {**_METRICS, **_RENDERED}
+        if unknown := [name for name in names if name not in known]:
+            raise JaxmarkError(f"There is no metric {unknown[0]!r}; there are {', '.join(known)}.")
+        pair = _Pair(self, distorted)
+        wanted = {name for name in names if pair.same or name in _ANY_CONNECTIVITY}
+        found: dict[Metric, float | None] = {}
+        for metric in metrics:
+            if isinstance(metric, str):
+                found[metric] = float(known[metric](pair)) if metric in wanted else None
+                continue
+            found[metric] = value = float(metric(*pair.given))
+            if not 0 <= value < np.inf:
+                said = f"The metric {name_of(metric)!r} must be a finite number, not negative"
+                raise JaxmarkError(f"{said}, got {value:g}.")
+        return found
+
+
 class _Pair:
     """Two meshes at unit size, with the intermediates that several metrics share, computed at first use."""
 
-    def __init__(self, original: Mesh, distorted: Mesh) -> None:
-        first, second = host_mesh(original), host_mesh(distorted)
-        self.given = first, second
-        self.same = same_connectivity(first, second)
-        length, self.welded = diagonal(first), weld(first.vertices)
-        centre = np.asarray(first.vertices, np.float64)[used_vertices(first)].mean(axis=0)
-        self.meshes = [
-            _plain(mesh._replace(vertices=(np.asarray(mesh.vertices, np.float64) - centre) / length), points)
-            for mesh, points in ((first, self.welded), (second, self.welded if self.same else weld(second.vertices)))
-        ]
-        for which, mesh in zip(("original", "distorted mesh"), self.meshes, strict=True):
-            if not 0 < area(mesh) < np.inf:
-                raise JaxmarkError(f"The {which} has an area of {area(mesh):g}; its shape cannot be compared.")
+    def __init__(self, reference: Reference, distorted: Mesh) -> None:
+        second = host_mesh(distorted)
+        self.reference, self.given = reference, (reference.given, second)
+        self.same = same_connectivity(*self.given)
+        points = reference.welded if self.same else weld(second.vertices)
+        self.meshes = reference.mesh, reference.at_unit_size(second, points, "distorted mesh")
         self.faces = [np.asarray(mesh.faces) for mesh in self.meshes]
         self.x, self.y = (jnp.asarray(mesh.vertices, jnp.float32) for mesh in self.meshes)
 
@@ -110,21 +161,13 @@ class _Pair:
         return surface_distance(*self.meshes)
 
     @cached_property
-    def hinges(self) -> Hinges:
-        return make_hinges(self.faces[0])
-
-    @cached_property
-    def hiding(self) -> Hiding:
-        return make_hiding(np.asarray(self.meshes[0].vertices), self.faces[0])
-
-    @cached_property
     def views(self) -> Views:
         return msdm2_views(*self.meshes)
 
     def tensor_distance(self) -> Array:
         largest = jax.tree.map(lambda leaf: leaf[-1], self.views.scales)
         balls = (self.x, largest.original), (self.y, largest.distorted)
-        return tensor_distance(*(curvature_tensor(points, self.hinges, ball) for points, ball in balls))
+        return tensor_distance(*(curvature_tensor(points, self.reference.hinges, ball) for points, ball in balls))
 
 
 _METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
@@ -133,12 +176,13 @@ _METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
     "mrms": lambda pair: pair.surfaces.mrms,
     "hausdorff": lambda pair: pair.surfaces.hausdorff,
     "gl": lambda pair: gl(pair.x, pair.y, edges(pair.faces[0])),
-    "dame": lambda pair: dame(pair.x, pair.y, pair.hinges),
+    "dame": lambda pair: dame(pair.x, pair.y, pair.reference.hinges),
     "fmpd": lambda pair: fmpd(local_roughness(pair.x, pair.faces[0]), local_roughness(pair.y, pair.faces[1])),
     "msdm": lambda pair: msdm(pair.x, pair.y, msdm_views(*pair.meshes)),
     "msdm2": lambda pair: msdm2(pair.x, pair.y, pair.views),
     "curvature": _Pair.tensor_distance,
-    "shading": lambda pair: shading(pair.x, pair.y, pair.hiding),
+    "stretch": lambda pair: stretch(pair.x, pair.y, pair.reference.hinges.edges),
+    "shading": lambda pair: shading(pair.x, pair.y, pair.reference.hiding),
 }
 _RENDERED: Mapping[str, Callable[[_Pair], float]] = {
     "flip": lambda pair: flip(pair.meshes[0], pair.meshes[1]).high,
@@ -149,9 +193,6 @@ METRICS = tuple(_METRICS)
 #: Names of the metrics of pictures: many seconds each, and so only computed where they are asked for.
 RENDERED = tuple(_RENDERED)
 _ANY_CONNECTIVITY = {"mrms", "hausdorff", "fmpd", "msdm2", *RENDERED}
-
-
-Metric = str | Callable[[Mesh, Mesh], float]  # a name in `METRICS` or `RENDERED`, or a function: see `measure`
 
 
 def measure(original: Mesh, distorted: Mesh, metrics: Collection[Metric]) -> dict[Metric, float | None]:
@@ -169,21 +210,7 @@ def measure(original: Mesh, distorted: Mesh, metrics: Collection[Metric]) -> dic
     Raises:
         JaxmarkError: see `compare`; also if a function's value is not a finite number of at least 0.
     """
-    names = [metric for metric in metrics if isinstance(metric, str)]
-    known = {**_METRICS, **_RENDERED}
-    if unknown := [name for name in names if name not in known]:
-        raise JaxmarkError(f"There is no metric {unknown[0]!r}; there are {', '.join(known)}.")
-    pair = _Pair(original, distorted)
-    wanted = {name for name in names if pair.same or name in _ANY_CONNECTIVITY}
-    found: dict[Metric, float | None] = {}
-    for metric in metrics:
-        if isinstance(metric, str):
-            found[metric] = float(known[metric](pair)) if metric in wanted else None
-            continue
-        found[metric] = value = float(metric(*pair.given))
-        if not 0 <= value < np.inf:
-            raise JaxmarkError(f"The metric {name_of(metric)!r} must be a finite number, not negative, got {value:g}.")
-    return found
+    return Reference(original).measure(distorted, metrics)
 
 
 def name_of(metric: Metric) -> str:
@@ -223,13 +250,14 @@ def shading_at_vertices(original: Mesh, distorted: Mesh) -> Float[np.ndarray, " 
     Raises:
         JaxmarkError: if the connectivity differs, or see `compare`.
     """
-    pair = _Pair(original, distorted)
+    reference = Reference(original)
+    pair, hiding = _Pair(reference, distorted), reference.hiding
     if not pair.same:
         raise JaxmarkError("The turn of normals is known only between meshes of the same connectivity.")
-    used = used_vertices(weld_mesh(pair.given[0], pair.welded))
+    used = used_vertices(weld_mesh(reference.given, reference.welded))
     points = np.zeros(len(used), np.float32)
-    points[used] = vertex_means(visible_turn(pair.x, pair.y, pair.hiding), pair.hiding, len(pair.x))
-    return points[pair.welded.point]
+    points[used] = vertex_means(visible_turn(pair.x, pair.y, hiding), hiding, len(pair.x))
+    return points[reference.welded.point]
 
 
 def _plain(mesh: Mesh, welded: Weld) -> Mesh:

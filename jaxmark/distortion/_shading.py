@@ -30,7 +30,7 @@ creases that turn as a whole; silhouettes; and displacements along the surface, 
 """
 
 import math
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -44,12 +44,13 @@ from jaxmark.distortion.roots import root
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import band_components, filter
 from jaxmark.spectral.laplacian import Laplacian, graph_laplacian
+from jaxmark.spectral.shapes import common_size, pad_edges, pad_rows
 
-SHARE = 0.95  # share of the area on which less is seen than the metric says
+SHARE = 0.99  # share of the area on which less is seen than the metric says
 _INCIDENCE = math.radians(60)  # angle between the light and the surroundings' mean normal
 _CREASE = math.radians(45)  # angle of the original's faces at which a link between them has lost all but 1/e
 _SCALES = (0, 2, 4, 6, 8, 10)  # binary logarithms of the steps of diffusion that divide the bands
-_TERMS = 97  # of the series of diffusion; the rest is below 3e-5
+BANDS = len(_SCALES)
 _WAVELENGTHS = 3 * 2.0 ** np.arange(-1, len(_SCALES) - 1)  # of the bands' best waves, in lengths of edges
 _GAINS = np.array([1, *[2] * (len(_SCALES) - 1)])  # inverse of the bands' responses to their best waves
 _SIZE = 40.0  # degrees of the field of view that the diagonal takes when people look closely
@@ -69,12 +70,22 @@ class Hiding(NamedTuple):
     faces: Int[Array | np.ndarray, "faces 3"]
     area: Float[Array | np.ndarray, " faces"]  # share of the whole; 0 for faces without a normal
     turned: Float[Array | np.ndarray, " faces"]  # -1 for faces that run against their neighbours, otherwise 1
-    links: Laplacian  # of the graph of faces that share an edge that is no crease
+    links: Laplacian  # of the graph of faces that share an edge that is no crease; padded, see `spectral.shapes`
     threshold: Float[Array | np.ndarray, "bands faces"]  # normals' just noticeable turn in each band, in radians
+    bare: Float[Array | np.ndarray, "bands faces"]  # the same if the surface had nothing that hides
+    bend: Float[Array | np.ndarray, " faces"]  # second largest angle to a neighbour: 0 on planes and along their edges
 
 
-def make_hiding(vertices: Float[Array | np.ndarray, "vertices 3"], faces: Int[Array | np.ndarray, "faces 3"]) -> Hiding:
-    """Compute what an original hides, on the host. Edges of one face, or of three or more, link nothing."""
+def make_hiding(
+    vertices: Float[Array | np.ndarray, "vertices 3"], faces: Int[Array | np.ndarray, "faces 3"], bands: int = BANDS
+) -> Hiding:
+    """Compute what an original hides, on the host. Edges of one face, or of three or more, link nothing.
+
+    Args:
+        vertices: positions.
+        faces: the triangles.
+        bands: number of bands that are looked at, from the shortest waves on.
+    """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -88,17 +99,22 @@ def make_hiding(vertices: Float[Array | np.ndarray, "vertices 3"], faces: Int[Ar
     angle = np.arccos(np.clip(np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1), -1, 1))
     mean = area.sum() / max(np.count_nonzero(area), 1) or 1.0
     size = np.where(area > 0, np.maximum(area / mean, _MIN_AREA), 0)
-    links = graph_laplacian(pairs, len(faces), np.exp(-((angle / _CREASE) ** 4)) * size[pairs].prod(axis=1))
+    weights = np.exp(-((angle / _CREASE) ** 4)) * size[pairs].prod(axis=1)
+    count = common_size(len(faces))
+    # A closed surface of triangles has three edges for two faces.
+    links = pad_edges(graph_laplacian(pairs, count, weights), 1.5)
 
     used = vertices[faces[area > 0]].reshape(-1, 3)
     diagonal = float(np.linalg.norm(np.ptp(used, axis=0))) if len(used) else 1.0
     lengths = np.sqrt(4 / math.sqrt(3) * size * mean) / diagonal  # of equilateral triangles' sides
-    hidden = _hidden(links, jnp.asarray(normals), jnp.asarray(lengths))
-    contrast, local = (np.asarray(values, np.float64) for values in hidden)
-    sensitivity = _sensitivity(np.maximum(_WAVELENGTHS[:, None] * local, 1e-9))
+    padded = jnp.asarray(pad_rows(normals, count)), jnp.asarray(pad_rows(lengths, count))
+    hidden = _hidden(links, *padded, bands)
+    contrast, local = (np.asarray(values, np.float64)[:, : len(faces)] for values in hidden)
+    sensitivity = _sensitivity(np.maximum(_WAVELENGTHS[:bands, None] * local, 1e-9))
     masked = (1 + (_MASKING_SLOPE * contrast * sensitivity) ** _MASKING_BEND) ** (1 / _MASKING_BEND)
-    threshold = masked / sensitivity / math.tan(_INCIDENCE)
-    return Hiding(faces.astype(np.int32), area / (area.sum() or 1.0), turned, links, threshold)
+    bare = 1 / sensitivity / math.tan(_INCIDENCE)
+    share, bend = area / (area.sum() or 1.0), _second_largest(pairs, angle, len(faces))
+    return Hiding(faces.astype(np.int32), share, turned, links, masked * bare, bare, bend)
 
 
 @jax.jit
@@ -116,7 +132,9 @@ def visible_turn(
     # Compiled code may round equal positions to different normals. Only the value is mended: the derivative is sound.
     unmoved = jnp.all((original == distorted)[hiding.faces], axis=(1, 2))[:, None]
     change -= jax.lax.stop_gradient(jnp.where(unmoved, change, 0))
-    turn = root(jnp.sum(_bands(hiding.links, change) ** 2, axis=2)) / jnp.asarray(hiding.threshold).astype(change.dtype)
+    padded = jnp.pad(change, ((0, len(hiding.links.degree) - len(change)), (0, 0)))
+    energy = jnp.sum(_bands(hiding.links, padded, len(hiding.threshold))[:, : len(change)] ** 2, axis=2)
+    turn = root(energy) / jnp.asarray(hiding.threshold).astype(change.dtype)
     largest = jax.lax.stop_gradient(jnp.max(turn, axis=0))
     largest = jnp.where(largest > 0, largest, 1)
     # Powers are taken of ratios, which neither overflow nor vanish.
@@ -131,7 +149,7 @@ def shading(
     hiding: Hiding,
     share: float | Float[Array, ""] = SHARE,
 ) -> Float[Array, ""]:
-    """The visible turn of normals that is exceeded on 5 % of the area, in just noticeable differences.
+    """The visible turn of normals that is exceeded on 1 % of the area, in just noticeable differences.
 
     Normals are split into bands of spatial frequency; a turn in each is taken over the least that is seen there, which
     the original's own contrast in the band raises (masking as by Daly, with the constants of Nader, Wang,
@@ -175,6 +193,17 @@ def _face_pairs(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return pairs[kept], against[kept]
 
 
+def _second_largest(pairs: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """The second largest of the values of the pairs that each of so many things is in; 0 where it is in but one."""
+    which, twice = pairs.T.ravel(), np.tile(values, 2)
+    order = np.lexsort((-twice, which))
+    first = np.searchsorted(which[order], np.arange(count))
+    in_two = np.bincount(which, minlength=count) > 1
+    found = np.zeros(count)
+    found[in_two] = twice[order][first[in_two] + 1]
+    return found
+
+
 def _orient(pairs: np.ndarray, against: np.ndarray, count: int) -> np.ndarray:
     """Signs that make the faces of each piece run alike, +1 throughout where a piece has but one side.
 
@@ -198,22 +227,25 @@ def _normals(x: Array, hiding: Hiding) -> Array:
 
 
 @cache
-def _diffusions() -> Float[np.ndarray, "scales terms"]:
-    """Chebyshev coefficients of the diffusions that divide the bands."""
-    return diffusion(_SCALES[-1] + 1, _TERMS)[list(_SCALES)]
+def _diffusions(count: int) -> Float[np.ndarray, "scales terms"]:
+    """Chebyshev coefficients of the diffusions that divide so many bands."""
+    last = _SCALES[count - 1]
+    # The rest of the series is below 3e-5.
+    return diffusion(last + 1, round(3 * 2 ** (last / 2)) + 1)[list(_SCALES[:count])]
 
 
-def _bands(links: Laplacian, x: Array) -> Array:
+def _bands(links: Laplacian, x: Array, count: int) -> Array:
     """Split signals of faces into bands, from the shortest waves on; what diffusion leaves is in none of them."""
-    bands = _GAINS[:, None] * (np.vstack([np.eye(1, _TERMS), _diffusions()[:-1]]) - _diffusions())
+    passed = _diffusions(count)
+    bands = _GAINS[:count, None] * (np.vstack([np.eye(1, passed.shape[1]), passed[:-1]]) - passed)
     return band_components(links, jnp.asarray(bands, x.dtype), x)
 
 
-@jax.jit
-def _hidden(links: Laplacian, normals: Array, length: Array) -> tuple[Array, Array]:
+@partial(jax.jit, static_argnames="count")
+def _hidden(links: Laplacian, normals: Array, length: Array, count: int) -> tuple[Array, Array]:
     """Contrast of normals in each band, and the length of edges, both as means around each face."""
-    energy = jnp.sum(_bands(links, normals) ** 2, axis=2)
-    diffusions = jnp.asarray(_diffusions(), energy.dtype)
+    energy = jnp.sum(_bands(links, normals, count) ** 2, axis=2)
+    diffusions = jnp.asarray(_diffusions(count), energy.dtype)
     around = filter(links, diffusions.T, energy.T).T
     return math.tan(_INCIDENCE) * root(around), band_components(links, diffusions, length)
 

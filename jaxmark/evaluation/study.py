@@ -23,7 +23,7 @@ from jaxmark.evaluation.results import Results
 from jaxmark.files import load_mesh
 from jaxmark.geometry.hashing import geometry_hash
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.budget import DEFAULT_LIMITS, Budget, make_budget
+from jaxmark.watermark.budget import Budget, Visibility, make_budget
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.marking import DEFAULT_BITS, Marker, make_marker
 from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme, get_scheme, parameters_of
@@ -43,7 +43,7 @@ class Study:
     attacks: Mapping[str, Sequence[float] | Attack]  # strengths by name in `ATTACKS`, or attacks of your own
     schemes: Sequence[str] | Mapping[str, str | Scheme] = (DEFAULT_SCHEME,)  # names, or schemes of your own by any name
     payloads: Sequence[int] = (DEFAULT_BITS,)
-    budgets: Sequence[float | Mapping[str, float]] = (DEFAULT_LIMITS,)  # RMS over the diagonal, or limits on metrics
+    budgets: Sequence[float | Visibility | Mapping[str, float]] = ("hidden",)  # RMS, names, or limits; see `embed`
     seeds: int = 5  # number of seeds: 0, 1, …
 
     def __post_init__(self) -> None:
@@ -104,11 +104,13 @@ class Study:
 
     @property
     def _budgets(self) -> dict[str, Budget]:
-        """Budgets by the names that they have in rows: `0.0008`, or `dame=0.008`."""
+        """Budgets by the names that they have in rows: `0.0008`, `hidden`, or `dame=0.008`."""
         found = {}
         for one in self.budgets:
             if isinstance(one, Mapping):
                 found[" ".join(f"{name}={value}" for name, value in one.items())] = make_budget(limits=one)
+            elif isinstance(one, str):
+                found[one] = make_budget(visibility=one)
             else:
                 found[str(one)] = make_budget(one)
         return found

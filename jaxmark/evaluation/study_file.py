@@ -14,8 +14,8 @@ def load_study(path: str | os.PathLike[str]) -> Study:
     """Load a study from a TOML file.
 
     The tables `meshes` (files, relative to the TOML file's folder) and `attacks` (lists of strengths) are by name.
-    `schemes` (names), `payloads`, `budgets` (numbers, or tables of limits) and `seeds` are as in `Study`, and have its
-    defaults.
+    `schemes` (names), `payloads`, `budgets` (numbers, names, or tables of limits) and `seeds` are as in `Study`, and
+    have its defaults.
 
     Raises:
         JaxmarkError: if the file cannot be read, is not TOML, or declares no study.
@@ -70,8 +70,8 @@ _FIELDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "schemes": ("a list of names", _list(_text)),
     "payloads": ("a list of whole numbers of bits", _list(_whole)),
     "budgets": (
-        "a list of numbers or tables of limits",
-        _list(lambda one: _number(one) or (bool(one) and _table(_number)(one))),
+        "a list of numbers, names or tables of limits",
+        _list(lambda one: _number(one) or _text(one) or (bool(one) and _table(_number)(one))),
     ),
     "seeds": ("a whole number", _whole),
 }

@@ -28,7 +28,7 @@ from jaxmark.watermark.carriers.carrier import Displacement
 from jaxmark.watermark.channels import Channels, Margin, margins, measure
 from jaxmark.watermark.probes import probe_signs
 from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme, TunableScheme, get_scheme
-from jaxmark.watermark.visibility import band_visibility
+from jaxmark.watermark.visibility import apply_mask, band_visibility
 
 Solver = Literal["projected-gradient", "accelerated-gradient"]
 Attacker = tuple[Kind, float] | Callable[[Mesh, int], Mesh]  # an attack and a strength, or (mesh, seed) → mesh
@@ -106,12 +106,11 @@ def tune(
     (signs,) = probe_signs("tuning", original.signal.shape, dtype=original.signal.dtype)
     signs = signs * original.to_traced(original.used)[:, None]
     mask = tunable.mask(original)
-    hidden = 1.0 if mask is None else original.to_host(mask)[:, None]
 
     def shape_signs(strengths: Float64[np.ndarray, " bands"]) -> Float64[np.ndarray, "points 3"]:
-        return hidden * original.to_host(filter(original.operator, family.T @ strengths, signs))
+        return original.to_host(apply_mask(mask, filter(original.operator, family.T @ strengths, signs)))
 
-    cost = _costs(original, family, signs, bounds)
+    cost = _costs(original, family, signs, mask, bounds)
     equal = 1 / np.sqrt(len(family) * cost.sum(axis=0))
     # Equal shares, so that each band is measured.
     probe = shape_signs(equal)
@@ -350,13 +349,17 @@ def _balanced(
 
 
 def _costs(
-    original: Original, family: Float64[np.ndarray, "bands terms"], signs: Displacement, bounds: Budget
+    original: Original,
+    family: Float64[np.ndarray, "bands terms"],
+    signs: Displacement,
+    mask: Float[Array, " rows *axes"] | None,
+    bounds: Budget,
 ) -> Float64[np.ndarray, "limits bands"]:
     """Share of each limit, squared, that β_j = 1 uses up in band j."""
     whole = band_energies(original.operator, jnp.asarray(family, signs.dtype), signs, signs)
     energy = np.maximum(np.asarray(whole, np.float64) / original.used.sum(), 1e-12)
     seen = list(bounds.limits)
-    visible = band_visibility(original, family, seen) if seen else np.empty((0, len(family)))
+    visible = band_visibility(original, family, seen, mask) if seen else np.empty((0, len(family)))
     rows = [energy * (row / bounds.limits[name]) ** 2 for name, row in zip(seen, visible, strict=True)]
     return np.stack(rows + ([energy / bounds.rms**2] if bounds.rms is not None else []))
 

@@ -164,6 +164,15 @@ def boundary_vertices(faces: Int[Array | np.ndarray, "faces 3"]) -> Int64[np.nda
     return np.unique(pairs[count == 1])
 
 
+def open_sides(faces: Int[Array | np.ndarray, "faces 3"]) -> Bool[np.ndarray, "faces 3"]:
+    """Which sides of each face no other side runs along; side k goes from corner k to corner k + 1."""
+    faces = np.asarray(faces, np.int64)
+    low, high = np.minimum(faces, np.roll(faces, -1, axis=1)), np.maximum(faces, np.roll(faces, -1, axis=1))
+    bits = int(faces.max(initial=0)).bit_length()
+    _, which, count = np.unique((low << bits | high).ravel(), return_inverse=True, return_counts=True)
+    return ((count == 1)[which.reshape(-1)] & (low != high).ravel()).reshape(faces.shape)
+
+
 def area(mesh: Mesh) -> float:
     """Total surface area, in squared units of the mesh."""
     return float(np.linalg.norm(_area_vectors(mesh), axis=1).sum() / 2)

@@ -4,6 +4,8 @@ Padding vertices are isolated: nothing moves them, and they move nothing. Large 
 compile for, stay as they are.
 """
 
+import math
+
 import numpy as np
 from jaxtyping import Shaped
 
@@ -39,12 +41,23 @@ def common_laplacian(mesh: Mesh, weights: Weighting = "valence", lowering: Lower
     """
     vertices = np.asarray(mesh.vertices, np.float64)
     padded = mesh._replace(vertices=pad_rows(vertices, common_size(len(vertices))))
-    operator = make_laplacian(padded, weights, lowering=lowering)
+    # A closed surface of triangles has about three edges per vertex.
+    return pad_edges(make_laplacian(padded, weights, lowering=lowering), 3)
+
+
+def pad_edges(operator: Laplacian, valence: float) -> Laplacian:
+    """Pad an operator of a common size with edges past the last vertex.
+
+    Args:
+        operator: of any graph.
+        valence: edges per vertex that most such graphs do not exceed.
+    """
     size, edges = len(operator.degree), np.asarray(operator.edges)
     if size > _MAX_PADDED_SIZE:
         return operator
-    # A closed surface of triangles has about three edges per vertex.
-    count = 3 * size if len(edges) <= 3 * size else common_size(len(edges))
+    count = math.ceil(valence * size)
+    if len(edges) > count:
+        count = common_size(len(edges))
     values = None if operator.weights is None else pad_rows(np.asarray(operator.weights), count)
     operator = operator._replace(edges=pad_rows(edges, count, size), weights=values)
     table = operator.neighbours

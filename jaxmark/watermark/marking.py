@@ -21,7 +21,7 @@ from jaxmark.geometry.canonical import Canonical
 from jaxmark.geometry.imprint import Imprint, make_imprint, restore
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark import evidence
-from jaxmark.watermark.budget import Budget, Limits, make_budget, write
+from jaxmark.watermark.budget import Budget, Limits, Visibility, make_budget, write
 from jaxmark.watermark.carriers.carrier import Carrier, Reader, Received
 from jaxmark.watermark.coding.keys import SCHEME_VERSION, VERSIONS, Choices, Key, bind, commitment
 from jaxmark.watermark.coding.message import TAG_BITS, Decoded, decode, encode
@@ -114,6 +114,7 @@ class Marker:
         budget: float | None = None,
         *,
         limits: Limits | None = None,
+        visibility: Visibility | None = None,
         noise: float = NOISE,
         read_back: bool = True,
     ) -> tuple[Mesh, EmbedInfo]:
@@ -122,7 +123,7 @@ class Marker:
         Pass `read_back=False` if you verify the written file yourself.
         """
         self.check_size(message)
-        bounds = make_budget(budget, limits)
+        bounds = make_budget(budget, limits, visibility)
         if not 0 <= noise < math.inf:
             raise JaxmarkError(f"The noise to survive is a number of at least 0, got {noise}.")
         marked, info = self.write(self.codeword(message), bounds, told=message)
@@ -442,7 +443,7 @@ def make_marker(
             )
     used = record.version if record is not None else SCHEME_VERSION if version is None else version
     ready, doubts = recall(original, key, record, used)
-    scheme = get_scheme(scheme)
+    scheme = get_scheme(scheme, version=used)
     payload = DEFAULT_BITS if bits is None else bits
     code_bits = scheme.code_length(ready, payload)
     choices = bind_mark(key, ready, scheme, payload, "message", used, record=record)
@@ -543,14 +544,14 @@ def embed(
     *,
     budget: float | None = None,
     limits: Limits | None = None,
+    visibility: Visibility | None = None,
     noise: float = NOISE,
     scheme: str | Scheme = DEFAULT_SCHEME,
 ) -> tuple[Mesh, EmbedInfo]:
     """Embed a message in the vertex positions of a mesh.
 
-    The mark is as strong as budget and limits allow; by default it is so weak that people do not notice it
-    (`budget.DEFAULT_LIMITS`). The message is read back before the mesh is returned, and a mesh that cannot carry it is
-    refused.
+    The mark is as strong as budget and limits allow; by default it is so weak that people do not notice it. The message
+    is read back before the mesh is returned, and a mesh that cannot carry it is refused.
 
     Args:
         mesh: the original.
@@ -560,6 +561,8 @@ def embed(
             axis-aligned bounding box: 0.0008 is 0.08 % of it. It is met exactly, unless a limit is reached first.
         limits: the largest values that metrics of `distortion.METRICS` may reach, by name, in the units of
             `distortion.Comparison`; or that metrics of your own may, by function (see `distortion.measure`).
+        visibility: how well people may see the mark: `"hidden"`, the default if budget and limits are not given;
+            `"careful look"`, seen beside the original; `"visible"`. See `jaxmark.watermark.budget.VISIBILITY`.
         noise: the noise that the message must survive when half of the vertices are lost, see `capacity`; 0 requires
             only that there are enough dimensions. It has no effect for schemes whose readers have no model of noise,
             such as `host` and `eigen`.
@@ -575,7 +578,7 @@ def embed(
     if not isinstance(message, bytes):
         raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
     marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
-    return marker.embed(message, budget, limits=limits, noise=noise)
+    return marker.embed(message, budget, limits=limits, visibility=visibility, noise=noise)
 
 
 def capacity(
@@ -583,6 +586,7 @@ def capacity(
     budget: float | None = None,
     *,
     limits: Limits | None = None,
+    visibility: Visibility | None = None,
     noise: float = NOISE,
     coverage: float = COVERAGE,
     scheme: str | Scheme = DEFAULT_SCHEME,
@@ -595,6 +599,7 @@ def capacity(
         mesh: the original.
         budget: RMS displacement, see `embed`.
         limits: limits on metrics, see `embed`; how much displacement they allow is tried for each payload size.
+        visibility: see `embed`.
         noise: half width of uniform noise on each coordinate, relative to the mean distance of the vertices to their
             centre; by default the strongest of the SMI 2010 protocol (Wang et al.), 0.5 %.
         coverage: share of the vertices that may be left.
@@ -610,7 +615,7 @@ def capacity(
         raise JaxmarkError(
             f"capacity needs a noise of at least 0 and a coverage in (0, 1], got {noise:g} and {coverage:g}."
         )
-    conditions = Conditions(make_budget(budget, limits), noise, coverage)
+    conditions = Conditions(make_budget(budget, limits, visibility), noise, coverage)
     return Capacity(make_original(mesh), get_scheme(scheme)).bits(conditions)
 
 

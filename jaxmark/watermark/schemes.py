@@ -20,10 +20,11 @@ from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark.carriers import Carrier, KeyedCarrier, ModulatedCarrier, eigenspaces, host_bands, make_chips
 from jaxmark.watermark.carriers.modulated import Components
 from jaxmark.watermark.carriers.reception import Host, Receiver, make_host, make_receiver
-from jaxmark.watermark.coding.keys import Choices
+from jaxmark.watermark.coding.keys import SCHEME_VERSION, Choices
 from jaxmark.watermark.coding.message import TAG_BITS, code_length
 from jaxmark.watermark.coding.sequences import orthogonal_sequences
 from jaxmark.watermark.detectors import Detector, decorrelate, joint
+from jaxmark.watermark.hiding import hiding_directions
 from jaxmark.watermark.visibility import masking
 
 # Relative strengths of the lowest 20 of 64 bands: the mean over meshes that were tuned to noise, smoothing and
@@ -46,7 +47,10 @@ _MAX_NUISANCE_DEGREE = {"tapered": 6, "narrow": 8}
 _MAX_COMPONENTS = 512
 
 # Values of the fields that are missing from a record because it was written before they existed; by scheme.
-_FIELDS_OF_OLD_RECORDS: Mapping[str, Mapping[str, Any]] = {"keyed": {"passband": "narrow"}}
+_FIELDS_OF_OLD_RECORDS: Mapping[str, Mapping[str, Any]] = {"keyed": {"passband": "narrow", "hiding": False}}
+
+# Values of fields that marks of version 1 had by default; by scheme.
+_FIELDS_OF_VERSION_1: Mapping[str, Mapping[str, Any]] = {"keyed": {"hiding": False}}
 
 
 @runtime_checkable
@@ -126,8 +130,8 @@ class TunableScheme(Scheme, Protocol):
         """Chebyshev coefficients of all bands, which are non-negative and add up to 1 over the spectrum."""
         ...
 
-    def mask(self, original: Original) -> Float[Array, " rows"] | None:
-        """Factor on the displacement of each vertex; None if it is 1 everywhere."""
+    def mask(self, original: Original) -> Float[Array, " rows *axes"] | None:
+        """Factor on each vertex's displacement, or symmetric matrix `[3, 3]`; None if it is 1 everywhere."""
         ...
 
     def receiver(self, original: Original, bits: int) -> Receiver:
@@ -167,6 +171,7 @@ class KeyedScheme(Scheme):
     profile: tuple[float, ...] = ()  # relative strengths of the lowest bands, from `tune`; by default by `passband`
     masking: bool = False  # whether rough regions move more; see `jaxmark.watermark.visibility.masking`
     passband: Literal["tapered", "narrow"] = "tapered"  # how bands and nuisance are chosen
+    hiding: bool = True  # whether points move where and as it is hidden; see `jaxmark.watermark.hiding`
 
     @property
     def detector(self) -> Detector:
@@ -232,9 +237,12 @@ class KeyedScheme(Scheme):
         """See `TunableScheme`."""
         return scaling(self.bands, damping="jackson")
 
-    def mask(self, original: Original) -> Float[Array, " rows"] | None:
+    def mask(self, original: Original) -> Float[Array, " rows *axes"] | None:
         """See `TunableScheme`."""
-        return masking(original) if self.masking else None
+        if not self.hiding or self.direction != "coordinates":
+            return masking(original) if self.masking else None
+        directions = original.to_traced(hiding_directions(original))
+        return masking(original)[:, None, None] * directions if self.masking else directions
 
     def receiver(self, original: Original, bits: int) -> Receiver:
         """See `TunableScheme`."""
@@ -367,12 +375,15 @@ SCHEMES: Mapping[str, type[KeyedScheme] | type[HostScheme] | type[EigenScheme]] 
 DEFAULT_SCHEME = KeyedScheme.name
 
 
-def get_scheme(scheme: str | Scheme, parameters: Mapping[str, Any] | None = None) -> Scheme:
+def get_scheme(
+    scheme: str | Scheme, parameters: Mapping[str, Any] | None = None, version: int = SCHEME_VERSION
+) -> Scheme:
     """Make a scheme from its name, with its defaults or the fields in a record; a scheme itself is returned as it is.
 
     Args:
         scheme: one of `SCHEMES`, or a scheme.
         parameters: the fields in a record; None for the defaults.
+        version: version of the keyed choices whose defaults are meant.
 
     Raises:
         JaxmarkError: if there is no such scheme, or it has no such field.
@@ -395,7 +406,10 @@ def get_scheme(scheme: str | Scheme, parameters: Mapping[str, Any] | None = None
         raise JaxmarkError(f"The scheme {scheme!r} takes the parameters {', '.join(known)}, not {given}.")
     if any(not 0 < given.get(name, 1) <= _MAX_COMPONENTS for name in ("bands", "pairs")):
         raise JaxmarkError(f"A record's scheme has 1 to {_MAX_COMPONENTS} bands or pairs, not {given}.")
-    before = {} if parameters is None else _FIELDS_OF_OLD_RECORDS.get(scheme, {})
+    if parameters is not None:
+        before = _FIELDS_OF_OLD_RECORDS.get(scheme, {})
+    else:
+        before = _FIELDS_OF_VERSION_1.get(scheme, {}) if version == 1 else {}
     return SCHEMES[scheme](**{**before, **given})
 
 

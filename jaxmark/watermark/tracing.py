@@ -13,7 +13,7 @@ from jaxmark.alignment.alignment import Align
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark import evidence
-from jaxmark.watermark.budget import Limits, make_budget
+from jaxmark.watermark.budget import Limits, Visibility, make_budget
 from jaxmark.watermark.coding.keys import KEY_BYTES, SCHEME_VERSION, Key
 from jaxmark.watermark.marking import ALIGN_SHARES, EmbedInfo, Marker, bind_mark, recall, versions_of
 from jaxmark.watermark.record import Record
@@ -37,13 +37,19 @@ class Tracer:
     marker: Marker  # writes and reads fingerprints
 
     def fingerprint(
-        self, recipient: str, budget: float | None = None, *, limits: Limits | None = None
+        self,
+        recipient: str,
+        budget: float | None = None,
+        *,
+        limits: Limits | None = None,
+        visibility: Visibility | None = None,
     ) -> tuple[Mesh, EmbedInfo]:
         """Make the copy for one recipient; see `fingerprint`."""
         choices = self.marker.choices
         if self.marker.code_bits >= _MIN_SLOTS:
             word = codewords([recipient], choices, biases(choices, self.marker.code_bits))[0]
-            marked, info = self.marker.write(word.astype(float), make_budget(budget, limits), told=recipient.encode())
+            bounds = make_budget(budget, limits, visibility)
+            marked, info = self.marker.write(word.astype(float), bounds, told=recipient.encode())
             if self.finds(marked, recipient):
                 return marked, info
         raise JaxmarkError(
@@ -109,6 +115,7 @@ def fingerprint(
     *,
     budget: float | None = None,
     limits: Limits | None = None,
+    visibility: Visibility | None = None,
 ) -> tuple[Mesh, EmbedInfo]:
     """Make the copy of a mesh for one recipient.
 
@@ -118,6 +125,7 @@ def fingerprint(
         key: 32 bytes, from `new_key`.
         budget: RMS displacement, see `embed`.
         limits: limits on metrics of distortion, see `embed`.
+        visibility: how well people may see the mark, see `embed`.
 
     Returns:
         The copy (float64 vertices, same faces) and what was done to it.
@@ -125,7 +133,7 @@ def fingerprint(
     Raises:
         JaxmarkError: if the mesh, key, budget or identifier is unusable, or the mesh is too small.
     """
-    return make_tracer(mesh, key).fingerprint(recipient, budget, limits=limits)
+    return make_tracer(mesh, key).fingerprint(recipient, budget, limits=limits, visibility=visibility)
 
 
 def identify(

@@ -12,6 +12,7 @@ from jaxmark.distortion import Metric
 from jaxmark.distortion.roughness import MAX_ROUGHNESS, MIN_ROUGHNESS, POWER
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import filter
+from jaxmark.spectral.precision import matmul
 from jaxmark.watermark.probes import probe_signs
 
 _SAMPLED_BANDS = 16  # visibility varies smoothly from one band to the next
@@ -21,7 +22,10 @@ _AVERAGING_SCALE = 5  # roughness is averaged over 2^5 steps of diffusion
 
 
 def band_visibility(
-    original: Original, coefficients: Float64[np.ndarray, "bands terms"], metrics: Sequence[Metric]
+    original: Original,
+    coefficients: Float64[np.ndarray, "bands terms"],
+    metrics: Sequence[Metric],
+    mask: Float[Array, " rows *axes"] | None = None,
 ) -> Float64[np.ndarray, "metrics bands"]:
     """Measure how much metrics rise per unit of RMS displacement (in diagonals) in each band, with random signs.
 
@@ -31,6 +35,7 @@ def band_visibility(
         original: the mesh that is displaced.
         coefficients: Chebyshev coefficients of the bands.
         metrics: names in `distortion.METRICS`, or functions of your own.
+        mask: of the displacements, see `apply_mask`.
 
     Returns:
         `[metrics, bands]`, in the units of each metric per diagonal.
@@ -44,7 +49,7 @@ def band_visibility(
     tried = np.unique(np.round(np.geomspace(1, count, min(_SAMPLED_BANDS, count))).astype(int)) - 1
     values = []
     for band in tried:
-        shift = original.to_host(filter(original.operator, coefficients[band], signs))
+        shift = original.to_host(apply_mask(mask, filter(original.operator, coefficients[band], signs)))
         size = float(distortion.rms(shift[original.used]))
         # A band beyond the mesh's spectrum is empty.
         found = _per_rms(original, shift / size, metrics) if size > 1e-6 else [np.inf] * len(metrics)
@@ -69,6 +74,18 @@ def _per_rms(original: Original, shift: Float64[np.ndarray, "points 3"], metrics
         if value * _FIRST_RMS > _MAX_METRIC_VALUE:
             values |= measure_at([name], _MAX_METRIC_VALUE / 2 / value)
     return list(values.values())
+
+
+def apply_mask(
+    mask: Float[Array | np.ndarray, " rows *axes"] | None, x: Float[Array, "rows 3"]
+) -> Float[Array, "rows 3"]:
+    """Mask displacements by a factor or a symmetric matrix `[3, 3]` for each vertex; this is its own adjoint."""
+    if mask is None:
+        return x
+    factor = jnp.asarray(mask)
+    if factor.ndim == 1:
+        return factor[:, None] * x
+    return matmul(factor, x[:, :, None])[:, :, 0]
 
 
 def masking(original: Original) -> Float[Array, " rows"]:

@@ -30,6 +30,7 @@ from jaxmark.watermark.carriers.reception import (
 )
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.probes import probe_signs
+from jaxmark.watermark.visibility import apply_mask
 
 
 class Chips(NamedTuple):
@@ -141,13 +142,13 @@ class KeyedCarrier(NamedTuple):
     ) -> Displacement:
         """Filter any chips into a displacement."""
         along = filter(self.host.operator, coefficients, chips)
-        return self._mask(along if self.normals is None else self.normals * along)
+        return apply_mask(self.masking, along if self.normals is None else self.normals * along)
 
     def match_chips(
         self, residual: Displacement, coefficients: Float[Array, " terms *channels"]
     ) -> Float[Array, "vertices channels"]:
         """Apply the plain adjoint of `filter_chips`, which is a matched filter."""
-        hidden = self._mask(residual)
+        hidden = apply_mask(self.masking, residual)
         along = hidden if self.normals is None else jnp.sum(self.normals * hidden, axis=1, keepdims=True)
         return transpose(self.host.operator, coefficients, along)
 
@@ -155,14 +156,15 @@ class KeyedCarrier(NamedTuple):
         """Give each chip its value: its sign times the bit in its slot."""
         return self._signs * jnp.asarray(bits).astype(self._signs.dtype)[self.chips.slots]
 
-    def _mask(self, displacement: Displacement) -> Displacement:
-        """Apply the masking, which is its own adjoint: a factor, or a symmetric matrix."""
+    def masked_share(self) -> float:
+        """Share of the dimensions that the masking leaves: (Σ λ)² / (n Σ λ²) over the energies λ that it gives to n."""
         if self.masking is None:
-            return displacement
-        factor = jnp.asarray(self.masking)
-        if factor.ndim == 1:
-            return factor[:, None] * displacement
-        return matmul(factor, displacement[:, :, None])[:, :, 0]
+            return 1.0
+        root = np.asarray(self.masking, np.float64)
+        square = root[:, None] ** 2 * np.ones(3) if root.ndim == 1 else root @ root
+        total = square.sum() if root.ndim == 1 else np.trace(square, axis1=1, axis2=2).sum()
+        moving = np.count_nonzero(np.asarray(self.chips.signs).any(axis=1))
+        return float(total**2 / (3 * moving * np.sum(square**2)))
 
     @property
     def _signs(self) -> Float[Array, "vertices channels"]:
@@ -226,7 +228,10 @@ class KeyedReader(NamedTuple):
         strength = np.ones(len(whole)) if profile is None else np.asarray(profile, np.float64)
         # A whole band sums over three coordinates of each vertex, or over one along its normal.
         displaced = whole @ strength**2 / np.count_nonzero(moving)
-        return Room(left * (strength > 0), strength**2 / displaced if displaced > 0 else strength**2)
+        energy = strength**2 / displaced if displaced > 0 else strength**2
+        # Masked, the same energy is in fewer dimensions.
+        share = self.carrier.masked_share()
+        return Room(share * left * (strength > 0), energy / share)
 
     def with_carrier(self, carrier: KeyedCarrier) -> "KeyedReader":
         """See `Reader`."""

@@ -1,0 +1,108 @@
+"""Where a displacement is hidden, and in which direction: along planes, cylinders and edges more than across them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float64, Int
+from scipy import sparse
+
+from jaxmark.alignment.original import Original
+from jaxmark.distortion import Hiding, make_hiding
+from jaxmark.geometry.mesh import Mesh, area, edges, face_normals, open_sides, unit
+from jaxmark.spectral.bands import diffusion
+from jaxmark.spectral.chebyshev import filter
+from jaxmark.spectral.shapes import pad_rows
+
+_BAND = 2  # of `Hiding`: waves six edges long, of which marks mostly consist
+_SLOPE = 0.9  # largest slope of such a wave, times an edge, over its height
+_ALONG = 0.03  # displacement along the surface, in edges, that counts as much as a just noticeable one across it
+_BENT = np.radians(2)  # angle between faces from which on a surface may hide as much as that angle
+_MIN_HIDDEN = 0.02  # of what a plane hides
+_LEAST_BEND = 1e-4  # radians that the flattest faces hide in the mean of those around
+_AVERAGING_SCALE = 2  # bends are averaged over 2^2 steps of diffusion
+
+
+def hiding_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
+    """Matrices that turn and scale displacements so that each point is moved where, and as, it is hidden.
+
+    Each face around a point allows a displacement along its normal as far as a wave of that height is just noticeable
+    in shading (see `jaxmark.distortion.shading`); any displacement along the surface is allowed 3 % of an edge. A
+    border allows as much as the edge of a solid sheet would. What all faces around a point allow is an ellipsoid; the
+    matrix maps the unit sphere to it. On a plane it is flat, along an edge it is a needle, where the surface is rough
+    or curved it is round.
+
+    A plane beside something rough hides nothing: what a face hides is capped by the second largest angle to its
+    neighbours, which is 0 on planes and cylinders up to their rims.
+
+    Args:
+        original: the mesh to mark. Nothing else decides: no key, no message.
+
+    Returns:
+        Symmetric positive definite matrices; 0 for points that no face uses. They keep the root mean square of a
+        displacement whose coordinates are independent.
+    """
+    points, faces = original.positions, np.asarray(original.points.faces)
+    mesh, size = Mesh(points, faces), len(points)
+    with jax.ensure_compile_time_eval():  # carriers may be made in traced code
+        hiding = make_hiding(points, faces, _BAND + 1)
+        bends = _bends(hiding)
+    normals = face_normals(mesh)
+    sides = points[np.roll(faces, -1, axis=1)] - points[faces]
+    angles = np.arccos(np.clip(-np.sum(unit(sides) * unit(np.roll(sides, 1, axis=1)), axis=2), -1, 1))
+    edge = np.sqrt(4 / np.sqrt(3) * hiding.area * area(mesh))  # of an equilateral triangle
+    bare, masked = hiding.bare[_BAND], hiding.threshold[_BAND]
+    height = edge * np.maximum(np.minimum(masked - bare, bends), _MIN_HIDDEN * bare) / _SLOPE
+    sound = np.flatnonzero(hiding.area)
+    form, weight = _sums(faces[sound], angles[sound], _squares(normals[sound], height[sound]), size)
+
+    # A border hides what the edge of a solid sheet does: as if a wall stood on it.
+    face, side = np.nonzero(open_sides(faces) & (hiding.area > 0)[:, None])
+    outward = unit(np.cross(sides[face, side], normals[face]))
+    walls = _squares(outward, (edge * _MIN_HIDDEN * bare / _SLOPE)[face])
+    ends = np.stack([faces[face, side], faces[face, (side + 1) % 3]], axis=1)
+    more, added = _sums(ends, np.full(ends.shape, np.pi / 2), walls, size)
+    weight += added
+    form = (form + more) / np.where(weight > 0, weight, 1)[:, None, None]
+
+    # A displacement is hidden where its form is at most 1.
+    along = _ALONG * _mean_edges(mesh)
+    free = original.used & (along > 0)
+    form[free] += np.eye(3) / along[free, None, None] ** 2
+    form[~free] = np.eye(3)
+    values, vectors = np.linalg.eigh(form)
+    matrices = (vectors / np.sqrt(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    matrices[~free] = 0
+    return matrices / np.sqrt(np.mean(np.sum(matrices[original.used] ** 2, axis=(1, 2))) / 3)
+
+
+def _bends(hiding: Hiding) -> Float64[np.ndarray, " faces"]:
+    """The most that faces hide by how they bend, as geometric means around each."""
+    logs = pad_rows(np.log(np.maximum(hiding.bend**2 / _BENT, _LEAST_BEND)), len(hiding.links.degree))
+    average = diffusion(_AVERAGING_SCALE + 1, 2**_AVERAGING_SCALE + 1)[_AVERAGING_SCALE]
+    return np.exp(np.asarray(filter(hiding.links, average, jnp.asarray(logs)), np.float64)[: len(hiding.bend)])
+
+
+def _squares(x: Float64[np.ndarray, "rows 3"], size: Float64[np.ndarray, " rows"]) -> Float64[np.ndarray, "rows 3 3"]:
+    """Forms that are 1 for a displacement of so much along each unit vector."""
+    scaled = x / size[:, None]
+    return scaled[:, :, None] * scaled[:, None, :]
+
+
+def _sums(
+    points: Int[np.ndarray, "rows corners"],
+    weights: Float64[np.ndarray, "rows corners"],
+    forms: Float64[np.ndarray, "rows 3 3"],
+    size: int,
+) -> tuple[Float64[np.ndarray, "points 3 3"], Float64[np.ndarray, " points"]]:
+    """Weighted sums of rows' forms at the points of each row, and the sums of the weights."""
+    rows = np.repeat(np.arange(len(points)), points.shape[1])
+    incidence = sparse.csr_array((weights.ravel(), (points.ravel(), rows)), shape=(size, len(points)))
+    return (incidence @ forms.reshape(-1, 9)).reshape(-1, 3, 3), np.asarray(incidence.sum(axis=1))
+
+
+def _mean_edges(mesh: Mesh) -> Float64[np.ndarray, " points"]:
+    """Mean length of the edges at each point; 0 where there are none."""
+    pairs = edges(mesh.faces)
+    lengths = np.linalg.norm(mesh.vertices[pairs[:, 0]] - mesh.vertices[pairs[:, 1]], axis=1)
+    size, ends = len(mesh.vertices), pairs.T.ravel()
+    return np.bincount(ends, np.tile(lengths, 2), size) / np.maximum(np.bincount(ends, minlength=size), 1)
