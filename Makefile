@@ -3,7 +3,9 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: help demo test lint types tests slow-tests coverage docs clean
+PICTURED = fandisk_6475.obj casting.off teapot_utah.obj blub_7106.obj hand_10345.obj bunny_oded_3301.obj
+
+.PHONY: help demo test lint types tests slow-tests coverage pictures docs clean
 
 help:  ## list these commands
 	@awk -F ':.*  ## ' '/^[a-z-]+:.*  ## / {printf "%-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -28,6 +30,9 @@ slow-tests: $(VENV)/.dev  ## pytest: the slow ones
 
 coverage: $(VENV)/.dev  ## which lines the tests run; all of it in build/coverage
 	$(BIN)/python -m pytest -q -n auto --cov --cov-report=term:skip-covered --cov-report=html
+
+pictures: $(VENV)/.all  ## the pictures of the documentation, of meshes that are not in it: make pictures MESHES=folder
+	$(BIN)/python benchmarks/pictures/looks.py $(addprefix $(MESHES)/,$(PICTURED)) --levels fandisk_6475 bunny_oded_3301
 
 docs: $(VENV)/.docs  ## all pages, in docs/_build/html
 	$(BIN)/sphinx-build --quiet --fresh-env --nitpicky --fail-on-warning --keep-going docs docs/_build/html

@@ -17,7 +17,7 @@ import jaxmark as jm
 from tests.samples import bumpy_sphere
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-GROUPS = ("speed", "robustness", "security", "theory")
+GROUPS = ("speed", "robustness", "security", "theory", "pictures")
 PROGRAMS = sorted(path for group in GROUPS for path in (BENCHMARKS / group).glob("*.py"))
 SHARED = sorted((BENCHMARKS / "common").glob("*.py"))
 NAMES = [path.stem for path in PROGRAMS]

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
 from jaxmark.alignment.original import make_original
-from jaxmark.geometry.mesh import Mesh, face_normals, make_mesh
+from jaxmark.distortion import stretch, texture_drift
+from jaxmark.geometry.mesh import Mesh, edges, face_normals, make_mesh
 from jaxmark.watermark.budget import VISIBILITY, make_budget
 from jaxmark.watermark.carriers import KeyedCarrier
 from jaxmark.watermark.coding.keys import Choices
@@ -209,3 +210,33 @@ def test_records_keep_how_a_mark_was_hidden():
     assert get_scheme("keyed", parameters_of(KeyedScheme())) == KeyedScheme()
     before = {name: value for name, value in parameters_of(KeyedScheme()).items() if name != "hiding"}
     assert get_scheme("keyed", before) == KeyedScheme(hiding=False)
+
+
+def test_a_texture_drifts_as_far_as_its_surface_moves():
+    vertices, faces = sheet(9)
+    mesh = make_mesh(vertices, faces)
+    places = (vertices[:, :2] @ [[0.05, 0.0], [0.02, 0.03]])[faces]
+    moved = mesh._replace(vertices=vertices + np.array([0.01, 0.02, 0.3]))
+    # What is moved off the surface stays where it was in the texture.
+    expected = 1024 * np.hypot(0.05 * 0.01 + 0.02 * 0.02, 0.03 * 0.02)
+    assert texture_drift(mesh, moved, places, 1024) == pytest.approx(expected)
+    places[:4] = np.nan
+    assert texture_drift(mesh, moved, places, 1024) == pytest.approx(expected)
+    assert texture_drift(mesh, moved, np.full_like(places, np.nan)) is None
+
+
+def test_the_edges_that_change_most():
+    vertices, faces = sheet(9)
+    pairs = edges(faces)
+    stretched = jnp.asarray(vertices * [1.1, 1.1, 1])
+    assert float(stretch(jnp.asarray(vertices), stretched, pairs)) == pytest.approx(0.1, rel=1e-4)
+    rng = np.random.default_rng(0)
+    moved = vertices + 0.05 * rng.normal(size=vertices.shape)
+    before, after = (np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1) for x in (vertices, moved))
+    change = np.sort(np.abs(after - before) / before)
+    found = float(stretch(jnp.asarray(vertices), jnp.asarray(moved), pairs))
+    assert change[-4] < found < change[-1]
+    assert np.mean(change > found + 1e-6) <= 0.01 <= np.mean(change > found - 0.01)
+    slope = jax.grad(stretch, argnums=1)(jnp.asarray(vertices), jnp.asarray(moved), pairs)
+    assert np.count_nonzero(np.asarray(slope).any(axis=1)) == 2
+    assert float(stretch(jnp.zeros((3, 3)), jnp.ones((3, 3)), np.array([[0, 1], [1, 2]]))) == 0

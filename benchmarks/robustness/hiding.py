@@ -19,9 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxmark as jm
-from jaxmark.distortion import dihedral_angles, make_hinges
-from jaxmark.distortion._shading import SHARE, shading
-from jaxmark.geometry.mesh import Mesh, compact, diagonal, face_normals, host_mesh, weld, weld_mesh
+from jaxmark.distortion import shading
+from jaxmark.geometry.mesh import Mesh, compact, diagonal, host_mesh, weld, weld_mesh
 from jaxmark.watermark.budget import Budget, make_budget
 from jaxmark.watermark.detectors import claims
 from jaxmark.watermark.schemes import KeyedScheme
@@ -32,31 +31,9 @@ from common.attacks import attacked
 from common.marks import KEY, MESSAGE, write
 from common.shapes import SHAPES
 from common.tables import Row, say, table
+from common.turns import planes, turns
 
 ATTACKS = """noise 0.005; smoothing 50; quantisation 8; quantisation 7; simplification 0.9; isotropic 1"""
-
-
-def planes(mesh: Mesh) -> np.ndarray:
-    """Which faces turn by less than 0.1° at each of their edges."""
-    faces = np.asarray(mesh.faces)
-    hinges = make_hinges(faces)
-    bent = np.abs(np.degrees(dihedral_angles(jnp.asarray(mesh.vertices, jnp.float32), hinges))) > 0.1
-    pairs = np.sort(np.asarray(hinges.edges)[bent], axis=1) @ [len(mesh.vertices), 1]
-    sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1) @ [len(mesh.vertices), 1]
-    return np.asarray(~np.isin(sides, pairs)).all(axis=1)
-
-
-def turn_of_planes(mesh: Mesh, marked: Mesh, share: float = 0.95) -> float:
-    """Turn of plane faces' normals that is not exceeded on a share of their area, in degrees."""
-    plane, one, other = planes(mesh), face_normals(mesh), face_normals(marked)
-    if not plane.any():
-        return float("nan")
-    turn = np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other), axis=1), np.sum(one * other, axis=1)))[plane]
-    corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)[plane]]
-    size = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    order = np.argsort(turn)
-    below = np.cumsum(size[order])
-    return float(turn[order][np.searchsorted(below, share * below[-1])])
 
 
 def nats(marker: jm.watermark.Marker, suspect: Mesh) -> float:
@@ -81,13 +58,13 @@ def row(name: str, mesh: Mesh, budget: Budget, attacks: list[str]) -> Row:
             jnp.asarray((np.asarray(one.vertices) - reference.centre) / diagonal(mesh), jnp.float32)
             for one in (mesh, marked)
         )
-        seen = [float(shading(x, y, reference.hiding, share)) for share in (SHARE, 0.99)]
+        seen = [float(shading(x, y, reference.hiding, share)) for share in (0.95, 0.99)]
         told = {
             "rms": f"{1e3 * (found['rms'] or 0):.2f}",
             "shading": " / ".join(f"{value:.2f}" for value in seen),
             "dame": f"{found['dame']:.4f}",
             "stretch": f"{found['stretch']:.3f}",
-            "plane": f"{turn_of_planes(mesh, marked):.2f}",
+            "plane": f"{turns(mesh, marked, (0.95,), planes(mesh))[0]:.2f}",
         }
         told |= {attack: f"{nats(marker, attacked(marked, attack, 1)):.0f}" for attack in attacks}
         for column, value in told.items():

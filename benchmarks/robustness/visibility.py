@@ -3,10 +3,13 @@
 A line for each mesh, of which there may be none, and for each shape that is made on the spot, marked with 64 bits at
 the default strength or within --limit. Columns:
 
+rms        displacement over the diagonal
 dame       mean masked change of dihedral angles, in radians
+stretch    change of length that 1 % of the edges exceed
 turn       of face normals, in degrees, that half / 5 % of the area exceed
 shading    visible turn of normals, in just noticeable differences, that half / 5 % / 1 % of the area exceed
-plane      the turn of normals that is just noticed, in degrees, where the original hides least (5 % of the area, the
+on planes  the same of planes, in degrees, that 5 % of their area exceeds; their edges turn by less than 0.1°
+least      the turn of normals that is just noticed, in degrees, where the original hides least (5 % of the area, the
            most sensitive band)
 flip, ssim differences of pictures that 1 % of their pixels exceed, with --pictures
 seconds    to prepare the original / to measure / to take the gradient, once compiled
@@ -32,16 +35,7 @@ from common.marks import KEY, MESSAGE, write
 from common.shapes import SHAPES
 from common.tables import Row, say, table
 from common.timing import timed
-
-
-def turns(original: Mesh, marked: Mesh, shares: tuple[float, ...]) -> list[float]:
-    """Turn of face normals, in degrees, that is not exceeded on shares of the area."""
-    first, second = (np.asarray(mesh.vertices)[np.asarray(mesh.faces)] for mesh in (original, marked))
-    one, other = (np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) for corner in (first, second))
-    turn = np.degrees(np.arctan2(np.linalg.norm(np.cross(one, other), axis=1), np.sum(one * other, axis=1)))
-    order = np.argsort(turn)
-    share = np.cumsum(np.linalg.norm(one, axis=1)[order])
-    return [float(turn[order][np.searchsorted(share, least * share[-1])]) for least in shares]
+from common.turns import planes, turns
 
 
 def again(function: Callable[[], Any]) -> tuple[Any, float]:
@@ -54,7 +48,7 @@ def row(name: str, mesh: Mesh, budget: Budget, pictures: bool) -> Row:
     """A line of the table."""
     mesh = host_mesh(compact(weld_mesh(mesh, weld(mesh.vertices))))
     marked = write(jm.make_marker(mesh, KEY, bits=8 * len(MESSAGE)), MESSAGE, budget)
-    metrics = ("dame", *(RENDERED if pictures else ()))
+    metrics = ("rms", "dame", "stretch", *(RENDERED if pictures else ()))
     found = jm.distortion.measure(mesh, marked, metrics)
     points = [np.asarray(one.vertices, np.float64) / diagonal(mesh) for one in (mesh, marked)]
     points = [one - points[0].mean(axis=0) for one in points]
@@ -68,10 +62,12 @@ def row(name: str, mesh: Mesh, budget: Budget, pictures: bool) -> Row:
     return {
         "mesh": name,
         "points": len(x),
-        **{metric: found[metric] for metric in metrics},
+        **{metric: found[metric] for metric in metrics[:3]},
         "turn": " / ".join(f"{value:.2f}" for value in turns(mesh, marked, (0.5, 0.95))),
+        "on planes": f"{turns(mesh, marked, (0.95,), planes(mesh))[0]:.2f}",
         "shading": " / ".join(f"{value:.2f}" for value in seen),
-        "plane": f"{least:.2f}",
+        "least": f"{least:.2f}",
+        **{metric: found[metric] for metric in metrics[3:]},
         "seconds": " / ".join(f"{value:.2f}" for value in (prepare, measure, differentiate)),
     }
 

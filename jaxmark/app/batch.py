@@ -13,7 +13,7 @@ from jaxmark.app.dossier import Case, file_hash, save_dossier
 from jaxmark.app.mistakes import guess_mistakes, is_original
 from jaxmark.app.report import save_report
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import SUFFIXES, load_mesh, save_mesh
+from jaxmark.files import SUFFIXES, load_mesh, load_texture, save_mesh
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.budget import Visibility
@@ -109,6 +109,8 @@ def mark_file(
                 " more digits."
             )
         write_atomically(record_draft, info.record.to_json().encode())
+    texture = load_texture(original)
+    drift = None if texture is None else distortion.texture_drift(mesh, written, texture)
     change = distortion.DisplacementSize.of(shift_of(prepared, written)[prepared.used])
     answer = {
         "rms": change.rms,
@@ -116,10 +118,13 @@ def mark_file(
         "bits": info.record.bits,
         "scheme": info.record.scheme,
         "content": info.record.content,
+        "texture_drift": drift,
         "record": str(record),
         "marked": str(marked),
     }
     text = f"{said} → {marked}, RMS {change.rms:.3g} and max {change.max:.3g} of the diagonal; record → {record}"
+    if drift is not None:
+        text += f"; a texture of 2,048 x 2,048 drifts by {drift:.2g} texels"
     return Told(answer, text)
 
 

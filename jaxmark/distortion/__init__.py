@@ -31,6 +31,7 @@ from jaxmark.distortion._shading import shading as shading
 from jaxmark.distortion._shading import vertex_means as vertex_means
 from jaxmark.distortion._shading import visible_turn as visible_turn
 from jaxmark.distortion._stretch import stretch as stretch
+from jaxmark.distortion._texture import texture_drift as texture_drift
 from jaxmark.distortion.dihedral import dame as dame
 from jaxmark.distortion.dihedral import dihedral_angles as dihedral_angles
 from jaxmark.distortion.dihedral import make_hinges as make_hinges

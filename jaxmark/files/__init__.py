@@ -12,10 +12,10 @@ import numpy as np
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import glb, obj, off, ply, stl
 from jaxmark.files.atomic import write_atomically
-from jaxmark.files.source import Source
+from jaxmark.files.source import Source, Texture
 from jaxmark.geometry.mesh import Mesh, host_mesh, make_mesh
 
-__all__ = ["SUFFIXES", "load_mesh", "save_mesh", "write_atomically"]
+__all__ = ["SUFFIXES", "load_mesh", "load_texture", "save_mesh", "write_atomically"]
 
 _FORMATS: dict[str, Callable[[bytes], Source]] = {
     ".obj": obj.parse,
@@ -46,6 +46,23 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
         JaxmarkError: if the file is missing, of another format, malformed, or holds no valid mesh (see `make_mesh`).
     """
     return _read(path)[1]
+
+
+def load_texture(path: str | os.PathLike) -> Texture:
+    """Read the texture coordinates of an OBJ or GLB file.
+
+    Args:
+        path: a mesh file, see `load_mesh`.
+
+    Returns:
+        One pair for each corner of the faces that `load_mesh` returns, NaN for those that have none; None if the file
+        or its format has no texture coordinates, or none that can be read.
+
+    Raises:
+        JaxmarkError: see `load_mesh`.
+    """
+    found = _read(path)[0].texture()
+    return None if found is None or not np.isfinite(found).any() else found
 
 
 def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | None = None) -> None:

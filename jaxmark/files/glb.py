@@ -4,6 +4,7 @@ import json
 import re
 import struct
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,10 +36,11 @@ def parse(data: bytes) -> Source:
     points = _joined(file, [primitive.position for primitive in primitives])
     normals = _joined(file, [primitive.normal for primitive in primitives if primitive.normal is not None])
     _refuse_overlaps(file, points.indices + normals.indices)
-    faces, corners = [], []
+    faces, corners, textures = [], [], []
     for primitive in primitives:
         index = _triangles(file, primitive.data, points.rows(primitive.position))
         faces.append(index + points.first_row(primitive.position))
+        textures.append(partial(_texture, file, primitive.data, index))
         if primitive.normal is None or normals.rows(primitive.normal) != points.rows(primitive.position):
             corners.append(np.full_like(index, -1))
         else:
@@ -48,7 +50,9 @@ def parse(data: bytes) -> Source:
     if normals.indices:
         turned = Transported(BinaryNumbers(file.data, normals.offsets, types), np.concatenate(corners))
     coordinates = BinaryNumbers(file.data, points.offsets, types)
-    return _GlbSource(file.data, coordinates, np.concatenate(faces), turned, file=file, points=points)
+    source = _GlbSource(file.data, coordinates, np.concatenate(faces), turned, file=file, points=points)
+    source.texture = lambda: np.concatenate([read() for read in textures])
+    return source
 
 
 class _File:
@@ -241,6 +245,24 @@ def _triangles(file: _File, primitive: dict[str, Any], count: int) -> Int64[np.n
     if (index >= count).any():
         raise JaxmarkError(f"{where} refers to vertex {index.max()}, but there are {count}, numbered from 0.")
     return index.reshape(-1, 3)
+
+
+def _texture(
+    file: _File, primitive: dict[str, Any], index: Int64[np.ndarray, "faces 3"]
+) -> Float64[np.ndarray, "faces 3 2"]:
+    """Texture coordinates of the corners of a primitive's faces; NaN unless they are plain pairs of floats."""
+    nothing = np.full((*index.shape, 2), np.nan)
+    try:
+        number = _attribute(primitive, "TEXCOORD_0")
+        if number is None:
+            return nothing
+        starts, dtype, width = file.elements(number)
+    except JaxmarkError:  # a wrong texture is no reason to refuse the file
+        return nothing
+    if width != 2 or dtype != _FLOAT or index.max(initial=-1) >= len(starts):
+        return nothing
+    pairs = gather(file.data, (starts[:, None] + [0, 4]).ravel(), _FLOAT).astype(np.float64)
+    return pairs.reshape(-1, 2)[index]
 
 
 def _objects(parent: dict[str, Any], key: str, where: str) -> list[dict[str, Any]]:

@@ -5,8 +5,9 @@ import re
 import numpy as np
 from jaxtyping import Int64
 
+from jaxmark.errors import JaxmarkError
 from jaxmark.files.normals import Transported
-from jaxmark.files.source import Source, fan, ranges
+from jaxmark.files.source import Source, Texture, fan, ranges
 from jaxmark.files.text import Text, TextNumbers, unix, without_comments
 
 
@@ -45,16 +46,42 @@ def parse(data: bytes) -> Source:
         )
     triangles = fan(sizes)
     source = Source(data, coordinates, index[triangles])
+    second = text.seek("/", np.minimum(slash + 1, ends), ends)
+    source.texture = lambda: _texture(text, first, count, lines, sizes, slash + 1, second)
     if len(normals):
         numbers = _triples(text, normals, first, count, "normal")
         used = np.full(len(corners), -1)
-        second = text.seek("/", np.minimum(slash + 1, ends), ends) + 1
-        named = second < ends
+        named = second + 1 < ends
         before = np.repeat(np.searchsorted(normals, lines), sizes)
-        used[named] = _absolute(text.ints(second[named], ends[named]), before[named])
+        used[named] = _absolute(text.ints(second[named] + 1, ends[named]), before[named])
         used[(used < 0) | (used >= len(normals))] = -1  # a wrong index of a normal is no reason to refuse the file
         source.normals = Transported(numbers, used[triangles])
     return source
+
+
+def _texture(
+    text: Text,
+    first: Int64[np.ndarray, " lines"],
+    count: Int64[np.ndarray, " lines"],
+    lines: Int64[np.ndarray, " polygons"],
+    sizes: Int64[np.ndarray, " polygons"],
+    begins: Int64[np.ndarray, " corners"],
+    ends: Int64[np.ndarray, " corners"],
+) -> Texture:
+    """Texture coordinates of the triangles' corners, which lie between these places as indices of `vt` lines."""
+    rows = first[_keyword(text, first, b"vt")]
+    if not len(rows) or (count[np.searchsorted(first, rows)] < 3).any():
+        return None
+    tokens = (rows[:, None] + np.arange(1, 3)).ravel()
+    try:
+        values = text.floats(text.starts[tokens], text.ends[tokens]).reshape(-1, 2)
+        named, used = begins < ends, np.full(len(begins), -1)
+        before = np.repeat(np.searchsorted(rows, lines), sizes)
+        used[named] = _absolute(text.ints(begins[named], ends[named]), before[named])
+    except JaxmarkError:  # a wrong texture is no reason to refuse the file
+        return None
+    known = (used >= 0) & (used < len(rows))
+    return np.where(known[:, None], values[used.clip(0, len(rows) - 1)], np.nan)[fan(sizes)]
 
 
 def _keyword(text: Text, first: Int64[np.ndarray, " lines"], word: bytes) -> np.ndarray:

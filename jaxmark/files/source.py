@@ -1,6 +1,6 @@
 """Parsed mesh files, which can be written again with other positions and otherwise the same bytes."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -58,6 +58,14 @@ class Normals(Protocol):
         ...
 
 
+Texture = Float64[np.ndarray, "faces 3 2"] | None
+
+
+def no_texture() -> Texture:
+    """The texture coordinates of a file that has none."""
+    return None
+
+
 @dataclass
 class Source:
     """One parsed file.
@@ -67,12 +75,14 @@ class Source:
         coordinates: the positions in the file.
         faces: `[F, 3]` zero-based indices into the positions; polygons are split into triangles.
         normals: the normals that follow the positions, if the file has any.
+        texture: reads the texture coordinates of each face's corners, NaN where there are none; None without any.
     """
 
     data: bytes
     coordinates: Numbers
     faces: Int64[np.ndarray, "faces 3"]
     normals: Normals | None = None
+    texture: Callable[[], Texture] = no_texture
 
     @property
     def positions(self) -> Float64[np.ndarray, "points 3"]:

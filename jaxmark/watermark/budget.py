@@ -22,7 +22,7 @@ Visibility = Literal["hidden", "careful look", "visible"]
 #: wireframes and textures show, change by no more than a tenth. On a careful look: two to three times that is seen by
 #: who compares with the original. Visible: five times and more.
 VISIBILITY: Mapping[Visibility, Mapping[str, float]] = {
-    "hidden": {"shading": 0.9, "dame": 0.008, "stretch": 0.1},
+    "hidden": {"shading": 0.85, "dame": 0.008, "stretch": 0.1},
     "careful look": {"shading": 2.5, "dame": 0.02, "stretch": 0.15},
     "visible": {"shading": 6.0, "dame": 0.05, "stretch": 0.25},
 }

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import load_mesh
+from jaxmark.files import load_mesh, load_texture
 from tests.files.helpers import loaded, noisy, patched, shifted, turned, written
 
 POINTS = [[0.5, 0, 0], [1, 0, 0], [0, 0, 1]]
@@ -196,3 +197,19 @@ def test_any_value_may_be_of_any_kind(tmp_path: Path, value: Any) -> None:
         except JaxmarkError:
             continue
         patched(source, noisy(mesh, 0.1))
+
+
+def test_texture_coordinates_are_those_of_another_program(tmp_path):
+    rng = np.random.default_rng(0)
+    shape = trimesh.creation.icosphere(1)
+    places = rng.uniform(size=(len(shape.vertices), 2)).astype(np.float32)
+    shape.visual = trimesh.visual.TextureVisuals(uv=places)
+    path = tmp_path / "ball.glb"
+    shape.export(path)
+    again = trimesh.load(path, process=False, force="mesh")
+    mesh, found = load_mesh(path), load_texture(path)
+    assert found is not None
+    # glTF counts from the upper edge of a picture, trimesh from the lower one.
+    np.testing.assert_allclose(found * [1, -1] + [0, 1], again.visual.uv[mesh.faces], atol=1e-6)
+    trimesh.creation.icosphere(1).export(path)
+    assert load_texture(path) is None

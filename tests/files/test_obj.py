@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import load_mesh, save_mesh
+from jaxmark.files import load_mesh, load_texture, save_mesh
 from tests.files.helpers import loaded, noisy, patched, shifted, turned, written
 
 # A square of two triangles on a UV seam, with whatever else such files hold. No newline at the end.
@@ -170,3 +170,21 @@ def test_digits_beyond_doubles_are_not_invented(tmp_path: Path) -> None:
     source = written(tmp_path, "long.obj", data)
     moved = shifted(load_mesh(source), 0, [0.5, 0, 0])
     assert patched(source, moved).startswith(b"v 0.5623894900711343 0 0\n")
+
+
+def test_texture_coordinates_of_corners(tmp_path):
+    """By `vt` lines, whose indices may be negative or absent, of polygons that are split as faces are."""
+    path = tmp_path / "quad.obj"
+    path.write_text(
+        "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 2 0 0\nvt 0 0\nvt 1 0 0\nvt 1 1\nvt 0 0.5\nvn 0 0 1\n"
+        "f 1/1/1 2/-3/1 3/3/1 4/4/1\nf 2 5//1 3/9\n"
+    )
+    found = load_texture(path)
+    assert found is not None
+    np.testing.assert_array_equal(found[0], [[0, 0], [1, 0], [1, 1]])
+    np.testing.assert_array_equal(found[1], [[0, 0], [1, 1], [0, 0.5]])
+    assert np.isnan(found[2]).all()
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt a b\nf 1/1 2/1 3/1\n")
+    assert load_texture(path) is None
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    assert load_texture(path) is None
