@@ -53,7 +53,7 @@ def test_planes_edges_and_corners():
     for count in (1, 2, 3):
         chosen = sides.sum(axis=1) == count
         across, within = along[chosen][sides[chosen]], along[chosen][~sides[chosen]]
-        assert across.max() < 0.01 * along.max()
+        assert across.max() < 0.05 * along.max()
         assert count == 3 or within.min() > 0.5 * along.max()
 
 
@@ -63,8 +63,8 @@ def test_borders_hide_as_edges_do():
     row = vertices[:, 1]
     bottom = np.isclose(row, 0) & (vertices[:, 0] > 2) & (vertices[:, 0] < 18)
     inside = (row > 5) & (row < 12) & (vertices[:, 0] > 9) & (vertices[:, 0] < 18)
-    assert ratio(mesh, np.array([0.0, 0, 1])).max() < 0.01
-    assert ratio(mesh, np.array([0.0, 1, 0]))[bottom].max() < 0.01
+    assert ratio(mesh, np.array([0.0, 0, 1])).max() < 0.05
+    assert ratio(mesh, np.array([0.0, 1, 0]))[bottom].max() < 0.05
     np.testing.assert_allclose(ratio(mesh, np.array([1.0, 0, 0]))[bottom], np.sqrt(0.5), atol=0.01)
     np.testing.assert_allclose(ratio(mesh, np.array([0.0, 1, 0]))[inside], np.sqrt(0.5), atol=0.01)
 

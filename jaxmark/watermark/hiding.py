@@ -17,7 +17,7 @@ _BAND = 2  # of `Hiding`: waves six edges long, of which marks mostly consist
 _SLOPE = 0.9  # largest slope of such a wave, times an edge, over its height
 _ALONG = 0.03  # displacement along the surface, in edges, that counts as much as a just noticeable one across it
 _BENT = np.radians(2)  # angle between faces from which on a surface may hide as much as that angle
-_MIN_HIDDEN = 0.02  # of what a plane hides
+_MIN_HIDDEN = 0.12  # of what a plane hides
 _LEAST_BEND = 1e-4  # radians that the flattest faces hide in the mean of those around
 _AVERAGING_SCALE = 2  # bends are averaged over 2^2 steps of diffusion
 
