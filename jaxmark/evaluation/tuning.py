@@ -244,6 +244,7 @@ def _allocate(
     return jnp.where(empty, 0, budget * jnp.sqrt(jnp.where(empty, 1, shares) / cost))
 
 
+@partial(jax.jit, static_argnames="cap")
 def _capped_simplex(x: Float[Array, " bands"], cap: float) -> Float[Array, " bands"]:
     """Project onto Σ_j s_j = 1, 0 ≤ s_j ≤ cap: subtract one level from all, and clip."""
 

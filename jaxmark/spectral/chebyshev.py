@@ -100,6 +100,7 @@ def band_components(
     return jax.vmap(operator.leave)(_scan_terms(operator, x, c.T, add, jnp.multiply.outer(c[:, 0], x))[0])
 
 
+@partial(jax.jit, static_argnums=0)
 def over_bands(
     function: Callable[[Float[Array, " vertices *columns"]], Any],
     operator: Laplacian,
@@ -109,7 +110,8 @@ def over_bands(
     """Apply a function to each band component f_j(Δ)x, a few at a time, so that it takes O(N) memory.
 
     Args:
-        function: maps one component, in the shape of `x`, to an array or a tuple of arrays.
+        function: maps one component, in the shape of `x`, to an array or a tuple of arrays. Eager calls compile once
+            for each function object, so define it outside of loops.
         operator: see `band_components`.
         coefficients: see `band_components`.
         x: see `band_components`.

@@ -78,6 +78,7 @@ def leja(nodes: Float[np.ndarray, " nodes"]) -> Int64[np.ndarray, " nodes"]:
     return np.array(chosen, np.int64)
 
 
+@jax.jit
 def filter_by_factors(
     operator: Operator, factors: Factors, x: Float[Array | np.ndarray, " vertices *columns"]
 ) -> Float[Array, " vertices *columns"]:

@@ -4,6 +4,8 @@ Functions are given in second-order sections, as in signal processing: f(λ) is 
 (b_0 + b_1λ + b_2λ²)/(a_0 + a_1λ + a_2λ²), each a row [b_0, b_1, b_2, a_0, a_1, a_2] of `[sections, 6]`.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,12 +16,13 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.spectral.laplacian import Operator, per_row
 
 
+@partial(jax.jit, static_argnames="iterations")
 def filter_rational(
     operator: Operator,
     sections: Float[Array | np.ndarray, "sections 6"],
     x: Float[Array | np.ndarray, " vertices *columns"],
     *,
-    tolerance: float | None = None,
+    tolerance: float | Float[Array, ""] | None = None,
     iterations: int = 2000,
 ) -> Float[Array, " vertices *columns"]:
     """Filter a signal by a rational function: f(Δ)x, section by section.

@@ -94,6 +94,7 @@ class KeyedCarrier(NamedTuple):
         """See `Carrier`."""
         return self.correlate(per_row(self.host.operator.degree, residual) * residual, self.coefficients(beta))
 
+    @jax.jit
     def gram(self, beta: Strength = 1.0) -> Float[Array, "bits bits"]:
         """See `Carrier`; takes one filter per bit, so it is for tests and small codes."""
         unit = jnp.eye(self.code_bits, dtype=self._signs.dtype)

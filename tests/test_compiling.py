@@ -1,0 +1,72 @@
+"""Eager calls of numerical functions compile once: no more for other arguments, or fresh operators, of equal shape."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmark as jm
+from jaxmark import spectral
+from jaxmark.alignment.original import make_original
+from jaxmark.evaluation.tuning import allocate
+from jaxmark.spectral.chebyshev import band_energies, over_bands
+from jaxmark.watermark.channels import Channels
+from jaxmark.watermark.coding.keys import Choices
+from jaxmark.watermark.schemes import KeyedScheme
+from tests.samples import rough_sphere
+
+BANDS = np.asarray(spectral.bands.scaling(8, damping="jackson"), np.float32)
+SECTIONS = np.array([[1, 0, 0, 1, 0.5, 0.0]])
+
+
+def square(x: jax.Array) -> jax.Array:
+    return jnp.sum(x**2)
+
+
+def factors() -> spectral.Factors:
+    first = spectral.lagrange_factors(np.array([0.1, 0.5, 1.1, 1.7]))
+    return spectral.Factors(*(part[0] for part in first))
+
+
+def carrier(seed: int) -> Any:
+    original = make_original(rough_sphere(67))
+    return KeyedScheme().carrier(original, Choices(jm.Key(bytes([seed] * 32)), b""), 8, 64)
+
+
+CALLS: dict[str, Callable[[Any, Any, int], Any]] = {
+    "apply": lambda operator, x, seed: operator.apply(x),
+    "inner": lambda operator, x, seed: operator.inner(x, x),
+    "filter": lambda operator, x, seed: spectral.filter(operator, BANDS[0], x),
+    "filter by scan": lambda operator, x, seed: spectral.filter(operator, BANDS[0], x, derivative="scan"),
+    "transpose": lambda operator, x, seed: spectral.transpose(operator, BANDS[0], x),
+    "band_components": lambda operator, x, seed: spectral.band_components(operator, BANDS, x),
+    "over_bands": lambda operator, x, seed: over_bands(square, operator, BANDS, x),
+    "band_energies": lambda operator, x, seed: band_energies(operator, jnp.asarray(BANDS), x, x),
+    "moments": lambda operator, x, seed: spectral.moments(operator, x, degree=5),
+    "cross_moments": lambda operator, x, seed: spectral.cross_moments(operator, x, x, degree=5),
+    "gram": lambda operator, x, seed: spectral.gram(operator, BANDS, x),
+    "filter_rational": lambda operator, x, seed: spectral.filter_rational(operator, SECTIONS, x),
+    "filter_by_factors": lambda operator, x, seed: spectral.filter_by_factors(operator, factors(), x),
+    "allocate": lambda _, x, seed: allocate(Channels(*(jnp.full((2, 8), 1.0 + seed),) * 3), jnp.ones(8)),
+    "carrier": lambda _, x, seed: carrier(seed).displacement(jnp.ones(64)),
+    "carrier gram": lambda _, x, seed: carrier(seed).gram(),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_the_second_call_compiles_nothing(name: str, caplog: pytest.LogCaptureFixture):
+    compiled = []
+    for seed in (0, 1):
+        mesh = rough_sphere(67, seed)
+        operator = spectral.make_laplacian(mesh, "inverse-length", lowering="segments")
+        x = jnp.asarray(mesh.vertices, jnp.float32)
+        caplog.clear()
+        with jax.log_compiles(True):
+            jax.block_until_ready(CALLS[name](operator, x, seed))
+        compiled.append([record.message for record in caplog.records if "ompil" in record.message])
+    first, second = compiled
+    assert first
+    assert second == []
