@@ -11,6 +11,8 @@ from jaxmark.spectral.chebyshev import filter as filter
 from jaxmark.spectral.chebyshev import gram as gram
 from jaxmark.spectral.chebyshev import moments as moments
 from jaxmark.spectral.chebyshev import transpose as transpose
+from jaxmark.spectral.graphs import from_edges as from_edges
+from jaxmark.spectral.graphs import from_points as from_points
 from jaxmark.spectral.laplacian import Laplacian as Laplacian
 from jaxmark.spectral.laplacian import Operator as Operator
 from jaxmark.spectral.laplacian import centre as centre

@@ -195,12 +195,22 @@ def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence", *, lo
                     f"weights must be 'valence', 'inverse-length', 'cotangent' or an array, got {weights!r}."
                 )
     else:
-        values = np.asarray(weights, np.float64)
-        if values.shape != (len(pairs),):
-            raise JaxmarkError(f"weights must have one value for each of the {len(pairs)} edges, got {values.shape}.")
-        if not (np.isfinite(values) & (values >= 0)).all():
-            raise JaxmarkError("weights must be finite and not negative; otherwise the spectrum leaves [0, 2].")
+        values = checked_weights(weights, len(pairs))
     return graph_laplacian(pairs, len(mesh.vertices), values, lowering=lowering)
+
+
+def checked_weights(weights: ArrayLike, count: int) -> Float64[np.ndarray, " edges"]:
+    """Weights of so many edges as an array.
+
+    Raises:
+        JaxmarkError: if there are more or fewer, or one is negative or not finite.
+    """
+    values = np.asarray(weights, np.float64)
+    if values.shape != (count,):
+        raise JaxmarkError(f"weights must have one value for each of the {count} edges, got {values.shape}.")
+    if not (np.isfinite(values) & (values >= 0)).all():
+        raise JaxmarkError("weights must be finite and not negative; otherwise the spectrum leaves [0, 2].")
+    return values
 
 
 def graph_laplacian(
