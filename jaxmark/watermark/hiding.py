@@ -15,7 +15,7 @@ from jaxmark.spectral.shapes import pad_rows
 
 _BAND = 2  # of `Hiding`: waves six edges long, of which marks mostly consist
 _SLOPE = 0.9  # largest slope of such a wave, times an edge, over its height
-_ALONG = 0.03  # displacement along the surface, in edges, that counts as much as a just noticeable one across it
+_ALONG = 0.04  # displacement along the surface, in edges, that counts as much as a just noticeable one across it
 _BENT = np.radians(2)  # angle between faces from which on a surface may hide as much as that angle
 _MIN_HIDDEN = 0.12  # of what a plane hides
 _LEAST_BEND = 1e-4  # radians that the flattest faces hide in the mean of those around
@@ -26,7 +26,7 @@ def hiding_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     """Matrices that turn and scale displacements so that each point is moved where, and as, it is hidden.
 
     Each face around a point allows a displacement along its normal as far as a wave of that height is just noticeable
-    in shading (see `jaxmark.distortion.shading`); any displacement along the surface is allowed 3 % of an edge. A
+    in shading (see `jaxmark.distortion.shading`); along each edge, and in any direction, 4 % of an edge is allowed. A
     border allows as much as the edge of a solid sheet would. What all faces around a point allow is an ellipsoid; the
     matrix maps the unit sphere to it. On a plane it is flat, along an edge it is a needle, where the surface is rough
     or curved it is round.
@@ -64,11 +64,19 @@ def hiding_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     weight += added
     form = (form + more) / np.where(weight > 0, weight, 1)[:, None, None]
 
-    # A displacement is hidden where its form is at most 1.
-    along = _ALONG * _mean_edges(mesh)
-    free = original.used & (along > 0)
-    form[free] += np.eye(3) / along[free, None, None] ** 2
+    # Along each edge, and in all directions, a displacement is bounded by lengths of edges. One long edge among short
+    # ones does not count more than twice: a mark that is mostly in a few points proves little.
+    pairs = edges(faces)
+    ends = points[pairs[:, 1]] - points[pairs[:, 0]]
+    lengths = np.linalg.norm(ends, axis=1)
+    along, count = _sums(pairs, np.ones(pairs.shape), _squares(unit(ends), _ALONG * lengths), size)
+    mean = np.bincount(pairs.ravel(), np.repeat(lengths, 2), size) / np.maximum(count, 1)
+    free = original.used & (count > 0)
+    most = _ALONG * np.minimum(mean, 2 * np.median(mean[free])) if free.any() else mean
+    form[free] += along[free] / count[free, None, None] + np.eye(3) / most[free, None, None] ** 2
     form[~free] = np.eye(3)
+
+    # A displacement is hidden where its form is at most 1.
     values, vectors = np.linalg.eigh(form)
     matrices = (vectors / np.sqrt(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
     matrices[~free] = 0
@@ -98,11 +106,3 @@ def _sums(
     rows = np.repeat(np.arange(len(points)), points.shape[1])
     incidence = sparse.csr_array((weights.ravel(), (points.ravel(), rows)), shape=(size, len(points)))
     return (incidence @ forms.reshape(-1, 9)).reshape(-1, 3, 3), np.asarray(incidence.sum(axis=1))
-
-
-def _mean_edges(mesh: Mesh) -> Float64[np.ndarray, " points"]:
-    """Mean length of the edges at each point; 0 where there are none."""
-    pairs = edges(mesh.faces)
-    lengths = np.linalg.norm(mesh.vertices[pairs[:, 0]] - mesh.vertices[pairs[:, 1]], axis=1)
-    size, ends = len(mesh.vertices), pairs.T.ravel()
-    return np.bincount(ends, np.tile(lengths, 2), size) / np.maximum(np.bincount(ends, minlength=size), 1)
