@@ -16,7 +16,7 @@ def planes(mesh: Mesh) -> np.ndarray:
     bent = np.abs(np.degrees(dihedral_angles(jnp.asarray(mesh.vertices, jnp.float32), hinges))) > PLANE
     pairs = np.sort(np.asarray(hinges.edges)[bent], axis=1) @ [size, 1]
     sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1) @ [size, 1]
-    return np.asarray(~np.isin(sides, pairs)).all(axis=1)
+    return np.asarray(np.all(~np.isin(sides, pairs), axis=1))
 
 
 def turns(original: Mesh, marked: Mesh, shares: tuple[float, ...], where: np.ndarray | None = None) -> list[float]:

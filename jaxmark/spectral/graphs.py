@@ -5,7 +5,7 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy.typing import ArrayLike
-from scipy import spatial
+from scipy.spatial import KDTree
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.spectral.laplacian import Laplacian, Lowering, checked_weights, graph_laplacian
@@ -111,7 +111,8 @@ def from_points(
 
 def _nearest(positions: Float64[np.ndarray, "points axes"], count: int) -> tuple[Int64[np.ndarray, "edges 2"], float]:
     """Pairs of points one of which is among the nearest of the other, and the mean distance of the last of these."""
-    distance, nearest = spatial.cKDTree(positions).query(positions, count + 1)
+    found = KDTree(positions).query(positions, count + 1)
+    distance, nearest = (np.asarray(part) for part in found)
     size = len(positions)
     own = nearest == np.arange(size)[:, None]
     # Among many points at one position, a point may not be among its own nearest: then the last one is left out.

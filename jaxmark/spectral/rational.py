@@ -16,13 +16,13 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.spectral.laplacian import Operator, per_row
 
 
-@partial(jax.jit, static_argnames="iterations")
+@partial(jax.jit, static_argnames=("tolerance", "iterations"))
 def filter_rational(
     operator: Operator,
     sections: Float[Array | np.ndarray, "sections 6"],
     x: Float[Array | np.ndarray, " vertices *columns"],
     *,
-    tolerance: float | Float[Array, ""] | None = None,
+    tolerance: float | None = None,
     iterations: int = 2000,
 ) -> Float[Array, " vertices *columns"]:
     """Filter a signal by a rational function: f(Δ)x, section by section.

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from trimesh.visual import TextureVisuals
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, load_texture
@@ -203,10 +204,10 @@ def test_texture_coordinates_are_those_of_another_program(tmp_path):
     rng = np.random.default_rng(0)
     shape = trimesh.creation.icosphere(1)
     places = rng.uniform(size=(len(shape.vertices), 2)).astype(np.float32)
-    shape.visual = trimesh.visual.TextureVisuals(uv=places)
+    shape.visual = TextureVisuals(uv=places)
     path = tmp_path / "ball.glb"
     shape.export(path)
-    again = trimesh.load(path, process=False, force="mesh")
+    again: Any = trimesh.load(path, process=False, force="mesh")
     mesh, found = load_mesh(path), load_texture(path)
     assert found is not None
     # glTF counts from the upper edge of a picture, trimesh from the lower one.

@@ -20,9 +20,10 @@ MESSAGE = b"mark"
 RECIPIENTS = ("alice", "bob")
 BUDGET = 2e-3
 MARKS: dict[str, Scheme] = {
-    "keyed": KeyedScheme(),
+    "hidden": KeyedScheme(),
+    "keyed": KeyedScheme(hiding=False),
     "normals": KeyedScheme(direction="normals"),
-    "narrow": KeyedScheme(passband="narrow"),
+    "narrow": KeyedScheme(passband="narrow", hiding=False),
     "host": HostScheme(),
     "eigen": EigenScheme(),
 }
