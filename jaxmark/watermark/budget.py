@@ -88,13 +88,19 @@ def make_budget(rms: float | None = None, limits: Limits | None = None, visibili
     return Budget(rms, checked)
 
 
-def write(original: Original, shift: Float64[np.ndarray, "points 3"], budget: Budget) -> Written:
+def write(
+    original: Original,
+    shift: Float64[np.ndarray, "points 3"],
+    budget: Budget,
+    reference: distortion.Reference | None = None,
+) -> Written:
     """Displace an original as far as a budget allows: to the RMS exactly, or to limits within 1 %, never beyond.
 
     Args:
         original: the mesh to displace.
         shift: displacement of each point, in diagonals, up to a common factor; not all zero.
         budget: the bounds to keep.
+        reference: of the original's mesh, if there is one already: limits are measured against it.
 
     Raises:
         JaxmarkError: if the displacement is lost in rounding; if limits alone allow an RMS displacement of 0.01; or see
@@ -103,11 +109,11 @@ def write(original: Original, shift: Float64[np.ndarray, "points 3"], budget: Bu
     # Budgets are relative to the file's diagonal; the original's points may be rounded.
     size = float(distortion.rms(shift[original.used])) * original.diagonal / diagonal(original.mesh)
 
-    reference = distortion.Reference(original.mesh)
+    compared = reference or distortion.Reference(original.mesh)
 
     def limit_ratio(rms: float) -> float:
         """The largest ratio of a metric to its limit."""
-        found = reference.measure(displace(original, rms / size * shift), budget.limits.keys())
+        found = compared.measure(displace(original, rms / size * shift), budget.limits.keys())
         return max((found[metric] or 0.0) / limit for metric, limit in budget.limits.items())
 
     rms = budget.rms or _MAX_RMS

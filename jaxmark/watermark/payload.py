@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Hashable, Mapping
+from functools import cached_property
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ from jaxtyping import Float64
 from scipy import optimize
 from scipy.special import log_ndtr, ndtri  # scipy.stats takes long to import
 
+from jaxmark import distortion
 from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.budget import Budget, write
@@ -23,6 +25,9 @@ _MAX_PAYLOAD_BYTES = 2**20  # if nothing else bounds the payload
 # Energy in decibels that the polar code needs beyond the least, at a message error rate of 1e-3;
 # `benchmarks/theory/limit.py --code-only` measures it.
 _CODE_GAP_DB = 1.0
+
+_PROBES = 5  # marks that are tried to see how strong limits allow them to be
+_SPREADS, _MIN_SPREAD = 3, 0.007  # standard deviations of their logarithms that are subtracted, and the least of these
 
 
 def least_energy(bits: int, error: float = 1e-3) -> float:
@@ -149,11 +154,22 @@ class Capacity:
         layout = self._scheme.layout(self._original, bits)
         if layout not in self._reached:
             carrier = self._carrier(bits, self._scheme.code_length(self._original, bits))
-            probe = carrier.displacement(jnp.ones(carrier.code_bits, self._original.signal.dtype))
-            reached = write(self._original, self._original.to_host(probe), budget).moved.rms
-            # Two marks under the same limits differ by about one percent; two are subtracted to be sure.
-            self._reached[layout] = 0.98 * reached
+            reached = [self._write(carrier, word, budget) for word in range(_PROBES)]
+            # Marks under the same limits differ: by a percent where a limit is a mean, by ten where it is a percentile.
+            logs = np.log(reached)
+            spread = max(float(logs.std(ddof=1)), _MIN_SPREAD)
+            self._reached[layout] = math.exp(logs.mean() - _SPREADS * spread)
         return self._reached[layout]
+
+    def _write(self, carrier: Carrier, word: int, budget: Budget) -> float:
+        """RMS displacement of a mark with one of several codewords."""
+        signs = np.random.default_rng(word).choice([-1.0, 1.0], carrier.code_bits)
+        probe = carrier.displacement(jnp.asarray(signs, self._original.signal.dtype))
+        return write(self._original, self._original.to_host(probe), budget, self._reference).moved.rms
+
+    @cached_property
+    def _reference(self) -> distortion.Reference:
+        return distortion.Reference(self._original.mesh)
 
     def _room(self, reader: Reader) -> Room | None:
         return reader.room(self._original.to_traced(self._original.used))
