@@ -92,7 +92,7 @@ def test_bits_are_noise_to_each_other():
 @pytest.mark.parametrize("passband", ["tapered", "narrow"])
 def test_room_is_what_the_projection_leaves(direction, passband, x64):
     """By dense matrices: of white displacements in each band, and the energy of a mark of unit mean square."""
-    original, scheme = make_original(bumpy_sphere(2)), KeyedScheme(bands=32, direction=direction, passband=passband)
+    original, scheme = make_original(bumpy_sphere(2)), KeyedScheme(32, direction, passband=passband, hiding=False)
     carrier = scheme.carrier(original, Choices(jm.Key(bytes(32)), b""), 8, 32)
     passing = scheme.layout(original, 8).passing
     count = len(original.used)
@@ -187,9 +187,9 @@ def test_what_carries_a_payload_carries_a_shorter_one():
 def test_payloads_that_must_not_be_refused(vertices, bits, budget, known: Capacity):
     """They read with half of the vertices lost under the strongest noise of the protocol.
 
-    The room is measured with one probe, which may be off by a percent.
+    The room is measured with one probe, which may be off by a percent; that some points move more takes another.
     """
-    budget *= 1.01
+    budget *= 1.02
     if vertices == 1100:
         assert known.least_budget(bits, USUAL) <= budget
         return
