@@ -49,7 +49,7 @@ def test_inversion_fails_only_by_the_hash(published, forged):
     assert jm.distortion.displacement_size(forged, mesh).rms == pytest.approx(8e-4, rel=1e-2)
     # Did the choices not depend on the original, the forger would have his claim ...
     without = unbound(forged, mesh, FORGER)
-    assert without.detect(mesh, FORGED).log10_p < -30
+    assert without.detect(mesh, FORGED).log10_p < -20
     assert without.detect(mesh).message == FORGED
     # ... and with any luck in the world he does not: 1e-6 is one in a million keys.
     as_it_is = jm.detect(mesh, original=forged, key=FORGER, message=FORGED)

@@ -92,7 +92,7 @@ def test_who_optimises_does_more_than_who_writes_another_mark(scheme, key: jm.Ke
         assert max(found["bands", 40], found["evolution"]) < 0.97 * other
     # Twice the steps change next to nothing.
     for family in ("bands", "vertices"):
-        assert found[family, 40] == pytest.approx(found[family, 20], rel=0.06)
+        assert found[family, 40] == pytest.approx(found[family, 20], rel=0.08)
     # The owner sees what was expected; by how much it varies is 1 for every key.
     suspect = mesh._replace(
         vertices=mesh.vertices + original.diagonal * original.to_host(shifts["bands", 40])[original.weld.point]
