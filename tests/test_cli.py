@@ -255,7 +255,7 @@ def test_other_connectivity_is_read_where_it_can_be(workshop: Workshop):
     assert told["message"] == MESSAGE
     alignment = told["alignment"]
     assert alignment["method"] == "surface"
-    np.testing.assert_allclose(np.array(alignment["pose"]["matrix"]) @ turn * 30, np.eye(3), atol=1e-3)
+    np.testing.assert_allclose(np.array(alignment["pose"]["matrix"]) @ turn * 30, np.eye(3), atol=2e-3)
     assert 0 < alignment["residual"] < 1e-3
     assert alignment["seconds"] > 0
     assert Path("seen/alignment.png").read_bytes().startswith(b"\x89PNG")
