@@ -24,10 +24,10 @@ def close(found, expected, dtype) -> None:
 
 
 @pytest.mark.parametrize(
-    ("along", "lowering", "derivative", "count", "columns"),
-    [("curve", "gather", "recompute", 4, ()), ("graph", "segments", "scan", 3, (2,))],
+    ("along", "lowering", "count", "columns"),
+    [("curve", "gather", 4, ()), ("graph", "segments", 3, (2,))],
 )  # neither 3 nor 4 divides 642
-def test_filter_and_gradients_are_those_of_one_device(sphere: Mesh, along, lowering, derivative, count, columns, dtype):
+def test_filter_and_gradients_are_those_of_one_device(sphere: Mesh, along, lowering, count, columns, dtype):
     operator = make_laplacian(sphere, "cotangent", lowering=lowering)
     positions = sphere.vertices if along == "curve" else None
     sharded = sharding.shard(operator, jax.devices()[:count], positions)
@@ -41,7 +41,7 @@ def test_filter_and_gradients_are_those_of_one_device(sphere: Mesh, along, lower
     @partial(jax.jit, static_argnums=0)
     def derived(filter, operator, c, x):
         def loss(c, x):
-            y = filter(operator, c, x, derivative=derivative)
+            y = filter(operator, c, x)
             return jnp.sum(jnp.sin(y)), y
 
         return jax.grad(loss, (0, 1), has_aux=True)(c, x)

@@ -1,4 +1,4 @@
-from functools import partial
+from functools import partial, reduce
 
 import jax
 import jax.numpy as jnp
@@ -43,16 +43,13 @@ def random_array(*shape: int, seed: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, DEGREE])
-@pytest.mark.parametrize("derivative", ["recompute", "scan"])
 @pytest.mark.parametrize(("columns", "per_column"), [((), False), ((3,), False), ((3,), True)])
-def test_filter_is_the_polynomial_of_the_dense_matrix(
-    operator, polynomials, degree, derivative, columns, per_column, dtype
-):
+def test_filter_is_the_polynomial_of_the_dense_matrix(operator, polynomials, degree, columns, per_column, dtype):
     c = random_array(degree + 1, *(columns if per_column else ())).astype(dtype)
     x = random_array(len(operator.degree), *columns, seed=1).astype(dtype)
     subscripts = "kc,kuv,vc->uc" if per_column else "k,kuv,v...->u..."
     expected = np.einsum(subscripts, c, polynomials[: degree + 1], x)
-    y = chebyshev.filter(operator, c, jnp.asarray(x), derivative=derivative)
+    y = chebyshev.filter(operator, c, jnp.asarray(x))
     assert y.dtype == dtype
     np.testing.assert_allclose(y, expected, atol=tolerance(dtype, 10))
 
@@ -79,13 +76,12 @@ def test_band_components_moments_and_grams(operator, polynomials, dtype):
         np.testing.assert_allclose(single, gram[0], **close)
 
 
-@pytest.mark.parametrize("derivative", ["recompute", "scan"])
 @pytest.mark.parametrize("per_column", [False, True])
-def test_reverse_mode_agrees_with_dense_jacobians(operator, polynomials, derivative, per_column, x64):
+def test_reverse_mode_agrees_with_dense_jacobians(operator, polynomials, per_column, x64):
     c = jnp.asarray(random_array(DEGREE + 1, *([3] if per_column else [])))
     x = jnp.asarray(random_array(len(operator.degree), 3, seed=1))
     y_bar = jnp.asarray(random_array(len(operator.degree), 3, seed=2))
-    _, pull = jax.vjp(lambda c, x: chebyshev.filter(operator, c, x, derivative=derivative), c, x)
+    _, pull = jax.vjp(lambda c, x: chebyshev.filter(operator, c, x), c, x)
     c_bar, x_bar = pull(y_bar)
     terms = polynomials[: DEGREE + 1]
     per_column_c = c if per_column else jnp.broadcast_to(c[:, None], (DEGREE + 1, 3))
@@ -94,67 +90,139 @@ def test_reverse_mode_agrees_with_dense_jacobians(operator, polynomials, derivat
     np.testing.assert_allclose(c_bar, expected if per_column else expected.sum(1), atol=1e-10)
 
 
-@pytest.mark.slow
-def test_derivatives_by_transformation(operator, x64):
-    c = jnp.asarray(random_array(DEGREE + 1))
-    x = jnp.asarray(random_array(5, len(operator.degree), seed=1))
+def dense_filter(parts, c, x):
+    """The same filter by dense matrices that JAX differentiates: of edges and their weights, degrees and mass."""
+    pairs, weights, degree, mass, scale = parts
+    stiffness = jnp.diag(degree).at[pairs[:, 0], pairs[:, 1]].add(-weights).at[pairs[:, 1], pairs[:, 0]].add(-weights)
+    inverse = jnp.where(degree > 0, 1 / jnp.where(degree > 0, mass * scale, 1), 0)
+    shifted = inverse[:, None] * stiffness - jnp.eye(len(degree))
+    terms = [x, shifted @ x]
+    while len(terms) < len(c):
+        terms.append(2 * shifted @ terms[-1] - terms[-2])
+    return sum(c_k * t for c_k, t in zip(c, terms, strict=False))
+
+
+@pytest.mark.parametrize(
+    ("lumped", "order"),
+    [
+        (False, ("rev", "fwd")),
+        (True, ("rev",)),
+        pytest.param(True, ("fwd", "fwd"), marks=pytest.mark.slow),
+        pytest.param(True, ("rev", "fwd"), marks=pytest.mark.slow),
+        pytest.param(True, ("fwd", "rev"), marks=pytest.mark.slow),
+        pytest.param(False, ("rev", "rev"), marks=pytest.mark.slow),
+    ],
+)
+def test_all_derivatives_are_those_of_dense_matrices(operator, lumped, order, x64):
+    """With respect to weights, degrees, mass, coefficients and signal, along one direction, in nested modes."""
+    size = len(operator.degree)
+    random = np.random.default_rng(1)
+    mass = np.where(operator.degree > 0, random.uniform(1, 2, size), 0) if lumped else operator.degree
+    scale = np.max(operator.degree) if lumped else np.float64(1)
+    arguments = (operator.weights, operator.degree, mass, random.normal(size=5), random.normal(size=(size, 2)))
+    arguments = tuple(map(jnp.asarray, arguments))
+    tangents = tuple(jnp.asarray(random.normal(size=part.shape)) for part in arguments)
+
+    def ours(weights, degree, mass, c, x):
+        changed = operator._replace(weights=weights, degree=degree)
+        if lumped:
+            changed = changed._replace(lumped_mass=mass, scale=scale)
+        moments = chebyshev.moments(changed, x, degree=2)
+        return jnp.sum(jnp.sin(0.1 * chebyshev.filter(changed, c, x))) + jnp.sum(jnp.sin(0.01 * moments))
+
+    def dense(weights, degree, mass, c, x):
+        mass = mass if lumped else degree
+        parts = (operator.edges, weights, degree, mass, scale)
+        moments = jnp.stack([jnp.sum(mass[:, None] * x * dense_filter(parts, one, x), axis=0) for one in jnp.eye(5)])
+        return jnp.sum(jnp.sin(0.1 * dense_filter(parts, c, x))) + jnp.sum(jnp.sin(0.01 * moments))
+
+    def along(function, mode):
+        if mode == "fwd":
+            return lambda *given: jax.jvp(function, given, tangents)[1]
+        return lambda *given: sum(map(jnp.vdot, jax.grad(function, range(5))(*given), tangents))
+
+    found, expected = (jax.jit(reduce(along, order, function))(*arguments) for function in (ours, dense))
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("axes", [(0, None), (None, 0), (0, 0)])
+def test_derivatives_of_mapped_filters(operator, axes, x64):
+    """What all members share collects the derivatives of all; and derivatives are mapped as well."""
+    several = (random_array(3, DEGREE + 1), random_array(3, len(operator.degree), 2, seed=1))
+    given = tuple(jnp.asarray(part if axis == 0 else part[0]) for part, axis in zip(several, axes, strict=True))
 
     def loss(c, x):
         return jnp.sum(jnp.sin(chebyshev.filter(operator, c, x)))
 
-    check_grads(loss, (c, x[0]), order=2, modes=["rev"])
-    check_grads(jax.jit(loss), (c, x[0]), order=1, modes=["rev"])
-    mapped = jax.vmap(jax.grad(loss, (0, 1)), (None, 0))(c, x)
-    for one, row in zip(zip(*mapped, strict=True), x, strict=True):
-        for got, expected in zip(one, jax.grad(loss, (0, 1))(c, row), strict=True):
-            np.testing.assert_allclose(got, expected, atol=1e-12)
+    mapped = jax.vmap(jax.grad(loss, (0, 1)), axes)(*given)
+    total = jax.grad(lambda c, x: jax.vmap(loss, axes)(c, x).sum(), (0, 1))(*given)
+    single = [
+        jax.grad(loss, (0, 1))(*(part[k] if axis == 0 else part for part, axis in zip(given, axes, strict=True)))
+        for k in range(3)
+    ]
+    for part, axis in enumerate(axes):
+        every = jnp.stack([found[part] for found in single])
+        np.testing.assert_allclose(mapped[part], every, atol=1e-10)
+        np.testing.assert_allclose(total[part], every if axis == 0 else every.sum(axis=0), atol=1e-10)
 
-    def projected(u, x):
-        return jnp.sum(jnp.sin(0.01 * chebyshev.cross_moments(operator, u, x, degree=DEGREE)))
 
-    check_grads(projected, (x[1], x[0]), order=2, modes=["rev"])
-    columns = jnp.asarray(random_array(2, len(operator.degree), 3, seed=3))
-    check_grads(jax.jit(projected), tuple(columns), order=1, modes=["rev"])
+@pytest.mark.slow
+def test_derivatives_by_transformation(operator, x64):
+    c, x = jnp.asarray(random_array(DEGREE + 1)), jnp.asarray(random_array(len(operator.degree), 2, seed=1))
 
-    def scanned(c, x, weights):
-        return jnp.sum(jnp.sin(chebyshev.filter(operator._replace(weights=weights), c, x, derivative="scan")))
+    def loss(c, x):
+        return jnp.sum(jnp.sin(chebyshev.filter(operator, c, x)))
 
-    check_grads(scanned, (c, x[0], jnp.asarray(operator.weights)), order=1, modes=["fwd", "rev"])
+    for form in (loss, jax.jit(loss), jax.checkpoint(loss)):
+        check_grads(form, (c, x), order=2)
+    value, linear = jax.linearize(loss, c, x)
+    np.testing.assert_allclose(linear(c, x), jax.jvp(loss, (c, x), (c, x))[1], rtol=1e-12)
+    np.testing.assert_allclose(value, loss(c, x), rtol=1e-12)
+    np.testing.assert_allclose(jax.jacfwd(loss)(c, x), jax.jacrev(loss)(c, x), atol=1e-10)
+    hessian = jax.hessian(loss)(c, x)
+    np.testing.assert_allclose(hessian, jax.jacrev(jax.jacrev(loss))(c, x), atol=1e-9)
+    with jax.debug_nans(True), jax.numpy_dtype_promotion("strict"):
+        jax.jvp(jax.grad(loss), (c, x), (c, x))
 
 
 @pytest.mark.parametrize(("columns", "per_column"), [((), False), ((3,), False), ((3,), True)])
-def test_derivatives_of_either_kind_agree(columns, per_column, dtype):
+def test_derivatives_are_those_of_the_recurrence(columns, per_column, dtype):
     """On more vertices than are summed at once: those in O(N) memory, and JAX's own of the recurrence."""
     operator = make_laplacian(bumpy_sphere(3), "inverse-length")
     c = jnp.asarray(random_array(DEGREE + 1, *(columns if per_column else ())), dtype)
     x, u = (jnp.asarray(random_array(642, *columns, seed=seed), dtype) for seed in (1, 2))
 
-    def loss(c, x, derivative):
-        return jnp.sum(u * jnp.sin(chebyshev.filter(operator, c, x, derivative=derivative)))
+    def loss(filter, weights, c, x):
+        return jnp.sum(u * jnp.sin(filter(operator._replace(weights=weights), c, x)))
 
-    gradients = [jax.jit(jax.grad(partial(loss, derivative=kind), (0, 1)))(c, x) for kind in ("recompute", "scan")]
+    def recurrence(operator, c, x):
+        return chebyshev._filter_scan(operator, c if c.ndim == x.ndim else c[:, None] * jnp.ones(3, dtype), x)
+
+    gradients = [
+        jax.jit(jax.grad(partial(loss, filter), (0, 1, 2)))(jnp.asarray(operator.weights, dtype), c, x)
+        for filter in (chebyshev.filter, recurrence)
+    ]
     for got, expected in zip(*gradients, strict=True):
-        np.testing.assert_allclose(got, expected, atol=tolerance(dtype, 30))
-
-
-def test_derivative_of_weights_is_refused_by_name(operator, x64):
-    x = jnp.asarray(random_array(len(operator.degree)))
-    with pytest.raises(JaxmarkError, match="derivative='scan'"):
-        jax.grad(lambda w: chebyshev.filter(operator._replace(weights=w), np.ones(3), x).sum())(
-            jnp.asarray(operator.weights)
-        )
+        np.testing.assert_allclose(got, expected, atol=tolerance(dtype, 30) * (1 + abs(expected).max()))
 
 
 def test_memory_does_not_grow_with_the_degree():
     operator = jax.tree.map(jnp.asarray, make_laplacian(bumpy_sphere(4)))
     x = jnp.ones((len(operator.degree), 3), jnp.float32)
 
-    def scratch(degree: int, derivative: str) -> int:
-        def loss(c, x):
-            return jnp.sum(chebyshev.filter(operator, c, x, derivative=derivative) ** 2)
+    weights = jnp.ones(len(operator.edges), jnp.float32)
+    weighted = operator._replace(weights=weights)
 
-        compiled = jax.jit(jax.value_and_grad(loss, (0, 1))).lower(jnp.ones(degree + 1, jnp.float32), x).compile()
-        return compiled.memory_analysis().temp_size_in_bytes
+    def scratch(degree: int, filter=chebyshev.filter, derived=jax.value_and_grad) -> int:
+        def loss(c, x, weights):
+            return jnp.sum(filter(weighted._replace(weights=weights), c, x) ** 2)
+
+        def along(*given):
+            return jax.jvp(derived(loss, (0, 1, 2)), given, given)
+
+        of = derived(loss, (0, 1, 2)) if derived is jax.value_and_grad else along
+        lowered = jax.jit(of).lower(jnp.ones((degree + 1, 3), jnp.float32), x, weights)
+        return lowered.compile().memory_analysis().temp_size_in_bytes
 
     def scratch_of_moments(degree: int) -> int:
         def loss(u, x):
@@ -171,8 +239,9 @@ def test_memory_does_not_grow_with_the_degree():
 
     assert scratch_of_moments(256) < 1.1 * scratch_of_moments(32)
     assert scratch_of_own_moments(256) < 1.1 * scratch_of_own_moments(32)
-    assert scratch(256, "recompute") < 1.1 * scratch(32, "recompute")
-    assert scratch(256, "scan") > 4 * scratch(32, "scan")  # what the rule is for
+    assert scratch(256) < 1.1 * scratch(32)
+    assert scratch(256, derived=jax.grad) < 1.1 * scratch(32, derived=jax.grad)  # forward mode over reverse mode
+    assert scratch(256, chebyshev._filter_scan) > 4 * scratch(32, chebyshev._filter_scan)  # what the rules are for
 
 
 def test_band_by_band_is_the_same_as_all_at_once(operator, dtype):
@@ -201,11 +270,7 @@ def test_memory_does_not_grow_with_the_bands():
 
 def test_derivative_of_moments(operator, x64):
     x = jnp.asarray(random_array(len(operator.degree), 3))
-    check_grads(lambda x: chebyshev.moments(operator, x, degree=DEGREE), (x,), order=1, modes=["rev"])
-    with pytest.raises(JaxmarkError, match="moments has no derivative"):
-        jax.grad(lambda w: chebyshev.moments(operator._replace(weights=w), x, degree=2).sum())(
-            jnp.asarray(operator.weights)
-        )
+    check_grads(lambda x: chebyshev.moments(operator, x, degree=DEGREE), (x,), order=2)
 
 
 def test_moments_in_float32_lose_weak_bands_and_components_do_not(sphere):
@@ -255,6 +320,7 @@ def test_refusals(operator, unchecked):
         (lambda: chebyshev.filter(operator, np.ones((3, 2)), x), "coefficients"),
         (lambda: chebyshev.filter(operator, np.ones(0), x), "coefficients"),
         (lambda: chebyshev.filter(operator, np.ones(3), x.astype(int)), "floating"),
+        (lambda: chebyshev.moments(operator, x.astype(jnp.bfloat16), degree=3), "float32 or float64, got bfloat16"),
         (lambda: chebyshev.band_components(operator, np.ones((2, 0)), x), r"\[bands, degree \+ 1\]"),
     ]:
         with pytest.raises(JaxmarkError, match=sentence):

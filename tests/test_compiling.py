@@ -40,7 +40,6 @@ CALLS: dict[str, Callable[[Any, Any, int], Any]] = {
     "apply": lambda operator, x, seed: operator.apply(x),
     "inner": lambda operator, x, seed: operator.inner(x, x),
     "filter": lambda operator, x, seed: spectral.filter(operator, BANDS[0], x),
-    "filter by scan": lambda operator, x, seed: spectral.filter(operator, BANDS[0, :-1], x, derivative="scan"),
     "transpose": lambda operator, x, seed: spectral.transpose(operator, BANDS[0], x),
     "band_components": lambda operator, x, seed: spectral.band_components(operator, BANDS, x),
     "over_bands": lambda operator, x, seed: over_bands(square, operator, BANDS, x),

@@ -3,19 +3,25 @@
 The spectrum of Δ̃ = Δ - I lies in [-1, 1], and T_k(Δ̃)x follows by T_k = 2Δ̃T_{k-1} - T_{k-2} (Sohn et al., Method 2; the
 paper's start t_0 = 0, T_0 = 0 is an erratum for t_0 = 1, T_0 = I). All functions here take signals `[N]` or `[N, C]`,
 keep the dtype of the signal, and cost `degree` products with Δ.
+
+A filter f(Δ)x = Σ_k c_k T_k(Δ̃)x is linear in c and in x, and a projection p_k = Σ_v u_v (T_k(Δ̃)x)_v is linear in u and in
+x. As Δ is self-adjoint, each is the other's transpose, so that derivatives of any order are filters and projections
+again. For the derivative with respect to the operator, the recurrence is run backwards: T_{k-2} = 2Δ̃T_{k-1} - T_k.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float, PyTree
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.spectral.laplacian import Laplacian, Operator, per_row
+from jaxmark.spectral.linear import Linear, combine, floats
 from jaxmark.spectral.precision import einsum, matmul
 
 Signal = Float[Array | np.ndarray, " vertices *columns"]
@@ -25,30 +31,27 @@ _ROWS_AT_ONCE = 128  # rows that are summed as one wide row
 _MIN_UNROLLED_VALUES = 2**16  # values of a signal from which on running the recurrence takes longer than compiling it
 
 
+@jax.jit
 def filter(
-    operator: Operator,
-    coefficients: Float[Array | np.ndarray, " terms *filters"],
-    x: Signal,
-    *,
-    derivative: Literal["recompute", "scan"] = "recompute",
+    operator: Operator, coefficients: Float[Array | np.ndarray, " terms *filters"], x: Signal
 ) -> Float[Array, " vertices *columns"]:
     """Filter a signal: f(Δ)x for the Chebyshev series f(λ) = Σ_k c_k T_k(λ - 1), as one `lax.scan`.
+
+    Derivatives of any order and mode are with respect to the coefficients, the signal and the operator's weights,
+    degrees and mass. The first, in reverse mode too, take O(N) memory at any degree, and so do forward-mode derivatives
+    of these, such as products with Hessians. Reverse mode takes one filter for the signal and one for the coefficients;
+    for the operator, it runs the recurrence back and forth, which takes about six filters.
 
     Args:
         operator: the Laplacian, of N vertices.
         coefficients: `[degree + 1]`, or `[degree + 1, C]` for one filter per column of `x`.
         x: `[N]` or `[N, C]`.
-        derivative: `"recompute"` (default) takes O(N) memory in reverse mode at any degree: because Δ is self-adjoint,
-            x̄ = D f(Δ) D⁻¹ȳ is another filter, and c̄_k = Σ ȳ·T_k(Δ̃)x is computed by running the recurrence again. It
-            has no forward mode and no derivative with respect to the operator. `"scan"` leaves differentiation to JAX:
-            it has forward mode and derivatives with respect to edge weights and degrees, and takes O(degree · N) memory
-            in reverse mode.
 
     Returns:
         f(Δ)x, in the shape and dtype of `x`.
 
     Raises:
-        JaxmarkError: if shapes do not fit, or the operator is differentiated under `"recompute"`.
+        JaxmarkError: if shapes do not fit, or the signal is neither float32 nor float64.
     """
     x = jnp.asarray(x)
     _check_signal("filter", operator, x)
@@ -57,21 +60,16 @@ def filter(
         raise JaxmarkError(
             f"filter needs coefficients [degree + 1] or [degree + 1, C] for a signal {x.shape}, got {c.shape}."
         )
-    match derivative:
-        case "recompute":
-            return _filter_recompute(operator, c, x)
-        case "scan":
-            return _filter_scan(operator, c, x)
-    raise JaxmarkError(f"derivative must be 'recompute' or 'scan', got {derivative!r}.")
+    return _filter(operator, c if c.ndim == x.ndim else jnp.broadcast_to(c[:, None], (len(c), x.shape[1])), x)
 
 
+@jax.jit
 def transpose(
     operator: Operator, coefficients: Float[Array | np.ndarray, " terms *filters"], y: Signal
 ) -> Float[Array, " vertices *columns"]:
-    """f(Δ)ᵀy = D f(Δ) D⁻¹y, by the self-adjointness of Δ: the Euclidean adjoint of `filter`, with its arguments."""
+    """f(Δ)ᵀy = M f(Δ) M⁻¹y, by the self-adjointness of Δ: the Euclidean adjoint of `filter`, with its arguments."""
     y = jnp.asarray(y)
-    mass = per_row(operator.degree, y)
-    mass = jnp.where(mass > 0, mass, 1)  # an isolated vertex is its own block of Δ, so any positive mass serves
+    mass = _inner_mass(operator, y)
     return mass * filter(operator, coefficients, y / mass)
 
 
@@ -132,11 +130,11 @@ def over_bands(
 
 @partial(jax.jit, static_argnames="degree")
 def cross_moments(operator: Laplacian, u: Signal, x: Signal, *, degree: int) -> Float[Array, " terms *columns"]:
-    """Compute ⟨u, T_k(Δ̃)x⟩_D for k = 0 … degree, column by column.
+    """Compute ⟨u, T_k(Δ̃)x⟩_M for k = 0 … degree, column by column.
 
-    They give the correlation of `u` with every band: ⟨u, f_j(Δ)x⟩_D = Σ_k C_jk ⟨u, T_k x⟩_D. Weak bands are then small
-    differences of large numbers: in float32 a band is lost where ‖f_j x‖ is below about 1e-6 ‖x‖. Reverse mode takes
-    two filters and O(N) memory; there is no forward mode and no derivative with respect to the operator.
+    They give the correlation of `u` with every band: ⟨u, f_j(Δ)x⟩_M = Σ_k C_jk ⟨u, T_k x⟩_M. Weak bands are then small
+    differences of large numbers: in float32 a band is lost where ‖f_j x‖ is below about 1e-6 ‖x‖. Derivatives are as
+    those of `filter`.
 
     Args:
         operator: the Laplacian, of N vertices.
@@ -148,14 +146,14 @@ def cross_moments(operator: Laplacian, u: Signal, x: Signal, *, degree: int) -> 
         `[degree + 1]` or `[degree + 1, C]`.
 
     Raises:
-        JaxmarkError: if shapes do not fit, or the operator is differentiated.
+        JaxmarkError: if shapes do not fit, or the signal is neither float32 nor float64.
     """
     x = jnp.asarray(x)
     u = jnp.asarray(u).astype(x.dtype)
     _check_signal("cross_moments", operator, x)
     if u.shape != x.shape:
         raise JaxmarkError(f"cross_moments needs two signals of one shape, got {u.shape} and {x.shape}.")
-    return _projections(operator, per_row(operator.degree, u) * u, x, degree)
+    return _projection(degree + 1)(operator, x, per_row(operator.mass, u) * u)
 
 
 def band_energies(
@@ -164,19 +162,18 @@ def band_energies(
     u: Float[Array, "vertices columns"],
     v: Float[Array, "vertices columns"],
 ) -> Float[Array, " bands"]:
-    """⟨u, f_j(Δ)v⟩ for each band, with vertices weighed by valence over its mean; of unit noise, the dimensions."""
+    """⟨u, f_j(Δ)v⟩ for each band, with vertices weighed by mass over its mean; of unit noise, the dimensions."""
     moments = cross_moments(operator, u, v, degree=coefficients.shape[1] - 1)
-    mass = operator.degree.astype(u.dtype)
+    mass = jnp.asarray(operator.mass).astype(u.dtype)
     return matmul(coefficients, moments.sum(axis=1)) * (jnp.sum(jnp.sign(mass)) / mass.sum())
 
 
 @partial(jax.jit, static_argnames="degree")
 def moments(operator: Laplacian, x: Signal, *, degree: int) -> Float[Array, " moments *columns"]:
-    """Compute the moments m_k = ⟨x, T_k(Δ̃)x⟩_D for k = 0 … 2·degree by only `degree` products, column by column.
+    """Compute the moments m_k = ⟨x, T_k(Δ̃)x⟩_M for k = 0 … 2·degree by only `degree` products, column by column.
 
-    By T_{j+k} + T_{|j-k|} = 2T_jT_k: m_2k = 2⟨T_k x, T_k x⟩_D - m_0 and m_{2k-1} = 2⟨T_k x, T_{k-1} x⟩_D - m_1. Reverse
-    mode takes a filter of twice the degree and O(N) memory; there is no forward mode and no derivative with respect to
-    the operator.
+    By T_{j+k} + T_{|j-k|} = 2T_jT_k: m_2k = 2⟨T_k x, T_k x⟩_M - m_0 and m_{2k-1} = 2⟨T_k x, T_{k-1} x⟩_M - m_1.
+    Derivatives are those of `cross_moments` of twice the degree.
 
     Args:
         operator: the Laplacian, of N vertices.
@@ -187,16 +184,16 @@ def moments(operator: Laplacian, x: Signal, *, degree: int) -> Float[Array, " mo
         `[2 · degree + 1]` or `[2 · degree + 1, C]`.
 
     Raises:
-        JaxmarkError: if shapes do not fit, or the operator is differentiated.
+        JaxmarkError: if shapes do not fit, or the signal is neither float32 nor float64.
     """
     x = jnp.asarray(x)
     _check_signal("moments", operator, x)
     return _moments(operator, x, degree)
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _moments(operator: Laplacian, x: Array, degree: int) -> Array:
-    x, mass = operator.enter(x), operator.enter(per_row(operator.degree, x))
+@partial(jax.custom_jvp, nondiff_argnums=(2,))
+def _moments(operator: Operator, x: Array, degree: int) -> Array:
+    x, mass = operator.enter(x), operator.enter(per_row(operator.mass, x))
 
     def products(_: None, t: Array, before: Array, __: Array) -> tuple[None, tuple[Array, Array]]:
         return None, (_sums(mass * t * before), _sums(mass * t * t))
@@ -209,18 +206,28 @@ def _moments(operator: Laplacian, x: Array, degree: int) -> Array:
     return jnp.concatenate([m0, pairs.reshape(2 * degree, *x.shape[1:])])
 
 
-def _moments_forward(operator: Any, x: Any, degree: int) -> tuple[Array, tuple[Any, Array]]:
-    inputs: Any = (_fixed(operator, "moments", ""), x.value)
-    return _moments(*inputs, degree), inputs
+@partial(_moments.defjvp, symbolic_zeros=True)
+def _moments_derivative(degree: int, primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
+    """The derivative 2⟨x, T_k(Δ̃)ẋ⟩_M, as T_k(Δ̃) is self-adjoint, and that of the operator beside."""
+    operator, x = primals
+    changes, x_change = tangents
+    value = _moments(operator, x, degree)
+    change = jnp.zeros_like(value)
+    if not isinstance(x_change, SymbolicZero):
+        change += 2 * _projection(2 * degree + 1)(operator, x, per_row(operator.mass, x) * x_change)
+    leaves = jax.tree.leaves(changes, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
+    if any(not isinstance(leaf, SymbolicZero) for leaf in leaves):
+        part = [
+            jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, SymbolicZero) else leaf
+            for leaf in leaves
+            if jnp.issubdtype(leaf.dtype, jnp.inexact)
+        ]
 
+        def of_operator(part: list[Array]) -> Array:
+            return cross_moments(combine(part, operator), x, x, degree=2 * degree)
 
-def _moments_reverse(degree: int, inputs: tuple[Any, Array], cotangent: Any) -> tuple[None, Array]:
-    """The cotangent x̄ = 2D Σ_k m̄_k T_k(Δ̃)x, since each moment is a quadratic form in x with a self-adjoint T_k(Δ̃)."""
-    operator, x = inputs
-    return None, 2 * per_row(operator.degree, x) * _filter_recompute(operator, _instantiate(cotangent), x)
-
-
-_moments.defvjp(_moments_forward, _moments_reverse, symbolic_zeros=True)
+        change += jax.jvp(of_operator, (jax.tree.leaves(floats(operator)),), (part,))[1]
+    return value, change
 
 
 @partial(jax.jit, static_argnames="method")
@@ -231,14 +238,14 @@ def gram(
     *,
     method: Literal["bands", "moments"] = "bands",
 ) -> Float[Array, "*columns bands bands"]:
-    """Gram matrix ⟨f_i(Δ)x, f_j(Δ)x⟩_D of the band components, one for each column of `x`.
+    """Gram matrix ⟨f_i(Δ)x, f_j(Δ)x⟩_M of the band components, one for each column of `x`.
 
     Args:
         operator: the Laplacian, of N vertices.
         coefficients: one Chebyshev series per row, `[bands, degree + 1]`.
         x: `[N]` or `[N, C]`.
         method: `"bands"` forms the components; it takes O(bands · N) memory and is accurate for weak bands. `"moments"`
-            takes O(N) memory by ⟨T_j x, T_k x⟩_D = (m_{j+k} + m_{|j-k|})/2, but entries below about eps · ‖x‖² are
+            takes O(N) memory by ⟨T_j x, T_k x⟩_M = (m_{j+k} + m_{|j-k|})/2, but entries below about eps · ‖x‖² are
             rounding noise: use it in float64, or where no band is weak.
 
     Returns:
@@ -249,7 +256,7 @@ def gram(
     match method:
         case "bands":
             y = band_components(operator, c, x)
-            return einsum("v,iv...,jv...->...ij", jnp.asarray(operator.degree).astype(x.dtype), y, y)
+            return einsum("v,iv...,jv...->...ij", jnp.asarray(operator.mass).astype(x.dtype), y, y)
         case "moments":
             terms = c.shape[1]
             m = moments(operator, x, degree=terms - 1)
@@ -295,62 +302,122 @@ def _filter_scan(operator: Operator, coefficients: Array, x: Array) -> Array:
     return operator.leave(_scan_terms(operator, x, coefficients, add, coefficients[0] * x)[0])
 
 
-@jax.custom_vjp
-def _filter_recompute(operator: Operator, coefficients: Array, x: Array) -> Array:
-    return _filter_scan(operator, coefficients, x)
-
-
-def _filter_forward(operator: Any, coefficients: Any, x: Any) -> tuple[Array, tuple[Operator, Array, Array]]:
-    inputs = (
-        _fixed(operator, "filter", "; call it with derivative='scan' for one in O(degree · N)"),
-        coefficients.value,
-        x.value,
-    )
-    return _filter_scan(*inputs), inputs
-
-
-def _filter_reverse(inputs: tuple[Operator, Array, Array], cotangent: Any) -> tuple[None, Array, Array]:
-    operator, coefficients, x = inputs
-    y_bar = _instantiate(cotangent)
-    c_bar: Any = _projections(operator, y_bar, x, len(coefficients) - 1)
-    return None, c_bar if coefficients.ndim == x.ndim else c_bar.sum(axis=1), transpose(operator, coefficients, y_bar)
-
-
-_filter_recompute.defvjp(_filter_forward, _filter_reverse, symbolic_zeros=True)
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(3,))
-def _projections(operator: Operator, u: Array, x: Array, degree: int) -> Array:
-    """Compute Σ_v u_v (T_k(Δ̃)x)_v for k = 0 … degree, column by column."""
-    return _projections_scan(operator, u, x, degree)
-
-
-@partial(jax.jit, static_argnums=3)
-def _projections_scan(operator: Operator, u: Array, x: Array, degree: int) -> Array:
+@partial(jax.jit, static_argnums=0)
+def _projection_scan(terms: int, operator: Operator, x: Array, u: Array) -> Array:
+    """Compute Σ_v u_v (T_k(Δ̃)x)_v for so many k, column by column."""
     u, x = operator.enter(u), operator.enter(x)
 
     def project(_: None, t: Array, __: Array, ___: Array) -> tuple[None, Array]:
         return None, _sums(u * t)
 
-    _, rest = _scan_terms(operator, x, jnp.zeros(degree + 1, x.dtype), project, None)
+    _, rest = _scan_terms(operator, x, jnp.zeros(terms, x.dtype), project, None)
     return jnp.concatenate([_sums(u * x)[None], rest])
 
 
-def _projections_forward(operator: Any, u: Any, x: Any, degree: int) -> tuple[Array, tuple[Operator, Array, Array]]:
-    inputs = (_fixed(operator, "cross_moments", ""), u.value, x.value)
-    return _projections_scan(*inputs, degree), inputs
+def _transposed_filter(operator: Operator, c: Array, y: Array) -> Array:
+    mass = _inner_mass(operator, y)
+    return mass * _filter(operator, c, y / mass)
 
 
-def _projections_reverse(
-    degree: int, inputs: tuple[Operator, Array, Array], cotangent: Any
-) -> tuple[None, Array, Array]:
-    """The cotangents of u and x: two filters, with the cotangents of the projections as coefficients."""
-    operator, u, x = inputs
-    m_bar = _instantiate(cotangent)
-    return None, _filter_recompute(operator, m_bar, x), transpose(operator, m_bar, u)
+def _pulled_back(operator: Operator, c: Array, x: Array, y: Array) -> list[Array]:
+    """The gradient of ⟨y, Σ_k c_k T_k(Δ̃)x⟩ with respect to the floating leaves of the operator, in O(N) memory.
+
+    With b_k = c_k y + 2Δ̃ᵀb_{k+1} - b_{k+2}, it is the sum of the gradients of ⟨b_{k+1}, 2Δ T_k x⟩ over k, where b and T
+    are held fixed, and the factor 2 is 1 at k = 0. Both recurrences run downwards, that of T from its last two terms.
+    """
+    mass = _inner_mass(operator, x)
+    x, y, mass = (operator.enter(rows) for rows in (x, y, mass))
+    product = operator.product(x)
+
+    def up(state: tuple[Array, Array], factor: Array) -> tuple[tuple[Array, Array], None]:
+        before, t = state
+        return (t, factor * (product(t) - t) - before), None
+
+    factors = jnp.full(len(c) - 1, 2, x.dtype).at[:1].set(1)
+    (before, last), _ = jax.lax.scan(up, (jnp.zeros_like(x), x), factors)
+
+    # Sums over edges have derivatives that only read rows; those of tables would add to them.
+    edgewise = operator.by_segments
+    parts = jax.tree.leaves(floats(edgewise))
+
+    def edgewise_product(parts: list[Array], rows: Array) -> Array:
+        return combine(parts, edgewise).product(rows)(rows)
+
+    def down(state: Any, inputs: tuple[Array, Array]) -> tuple[Any, None]:
+        t, following, b, b_after, total = state
+        factor, c_k = inputs
+        rows = operator.leave(t)
+        _, pull = jax.vjp(lambda parts: edgewise_product(parts, rows), parts)
+        total = jax.tree.map(jnp.add, total, pull(operator.leave(factor * b))[0])
+        scaled = b / mass
+        b_before = c_k * y + factor * mass * (product(scaled) - scaled) - b_after
+        return (factor * (product(t) - t) - following, t, b_before, b, total), None
+
+    start = (before, last, c[-1] * y, jnp.zeros_like(y), jax.tree.map(jnp.zeros_like, parts))
+    (*_, total), _ = jax.lax.scan(down, start, (factors, c[:-1]), reverse=True)
+    return total
 
 
-_projections.defvjp(_projections_forward, _projections_reverse, symbolic_zeros=True)
+def _changed_filter(operator: Operator, c: Array, x: Array, change: PyTree) -> Array:
+    """The derivative of a filter in the direction of a change of the operator's floating leaves."""
+    return jax.jvp(lambda part: _filter_scan(combine(part, operator), c, x), (floats(operator),), (change,))[1]
+
+
+_change = Linear(_changed_filter, _pulled_back)
+
+# f(Δ)x as a function of x.
+_filter = Linear(
+    _filter_scan,
+    _transposed_filter,
+    (_change, lambda operator, c, x, change: _combination(len(c))(operator, x, change)),
+)
+
+
+@cache
+def _combination(terms: int) -> Linear:
+    """f(Δ)x as a function of its coefficients: `(operator, x, c)`."""
+    return Linear(
+        lambda operator, x, c: _filter_scan(operator, c, x),
+        _projection(terms),
+        (
+            lambda operator, x, c, change: _change(operator, c, x, change),
+            lambda operator, x, c, change: _filter(operator, c, change),
+        ),
+    )
+
+
+@cache
+def _projection(terms: int) -> Linear:
+    """Σ_v u_v (T_k(Δ̃)x)_v for so many k as a function of u: `(operator, x, u)`."""
+
+    def of_signal(operator: Operator, x: Array, u: Array, change: Array) -> Array:
+        mass = _inner_mass(operator, u)
+        return _projection(terms)(operator, u / mass, mass * change)
+
+    return Linear(
+        partial(_projection_scan, terms),
+        lambda operator, x, m: _combination(terms)(operator, x, m),
+        (_changed_projection(terms), of_signal),
+    )
+
+
+@cache
+def _changed_projection(terms: int) -> Linear:
+    """The derivative of a projection in the direction of a change of the operator's floating leaves."""
+
+    def apply(operator: Operator, x: Array, u: Array, change: PyTree) -> Array:
+        def of_operator(part: PyTree) -> Array:
+            return _projection_scan(terms, combine(part, operator), x, u)
+
+        return jax.jvp(of_operator, (floats(operator),), (change,))[1]
+
+    return Linear(apply, lambda operator, x, u, m: _pulled_back(operator, m, x, u))
+
+
+def _inner_mass(operator: Operator, x: Array) -> Array:
+    """The mass of each vertex, or 1 at vertices without any: they are blocks of their own, so any mass serves."""
+    mass = per_row(operator.mass, x)
+    return jnp.where(mass > 0, mass, 1)
 
 
 def _sums(x: Array) -> Array:
@@ -360,28 +427,13 @@ def _sums(x: Array) -> Array:
     return wide.reshape(_ROWS_AT_ONCE, *x.shape[1:]).sum(axis=0) + x[whole:].sum(axis=0)
 
 
-def _fixed(operator: Any, name: str, remedy: str) -> Operator:
-    """The operator inside a derivative rule; refused if it is differentiated itself."""
-    leaves, structure = jax.tree.flatten(operator, is_leaf=lambda leaf: hasattr(leaf, "perturbed"))
-    if any(leaf.perturbed for leaf in leaves):
-        raise JaxmarkError(f"{name} has no derivative with respect to the operator's weights in O(N) memory{remedy}.")
-    return jax.tree.unflatten(structure, [leaf.value for leaf in leaves])
-
-
-def _instantiate(cotangent: Any) -> Array:
-    """A cotangent as an array, even if JAX passes a symbolic zero."""
-    if isinstance(cotangent, jax.custom_derivatives.SymbolicZero):
-        return jnp.zeros(cotangent.shape, cotangent.dtype)  # pyright: ignore[reportArgumentType]
-    return jnp.asarray(cotangent)  # it may be a NumPy array
-
-
 def _check_signal(name: str, operator: Operator, x: Array | np.ndarray) -> None:
-    if x.ndim not in (1, 2) or x.shape[0] != operator.degree.shape[0]:
+    if x.ndim not in (1, 2) or x.shape[0] != operator.mass.shape[0]:
         raise JaxmarkError(
-            f"{name} needs a signal [N] or [N, C] with N = {operator.degree.shape[0]} vertices, got {x.shape}."
+            f"{name} needs a signal [N] or [N, C] with N = {operator.mass.shape[0]} vertices, got {x.shape}."
         )
-    if not jnp.issubdtype(x.dtype, jnp.floating):
-        raise JaxmarkError(f"{name} needs a floating-point signal, got {x.dtype}.")
+    if x.dtype not in (jnp.float32, jnp.float64):
+        raise JaxmarkError(f"{name} needs a floating-point signal of float32 or float64, got {x.dtype}.")
 
 
 def _check_bands(coefficients: Array | np.ndarray) -> Array:

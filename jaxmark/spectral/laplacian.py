@@ -3,6 +3,10 @@
 Δ = I - D⁻¹W with symmetric non-negative edge weights W and the diagonal D of their row sums (Sohn et al., eq. 4-5; the
 paper prints D = diag(1/d), but its Lemma 3.1 holds for D = diag(d)). The spectrum is real and lies in [0, 2], and Δ is
 self-adjoint in the inner product ⟨x, y⟩_D = xᵀDy.
+
+With a lumped mass M, Δ = M⁻¹(D - W)/s stands for the generalised problem (D - W)x = λMx of finite elements, where s is
+half a bound of its spectrum: an eigenvalue λ of that is λ/s of Δ, in [0, 2] as well, and Δ is self-adjoint in
+⟨x, y⟩_M = xᵀMy. Without one, M = D and s = 1.
 """
 
 from collections.abc import Callable
@@ -31,15 +35,20 @@ _MIN_ORDERED_VERTICES = 2**14  # from here on a signal outgrows the fastest memo
 
 @runtime_checkable
 class Operator(Protocol):
-    """The part of Δ that filters need, D and products: a `Laplacian`, or one device's part of it.
+    """The part of Δ that filters need, M and products: a `Laplacian`, or one device's part of it.
 
     Products take and give rows in the operator's own order, in which neighbours are near in memory: signals `enter` it
     before the first product, and results `leave` it after the last.
     """
 
     @property
-    def degree(self) -> Float[Array | np.ndarray, " vertices"]:
-        """The diagonal of D; 0 where a vertex is isolated."""
+    def mass(self) -> Float[Array | np.ndarray, " vertices"]:
+        """The diagonal of M; 0 where a vertex is isolated, unless it has a mass of its own."""
+        ...
+
+    @property
+    def by_segments(self) -> "Operator":
+        """The same operator in the vertices' order, by sums over edges, whose derivatives by weights only read rows."""
         ...
 
     def product(
@@ -82,6 +91,18 @@ class Laplacian(NamedTuple):
     weights: Float[Array | np.ndarray, " edges"] | None  # W, symmetric by construction, non-negative; None if all are 1
     degree: Float[Array | np.ndarray, " vertices"]  # D: the row sums of W, 0 where a vertex is isolated
     neighbours: Neighbours | None = None  # the edges once more, as a table for products by gathering
+    lumped_mass: Float[Array | np.ndarray, " vertices"] | None = None  # M, such as areas; None if it is D
+    scale: Float[Array | np.ndarray, ""] | None = None  # s, half a bound of the spectrum of M⁻¹(D - W); None if it is 1
+
+    @property
+    def mass(self) -> Float[Array | np.ndarray, " vertices"]:
+        """M, which weighs vertices in the inner product: the lumped mass, or else the degrees."""
+        return self.degree if self.lumped_mass is None else self.lumped_mass
+
+    @property
+    def by_segments(self) -> "Laplacian":
+        """The same operator without a table of neighbours; see `Operator`."""
+        return self._replace(neighbours=None)
 
     @jax.jit
     def apply(self, x: Float[Array, " vertices *columns"]) -> Float[Array, " vertices *columns"]:
@@ -104,11 +125,8 @@ class Laplacian(NamedTuple):
         """
         if not jnp.issubdtype(like.dtype, jnp.floating):
             raise JaxmarkError(f"Laplacian.apply needs a floating-point signal, got {like.dtype}.")
-        degree = per_row(self.enter(jnp.asarray(self.degree)), like)
-        # Select before dividing, so that isolated vertices keep finite gradients.
-        linked = degree > 0
-        inverse = jnp.where(linked, 1 / jnp.where(linked, degree, 1), 0)
-        own = linked.astype(like.dtype)
+        degree, inverse = (self.enter(rows) for rows in (per_row(self.degree, like), self.inverse_mass(like)))
+        own = (degree > 0).astype(like.dtype) if self.lumped_mass is None else degree * inverse
         if (table := self._table) is None:
             total = self._segments(like)
         elif self.weights is None:
@@ -117,6 +135,14 @@ class Laplacian(NamedTuple):
         else:
             total = _weighted_gather(table, self.weights, like)
         return lambda x: own * x - inverse * total(x)
+
+    def inverse_mass(self, like: Shaped[Array, " vertices *columns"]) -> Float[Array, "vertices *ones"]:
+        """1/(M s), by which sums over neighbours are divided, to multiply signals like this; 0 at isolated vertices."""
+        # Select before dividing, so that isolated vertices keep finite gradients.
+        linked = per_row(self.degree, like) > 0
+        mass = per_row(self.mass, like)
+        mass = mass if self.scale is None else mass * jnp.asarray(self.scale).astype(like.dtype)
+        return jnp.where(linked, 1 / jnp.where(linked, mass, 1), 0)
 
     def enter(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
         """Reorder rows to the operator's own order; see `Operator`."""
@@ -145,14 +171,14 @@ class Laplacian(NamedTuple):
     def inner(
         self, x: Float[Array, " vertices *columns"], y: Float[Array, " vertices *columns"]
     ) -> Float[Array, " *columns"]:
-        """The inner product ⟨x, y⟩_D = Σ_v D_v x_v y_v, column by column: a scalar for `[N]`, `[C]` for `[N, C]`.
+        """The inner product ⟨x, y⟩_M = Σ_v M_v x_v y_v, column by column: a scalar for `[N]`, `[C]` for `[N, C]`.
 
         Raises:
             JaxmarkError: if the shapes differ.
         """
         if x.shape != y.shape:
             raise JaxmarkError(f"Laplacian.inner needs two signals of one shape, got {x.shape} and {y.shape}.")
-        return jnp.sum(per_row(self.degree, x) * x * y, axis=0)
+        return jnp.sum(per_row(self.mass, x) * x * y, axis=0)
 
 
 def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence", *, lowering: Lowering = "auto") -> Laplacian:
@@ -320,21 +346,21 @@ def per_row(values: Num[Array | np.ndarray, " rows"], x: Array | np.ndarray) -> 
 def centre(
     operator: Laplacian, x: Float[Array | np.ndarray, "vertices columns"]
 ) -> Float64[np.ndarray, "vertices columns"]:
-    """Subtract the D-weighted mean of each connected component, on the host in float64.
+    """Subtract the M-weighted mean of each connected component, on the host in float64.
 
     The result has no part in the null space of Δ, so that a filtered signal does not depend on where the object, or any
     piece of it, is placed. Centre before casting to float32, or large offsets eat the digits. An isolated vertex
     becomes 0.
     """
     x = np.asarray(x, np.float64)
-    degree = np.asarray(operator.degree, np.float64)
-    size = len(degree)
+    mass = np.asarray(operator.mass, np.float64)
+    size = len(mass)
     pairs, weights = host_edges(operator)
     # An edge of weight zero joins nothing.
     tail, head = pairs[weights > 0].T
     graph = sparse.coo_array((np.ones(len(tail)), (tail, head)), shape=(size, size))
     count, component = csgraph.connected_components(graph, directed=False)
-    mass = np.where(degree > 0, degree, 1.0)
+    mass = np.where(mass > 0, mass, 1.0)
     total = np.bincount(component, mass, count)
     means = np.stack([np.bincount(component, mass * column, count) for column in x.T], axis=1) / total[:, None]
     centred = x - means[component]
@@ -344,14 +370,15 @@ def centre(
 
 
 def sparse_matrices(operator: Laplacian) -> tuple[sparse.csr_array, sparse.dia_array]:
-    """(D - W, D) as SciPy sparse matrices in float64, for host-side linear algebra; D⁻¹(D - W) is Δ."""
+    """((D - W)/s, M) as SciPy sparse matrices in float64, for host-side linear algebra; M⁻¹(D - W)/s is Δ."""
     degree = np.asarray(operator.degree, np.float64)
     pairs, weights = host_edges(operator)
     adjacency = sparse.coo_array((weights, tuple(pairs.T)), shape=(len(degree), len(degree)))
-    mass = sparse.diags_array(degree)
-    stiffness = sparse.csr_array(mass - adjacency - adjacency.T)
+    stiffness = sparse.csr_array(sparse.diags_array(degree) - adjacency - adjacency.T)
     stiffness.eliminate_zeros()
-    return stiffness, mass
+    if operator.scale is not None:
+        stiffness = stiffness / float(operator.scale)
+    return stiffness, sparse.diags_array(np.asarray(operator.mass, np.float64))
 
 
 def host_edges(operator: Laplacian) -> tuple[Int[np.ndarray, "edges 2"], Float64[np.ndarray, " edges"]]:

@@ -101,9 +101,9 @@ def filter_by_factors(
     """
     x = jnp.asarray(x)
     zeros, scales = (jnp.asarray(part).astype(x.dtype) for part in factors)
-    if len(x) != operator.degree.shape[0] or zeros.ndim != 1 or zeros.shape != scales.shape:
+    if len(x) != operator.mass.shape[0] or zeros.ndim != 1 or zeros.shape != scales.shape:
         raise JaxmarkError(
-            f"filter_by_factors needs factors [degree] and a signal [N] or [N, C] with N = {operator.degree.shape[0]},"
+            f"filter_by_factors needs factors [degree] and a signal [N] or [N, C] with N = {operator.mass.shape[0]},"
             f" got {zeros.shape}, {scales.shape} and {x.shape}."
         )
     product = operator.product(x)

@@ -27,7 +27,7 @@ def filter_rational(
 ) -> Float[Array, " vertices *columns"]:
     """Filter a signal by a rational function: f(Δ)x, section by section.
 
-    **Denominators must be positive on [0, 2].** Scaled by D^½, the system of each denominator a(Δ) is symmetric
+    **Denominators must be positive on [0, 2].** Scaled by M^½, the system of each denominator a(Δ) is symmetric
     positive definite, with condition number κ = max a / min a over [0, 2]. A solve takes about √κ/2 · ln(2/tolerance)
     iterations of two products, or fewer, and has an error of about κ times the larger of `tolerance` and the dtype's
     rounding.
@@ -41,7 +41,7 @@ def filter_rational(
         sections: `[sections, 6]`, applied in this order. `[[1, 0, 0, 1, τ, 0]] * p` is p steps of implicit smoothing,
             1/(1 + τλ)^p.
         x: `[N]` or `[N, C]`.
-        tolerance: bound of each solve's residual, relative to the right-hand side, in the D-norm over all columns
+        tolerance: bound of each solve's residual, relative to the right-hand side, in the M-norm over all columns
             together; by default ten times the machine epsilon of the dtype of `x`.
         iterations: largest number of iterations of each solve.
 
@@ -53,15 +53,15 @@ def filter_rational(
     """
     x = jnp.asarray(x)
     sections = jnp.asarray(sections).astype(x.dtype)
-    if len(x) != operator.degree.shape[0] or sections.ndim != 2 or sections.shape[1] != 6:
+    if len(x) != operator.mass.shape[0] or sections.ndim != 2 or sections.shape[1] != 6:
         raise JaxmarkError(
             "filter_rational needs sections [sections, 6] and a signal [N] or [N, C] with"
-            f" N = {operator.degree.shape[0]}, got {sections.shape} and {x.shape}."
+            f" N = {operator.mass.shape[0]}, got {sections.shape} and {x.shape}."
         )
     tolerance = 10 * float(jnp.finfo(x.dtype).eps) if tolerance is None else tolerance
     product = operator.product(x)
-    degree = per_row(operator.enter(jnp.asarray(operator.degree)), x)
-    root = jnp.sqrt(jnp.where(degree > 0, degree, 1))  # an isolated vertex is its own block of Δ
+    mass = per_row(operator.enter(jnp.asarray(operator.mass)), x)
+    root = jnp.sqrt(jnp.where(mass > 0, mass, 1))  # an isolated vertex is its own block of Δ
 
     def quadratic(c: Array, y: Array) -> Array:
         first = product(y)

@@ -10,7 +10,7 @@ the same code as on one device.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -54,9 +54,14 @@ class Shard(NamedTuple):
     plan: Plan
 
     @property
-    def degree(self) -> Float[Array | np.ndarray, " rows"]:
-        """The diagonal of D for the block's rows; 0 where a vertex is isolated and past the last vertex."""
-        return self.interior.degree
+    def mass(self) -> Float[Array | np.ndarray, " rows"]:
+        """The diagonal of M for the block's rows; 0 past the last vertex."""
+        return self.interior.mass
+
+    @property
+    def by_segments(self) -> "Shard":
+        """The same operator by sums over edges; see `Operator`."""
+        return self._replace(interior=self.interior.by_segments)
 
     def product(
         self, like: Shaped[Array, " rows *columns"]
@@ -68,8 +73,7 @@ class Shard(NamedTuple):
         """
         inside = self.interior.product(like)
         row, place = jnp.asarray(self.cut).T
-        degree = per_row(self.degree, like)[row]
-        factor = per_row(self.weights, like) / jnp.where(degree > 0, degree, 1)
+        factor = per_row(self.weights, like) * self.interior.inverse_mass(like)[row]
         # The received rows are used last, so that the block's own edges are computed while rows are on their way.
         return lambda x: inside(x).at[row].add(-factor * self._received(x)[place])
 
@@ -184,7 +188,7 @@ def partition(operator: Laplacian, count: int, positions: ArrayLike | None = Non
     Raises:
         JaxmarkError: if there are fewer vertices than parts, or the positions are not `[N, 3]` and finite.
     """
-    size = len(operator.degree)
+    size = len(operator.mass)
     if not 1 <= count <= size:
         raise JaxmarkError(f"{size} vertices can be shared by 1 to {size} devices, not by {count}.")
     pairs, weights = host_edges(operator)
@@ -197,12 +201,20 @@ def partition(operator: Laplacian, count: int, positions: ArrayLike | None = Non
     place[order] = device * rows + np.arange(size) - start[device]
     vertices = np.full(count * rows, -1)
     vertices[place] = np.arange(size)
-    degree = np.zeros(count * rows)
-    degree[place] = operator.degree
+
+    def spread(values: Array | np.ndarray) -> np.ndarray:
+        whole = np.zeros(count * rows)
+        whole[place] = values
+        return whole.reshape(count, rows)
+
     pairs = place[pairs]
     cut = pairs[:, 0] // rows != pairs[:, 1] // rows
     inside = weights[~cut] if operator.weights is not None else None
-    interior = _interior(pairs[~cut], inside, degree.reshape(count, rows), operator.neighbours is not None)
+    interior = _interior(pairs[~cut], inside, spread(operator.degree), operator.neighbours is not None)
+    if operator.lumped_mass is not None:
+        interior = interior._replace(lumped_mass=spread(operator.lumped_mass))
+    if operator.scale is not None:
+        interior = interior._replace(scale=np.full(count, operator.scale))
     return ShardedLaplacian(
         _with_cut(interior, pairs[cut], weights[cut], size), vertices.reshape(count, rows).astype(np.int32)
     )
@@ -223,13 +235,11 @@ def place(parts: ShardedLaplacian, devices: Devices) -> ShardedLaplacian:
     return placed._replace(shards=placed.shards._replace(plan=replace(parts.plan, mesh=mesh)))
 
 
-@partial(jax.jit, static_argnames="derivative")
+@jax.jit
 def filter_sharded(
     operator: ShardedLaplacian,
     coefficients: Float[Array | np.ndarray, " terms *filters"],
     x: Float[Array, "devices rows *columns"],
-    *,
-    derivative: Literal["recompute", "scan"] = "recompute",
 ) -> Float[Array, "devices rows *columns"]:
     """Filter a signal over several devices: f(Δ)x in O(N / devices) memory on each, derivatives included.
 
@@ -237,14 +247,12 @@ def filter_sharded(
         operator: the Laplacian, placed on its devices by `shard`.
         coefficients: `[degree + 1]`, or `[degree + 1, C]` for one filter per column; the same on all devices.
         x: `[devices, rows]` or `[devices, rows, C]`, from `ShardedLaplacian.scatter`.
-        derivative: see `jaxmark.spectral.chebyshev.filter`.
 
     Returns:
         f(Δ)x, in the shape, dtype and placement of `x`; 0 past the last vertex if `x` is 0 there.
 
     Raises:
-        JaxmarkError: if shapes do not fit, the operator is not on devices, or it is differentiated under
-            `"recompute"`.
+        JaxmarkError: if shapes do not fit, or the operator is not on devices.
     """
     mesh = _placed(operator)
     _check_values("filter", operator, x)
@@ -253,7 +261,7 @@ def filter_sharded(
         own = jax.tree.map(lambda leaf: leaf[0], shards)
         # Each device computes its own part of the coefficients' derivative, and the transpose of this cast sums them.
         c = jax.lax.pcast(c, _AXIS, to="varying")
-        return chebyshev.filter(own, c, x[0], derivative=derivative)[None]
+        return chebyshev.filter(own, c, x[0])[None]
 
     over, whole = PartitionSpec(_AXIS), PartitionSpec()
     mapped = jax.shard_map(local, mesh=mesh, in_specs=(over, whole, over), out_specs=over)

@@ -22,20 +22,20 @@ _DENSE_LIMIT = 2500
 class Eigenpairs(NamedTuple):
     """The lowest eigenpairs of Δ on the vertices that have edges, ascending."""
 
-    values: Float64[np.ndarray, " pairs"]  # in [0, 2]
-    vectors: Float64[np.ndarray, "vertices pairs"]  # D-orthonormal; 0 at isolated vertices
+    values: Float64[np.ndarray, " pairs"]  # in [0, 2]; times `Laplacian.scale`, those of (D - W)x = λMx
+    vectors: Float64[np.ndarray, "vertices pairs"]  # M-orthonormal; 0 at isolated vertices
     space: Int64[np.ndarray, " pairs"]  # index of the first pair in the same eigenspace
 
 
 class Quadrature(NamedTuple):
-    """Nodes and weights with ⟨x, f(Δ)x⟩_D = Σ_i weight_i f(node_i) for polynomials f of degree < 2 · nodes."""
+    """Nodes and weights with ⟨x, f(Δ)x⟩_M = Σ_i weight_i f(node_i) for polynomials f of degree < 2 · nodes."""
 
     nodes: Float64[np.ndarray, " nodes"]
     weights: Float64[np.ndarray, " nodes"]
 
 
 def eigenpairs(operator: Laplacian, count: int | None = None, *, tolerance: float = 1e-7) -> Eigenpairs:
-    """Compute eigenpairs of Δ above its null space, D-orthonormal, so that x = Σ_i ⟨x, φ_i⟩_D φ_i for centred x.
+    """Compute eigenpairs of Δ above its null space, M-orthonormal, so that x = Σ_i ⟨x, φ_i⟩_M φ_i for centred x.
 
     By a dense decomposition (`eigh`) up to 2,500 vertices, beyond by shift-and-invert Lanczos (`eigsh`) from a fixed
     start.
@@ -90,7 +90,7 @@ def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: 
         steps: number of nodes; the result has fewer if the signal lies in a smaller invariant subspace.
 
     Returns:
-        Nodes in [0, 2], and non-negative weights that sum to ⟨x, x⟩_D.
+        Nodes in [0, 2], and non-negative weights that sum to ⟨x, x⟩_M.
     """
     linked, root, scaled = _symmetric(operator)
     vector = root * x[linked]
@@ -118,7 +118,7 @@ def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: 
 def white_probes(operator: Laplacian, key: PRNGKeyArray, probes: int) -> Float64[np.ndarray, "vertices probes"]:
     """Random signals whose spectral measures sum, in expectation, to the counting measure of the eigenvalues.
 
-    The signals are random signs over √D, as in Hutchinson's estimator: Σ_p ⟨u_p, f(Δ)u_p⟩_D estimates Σ_i f(λ_i), over
+    The signals are random signs over √M, as in Hutchinson's estimator: Σ_p ⟨u_p, f(Δ)u_p⟩_M estimates Σ_i f(λ_i), over
     eigenvalues above the null space, with a variance of at most 2 Σ_i f(λ_i)²/probes (Avron, Toledo, J. ACM 58, 2011).
     Their `chebyshev.moments`, summed over the signals, are those of the spectral density.
 
@@ -130,18 +130,17 @@ def white_probes(operator: Laplacian, key: PRNGKeyArray, probes: int) -> Float64
     Returns:
         `[N, probes]`, centred, 0 at isolated vertices.
     """
-    degree = np.asarray(operator.degree, np.float64)
-    signs = np.asarray(jax.random.rademacher(key, (len(degree), probes)), np.float64)
-    scale = np.where(degree > 0, 1 / np.sqrt(np.where(degree > 0, probes * degree, 1)), 0)
+    mass = np.where(np.asarray(operator.degree) > 0, np.asarray(operator.mass, np.float64), 0)
+    signs = np.asarray(jax.random.rademacher(key, (len(mass), probes)), np.float64)
+    scale = np.where(mass > 0, 1 / np.sqrt(np.where(mass > 0, probes * mass, 1)), 0)
     return centre(operator, scale[:, None] * signs)
 
 
 def _symmetric(operator: Laplacian) -> tuple[Int64[np.ndarray, " linked"], np.ndarray, sparse.csc_array]:
-    """The vertices that have edges, √D on them, and the symmetric form D^-1/2 (D - W) D^-1/2 of Δ on them."""
+    """The vertices that have edges, √M on them, and the symmetric form M^1/2 Δ M^-1/2 of Δ on them."""
     stiffness, mass = sparse_matrices(operator)
-    degree = mass.diagonal()
-    linked = np.flatnonzero(degree > 0)
-    root = np.sqrt(degree[linked])
+    linked = np.flatnonzero(np.asarray(operator.degree) > 0)
+    root = np.sqrt(mass.diagonal()[linked])
     inverse = sparse.diags_array(1 / root)
     return linked, root, sparse.csc_array(inverse @ stiffness[linked][:, linked] @ inverse)
 
@@ -149,9 +148,9 @@ def _symmetric(operator: Laplacian) -> tuple[Int64[np.ndarray, " linked"], np.nd
 def _lowest(
     scaled: sparse.csc_array, root: np.ndarray, component: np.ndarray, wanted: int
 ) -> tuple[Float64[np.ndarray, " pairs"], Float64[np.ndarray, "vertices pairs"]]:
-    """The lowest eigenpairs above the null space of D^-1/2 (D - W) D^-1/2, by shift-and-invert Lanczos.
+    """The lowest eigenpairs above the null space of M^1/2 Δ M^-1/2, by shift-and-invert Lanczos.
 
-    The null vectors, D^1/2 on each component, are known; with them projected out, only wanted pairs are iterated for.
+    The null vectors, M^1/2 on each component, are known; with them projected out, only wanted pairs are iterated for.
     """
     size = len(root)
     null = sparse.csr_array((root, (np.arange(size), component)))

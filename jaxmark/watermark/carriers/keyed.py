@@ -92,7 +92,7 @@ class KeyedCarrier(NamedTuple):
 
     def adjoint(self, residual: Displacement, beta: Strength = 1.0) -> Float[Array, " bits"]:
         """See `Carrier`."""
-        return self.correlate(per_row(self.host.operator.degree, residual) * residual, self.coefficients(beta))
+        return self.correlate(per_row(self.host.operator.mass, residual) * residual, self.coefficients(beta))
 
     @jax.jit
     def gram(self, beta: Strength = 1.0) -> Float[Array, "bits bits"]:

@@ -217,7 +217,7 @@ def _receive(receiver: Receiver, seen: Observation) -> tuple[Array, Array, Array
 
     # Where nothing is seen, the host is assumed to have moved with the nuisance, because a hole would leak into every
     # band. Bands of the host differ by orders of magnitude, which moments cannot resolve, so each band is filtered.
-    mass = per_row(receiver.operator.degree, residual)
+    mass = per_row(receiver.operator.mass, residual)
 
     def products(pair: Float[Array, "vertices 6"]) -> tuple[Array, Array]:
         return jnp.sum(mass * pair[:, 3:] * pair[:, :3]), jnp.sum(mass * pair[:, 3:] ** 2)
