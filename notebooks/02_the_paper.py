@@ -24,8 +24,8 @@ from jaxmark.spectral import (
     eigenpairs,
     filter,
     filter_by_factors,
+    from_mesh,
     lagrange_factors,
-    make_laplacian,
 )
 from jaxmark.spectral.bands import hat, nodes, scaling
 from jaxmark.spectral.laplacian import sparse_matrices
@@ -47,7 +47,7 @@ print(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
 # eigenvectors are orthonormal in that sense:
 
 # %%
-operator = make_laplacian(mesh)
+operator = from_mesh(mesh)
 pairs = eigenpairs(operator)
 stiffness, mass = sparse_matrices(operator)
 gram = pairs.vectors.T @ (mass @ pairs.vectors)

@@ -13,7 +13,7 @@ from jaxmark import plot
 from jaxmark.alignment import make_original
 from jaxmark.app.demo import sample_mesh
 from jaxmark.evaluation import pictures
-from jaxmark.spectral import centre, make_laplacian, quadrature
+from jaxmark.spectral import centre, from_mesh, quadrature
 from jaxmark.spectral.bands import bernstein, hat, nodes, report, scaling
 
 mesh = jm.attack(jm.load_mesh(sample_mesh()), "simplification", 0.9, seed=0)
@@ -78,7 +78,7 @@ plot.spectra(original, moves)
 # by a quadrature of its spectral measure, without eigenvectors.
 
 # %%
-operator = make_laplacian(mesh)
+operator = from_mesh(mesh)
 measure = quadrature(operator, centre(operator, np.asarray(mesh.vertices))[:, 0], 256)
 
 

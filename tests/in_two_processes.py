@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmark.spectral import chebyshev, sharding
-from jaxmark.spectral.laplacian import make_laplacian
+from jaxmark.spectral.graphs import from_mesh
 from tests.samples import bumpy_sphere
 
 
@@ -20,7 +20,7 @@ def main(index: int, port: str) -> None:
     jax.config.update("jax_num_cpu_devices", 2)
     jax.distributed.initialize(f"localhost:{port}", num_processes=2, process_id=index)
     mesh = bumpy_sphere(3)
-    operator = make_laplacian(mesh)
+    operator = from_mesh(mesh)
     sharded = sharding.shard(operator, jax.devices(), mesh.vertices)
     x, c = np.asarray(mesh.vertices), np.random.default_rng(0).normal(size=12)
     there = sharded.scatter(x)

@@ -10,7 +10,7 @@ import pytest
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral import chebyshev, sharding
-from jaxmark.spectral.laplacian import make_laplacian
+from jaxmark.spectral.graphs import from_mesh
 from tests.dense import laplacian_matrix, tolerance
 
 pytestmark = pytest.mark.skipif("jax.device_count() < 4", reason="needs four devices")
@@ -28,7 +28,7 @@ def close(found, expected, dtype) -> None:
     [("curve", "gather", 4, ()), ("graph", "segments", 3, (2,))],
 )  # neither 3 nor 4 divides 642
 def test_filter_and_gradients_are_those_of_one_device(sphere: Mesh, along, lowering, count, columns, dtype):
-    operator = make_laplacian(sphere, "cotangent", lowering=lowering)
+    operator = from_mesh(sphere, "cotangent", lowering=lowering)
     positions = sphere.vertices if along == "curve" else None
     sharded = sharding.shard(operator, jax.devices()[:count], positions)
     random = np.random.default_rng(0)
@@ -56,7 +56,7 @@ def test_filter_and_gradients_are_those_of_one_device(sphere: Mesh, along, lower
 
 def test_parts_of_a_hard_graph(hard_graph: Mesh, dtype):
     """Isolated vertices and several components; one device's block has hardly an edge."""
-    operator = make_laplacian(hard_graph)
+    operator = from_mesh(hard_graph)
     x = np.random.default_rng(1).normal(size=(11, 3)).astype(dtype)
     for count in (1, 2, 4):
         sharded = sharding.shard(operator, jax.devices()[:count])
@@ -68,7 +68,7 @@ def test_parts_of_a_hard_graph(hard_graph: Mesh, dtype):
 def test_more_devices_than_some_blocks_have_neighbours(x64):
     """A path in one piece and four vertices on four devices: every edge is cut."""
     mesh = Mesh(np.eye(4, 3), np.array([[0, 1, 1], [1, 2, 2], [2, 3, 3]]))
-    operator = make_laplacian(mesh)
+    operator = from_mesh(mesh)
     sharded = sharding.shard(operator, jax.devices()[:4])
     assert sharding.traffic(sharded) == (6, 6, 3)
     found = sharded.gather(sharding.filter_sharded(sharded, np.ones(2), sharded.scatter(mesh.vertices)))
@@ -76,7 +76,7 @@ def test_more_devices_than_some_blocks_have_neighbours(x64):
 
 
 def test_what_is_refused(sphere: Mesh, unchecked):
-    operator = make_laplacian(sphere)
+    operator = from_mesh(sphere)
     parts = sharding.partition(operator, 4)
     sharded = sharding.place(parts, jax.devices()[:4])
     x = np.asarray(sphere.vertices)

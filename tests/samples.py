@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from jaxmark.geometry.mesh import Mesh, make_mesh
-from jaxmark.spectral.laplacian import Laplacian, Weighting, make_laplacian
+from jaxmark.spectral.graphs import Weighting, from_mesh
+from jaxmark.spectral.laplacian import Laplacian
 
 
 def bumpy_sphere(level: int, seed: int = 0) -> Mesh:
@@ -51,11 +52,11 @@ def exact_sheet(size: int) -> Mesh:
     return make_mesh(vertices, faces)
 
 
-def ordered_laplacian(mesh: Mesh, weights: Weighting) -> Laplacian:
+def ordered_laplacian(mesh: Mesh, weights: Weighting = "valence", **options) -> Laplacian:
     """With rows in an order of its own, as large meshes have them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jaxmark.spectral.laplacian._MIN_ORDERED_VERTICES", 0)
-        made = make_laplacian(mesh, weights)
+        made = from_mesh(mesh, weights, **options)
     assert made.neighbours is not None
     assert not np.array_equal(made.neighbours.order, np.arange(len(made.degree)))
     return made

@@ -14,7 +14,8 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral.bands import bernstein, equal_edges, hat, intervals, lagrange, minimax, nodes, report, scaling
 from jaxmark.spectral.chebyshev import band_components, cross_moments, moments
-from jaxmark.spectral.laplacian import centre, make_laplacian
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import centre
 from jaxmark.spectral.spectrum import eigenpairs, quadrature, white_probes
 from tests.dense import laplacian_matrix
 
@@ -89,7 +90,7 @@ def test_damping_factors_by_their_closed_forms():
 
 @pytest.mark.parametrize(("kernel", "damping"), [("printed", "none"), ("halved", "none"), ("halved", "jackson")])
 def test_report_against_the_full_spectrum(sphere: Mesh, kernel, damping):
-    operator = make_laplacian(sphere)
+    operator = from_mesh(sphere)
     x = centre(operator, sphere.vertices)[:, 0]
     family = scaling(16, kernel=kernel, damping=damping)
     found = report(quadrature(operator, x, len(x)), family)
@@ -114,7 +115,7 @@ def test_report_against_the_full_spectrum(sphere: Mesh, kernel, damping):
 
 def test_damping_makes_components_of_a_mesh_orthogonal(sphere: Mesh):
     """Condition 3: what the printed kernel lacks."""
-    operator = make_laplacian(sphere)
+    operator = from_mesh(sphere)
     measure = quadrature(operator, centre(operator, sphere.vertices)[:, 0], 128)
     printed = report(measure, scaling(32, kernel="printed"))
     damped = report(measure, scaling(32, damping="jackson"))
@@ -125,7 +126,7 @@ def test_damping_makes_components_of_a_mesh_orthogonal(sphere: Mesh):
 
 def test_report_of_any_responses_and_edges(sphere: Mesh):
     """Of indicators nothing leaks; half of it does where the edges say that two of four bands lie elsewhere."""
-    operator = make_laplacian(sphere)
+    operator = from_mesh(sphere)
     measure = quadrature(operator, centre(operator, sphere.vertices)[:, 0], 200)
     edges = np.array([0, 0.1, 0.3, 0.8, 1.1, 2])
 
@@ -171,7 +172,7 @@ def test_intervals_are_damped_projections_of_indicators():
 
 def test_bands_by_density_hold_equal_counts_of_eigenvalues(sphere: Mesh, x64):
     """Exactly so of the damped estimate; of the eigenvalues themselves within its error: the probes' and the blur's."""
-    operator, probes, bands = make_laplacian(sphere), 16, 8
+    operator, probes, bands = from_mesh(sphere), 16, 8
     signals = jnp.asarray(white_probes(operator, jax.random.key(0), probes))
     found = np.asarray(moments(operator, signals, degree=100)).sum(axis=1)
     edges = equal_edges(found, bands)
@@ -191,7 +192,7 @@ def test_bands_by_density_hold_equal_counts_of_eigenvalues(sphere: Mesh, x64):
 
 
 def test_bands_by_energy_hold_equal_parts_of_the_host(sphere: Mesh, dtype):
-    operator = make_laplacian(sphere)
+    operator = from_mesh(sphere)
     x = jnp.asarray(centre(operator, sphere.vertices).astype(dtype))
     found = np.asarray(moments(operator, x, degree=32)).sum(axis=1)
     family = intervals(equal_edges(found, 10), len(found))
@@ -208,7 +209,7 @@ def test_lagrange_at_the_zeros_is_scaling():
 def test_lagrange_at_the_eigenvalues_projects(x64):
     """Equations 8 to 10: idempotent, D-orthogonal, complete, and c² = ⟨f_λ(Δ)x, x⟩_D; eigenspaces of several."""
     ball = trimesh.creation.icosphere(subdivisions=1)
-    operator = make_laplacian(make_mesh(ball.vertices, ball.faces))
+    operator = from_mesh(make_mesh(ball.vertices, ball.faces))
     pairs = eigenpairs(operator)
     spaces = np.unique(pairs.space)
     family = lagrange(np.append(0, pairs.values[spaces]))

@@ -9,7 +9,8 @@ from jax.test_util import check_grads
 import jaxmark as jm
 from jaxmark.alignment.observation import observe
 from jaxmark.spectral.bands import scaling
-from jaxmark.spectral.laplacian import Laplacian, centre, make_laplacian
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import Laplacian, centre
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark.carriers import Carrier, ModulatedCarrier, eigenspaces, host_bands
 from jaxmark.watermark.coding.keys import Choices
@@ -28,7 +29,7 @@ def mesh():
 
 @pytest.fixture(scope="module")
 def operator(mesh) -> Laplacian:
-    return make_laplacian(mesh, "inverse-length")
+    return from_mesh(mesh, "inverse-length")
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +189,7 @@ def test_the_whole_eigenspace_stands_for_a_repeated_eigenvalue(key: jm.Key, x64)
 
     ball = trimesh.creation.icosahedron()
     mesh = make_mesh(ball.vertices * [1, 1.2, 1.5] + 0.1 * np.cos(3 * ball.vertices[:, [1, 2, 0]] + 1), ball.faces)
-    operator = make_laplacian(mesh)
+    operator = from_mesh(mesh)
     signal = jnp.asarray(centre(operator, mesh.vertices))
     pairs = eigenpairs(operator)
     turn = np.eye(11)

@@ -12,7 +12,8 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral import chebyshev
 from jaxmark.spectral.bands import scaling
-from jaxmark.spectral.laplacian import Laplacian, make_laplacian
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import Laplacian
 from tests.dense import chebyshev_matrices, tolerance
 from tests.samples import bumpy_sphere, ordered_laplacian
 
@@ -188,7 +189,7 @@ def test_derivatives_by_transformation(operator, x64):
 @pytest.mark.parametrize(("columns", "per_column"), [((), False), ((3,), False), ((3,), True)])
 def test_derivatives_are_those_of_the_recurrence(columns, per_column, dtype):
     """On more vertices than are summed at once: those in O(N) memory, and JAX's own of the recurrence."""
-    operator = make_laplacian(bumpy_sphere(3), "inverse-length")
+    operator = from_mesh(bumpy_sphere(3), "inverse-length")
     c = jnp.asarray(random_array(DEGREE + 1, *(columns if per_column else ())), dtype)
     x, u = (jnp.asarray(random_array(642, *columns, seed=seed), dtype) for seed in (1, 2))
 
@@ -207,7 +208,7 @@ def test_derivatives_are_those_of_the_recurrence(columns, per_column, dtype):
 
 
 def test_memory_does_not_grow_with_the_degree():
-    operator = jax.tree.map(jnp.asarray, make_laplacian(bumpy_sphere(4)))
+    operator = jax.tree.map(jnp.asarray, from_mesh(bumpy_sphere(4)))
     x = jnp.ones((len(operator.degree), 3), jnp.float32)
 
     weights = jnp.ones(len(operator.edges), jnp.float32)
@@ -255,7 +256,7 @@ def test_band_by_band_is_the_same_as_all_at_once(operator, dtype):
 
 
 def test_memory_does_not_grow_with_the_bands():
-    operator = jax.tree.map(jnp.asarray, make_laplacian(bumpy_sphere(4)))
+    operator = jax.tree.map(jnp.asarray, from_mesh(bumpy_sphere(4)))
     x = jnp.ones((len(operator.degree), 3), jnp.float32)
 
     def scratch(bands: int) -> int:
@@ -275,7 +276,7 @@ def test_derivative_of_moments(operator, x64):
 
 def test_moments_in_float32_lose_weak_bands_and_components_do_not(sphere):
     """Why `gram` has two methods, and which is the default."""
-    operator = make_laplacian(sphere)
+    operator = from_mesh(sphere)
     family = scaling(48, damping="jackson")
     x = sphere.vertices - operator.degree @ sphere.vertices / operator.degree.sum()
     with jax.enable_x64(True):
@@ -298,7 +299,7 @@ def test_linearity_pose_and_vertex_order(seed):
     mesh = bumpy_sphere(1)
     c = random.normal(size=6)
     with jax.enable_x64(True):
-        operator = make_laplacian(mesh)
+        operator = from_mesh(mesh)
         x, y = (jnp.asarray(random.normal(size=mesh.vertices.shape)) for _ in range(2))
         a, b = random.normal(size=2)
         out = chebyshev.filter(operator, c, x)
@@ -308,7 +309,7 @@ def test_linearity_pose_and_vertex_order(seed):
         np.testing.assert_allclose(chebyshev.filter(operator, c, x @ turn), out @ turn, atol=1e-10)
         order = random.permutation(len(x))
         rank = np.argsort(order)
-        shuffled = make_laplacian(make_mesh(mesh.vertices[order], rank[mesh.faces]))
+        shuffled = from_mesh(make_mesh(mesh.vertices[order], rank[mesh.faces]))
         np.testing.assert_allclose(chebyshev.filter(shuffled, c, x[order]), out[order], atol=1e-10)
 
 

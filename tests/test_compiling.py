@@ -60,7 +60,7 @@ def test_the_second_call_compiles_nothing(name: str, caplog: pytest.LogCaptureFi
     compiled = []
     for seed in (0, 1):
         mesh = rough_sphere(67, seed)
-        operator = spectral.make_laplacian(mesh, "inverse-length", lowering="segments")
+        operator = spectral.from_mesh(mesh, "inverse-length", lowering="segments")
         x = jnp.asarray(mesh.vertices, jnp.float32)
         caplog.clear()
         with jax.log_compiles(True):

@@ -12,7 +12,7 @@ from jaxmark.alignment.original import make_original
 from jaxmark.attacks import ATTACKS
 from jaxmark.distortion import METRICS
 from jaxmark.geometry.mesh import Mesh, make_mesh
-from jaxmark.spectral import bands, filter, make_laplacian
+from jaxmark.spectral import bands, filter, from_mesh
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark import SCHEMES
 from jaxmark.watermark.budget import make_budget
@@ -176,7 +176,7 @@ def test_marks_move_copies_of_a_point_together(name, small: Mesh, key: jm.Key):
 @pytest.mark.parametrize("name", FAMILIES)
 def test_families_filter_as_functions_of_the_spectrum(name, small: Mesh, dtype):
     """Against the dense eigenbasis, by every transformation."""
-    family, operator = FAMILIES[name](), make_laplacian(small)
+    family, operator = FAMILIES[name](), from_mesh(small)
     pairs = eigenpairs(operator)
     x = pairs.vectors @ np.random.default_rng(0).normal(size=(len(pairs.values), 2))
     response = np.polynomial.chebyshev.chebval(pairs.values - 1, family.T)

@@ -16,7 +16,8 @@ from jaxmark.alignment.observation import Observation
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import filter, transpose
-from jaxmark.spectral.laplacian import centre, make_laplacian
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import centre
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark.carriers import ModulatedCarrier, eigenspaces, host_bands
 from jaxmark.watermark.detectors import correlate
@@ -81,7 +82,7 @@ def test_a_filter_costs_what_its_edges_do():
     """Printed: O(nN²). Four times the vertices take four times the work and the memory; a dense product sixteen."""
 
     def cost(level: int, dense: bool) -> tuple[float, float]:
-        operator = make_laplacian(bumpy_sphere(level))
+        operator = from_mesh(bumpy_sphere(level))
         x = jnp.ones((len(operator.degree), 3), jnp.float32)
         matrix = jnp.zeros((len(x), len(x)), jnp.float32)
         program = jax.jit(jnp.matmul if dense else type(operator).apply).lower(matrix if dense else operator, x)
@@ -148,7 +149,7 @@ def test_side_lobes_where_meshes_have_their_energy():
 
 def test_detection_value_needs_the_mass(sphere: Mesh, x64):
     """Printed: a plain inner product in 2.2.2, by which components that are orthogonal by ⟨·,·⟩_D are not."""
-    operator = make_laplacian(sphere, "inverse-length")
+    operator = from_mesh(sphere, "inverse-length")
     signal = jnp.asarray(centre(operator, sphere.vertices))
     components = eigenspaces(operator, signal, eigenpairs(operator, 8))
     amplitudes = np.random.default_rng(1).normal(size=(components.gram.shape[-1], 3))
@@ -162,7 +163,7 @@ def test_detection_value_needs_the_mass(sphere: Mesh, x64):
 
 def test_the_filter_matched_to_white_noise_is_the_plain_adjoint(sphere: Mesh, x64):
     """Printed: correlation with f(Δ)x. Noise that is white on coordinates needs f(Δ)ᵀ = D f(Δ) D⁻¹."""
-    operator = make_laplacian(sphere, "inverse-length")
+    operator = from_mesh(sphere, "inverse-length")
     x, y = jnp.asarray(np.random.default_rng(2).normal(size=(2, len(sphere.vertices))))
     c = scaling(12)[3]
     plain = float(jnp.vdot(filter(operator, c, x), y))
@@ -172,7 +173,7 @@ def test_the_filter_matched_to_white_noise_is_the_plain_adjoint(sphere: Mesh, x6
 
 def test_bound_3_needs_the_strength(sphere: Mesh, x64):
     """Printed: |W| ≥ n - … whatever β is. Unattacked, on orthonormal components (ε = 0), W is nβ and no more."""
-    operator = make_laplacian(sphere)
+    operator = from_mesh(sphere)
     signal = jnp.asarray(centre(operator, sphere.vertices))
     components = eigenspaces(operator, signal, eigenpairs(operator, 8))
     norm = np.sqrt(np.diagonal(components.gram, axis1=1, axis2=2).T)
@@ -187,7 +188,7 @@ def test_bound_3_needs_the_strength(sphere: Mesh, x64):
 
 def test_bound_3_says_nothing_on_meshes(sphere: Mesh, x64):
     """Printed: for small ε. Of n components, the others' part of W is bounded by εn(n - 1), and ε is near 1."""
-    operator, n = make_laplacian(sphere), 16
+    operator, n = from_mesh(sphere), 16
     signal = jnp.asarray(centre(operator, sphere.vertices))
     products = np.asarray(host_bands(operator, signal, scaling(n, kernel="printed")).gram)
     printed = np.abs(products - np.eye(n)).max(axis=(1, 2))
@@ -199,7 +200,7 @@ def test_bound_3_says_nothing_on_meshes(sphere: Mesh, x64):
 
 def test_components_depend_on_the_position_unless_centred(sphere: Mesh, x64):
     """Not in the paper: λ = 0 is where the mesh stands, so without centring the mark grows with the distance to 0."""
-    operator, rows = make_laplacian(sphere), scaling(16, kernel="printed")
+    operator, rows = from_mesh(sphere), scaling(16, kernel="printed")
     near, far = (jnp.asarray(np.asarray(sphere.vertices) + shift) for shift in (0.0, 100.0))
 
     def marks(position) -> np.ndarray:
@@ -212,7 +213,7 @@ def test_components_depend_on_the_position_unless_centred(sphere: Mesh, x64):
 
 def test_the_spectrum_is_real_for_symmetric_weights_only(sphere: Mesh):
     """Printed: for any weights with rows that sum to 1."""
-    stochastic = np.eye(len(sphere.vertices)) - laplacian_matrix(make_laplacian(sphere))
+    stochastic = np.eye(len(sphere.vertices)) - laplacian_matrix(from_mesh(sphere))
     factors = np.random.default_rng(4).uniform(0.1, 1, stochastic.shape)
     for scale, real in ((factors + factors.T, True), (factors, False)):
         weights = scale * (stochastic > 0)

@@ -9,7 +9,7 @@ from jax.test_util import check_grads
 import jaxmark as jm
 from jaxmark.attacks import band_stop, low_pass
 from jaxmark.geometry.mesh import Mesh, make_mesh
-from jaxmark.spectral.laplacian import make_laplacian
+from jaxmark.spectral.graphs import from_mesh
 from tests.dense import laplacian_matrix
 from tests.samples import rough_sphere
 
@@ -24,7 +24,7 @@ def cap() -> Mesh:
 @pytest.fixture(scope="module")
 def spectrum(cap: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Eigenvalues and orthonormal eigenvectors of D^½ Δ D^-½, and D^½; of the vertices that faces use."""
-    operator, used = make_laplacian(cap), np.unique(cap.faces)
+    operator, used = from_mesh(cap), np.unique(cap.faces)
     root = np.sqrt(np.asarray(operator.degree)[used])
     symmetric = root[:, None] * laplacian_matrix(operator)[np.ix_(used, used)] / root
     np.testing.assert_allclose(symmetric, symmetric.T, atol=1e-15)
@@ -96,7 +96,7 @@ def test_nothing_is_removed_at_strength_zero(cap: Mesh):
 
 
 def test_components_stay_where_they_are(hard_graph: Mesh, x64):
-    degree = np.asarray(make_laplacian(hard_graph).degree)
+    degree = np.asarray(from_mesh(hard_graph).degree)
     for kind in (low_pass, band_stop):
         shift = np.asarray(kind(hard_graph, 0.9).vertices) - hard_graph.vertices
         assert np.abs(shift).max() > 0.01

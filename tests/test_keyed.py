@@ -12,7 +12,8 @@ import jaxmark as jm
 from jaxmark.alignment.observation import Observation, observe
 from jaxmark.geometry.mesh import vertex_normals
 from jaxmark.spectral.bands import scaling
-from jaxmark.spectral.laplacian import Laplacian, centre, make_laplacian
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import Laplacian, centre
 from jaxmark.watermark import detectors
 from jaxmark.watermark.bits import detect_bits, embed_bits
 from jaxmark.watermark.carriers import Carrier, KeyedCarrier, KeyedReader, ModulatedCarrier, host_bands, make_chips
@@ -38,7 +39,7 @@ class Case(NamedTuple):
 
 def make_case(level: int) -> Case:
     mesh = bumpy_sphere(level)
-    operator = make_laplacian(mesh, "inverse-length")
+    operator = from_mesh(mesh, "inverse-length")
     moving = np.arange(len(mesh.vertices)) % 7 != 3
     terms = chebyshev_matrices(operator, FAMILY.shape[1] - 1)
     filters = np.einsum("jk,kuv->juv", FAMILY, terms)

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, edges, make_mesh
-from jaxmark.spectral.laplacian import Laplacian, centre, host_edges, make_laplacian, sparse_matrices
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import Laplacian, centre, host_edges, sparse_matrices
 from jaxmark.spectral.spectrum import eigenpairs
 from tests.dense import laplacian_matrix, tolerance
 
@@ -27,7 +28,7 @@ def lowering(request, monkeypatch):
 @pytest.mark.parametrize("weights", WEIGHTINGS)
 @pytest.mark.parametrize("columns", [(), (3,)])
 def test_apply_is_the_dense_matrix(hard_graph: Mesh, lowering, weights, columns, dtype):
-    operator = make_laplacian(hard_graph, weights, lowering=lowering)
+    operator = from_mesh(hard_graph, weights, lowering=lowering)
     x = np.random.default_rng(0).normal(size=(len(hard_graph.vertices), *columns)).astype(dtype)
     y = operator.apply(jnp.asarray(x))
     assert y.dtype == dtype
@@ -36,7 +37,7 @@ def test_apply_is_the_dense_matrix(hard_graph: Mesh, lowering, weights, columns,
 
 @pytest.mark.parametrize("weights", WEIGHTINGS)
 def test_spectrum_lies_in_0_2_and_each_component_is_in_the_null_space(hard_graph: Mesh, weights):
-    values = np.linalg.eigvals(laplacian_matrix(make_laplacian(hard_graph, weights)))
+    values = np.linalg.eigvals(laplacian_matrix(from_mesh(hard_graph, weights)))
     assert np.abs(values.imag).max() < 1e-12
     assert values.real.min() > -1e-12
     assert values.real.max() < 2 + 1e-12
@@ -48,14 +49,14 @@ def test_spectrum_lies_in_0_2_and_each_component_is_in_the_null_space(hard_graph
 def test_self_adjoint_in_the_inner_product(seed, weights):
     random = np.random.default_rng(seed)
     mesh = make_mesh(random.normal(size=(12, 3)), random.integers(0, 12, (20, 3)))
-    operator = make_laplacian(mesh, weights)
+    operator = from_mesh(mesh, weights)
     x, y = jnp.asarray(random.normal(size=(2, 12)), jnp.float32)
     assert operator.inner(operator.apply(x), y) == pytest.approx(float(operator.inner(x, operator.apply(y))), abs=1e-3)
 
 
 def test_the_papers_mass_is_not_self_adjoint(hard_graph: Mesh):
     """Erratum: with D = diag(1/d), as printed, Lemma 3.1 fails."""
-    operator = make_laplacian(hard_graph)
+    operator = from_mesh(hard_graph)
     delta = laplacian_matrix(operator)
     linked = operator.degree > 0
     right = np.diag(operator.degree) @ delta
@@ -65,14 +66,14 @@ def test_the_papers_mass_is_not_self_adjoint(hard_graph: Mesh):
 
 
 def test_inner_is_weighted_by_row_sums(hard_graph: Mesh, dtype):
-    operator = make_laplacian(hard_graph, "inverse-length")
+    operator = from_mesh(hard_graph, "inverse-length")
     x, y = np.random.default_rng(1).normal(size=(2, len(hard_graph.vertices), 3)).astype(dtype)
     expected = np.einsum("v,vc,vc->c", operator.degree, x, y)
     np.testing.assert_allclose(operator.inner(jnp.asarray(x), jnp.asarray(y)), expected, rtol=tolerance(dtype, 10))
 
 
 def test_cotangents_agree_with_angles(sphere: Mesh):
-    operator = make_laplacian(sphere, "cotangent")
+    operator = from_mesh(sphere, "cotangent")
     angles = trimesh.Trimesh(*sphere, process=False).face_angles
     expected = {tuple(edge): 0.0 for edge in operator.edges}
     for face, corners in zip(sphere.faces, angles, strict=True):
@@ -85,16 +86,16 @@ def test_cotangents_agree_with_angles(sphere: Mesh):
 def test_array_weights_and_their_refusal(sphere: Mesh):
     count = len(edges(sphere.faces))
     given_weights = np.random.default_rng(2).uniform(size=count)
-    np.testing.assert_array_equal(make_laplacian(sphere, given_weights).weights, given_weights)
+    np.testing.assert_array_equal(from_mesh(sphere, given_weights).weights, given_weights)
     for bad, sentence in [(np.ones(3), "one value for each"), (-np.ones(count), "not negative"), ("cot", "must be")]:
         with pytest.raises(JaxmarkError, match=sentence):
-            make_laplacian(sphere, bad)
+            from_mesh(sphere, bad)
     with pytest.raises(JaxmarkError, match="length zero"):
-        make_laplacian(make_mesh(np.zeros((3, 3)), np.array([[0, 1, 2]])), "inverse-length")
+        from_mesh(make_mesh(np.zeros((3, 3)), np.array([[0, 1, 2]])), "inverse-length")
 
 
 def test_centring_removes_the_position_of_every_piece(hard_graph: Mesh):
-    operator = make_laplacian(hard_graph, "inverse-length")
+    operator = from_mesh(hard_graph, "inverse-length")
     centred = centre(operator, hard_graph.vertices)
     pieces = [[0, 1, 2, 3, 4], [6, 7, 8, 9]]
     shifted = hard_graph.vertices + 1e6
@@ -108,7 +109,7 @@ def test_centring_removes_the_position_of_every_piece(hard_graph: Mesh):
 def test_an_edge_of_weight_zero_joins_nothing():
     mesh = make_mesh(np.random.default_rng(4).normal(size=(6, 3)), np.array([[0, 1, 2], [3, 4, 5], [2, 3, 3]]))
     weights = np.array([0.0 if {*edge} == {2, 3} else 1.0 for edge in edges(mesh.faces)])
-    operator = make_laplacian(mesh, weights)
+    operator = from_mesh(mesh, weights)
     centred = centre(operator, mesh.vertices)
     for piece in ([0, 1, 2], [3, 4, 5]):
         np.testing.assert_allclose(operator.degree[piece] @ centred[piece], 0, atol=1e-12)
@@ -116,7 +117,7 @@ def test_an_edge_of_weight_zero_joins_nothing():
 
 
 def test_shapes_and_types_are_checked(hard_graph: Mesh, unchecked):
-    operator = make_laplacian(hard_graph)
+    operator = from_mesh(hard_graph)
     x = jnp.ones((len(hard_graph.vertices), 3))
     with pytest.raises(JaxmarkError, match="one shape"):
         operator.inner(x, x[:, :1])
@@ -125,13 +126,13 @@ def test_shapes_and_types_are_checked(hard_graph: Mesh, unchecked):
 
 
 def test_sparse_matrices(hard_graph: Mesh):
-    operator = make_laplacian(hard_graph, "inverse-length")
+    operator = from_mesh(hard_graph, "inverse-length")
     stiffness, mass = sparse_matrices(operator)
     np.testing.assert_allclose(stiffness.toarray(), mass.toarray() @ laplacian_matrix(operator), atol=1e-12)
 
 
 def test_transformations(hard_graph: Mesh, lowering, x64):
-    operator = make_laplacian(hard_graph, lowering=lowering)
+    operator = from_mesh(hard_graph, lowering=lowering)
     matrix = laplacian_matrix(operator)
     batch = jnp.asarray(np.random.default_rng(3).normal(size=(4, len(matrix), 3)))
     np.testing.assert_allclose(jax.jit(Laplacian.apply)(operator, batch[0]), matrix @ batch[0], atol=1e-12)
@@ -152,7 +153,7 @@ def fan(spokes: int) -> Mesh:
 @pytest.mark.parametrize("weights", WEIGHTINGS)
 def test_what_a_table_has_no_slots_for_is_added_one_by_one(weights, dtype):
     mesh = fan(200)
-    operator = make_laplacian(mesh, weights)
+    operator = from_mesh(mesh, weights)
     assert operator.neighbours is not None
     assert len(operator.neighbours.vertices) == 4
     assert len(operator.neighbours.rest) == 196
@@ -161,24 +162,24 @@ def test_what_a_table_has_no_slots_for_is_added_one_by_one(weights, dtype):
 
 
 def test_a_table_is_used_where_it_pays(unchecked, monkeypatch):
-    assert make_laplacian(fan(5)).neighbours is not None
+    assert from_mesh(fan(5)).neighbours is not None
     # Where adding costs less, it pays less.
-    assert make_laplacian(fan(200)).neighbours is not None
+    assert from_mesh(fan(200)).neighbours is not None
     with monkeypatch.context() as elsewhere:
         elsewhere.setattr("jax.default_backend", lambda: "gpu")
-        assert make_laplacian(fan(200)).neighbours is None
+        assert from_mesh(fan(200)).neighbours is None
     # One triangle among a thousand vertices without edges.
     sparse = make_mesh(np.random.default_rng(7).normal(size=(1000, 3)), np.array([[0, 1, 2]]))
-    assert make_laplacian(sparse).neighbours is None
-    assert make_laplacian(sparse, lowering="gather").neighbours is not None
-    assert make_laplacian(fan(5), lowering="segments").neighbours is None
+    assert from_mesh(sparse).neighbours is None
+    assert from_mesh(sparse, lowering="gather").neighbours is not None
+    assert from_mesh(fan(5), lowering="segments").neighbours is None
     with pytest.raises(JaxmarkError, match="gather, segments, not 'scatter'"):
-        make_laplacian(sparse, lowering="scatter")
+        from_mesh(sparse, lowering="scatter")
 
 
 def test_what_is_past_the_last_vertex_counts_nothing(hard_graph: Mesh, lowering, dtype):
     """Arrays can be filled up to one shape."""
-    operator = make_laplacian(hard_graph, lowering=lowering)
+    operator = from_mesh(hard_graph, lowering=lowering)
     size = len(hard_graph.vertices)
     filled = operator._replace(edges=np.concatenate([operator.edges, np.full((3, 2), size)]))
     if (table := operator.neighbours) is not None:
@@ -191,7 +192,7 @@ def test_what_is_past_the_last_vertex_counts_nothing(hard_graph: Mesh, lowering,
 
 @pytest.mark.parametrize("weights", WEIGHTINGS)
 def test_gradients_of_weights_are_finite_and_right(hard_graph: Mesh, lowering, weights, x64):
-    operator = make_laplacian(hard_graph, weights, lowering=lowering)
+    operator = from_mesh(hard_graph, weights, lowering=lowering)
     assert (operator.weights is None) == (weights == "valence")
     x = jnp.asarray(hard_graph.vertices)
 

@@ -9,7 +9,7 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral import product
 from jaxmark.spectral.bands import nodes, scaling
 from jaxmark.spectral.chebyshev import band_components
-from jaxmark.spectral.laplacian import make_laplacian
+from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.product import Factors, lagrange_factors, leja
 from tests.dense import laplacian_matrix, tolerance
 from tests.samples import ordered_laplacian
@@ -44,7 +44,7 @@ def test_lagrange_factors_are_1_at_their_node_and_0_at_the_others(order):
 
 @pytest.mark.parametrize(("order", "bands"), [("printed", 8), ("leja", 8), ("leja", 32), ("leja", 128)])
 def test_both_methods_agree(sphere: Mesh, order, bands, dtype):
-    operator = make_laplacian(sphere)
+    operator = from_mesh(sphere)
     x = jnp.asarray(np.random.default_rng(0).normal(size=(642, 3)).astype(dtype))
     second = band_components(operator, scaling(bands), x)
     first = all_bands(operator, lagrange_factors(nodes(bands), order=order), x)
@@ -53,7 +53,7 @@ def test_both_methods_agree(sphere: Mesh, order, bands, dtype):
 
 def test_the_printed_order_loses_all_digits(sphere: Mesh, x64):
     """Why the order is not a matter of taste: 64 bands have errors of 10⁸ in float64, and overflow in float32."""
-    operator = make_laplacian(sphere)
+    operator = from_mesh(sphere)
     x = np.random.default_rng(0).normal(size=642)
     second = band_components(operator, scaling(64), jnp.asarray(x))
     first = all_bands(operator, lagrange_factors(nodes(64), order="printed"), jnp.asarray(x))
@@ -87,7 +87,7 @@ def test_derivatives(hard_graph: Mesh, x64):
 
 
 def test_refusals(sphere: Mesh, unchecked):
-    operator, x = make_laplacian(sphere), jnp.ones(642)
+    operator, x = from_mesh(sphere), jnp.ones(642)
     factors = lagrange_factors(nodes(4))
     for call in (
         lambda: product.filter_by_factors(operator, factors, x),

@@ -10,7 +10,8 @@ from scipy import sparse
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral import rational
-from jaxmark.spectral.laplacian import Laplacian, make_laplacian, sparse_matrices
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import Laplacian, sparse_matrices
 from jaxmark.spectral.rational import butterworth, response
 from tests.dense import laplacian_matrix, tolerance
 from tests.samples import ordered_laplacian
@@ -47,7 +48,7 @@ def test_response_is_what_an_eigenvector_sees():
 
 
 def test_implicit_smoothing_against_a_direct_solver(sphere: Mesh, x64):
-    operator = make_laplacian(sphere)
+    operator = from_mesh(sphere)
     stiffness, mass = sparse_matrices(operator)
     x = np.asarray(sphere.vertices)
     system = sparse.csc_array(mass + 30 * stiffness)
@@ -74,7 +75,7 @@ def test_butterworth_bands_by_their_closed_form(order):
 
 def test_bands_of_a_bank(sphere: Mesh, dtype):
     """Against the dense eigenbasis; they sum to the signal, and are self-adjoint in the D inner product."""
-    operator = make_laplacian(sphere)
+    operator = from_mesh(sphere)
     bank = butterworth(1 - np.cos(np.linspace(0, np.pi, 7)), 2)
     x, u = np.random.default_rng(0).normal(size=(2, 642)).astype(dtype)
     apply = jax.jit(jax.vmap(rational.filter_rational, (None, 0, None)))

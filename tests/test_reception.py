@@ -12,7 +12,8 @@ from jaxmark.alignment.observation import Observation, observe
 from jaxmark.geometry.mesh import vertex_normals
 from jaxmark.spectral.bands import diffusion, scaling
 from jaxmark.spectral.chebyshev import filter
-from jaxmark.spectral.laplacian import Laplacian, centre, make_laplacian
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import Laplacian, centre
 from jaxmark.watermark.carriers import reception
 from jaxmark.watermark.carriers.reception import Receiver, clean, extend, make_host, make_receiver, receive
 from tests.dense import laplacian_matrix
@@ -37,7 +38,7 @@ class Case(NamedTuple):
 def case() -> Case:
     """162 vertices."""
     mesh = bumpy_sphere(2)
-    operator = make_laplacian(mesh)
+    operator = from_mesh(mesh)
     root = np.sqrt(operator.degree)
     values, vectors = np.linalg.eigh(root[:, None] * laplacian_matrix(operator) / root)
     return Case(operator, centre(operator, mesh.vertices), vertex_normals(mesh), values, vectors / root[:, None])

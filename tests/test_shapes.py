@@ -7,7 +7,7 @@ import jaxmark as jm
 from jaxmark.alignment.original import make_original
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral.chebyshev import filter
-from jaxmark.spectral.laplacian import make_laplacian
+from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.shapes import common_laplacian, common_size, pad_rows
 from tests.dense import tolerance
 from tests.samples import bumpy_sphere
@@ -31,7 +31,7 @@ def test_common_sizes_are_few_and_not_much_larger():
 @pytest.mark.parametrize("weights", ["valence", "cotangent"])
 @pytest.mark.parametrize("lowering", ["gather", "segments"])
 def test_what_is_filled_in_changes_nothing(hard_graph: Mesh, weights, lowering, dtype):
-    plain = make_laplacian(hard_graph, weights, lowering=lowering)
+    plain = from_mesh(hard_graph, weights, lowering=lowering)
     filled = common_laplacian(hard_graph, weights, lowering)
     x = np.random.default_rng(0).normal(size=(len(hard_graph.vertices), 3)).astype(dtype)
     c = np.random.default_rng(1).normal(size=9).astype(dtype)

@@ -14,7 +14,7 @@ import pytest
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral import chebyshev, sharding
-from jaxmark.spectral.laplacian import make_laplacian
+from jaxmark.spectral.graphs import from_mesh
 from tests.samples import bumpy_sphere
 
 ROOT = Path(__file__).parents[1]
@@ -55,7 +55,7 @@ def test_in_two_processes():
 @pytest.mark.parametrize("count", [2, 3, 4, 8, 32])
 def test_traffic_is_within_a_fifth_of_the_edge_cut(count, along):
     mesh = bumpy_sphere(5)
-    operator = make_laplacian(mesh)
+    operator = from_mesh(mesh)
     parts = sharding.partition(operator, count, mesh.vertices if along == "curve" else None)
     # Counted once more from the definitions.
     device = np.empty(len(mesh.vertices), int)
@@ -73,7 +73,7 @@ def test_traffic_is_within_a_fifth_of_the_edge_cut(count, along):
 
 def test_every_vertex_is_in_one_place_and_blocks_are_equal(sphere: Mesh):
     for count in (1, 5, 64, 642):
-        vertices = sharding.partition(make_laplacian(sphere), count, sphere.vertices).vertices
+        vertices = sharding.partition(from_mesh(sphere), count, sphere.vertices).vertices
         sizes = (vertices >= 0).sum(axis=1)
         assert sizes.max() - sizes.min() <= 1
         np.testing.assert_array_equal(np.sort(vertices[vertices >= 0]), np.arange(642))
@@ -83,12 +83,12 @@ def test_the_curve_passes_each_cell_of_a_grid_by_steps_of_one():
     """Hilbert's, by its definition: consecutive cells are neighbours."""
     cells = np.stack(np.meshgrid(*[np.arange(8)] * 3), axis=-1).reshape(-1, 3)
     mesh = Mesh(cells.astype(float), np.zeros((0, 3), int))
-    order = sharding.partition(make_laplacian(mesh), 1, mesh.vertices).vertices[0]
+    order = sharding.partition(from_mesh(mesh), 1, mesh.vertices).vertices[0]
     assert (np.abs(np.diff(cells[order], axis=0)).sum(axis=1) == 1).all()
 
 
 def test_one_device_in_this_process(sphere: Mesh):
-    operator = make_laplacian(sphere)
+    operator = from_mesh(sphere)
     sharded = sharding.shard(operator, jax.devices()[:1])
     x = np.asarray(sphere.vertices, np.float32)
     c = jnp.asarray([1.0, -2.0, 0.5], jnp.float32)
@@ -99,7 +99,7 @@ def test_one_device_in_this_process(sphere: Mesh):
 
 
 def test_what_is_refused(sphere: Mesh, unchecked):
-    operator = make_laplacian(sphere)
+    operator = from_mesh(sphere)
     for count, positions in [(643, None), (0, None), (2, np.zeros((3, 3))), (2, np.full((642, 3), np.nan))]:
         with pytest.raises(JaxmarkError):
             sharding.partition(operator, count, positions)

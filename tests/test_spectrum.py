@@ -6,14 +6,15 @@ import trimesh
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral import spectrum
-from jaxmark.spectral.laplacian import centre, make_laplacian
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import centre
 from jaxmark.spectral.spectrum import eigenpairs, quadrature, white_probes
 from tests.dense import laplacian_matrix
 
 
 @pytest.mark.parametrize("weights", ["valence", "inverse-length"])
 def test_eigenpairs_of_a_hard_graph(hard_graph: Mesh, weights):
-    operator = make_laplacian(hard_graph, weights)
+    operator = from_mesh(hard_graph, weights)
     pairs = eigenpairs(operator)
     delta, mass = laplacian_matrix(operator), np.diag(operator.degree)
     assert len(pairs.values) == 7  # 9 linked vertices in two components
@@ -27,7 +28,7 @@ def test_eigenpairs_of_a_hard_graph(hard_graph: Mesh, weights):
 
 
 def test_iterated_pairs_are_the_dense_ones(sphere: Mesh, monkeypatch):
-    operator = make_laplacian(sphere, "inverse-length")  # by valence, this graph has repeated eigenvalues
+    operator = from_mesh(sphere, "inverse-length")  # by valence, this graph has repeated eigenvalues
     dense = eigenpairs(operator, 20)
     monkeypatch.setattr(spectrum, "_DENSE_LIMIT", 0)
     iterated = eigenpairs(operator, 20)
@@ -41,7 +42,7 @@ def test_iterated_pairs_are_the_dense_ones(sphere: Mesh, monkeypatch):
 def test_repeated_eigenvalues_are_one_space():
     """The icosahedron's graph: eigenvalues 1 - 1/√5 (3 times), 6/5 (5 times), 1 + 1/√5 (3 times)."""
     ball = trimesh.creation.icosahedron()
-    pairs = eigenpairs(make_laplacian(make_mesh(ball.vertices, ball.faces)))
+    pairs = eigenpairs(from_mesh(make_mesh(ball.vertices, ball.faces)))
     np.testing.assert_allclose(pairs.values, [1 - 5**-0.5] * 3 + [1.2] * 5 + [1 + 5**-0.5] * 3, atol=1e-12)
     np.testing.assert_array_equal(pairs.space, [0] * 3 + [3] * 5 + [8] * 3)
 
@@ -49,14 +50,14 @@ def test_repeated_eigenvalues_are_one_space():
 def test_an_eigenspace_that_the_count_would_cut_is_left_out():
     """Part of an eigenspace would depend on the basis that a solver happened to pick."""
     ball = trimesh.creation.icosahedron()
-    operator = make_laplacian(make_mesh(ball.vertices, ball.faces))
+    operator = from_mesh(make_mesh(ball.vertices, ball.faces))
     assert [len(eigenpairs(operator, count).values) for count in (1, 2, 3, 4, 7, 8, 10, 11, 50)] == [
         *(0, 0, 3, 3, 3, 8, 8, 11, 11)
     ]
 
 
 def test_quadrature_is_exact_for_polynomials(hard_graph: Mesh):
-    operator = make_laplacian(hard_graph, "inverse-length")
+    operator = from_mesh(hard_graph, "inverse-length")
     x = centre(operator, hard_graph.vertices)[:, 0]
     delta = laplacian_matrix(operator)
     for steps in (1, 3, 50):
@@ -69,7 +70,7 @@ def test_quadrature_is_exact_for_polynomials(hard_graph: Mesh):
 
 def test_white_signals_estimate_traces(hard_graph: Mesh):
     """Σ f(λ_i) above the null space, within four of Hutchinson's standard deviations; without isolated vertices."""
-    operator = make_laplacian(hard_graph, "inverse-length")
+    operator = from_mesh(hard_graph, "inverse-length")
     signals = white_probes(operator, jax.random.key(0), 1000)
     delta, values = laplacian_matrix(operator), eigenpairs(operator).values
     np.testing.assert_array_equal(signals[[5, 10]], 0)
@@ -82,4 +83,4 @@ def test_white_signals_estimate_traces(hard_graph: Mesh):
 
 def test_refuses_no_pairs(sphere: Mesh):
     with pytest.raises(JaxmarkError, match="at least 1"):
-        eigenpairs(make_laplacian(sphere), 0)
+        eigenpairs(from_mesh(sphere), 0)

@@ -9,7 +9,7 @@ from jax.test_util import check_grads
 import jaxmark as jm
 from jaxmark.attacks import bending, jamming, twisting, warp
 from jaxmark.geometry.mesh import Mesh, diagonal, make_mesh
-from jaxmark.spectral.laplacian import make_laplacian
+from jaxmark.spectral.graphs import from_mesh
 from jaxmark.watermark.schemes import DERIVED
 from tests.dense import laplacian_matrix
 from tests.samples import exact_sheet, rough_sphere
@@ -144,7 +144,7 @@ def test_twists_turn_about_the_axis(axis, dtype):
 
 def test_jamming_is_shaped_like_a_mark(cap: Mesh, x64):
     """Against the same bands by a dense eigendecomposition; the scheme's own carrier shapes chips alike."""
-    operator, used = make_laplacian(cap), np.unique(cap.faces)
+    operator, used = from_mesh(cap), np.unique(cap.faces)
     values, vectors = np.linalg.eig(laplacian_matrix(operator)[np.ix_(used, used)])
     k, terms = np.arange(64), 64
     q = np.pi / (terms + 1)

@@ -6,7 +6,8 @@ from jax.test_util import check_grads
 
 import jaxmark as jm
 from jaxmark.spectral.bands import scaling
-from jaxmark.spectral.laplacian import centre, make_laplacian
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import centre
 from jaxmark.watermark.bits import detect_bits, embed_bits
 from jaxmark.watermark.carriers import ModulatedCarrier, host_bands
 from jaxmark.watermark.coding.keys import Choices
@@ -21,7 +22,7 @@ BITS = 8
 @pytest.fixture(scope="module")
 def prepared():
     mesh = bumpy_sphere(2)
-    operator = make_laplacian(mesh)
+    operator = from_mesh(mesh)
     return operator, centre(operator, mesh.vertices)
 
 

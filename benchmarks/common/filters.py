@@ -10,7 +10,8 @@ from scipy import sparse
 import jaxmark as jm
 from jaxmark.alignment.original import Original
 from jaxmark.geometry.mesh import weld_mesh
-from jaxmark.spectral.laplacian import Laplacian, make_laplacian, sparse_matrices
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import Laplacian, sparse_matrices
 
 DEGREE = 64
 TOLERANCE = 1e-4  # of two programs' results, over the largest value
@@ -45,7 +46,7 @@ def reordered(mesh: jm.Mesh) -> jm.Mesh:
 def graph(original: Original) -> tuple[Laplacian, jax.Array]:
     """Operator and signal of just its points, on the device."""
     points = weld_mesh(original.mesh, original.weld)
-    return jax.tree.map(jnp.asarray, make_laplacian(points)), original.signal[: len(points.vertices)]
+    return jax.tree.map(jnp.asarray, from_mesh(points)), original.signal[: len(points.vertices)]
 
 
 def shifted(operator: Laplacian) -> sparse.csr_array:

@@ -23,7 +23,7 @@ import numpy as np
 
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral import chebyshev, sharding
-from jaxmark.spectral.laplacian import make_laplacian
+from jaxmark.spectral.graphs import from_mesh
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import make_parser
@@ -63,7 +63,7 @@ def torus(count: int) -> Mesh:
 def prepare(folder: Path, count: int, devices: int, degree: int, repeat: int) -> Row:
     """Leave parts, signal, coefficients and what one device makes of them in a folder."""
     mesh = torus(count)
-    operator = make_laplacian(mesh)
+    operator = from_mesh(mesh)
     parts, seconds = timed(sharding.partition, operator, devices, mesh.vertices)
     most = peak_mib()
     leaves, structure = jax.tree.flatten(parts)
@@ -147,7 +147,7 @@ def case(count: int, processes: int, devices: int, degree: int, repeat: int) -> 
 def traffic(count: int, devices: int) -> Row:
     """What partitions alone say, also of more devices than there are here."""
     mesh = torus(count)
-    parts = sharding.partition(make_laplacian(mesh), devices, mesh.vertices)
+    parts = sharding.partition(from_mesh(mesh), devices, mesh.vertices)
     found = sharding.traffic(parts)
     rows = parts.vertices.shape[1]
     held = sum(leaf.size * min(leaf.itemsize, 4) for leaf in jax.tree.leaves(parts))

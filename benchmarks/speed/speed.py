@@ -42,7 +42,8 @@ from jaxmark.alignment.original import Original, make_original
 from jaxmark.extras import require
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import band_components, filter, moments
-from jaxmark.spectral.laplacian import Laplacian, make_laplacian, sparse_matrices
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import Laplacian, sparse_matrices
 from jaxmark.watermark.schemes import KeyedScheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -146,7 +147,7 @@ def stages(bench: Bench) -> Iterator[Row]:
     sizes: list[int] = []
     seconds: list[float] = []
     for size in DENSE:
-        stiffness, mass = sparse_matrices(make_laplacian(bumpy_torus(size)))
+        stiffness, mass = sparse_matrices(from_mesh(bumpy_torus(size)))
         root = 1 / np.sqrt(mass.diagonal())
         dense = root[:, None] * stiffness.toarray() * root
         sizes.append(len(dense))

@@ -35,7 +35,8 @@ from jaxmark.spectral import product, rational
 from jaxmark.spectral.bands import bernstein, equal_edges, hat, intervals, lagrange, nodes, report, scaling
 from jaxmark.spectral.bands.damping import Damping
 from jaxmark.spectral.chebyshev import band_components, filter, moments
-from jaxmark.spectral.laplacian import Laplacian, centre, make_laplacian, sparse_matrices
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import Laplacian, centre, sparse_matrices
 from jaxmark.spectral.spectrum import Quadrature, eigenpairs, quadrature, white_probes
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -125,7 +126,7 @@ FAMILIES = [
 
 def make_sample(name: str, mesh: jm.Mesh, degree: int) -> Sample:
     points = weld_mesh(mesh, weld(np.asarray(mesh.vertices)))
-    operator = make_laplacian(points)
+    operator = from_mesh(points)
     x = centre(operator, np.asarray(points.vertices))
     with jax.enable_x64(True):
         density, energy = (
@@ -230,7 +231,7 @@ def methods(sample: Sample, repeat: int) -> None:
             print(line("scaling", bands - 1, dtype, *errors))
     for name in ("icosahedron", "icosphere of 42"):
         solid = trimesh.creation.icosphere(subdivisions=int(name != "icosahedron"))
-        operator = make_laplacian(make_mesh(solid.vertices, solid.faces))
+        operator = from_mesh(make_mesh(solid.vertices, solid.faces))
         pairs = eigenpairs(operator)
         values = np.append(0, pairs.values[np.unique(pairs.space)])
         for dtype in ("float32", "float64"):

@@ -20,7 +20,8 @@ from jaxmark.distortion import rms
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.hashing import geometry_hash
 from jaxmark.geometry.mesh import Mesh, diagonal, host_mesh, used_vertices
-from jaxmark.spectral.laplacian import Laplacian, make_laplacian
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import Laplacian
 from jaxmark.watermark.coding.keys import Choices, Key
 from jaxmark.watermark.detectors import claims
 from jaxmark.watermark.marking import Marker
@@ -316,7 +317,7 @@ class _Space:
 
 def _space(mesh: Mesh) -> _Space:
     mesh = host_mesh(mesh)
-    return _Space(mesh, make_laplacian(mesh), used_vertices(mesh), diagonal(mesh))
+    return _Space(mesh, from_mesh(mesh), used_vertices(mesh), diagonal(mesh))
 
 
 def _log10(alpha: float) -> float:

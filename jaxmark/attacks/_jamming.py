@@ -9,7 +9,8 @@ from jaxmark.attacks.extent import displace_by
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import filter
-from jaxmark.spectral.laplacian import Operator, make_laplacian
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import Operator
 from jaxmark.watermark.schemes import DERIVED, KeyedScheme
 
 
@@ -30,7 +31,7 @@ def jamming(mesh: Mesh, strength: float | Float[Array, ""], key: PRNGKeyArray) -
     """
     vertices = jnp.asarray(mesh.vertices)
     noise = jax.random.normal(key, vertices.shape, vertices.dtype)
-    return displace_by(mesh, through_bands(make_laplacian(mesh), noise), strength)
+    return displace_by(mesh, through_bands(from_mesh(mesh), noise), strength)
 
 
 def through_bands(operator: Operator, noise: Float[Array, "vertices columns"]) -> Float[Array, "vertices columns"]:

@@ -15,7 +15,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, used_vertices
 from jaxmark.spectral.bands import intervals
 from jaxmark.spectral.chebyshev import filter
-from jaxmark.spectral.laplacian import make_laplacian
+from jaxmark.spectral.graphs import from_mesh
 
 _CHEBYSHEV_TERMS = 65
 _MAX_LAMBDA = 2.0  # upper end of the spectrum
@@ -67,7 +67,7 @@ def _remove(mesh: Mesh, low: float, high: float) -> Mesh:
     vertices, used = jnp.asarray(mesh.vertices), used_vertices(mesh)
     # Positions are filtered relative to their mean, so that a distant mesh loses no digits.
     start = jnp.where(used[:, None], vertices - surface(mesh).mean(axis=0), 0)
-    removed = filter(make_laplacian(mesh), _removal_coefficients(low, high).astype(vertices.dtype), start)
+    removed = filter(from_mesh(mesh), _removal_coefficients(low, high).astype(vertices.dtype), start)
     return displace(mesh, -removed)
 
 

@@ -6,16 +6,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxmark.attacks.extent import displace, surface
-from jaxmark.distortion.roots import root
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, boundary_vertices, edges, sides, used_vertices
+from jaxmark.geometry.mesh import Mesh, boundary_vertices, edges, used_vertices
 from jaxmark.spectral import rational
-from jaxmark.spectral.laplacian import Laplacian, make_laplacian
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.laplacian import Laplacian, graph_laplacian
+from jaxmark.spectral.weights import cotangent_weights
 
 _STEP_SIZE = 0.1  # of the SMI 2010 benchmark
 _TAUBIN_STEP_SIZES = (0.5, -0.53)  # Taubin's λ and μ: frequencies up to 1/λ + 1/μ = 0.11 are passed, not damped
 _MAX_STEPS = 100_000
-_MIN_WEIGHT_RATIO = 1e-6  # over the largest cotangent weight
 
 
 def laplacian_smoothing(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
@@ -62,7 +62,7 @@ def cotangent_smoothing(mesh: Mesh, strength: float | Float[Array, ""], key: PRN
     """Smooth by one implicit diffusion step with cotangent weights: v' solves (I + t Δ) v' = v.
 
     Desbrun et al., "Implicit fairing of irregular meshes using diffusion and curvature flow", SIGGRAPH 1999. Δ is the
-    Laplacian of `make_laplacian(mesh, "cotangent")`, whose weights are clipped to be positive. Boundary vertices move
+    Laplacian of `from_mesh(mesh, "cotangent")`, whose weights are clipped to be positive. Boundary vertices move
     as all others do. The weighted mean position of each component stays. A mesh without a positive weight stays.
 
     Args:
@@ -100,7 +100,7 @@ def inner_vertices(mesh: Mesh) -> Bool[np.ndarray, "vertices 1"]:
 def _smooth_by_steps(mesh: Mesh, factors: Float[np.ndarray, " steps"]) -> Mesh:
     """Smooth a mesh by one explicit step of the graph Laplacian for each factor; boundary vertices stay."""
     vertices = jnp.asarray(mesh.vertices)
-    moved = _smooth(make_laplacian(mesh), inner_vertices(mesh), vertices, factors.astype(vertices.dtype))
+    moved = _smooth(from_mesh(mesh), inner_vertices(mesh), vertices, factors.astype(vertices.dtype))
     return Mesh(moved, mesh.faces)
 
 
@@ -121,15 +121,7 @@ def _diffuse(operator: Laplacian, x: Float[Array, "vertices 3"], time: Float[Arr
 
 
 def _cotangent(mesh: Mesh) -> Laplacian:
-    """The Laplacian of `make_laplacian(mesh, "cotangent")`, for positions that may be traced."""
-    v, faces = jnp.asarray(mesh.vertices), np.asarray(mesh.faces)
-    pairs, (ends, apex), base = edges(faces), sides(faces), np.array([len(v), 1])
-    first, second = v[ends[:, 0]] - v[apex], v[ends[:, 1]] - v[apex]
-    area = root(jnp.sum(jnp.cross(first, second) ** 2, axis=1))
-    sound = area > 0  # a degenerate face has no angles
-    cotangent = jnp.where(sound, jnp.sum(first * second, axis=1) / jnp.where(sound, area, 1), 0)
-    which = np.searchsorted(pairs @ base, np.sort(ends, axis=1) @ base)
-    weights = jax.ops.segment_sum(cotangent / 2, which, len(pairs))
-    weights = jnp.maximum(weights, _MIN_WEIGHT_RATIO * jnp.max(weights, initial=0))
-    degree = jax.ops.segment_sum(jnp.repeat(weights, 2), pairs.ravel(), len(v))
-    return make_laplacian(mesh, np.ones(len(pairs)))._replace(weights=weights, degree=degree)
+    """The Laplacian of `from_mesh(mesh, "cotangent")`, in which a mesh without a positive weight has no edges."""
+    pairs, size = edges(np.asarray(mesh.faces)), len(mesh.vertices)
+    weighted = graph_laplacian(pairs, size, np.ones(len(pairs)))
+    return weighted.with_weights(cotangent_weights(jnp.asarray(mesh.vertices), mesh.faces))

@@ -41,6 +41,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxmark.distortion.roots import root
+from jaxmark.geometry.mesh import face_pairs
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import band_components, filter
 from jaxmark.spectral.laplacian import Laplacian, graph_laplacian
@@ -93,7 +94,7 @@ def make_hiding(
     longest = np.max(np.sum((np.roll(corners, 1, axis=1) - corners) ** 2, axis=2), axis=1, initial=0)
     area = np.where(double > _MIN_HEIGHT * longest, double / 2, 0)
     normals = cross / np.where(area > 0, double, 1)[:, None]
-    pairs, against = _face_pairs(faces)
+    pairs, against = face_pairs(faces)
     turned = _orient(pairs, against, len(faces))
     normals *= turned[:, None]
     angle = np.arccos(np.clip(np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1), -1, 1))
@@ -176,21 +177,6 @@ def vertex_means(values: Float[Array, " faces"], hiding: Hiding, count: int) -> 
     zeros, corners = jnp.zeros(count, values.dtype), hiding.faces
     total, around = zeros.at[corners].add(area), zeros.at[corners].add(area * values[:, None])
     return jnp.where(total > 0, around / jnp.where(total > 0, total, 1), 0)
-
-
-def _face_pairs(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of faces that alone share an edge, each once, and whether they run along it in the same direction."""
-    start, end = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
-    face = np.tile(np.arange(len(faces)), 3)
-    base = int(faces.max(initial=0)) + 1
-    code = np.minimum(start, end) * base + np.maximum(start, end)
-    order = np.argsort(code, kind="stable")
-    _, first, count = np.unique(code[order], return_index=True, return_counts=True)
-    one, other = order[first[count == 2]], order[first[count == 2] + 1]
-    pairs, against = np.sort(np.stack([face[one], face[other]], axis=1), axis=1), start[one] == start[other]
-    _, kept = np.unique(pairs @ [len(faces), 1], return_index=True)
-    kept = kept[pairs[kept, 0] != pairs[kept, 1]]
-    return pairs[kept], against[kept]
 
 
 def _second_largest(pairs: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:

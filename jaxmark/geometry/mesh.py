@@ -130,6 +130,24 @@ def sides(
     return np.concatenate([face[:, :2] for face in turned]), np.concatenate([face[:, 2] for face in turned])
 
 
+def face_pairs(
+    faces: Int[Array | np.ndarray, "faces 3"],
+) -> tuple[Int64[np.ndarray, "pairs 2"], Bool[np.ndarray, " pairs"]]:
+    """Pairs of faces that alone share an edge, each once, and whether they run along it in the same direction."""
+    faces = np.asarray(faces, np.int64)
+    start, end = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
+    face = np.tile(np.arange(len(faces)), 3)
+    base = int(faces.max(initial=0)) + 1
+    code = np.minimum(start, end) * base + np.maximum(start, end)
+    order = np.argsort(code, kind="stable")
+    _, first, count = np.unique(code[order], return_index=True, return_counts=True)
+    one, other = order[first[count == 2]], order[first[count == 2] + 1]
+    pairs, against = np.sort(np.stack([face[one], face[other]], axis=1), axis=1), start[one] == start[other]
+    _, kept = np.unique(pairs @ [len(faces), 1], return_index=True)
+    kept = kept[pairs[kept, 0] != pairs[kept, 1]]
+    return pairs[kept], against[kept]
+
+
 def diagonal(mesh: Mesh) -> float:
     """Length of the bounding-box diagonal, in the mesh's units; all distortions are relative to it.
 

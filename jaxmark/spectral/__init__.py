@@ -1,7 +1,8 @@
 """Differentiable spectral filtering of meshes by polynomials and rational functions of the graph Laplacian.
 
-`make_laplacian` builds the operator of a mesh, `bands` has families of band filters as Chebyshev coefficients, `filter`
-applies one filter to a signal and `band_components` a whole family; `eigenpairs` is the exact reference.
+`from_mesh`, `from_edges`, `from_points` and `from_matrices` build the operator of a graph, `bands` has families of band
+filters as Chebyshev coefficients, `filter` applies one filter to a signal and `band_components` a whole family;
+`eigenpairs` is the exact reference.
 """
 
 from jaxmark.spectral import bands as bands
@@ -12,11 +13,12 @@ from jaxmark.spectral.chebyshev import gram as gram
 from jaxmark.spectral.chebyshev import moments as moments
 from jaxmark.spectral.chebyshev import transpose as transpose
 from jaxmark.spectral.graphs import from_edges as from_edges
+from jaxmark.spectral.graphs import from_matrices as from_matrices
+from jaxmark.spectral.graphs import from_mesh as from_mesh
 from jaxmark.spectral.graphs import from_points as from_points
 from jaxmark.spectral.laplacian import Laplacian as Laplacian
 from jaxmark.spectral.laplacian import Operator as Operator
 from jaxmark.spectral.laplacian import centre as centre
-from jaxmark.spectral.laplacian import make_laplacian as make_laplacian
 from jaxmark.spectral.laplacian import sparse_matrices as sparse_matrices
 from jaxmark.spectral.product import Factors as Factors
 from jaxmark.spectral.product import filter_by_factors as filter_by_factors
@@ -31,3 +33,7 @@ from jaxmark.spectral.spectrum import Quadrature as Quadrature
 from jaxmark.spectral.spectrum import eigenpairs as eigenpairs
 from jaxmark.spectral.spectrum import quadrature as quadrature
 from jaxmark.spectral.spectrum import white_probes as white_probes
+from jaxmark.spectral.stacking import stack as stack
+from jaxmark.spectral.weights import cotangent_weights as cotangent_weights
+from jaxmark.spectral.weights import inverse_length_weights as inverse_length_weights
+from jaxmark.spectral.weights import vertex_areas as vertex_areas

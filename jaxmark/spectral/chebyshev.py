@@ -4,8 +4,8 @@ The spectrum of Δ̃ = Δ - I lies in [-1, 1], and T_k(Δ̃)x follows by T_k = 2
 paper's start t_0 = 0, T_0 = 0 is an erratum for t_0 = 1, T_0 = I). All functions here take signals `[N]` or `[N, C]`,
 keep the dtype of the signal, and cost `degree` products with Δ.
 
-A filter f(Δ)x = Σ_k c_k T_k(Δ̃)x is linear in c and in x, and a projection p_k = Σ_v u_v (T_k(Δ̃)x)_v is linear in u and in
-x. As Δ is self-adjoint, each is the other's transpose, so that derivatives of any order are filters and projections
+A filter f(Δ)x = Σ_k c_k T_k(Δ̃)x is linear in c and in x, and a projection p_k = Σ_v u_v (T_k(Δ̃)x)_v is linear in u and
+in x. As Δ is self-adjoint, each is the other's transpose, so that derivatives of any order are filters and projections
 again. For the derivative with respect to the operator, the recurrence is run backwards: T_{k-2} = 2Δ̃T_{k-1} - T_k.
 """
 

@@ -1,16 +1,155 @@
 """Laplacians of graphs that are no meshes: of any edges, and of points and their nearest neighbours."""
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
+import jax
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Array, Float, Float64, Int64
 from numpy.typing import ArrayLike
+from scipy import sparse
+from scipy.sparse import linalg
 from scipy.spatial import KDTree
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.laplacian import Laplacian, Lowering, checked_weights, graph_laplacian
+from jaxmark.geometry.mesh import Mesh, edges, face_pairs
+from jaxmark.spectral.laplacian import Laplacian, Lowering, graph_laplacian, sparse_matrices
+from jaxmark.spectral.weights import cotangent_weights, inverse_length_weights, vertex_areas
 
+Weighting = Literal["valence", "inverse-length", "cotangent"]
 PointWeighting = Literal["valence", "inverse-length", "gaussian"]
+Elements = Literal["vertices", "faces", "edges"]
+
+_BOUND_MARGIN = 1.01  # over an estimate of the largest eigenvalue that is good to a thousandth
+_MAX_MEETINGS = 100  # pairs of edges that meet, for each edge; in most meshes about five
+_ROUNDING = 1e-9  # of a matrix's rows that should sum to zero, relative to its diagonal
+
+
+def from_mesh(
+    mesh: Mesh,
+    weights: Weighting | ArrayLike = "valence",
+    *,
+    mass: Literal["areas"] | ArrayLike | None = None,
+    bound: float | None = None,
+    elements: Elements = "vertices",
+    lowering: Lowering = "auto",
+) -> Laplacian:
+    """Build the graph Laplacian of a mesh, on the host.
+
+    Vertices at the same position are *not* merged; see `jaxmark.geometry.mesh.weld`. Positions may be traced, for
+    derivatives of filters with respect to them through weights and areas.
+
+    Args:
+        mesh: any mesh, its faces concrete; boundary edges, edges of three faces or more, and several components are
+            well defined.
+        weights: `"valence"`, each edge 1, so that w_ij = 1/d(v_i) as in the paper; `"inverse-length"`, 1 over the
+            edge's length; `"cotangent"`, see `jaxmark.spectral.cotangent_weights`; or an array `[E]` of non-negative
+            weights, in the order of `jaxmark.geometry.mesh.edges`.
+        mass: the lumped mass M of the generalised problem (D - W)x = λMx: `"areas"`, see
+            `jaxmark.spectral.vertex_areas`, or `[N]`. By default M = D.
+        bound: with a mass, a bound of λ; filters are functions of 2λ/bound. By default 1 % above the largest λ, which
+            is found by Lanczos iteration; for traced positions it must be given.
+        elements: what the graph's vertices are: the mesh's `"vertices"`, joined by its edges; its `"faces"`, joined
+            where two of them alone share an edge; or its `"edges"`, joined where they meet (the line graph). Faces and
+            edges stand at their centres. They have no cotangents and areas, and weights for them come in the order of
+            the operator's `edges`.
+        lowering: how products are computed: `"segments"`, by segment-sums over the edges; `"gather"`, by a table of
+            each vertex's neighbours; `"auto"`, by the table unless the valences differ so much that it does not pay on
+            this platform.
+
+    Returns:
+        A `Laplacian` of NumPy arrays in float64, but for what depends on traced positions; it computes in the dtype of
+        the signal it is applied to. Its `weights` are None if all are 1.
+
+    Raises:
+        JaxmarkError: if a name is unknown, weights or masses are not one for each edge or vertex, finite and not
+            negative, an edge has length zero under `"inverse-length"`, no edge has a positive weight under
+            `"cotangent"`, a vertex with edges has no mass, or there is no bound for traced positions.
+    """
+    _check_name("Products are lowered by", lowering, Lowering)
+    traced = isinstance(mesh.vertices, jax.core.Tracer)
+    vertices = mesh.vertices if traced else np.asarray(mesh.vertices, np.float64)
+    faces = np.asarray(mesh.faces)
+    pairs, positions = _graph(vertices, faces, elements)
+    if isinstance(weights, str):
+        _check_name("weights are an array, or", weights, Weighting)
+        by_name = {
+            "valence": lambda: None,
+            "inverse-length": lambda: inverse_length_weights(positions, pairs),
+            "cotangent": lambda: cotangent_weights(_of_vertices("cotangents", vertices, elements), faces),
+        }
+        values = by_name[weights]()
+        if values is not None and not traced:
+            _check_found(values, pairs, weights)
+    else:
+        values = checked_weights(weights, len(pairs))
+    masses = mass
+    if isinstance(mass, str):
+        _check_name("mass is an array, or", mass, Literal["areas"])
+        masses = vertex_areas(_of_vertices("areas", vertices, elements), faces)
+    if not traced or not (isinstance(values, jax.Array) or isinstance(masses, jax.Array)):
+        return _with_mass(graph_laplacian(pairs, len(positions), values, lowering=lowering), masses, bound)
+    if masses is not None and bound is None:
+        raise JaxmarkError("Traced positions need a bound of the spectrum; 2 * operator.scale is that of like meshes.")
+    weighted = graph_laplacian(pairs, len(positions), np.ones(len(pairs)), lowering=lowering)
+    weighted = weighted.with_weights(np.ones(len(pairs)) if values is None else values, masses)
+    return weighted if masses is None or bound is None else weighted._replace(scale=np.float64(bound / 2))
+
+
+def from_matrices(
+    stiffness: Any, mass: Any = None, *, bound: float | None = None, lowering: Lowering = "auto"
+) -> Laplacian:
+    """Build the operator of a stiffness matrix S = D - W, such as of `robust_laplacian` or `libigl`, on the host.
+
+    `from_matrices(*robust_laplacian.mesh_laplacian(vertices, faces))` has weights of an intrinsic Delaunay
+    triangulation, none of which is negative (Sharp, Crane, "A Laplacian for nonmanifold triangle meshes", 2020).
+
+    Args:
+        stiffness: `[N, N]`, any sparse matrix of SciPy's, or a dense one: symmetric, with rows that sum to zero, and
+            nothing positive off the diagonal.
+        mass: M, a diagonal matrix `[N, N]` or its diagonal `[N]`. By default the diagonal of the stiffness.
+        bound: see `from_mesh`.
+        lowering: see `from_mesh`.
+
+    Raises:
+        JaxmarkError: if the stiffness is not as above, or the mass no diagonal matrix that is positive at vertices
+            with edges.
+    """
+    matrix = sparse.coo_array(stiffness).astype(np.float64)
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+        raise JaxmarkError(f"A stiffness matrix is square, got {matrix.shape}.")
+    size, diagonal = matrix.shape[0], matrix.diagonal()
+    small = _ROUNDING * np.abs(diagonal).max(initial=0)
+    if not abs(matrix - matrix.T).max() <= small or not np.abs(matrix.sum(axis=1)).max(initial=0) <= small:
+        raise JaxmarkError("A stiffness matrix is symmetric and finite, and its rows sum to zero.")
+    upper = sparse.triu(matrix, 1).tocoo()
+    if upper.data.max(initial=0) > small:
+        bad = int(np.argmax(upper.data))
+        raise JaxmarkError(
+            f"The edge [{upper.row[bad]}, {upper.col[bad]}] has the weight {-upper.data[bad]:.3g}; filters need weights"
+            " that are not negative, such as those of an intrinsic Delaunay triangulation."
+        )
+    kept = upper.data < 0
+    pairs = np.stack([upper.row[kept], upper.col[kept]], axis=1).astype(np.int64)
+    if sparse.issparse(mass) or np.ndim(mass) == 2:
+        square = sparse.coo_array(mass)
+        if (square.row != square.col).any():
+            raise JaxmarkError("A lumped mass is a diagonal matrix, or its diagonal.")
+        mass = square.diagonal()
+    return _with_mass(graph_laplacian(pairs, size, -upper.data[kept], lowering=lowering), mass, bound)
+
+
+def checked_weights(weights: ArrayLike, count: int) -> Float64[np.ndarray, " edges"]:
+    """Weights of so many edges as an array.
+
+    Raises:
+        JaxmarkError: if there are more or fewer, or one is negative or not finite, or a vertex with edges has no mass.
+    """
+    values = np.asarray(weights, np.float64)
+    if values.shape != (count,):
+        raise JaxmarkError(f"weights must have one value for each of the {count} edges, got {values.shape}.")
+    if not (np.isfinite(values) & (values >= 0)).all():
+        raise JaxmarkError("weights must be finite and not negative; otherwise the spectrum leaves [0, 2].")
+    return values
 
 
 def from_edges(
@@ -18,6 +157,8 @@ def from_edges(
     weights: ArrayLike | None = None,
     size: int | None = None,
     *,
+    mass: ArrayLike | None = None,
+    bound: float | None = None,
     duplicates: Literal["refuse", "add"] = "refuse",
     lowering: Lowering = "auto",
 ) -> Laplacian:
@@ -27,17 +168,19 @@ def from_edges(
         edges: pairs of vertices `[E, 2]`, numbered from 0; the direction of a pair does not matter.
         weights: `[E]`, finite and not negative; all 1 unless given.
         size: number of vertices; by default one more than the largest number.
+        mass: `[size]`, the lumped mass M of the generalised problem (D - W)x = λMx; see `from_mesh`, as for `bound`.
+        bound: of λ, with a mass.
         duplicates: what to do with a pair that is there twice, in one direction or in both: `"refuse"`, or `"add"`
             the weights, as SciPy's sparse matrices do. A graph of directed edges, each in both directions, doubles all
             weights so, which leaves Δ as it is.
-        lowering: see `make_laplacian`.
+        lowering: see `from_mesh`.
 
     Returns:
         A `Laplacian` of NumPy arrays in float64; its `weights` are None if all are 1.
 
     Raises:
         JaxmarkError: if an edge joins a vertex to itself, is there twice or has a vertex that is not there, or a weight
-            is negative or not finite.
+            is negative or not finite, or a vertex with edges has no mass.
     """
     given = np.asarray(edges)
     if given.ndim != 2 or given.shape[1] != 2 or not (np.issubdtype(given.dtype, np.integer) or given.size == 0):
@@ -60,7 +203,7 @@ def from_edges(
             raise JaxmarkError(f"The edge {pair} is there more than once; merge them, or pass duplicates='add'.")
         values = np.bincount(which.reshape(-1), np.ones(len(pairs)) if values is None else values, len(found))
         pairs = pairs[first]
-    return graph_laplacian(pairs, count, values, lowering=lowering)
+    return _with_mass(graph_laplacian(pairs, count, values, lowering=lowering), mass, bound)
 
 
 def from_points(
@@ -79,7 +222,7 @@ def from_points(
         neighbours: number of nearest points that each is joined to, at least.
         weights: `"valence"`, each edge 1; `"inverse-length"`, 1 over its length; `"gaussian"`, exp(-l²/2σ²) of its
             length l, with σ the mean distance to the farthest of the nearest points.
-        lowering: see `make_laplacian`.
+        lowering: see `from_mesh`.
 
     Returns:
         See `from_edges`.
@@ -95,8 +238,7 @@ def from_points(
         raise JaxmarkError(
             f"Each of {len(positions)} points has up to {len(positions) - 1} neighbours, not {neighbours}."
         )
-    if weights not in get_args(PointWeighting):
-        raise JaxmarkError(f"weights are {', '.join(map(repr, get_args(PointWeighting)))}, not {weights!r}.")
+    _check_name("weights are", weights, PointWeighting)
     pairs, reach = _nearest(positions, neighbours)
     if weights == "valence":
         return graph_laplacian(pairs, len(positions), lowering=lowering)
@@ -121,3 +263,86 @@ def _nearest(positions: Float64[np.ndarray, "points axes"], count: int) -> tuple
     pairs = np.sort(np.stack([np.repeat(np.arange(size), count), others.ravel()], axis=1), axis=1)
     codes = np.unique(pairs @ [size, 1])
     return np.stack(np.divmod(codes, size), axis=1), float(distance[:, -1].mean())
+
+
+def _graph(
+    vertices: Float[Array | np.ndarray, "vertices 3"], faces: np.ndarray, elements: Elements
+) -> tuple[Int64[np.ndarray, "edges 2"], Float[Array | np.ndarray, "elements 3"]]:
+    """The edges of the graph of a mesh's elements, and where these stand."""
+    match elements:
+        case "vertices":
+            return edges(faces), vertices
+        case "faces":
+            return face_pairs(faces)[0], vertices[faces].mean(axis=1)
+        case "edges":
+            pairs = edges(faces)
+            return _meetings(pairs), vertices[pairs].mean(axis=1)
+    raise JaxmarkError(f"Elements are {', '.join(map(repr, get_args(Elements)))}, not {elements!r}.")
+
+
+def _meetings(pairs: Int64[np.ndarray, "edges 2"]) -> Int64[np.ndarray, "meetings 2"]:
+    """Pairs of edges that share a vertex, each once."""
+    ends = pairs.T.ravel()
+    order = np.argsort(ends, kind="stable")
+    around = order % max(len(pairs), 1)  # the edges around the first vertex, then around the second, and so on
+    count = np.bincount(ends)
+    # Each edge meets those after it around the same vertex.
+    after = np.repeat(np.cumsum(count), count) - np.arange(len(ends)) - 1
+    if after.sum() > _MAX_MEETINGS * len(pairs):
+        raise JaxmarkError(
+            f"Vertex {int(np.argmax(count))} has {count.max()} edges, all of which meet; the line graph is too large."
+        )
+    first = np.repeat(np.arange(len(ends)), after)
+    second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(after) - after, after)
+    return np.sort(np.stack([around[first], around[second]], axis=1), axis=1)
+
+
+def _of_vertices(what: str, vertices: Any, elements: Elements) -> Any:
+    if elements != "vertices":
+        raise JaxmarkError(f"The {what} of a mesh belong to its vertices, not to its {elements}.")
+    return vertices
+
+
+def _with_mass(operator: Laplacian, mass: ArrayLike | None, bound: float | None) -> Laplacian:
+    """Put a lumped mass in, and half a bound of the spectrum."""
+    if mass is None:
+        return operator
+    values, size = np.asarray(mass, np.float64), len(operator.degree)
+    if values.shape != (size,) or not (np.isfinite(values) & (values >= 0)).all():
+        raise JaxmarkError(f"A mass is one number for each of {size} vertices, finite and not negative.")
+    linked = np.asarray(operator.degree) > 0
+    if (lacking := linked & (values == 0)).any():
+        raise JaxmarkError(
+            f"Vertex {int(np.argmax(lacking))} has edges, but no mass; remove degenerate faces, or pass other masses."
+        )
+    with_mass = operator._replace(lumped_mass=values, scale=np.float64(1))
+    return with_mass._replace(scale=np.float64((_bound(with_mass) if bound is None else bound) / 2))
+
+
+def _bound(operator: Laplacian) -> float:
+    """A bound of the spectrum of M⁻¹(D - W): by its rows (Gershgorin), or a little above the largest eigenvalue."""
+    stiffness, mass = sparse_matrices(operator)
+    linked = np.flatnonzero(np.asarray(operator.degree) > 0)
+    if len(linked) == 0:
+        return 2.0
+    inverse = 1 / np.sqrt(mass.diagonal()[linked])
+    by_rows = 2 * float((stiffness.diagonal()[linked] * inverse**2).max())
+    if len(linked) < 3:
+        return by_rows
+    scaled = sparse.diags_array(inverse) @ stiffness[linked][:, linked] @ sparse.diags_array(inverse)
+    start = np.cos(np.arange(len(linked), dtype=np.float64))  # a fixed start makes the result repeatable
+    found: Any = linalg.eigsh(scaled, 1, which="LA", tol=1e-3, v0=start, return_eigenvectors=False)  # pyright: ignore[reportArgumentType]
+    return min(by_rows, _BOUND_MARGIN * float(found[0]))
+
+
+def _check_found(values: np.ndarray, pairs: np.ndarray, weights: str) -> None:
+    if not np.isfinite(values).all():
+        bad = pairs[int(np.argmax(values))]
+        raise JaxmarkError(f"Edge {bad.tolist()} has length zero; weld its vertices or use valence weights.")
+    if not values.max(initial=0.0) > 0:
+        raise JaxmarkError(f"No edge has a positive {weights} weight; use valence weights.")
+
+
+def _check_name(sentence: str, name: str, names: Any) -> None:
+    if name not in get_args(names):
+        raise JaxmarkError(f"{sentence} {', '.join(map(repr, get_args(names)))}, not {name!r}.")

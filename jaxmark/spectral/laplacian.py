@@ -10,20 +10,17 @@ half a bound of its spectrum: an eigenvalue λ of that is λ/s of Δ, in [0, 2] 
 """
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int, Int64, Num, Shaped
-from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, edges
 
-Weighting = Literal["valence", "inverse-length", "cotangent"]
 Lowering = Literal["auto", "gather", "segments"]
 
 # The cost of adding to a row at any index, in units of reading a row: on processors by measurement, elsewhere assumed,
@@ -99,6 +96,25 @@ class Laplacian(NamedTuple):
         """M, which weighs vertices in the inner product: the lumped mass, or else the degrees."""
         return self.degree if self.lumped_mass is None else self.lumped_mass
 
+    def with_weights(
+        self,
+        weights: Float[Array | np.ndarray, " edges"],
+        lumped_mass: Float[Array | np.ndarray, " vertices"] | None = None,
+    ) -> "Laplacian":
+        """The operator of the same edges with other weights, and mass, as a pure function with derivatives.
+
+        Args:
+            weights: not negative, in the order of `edges`. Products are by table only if the operator had weights.
+            lumped_mass: M, positive; by default the operator's own, or the new degrees if it has none.
+
+        Returns:
+            The operator, with the same `scale`: with a mass, the spectrum of M⁻¹(D - W) must stay below twice that.
+        """
+        values = jnp.asarray(weights)
+        degree = sum(jax.ops.segment_sum(values, end, len(self.degree)) for end in jnp.asarray(self.edges).T)
+        mass = self.lumped_mass if lumped_mass is None else lumped_mass
+        return self._replace(weights=values, degree=degree, lumped_mass=mass)
+
     @property
     def by_segments(self) -> "Laplacian":
         """The same operator without a table of neighbours; see `Operator`."""
@@ -136,7 +152,7 @@ class Laplacian(NamedTuple):
             total = _weighted_gather(table, self.weights, like)
         return lambda x: own * x - inverse * total(x)
 
-    def inverse_mass(self, like: Shaped[Array, " vertices *columns"]) -> Float[Array, "vertices *ones"]:
+    def inverse_mass(self, like: Shaped[Array, " vertices *columns"]) -> Float[Array, " vertices *ones"]:
         """1/(M s), by which sums over neighbours are divided, to multiply signals like this; 0 at isolated vertices."""
         # Select before dividing, so that isolated vertices keep finite gradients.
         linked = per_row(self.degree, like) > 0
@@ -181,64 +197,6 @@ class Laplacian(NamedTuple):
         return jnp.sum(per_row(self.mass, x) * x * y, axis=0)
 
 
-def make_laplacian(mesh: Mesh, weights: Weighting | ArrayLike = "valence", *, lowering: Lowering = "auto") -> Laplacian:
-    """Build the graph Laplacian of a mesh's edges, on the host.
-
-    Vertices at the same position are *not* merged; see `jaxmark.geometry.mesh.weld`.
-
-    Args:
-        mesh: any mesh; boundary edges, edges of three faces or more, and several components are well defined.
-        weights: `"valence"`, each edge 1, so that w_ij = 1/d(v_i) as in the paper; `"inverse-length"`, 1 over the
-            edge's length; `"cotangent"`, half the sum of the cotangents of the angles opposite the edge, clipped below
-            at 1e-6 of the largest; or an array `[E]` of non-negative weights in the order of
-            `jaxmark.geometry.mesh.edges`.
-        lowering: how products are computed: `"segments"`, by segment-sums over the edges; `"gather"`, by a table of
-            each vertex's neighbours; `"auto"`, by the table unless the valences differ so much that it does not pay on
-            this platform.
-
-    Returns:
-        A `Laplacian` of NumPy arrays in float64; it computes in the dtype of the signal it is applied to. Its `weights`
-        are None if all are 1; to differentiate with respect to them, put an array in by `_replace`.
-
-    Raises:
-        JaxmarkError: if the name of the weights is unknown, an array of them is not `[E]`, finite and non-negative, an
-            edge has length zero under `"inverse-length"`, no edge has a positive weight under `"cotangent"`, or the
-            lowering is unknown.
-    """
-    if lowering not in get_args(Lowering):
-        raise JaxmarkError(f"Products are lowered by {', '.join(get_args(Lowering))}, not {lowering!r}.")
-    pairs = edges(np.asarray(mesh.faces))
-    if isinstance(weights, str):
-        match weights:
-            case "valence":  # needs no positions: they may be traced
-                values = None
-            case "inverse-length":
-                values = _inverse_lengths(np.asarray(mesh.vertices, np.float64), pairs)
-            case "cotangent":
-                values = _cotangents(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces), pairs)
-            case _:
-                raise JaxmarkError(
-                    f"weights must be 'valence', 'inverse-length', 'cotangent' or an array, got {weights!r}."
-                )
-    else:
-        values = checked_weights(weights, len(pairs))
-    return graph_laplacian(pairs, len(mesh.vertices), values, lowering=lowering)
-
-
-def checked_weights(weights: ArrayLike, count: int) -> Float64[np.ndarray, " edges"]:
-    """Weights of so many edges as an array.
-
-    Raises:
-        JaxmarkError: if there are more or fewer, or one is negative or not finite.
-    """
-    values = np.asarray(weights, np.float64)
-    if values.shape != (count,):
-        raise JaxmarkError(f"weights must have one value for each of the {count} edges, got {values.shape}.")
-    if not (np.isfinite(values) & (values >= 0)).all():
-        raise JaxmarkError("weights must be finite and not negative; otherwise the spectrum leaves [0, 2].")
-    return values
-
-
 def graph_laplacian(
     pairs: Int[np.ndarray, "edges 2"],
     size: int,
@@ -252,7 +210,7 @@ def graph_laplacian(
         pairs: the edges, each once, none from a vertex to itself.
         size: number of vertices.
         weights: finite and not negative; all 1 unless given.
-        lowering: see `make_laplacian`.
+        lowering: see `jaxmark.spectral.from_mesh`.
     """
     degree = np.bincount(pairs.ravel(), None if weights is None else np.repeat(weights, 2), size).astype(np.float64)
     neighbours = None
@@ -387,30 +345,3 @@ def host_edges(operator: Laplacian) -> tuple[Int[np.ndarray, "edges 2"], Float64
     real = pairs[:, 0] < len(operator.degree)
     weights = np.ones(len(pairs)) if operator.weights is None else np.asarray(operator.weights, np.float64)
     return pairs[real], weights[real]
-
-
-def _inverse_lengths(vertices: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    lengths = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
-    if (lengths == 0).any():
-        bad = pairs[int(np.argmin(lengths))]
-        raise JaxmarkError(f"Edge {bad.tolist()} has length zero; weld its vertices or use valence weights.")
-    return 1.0 / lengths
-
-
-def _cotangents(vertices: np.ndarray, faces: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Half the sum of the cotangents opposite each edge, clipped at 1e-6 of the largest to keep W non-negative."""
-    values = np.zeros(len(pairs))
-    base = len(vertices)
-    codes = pairs[:, 0] * base + pairs[:, 1]
-    for corner in range(3):
-        apex, first, second = (faces[:, (corner + shift) % 3] for shift in range(3))
-        u, v = vertices[first] - vertices[apex], vertices[second] - vertices[apex]
-        area = np.linalg.norm(np.cross(u, v), axis=1)
-        sound = area > 0  # a degenerate face has no angles
-        cotangent = np.einsum("ij,ij->i", u, v)[sound] / area[sound]
-        edge = np.minimum(first, second)[sound] * base + np.maximum(first, second)[sound]
-        values += np.bincount(np.searchsorted(codes, edge), 0.5 * cotangent, len(pairs))
-    largest = values.max(initial=0.0)
-    if largest <= 0:
-        raise JaxmarkError("No edge has a positive cotangent weight; use valence weights.")
-    return np.maximum(values, 1e-6 * largest)

@@ -93,7 +93,7 @@ def _evaluate_abstractly(*avals: Any, rule: Linear, structure: Any) -> Any:
 def _differentiate(primals: Any, tangents: Any, *, rule: Linear, structure: Any) -> tuple[Array, Any]:
     arguments = jax.tree.unflatten(structure, primals)
     value = _primitive.bind(*primals, rule=rule, structure=structure)
-    terms = []
+    terms = []  # one or more, for JAX asks only where something is differentiated
     for index, (tree, part) in enumerate(_split(structure, tangents)):
         if all(isinstance(leaf, ad.Zero) for leaf in part):
             continue
@@ -102,7 +102,7 @@ def _differentiate(primals: Any, tangents: Any, *, rule: Linear, structure: Any)
             for leaf, old in zip(part, jax.tree.leaves(arguments[index]), strict=True)
         ]
         terms.append(rule.derivative(index, arguments, jax.tree.unflatten(tree, leaves)))
-    return value, sum(terms[1:], terms[0]) if terms else ad.Zero.from_primal_value(value)
+    return value, sum(terms[1:], terms[0])
 
 
 def _transpose(cotangent: Any, *operands: Any, rule: Linear, structure: Any) -> list[Any]:

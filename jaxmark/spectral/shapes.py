@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Shaped
 
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.spectral.laplacian import Laplacian, Lowering, Weighting, make_laplacian
+from jaxmark.spectral.graphs import Weighting, from_mesh
+from jaxmark.spectral.laplacian import Laplacian, Lowering
 
 _MIN_STEP = 16  # between two sizes
 _MAX_PADDED_SIZE = 2**17  # beyond this, running takes longer than compiling
@@ -32,17 +33,17 @@ def pad_rows(rows: Shaped[np.ndarray, " rows *columns"], count: int, value: floa
 
 
 def common_laplacian(mesh: Mesh, weights: Weighting = "valence", lowering: Lowering = "auto") -> Laplacian:
-    """`make_laplacian`, padded with isolated vertices and with edges past the last vertex.
+    """`from_mesh`, padded with isolated vertices and with edges past the last vertex.
 
     Pad signals to the operator's size, such as by `pad_rows`.
 
     Raises:
-        JaxmarkError: see `make_laplacian`.
+        JaxmarkError: see `from_mesh`.
     """
     vertices = np.asarray(mesh.vertices, np.float64)
     padded = mesh._replace(vertices=pad_rows(vertices, common_size(len(vertices))))
     # A closed surface of triangles has about three edges per vertex.
-    return pad_edges(make_laplacian(padded, weights, lowering=lowering), 3)
+    return pad_edges(from_mesh(padded, weights, lowering=lowering), 3)
 
 
 def pad_edges(operator: Laplacian, valence: float) -> Laplacian:
