@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float64, Int64, PRNGKeyArray
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from jaxmark.attacks.host import on_host
 from jaxmark.attacks.random import generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, compact, edges, used_vertices
@@ -12,6 +13,7 @@ from jaxmark.geometry.mesh import Mesh, compact, edges, used_vertices
 _HOLE_COUNT = 10
 
 
+@on_host
 def cropping(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     """Cut off the part of the mesh beyond a plane of random direction.
 
@@ -31,6 +33,7 @@ def cropping(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     return _remove(mesh, used[np.argsort(-along, kind="stable")[:count]])
 
 
+@on_host
 def region_cropping(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     """Cut out a region: the vertices nearest to a random one, by distance along edges.
 
@@ -50,6 +53,7 @@ def region_cropping(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     return _remove(mesh, _nearest(mesh, used, int(generator(key).choice(used)), count))
 
 
+@on_host
 def holes(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     """Cut out ten regions, each as `region_cropping` does; their numbers of vertices differ by at most one.
 

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from jaxmark.attacks.host import on_host
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, compact, diagonal
@@ -12,6 +13,7 @@ from jaxmark.geometry.mesh import Mesh, compact, diagonal
 _INPUT_DIAGONAL = 100
 
 
+@on_host
 def simplification(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
     """Collapse edges, those of least quadric error first, until only a share of the faces is left; on the host.
 

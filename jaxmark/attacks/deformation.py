@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float64, PRNGKeyArray
 
+from jaxmark.attacks.host import on_host
 from jaxmark.attacks.random import generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
@@ -12,6 +13,7 @@ _HANDLE_SHARE = 0.05  # of the vertices, at either end
 _ARAP_STEPS = 50
 
 
+@on_host
 def as_rigid_as_possible(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     """Drag one end of the mesh sideways while the other is held; the rest follows as rigidly as possible.
 

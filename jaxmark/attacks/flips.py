@@ -5,6 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, PRNGKeyArray
 
+from jaxmark.attacks.host import on_host
 from jaxmark.attacks.random import generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, edges, sides, unit
@@ -14,6 +15,7 @@ Faces = Int64[np.ndarray, "faces 3"]
 Codes = Int64[np.ndarray, " edges"]
 
 
+@on_host
 def edge_flips(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     """Replace edges between two faces by the other diagonals of their quadrilaterals; on the host, in NumPy.
 

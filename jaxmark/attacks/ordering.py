@@ -3,11 +3,13 @@
 import numpy as np
 from jaxtyping import Int64, PRNGKeyArray
 
+from jaxmark.attacks.host import on_host
 from jaxmark.attacks.random import generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, used_vertices
 
 
+@on_host
 def reordering(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     """Permute random vertices among themselves, and random faces among themselves; on the host.
 

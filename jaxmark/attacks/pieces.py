@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float64, Int64, PRNGKeyArray
 
+from jaxmark.attacks.host import on_host
 from jaxmark.attacks.random import generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, used_vertices
@@ -10,6 +11,7 @@ from jaxmark.geometry.mesh import Mesh, compact, diagonal, used_vertices
 _OCTANT_COUNT = 8
 
 
+@on_host
 def mosaic(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     """Shift the pieces of the mesh apart, each in a random direction.
 
@@ -37,6 +39,7 @@ def mosaic(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     return Mesh(np.asarray(mesh.vertices)[vertex] + shift[owner], place.reshape(-1, 3))
 
 
+@on_host
 def missing_pieces(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     """Remove pieces of the mesh, separated as by `mosaic`.
 

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float64, Int64, PRNGKeyArray
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from jaxmark.attacks.host import on_host
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, boundary_vertices, diagonal, face_normals, used_vertices
 from jaxmark.geometry.pose import Points
@@ -78,6 +79,7 @@ class Found(NamedTuple):
 Fit = Callable[[Region], Shape | None]  # None for a region that it does not apply to
 
 
+@on_host
 def plane_fitting(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
     """Flatten nearly flat regions.
 
@@ -106,6 +108,7 @@ def plane_fitting(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) 
     return _refit(mesh, strength, ((1.0, (_plane,)),))
 
 
+@on_host
 def primitive_fitting(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
     """Flatten nearly flat regions, and make nearly spherical or cylindrical ones exactly so.
 

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float64, Int64, PRNGKeyArray
 
+from jaxmark.attacks.host import on_host
 from jaxmark.attacks.meshlab import apply_filter, apply_filter_to_points
 from jaxmark.attacks.random import generator
 from jaxmark.errors import JaxmarkError
@@ -15,6 +16,7 @@ _SAMPLES_PER_VERTEX = 30
 _CELLS_PER_BLOCK = 4  # along each side of a block; a coarse grid of blocks tells where the surface may be
 
 
+@on_host
 def isotropic(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
     """Remesh with edges of about one length and vertices on the surface, by MeshLab.
 
@@ -38,6 +40,7 @@ def isotropic(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> M
     return apply_filter("meshing_isotropic_explicit_remeshing", mesh, targetlen=length)
 
 
+@on_host
 def iso_surface(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
     """Extract the surface again from a grid of signed distances, by libigl and the marching cubes of scikit-image.
 
@@ -80,6 +83,7 @@ def iso_surface(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) ->
     return Mesh(low + cell * points.astype(np.float64), faces.astype(np.int64))
 
 
+@on_host
 def poisson(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     """Reconstruct the surface from random points with normals, 30 for each vertex, by MeshLab.
 

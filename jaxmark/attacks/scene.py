@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from jaxmark.attacks.host import on_host
 from jaxmark.attacks.random import generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, diagonal, used_vertices
@@ -10,6 +11,7 @@ from jaxmark.geometry.mesh import Mesh, diagonal, used_vertices
 _GAP_DIAGONALS = 0.1  # between the bounding spheres of the mesh and of each object, in diagonals of the mesh
 
 
+@on_host
 def adding_geometry(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     """Add a ring on one side of the mesh and a box on the other, in a random direction and poses; on the host.
 

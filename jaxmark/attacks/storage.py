@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, PRNGKeyArray
 
+from jaxmark.attacks.host import on_host
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
 from jaxmark.geometry.mesh import Mesh, used_vertices
@@ -15,6 +16,7 @@ _FLOAT_TYPES = {64: np.float64, 32: np.float32, 16: np.float16}  # by their bits
 _MAX_ROUND_TRIPS = 10
 
 
+@on_host
 def digits(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
     """Round coordinates to a number of significant decimal digits, as text files do.
 
@@ -35,6 +37,7 @@ def digits(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh
     return _replace_used(mesh, np.char.mod(f"%.{int(strength) - 1}e", vertices).astype(np.float64))
 
 
+@on_host
 def float_bits(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
     """Round coordinates to IEEE 754 binary floats of a number of bits.
 
@@ -62,6 +65,7 @@ def float_bits(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> 
     return _replace_used(mesh, rounded)
 
 
+@on_host
 def soup(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
     """Write the mesh to a binary STL file and read it again: single precision, and no vertices shared by faces.
 

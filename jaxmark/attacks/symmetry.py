@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, PRNGKeyArray
 
 from jaxmark.alignment.registration import refine
+from jaxmark.attacks.host import on_host
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, component_of, diagonal, used_vertices
 from jaxmark.geometry.pose import IDENTITY, Points, PointSets, Pose, similarity
@@ -24,6 +25,7 @@ _MIN_PART_VERTICES = 4  # triangles are too often similar
 _PROCRUSTES_ROUNDS = 3
 
 
+@on_host
 def mirror_averaging(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
     """Average the mesh with its mirror image.
 
@@ -62,6 +64,7 @@ def mirror_averaging(mesh: Mesh, strength: float, key: PRNGKeyArray | None = Non
     return Mesh(vertices, mesh.faces)
 
 
+@on_host
 def instance_averaging(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
     """Average parts of the mesh that repeat each other, such as screws, leaves or wheels.
 

@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Float64, PRNGKeyArray
 from scipy import optimize
 
@@ -187,6 +188,8 @@ def allocate(
             "allocate needs gain, noise and dimensions [attacks, bands] and cost [bands], got"
             f" {channels.gain.shape}, {channels.noise.shape}, {channels.dimensions.shape} and {cost.shape}."
         )
+    if not isinstance(cost, Tracer) and not (np.asarray(cost) > 0).all():
+        raise JaxmarkError(f"allocate needs a positive cost of every band, got {np.asarray(cost).min():g} for one.")
     if isinstance(budget, float | int) and not budget > 0:
         raise JaxmarkError(f"allocate needs a positive budget, got {budget}.")
     if not cap * bands >= 1:

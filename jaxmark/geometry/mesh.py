@@ -5,9 +5,10 @@ runs on the host with NumPy, keeps float64, and says what is wrong before anythi
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Float64, Int, Int64
 from numpy.typing import ArrayLike
 from scipy import sparse
@@ -80,8 +81,22 @@ def make_mesh(vertices: ArrayLike, faces: ArrayLike) -> Mesh:
 
 
 def host_mesh(mesh: Mesh) -> Mesh:
-    """Convert a mesh of any arrays to validated NumPy arrays; raises as `make_mesh` does."""
+    """Convert a mesh of any arrays to validated NumPy arrays; raises as `make_mesh` does, and for traced arrays."""
+    check_concrete("This", mesh.vertices, mesh.faces)
     return make_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def check_concrete(name: str, *values: Any) -> None:
+    """Refuse values that JAX traces, for functions of the host.
+
+    Raises:
+        JaxmarkError: if one of them is traced.
+    """
+    if any(isinstance(value, Tracer) for value in values):
+        raise JaxmarkError(
+            f"{name} runs on the host, where nothing can be traced: call it outside of jit, vmap and grad, or hold its"
+            " result fixed."
+        )
 
 
 def weld(vertices: Float[Array | np.ndarray, "vertices 3"]) -> Weld:

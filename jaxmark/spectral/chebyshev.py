@@ -20,7 +20,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, PyTree
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.laplacian import Laplacian, Operator, per_row
+from jaxmark.spectral.laplacian import Laplacian, Operator, check_signal, per_row
 from jaxmark.spectral.linear import Linear, combine, floats
 from jaxmark.spectral.precision import einsum, matmul
 
@@ -54,7 +54,7 @@ def filter(
         JaxmarkError: if shapes do not fit, or the signal is neither float32 nor float64.
     """
     x = jnp.asarray(x)
-    _check_signal("filter", operator, x)
+    check_signal("filter", operator, x)
     c = jnp.asarray(coefficients).astype(x.dtype)
     if c.ndim not in (1, 2) or len(c) == 0 or (c.ndim == 2 and c.shape[1:] != x.shape[1:]):
         raise JaxmarkError(
@@ -88,7 +88,7 @@ def band_components(
         `[bands, N]` or `[bands, N, C]`.
     """
     x = jnp.asarray(x)
-    _check_signal("band_components", operator, x)
+    check_signal("band_components", operator, x)
     c = _check_bands(coefficients).astype(x.dtype)
     x = operator.enter(x)
 
@@ -150,7 +150,7 @@ def cross_moments(operator: Laplacian, u: Signal, x: Signal, *, degree: int) -> 
     """
     x = jnp.asarray(x)
     u = jnp.asarray(u).astype(x.dtype)
-    _check_signal("cross_moments", operator, x)
+    check_signal("cross_moments", operator, x)
     if u.shape != x.shape:
         raise JaxmarkError(f"cross_moments needs two signals of one shape, got {u.shape} and {x.shape}.")
     return _projection(degree + 1)(operator, x, per_row(operator.mass, u) * u)
@@ -187,7 +187,7 @@ def moments(operator: Laplacian, x: Signal, *, degree: int) -> Float[Array, " mo
         JaxmarkError: if shapes do not fit, or the signal is neither float32 nor float64.
     """
     x = jnp.asarray(x)
-    _check_signal("moments", operator, x)
+    check_signal("moments", operator, x)
     return _moments(operator, x, degree)
 
 
@@ -251,7 +251,7 @@ def gram(
     Returns:
         `[bands, bands]`, or `[C, bands, bands]` for `[N, C]`.
     """
-    _check_signal("gram", operator, x)
+    check_signal("gram", operator, x)
     c = _check_bands(coefficients).astype(x.dtype)
     match method:
         case "bands":
@@ -425,15 +425,6 @@ def _sums(x: Array) -> Array:
     whole = len(x) // _ROWS_AT_ONCE * _ROWS_AT_ONCE
     wide = x[:whole].reshape(-1, _ROWS_AT_ONCE * (x.size // max(len(x), 1))).sum(axis=0)
     return wide.reshape(_ROWS_AT_ONCE, *x.shape[1:]).sum(axis=0) + x[whole:].sum(axis=0)
-
-
-def _check_signal(name: str, operator: Operator, x: Array | np.ndarray) -> None:
-    if x.ndim not in (1, 2) or x.shape[0] != operator.mass.shape[0]:
-        raise JaxmarkError(
-            f"{name} needs a signal [N] or [N, C] with N = {operator.mass.shape[0]} vertices, got {x.shape}."
-        )
-    if x.dtype not in (jnp.float32, jnp.float64):
-        raise JaxmarkError(f"{name} needs a floating-point signal of float32 or float64, got {x.dtype}.")
 
 
 def _check_bands(coefficients: Array | np.ndarray) -> Array:

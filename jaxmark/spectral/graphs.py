@@ -4,6 +4,7 @@ from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Float64, Int64
 from numpy.typing import ArrayLike
 from scipy import sparse
@@ -66,7 +67,7 @@ def from_mesh(
             `"cotangent"`, a vertex with edges has no mass, or there is no bound for traced positions.
     """
     _check_name("Products are lowered by", lowering, Lowering)
-    traced = isinstance(mesh.vertices, jax.core.Tracer)
+    traced = isinstance(mesh.vertices, Tracer)
     vertices = mesh.vertices if traced else np.asarray(mesh.vertices, np.float64)
     faces = np.asarray(mesh.faces)
     pairs, positions = _graph(vertices, faces, elements)
@@ -82,7 +83,7 @@ def from_mesh(
             _check_found(values, pairs, weights)
     else:
         values = checked_weights(weights, len(pairs))
-    masses = mass
+    masses: Any = mass
     if isinstance(mass, str):
         _check_name("mass is an array, or", mass, Literal["areas"])
         masses = vertex_areas(_of_vertices("areas", vertices, elements), faces)
@@ -114,14 +115,14 @@ def from_matrices(
         JaxmarkError: if the stiffness is not as above, or the mass no diagonal matrix that is positive at vertices
             with edges.
     """
-    matrix = sparse.coo_array(stiffness).astype(np.float64)
+    matrix: Any = sparse.coo_array(stiffness).astype(np.float64)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
         raise JaxmarkError(f"A stiffness matrix is square, got {matrix.shape}.")
     size, diagonal = matrix.shape[0], matrix.diagonal()
     small = _ROUNDING * np.abs(diagonal).max(initial=0)
     if not abs(matrix - matrix.T).max() <= small or not np.abs(matrix.sum(axis=1)).max(initial=0) <= small:
         raise JaxmarkError("A stiffness matrix is symmetric and finite, and its rows sum to zero.")
-    upper = sparse.triu(matrix, 1).tocoo()
+    upper: Any = sparse.triu(matrix, 1).tocoo()
     if upper.data.max(initial=0) > small:
         bad = int(np.argmax(upper.data))
         raise JaxmarkError(

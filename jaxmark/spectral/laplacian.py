@@ -20,6 +20,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.spectral.precision import check_precision
 
 Lowering = Literal["auto", "gather", "segments"]
 
@@ -299,6 +300,19 @@ def _with_rest(total: Array, rest: Array, x: Array, factor: Array | float = 1.0)
 def per_row(values: Num[Array | np.ndarray, " rows"], x: Array | np.ndarray) -> Array:
     """Cast one value per row, such as D, to the dtype of `x`, and shape it to broadcast against its columns."""
     return jnp.asarray(values).astype(x.dtype).reshape(-1, *[1] * (x.ndim - 1))
+
+
+def check_signal(name: str, operator: Operator, x: Array | np.ndarray) -> None:
+    """Refuse a signal that is not of the operator's vertices, or in half precision.
+
+    Raises:
+        JaxmarkError: if it is not `[N]` or `[N, C]`, in float32 or float64.
+    """
+    if x.ndim not in (1, 2) or x.shape[0] != operator.mass.shape[0]:
+        raise JaxmarkError(
+            f"{name} needs a signal [N] or [N, C] with N = {operator.mass.shape[0]} vertices, got {x.shape}."
+        )
+    check_precision(name, x)
 
 
 def centre(

@@ -9,12 +9,25 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from jaxmark.errors import JaxmarkError
 
 matmul = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
 einsum = partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
 
 _FOLDED_ROWS = 64  # into which terms are folded; rows are added one after the other, all columns at once
+
+
+def check_precision(name: str, x: Array | np.ndarray) -> None:
+    """Refuse half precision, in which recurrences and solves keep no digit, and what is no floating-point number.
+
+    Raises:
+        JaxmarkError: if the dtype is neither float32 nor float64.
+    """
+    if x.dtype not in (np.float32, np.float64):
+        raise JaxmarkError(f"{name} needs floating-point values, float32 or float64, got {x.dtype}.")
 
 
 @jax.custom_jvp

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.laplacian import Operator
+from jaxmark.spectral.laplacian import Operator, check_signal
 
 
 class Factors(NamedTuple):
@@ -101,11 +101,9 @@ def filter_by_factors(
     """
     x = jnp.asarray(x)
     zeros, scales = (jnp.asarray(part).astype(x.dtype) for part in factors)
-    if len(x) != operator.mass.shape[0] or zeros.ndim != 1 or zeros.shape != scales.shape:
-        raise JaxmarkError(
-            f"filter_by_factors needs factors [degree] and a signal [N] or [N, C] with N = {operator.mass.shape[0]},"
-            f" got {zeros.shape}, {scales.shape} and {x.shape}."
-        )
+    check_signal("filter_by_factors", operator, x)
+    if zeros.ndim != 1 or zeros.shape != scales.shape:
+        raise JaxmarkError(f"filter_by_factors needs factors [degree], got {zeros.shape} and {scales.shape}.")
     product = operator.product(x)
     x = operator.enter(x)
 

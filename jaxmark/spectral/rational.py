@@ -13,7 +13,7 @@ from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, Float64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.laplacian import Operator, per_row
+from jaxmark.spectral.laplacian import Operator, check_signal, per_row
 
 
 @partial(jax.jit, static_argnames=("tolerance", "iterations"))
@@ -53,11 +53,9 @@ def filter_rational(
     """
     x = jnp.asarray(x)
     sections = jnp.asarray(sections).astype(x.dtype)
-    if len(x) != operator.mass.shape[0] or sections.ndim != 2 or sections.shape[1] != 6:
-        raise JaxmarkError(
-            "filter_rational needs sections [sections, 6] and a signal [N] or [N, C] with"
-            f" N = {operator.mass.shape[0]}, got {sections.shape} and {x.shape}."
-        )
+    check_signal("filter_rational", operator, x)
+    if sections.ndim != 2 or sections.shape[1] != 6:
+        raise JaxmarkError(f"filter_rational needs sections [sections, 6], got {sections.shape}.")
     tolerance = 10 * float(jnp.finfo(x.dtype).eps) if tolerance is None else tolerance
     product = operator.product(x)
     mass = per_row(operator.enter(jnp.asarray(operator.mass)), x)

@@ -4,6 +4,9 @@
 prepare an original once for many. A `Scheme` fixes how marks are written and read.
 """
 
+from jaxmark.watermark.bits import detect_bits as detect_bits
+from jaxmark.watermark.bits import embed_bits as embed_bits
+from jaxmark.watermark.bits import log_evidence as log_evidence
 from jaxmark.watermark.coding.keys import Key as Key
 from jaxmark.watermark.coding.keys import load_key as load_key
 from jaxmark.watermark.coding.keys import new_key as new_key

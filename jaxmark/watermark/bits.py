@@ -1,15 +1,18 @@
-"""Embedding and detection as two pure functions of arrays.
+"""Embedding, detection and evidence as three pure functions of arrays.
 
-`embed_bits` and `detect_bits` take carrier and detector as arguments, and work under `jit`, `vmap` and `grad`.
+`embed_bits`, `detect_bits` and `log_evidence` take carriers as arguments, and work under every transformation of JAX.
 `jaxmark.watermark.marking` does the same for meshes, messages and keys.
 """
 
+import math
+
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxmark.alignment.observation import observe
 from jaxmark.watermark.carriers import Carrier
 from jaxmark.watermark.carriers.carrier import Strength
-from jaxmark.watermark.detectors import Detector, decorrelate
+from jaxmark.watermark.detectors import Detector, claims, decorrelate
 
 
 def embed_bits(
@@ -57,3 +60,39 @@ def detect_bits(
     """
     reader = carrier.reader()
     return detector(reader, reader.receive(observe(suspect - x, weights, normals)), beta)
+
+
+def log_evidence(
+    suspect: Float[Array, "vertices 3"],
+    x: Float[Array, "vertices 3"],
+    carrier: Carrier,
+    codeword: Float[Array, " code"],
+    *,
+    weights: Float[Array, " vertices"] | None = None,
+    normals: Float[Array, "vertices 3"] | None = None,
+) -> Float[Array, ""]:
+    """Compute -ln p of a claimed codeword, for p the bound on the probability of a false detection, in nats.
+
+    It is what gradient attacks lower and defences raise: a function of the suspect and, through the carrier, of the
+    bands and their strengths. Keyed signs and codeword are made once on the host (`Marker.reader.carrier`,
+    `Marker.codeword`), and gradients hold them fixed.
+
+    Args:
+        suspect: see `detect_bits`.
+        x: see `detect_bits`.
+        carrier: see `detect_bits`; `KeyedCarrier.with_bands` puts other bands and strengths in.
+        codeword: ±1, `[code bits]`, fixed before the suspect was seen.
+        weights: see `detect_bits`.
+        normals: see `detect_bits`.
+
+    Returns:
+        max t²/2 - ln(ways) over the ways of weighting the suspect, for t = S/‖a‖ (Hoeffding's bound, and Bonferroni's);
+        negative where nothing is proven.
+
+    Raises:
+        JaxmarkError: if the suspect is neither float32 nor float64.
+    """
+    reader = carrier.reader()
+    scores, norms = claims(reader, reader.receive(observe(suspect - x, weights, normals)), codeword)
+    ratios = jnp.maximum(scores / norms, 0)
+    return jnp.max(ratios) ** 2 / 2 - math.log(len(ratios))

@@ -111,6 +111,18 @@ class KeyedCarrier(NamedTuple):
         signs = moving * jax.random.rademacher(key, moving.shape, jnp.int8)
         return self._replace(chips=self.chips._replace(signs=signs))
 
+    def with_bands(
+        self, strengths: Float[Array, " bands"], bands: Float[Array, "bands terms"] | None = None
+    ) -> "KeyedCarrier":
+        """The same chips with other relative strengths of the bands, and other bands, as a pure function.
+
+        Args:
+            strengths: factor on β for each band, `[bands]`.
+            bands: Chebyshev coefficients, one band a row; by default the carrier's own.
+        """
+        host = self.host if bands is None else self.host._replace(coefficients=bands)
+        return self._replace(profile=strengths, host=host)
+
     def reader(self) -> "KeyedReader":
         """See `Carrier`."""
         return KeyedReader(self, nuisance_basis(self.host))

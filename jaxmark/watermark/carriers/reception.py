@@ -19,7 +19,7 @@ from jaxmark.alignment.observation import Observation
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import band_components, filter, gram, over_bands
 from jaxmark.spectral.laplacian import Laplacian, per_row
-from jaxmark.spectral.precision import einsum, matmul
+from jaxmark.spectral.precision import check_precision, einsum, matmul
 from jaxmark.watermark.probes import probe_signs
 
 _BLOCK_VERTICES = 2**14  # vertices whose nuisance is formed at a time
@@ -189,7 +189,11 @@ def receive(receiver: Receiver, seen: Observation) -> Reception:
     Args:
         receiver: the original, from `make_receiver`.
         seen: what the suspect shows of the displacement, in the units of the host.
+
+    Raises:
+        JaxmarkError: if the residual is neither float32 nor float64.
     """
+    check_precision("receive", seen.residual)
     wider = extend(receiver, seen)
     # Only `_receive` is compiled, because a compiled function would return copies of its arguments.
     return Reception(wider, seen, *_receive(wider, seen))
