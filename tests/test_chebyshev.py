@@ -10,7 +10,7 @@ from jax.test_util import check_grads
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, make_mesh
-from jaxmark.spectral import chebyshev
+from jaxmark.spectral import chebyshev, recurrence
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.laplacian import Laplacian
@@ -196,15 +196,44 @@ def test_derivatives_are_those_of_the_recurrence(columns, per_column, dtype):
     def loss(filter, weights, c, x):
         return jnp.sum(u * jnp.sin(filter(operator._replace(weights=weights), c, x)))
 
-    def recurrence(operator, c, x):
-        return chebyshev._filter_scan(operator, c if c.ndim == x.ndim else c[:, None] * jnp.ones(3, dtype), x)
+    def by_steps(operator, c, x):
+        return recurrence.filter_scan(operator, c if c.ndim == x.ndim else c[:, None] * jnp.ones(3, dtype), x)
 
     gradients = [
         jax.jit(jax.grad(partial(loss, filter), (0, 1, 2)))(jnp.asarray(operator.weights, dtype), c, x)
-        for filter in (chebyshev.filter, recurrence)
+        for filter in (chebyshev.filter, by_steps)
     ]
     for got, expected in zip(*gradients, strict=True):
         np.testing.assert_allclose(got, expected, atol=tolerance(dtype, 30) * (1 + abs(expected).max()))
+
+
+@pytest.mark.parametrize("order", [("rev",), pytest.param(("fwd", "rev"), marks=pytest.mark.slow)])
+def test_derivatives_of_components_and_of_their_synthesis(operator, order, x64):
+    """Those of one filter for each band, along one direction in weights, degrees, coefficients and signals."""
+    size = len(operator.degree)
+    given = (operator.weights, operator.degree, *(random_array(*shape) for shape in ((3, 5), (size, 2), (3, size, 2))))
+    given = tuple(map(jnp.asarray, given))
+    tangents = tuple(jnp.asarray(random_array(*part.shape, seed=1)) for part in given)
+
+    def loss(components, synthesise, weights, degree, c, x, parts):
+        changed = operator._replace(weights=weights, degree=degree)
+        taken, whole = components(changed, c, x), synthesise(changed, c, parts)
+        return jnp.sum(jnp.sin(0.1 * taken)) + jnp.sum(jnp.sin(0.1 * whole))
+
+    def one(operator, c, x):
+        return recurrence.filter_scan(operator, jnp.broadcast_to(c[:, None], (len(c), 2)), x)
+
+    def along(function, mode):
+        if mode == "fwd":
+            return lambda *given: jax.jvp(function, given, tangents)[1]
+        return lambda *given: sum(map(jnp.vdot, jax.grad(function, range(5))(*given), tangents))
+
+    every = jax.vmap(one, (None, 0, None)), lambda *args: jax.vmap(one, (None, 0, 0))(*args).sum(axis=0)
+    found, expected = (
+        jax.jit(reduce(along, order, partial(loss, *pair)))(*given)
+        for pair in ((chebyshev.band_components, chebyshev.synthesise), every)
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_memory_does_not_grow_with_the_degree():
@@ -242,7 +271,7 @@ def test_memory_does_not_grow_with_the_degree():
     assert scratch_of_own_moments(256) < 1.1 * scratch_of_own_moments(32)
     assert scratch(256) < 1.1 * scratch(32)
     assert scratch(256, derived=jax.grad) < 1.1 * scratch(32, derived=jax.grad)  # forward mode over reverse mode
-    assert scratch(256, chebyshev._filter_scan) > 4 * scratch(32, chebyshev._filter_scan)  # what the rules are for
+    assert scratch(256, recurrence.filter_scan) > 4 * scratch(32, recurrence.filter_scan)  # what the rules are for
 
 
 def test_band_by_band_is_the_same_as_all_at_once(operator, dtype):

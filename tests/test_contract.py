@@ -43,6 +43,11 @@ FAMILIES: dict[str, Callable[[], np.ndarray]] = {
     "diffusion": lambda: bands.diffusion(3, 9),
     "hat": lambda: bands.hat(np.array([0.0, 0.5, 2.0]), 8),
     "intervals": lambda: bands.intervals(np.array([0.0, 0.5, 2.0]), 8),
+    "heat": lambda: bands.heat([0.5, 5.0]),
+    "mexican_hat": lambda: bands.mexican_hat(4, 30),
+    "abspline": lambda: bands.abspline(4, 30),
+    "meyer": lambda: bands.meyer(4, 30),
+    "itersine": lambda: bands.itersine(4, 30),
     "lagrange": lambda: bands.lagrange(np.array([0.1, 0.7, 1.2])),
 }
 

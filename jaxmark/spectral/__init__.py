@@ -1,17 +1,23 @@
 """Differentiable spectral filtering of meshes by polynomials and rational functions of the graph Laplacian.
 
 `from_mesh`, `from_edges`, `from_points` and `from_matrices` build the operator of a graph, `bands` has families of band
-filters as Chebyshev coefficients, `filter` applies one filter to a signal and `band_components` a whole family;
+filters as Chebyshev coefficients, `filter` applies one filter to a signal and `band_components` a whole family,
+`inverse` brings a signal back from its parts;
 `eigenpairs` is the exact reference.
 """
 
 from jaxmark.spectral import bands as bands
+from jaxmark.spectral._heat import heat as heat
 from jaxmark.spectral.chebyshev import band_components as band_components
 from jaxmark.spectral.chebyshev import cross_moments as cross_moments
 from jaxmark.spectral.chebyshev import filter as filter
 from jaxmark.spectral.chebyshev import gram as gram
 from jaxmark.spectral.chebyshev import moments as moments
+from jaxmark.spectral.chebyshev import synthesise as synthesise
 from jaxmark.spectral.chebyshev import transpose as transpose
+from jaxmark.spectral.frames import frame_bounds as frame_bounds
+from jaxmark.spectral.frames import inverse as inverse
+from jaxmark.spectral.frames import tight as tight
 from jaxmark.spectral.graphs import from_edges as from_edges
 from jaxmark.spectral.graphs import from_matrices as from_matrices
 from jaxmark.spectral.graphs import from_mesh as from_mesh

@@ -4,31 +4,26 @@ The spectrum of Δ̃ = Δ - I lies in [-1, 1], and T_k(Δ̃)x follows by T_k = 2
 paper's start t_0 = 0, T_0 = 0 is an erratum for t_0 = 1, T_0 = I). All functions here take signals `[N]` or `[N, C]`,
 keep the dtype of the signal, and cost `degree` products with Δ.
 
-A filter f(Δ)x = Σ_k c_k T_k(Δ̃)x is linear in c and in x, and a projection p_k = Σ_v u_v (T_k(Δ̃)x)_v is linear in u and
-in x. As Δ is self-adjoint, each is the other's transpose, so that derivatives of any order are filters and projections
-again. For the derivative with respect to the operator, the recurrence is run backwards: T_{k-2} = 2Δ̃T_{k-1} - T_k.
+`recurrence` computes all of it, and has the derivatives.
 """
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.spectral import recurrence
 from jaxmark.spectral.laplacian import Laplacian, Operator, check_signal, per_row
-from jaxmark.spectral.linear import Linear, combine, floats
 from jaxmark.spectral.precision import einsum, matmul
 
 Signal = Float[Array | np.ndarray, " vertices *columns"]
 
 _BANDS_AT_ONCE = 5  # band components that are formed together where each is used only once
-_ROWS_AT_ONCE = 128  # rows that are summed as one wide row
-_MIN_UNROLLED_VALUES = 2**16  # values of a signal from which on running the recurrence takes longer than compiling it
 
 
 @jax.jit
@@ -60,7 +55,8 @@ def filter(
         raise JaxmarkError(
             f"filter needs coefficients [degree + 1] or [degree + 1, C] for a signal {x.shape}, got {c.shape}."
         )
-    return _filter(operator, c if c.ndim == x.ndim else jnp.broadcast_to(c[:, None], (len(c), x.shape[1])), x)
+    per_column = c if c.ndim == x.ndim else jnp.broadcast_to(c[:, None], (len(c), x.shape[1]))
+    return recurrence.filtered(operator, per_column, x)
 
 
 @jax.jit
@@ -69,7 +65,7 @@ def transpose(
 ) -> Float[Array, " vertices *columns"]:
     """f(Δ)ᵀy = M f(Δ) M⁻¹y, by the self-adjointness of Δ: the Euclidean adjoint of `filter`, with its arguments."""
     y = jnp.asarray(y)
-    mass = _inner_mass(operator, y)
+    mass = recurrence.inner_mass(operator, y)
     return mass * filter(operator, coefficients, y / mass)
 
 
@@ -90,12 +86,32 @@ def band_components(
     x = jnp.asarray(x)
     check_signal("band_components", operator, x)
     c = _check_bands(coefficients).astype(x.dtype)
-    x = operator.enter(x)
+    return recurrence.components(operator, c, x)
 
-    def add(total: Array, t: Array, _: Array, c_k: Array) -> tuple[Array, None]:
-        return total + jnp.multiply.outer(c_k, t), None
 
-    return jax.vmap(operator.leave)(_scan_terms(operator, x, c.T, add, jnp.multiply.outer(c[:, 0], x))[0])
+@jax.jit
+def synthesise(
+    operator: Operator, coefficients: Float[Array | np.ndarray, "bands terms"], parts: Float[Array | np.ndarray, "..."]
+) -> Float[Array, " vertices *columns"]:
+    """Sum up filtered parts, Σ_j g_j(Δ)y_j, in one pass of `degree` products; O(bands · N) memory.
+
+    This is the adjoint of `band_components` in the inner product ⟨, ⟩_M. It is its inverse, too, if the frame is
+    `tight` with Σ_j g_j² = 1. Derivatives are as those of `filter`.
+
+    Args:
+        operator: the Laplacian, of N vertices.
+        coefficients: one Chebyshev series per row, `[bands, degree + 1]`.
+        parts: `[bands, N]` or `[bands, N, C]`, as `band_components` returns them.
+
+    Returns:
+        `[N]` or `[N, C]`, in the dtype of the parts.
+
+    Raises:
+        JaxmarkError: if shapes do not fit, or the parts are neither float32 nor float64.
+    """
+    parts, c = jnp.asarray(parts), _check_bands(coefficients)
+    check_parts("synthesise", operator, c, parts)
+    return recurrence.synthesis(operator, c.astype(parts.dtype), parts)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -153,7 +169,7 @@ def cross_moments(operator: Laplacian, u: Signal, x: Signal, *, degree: int) -> 
     check_signal("cross_moments", operator, x)
     if u.shape != x.shape:
         raise JaxmarkError(f"cross_moments needs two signals of one shape, got {u.shape} and {x.shape}.")
-    return _projection(degree + 1)(operator, x, per_row(operator.mass, u) * u)
+    return recurrence.projection(degree + 1)(operator, x, per_row(operator.mass, u) * u)
 
 
 def band_energies(
@@ -188,46 +204,7 @@ def moments(operator: Laplacian, x: Signal, *, degree: int) -> Float[Array, " mo
     """
     x = jnp.asarray(x)
     check_signal("moments", operator, x)
-    return _moments(operator, x, degree)
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(2,))
-def _moments(operator: Operator, x: Array, degree: int) -> Array:
-    x, mass = operator.enter(x), operator.enter(per_row(operator.mass, x))
-
-    def products(_: None, t: Array, before: Array, __: Array) -> tuple[None, tuple[Array, Array]]:
-        return None, (_sums(mass * t * before), _sums(mass * t * t))
-
-    _, (odd, even) = _scan_terms(operator, x, jnp.zeros(degree + 1, x.dtype), products, None)
-    m0 = jnp.sum(mass * x * x, axis=0)[None]
-    if degree == 0:
-        return m0
-    pairs = jnp.stack([2 * odd - odd[0], 2 * even - m0], axis=1)
-    return jnp.concatenate([m0, pairs.reshape(2 * degree, *x.shape[1:])])
-
-
-@partial(_moments.defjvp, symbolic_zeros=True)
-def _moments_derivative(degree: int, primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
-    """The derivative 2⟨x, T_k(Δ̃)ẋ⟩_M, as T_k(Δ̃) is self-adjoint, and that of the operator beside."""
-    operator, x = primals
-    changes, x_change = tangents
-    value = _moments(operator, x, degree)
-    change = jnp.zeros_like(value)
-    if not isinstance(x_change, SymbolicZero):
-        change += 2 * _projection(2 * degree + 1)(operator, x, per_row(operator.mass, x) * x_change)
-    leaves = jax.tree.leaves(changes, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
-    if any(not isinstance(leaf, SymbolicZero) for leaf in leaves):
-        part = [
-            jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, SymbolicZero) else leaf
-            for leaf in leaves
-            if jnp.issubdtype(leaf.dtype, jnp.inexact)
-        ]
-
-        def of_operator(part: list[Array]) -> Array:
-            return cross_moments(combine(part, operator), x, x, degree=2 * degree)
-
-        change += jax.jvp(of_operator, (jax.tree.leaves(floats(operator)),), (part,))[1]
-    return value, change
+    return recurrence.moments(operator, x, degree)
 
 
 @partial(jax.jit, static_argnames="method")
@@ -265,170 +242,19 @@ def gram(
     raise JaxmarkError(f"gram(method=...) must be 'bands' or 'moments', got {method!r}.")
 
 
-def _scan_terms(
-    operator: Operator,
-    x: Array,
-    data: Array,
-    step: Callable[[Any, Array, Array, Array], tuple[Any, Any]],
-    start: Any,
-) -> tuple[Any, Any]:
-    """Run `step(carry, T_k x, T_{k-1} x, data[k])` over k = 1 … len(data) - 1; callers treat T_0 x = x themselves.
-
-    Rows are in the operator's own order.
-    """
-    product = operator.product(x)
-
-    def body(state: tuple[Array, Array, Any], inputs: tuple[Array, Array]) -> tuple[tuple[Array, Array, Any], Any]:
-        before, current, carry = state
-        factor, datum = inputs
-        following = factor * (product(current) - current) - before
-        carry, output = step(carry, following, current, datum)
-        return (current, following, carry), output
-
-    # T_1 = Δ̃T_0 is the recurrence with factor 1 and T_{-1} = 0.
-    factors = jnp.full(len(data) - 1, 2, x.dtype).at[:1].set(1)
-    # Unrolling saves a copy of the carry in each step, but leaves more to compile.
-    unroll = 3 if x.size >= _MIN_UNROLLED_VALUES else 1
-    (_, _, carry), outputs = jax.lax.scan(body, (jnp.zeros_like(x), x, start), (factors, data[1:]), unroll=unroll)
-    return carry, outputs
-
-
-@jax.jit
-def _filter_scan(operator: Operator, coefficients: Array, x: Array) -> Array:
-    def add(total: Array, t: Array, _: Array, c_k: Array) -> tuple[Array, None]:
-        return total + c_k * t, None
-
-    x = operator.enter(x)
-    return operator.leave(_scan_terms(operator, x, coefficients, add, coefficients[0] * x)[0])
-
-
-@partial(jax.jit, static_argnums=0)
-def _projection_scan(terms: int, operator: Operator, x: Array, u: Array) -> Array:
-    """Compute Σ_v u_v (T_k(Δ̃)x)_v for so many k, column by column."""
-    u, x = operator.enter(u), operator.enter(x)
-
-    def project(_: None, t: Array, __: Array, ___: Array) -> tuple[None, Array]:
-        return None, _sums(u * t)
-
-    _, rest = _scan_terms(operator, x, jnp.zeros(terms, x.dtype), project, None)
-    return jnp.concatenate([_sums(u * x)[None], rest])
-
-
-def _transposed_filter(operator: Operator, c: Array, y: Array) -> Array:
-    mass = _inner_mass(operator, y)
-    return mass * _filter(operator, c, y / mass)
-
-
-def _pulled_back(operator: Operator, c: Array, x: Array, y: Array) -> list[Array]:
-    """The gradient of ⟨y, Σ_k c_k T_k(Δ̃)x⟩ with respect to the floating leaves of the operator, in O(N) memory.
-
-    With b_k = c_k y + 2Δ̃ᵀb_{k+1} - b_{k+2}, it is the sum of the gradients of ⟨b_{k+1}, 2Δ T_k x⟩ over k, where b and T
-    are held fixed, and the factor 2 is 1 at k = 0. Both recurrences run downwards, that of T from its last two terms.
-    """
-    mass = _inner_mass(operator, x)
-    x, y, mass = (operator.enter(rows) for rows in (x, y, mass))
-    product = operator.product(x)
-
-    def up(state: tuple[Array, Array], factor: Array) -> tuple[tuple[Array, Array], None]:
-        before, t = state
-        return (t, factor * (product(t) - t) - before), None
-
-    factors = jnp.full(len(c) - 1, 2, x.dtype).at[:1].set(1)
-    (before, last), _ = jax.lax.scan(up, (jnp.zeros_like(x), x), factors)
-
-    # Sums over edges have derivatives that only read rows; those of tables would add to them.
-    edgewise = operator.by_segments
-    parts = jax.tree.leaves(floats(edgewise))
-
-    def edgewise_product(parts: list[Array], rows: Array) -> Array:
-        return combine(parts, edgewise).product(rows)(rows)
-
-    def down(state: Any, inputs: tuple[Array, Array]) -> tuple[Any, None]:
-        t, following, b, b_after, total = state
-        factor, c_k = inputs
-        rows = operator.leave(t)
-        _, pull = jax.vjp(lambda parts: edgewise_product(parts, rows), parts)
-        total = jax.tree.map(jnp.add, total, pull(operator.leave(factor * b))[0])
-        scaled = b / mass
-        b_before = c_k * y + factor * mass * (product(scaled) - scaled) - b_after
-        return (factor * (product(t) - t) - following, t, b_before, b, total), None
-
-    start = (before, last, c[-1] * y, jnp.zeros_like(y), jax.tree.map(jnp.zeros_like, parts))
-    (*_, total), _ = jax.lax.scan(down, start, (factors, c[:-1]), reverse=True)
-    return total
-
-
-def _changed_filter(operator: Operator, c: Array, x: Array, change: PyTree) -> Array:
-    """The derivative of a filter in the direction of a change of the operator's floating leaves."""
-    return jax.jvp(lambda part: _filter_scan(combine(part, operator), c, x), (floats(operator),), (change,))[1]
-
-
-_change = Linear(_changed_filter, _pulled_back)
-
-# f(Δ)x as a function of x.
-_filter = Linear(
-    _filter_scan,
-    _transposed_filter,
-    (_change, lambda operator, c, x, change: _combination(len(c))(operator, x, change)),
-)
-
-
-@cache
-def _combination(terms: int) -> Linear:
-    """f(Δ)x as a function of its coefficients: `(operator, x, c)`."""
-    return Linear(
-        lambda operator, x, c: _filter_scan(operator, c, x),
-        _projection(terms),
-        (
-            lambda operator, x, c, change: _change(operator, c, x, change),
-            lambda operator, x, c, change: _filter(operator, c, change),
-        ),
-    )
-
-
-@cache
-def _projection(terms: int) -> Linear:
-    """Σ_v u_v (T_k(Δ̃)x)_v for so many k as a function of u: `(operator, x, u)`."""
-
-    def of_signal(operator: Operator, x: Array, u: Array, change: Array) -> Array:
-        mass = _inner_mass(operator, u)
-        return _projection(terms)(operator, u / mass, mass * change)
-
-    return Linear(
-        partial(_projection_scan, terms),
-        lambda operator, x, m: _combination(terms)(operator, x, m),
-        (_changed_projection(terms), of_signal),
-    )
-
-
-@cache
-def _changed_projection(terms: int) -> Linear:
-    """The derivative of a projection in the direction of a change of the operator's floating leaves."""
-
-    def apply(operator: Operator, x: Array, u: Array, change: PyTree) -> Array:
-        def of_operator(part: PyTree) -> Array:
-            return _projection_scan(terms, combine(part, operator), x, u)
-
-        return jax.jvp(of_operator, (floats(operator),), (change,))[1]
-
-    return Linear(apply, lambda operator, x, u, m: _pulled_back(operator, m, x, u))
-
-
-def _inner_mass(operator: Operator, x: Array) -> Array:
-    """The mass of each vertex, or 1 at vertices without any: they are blocks of their own, so any mass serves."""
-    mass = per_row(operator.mass, x)
-    return jnp.where(mass > 0, mass, 1)
-
-
-def _sums(x: Array) -> Array:
-    """Sum over vertices, column by column; many rows at a time, because processors sum few columns slowly."""
-    whole = len(x) // _ROWS_AT_ONCE * _ROWS_AT_ONCE
-    wide = x[:whole].reshape(-1, _ROWS_AT_ONCE * (x.size // max(len(x), 1))).sum(axis=0)
-    return wide.reshape(_ROWS_AT_ONCE, *x.shape[1:]).sum(axis=0) + x[whole:].sum(axis=0)
-
-
 def _check_bands(coefficients: Array | np.ndarray) -> Array:
     c = jnp.asarray(coefficients)
     if c.ndim != 2 or c.shape[1] == 0:
         raise JaxmarkError(f"Band coefficients must be [bands, degree + 1], got {c.shape}.")
     return c
+
+
+def check_parts(name: str, operator: Operator, c: Array | np.ndarray, parts: Array) -> None:
+    """Refuse parts that are not one signal for each band.
+
+    Raises:
+        JaxmarkError: if they are not `[bands, N]` or `[bands, N, C]`, in float32 or float64.
+    """
+    if parts.ndim not in (2, 3) or len(parts) != len(c):
+        raise JaxmarkError(f"{name} needs parts [bands, N] or [bands, N, C] of {len(c)} bands, got {parts.shape}.")
+    check_signal(name, operator, parts[0])

@@ -1,0 +1,52 @@
+"""Heat kernels: low-passes e^{-tλ}, what heat that flows along the edges for a time t leaves of each frequency."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import ArrayLike
+from scipy import special
+
+from jaxmark.errors import JaxmarkError
+
+
+def heat(times: ArrayLike, degree: int | None = None) -> Float64[np.ndarray, "times terms"]:
+    """Chebyshev coefficients of e^{-tλ}, one time t a row: e^{-t}I_0(t) for k = 0, and 2(-1)^k e^{-t}I_k(t).
+
+    I_k are modified Bessel functions. All times together, `band_components(operator, heat(times), x)`, cost as many
+    products as the longest. `spectral.heat` has derivatives with respect to t.
+
+    Args:
+        times: t `[times]`, finite and not negative, in any order. With λ in [0, 2], a time of 1 or so is one step of
+            smoothing.
+        degree: degree at which the series are truncated; by default at rounding, which is at 42 for t = 10, 284 for
+            10³, 2724 for 10⁵.
+
+    Returns:
+        `[times, degree + 1]`, in the order of the times.
+
+    Raises:
+        JaxmarkError: if there is no time, or one is negative or not finite.
+    """
+    t = np.asarray(times, np.float64)
+    if t.ndim != 1 or len(t) == 0:
+        raise JaxmarkError(f"heat needs times [times], one or more, got {t.shape}.")
+    k = np.arange(1 + (heat_degree(t) if degree is None else degree))
+    return np.where(k == 0, 1, 2) * (-1.0) ** k * special.ive(k, t[:, None])
+
+
+def heat_degree(times: ArrayLike, error: float = float(np.finfo(np.float64).eps)) -> int:
+    """A degree from which on the series of e^{-tλ} is off by less than `error`, for all of the times.
+
+    All |c_k| but the first are the probabilities that two Poisson counts of mean t/2 differ by k, one way or the other,
+    so that the rest of the series is at most P(|difference| > degree), which Bernstein's inequality bounds by
+    2 exp(-n²/(2t + 2n/3)) with n = degree + 1. This grows as √(2t log(2/error)).
+
+    Raises:
+        JaxmarkError: if a time is negative or not finite.
+    """
+    t = np.asarray(times, np.float64)
+    if not (np.isfinite(t) & (t >= 0)).all():
+        raise JaxmarkError(f"heat flows for times that are finite and not negative, got {times}.")
+    digits = math.log(2 / error)
+    return math.ceil(digits / 3 + math.sqrt(digits**2 / 9 + 2 * float(t.max()) * digits))

@@ -1,0 +1,287 @@
+"""The recurrence of Chebyshev polynomials, and its derivatives of any order and mode in O(N) memory.
+
+A filter f(Δ)x = Σ_k c_k T_k(Δ̃)x is linear in c and in x, and a projection p_k = Σ_v u_v (T_k(Δ̃)x)_v is linear in u and
+in x. As Δ is self-adjoint, each is the other's transpose, so that derivatives of any order are filters and projections
+again. So are the components of a bank of filters and their synthesis. For the derivative with respect to the operator,
+the recurrence is run backwards: T_{k-2} = 2Δ̃T_{k-1} - T_k.
+
+Coefficients are `[terms]` for signals `[N]`, and `[terms, C]` for signals `[N, C]`; those of a bank are
+`[bands, terms]`. Nothing is checked here.
+"""
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, PyTree
+
+from jaxmark.spectral.laplacian import Operator, per_row
+from jaxmark.spectral.linear import Linear, combine, floats
+from jaxmark.spectral.precision import einsum
+
+_ROWS_AT_ONCE = 128  # rows that are summed as one wide row
+_MIN_UNROLLED_VALUES = 2**16  # values of a signal from which on running the recurrence takes longer than compiling it
+
+
+def _scan_terms(
+    operator: Operator,
+    x: Array,
+    data: Array,
+    step: Callable[[Any, Array, Array, Array], tuple[Any, Any]],
+    start: Any,
+) -> tuple[Any, Any]:
+    """Run `step(carry, T_k x, T_{k-1} x, data[k])` over k = 1 … len(data) - 1; callers treat T_0 x = x themselves.
+
+    Rows are in the operator's own order.
+    """
+    product = operator.product(x)
+
+    def body(state: tuple[Array, Array, Any], inputs: tuple[Array, Array]) -> tuple[tuple[Array, Array, Any], Any]:
+        before, current, carry = state
+        factor, datum = inputs
+        following = factor * (product(current) - current) - before
+        carry, output = step(carry, following, current, datum)
+        return (current, following, carry), output
+
+    # T_1 = Δ̃T_0 is the recurrence with factor 1 and T_{-1} = 0.
+    factors = jnp.full(len(data) - 1, 2, x.dtype).at[:1].set(1)
+    # Unrolling saves a copy of the carry in each step, but leaves more to compile.
+    unroll = 3 if x.size >= _MIN_UNROLLED_VALUES else 1
+    (_, _, carry), outputs = jax.lax.scan(body, (jnp.zeros_like(x), x, start), (factors, data[1:]), unroll=unroll)
+    return carry, outputs
+
+
+@jax.jit
+def filter_scan(operator: Operator, coefficients: Array, x: Array) -> Array:
+    """Compute f(Δ)x without rules of its own; see `filtered`."""
+
+    def add(total: Array, t: Array, _: Array, c_k: Array) -> tuple[Array, None]:
+        return total + c_k * t, None
+
+    x = operator.enter(x)
+    return operator.leave(_scan_terms(operator, x, coefficients, add, coefficients[0] * x)[0])
+
+
+@partial(jax.jit, static_argnums=0)
+def _projection_scan(terms: int, operator: Operator, x: Array, u: Array) -> Array:
+    """Compute Σ_v u_v (T_k(Δ̃)x)_v for so many k, column by column."""
+    u, x = operator.enter(u), operator.enter(x)
+
+    def project(_: None, t: Array, __: Array, ___: Array) -> tuple[None, Array]:
+        return None, _sums(u * t)
+
+    _, rest = _scan_terms(operator, x, jnp.zeros(terms, x.dtype), project, None)
+    return jnp.concatenate([_sums(u * x)[None], rest])
+
+
+def _transposed_filter(operator: Operator, c: Array, y: Array) -> Array:
+    mass = inner_mass(operator, y)
+    return mass * filtered(operator, c, y / mass)
+
+
+def _pulled_back(operator: Operator, c: Array, x: Array, y: Array) -> list[Array]:
+    """The gradient of ⟨y, Σ_k c_k T_k(Δ̃)x⟩ with respect to the floating leaves of the operator, in O(N) memory.
+
+    With b_k = c_k y + 2Δ̃ᵀb_{k+1} - b_{k+2}, it is the sum of the gradients of ⟨b_{k+1}, 2Δ T_k x⟩ over k, where b and T
+    are held fixed, and the factor 2 is 1 at k = 0. Both recurrences run downwards, that of T from its last two terms.
+    """
+    mass = inner_mass(operator, x)
+    x, y, mass = (operator.enter(rows) for rows in (x, y, mass))
+    product = operator.product(x)
+
+    def up(state: tuple[Array, Array], factor: Array) -> tuple[tuple[Array, Array], None]:
+        before, t = state
+        return (t, factor * (product(t) - t) - before), None
+
+    factors = jnp.full(len(c) - 1, 2, x.dtype).at[:1].set(1)
+    (before, last), _ = jax.lax.scan(up, (jnp.zeros_like(x), x), factors)
+
+    # Sums over edges have derivatives that only read rows; those of tables would add to them.
+    edgewise = operator.by_segments
+    parts = jax.tree.leaves(floats(edgewise))
+
+    def edgewise_product(parts: list[Array], rows: Array) -> Array:
+        return combine(parts, edgewise).product(rows)(rows)
+
+    def down(state: Any, inputs: tuple[Array, Array]) -> tuple[Any, None]:
+        t, following, b, b_after, total = state
+        factor, c_k = inputs
+        rows = operator.leave(t)
+        _, pull = jax.vjp(lambda parts: edgewise_product(parts, rows), parts)
+        total = jax.tree.map(jnp.add, total, pull(operator.leave(factor * b))[0])
+        scaled = b / mass
+        b_before = c_k * y + factor * mass * (product(scaled) - scaled) - b_after
+        return (factor * (product(t) - t) - following, t, b_before, b, total), None
+
+    start = (before, last, c[-1] * y, jnp.zeros_like(y), jax.tree.map(jnp.zeros_like, parts))
+    (*_, total), _ = jax.lax.scan(down, start, (factors, c[:-1]), reverse=True)
+    return total
+
+
+def _changed_filter(operator: Operator, c: Array, x: Array, change: PyTree) -> Array:
+    """The derivative of a filter in the direction of a change of the operator's floating leaves."""
+    return jax.jvp(lambda part: filter_scan(combine(part, operator), c, x), (floats(operator),), (change,))[1]
+
+
+_change = Linear(_changed_filter, _pulled_back)
+
+#: f(Δ)x as a function of x: `(operator, c, x)`.
+filtered = Linear(
+    filter_scan,
+    _transposed_filter,
+    (_change, lambda operator, c, x, change: of_coefficients(len(c))(operator, x, change)),
+)
+
+
+@cache
+def of_coefficients(terms: int) -> Linear:
+    """f(Δ)x as a function of its coefficients: `(operator, x, c)`."""
+    return Linear(
+        lambda operator, x, c: filter_scan(operator, c, x),
+        projection(terms),
+        (
+            lambda operator, x, c, change: _change(operator, c, x, change),
+            lambda operator, x, c, change: filtered(operator, c, change),
+        ),
+    )
+
+
+@cache
+def projection(terms: int) -> Linear:
+    """Σ_v u_v (T_k(Δ̃)x)_v for so many k as a function of u: `(operator, x, u)`."""
+
+    def by_signal(operator: Operator, x: Array, u: Array, change: Array) -> Array:
+        mass = inner_mass(operator, u)
+        return projection(terms)(operator, u / mass, mass * change)
+
+    return Linear(
+        partial(_projection_scan, terms),
+        lambda operator, x, m: of_coefficients(terms)(operator, x, m),
+        (_changed_projection(terms), by_signal),
+    )
+
+
+@cache
+def _changed_projection(terms: int) -> Linear:
+    """The derivative of a projection in the direction of a change of the operator's floating leaves."""
+
+    def apply(operator: Operator, x: Array, u: Array, change: PyTree) -> Array:
+        def of_operator(part: PyTree) -> Array:
+            return _projection_scan(terms, combine(part, operator), x, u)
+
+        return jax.jvp(of_operator, (floats(operator),), (change,))[1]
+
+    return Linear(apply, lambda operator, x, u, m: _pulled_back(operator, m, x, u))
+
+
+def inner_mass(operator: Operator, x: Array) -> Array:
+    """The mass of each vertex, or 1 at vertices without any: they are blocks of their own, so any mass serves."""
+    mass = per_row(operator.mass, x)
+    return jnp.where(mass > 0, mass, 1)
+
+
+def _sums(x: Array) -> Array:
+    """Sum over vertices, column by column; many rows at a time, because processors sum few columns slowly."""
+    whole = len(x) // _ROWS_AT_ONCE * _ROWS_AT_ONCE
+    wide = x[:whole].reshape(-1, _ROWS_AT_ONCE * (x.size // max(len(x), 1))).sum(axis=0)
+    return wide.reshape(_ROWS_AT_ONCE, *x.shape[1:]).sum(axis=0) + x[whole:].sum(axis=0)
+
+
+@jax.jit
+def _components_scan(operator: Operator, c: Array, x: Array) -> Array:
+    def add(total: Array, t: Array, _: Array, c_k: Array) -> tuple[Array, None]:
+        return total + jnp.multiply.outer(c_k, t), None
+
+    x = operator.enter(x)
+    return jax.vmap(operator.leave)(_scan_terms(operator, x, c.T, add, jnp.multiply.outer(c[:, 0], x))[0])
+
+
+@jax.jit
+def _synthesis_scan(operator: Operator, c: Array, parts: Array) -> Array:
+    """Clenshaw's recurrence, on all parts at once."""
+    product, parts = operator.product(parts[0]), jax.vmap(operator.enter)(parts)
+
+    def step(state: tuple[Array, Array], c_k: Array) -> tuple[tuple[Array, Array], None]:
+        current, before = state
+        following = einsum("j,j...->...", c_k, parts) + 2 * (product(current) - current) - before
+        return (following, current), None
+
+    zero = jnp.zeros_like(parts[0])
+    (current, before), _ = jax.lax.scan(step, (zero, zero), c.T[:0:-1])
+    return operator.leave(einsum("j,j...->...", c[:, 0], parts) + (product(current) - current) - before)
+
+
+def _per_column(c: Array, x: Array) -> Array:
+    """The coefficients of a bank for each column of a signal."""
+    return c if x.ndim == 1 else jnp.broadcast_to(c[..., None], (*c.shape, x.shape[1]))
+
+
+#: All g_j(Δ)x as a function of x: `(operator, c, x)`.
+components = Linear(
+    _components_scan,
+    lambda operator, c, y: inner_mass(operator, y[0]) * synthesis(operator, c, y / inner_mass(operator, y[0])),
+    (
+        lambda operator, c, x, change: jax.vmap(_change, (None, 0, None, None))(operator, _per_column(c, x), x, change),
+        lambda operator, c, x, change: jax.vmap(of_coefficients(c.shape[1]), (None, None, 0))(
+            operator, x, _per_column(change, x)
+        ),
+    ),
+)
+
+#: Σ_j g_j(Δ)y_j as a function of all y_j: `(operator, c, y)`.
+synthesis = Linear(
+    _synthesis_scan,
+    lambda operator, c, x: inner_mass(operator, x) * components(operator, c, x / inner_mass(operator, x)),
+    (
+        lambda operator, c, y, change: jax.vmap(_change, (None, 0, 0, None))(
+            operator, _per_column(c, y[0]), y, change
+        ).sum(axis=0),
+        lambda operator, c, y, change: jax.vmap(of_coefficients(c.shape[1]), (None, 0, 0))(
+            operator, y, _per_column(change, y[0])
+        ).sum(axis=0),
+    ),
+)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(2,))
+def moments(operator: Operator, x: Array, degree: int) -> Array:
+    """Compute ⟨x, T_k(Δ̃)x⟩_M for k = 0 … 2·degree; see `chebyshev.moments`."""
+    x, mass = operator.enter(x), operator.enter(per_row(operator.mass, x))
+
+    def products(_: None, t: Array, before: Array, __: Array) -> tuple[None, tuple[Array, Array]]:
+        return None, (_sums(mass * t * before), _sums(mass * t * t))
+
+    _, (odd, even) = _scan_terms(operator, x, jnp.zeros(degree + 1, x.dtype), products, None)
+    m0 = jnp.sum(mass * x * x, axis=0)[None]
+    if degree == 0:
+        return m0
+    pairs = jnp.stack([2 * odd - odd[0], 2 * even - m0], axis=1)
+    return jnp.concatenate([m0, pairs.reshape(2 * degree, *x.shape[1:])])
+
+
+@partial(moments.defjvp, symbolic_zeros=True)
+def _moments_derivative(degree: int, primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
+    """The derivative 2⟨x, T_k(Δ̃)ẋ⟩_M, as T_k(Δ̃) is self-adjoint, and that of the operator beside."""
+    operator, x = primals
+    changes, x_change = tangents
+    value = moments(operator, x, degree)
+    change = jnp.zeros_like(value)
+    if not isinstance(x_change, SymbolicZero):
+        change += 2 * projection(2 * degree + 1)(operator, x, per_row(operator.mass, x) * x_change)
+    leaves: list[Any] = jax.tree.leaves(changes, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
+    if any(not isinstance(leaf, SymbolicZero) for leaf in leaves):
+        part = [
+            jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, SymbolicZero) else leaf
+            for leaf in leaves
+            if jnp.issubdtype(leaf.dtype, jnp.inexact)
+        ]
+
+        def of_operator(part: list[Array]) -> Array:
+            changed = combine(part, operator)
+            return projection(2 * degree + 1)(changed, x, per_row(changed.mass, x) * x)
+
+        change += jax.jvp(of_operator, (jax.tree.leaves(floats(operator)),), (part,))[1]
+    return value, change
