@@ -28,7 +28,7 @@ def check_package() -> None:
     package = importlib.resources.files("jaxmark")
     assert package.joinpath("py.typed").is_file(), "the wheel has no py.typed"
     assert not Path(str(package)).is_relative_to(Path(__file__).parents[1] / "jaxmark"), f"{package} is the checkout"
-    others = ("fast_simplification", "skimage", "igl", "flip_evaluator", "distributed")
+    others = ("fast_simplification", "skimage", "igl", "flip_evaluator", "distributed", "equinox")
     for extra in ("matplotlib", "pandas", "pymeshlab", *others):
         assert importlib.util.find_spec(extra) is None, f"{extra} came with the core"
 
@@ -75,6 +75,7 @@ def needing(folder: str) -> Iterator[tuple[str, str, Callable[[], object]]]:
     from jaxmark.app.demo import sample_mesh
     from jaxmark.evaluation.results import Results
     from jaxmark.geometry.surfaces import Surface
+    from jaxmark.spectral import learned
 
     mesh = jm.load_mesh(Path(folder, "model.ply"))
     yield "pictures of meshes", "plot", lambda: plot.draw([plot.View("model", mesh)])
@@ -82,6 +83,7 @@ def needing(folder: str) -> Iterator[tuple[str, str, Callable[[], object]]]:
     yield "pictures of studies", "plot", lambda: Results(()).plot()
     yield "tables of studies", "study", lambda: Results(()).frame()
     yield "closest points", "align", lambda: Surface(mesh).closest(mesh.vertices)
+    yield "modules of learned filters", "learned", lambda: learned.ChebConv
     yield "the sample mesh", "attacks", sample_mesh
     for name, strength in REMESHING.items():
         yield name, "attacks", lambda name=name, strength=strength: jm.attack(mesh, name, strength, seed=0)

@@ -36,6 +36,14 @@ def carrier(seed: int) -> Any:
     return KeyedScheme().carrier(original, Choices(jm.Key(bytes([seed] * 32)), b""), 8, 64)
 
 
+def layer(seed: int) -> dict[str, jax.Array]:
+    return spectral.init_cheb_conv(jax.random.key(seed), 3, 2, 4)
+
+
+def miss(parameters: dict[str, jax.Array], operator: Any, x: jax.Array) -> jax.Array:
+    return jnp.sum(spectral.cheb_conv(operator, parameters, x, form="symmetric") ** 2)
+
+
 CALLS: dict[str, Callable[[Any, Any, int], Any]] = {
     "apply": lambda operator, x, seed: operator.apply(x),
     "inner": lambda operator, x, seed: operator.inner(x, x),
@@ -52,6 +60,8 @@ CALLS: dict[str, Callable[[Any, Any, int], Any]] = {
     "gram": lambda operator, x, seed: spectral.gram(operator, BANDS, x),
     "filter_rational": lambda operator, x, seed: spectral.filter_rational(operator, SECTIONS, x),
     "filter_by_factors": lambda operator, x, seed: spectral.filter_by_factors(operator, factors(), x),
+    "cheb_conv": lambda operator, x, seed: spectral.cheb_conv(operator, layer(seed), x),
+    "cheb_conv, gradient": lambda operator, x, seed: jax.grad(miss)(layer(seed), operator, x),
     "allocate": lambda _, x, seed: allocate(Channels(*(jnp.full((2, 8), 1.0 + seed),) * 3), jnp.ones(8)),
     "carrier": lambda _, x, seed: carrier(seed).displacement(jnp.ones(64)),
     "carrier gram": lambda _, x, seed: carrier(seed).gram(),

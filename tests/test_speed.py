@@ -28,6 +28,19 @@ def test_programs_agree(tmp_path: Path):
 
 
 @pytest.mark.slow
+def test_peers_agree():
+    done = subprocess.run(
+        [sys.executable, str(SPEED.with_name("peers.py")), "--size", "1000", "--repeat", "1"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in done.stdout.splitlines() if line[:1] == "|"]
+    assert {row[1] for row in rows} >= {"jaxmark", "jaxmark moments", "matfree Lanczos", "PyG ChebConv"}
+    assert all(row[2] == "not installed" or float(row[2]) > 0 for row in rows if row[0].startswith("1,0"))
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [["no such mesh.ply"], ["--sizes", "10"], ["--repeat", "0"], ["--parts", "all"], ["--output", "x.txt"]]
 )

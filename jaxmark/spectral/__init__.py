@@ -2,8 +2,8 @@
 
 `from_mesh`, `from_edges`, `from_points` and `from_matrices` build the operator of a graph, `bands` has families of band
 filters as Chebyshev coefficients, `filter` applies one filter to a signal and `band_components` a whole family,
-`inverse` brings a signal back from its parts;
-`eigenpairs` is the exact reference.
+`inverse` brings a signal back from its parts, and `cheb_conv` is a layer of learned ones; `eigenpairs` is the exact
+reference.
 """
 
 from jaxmark.spectral import bands as bands
@@ -26,6 +26,8 @@ from jaxmark.spectral.laplacian import Laplacian as Laplacian
 from jaxmark.spectral.laplacian import Operator as Operator
 from jaxmark.spectral.laplacian import centre as centre
 from jaxmark.spectral.laplacian import sparse_matrices as sparse_matrices
+from jaxmark.spectral.learned import cheb_conv as cheb_conv
+from jaxmark.spectral.learned import init_cheb_conv as init_cheb_conv
 from jaxmark.spectral.product import Factors as Factors
 from jaxmark.spectral.product import filter_by_factors as filter_by_factors
 from jaxmark.spectral.product import lagrange_factors as lagrange_factors
