@@ -83,7 +83,7 @@ def test_cotangents_agree_with_angles(sphere: Mesh):
     np.testing.assert_allclose(operator.weights, np.maximum(values, 1e-6 * values.max()), rtol=1e-9)
 
 
-def test_array_weights_and_their_refusal(sphere: Mesh):
+def test_array_weights_and_their_refusal(sphere: Mesh, unchecked):
     count = len(edges(sphere.faces))
     given_weights = np.random.default_rng(2).uniform(size=count)
     np.testing.assert_array_equal(from_mesh(sphere, given_weights).weights, given_weights)

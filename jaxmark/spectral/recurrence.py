@@ -20,9 +20,10 @@ from jaxtyping import Array, PyTree
 
 from jaxmark.spectral.laplacian import Operator, per_row
 from jaxmark.spectral.linear import Linear, combine, floats
-from jaxmark.spectral.precision import einsum
+from jaxmark.spectral.precision import einsum, matmul
 
 _ROWS_AT_ONCE = 128  # rows that are summed as one wide row
+_MAX_SUMMED_COLUMNS = 6  # up to which sums took less time than matrix products, by measurement
 _MIN_UNROLLED_VALUES = 2**16  # values of a signal from which on running the recurrence takes longer than compiling it
 
 
@@ -82,10 +83,12 @@ def _transposed_filter(operator: Operator, c: Array, y: Array) -> Array:
     return mass * filtered(operator, c, y / mass)
 
 
-def _pulled_back(operator: Operator, c: Array, x: Array, y: Array) -> list[Array]:
-    """The gradient of ⟨y, Σ_k c_k T_k(Δ̃)x⟩ with respect to the floating leaves of the operator, in O(N) memory.
+def _pulled_back(
+    operator: Operator, c: Array, x: Array, y: Array, weigh: Callable[[Array, Array], Array] = jnp.multiply
+) -> list[Array]:
+    """The gradient of Σ_k ⟨c_k y, T_k(Δ̃)x⟩ with respect to the floating leaves of the operator, in O(N) memory.
 
-    With b_k = c_k y + 2Δ̃ᵀb_{k+1} - b_{k+2}, it is the sum of the gradients of ⟨b_{k+1}, 2Δ T_k x⟩ over k, where b and T
+    The product c_k y is what `weigh` makes of the two. With b_k = c_k y + 2Δ̃ᵀb_{k+1} - b_{k+2}, it is the sum of the gradients of ⟨b_{k+1}, 2Δ T_k x⟩ over k, where b and T
     are held fixed, and the factor 2 is 1 at k = 0. Both recurrences run downwards, that of T from its last two terms.
     """
     mass = inner_mass(operator, x)
@@ -113,20 +116,22 @@ def _pulled_back(operator: Operator, c: Array, x: Array, y: Array) -> list[Array
         _, pull = jax.vjp(lambda parts: edgewise_product(parts, rows), parts)
         total = jax.tree.map(jnp.add, total, pull(operator.leave(factor * b))[0])
         scaled = b / mass
-        b_before = c_k * y + factor * mass * (product(scaled) - scaled) - b_after
+        b_before = weigh(c_k, y) + factor * mass * (product(scaled) - scaled) - b_after
         return (factor * (product(t) - t) - following, t, b_before, b, total), None
 
-    start = (before, last, c[-1] * y, jnp.zeros_like(y), jax.tree.map(jnp.zeros_like, parts))
+    start = (before, last, weigh(c[-1], y), jnp.zeros_like(x), jax.tree.map(jnp.zeros_like, parts))
     (*_, total), _ = jax.lax.scan(down, start, (factors, c[:-1]), reverse=True)
     return total
 
 
-def _changed_filter(operator: Operator, c: Array, x: Array, change: PyTree) -> Array:
-    """The derivative of a filter in the direction of a change of the operator's floating leaves."""
-    return jax.jvp(lambda part: filter_scan(combine(part, operator), c, x), (floats(operator),), (change,))[1]
+def _along(function: Callable[[Operator], Array], operator: Operator, change: PyTree) -> Array:
+    """The derivative of a function in the direction of a change of the operator's floating leaves."""
+    return jax.jvp(lambda part: function(combine(part, operator)), (floats(operator),), (change,))[1]
 
 
-_change = Linear(_changed_filter, _pulled_back)
+_change = Linear(
+    lambda operator, c, x, change: _along(lambda changed: filter_scan(changed, c, x), operator, change), _pulled_back
+)
 
 #: f(Δ)x as a function of x: `(operator, c, x)`.
 filtered = Linear(
@@ -167,14 +172,10 @@ def projection(terms: int) -> Linear:
 @cache
 def _changed_projection(terms: int) -> Linear:
     """The derivative of a projection in the direction of a change of the operator's floating leaves."""
-
-    def apply(operator: Operator, x: Array, u: Array, change: PyTree) -> Array:
-        def of_operator(part: PyTree) -> Array:
-            return _projection_scan(terms, combine(part, operator), x, u)
-
-        return jax.jvp(of_operator, (floats(operator),), (change,))[1]
-
-    return Linear(apply, lambda operator, x, u, m: _pulled_back(operator, m, x, u))
+    return Linear(
+        lambda operator, x, u, change: _along(lambda changed: _projection_scan(terms, changed, x, u), operator, change),
+        lambda operator, x, u, m: _pulled_back(operator, m, x, u),
+    )
 
 
 def inner_mass(operator: Operator, x: Array) -> Array:
@@ -246,6 +247,81 @@ synthesis = Linear(
 )
 
 
+@jax.jit
+def _convolution_scan(operator: Operator, weight: Array, x: Array) -> Array:
+    def add(total: Array, t: Array, _: Array, w_k: Array) -> tuple[Array, None]:
+        return total + _mix(t, w_k), None
+
+    x = operator.enter(x)
+    return operator.leave(_scan_terms(operator, x, weight, add, _mix(x, weight[0]))[0])
+
+
+@partial(jax.jit, static_argnums=0)
+def _correlation_scan(terms: int, operator: Operator, x: Array, y: Array) -> Array:
+    """(T_k(Δ̃)x)ᵀy for so many k: `[terms, inputs, outputs]`."""
+    x, y = operator.enter(x), operator.enter(y)
+
+    def project(_: None, t: Array, __: Array, ___: Array) -> tuple[None, Array]:
+        return None, matmul(t.T, y)
+
+    _, rest = _scan_terms(operator, x, jnp.zeros(terms, x.dtype), project, None)
+    return jnp.concatenate([matmul(x.T, y)[None], rest])
+
+
+def _mix(x: Array, weight: Array) -> Array:
+    """The product xW; by sums over columns where these are few, as processors are slow at such narrow matrices."""
+    if x.shape[1] > _MAX_SUMMED_COLUMNS:
+        return matmul(x, weight)
+    return sum((x[:, i, None] * weight[i] for i in range(1, x.shape[1])), x[:, :1] * weight[0])
+
+
+_convolution_change = Linear(
+    lambda operator, w, x, change: _along(lambda changed: _convolution_scan(changed, w, x), operator, change),
+    lambda operator, w, x, y: _pulled_back(operator, w, x, y, lambda w_k, y: _mix(y, w_k.T)),
+)
+
+#: Σ_k T_k(Δ̃)x W_k as a function of x `[N, inputs]`: `(operator, W, x)` with W `[terms, inputs, outputs]`.
+convolution = Linear(
+    _convolution_scan,
+    lambda operator, w, y: inner_mass(operator, y) * convolution(operator, w.mT, y / inner_mass(operator, y)),
+    (_convolution_change, lambda operator, w, x, change: _of_weights(len(w))(operator, x, change)),
+)
+
+
+@cache
+def _of_weights(terms: int) -> Linear:
+    """Σ_k T_k(Δ̃)x W_k as a function of W: `(operator, x, W)`."""
+    return Linear(
+        lambda operator, x, w: _convolution_scan(operator, w, x),
+        lambda operator, x, y: _correlation(terms)(operator, x, y),
+        (
+            lambda operator, x, w, change: _convolution_change(operator, w, x, change),
+            lambda operator, x, w, change: convolution(operator, w, change),
+        ),
+    )
+
+
+@cache
+def _correlation(terms: int) -> Linear:
+    """(T_k(Δ̃)x)ᵀy for so many k as a function of y: `(operator, x, y)`."""
+
+    def by_signal(operator: Operator, x: Array, y: Array, change: Array) -> Array:
+        mass = inner_mass(operator, x)
+        return _correlation(terms)(operator, y / mass, mass * change).mT
+
+    change_of_operator = Linear(
+        lambda operator, x, y, change: _along(
+            lambda changed: _correlation_scan(terms, changed, x, y), operator, change
+        ),
+        lambda operator, x, y, w: _pulled_back(operator, w, x, y, lambda w_k, y: _mix(y, w_k.T)),
+    )
+    return Linear(
+        partial(_correlation_scan, terms),
+        lambda operator, x, w: convolution(operator, w, x),
+        (change_of_operator, by_signal),
+    )
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
 def moments(operator: Operator, x: Array, degree: int) -> Array:
     """Compute ⟨x, T_k(Δ̃)x⟩_M for k = 0 … 2·degree; see `chebyshev.moments`."""
@@ -274,14 +350,16 @@ def _moments_derivative(degree: int, primals: tuple[Any, Any], tangents: tuple[A
     leaves: list[Any] = jax.tree.leaves(changes, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
     if any(not isinstance(leaf, SymbolicZero) for leaf in leaves):
         part = [
-            jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, SymbolicZero) else leaf
+            None
+            if not jnp.issubdtype(leaf.dtype, jnp.inexact)
+            else jnp.zeros(leaf.shape, leaf.dtype)
+            if isinstance(leaf, SymbolicZero)
+            else leaf
             for leaf in leaves
-            if jnp.issubdtype(leaf.dtype, jnp.inexact)
         ]
 
-        def of_operator(part: list[Array]) -> Array:
-            changed = combine(part, operator)
+        def of_operator(changed: Operator) -> Array:
             return projection(2 * degree + 1)(changed, x, per_row(changed.mass, x) * x)
 
-        change += jax.jvp(of_operator, (jax.tree.leaves(floats(operator)),), (part,))[1]
+        change += _along(of_operator, operator, jax.tree.unflatten(jax.tree.structure(operator), part))
     return value, change
