@@ -172,7 +172,7 @@ def test_parameters_are_drawn_within_their_limit():
 def test_what_does_not_fit_is_refused(operator, unchecked):
     p, x = drawn(np.float32), numbers(16, INPUTS).astype(np.float32)
     for signal in (x[:, 0], x[1:], x.astype(int)):
-        with pytest.raises(JaxmarkError, match=r"signal \[N, (inputs|C)\]|floating-point"):
+        with pytest.raises(JaxmarkError, match=r"signal \[N|floating-point"):
             learned.cheb_conv(operator, p, signal)
     for wrong in (p | {"weight": p["weight"][:, 1:]}, p | {"bias": p["bias"][1:]}, p | {"weight": p["weight"][:0]}):
         with pytest.raises(JaxmarkError, match=r"cheb_conv needs weight \[degree \+ 1, 3, outputs\]"):

@@ -58,14 +58,14 @@ FEATURES = """
 polynomial filter of a signal             | yes    | yes | yes         | as a layer   | by hand
 gradient to the signal                    | yes    | no  | yes         | yes          | no
 gradient to the filter                    | yes    | no  | yes         | yes          | no
-both, in O(N) memory at any degree        | yes    | no  | signal only | no           | no
 gradient to edge weights                  | yes    | no  | yes         | yes          | no
+all of these, in O(N) memory              | yes    | no  | signal only | no           | no
 forward mode                              | yes    | no  | polynomials | torch.func   | no
 vmap                                      | yes    | no  | yes         | torch.func   | no
 GPU                                       | by JAX | no  | by JAX      | by PyTorch   | no
-frame bounds, inverse of a filter bank    | no     | yes | no          | no           | no
+frame bounds, inverse of a filter bank    | yes    | yes | no          | no           | no
 graph of a point cloud                    | yes    | yes | no          | with another package | by hand
-mass matrix other than the row sums       | no     | no  | any matrix  | no           | any matrix
+mass matrix other than the row sums       | lumped | no  | any matrix  | no           | any matrix
 trace, spectral density                   | yes    | no  | yes         | no           | by hand
 layer with learned filters (ChebConv)     | yes    | no  | no          | yes          | no
 """

@@ -88,8 +88,9 @@ def _pulled_back(
 ) -> list[Array]:
     """The gradient of Σ_k ⟨c_k y, T_k(Δ̃)x⟩ with respect to the floating leaves of the operator, in O(N) memory.
 
-    The product c_k y is what `weigh` makes of the two. With b_k = c_k y + 2Δ̃ᵀb_{k+1} - b_{k+2}, it is the sum of the gradients of ⟨b_{k+1}, 2Δ T_k x⟩ over k, where b and T
-    are held fixed, and the factor 2 is 1 at k = 0. Both recurrences run downwards, that of T from its last two terms.
+    The product c_k y is what `weigh` makes of the two. With b_k = c_k y + 2Δ̃ᵀb_{k+1} - b_{k+2}, it is the sum of the
+    gradients of ⟨b_{k+1}, 2Δ T_k x⟩ over k, where b and T are held fixed, and the factor 2 is 1 at k = 0. Both
+    recurrences run downwards, that of T from its last two terms.
     """
     mass = inner_mass(operator, x)
     x, y, mass = (operator.enter(rows) for rows in (x, y, mass))
@@ -350,11 +351,9 @@ def _moments_derivative(degree: int, primals: tuple[Any, Any], tangents: tuple[A
     leaves: list[Any] = jax.tree.leaves(changes, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
     if any(not isinstance(leaf, SymbolicZero) for leaf in leaves):
         part = [
-            None
-            if not jnp.issubdtype(leaf.dtype, jnp.inexact)
-            else jnp.zeros(leaf.shape, leaf.dtype)
-            if isinstance(leaf, SymbolicZero)
-            else leaf
+            (jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, SymbolicZero) else leaf)  # pyright: ignore[reportArgumentType]
+            if jnp.issubdtype(leaf.dtype, jnp.inexact)
+            else None
             for leaf in leaves
         ]
 

@@ -21,7 +21,9 @@ def inverse_length_weights(
 ) -> Float[Array | np.ndarray, " edges"]:
     """1 over the length of each edge, in the inverse of the positions' unit; infinite for edges of length zero."""
     xp = positions.__array_namespace__()
-    return 1 / xp.sqrt(xp.sum((positions[pairs[:, 0]] - positions[pairs[:, 1]]) ** 2, axis=1))
+    lengths = xp.sqrt(xp.sum((positions[pairs[:, 0]] - positions[pairs[:, 1]]) ** 2, axis=1))
+    with np.errstate(divide="ignore"):
+        return 1 / lengths
 
 
 def cotangent_weights(vertices: Positions, faces: Faces) -> Float[Array | np.ndarray, " edges"]:

@@ -76,7 +76,6 @@ class ModulatedCarrier(NamedTuple):
 
     Each bit has a sign per band and coordinate, or one per band that the three coordinates share. With polynomial bands
     as components this is the paper's scheme, with eigenspaces Ohbuchi's. It computes in the dtype of the components.
-    Polynomial bands have no forward-mode derivatives (see `jaxmark.spectral.chebyshev.filter`).
     """
 
     components: Components
