@@ -167,25 +167,6 @@ def test_derivatives_of_mapped_filters(operator, axes, x64):
         np.testing.assert_allclose(total[part], every if axis == 0 else every.sum(axis=0), atol=1e-10)
 
 
-@pytest.mark.slow
-def test_derivatives_by_transformation(operator, x64):
-    c, x = jnp.asarray(random_array(DEGREE + 1)), jnp.asarray(random_array(len(operator.degree), 2, seed=1))
-
-    def loss(c, x):
-        return jnp.sum(jnp.sin(chebyshev.filter(operator, c, x)))
-
-    for form in (loss, jax.jit(loss), jax.checkpoint(loss)):
-        check_grads(form, (c, x), order=2)
-    value, linear = jax.linearize(loss, c, x)
-    np.testing.assert_allclose(linear(c, x), jax.jvp(loss, (c, x), (c, x))[1], rtol=1e-12)
-    np.testing.assert_allclose(value, loss(c, x), rtol=1e-12)
-    np.testing.assert_allclose(jax.jacfwd(loss)(c, x), jax.jacrev(loss)(c, x), atol=1e-10)
-    hessian = jax.hessian(loss)(c, x)
-    np.testing.assert_allclose(hessian, jax.jacrev(jax.jacrev(loss))(c, x), atol=1e-9)
-    with jax.debug_nans(True), jax.numpy_dtype_promotion("strict"):
-        jax.jvp(jax.grad(loss), (c, x), (c, x))
-
-
 @pytest.mark.parametrize(("columns", "per_column"), [((), False), ((3,), False), ((3,), True)])
 def test_derivatives_are_those_of_the_recurrence(columns, per_column, dtype):
     """On more vertices than are summed at once: those in O(N) memory, and JAX's own of the recurrence."""

@@ -20,6 +20,7 @@ from jaxmark.adversaries.expected import Surrogate as Surrogate
 from jaxmark.adversaries.expected import evidence as evidence
 from jaxmark.adversaries.expected import make_surrogate as make_surrogate
 from jaxmark.adversaries.expected import random_mark as random_mark
+from jaxmark.adversaries.expected import rescale as rescale
 from jaxmark.adversaries.key_holder import erasure as erasure
 from jaxmark.adversaries.key_holder import erasure_by_descent as erasure_by_descent
 from jaxmark.adversaries.oracle import Counted as Counted

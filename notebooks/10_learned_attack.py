@@ -1,0 +1,61 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # A learned attack
+#
+# A network of two Chebyshev convolutions learns to displace a marked mesh so that little of the evidence is left. It
+# knows the program, but no key: each step draws a fresh one, and what counts is the evidence that is expected.
+
+# %%
+import jax
+import jax.numpy as jnp
+
+import jaxmark as jm
+from jaxmark import adversaries, spectral
+from jaxmark.app.demo import sample_mesh
+
+mesh = jm.attack(jm.load_mesh(sample_mesh()), "simplification", 0.9, seed=0)  # small, so that this takes a minute
+marker = jm.make_marker(mesh, jm.new_key(), bits=16)
+marked, _ = marker.embed(b"ok", 8e-4)
+surrogate, original = adversaries.make_surrogate(marked, "keyed", 16, 8e-4)
+sizes, draws = ((4, 8), (8, 3)), jax.random.split(jax.random.key(0), 3)
+layers = [spectral.init_cheb_conv(key, *size, degree=8) for key, size in zip(draws, sizes, strict=False)]
+
+
+def displaced(layers, noise):
+    seen = jnp.concatenate([100 * surrogate.operator.apply(surrogate.signal), noise], axis=1)
+    hidden = jnp.tanh(spectral.cheb_conv(surrogate.operator, layers[0], seen))
+    return adversaries.rescale(surrogate, spectral.cheb_conv(surrogate.operator, layers[1], hidden), 4 * 8e-4)
+
+
+@jax.jit
+def step(layers, key):
+    noise, mark = jax.random.normal(key, surrogate.signal[:, :1].shape), jax.random.fold_in(key, 1)
+    left, slope = jax.value_and_grad(lambda layers: adversaries.evidence(surrogate, displaced(layers, noise), mark))(
+        layers
+    )
+    return jax.tree.map(lambda value, change: value - 0.02 * jnp.sign(change), layers, slope), left
+
+
+history = []
+for key in jax.random.split(draws[2], 40):
+    layers, left = step(layers, key)
+    history.append(float(left))
+print("expected evidence S/‖a‖, step by step:", *(f"{left:.1f}" for left in history[::8]), f"{history[-1]:.1f}")
+assert sum(history[-5:]) < sum(history[:5])
+
+# %% [markdown]
+# What the owner reads after it, and after white noise of the same size.
+
+# %%
+shift = original.to_host(displaced(layers, jax.random.normal(draws[0], surrogate.signal[:, :1].shape)))
+attacked = marked._replace(vertices=marked.vertices + original.diagonal * shift[original.weld.point])
+noisy = jm.attack(marked, "jamming", 4 * 8e-4, seed=1)
+for name, suspect in {"learned": attacked, "another mark": noisy}.items():
+    print(f"{name:<12} log10 p {marker.detect(suspect, b'ok').log10_p:6.1f}")

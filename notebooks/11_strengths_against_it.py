@@ -1,0 +1,67 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # Strengths trained against a learned attack
+#
+# `log_evidence` is what a suspect proves, in nats, as a pure function of the suspect and, through the carrier, of the
+# strengths of the bands. Signs and codeword are made once on the host, and gradients hold them fixed. A network of two
+# Chebyshev convolutions attacks; network and strengths take a step in turn.
+
+# %%
+import jax
+import jax.numpy as jnp
+
+import jaxmark as jm
+from jaxmark import spectral
+from jaxmark.app.demo import sample_mesh
+from jaxmark.watermark import log_evidence
+
+mesh = jm.attack(jm.load_mesh(sample_mesh()), "simplification", 0.9, seed=0)  # small, so that this takes a minute
+marker, size = jm.make_marker(mesh, jm.new_key(), bits=16), 8e-4
+carrier, x = marker.reader.carrier, marker.original.signal
+word, bands = jnp.asarray(marker.codeword(b"ok"), x.dtype), len(carrier.host.coefficients)
+moving = jnp.asarray(marker.original.to_traced(marker.original.used))[:, None]
+
+
+def scaled(displacement):
+    """The displacement at an RMS of 1."""
+    return displacement / jnp.sqrt(jnp.sum((moving * displacement) ** 2) / moving.sum())
+
+
+@jax.jit
+def left(strengths, layers, key):
+    mine = carrier.with_bands(jnp.exp(strengths))
+    marked = x + size * scaled(mine.displacement(word))
+    noise = jax.random.normal(key, x[:, :1].shape)
+    seen = jnp.concatenate([100 * carrier.host.operator.apply(marked), noise], axis=1)
+    hidden = jnp.tanh(spectral.cheb_conv(carrier.host.operator, layers[0], seen))
+    shift = moving * spectral.cheb_conv(carrier.host.operator, layers[1], hidden)
+    return log_evidence(marked + 3 * size * scaled(shift), x, mine, word)
+
+
+both = jax.jit(jax.value_and_grad(left, (0, 1)))
+draws = jax.random.split(jax.random.key(0), 3)
+start = [spectral.init_cheb_conv(key, *shape, degree=8) for key, shape in zip(draws, ((4, 8), (8, 3)), strict=False)]
+
+
+def play(strengths, layers, answer):
+    """Let the network learn, and the strengths answer or not."""
+    history = []
+    for key in jax.random.split(draws[2], 40):
+        nats, (up, down) = both(strengths, layers, key)
+        layers = jax.tree.map(lambda value, change: value - 0.01 * jnp.sign(change), layers, down)
+        strengths = strengths + answer * jnp.sign(up)
+        history.append(float(nats))
+    return history, strengths
+
+
+fixed = jnp.log(jnp.ones(bands) if carrier.profile is None else jnp.asarray(carrier.profile))
+for name, answer in {"as they are": 0.0, "trained": 0.05}.items():
+    history, strengths = play(fixed, start, answer)
+    print(f"strengths {name:<12} nats that are left:", *(f"{nats:.0f}" for nats in history[::8]), f"{history[-1]:.0f}")

@@ -1,0 +1,48 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # The evidence's gradient to the bands
+#
+# What a suspect proves is a smooth function of the Chebyshev coefficients of all bands that the mark is written and read
+# by. Its gradient takes O(N) memory, forward mode confirms it, and a step along it is worth something.
+
+# %%
+import jax
+import jax.numpy as jnp
+
+import jaxmark as jm
+from jaxmark.app.demo import sample_mesh
+from jaxmark.watermark import log_evidence
+
+mesh = jm.attack(jm.load_mesh(sample_mesh()), "simplification", 0.9, seed=0)  # small, so that this takes a minute
+marker, size = jm.make_marker(mesh, jm.new_key(), bits=16), 8e-4
+carrier, x = marker.reader.carrier, marker.original.signal
+word, bands = jnp.asarray(marker.codeword(b"ok"), x.dtype), jnp.asarray(carrier.host.coefficients, x.dtype)
+strengths = jnp.ones(len(bands)) if carrier.profile is None else jnp.asarray(carrier.profile)
+noise = 4 * size * jax.random.normal(jax.random.key(0), x.shape) / jnp.sqrt(3.0)
+
+
+@jax.jit
+def evidence(bands):
+    mine = carrier.with_bands(strengths, bands)
+    mark = mine.displacement(word)
+    marked = x + size * mark / jnp.sqrt(jnp.mean(jnp.sum(mark**2, axis=1)))
+    return log_evidence(marked + noise, x, mine, word)
+
+
+slope = jax.jit(jax.grad(evidence))(bands)
+length = jnp.linalg.norm(slope)
+value, rate = jax.jvp(evidence, (bands,), (slope / length,))
+print(
+    f"{slope.shape} coefficients, {float(value):.1f} nats; gradient {float(length):.1f}, by forward mode {float(rate):.1f}"
+)
+steps = [float(evidence(bands + t * slope / length)) for t in (0.0, 0.01, 0.02, 0.05, 0.1)]
+print("nats after a step along it:", *(f"{nats:.1f}" for nats in steps))
+assert jnp.allclose(rate, length, rtol=1e-2)
+assert max(steps) > steps[0]
