@@ -68,10 +68,8 @@ cloud = spectral.from_points(mesh.vertices, 8, "gaussian")
 spark = jnp.zeros(len(mesh.vertices)).at[0].set(1)
 for time in (1.0, 100.0, 1e4):
     warm = spectral.heat(cloud, spark, time)
-    reached = np.asarray(warm) > 1e-6
-    print(
-        f"t = {time:g}: {reached.mean():.1%} of the points are warm, {float(cloud.inner(warm, jnp.ones_like(warm))):.3f} in all"
-    )
+    reached, whole = np.mean(np.asarray(warm) > 1e-6), float(cloud.inner(warm, jnp.ones_like(warm)))
+    print(f"t = {time:g}: {reached:.1%} of the points are warm, {whole:.3f} in all")
 
 # %% [markdown]
 # ## Wavelets, and back

@@ -9,8 +9,8 @@
 # %% [markdown]
 # # The evidence's gradient to the bands
 #
-# What a suspect proves is a smooth function of the Chebyshev coefficients of all bands that the mark is written and read
-# by. Its gradient takes O(N) memory, forward mode confirms it, and a step along it is worth something.
+# What a suspect proves is a smooth function of the Chebyshev coefficients of all bands that the mark is written and
+# read by. Its gradient takes O(N) memory, forward mode confirms it, and a step along it is worth something.
 
 # %%
 import jax
@@ -39,9 +39,8 @@ def evidence(bands):
 slope = jax.jit(jax.grad(evidence))(bands)
 length = jnp.linalg.norm(slope)
 value, rate = jax.jvp(evidence, (bands,), (slope / length,))
-print(
-    f"{slope.shape} coefficients, {float(value):.1f} nats; gradient {float(length):.1f}, by forward mode {float(rate):.1f}"
-)
+print(f"{slope.shape} coefficients, {float(value):.1f} nats")
+print(f"gradient {float(length):.1f}, by forward mode {float(rate):.1f}")
 steps = [float(evidence(bands + t * slope / length)) for t in (0.0, 0.01, 0.02, 0.05, 0.1)]
 print("nats after a step along it:", *(f"{nats:.1f}" for nats in steps))
 assert jnp.allclose(rate, length, rtol=1e-2)
