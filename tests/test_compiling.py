@@ -58,6 +58,8 @@ CALLS: dict[str, Callable[[Any, Any, int], Any]] = {
     "moments": lambda operator, x, seed: spectral.moments(operator, x, degree=5),
     "cross_moments": lambda operator, x, seed: spectral.cross_moments(operator, x, x, degree=5),
     "gram": lambda operator, x, seed: spectral.gram(operator, BANDS, x),
+    "trace": lambda operator, x, seed: spectral.trace(operator, jnp.exp, x, steps=5),
+    "lowest_eigenpairs": lambda operator, x, seed: spectral.lowest_eigenpairs(operator, 5, jax.random.key(seed)).values,
     "filter_rational": lambda operator, x, seed: spectral.filter_rational(operator, SECTIONS, x),
     "filter_by_factors": lambda operator, x, seed: spectral.filter_by_factors(operator, factors(), x),
     "cheb_conv": lambda operator, x, seed: spectral.cheb_conv(operator, layer(seed), x),

@@ -22,12 +22,16 @@ from jaxmark.spectral.graphs import from_edges as from_edges
 from jaxmark.spectral.graphs import from_matrices as from_matrices
 from jaxmark.spectral.graphs import from_mesh as from_mesh
 from jaxmark.spectral.graphs import from_points as from_points
+from jaxmark.spectral.lanczos import quadratic_form as quadratic_form
+from jaxmark.spectral.lanczos import trace as trace
 from jaxmark.spectral.laplacian import Laplacian as Laplacian
 from jaxmark.spectral.laplacian import Operator as Operator
 from jaxmark.spectral.laplacian import centre as centre
 from jaxmark.spectral.laplacian import sparse_matrices as sparse_matrices
 from jaxmark.spectral.learned import cheb_conv as cheb_conv
 from jaxmark.spectral.learned import init_cheb_conv as init_cheb_conv
+from jaxmark.spectral.lowest import LowestPairs as LowestPairs
+from jaxmark.spectral.lowest import lowest_eigenpairs as lowest_eigenpairs
 from jaxmark.spectral.product import Factors as Factors
 from jaxmark.spectral.product import filter_by_factors as filter_by_factors
 from jaxmark.spectral.product import lagrange_factors as lagrange_factors

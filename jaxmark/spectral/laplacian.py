@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int, Int64, Num, Shaped
+from jaxtyping import Array, Bool, Float, Float64, Int, Int64, Num, Shaped
 from scipy import sparse
 from scipy.sparse import csgraph
 
@@ -42,6 +42,10 @@ class Operator(Protocol):
     @property
     def mass(self) -> Float[Array | np.ndarray, " vertices"]:
         """The diagonal of M; 0 where a vertex is isolated, unless it has a mass of its own."""
+        ...
+
+    def linked(self, like: Shaped[Array, " vertices *columns"]) -> Bool[Array, " vertices *ones"]:
+        """Which vertices have edges, to select from signals like this."""
         ...
 
     @property
@@ -153,10 +157,14 @@ class Laplacian(NamedTuple):
             total = _weighted_gather(table, self.weights, like)
         return lambda x: own * x - inverse * total(x)
 
+    def linked(self, like: Shaped[Array, " vertices *columns"]) -> Bool[Array, " vertices *ones"]:
+        """Which vertices have edges, to select from signals like this."""
+        return per_row(self.degree, like) > 0
+
     def inverse_mass(self, like: Shaped[Array, " vertices *columns"]) -> Float[Array, " vertices *ones"]:
         """1/(M s), by which sums over neighbours are divided, to multiply signals like this; 0 at isolated vertices."""
         # Select before dividing, so that isolated vertices keep finite gradients.
-        linked = per_row(self.degree, like) > 0
+        linked = self.linked(like)
         mass = per_row(self.mass, like)
         mass = mass if self.scale is None else mass * jnp.asarray(self.scale).astype(like.dtype)
         return jnp.where(linked, 1 / jnp.where(linked, mass, 1), 0)

@@ -125,13 +125,27 @@ def _pulled_back(
     return total
 
 
-def _along(function: Callable[[Operator], Array], operator: Operator, change: PyTree) -> Array:
+def along(function: Callable[[Operator], Array], operator: Operator, change: PyTree) -> Array:
     """The derivative of a function in the direction of a change of the operator's floating leaves."""
     return jax.jvp(lambda part: function(combine(part, operator)), (floats(operator),), (change,))[1]
 
 
+def changes_of(operator: Operator, tangents: Any) -> PyTree | None:
+    """What a rule of `jax.custom_jvp` is given as tangents of an operator, for `along`; None if it does not change."""
+    leaves: list[Any] = jax.tree.leaves(tangents, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
+    if all(isinstance(leaf, SymbolicZero) for leaf in leaves):
+        return None
+    part = [
+        (jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, SymbolicZero) else leaf)  # pyright: ignore[reportArgumentType]
+        if jnp.issubdtype(leaf.dtype, jnp.inexact)
+        else None
+        for leaf in leaves
+    ]
+    return jax.tree.unflatten(jax.tree.structure(operator), part)
+
+
 _change = Linear(
-    lambda operator, c, x, change: _along(lambda changed: filter_scan(changed, c, x), operator, change), _pulled_back
+    lambda operator, c, x, change: along(lambda changed: filter_scan(changed, c, x), operator, change), _pulled_back
 )
 
 #: f(Δ)x as a function of x: `(operator, c, x)`.
@@ -174,7 +188,7 @@ def projection(terms: int) -> Linear:
 def _changed_projection(terms: int) -> Linear:
     """The derivative of a projection in the direction of a change of the operator's floating leaves."""
     return Linear(
-        lambda operator, x, u, change: _along(lambda changed: _projection_scan(terms, changed, x, u), operator, change),
+        lambda operator, x, u, change: along(lambda changed: _projection_scan(terms, changed, x, u), operator, change),
         lambda operator, x, u, m: _pulled_back(operator, m, x, u),
     )
 
@@ -277,7 +291,7 @@ def _mix(x: Array, weight: Array) -> Array:
 
 
 _convolution_change = Linear(
-    lambda operator, w, x, change: _along(lambda changed: _convolution_scan(changed, w, x), operator, change),
+    lambda operator, w, x, change: along(lambda changed: _convolution_scan(changed, w, x), operator, change),
     lambda operator, w, x, y: _pulled_back(operator, w, x, y, lambda w_k, y: _mix(y, w_k.T)),
 )
 
@@ -311,9 +325,7 @@ def _correlation(terms: int) -> Linear:
         return _correlation(terms)(operator, y / mass, mass * change).mT
 
     change_of_operator = Linear(
-        lambda operator, x, y, change: _along(
-            lambda changed: _correlation_scan(terms, changed, x, y), operator, change
-        ),
+        lambda operator, x, y, change: along(lambda changed: _correlation_scan(terms, changed, x, y), operator, change),
         lambda operator, x, y, w: _pulled_back(operator, w, x, y, lambda w_k, y: _mix(y, w_k.T)),
     )
     return Linear(
@@ -348,17 +360,11 @@ def _moments_derivative(degree: int, primals: tuple[Any, Any], tangents: tuple[A
     change = jnp.zeros_like(value)
     if not isinstance(x_change, SymbolicZero):
         change += 2 * projection(2 * degree + 1)(operator, x, per_row(operator.mass, x) * x_change)
-    leaves: list[Any] = jax.tree.leaves(changes, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
-    if any(not isinstance(leaf, SymbolicZero) for leaf in leaves):
-        part = [
-            (jnp.zeros(leaf.shape, leaf.dtype) if isinstance(leaf, SymbolicZero) else leaf)  # pyright: ignore[reportArgumentType]
-            if jnp.issubdtype(leaf.dtype, jnp.inexact)
-            else None
-            for leaf in leaves
-        ]
+    moved = changes_of(operator, changes)
+    if moved is not None:
 
         def of_operator(changed: Operator) -> Array:
             return projection(2 * degree + 1)(changed, x, per_row(changed.mass, x) * x)
 
-        change += _along(of_operator, operator, jax.tree.unflatten(jax.tree.structure(operator), part))
+        change += along(of_operator, operator, moved)
     return value, change

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Float, Int, Int64, Shaped
+from jaxtyping import Array, Bool, Float, Int, Int64, Shaped
 from numpy.typing import ArrayLike
 
 from jaxmark.errors import JaxmarkError
@@ -56,6 +56,10 @@ class Shard(NamedTuple):
     def mass(self) -> Float[Array | np.ndarray, " rows"]:
         """The diagonal of M for the block's rows; 0 past the last vertex."""
         return self.interior.mass
+
+    def linked(self, like: Shaped[Array, " rows *columns"]) -> Bool[Array, " rows *ones"]:
+        """Which of the block's vertices have edges; see `Operator`."""
+        return self.interior.linked(like)
 
     @property
     def by_segments(self) -> "Shard":
