@@ -96,6 +96,7 @@ def test_records_refuse_by_name(original, published, forged, key: jm.Key):
     assert jm.detect(mesh, original=Mesh(moved, original.faces), key=key, message=MESSAGE).log10_p > -6
 
 
+@pytest.mark.slow
 def test_searching_keys_pays_as_chance_does(original, published):
     """The number of keys with log10 p ≤ -x is at most binomial of probability 10^-x, and as a normal score has it."""
     keys = 300

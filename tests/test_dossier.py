@@ -147,6 +147,7 @@ def test_a_claim_against_the_record_is_refused(workshop: Workshop):
     assert told["log10_p"] > workshop.json(*claim, b"ok".hex(), *RECORD)["log10_p"]
 
 
+@pytest.mark.slow
 def test_mistakes_are_said(workshop: Workshop):
     exchanged = ("detect", "model.ply", "--original", "marked.ply", "--key", "owner.key")
     assert "The files look exchanged" in workshop.json(*exchanged, "--bits", "16", status=1)["remarks"][0]

@@ -131,6 +131,7 @@ def test_the_kernel_reproduces_if_halved_and_scaled():
         assert np.abs(factor * reproduced(first) - expected).max() > 0.1
 
 
+@pytest.mark.slow
 def test_bands_cover_the_spectrum_up_to_58_percent():
     """(13), printed for any δ: every point is in some B_j(δ), where a band has δ of its value at the node or more."""
     dense = np.cos(np.linspace(0, np.pi, 100_001))
