@@ -289,10 +289,13 @@ def test_what_is_no_operator_is_refused(ball, unchecked):
         (lambda: spectral.from_matrices(stiffness + np.eye(size)), "rows sum to zero"),
         (lambda: spectral.from_matrices(signed), r"The edge \[0, 1\] has the weight -4"),
         (lambda: spectral.from_matrices(stiffness, np.ones((size, size))), "diagonal"),
+        (lambda: spectral.from_mesh(ball, mass="areas", bound=1.0), "1 is no bound of the spectrum, which reaches"),
+        (lambda: spectral.from_mesh(ball, mass="areas", bound=float("nan")), "nan is no bound"),
+        (lambda: spectral.from_mesh(ball, bound=3.0), "belongs to a mass"),
         (lambda: spectral.stack([]), "no operator"),
         (
             lambda: jax.jit(lambda v: spectral.from_mesh(jm.Mesh(v, ball.faces), mass="areas").mass)(ball.vertices),
-            "need a bound",
+            "need a positive bound",
         ),
     ]:
         with pytest.raises(jm.JaxmarkError, match=sentence):

@@ -64,7 +64,7 @@ def from_mesh(
     Raises:
         JaxmarkError: if a name is unknown, weights or masses are not one for each edge or vertex, finite and not
             negative, an edge has length zero under `"inverse-length"`, no edge has a positive weight under
-            `"cotangent"`, a vertex with edges has no mass, or there is no bound for traced positions.
+            `"cotangent"`, a vertex with edges has no mass, the bound is none, or there is none for traced positions.
     """
     _check_name("Products are lowered by", lowering, Lowering)
     traced = isinstance(mesh.vertices, Tracer)
@@ -89,8 +89,8 @@ def from_mesh(
         masses = vertex_areas(_of_vertices("areas", vertices, elements), faces)
     if not traced or not (isinstance(values, jax.Array) or isinstance(masses, jax.Array)):
         return _with_mass(graph_laplacian(pairs, len(positions), values, lowering=lowering), masses, bound)
-    if masses is not None and bound is None:
-        raise JaxmarkError("Traced positions need a bound of the spectrum; 2 * operator.scale is that of like meshes.")
+    if masses is not None and not (bound is not None and np.isfinite(bound) and bound > 0):
+        raise JaxmarkError("Traced positions need a positive bound of the spectrum; 2 * operator.scale is that of like meshes.")
     weighted = graph_laplacian(pairs, len(positions), np.ones(len(pairs)), lowering=lowering)
     weighted = weighted.with_weights(np.ones(len(pairs)) if values is None else values, masses)
     return weighted if masses is None or bound is None else weighted._replace(scale=np.float64(bound / 2))
@@ -307,6 +307,8 @@ def _of_vertices(what: str, vertices: Any, elements: Elements) -> Any:
 def _with_mass(operator: Laplacian, mass: ArrayLike | None, bound: float | None) -> Laplacian:
     """Put a lumped mass in, and half a bound of the spectrum."""
     if mass is None:
+        if bound is not None:
+            raise JaxmarkError("A bound belongs to a mass; without one the spectrum is in [0, 2].")
         return operator
     values, size = np.asarray(mass, np.float64), len(operator.degree)
     if values.shape != (size,) or not (np.isfinite(values) & (values >= 0)).all():
@@ -316,6 +318,10 @@ def _with_mass(operator: Laplacian, mass: ArrayLike | None, bound: float | None)
         raise JaxmarkError(
             f"Vertex {int(np.argmax(lacking))} has edges, but no mass; remove degenerate faces, or pass other masses."
         )
+    # The largest λ is no smaller than any diagonal element of M⁻¹(D - W).
+    least = float(np.max(np.asarray(operator.degree)[linked] / values[linked], initial=0))
+    if bound is not None and not (np.isfinite(bound) and bound > 0 and bound >= least):
+        raise JaxmarkError(f"{bound:g} is no bound of the spectrum, which reaches {least:g} at least.")
     with_mass = operator._replace(lumped_mass=values, scale=np.float64(1))
     return with_mass._replace(scale=np.float64((_bound(with_mass) if bound is None else bound) / 2))
 
