@@ -90,7 +90,9 @@ def from_mesh(
     if not traced or not (isinstance(values, jax.Array) or isinstance(masses, jax.Array)):
         return _with_mass(graph_laplacian(pairs, len(positions), values, lowering=lowering), masses, bound)
     if masses is not None and not (bound is not None and np.isfinite(bound) and bound > 0):
-        raise JaxmarkError("Traced positions need a positive bound of the spectrum; 2 * operator.scale is that of like meshes.")
+        raise JaxmarkError(
+            "Traced positions need a positive bound of the spectrum; 2 * operator.scale is that of like meshes."
+        )
     weighted = graph_laplacian(pairs, len(positions), np.ones(len(pairs)), lowering=lowering)
     weighted = weighted.with_weights(np.ones(len(pairs)) if values is None else values, masses)
     return weighted if masses is None or bound is None else weighted._replace(scale=np.float64(bound / 2))

@@ -49,21 +49,20 @@ def quadratic_form(operator: Operator, function: Function, x: Signal, *, steps: 
     """
     x = jnp.asarray(x)
     check_signal("quadratic_form", operator, x)
-    if steps < 1:
-        raise JaxmarkError(f"quadratic_form needs one step or more, got {steps}.")
-    linked = operator.linked(x)
-    columns = jnp.where(linked, jnp.sqrt(inner_mass(operator, x)) * x, 0).reshape(len(x), -1).T
-    found = jax.vmap(partial(_form, function, steps), (None, 0))(operator, columns)
-    return found.reshape(x.shape[1:])
+    _check_steps("quadratic_form", steps)
+    return _forms(operator, function, jnp.sqrt(inner_mass(operator, x)) * x, steps)
 
 
+@partial(jax.jit, static_argnames=("function", "steps"))
 def trace(
     operator: Operator, function: Function, probes: Float[Array | np.ndarray, "vertices probes"], *, steps: int
 ) -> Float[Array, ""]:
     """Estimate Σ_i f(λ_i) over the eigenvalues of Δ above its null space, such as a log-determinant.
 
     Stochastic Lanczos quadrature (Ubaru, Chen, Saad, "Fast estimation of tr(f(A)) via stochastic Lanczos quadrature",
-    2017): the sum of `quadratic_form` over random signals. A density of eigenvalues is that of a narrow bump.
+    2017): the sum of `quadratic_form` over random signals. A density of eigenvalues is that of a narrow bump. For
+    derivatives with respect to the operator, signals are held fixed as √M times the probes, whose squares do not depend
+    on the mass: so the derivative estimates that of the sum.
 
     Args:
         operator: see `quadratic_form`.
@@ -71,7 +70,22 @@ def trace(
         probes: from `white_probes`, which says how large the variance is.
         steps: see `quadratic_form`.
     """
-    return jnp.sum(quadratic_form(operator, function, probes, steps=steps))
+    u = jnp.asarray(probes)
+    check_signal("trace", operator, u)
+    _check_steps("trace", steps)
+    return jnp.sum(_forms(operator, function, jax.lax.stop_gradient(jnp.sqrt(inner_mass(operator, u))) * u, steps))
+
+
+def _check_steps(name: str, steps: int) -> None:
+    if steps < 1:
+        raise JaxmarkError(f"{name} needs one step or more, got {steps}.")
+
+
+def _forms(operator: Operator, function: Function, v: Array, steps: int) -> Array:
+    """vᵀf(A)v column by column, one after the other, as each takes the memory of all its steps."""
+    columns = jnp.where(operator.linked(v), v, 0).reshape(len(v), -1).T
+    one = jax.checkpoint(lambda column: _form(function, steps, operator, column))
+    return jax.lax.map(one, columns).reshape(v.shape[1:])
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -143,7 +157,8 @@ def _ritz(steps: int, operator: Operator, v: Array) -> tuple[Array, Array, Array
     diagonal = jnp.where(alive & (length > 0), diagonal, value)
     matrix = jnp.diag(diagonal) + jnp.diag(beside[:-1], 1) + jnp.diag(beside[:-1], -1)
     values, turn = jnp.linalg.eigh(matrix)
-    # What is past the subspace is decoupled, so that the parts along it are zero but for rounding.
-    live = jnp.sum(jnp.where(alive[:, None], turn, 0) ** 2, axis=0) > 0.5
+    # What is past the subspace is decoupled, so that the parts along it are zero but for rounding, which must not count
+    # where the function has none of the values that rounding gives, such as a logarithm's at 0.
+    live = jnp.abs(turn[0]) > small
     values = jnp.where(live, values, value)
     return matmul(basis.T, turn), values, jnp.where(live, length * turn[0], 0)

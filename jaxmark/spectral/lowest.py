@@ -40,7 +40,7 @@ def lowest_eigenpairs(operator: Operator, count: int, key: PRNGKeyArray, *, dtyp
 
     Args:
         operator: the Laplacian, of N vertices.
-        count: number of pairs, null vectors included; with a fifth more and ten, at most the number of vertices.
+        count: number of pairs, null vectors included, at most the number of vertices.
         key: any random key, from which the iteration starts; converged pairs depend on it by signs, and by the bases of
             eigenspaces.
         dtype: float32 or float64.
@@ -49,14 +49,12 @@ def lowest_eigenpairs(operator: Operator, count: int, key: PRNGKeyArray, *, dtyp
         The pairs. They are iterated for until the residual is a hundred times the machine epsilon, or 60 times.
 
     Raises:
-        JaxmarkError: if there is no pair to compute, there are too few vertices, or the dtype is another.
+        JaxmarkError: if there are fewer vertices than pairs, no pair is asked for, or the dtype is another.
     """
-    size, block = operator.mass.shape[0], count + count // 5 + _GUARDS
-    if count < 1 or block > size:
-        raise JaxmarkError(
-            f"lowest_eigenpairs finds 1 pair or more among at least {block} vertices, not {count} among {size}; for"
-            " small graphs use eigenpairs."
-        )
+    size = operator.mass.shape[0]
+    block = min(count + count // 5 + _GUARDS, size)
+    if not 1 <= count <= size:
+        raise JaxmarkError(f"A graph of {size} vertices has 1 to {size} eigenpairs, not {count}.")
     if dtype not in (jnp.float32, jnp.float64):
         raise JaxmarkError(f"lowest_eigenpairs computes in float32 or float64, not in {jnp.dtype(dtype)}.")
     start = jax.random.normal(key, (size, block), dtype)
@@ -147,7 +145,7 @@ def _pairs_derivative(
     turned = along(lambda changed: symmetric(changed, kept)(kept), operator, changes)
     inside = matmul(kept.T, turned)
     gap = own - own[:, None]
-    near = jnp.abs(gap) < jnp.sqrt(jnp.finfo(own.dtype).eps) * 2
+    near = jnp.abs(gap) < 100 * jnp.finfo(own.dtype).eps
     mixed = jnp.where(near, 0, inside / jnp.where(near, 1, gap))
     # What is not asked for has not converged, and is left to the solver.
     rest = _beside(operator, kept, own, -turned)
