@@ -131,6 +131,13 @@ def test_derivatives_of_the_lowest_eigenpairs(operator, x64):
     np.testing.assert_allclose(by_reverse, by_forward, rtol=1e-8)
 
 
+def test_all_eigenpairs_of_a_small_graph_with_isolated_vertices(x64):
+    two = spectral.from_edges([[0, 1], [2, 3], [3, 4]], size=7)
+    found = spectral.lowest_eigenpairs(two, 7, jax.random.key(0), dtype=jnp.float64)
+    np.testing.assert_allclose(found.values, [0, 0, 1, 2, 2, 2, 2], atol=1e-12)
+    np.testing.assert_allclose(found.vectors[5:, :3], 0, atol=1e-12)
+
+
 def test_what_cannot_be_computed_is_refused(operator, unchecked):
     x = jnp.ones(len(operator.mass))
     for call, sentence in [

@@ -1,5 +1,6 @@
 """The lowest eigenpairs of the Laplacian in traced form, with derivatives."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -25,7 +26,7 @@ class LowestPairs(NamedTuple):
     """Eigenpairs of Δ from 0 on, ascending; a null vector for each component is among them."""
 
     values: Float[Array, " pairs"]  # in [0, 2]; times `Laplacian.scale`, those of (D - W)x = λMx
-    vectors: Float[Array, "vertices pairs"]  # M-orthonormal; 0 at isolated vertices
+    vectors: Float[Array, "vertices pairs"]  # M-orthonormal; isolated vertices come last, with the value 2
     residual: Float[Array, ""]  # the largest ‖Δφ - λφ‖_M of a pair
 
 
@@ -59,16 +60,22 @@ def lowest_eigenpairs(operator: Operator, count: int, key: PRNGKeyArray, *, dtyp
         raise JaxmarkError(f"lowest_eigenpairs computes in float32 or float64, not in {jnp.dtype(dtype)}.")
     start = jax.random.normal(key, (size, block), dtype)
     values, vectors = _pairs(count, operator, jnp.where(operator.linked(start), start, 0))
-    left = symmetric(operator, vectors)(vectors) - values * vectors
+    left = _product(operator, vectors)(vectors) - values * vectors
     residual = jnp.sqrt(jnp.max(jnp.sum(left**2, axis=0)[:count]))
     vectors = vectors[:, :count]
     return LowestPairs(values[:count], vectors / jnp.sqrt(inner_mass(operator, vectors)), residual)
 
 
+def _product(operator: Operator, like: Array) -> Callable[[Array], Array]:
+    """The map y → Ay, in which isolated vertices are the highest frequency, so that they are none of the lowest."""
+    product, linked = symmetric(operator, like), operator.linked(like)
+    return lambda y: product(y) + jnp.where(linked, 0, 2 * y)
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _pairs(count: int, operator: Operator, start: Array) -> tuple[Array, Array]:
     """The lowest eigenpairs of A = M^½ΔM^-½, as many as the start has columns, of which `count` have converged."""
-    product, small = symmetric(operator, start), 100 * jnp.finfo(start.dtype).eps
+    product, small = _product(operator, start), 100 * jnp.finfo(start.dtype).eps
 
     def rotate(block: Array) -> tuple[Array, Array, Array]:
         """Ritz pairs of a block (Rayleigh, Ritz), and the largest residual of those that count."""
