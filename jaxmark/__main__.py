@@ -1,6 +1,6 @@
 """`python -m jaxmark`."""
 
-from jaxmark.app.cli import main
+from jaxmark.app.start import main
 
 if __name__ == "__main__":
     main()

@@ -8,6 +8,7 @@ line, or such an object, for each file, and the exit status is the worst of thei
 import json
 import math
 import os
+import signal
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -27,7 +28,7 @@ from jaxmark.files import load_mesh, save_mesh
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import same_connectivity
 from jaxmark.watermark.budget import VISIBILITY, Visibility, make_budget
-from jaxmark.watermark.coding.keys import commitment, load_key, new_key, save_key
+from jaxmark.watermark.coding.keys import Key, commitment, load_key, new_key, save_key
 from jaxmark.watermark.deposit import Deposit, make_deposit
 from jaxmark.watermark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity
 from jaxmark.watermark.record import RECORD_SUFFIX, Record
@@ -202,11 +203,12 @@ def embed_command(
         record_file = record_file or marked.with_name(marked.name + RECORD_SUFFIX)
         _check_outputs(original, marked)
         _check_distinct(original=original, marked=marked, key=key_file, record=record_file)
-        told = mark(original, marked, record_file, key=load_key(key_file))
+        told = mark(original, marked, record_file, key=_key(key_file))
         return _answer(as_json, told.answer, told.said)
     if record_file is not None:
         raise JaxmarkError("Each file of a folder has a record beside it; leave out --record.")
-    key = load_key(key_file)
+    key = _key(key_file)
+    mesh_files(original)  # refuses a folder without any before another is made
     marked.mkdir(parents=True, exist_ok=True)
     _each(original, as_json, lambda file: mark(file, marked / file.name, marked / (file.name + RECORD_SUFFIX), key=key))
 
@@ -270,7 +272,7 @@ def detect_command(
     if deposit is not None and record_file is None:
         raise JaxmarkError("A deposit dates records: give the --record that is in it, too.")
     reader = FileReader(
-        load_key(key_file), bits, message, scheme, how, alpha, deposit, obtained, guesses=not suspect.is_dir()
+        _key(key_file), bits, message, scheme, how, alpha, deposit, obtained, guesses=not suspect.is_dir()
     )
     if suspect.is_dir():
         _each(
@@ -328,7 +330,7 @@ def identify_command(
     if not names:
         raise JaxmarkError(f"{recipients} names nobody; give one identifier a line.")
     record = None if record_file is None else Record.load(record_file)
-    key = load_key(key_file)
+    key = _key(key_file)
     meshes = load_mesh(suspect), load_mesh(original)
     found = identify(meshes[0], names, original=meshes[1], key=key, record=record, top=top, align=how)
     accused = [one for one in found if one.log10_p <= math.log10(alpha)]
@@ -523,6 +525,8 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
 
 def main() -> None:
     """Run the command line; refused input ends with exit status 2 and one sentence."""
+    # A request to end is an exception as others are, after which no draft is left.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         cli(standalone_mode=False)
     except click.exceptions.Exit as end:
@@ -566,6 +570,14 @@ def _each(folder: Path, as_json: bool, work: Callable[[Path], Told]) -> NoReturn
         status = max(status, 0 if told.done else 1)
         _answer(as_json, {"file": file.name, **told.answer}, f"{file.name}: {told.said}")
     sys.exit(status)
+
+
+def _key(path: Path) -> Key:
+    """Load a key, and say so if others may read it."""
+    key = load_key(path)
+    if os.name == "posix" and path.stat().st_mode & 0o077:
+        _say(f"jaxmark: the key file {path} may be read by others; chmod 600 {path} keeps it yours.")
+    return key
 
 
 def _member(path: Path, name: str) -> Path:

@@ -9,11 +9,12 @@ import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files.reading import read_file
 
 Cell = tuple[str | int | float, ...]  # values that JSON keeps as they are
 Row = Mapping[str, Any]
@@ -76,13 +77,20 @@ def run(
 
 
 def load_finished(output: str | os.PathLike[str]) -> list[dict[str, Any]]:
-    """Load the rows of a file; a last line that a killed run left incomplete is cut off."""
+    """Load the rows of a file; a last line that a killed run left incomplete is cut off.
+
+    Raises:
+        JaxmarkError: if the file cannot be read, or a line is no row.
+    """
     path = Path(output)
-    text = path.read_bytes() if path.exists() else b""
+    try:
+        text = read_file(path) if path.exists() else b""
+    except OSError as error:
+        raise JaxmarkError(f"Cannot read {path}: {error.strerror or error}.") from None
     whole = text[: text.rfind(b"\n") + 1]
     if whole != text:
         os.truncate(path, len(whole))
-    return [json.loads(line) for line in whole.splitlines()]
+    return [_row(line, path, number) for number, line in enumerate(whole.splitlines(), 1)]
 
 
 def _unfinished(cells: Iterable[Cell], output: Path) -> list[Cell]:
@@ -90,12 +98,26 @@ def _unfinished(cells: Iterable[Cell], output: Path) -> list[Cell]:
     return [cell for cell in cells if cell not in there]
 
 
+def _row(line: bytes, path: Path, number: int) -> dict[str, Any]:
+    row: Any = None
+    with suppress(ValueError, RecursionError):
+        row = json.loads(line)
+    cell = row.get("cell") if isinstance(row, dict) else None
+    if not isinstance(cell, list) or not all(isinstance(value, str | int | float) for value in cell):
+        raise JaxmarkError(f"Line {number} of {path} is no row of a study; delete that line to have it done again.")
+    return row
+
+
 def _cell(row: Row) -> Cell:
     return tuple(row["cell"])
 
 
 def _append(output: Path, row: Row) -> None:
-    """Append a row by one write, and wait until it is on disk."""
-    with output.open("ab", buffering=0) as file:
-        file.write(json.dumps(row).encode() + b"\n")
-        os.fsync(file.fileno())
+    """Append a row, and wait until it is on disk; a disk that is full leaves part of a line, which is cut off later."""
+    try:
+        with output.open("ab") as file:
+            file.write(json.dumps(row).encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise JaxmarkError(f"Cannot write {output}: {error.strerror or error}.") from None

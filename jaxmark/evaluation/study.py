@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 import pickle
 import time
@@ -10,7 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 from jaxmark.alignment.alignment import Alignment, align
@@ -21,6 +21,7 @@ from jaxmark.evaluation._robustness import NOTHING, read
 from jaxmark.evaluation.cells import Cell, Pool, processes, run
 from jaxmark.evaluation.results import Results
 from jaxmark.files import load_mesh
+from jaxmark.files.reading import read_file
 from jaxmark.geometry.hashing import geometry_hash
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.budget import Budget, Visibility, make_budget
@@ -58,6 +59,10 @@ class Study:
         for name, part in {**parts, "payload": self.payloads, "seed": range(self.seeds)}.items():
             if not part:
                 raise JaxmarkError(f"A study needs at least one {name}.")
+        for name in self.attacks:
+            for strength in self._strengths(name):
+                if not (math.isfinite(strength) and strength >= 0):
+                    raise JaxmarkError(f"The strengths of {name!r} are finite and not negative, got {strength}.")
         for bits in self.payloads:
             if bits < 8 or bits % 8:
                 raise JaxmarkError(f"A payload is a positive multiple of 8 bits, got {bits}.")
@@ -260,6 +265,6 @@ def _digest(mesh: str | os.PathLike[str] | Mesh) -> str:
     if isinstance(mesh, Mesh):
         return geometry_hash(mesh).hex()
     try:
-        return hashlib.sha256(Path(mesh).read_bytes()).hexdigest()
+        return hashlib.sha256(read_file(mesh)).hexdigest()
     except OSError as error:
         raise JaxmarkError(f"Cannot read {os.fspath(mesh)}: {error.strerror}.") from None

@@ -8,6 +8,9 @@ from typing import Any
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.study import Study
+from jaxmark.files.reading import read_file
+
+_MAX_FILE_BYTES = 2**24  # of a TOML file
 
 
 def load_study(path: str | os.PathLike[str]) -> Study:
@@ -22,7 +25,7 @@ def load_study(path: str | os.PathLike[str]) -> Study:
     """
     name = os.fspath(path)
     try:
-        declared = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        declared = tomllib.loads(read_file(path, _MAX_FILE_BYTES).decode("utf-8"))
     except OSError as error:
         raise JaxmarkError(f"Cannot read {name}: {error.strerror}.") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

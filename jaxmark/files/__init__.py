@@ -12,6 +12,7 @@ import numpy as np
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import glb, obj, off, ply, stl
 from jaxmark.files.atomic import write_atomically
+from jaxmark.files.reading import read_file
 from jaxmark.files.source import Source, Texture
 from jaxmark.geometry.mesh import Mesh, host_mesh, make_mesh
 
@@ -113,7 +114,7 @@ def _read(path: str | os.PathLike) -> tuple[Source, Mesh]:
     """Read a file as its source and as a validated mesh."""
     parse = _parser(path)
     try:
-        data = Path(path).read_bytes()
+        data = read_file(path)
     except (OSError, ValueError) as error:  # ValueError for a NUL in the name
         raise JaxmarkError(f"Cannot read {os.fspath(path)}: {getattr(error, 'strerror', None) or error}.") from error
     try:

@@ -55,7 +55,8 @@ def write_atomically(path: str | os.PathLike, data: bytes, *, mode: int | None =
 def replacing(target: Path) -> Iterator[Path]:
     """Yield the path of a draft that replaces a file if the block succeeds, and is deleted if it fails.
 
-    The draft has the file's name, in a temporary folder beside it.
+    The draft has the file's name, in a temporary folder beside it. A symbolic link is followed. What is refused of the
+    draft is said of the file.
 
     Raises:
         JaxmarkError: if the file's folder does not exist, or the target is itself a folder.
@@ -64,7 +65,11 @@ def replacing(target: Path) -> Iterator[Path]:
         raise JaxmarkError(f"The folder {target.parent} does not exist.")
     if target.is_dir():
         raise JaxmarkError(f"{target} is a folder; name a file.")
-    with tempfile.TemporaryDirectory(prefix=".jaxmark-", dir=target.parent) as folder:
+    real = Path(os.path.realpath(target))
+    with tempfile.TemporaryDirectory(prefix=".jaxmark-", dir=real.parent) as folder:
         draft = Path(folder) / target.name
-        yield draft
-        draft.replace(target)
+        try:
+            yield draft
+        except JaxmarkError as error:
+            raise JaxmarkError(str(error).replace(os.fspath(draft), os.fspath(target))) from error
+        draft.replace(real)

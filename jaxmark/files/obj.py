@@ -1,6 +1,7 @@
 """Parse Wavefront OBJ."""
 
 import re
+from codecs import BOM_UTF8
 
 import numpy as np
 from jaxtyping import Int64
@@ -19,6 +20,8 @@ def parse(data: bytes) -> Source:
             not exist; the message names the line.
     """
     work = without_comments(unix(data))
+    if work.startswith(BOM_UTF8):  # some programs begin text files so
+        work = b" " * len(BOM_UTF8) + work[len(BOM_UTF8) :]
     if b"\\" in work:  # a backslash at the end of a line continues it
         work = re.sub(rb"\\\r?\n", lambda match: b" " * len(match[0]), work)
     text = Text(data, work)

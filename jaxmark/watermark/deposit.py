@@ -12,11 +12,12 @@ import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files.reading import read_file
 from jaxmark.watermark.record import Record
 
+_MAX_FILE_BYTES = 2**30  # of a record of some hundred million points, or as many digests
 _FORMAT = "jaxmark-deposit"
 
 # TimeStampReq of RFC 3161, in DER: version 1, a SHA-256 imprint of 32 bytes, and the wish for the authority's
@@ -72,7 +73,7 @@ class Deposit:
             JaxmarkError: if the file cannot be read, is no deposit, or its root is not that of its digests.
         """
         try:
-            data = json.loads(Path(path).read_text(encoding="utf-8"))
+            data = json.loads(read_file(path, _MAX_FILE_BYTES))
             found = make_deposit(data["digests"])
             if data["format"] == _FORMAT and data["root"] == found.root:
                 return found

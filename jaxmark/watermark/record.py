@@ -12,15 +12,16 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files.reading import read_file
 from jaxmark.geometry.imprint import Imprint
 from jaxmark.watermark.coding.keys import KEY_BYTES, SCHEME_VERSION, VERSIONS, Choices, Key, canonical_json, commitment
 
+_MAX_FILE_BYTES = 2**30  # of a record of some hundred million points, or as many digests
 _FORMAT = "jaxmark-record"
 _READERS = {"message": "detect", "fingerprint": "identify"}  # the function that reads each content
 RECORD_SUFFIX = ".jaxmark.json"  # is appended to the name of the marked file
@@ -126,7 +127,7 @@ class Record:
             JaxmarkError: if the file cannot be read, is no record, or has a version that this jaxmark does not know.
         """
         try:
-            data = json.loads(Path(path).read_text(encoding="utf-8"))
+            data = json.loads(read_file(path, _MAX_FILE_BYTES))
         except OSError as error:
             raise JaxmarkError(f"The record {path} cannot be read: {error.strerror}.") from None
         except (ValueError, RecursionError):

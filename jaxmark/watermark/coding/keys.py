@@ -11,17 +11,18 @@ import os
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Int8, Int64
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files.reading import read_file
 
 SCHEME_VERSION = 2  # version of the keyed choices of new marks
 VERSIONS = (2, 1)  # versions that are read, the newest first
 KEY_BYTES = 32
+_MAX_FILE_BYTES = 4096  # of a key file, which has 65
 
 
 class Key(bytes):
@@ -65,8 +66,14 @@ def save_key(key: bytes, path: str | os.PathLike[str]) -> None:
         raise JaxmarkError(f"{path} exists; a key file is never overwritten. Choose another name.") from None
     except OSError as error:
         raise JaxmarkError(f"The key file {path} cannot be written: {error.strerror}.") from None
-    with os.fdopen(descriptor, "w") as file:
-        file.write(secret.hex() + "\n")
+    try:
+        with os.fdopen(descriptor, "w") as file:
+            file.write(secret.hex() + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:  # an empty file would stand in the way of the next try
+        os.unlink(path)  # noqa: PTH108
+        raise JaxmarkError(f"The key file {path} cannot be written: {error.strerror}.") from None
 
 
 def load_key(path: str | os.PathLike[str]) -> Key:
@@ -76,7 +83,7 @@ def load_key(path: str | os.PathLike[str]) -> Key:
         JaxmarkError: if the file cannot be read or does not hold 64 hexadecimal digits (the error does not show them).
     """
     try:
-        text = Path(path).read_text(encoding="ascii")
+        text = read_file(path, _MAX_FILE_BYTES).decode("ascii")
     except OSError as error:
         raise JaxmarkError(f"The key file {path} cannot be read: {error.strerror}.") from None
     except UnicodeDecodeError:

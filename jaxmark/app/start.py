@@ -1,0 +1,13 @@
+"""The command `jaxmark`, which may be interrupted while the library is still being imported."""
+
+import sys
+
+
+def main() -> None:
+    """Run the command line."""
+    try:
+        from jaxmark.app.cli import main as run
+    except KeyboardInterrupt:
+        sys.stderr.write("jaxmark: Interrupted.\n")
+        sys.exit(2)
+    run()

@@ -1,0 +1,27 @@
+"""Read whole files that end."""
+
+import errno
+import os
+from pathlib import Path
+
+
+def read_file(path: str | os.PathLike, most: int | None = None) -> bytes:
+    """Read all bytes of an ordinary file; a device or a pipe, which may never end, is refused.
+
+    Args:
+        path: the file; symbolic links are followed.
+        most: the largest number of bytes that make sense.
+
+    Raises:
+        OSError: if it cannot be read, is no ordinary file, or is larger than that.
+        ValueError: if its name holds a NUL.
+    """
+    target = Path(path)
+    found = target.stat()  # raises where there is nothing
+    if target.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
+    if not target.is_file():
+        raise OSError(errno.EINVAL, "it is no ordinary file; write its content to one", os.fspath(path))
+    if most is not None and found.st_size > most:
+        raise OSError(errno.EFBIG, f"it has {found.st_size} bytes, more than {most}", os.fspath(path))
+    return target.read_bytes()
