@@ -219,7 +219,7 @@ def graph_laplacian(
         pairs: the edges, each once, none from a vertex to itself.
         size: number of vertices.
         weights: finite and not negative; all 1 unless given.
-        lowering: see `jaxmark.spectral.from_mesh`.
+        lowering: see `jaxmark.spectral.graphs.from_mesh`.
     """
     degree = np.bincount(pairs.ravel(), None if weights is None else np.repeat(weights, 2), size).astype(np.float64)
     neighbours = None

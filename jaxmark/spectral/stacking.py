@@ -23,7 +23,7 @@ def stack(operators: Sequence[Laplacian]) -> Laplacian:
             segment-sums otherwise.
 
     Returns:
-        The batch; `jax.tree.map(lambda leaf: leaf[i], batch)` is the i-th operator, filled up.
+        The batch, of which `jax.tree.map(lambda leaf: leaf[i], batch)` is the operator number i, filled up.
 
     Raises:
         JaxmarkError: if there is no operator.

@@ -37,7 +37,7 @@ def cotangent_weights(vertices: Positions, faces: Faces) -> Float[Array | np.nda
         faces: `[F, 3]`, concrete.
 
     Returns:
-        `[E]`, in the order of `jaxmark.geometry.edges`; none is positive if no cotangent is.
+        `[E]`, in the order of `jaxmark.geometry.mesh.edges`; none is positive if no cotangent is.
     """
     xp = vertices.__array_namespace__()
     pairs, (ends, apex), base = edges(faces), sides(faces), np.array([len(vertices), 1])
