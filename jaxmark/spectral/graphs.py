@@ -43,8 +43,8 @@ def from_mesh(
         mesh: any mesh, its faces concrete; boundary edges, edges of three faces or more, and several components are
             well defined.
         weights: `"valence"`, each edge 1, so that w_ij = 1/d(v_i) as in the paper; `"inverse-length"`, 1 over the
-            edge's length; `"cotangent"`, see `jaxmark.spectral.weights.cotangent_weights`; or an array `[E]` of non-negative
-            weights, in the order of `jaxmark.geometry.mesh.edges`.
+            edge's length; `"cotangent"`, see `jaxmark.spectral.weights.cotangent_weights`; or an array `[E]` of
+            non-negative weights, in the order of `jaxmark.geometry.mesh.edges`.
         mass: the lumped mass M of the generalised problem (D - W)x = λMx: `"areas"`, see
             `jaxmark.spectral.weights.vertex_areas`, or `[N]`. By default M = D.
         bound: with a mass, a bound of λ; filters are functions of 2λ/bound. By default 1 % above the largest λ, which

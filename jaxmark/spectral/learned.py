@@ -77,9 +77,9 @@ def cheb_conv(
 ) -> Float[Array, "vertices outputs"]:
     """Convolve a signal: y = Σ_k T_k(Δ - I) x W_k + b, by `degree` products with Δ and one `lax.scan`.
 
-    It takes O(N) memory at any degree, and so do its derivatives, which are as those of `jaxmark.spectral.chebyshev.filter`: x̄ is
-    a convolution with the transposed weights, since Δ is self-adjoint, and W̄_k = (T_k x)ᵀȳ is computed by running the
-    recurrence again.
+    It takes O(N) memory at any degree, and so do its derivatives, which are as those of
+    `jaxmark.spectral.chebyshev.filter`: x̄ is a convolution with the transposed weights, since Δ is self-adjoint, and
+    W̄_k = (T_k x)ᵀȳ is computed by running the recurrence again.
 
     The weights of a `ChebConv` of PyTorch Geometric, trained with its default normalisation, serve in the symmetric
     form as `{"weight": [lin.weight.T for lin in layer.lins], "bias": layer.bias}`, stacked as NumPy arrays; those
