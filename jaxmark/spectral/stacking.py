@@ -15,15 +15,15 @@ def stack(operators: Sequence[Laplacian]) -> Laplacian:
     """Stack operators of any sizes into one whose arrays have a leading axis, on the host.
 
     `jax.vmap(spectral.filter, (0, None, 0))(stack(operators), coefficients, signals)` filters all in one call that is
-    compiled once, with signals `[operators, N]` or `[operators, N, C]` for the largest N. Smaller graphs are filled up
-    by isolated vertices, which move nothing: what a signal has there is of no consequence to the others.
+    compiled once, with signals `[batch, N]` or `[batch, N, C]` for the largest N. Smaller graphs are filled up by
+    isolated vertices, which move nothing: what a signal has there is of no consequence to the others.
 
     Args:
         operators: one or more. Products are by table where all have tables alike, with or without weights, and by
             segment-sums otherwise.
 
     Returns:
-        The batch, of which `jax.tree.map(lambda leaf: leaf[i], batch)` is the operator number i, filled up.
+        The batch; `jax.tree.map` with `lambda leaf: leaf[0]` takes its first operator, filled up.
 
     Raises:
         JaxmarkError: if there is no operator.
