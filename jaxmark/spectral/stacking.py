@@ -23,7 +23,7 @@ def stack(operators: Sequence[Laplacian]) -> Laplacian:
             segment-sums otherwise.
 
     Returns:
-        The batch; `jax.tree.map` with `lambda leaf: leaf[0]` takes its first operator, filled up.
+        The batch, from which `jax.tree.map` takes operators out one by one, filled up as they are.
 
     Raises:
         JaxmarkError: if there is no operator.
