@@ -168,11 +168,11 @@ pictures.p_values({"best of 50 keys": best, "best of 50, Gaussian": estimate, "b
 #
 # The proof needs a suspect that is independent of the key. A mesh that was marked *with that key* is not, whatever its
 # message: codewords of two messages agree in more or fewer of their bits, and the score of the wrong one gets its share
-# of the mark. So two thousand wrong messages are claimed in the very copy with the right one:
+# of the mark. So six thousand wrong messages are claimed in the very copy with the right one:
 
 # %%
 random = np.random.default_rng(0)
-lies = [(key_of(0), random.bytes(8)) for _ in range(2000)]
+lies = [(key_of(0), random.bytes(8)) for _ in range(6000)]
 same_key = bound(marked, lies)
 print(f"below 1e-3: {np.sum(same_key <= -3)} of {len(same_key)} wrong messages, the smallest 1e{same_key.min():.1f}")
 assert clopper_pearson(int(np.sum(same_key <= -3)), len(same_key), 0.999).low > 1e-3
