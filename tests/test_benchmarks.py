@@ -117,7 +117,7 @@ def test_a_stage_is_measured_in_a_process_from_a_copy(copy: Path, afresh, monkey
 @pytest.mark.parametrize(
     "program",
     [
-        ["security/forging.py", "--keys", "2", "--bands", "64", "--tries", "200"],
+        ["security/forging.py", "--keys", "1", "--bands", "64", "--tries", "50"],
         ["robustness/originals.py"],
     ],
     ids=["forging", "originals"],
