@@ -307,3 +307,18 @@ def test_meshes_of_different_faces_are_attacked_each_by_itself(sphere: Mesh, cap
         np.testing.assert_array_equal(one.vertices, jm.attack(mesh, "noise", 0.01, seed=seed).vertices)
     with pytest.raises(jm.JaxmarkError, match="strength of an attack"):
         attack_each([sphere], "noise", -1.0, seeds=[1])
+
+
+def test_attacks_of_the_host_refuse_to_be_traced_by_name():
+    mesh = bumpy_sphere(1)
+    for entry in ATTACKS.values():
+        if not entry.host:
+            continue
+
+        def traced(vertices, entry=entry):
+            return entry.apply(Mesh(vertices, mesh.faces), entry.strengths[0], None).vertices.sum()
+
+        with pytest.raises(jm.JaxmarkError, match=f"^{entry.apply.__name__} runs on the host"):
+            jax.grad(traced)(jnp.asarray(mesh.vertices))
+    with pytest.raises(jm.JaxmarkError, match="runs on the host"):
+        jax.jit(lambda v: jm.attack(Mesh(v, mesh.faces), "noise", 0.1, seed=0).vertices)(jnp.asarray(mesh.vertices))

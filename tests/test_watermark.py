@@ -1,3 +1,5 @@
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ import jaxmark as jm
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.laplacian import centre
-from jaxmark.watermark.bits import detect_bits, embed_bits
+from jaxmark.watermark.bits import detect_bits, embed_bits, log_evidence
 from jaxmark.watermark.carriers import ModulatedCarrier, host_bands
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.sequences import orthogonal_sequences
@@ -125,3 +127,25 @@ def test_the_completed_bound_3_holds(seed, x64):
     assert (np.abs(scores) >= bound - 1e-12).all()
     assert bound.max() > 0  # not vacuous here
     assert np.asarray(correlation_bound(jnp.asarray(sequences), jnp.asarray(attack), 0.9, beta)).max() < 0
+
+
+def test_evidence_is_what_a_detection_says(x64):
+    """The pure function in nats, against the bound that is printed, which pays for other ways to align and to claim."""
+    marker = jm.make_marker(bumpy_sphere(3), jm.Key(bytes(32)), bits=16)
+    marked, _ = marker.embed(b"ok", 4e-4, noise=0, read_back=False)
+    suspect = jm.attack(marked, "noise", 0.006, seed=0)
+    original = marker.original
+    moved = (np.asarray(suspect.vertices) - original.mesh.vertices)[original.weld.first] / original.diagonal
+    x = jnp.asarray(original.signal)
+    seen = marker.observe(suspect)
+    word = jnp.asarray(marker.codeword(b"ok"), x.dtype)
+
+    def nats(residual):
+        return log_evidence(x + residual, x, marker.reader.carrier, word, weights=seen.weights)
+
+    said = marker.detect(suspect, b"ok").log10_p
+    assert -60 < said < -3
+    assert nats(seen.residual) == pytest.approx(-math.log(10) * (said + 2 * math.log10(0.97)), rel=1e-3)
+    along = jnp.asarray(original.to_traced(moved))
+    slope = jax.jvp(nats, (seen.residual,), (along,))[1]
+    assert jnp.vdot(jax.grad(nats)(seen.residual), along) == pytest.approx(float(slope), rel=1e-3)
