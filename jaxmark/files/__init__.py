@@ -1,44 +1,74 @@
-"""Read and write mesh files: OBJ, PLY, OFF, STL and GLB.
+"""Read and write mesh files: OBJ, PLY, OFF, STL, GLB and glTF.
 
-A mesh is saved by patching the file that it was loaded from: whatever is no position or normal stays byte for byte.
+A file is saved by patching the one that it was loaded from: whatever is no position or normal stays byte for byte.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Int64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import glb, obj, off, ply, stl
-from jaxmark.files.atomic import write_atomically
-from jaxmark.files.reading import read_file
-from jaxmark.files.source import Source, Texture
+from jaxmark.files import gltf, obj, off, ply, stl
+from jaxmark.files.atomic import write_atomically, write_together
+from jaxmark.files.reading import read_beside, read_file
+from jaxmark.files.source import Patched, Source, Texture
 from jaxmark.geometry.mesh import Mesh, host_mesh, make_mesh
 
-__all__ = ["SUFFIXES", "load_mesh", "load_texture", "save_mesh", "write_atomically"]
+__all__ = [
+    "SUFFIXES",
+    "Scene",
+    "load_mesh",
+    "load_scene",
+    "load_texture",
+    "save_mesh",
+    "save_scene",
+    "write_atomically",
+]
 
-_FORMATS: dict[str, Callable[[bytes], Source]] = {
-    ".obj": obj.parse,
-    ".ply": ply.parse,
-    ".off": off.parse,
-    ".stl": stl.parse,
-    ".glb": glb.parse,
+# Parses a file's bytes; the second argument reads the files that it refers to.
+_Parser = Callable[[bytes, Callable[[str], bytes]], Source]
+
+
+def _alone(parse: Callable[[bytes], Source]) -> _Parser:
+    """The parser of a format whose files refer to no others."""
+    return lambda data, read: parse(data)
+
+
+_FORMATS: dict[str, _Parser] = {
+    ".obj": _alone(obj.parse),
+    ".ply": _alone(ply.parse),
+    ".off": _alone(off.parse),
+    ".stl": _alone(stl.parse),
+    ".glb": gltf.parse,
+    ".gltf": gltf.parse,
 }
 SUFFIXES = tuple(_FORMATS)
 # A file's numbers keep a displacement well enough if its RMS is at least this many times their spacing.
 _MIN_SPACINGS = 10
+_ONLY = "mesh"  # name of the mesh in a file that has just one
+
+
+class Scene(NamedTuple):
+    """The meshes of a file."""
+
+    meshes: Mapping[str, Mesh]  # by name, in the file's order, each in its own coordinates
+    left: Mapping[str, str]  # those that cannot be used, by name, and why
 
 
 def load_mesh(path: str | os.PathLike) -> Mesh:
     """Read a mesh from a file, in the format that its suffix names.
 
     Vertices are the file's own, in its order: none are merged or dropped, and isolated ones are kept. An STL file has
-    three vertices of its own for each facet. A GLB file gives the local coordinates of its one mesh; transformations of
-    nodes are not applied. Polygons are split into triangles (v0, v1, v2), (v0, v2, v3), …, for computing only.
+    three vertices of its own for each facet. A GLB or glTF file gives local coordinates; transformations of nodes are
+    not applied. Several meshes in a file follow each other as one; `load_scene` tells them apart. Polygons are split
+    into triangles (v0, v1, v2), (v0, v2, v3), …, for computing only.
 
     Args:
-        path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary) or GLB file.
+        path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary), GLB or glTF file.
 
     Returns:
         NumPy arrays: float64 vertices in the file's units, int64 faces.
@@ -46,11 +76,38 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
     Raises:
         JaxmarkError: if the file is missing, of another format, malformed, or holds no valid mesh (see `make_mesh`).
     """
-    return _read(path)[1]
+    return _whole(_read(path), path)
+
+
+def load_scene(path: str | os.PathLike) -> Scene:
+    """Read the meshes of a file: those of a GLB or glTF file, or the objects of an OBJ file.
+
+    Objects that share vertices are one mesh, and so are meshes that share positions. Instances and other nodes that
+    show the same mesh are not told apart. Files of other formats have one mesh.
+
+    Args:
+        path: see `load_mesh`.
+
+    Raises:
+        JaxmarkError: see `load_mesh`; but of several meshes, some may be invalid.
+    """
+    source = _read(path)
+    if not source.parts:
+        return Scene({_ONLY: _whole(source, path)}, {})
+    meshes: dict[str, Mesh] = {}
+    left = dict(source.left)
+    for part in source.parts:
+        try:
+            meshes[part.name] = make_mesh(source.positions[part.places], part.faces)
+        except JaxmarkError as error:
+            left[part.name] = str(error).rstrip(".")
+    if not meshes:
+        raise JaxmarkError(f"{os.fspath(path)}: " + "; ".join(f"{name}: {reason}" for name, reason in left.items()))
+    return Scene(meshes, left)
 
 
 def load_texture(path: str | os.PathLike) -> Texture:
-    """Read the texture coordinates of an OBJ or GLB file.
+    """Read the texture coordinates of an OBJ, GLB or glTF file.
 
     Args:
         path: a mesh file, see `load_mesh`.
@@ -62,7 +119,7 @@ def load_texture(path: str | os.PathLike) -> Texture:
     Raises:
         JaxmarkError: see `load_mesh`.
     """
-    found = _read(path)[0].texture()
+    found = _read(path).texture()
     return None if found is None or not np.isfinite(found).any() else found
 
 
@@ -74,7 +131,8 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | 
         path: the file to write, in the format that its suffix names. It may be the same file as `like`.
         like: the file that the mesh was loaded from. Only the numbers of vertices that moved change, their normals
             follow, and everything else stays byte for byte. Without it a new file is written: exact in OBJ and OFF,
-            in single precision in PLY, STL and GLB.
+            in single precision in PLY, STL and GLB. Files that a glTF file refers to come along: a buffer that changes
+            is named after the new file, the others are copied where they are not there already.
 
     Raises:
         JaxmarkError: if `path` has another suffix than `like`, the mesh has other faces or another number of
@@ -86,22 +144,50 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | 
     if like is None:
         from jaxmark.files.fresh import encode_new
 
-        write_atomically(path, encode_new(mesh, Path(path).suffix.lower(), parse))
+        data = encode_new(mesh, Path(path).suffix.lower(), lambda data: parse(data, read_beside(Path(path).parent)))
+        write_atomically(path, data)
         return
-    if Path(path).suffix.lower() != Path(like).suffix.lower():
-        raise JaxmarkError(
-            f"{os.fspath(path)} must have the same suffix as {os.fspath(like)}, whose bytes it takes over."
-        )
-    source, before = _read(like)
+    source = _source_of(path, like)
+    before = _whole(source, like)
     if len(mesh.vertices) != len(before.vertices) or not np.array_equal(mesh.faces, before.faces):
         raise JaxmarkError(
             f"The mesh ({len(mesh.vertices)} vertices, {len(mesh.faces)} faces) does not have the vertices and faces"
             f" of {os.fspath(like)} ({len(before.vertices)} vertices, {len(before.faces)} faces)."
         )
-    write_atomically(path, _patched(source, np.asarray(mesh.vertices), os.fspath(like)))
+    _save(source, np.asarray(mesh.vertices), path, like)
 
 
-def _parser(path: str | os.PathLike) -> Callable[[bytes], Source]:
+def save_scene(meshes: Mapping[str, Mesh], path: str | os.PathLike, *, like: str | os.PathLike) -> tuple[str, ...]:
+    """Write a file in which some meshes have other vertices.
+
+    Args:
+        meshes: meshes by their names in `load_scene`; those that are not given stay as they are.
+        path: see `save_mesh`.
+        like: the file that they were loaded from.
+
+    Returns:
+        What could not stay as it was, in sentences; mostly nothing.
+
+    Raises:
+        JaxmarkError: see `save_mesh`; also if there is no mesh of such a name.
+    """
+    source = _source_of(path, like)
+    if not source.parts:
+        if [*meshes] != [_ONLY]:
+            raise JaxmarkError(f"{os.fspath(like)} has one mesh, {_ONLY!r}, not {', '.join(map(repr, meshes))}.")
+        save_mesh(meshes[_ONLY], path, like=like)
+        return ()
+    positions = source.positions.copy()
+    parts = {part.name: part for part in source.parts}
+    for name, mesh in meshes.items():
+        part, mesh = parts.get(name), host_mesh(mesh)
+        if part is None or len(part.places) != len(mesh.vertices) or not np.array_equal(part.faces, mesh.faces):
+            raise JaxmarkError(f"{os.fspath(like)} has no mesh {name!r} with these vertices and faces.")
+        positions[part.places] = mesh.vertices
+    return _save(source, positions, path, like)
+
+
+def _parser(path: str | os.PathLike) -> _Parser:
     """The parser of the format that a path's suffix names."""
     suffix = Path(path).suffix.lower()
     if suffix not in _FORMATS:
@@ -110,36 +196,78 @@ def _parser(path: str | os.PathLike) -> Callable[[bytes], Source]:
     return _FORMATS[suffix]
 
 
-def _read(path: str | os.PathLike) -> tuple[Source, Mesh]:
-    """Read a file as its source and as a validated mesh."""
+def _read(path: str | os.PathLike) -> Source:
+    """Read a file."""
     parse = _parser(path)
     try:
         data = read_file(path)
     except (OSError, ValueError) as error:  # ValueError for a NUL in the name
         raise JaxmarkError(f"Cannot read {os.fspath(path)}: {getattr(error, 'strerror', None) or error}.") from error
     try:
-        source = parse(data)
-        return source, make_mesh(source.positions, source.faces)
+        return parse(data, read_beside(Path(path).parent))
     except JaxmarkError as error:
         raise JaxmarkError(f"{os.fspath(path)}: {error}") from error
 
 
-def _patched(source: Source, positions: np.ndarray, name: str) -> bytes:
-    """The source's bytes with new positions; refused if its numbers are too coarse for the displacement."""
-    with np.errstate(all="ignore"):
-        moved = np.abs(positions - source.positions)
-        largest = moved.max()
-        if largest == 0:
-            return source.data
-        rms = float(largest * np.sqrt(np.square(moved / largest).sum(axis=1).mean()))  # scaled: squares may overflow
+def _whole(source: Source, path: str | os.PathLike) -> Mesh:
+    """All meshes of a file as one."""
     try:
-        spacing = source.coordinates.spacing(positions)
-        if not spacing <= rms / _MIN_SPACINGS:
-            raise JaxmarkError(
-                f"The mesh differs from the file by {rms:.3g} (root mean square over the vertices, in file units),"
-                f" but the file's numbers are {spacing:.3g} apart, more than a tenth of that;"
-                f" {source.coordinates.advice(rms / _MIN_SPACINGS)}."
-            )
-        return source.patch(positions)
+        return make_mesh(source.positions, source.faces)
     except JaxmarkError as error:
-        raise JaxmarkError(f"{name}: {error}") from error
+        raise JaxmarkError(f"{os.fspath(path)}: {error}") from error
+
+
+def _source_of(path: str | os.PathLike, like: str | os.PathLike) -> Source:
+    """Read the file that another one is written like."""
+    _parser(path)
+    if Path(path).suffix.lower() != Path(like).suffix.lower():
+        raise JaxmarkError(
+            f"{os.fspath(path)} must have the same suffix as {os.fspath(like)}, whose bytes it takes over."
+        )
+    return _read(like)
+
+
+def _save(source: Source, positions: np.ndarray, path: str | os.PathLike, like: str | os.PathLike) -> tuple[str, ...]:
+    """Write a source with other positions, and the files beside it."""
+    try:
+        patched = _patched(source, positions, Path(path).stem)
+    except JaxmarkError as error:
+        raise JaxmarkError(f"{os.fspath(like)}: {error}") from error
+    beside = dict(patched.beside)
+    here, there = Path(like).parent, Path(path).parent
+    if os.path.realpath(here) != os.path.realpath(there):
+        read = read_beside(here)
+        for companion in source.companions():
+            try:
+                beside[companion] = read(companion)
+            except JaxmarkError:  # what is missing already, or lies elsewhere, is not ours to bring along
+                continue
+    write_together(path, patched.file, beside)
+    return patched.remarks
+
+
+def _patched(source: Source, positions: np.ndarray, name: str) -> Patched:
+    """The source with new positions; refused if its numbers are too coarse for the displacement."""
+    every = np.arange(len(positions))
+    any_moved = False
+    for places in [part.places for part in source.parts] or [every]:
+        any_moved |= _check_spacing(source, positions, places)
+    return source.patch(positions, name) if any_moved else Patched(source.file)
+
+
+def _check_spacing(source: Source, positions: np.ndarray, places: Int64[np.ndarray, " points"]) -> bool:
+    """Check that a mesh's numbers are fine enough for what changes; whether anything does."""
+    with np.errstate(all="ignore"):
+        moved = np.abs(positions[places] - source.positions[places])
+        largest = moved.max(initial=0.0)
+        if largest == 0:
+            return False
+        rms = float(largest * np.sqrt(np.square(moved / largest).sum(axis=1).mean()))  # scaled: squares may overflow
+    spacing = source.coordinates.spacing(positions, places)
+    if not spacing <= rms / _MIN_SPACINGS:
+        raise JaxmarkError(
+            f"The mesh differs from the file by {rms:.3g} (root mean square over the vertices, in file units),"
+            f" but the file's numbers are {spacing:.3g} apart, more than a tenth of that;"
+            f" {source.coordinates.advice(rms / _MIN_SPACINGS)}."
+        )
+    return True

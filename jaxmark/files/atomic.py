@@ -3,7 +3,7 @@
 import os
 import secrets
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -51,12 +51,55 @@ def write_atomically(path: str | os.PathLike, data: bytes, *, mode: int | None =
         raise JaxmarkError(f"Cannot write {os.fspath(path)}: {error.strerror or error}.") from error
 
 
+def write_together(path: str | os.PathLike, data: bytes, beside: Mapping[str, bytes]) -> None:
+    """Write a file and others that belong to it, all or none; those are there before the file is.
+
+    Args:
+        path: the file to write.
+        data: all of its bytes.
+        beside: the other files' bytes, by path relative to the folder of the first. None of them replaces a file.
+
+    Raises:
+        JaxmarkError: if one of them is there already, with other bytes; or see `write_atomically`.
+    """
+    folder = Path(os.path.realpath(path)).parent
+    written: list[Path] = []
+    try:
+        for name, content in beside.items():
+            target = folder / name
+            if _is_there(target, content):
+                continue
+            target.parent.mkdir(parents=True, exist_ok=True)
+            written.append(target)
+            write_atomically(target, content)
+        write_atomically(path, data)
+    except BaseException as error:
+        for target in written:
+            target.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise JaxmarkError(f"Cannot write {os.fspath(path)}: {error.strerror or error}.") from error
+        raise
+
+
+def _is_there(target: Path, content: bytes) -> bool:
+    """Whether a file is there already.
+
+    Raises:
+        JaxmarkError: if it has other bytes.
+    """
+    if not target.exists():
+        return False
+    if not target.is_file() or target.stat().st_size != len(content) or target.read_bytes() != content:
+        raise JaxmarkError(f"{target} is there already, and is another file; write into another folder.")
+    return True
+
+
 @contextmanager
 def replacing(target: Path) -> Iterator[Path]:
     """Yield the path of a draft that replaces a file if the block succeeds, and is deleted if it fails.
 
-    The draft has the file's name, in a temporary folder beside it. A symbolic link is followed. What is refused of the
-    draft is said of the file.
+    The draft has the file's name, in a temporary folder beside it; files that are written beside it there come along. A
+    symbolic link is followed. What is refused of the draft is said of the file.
 
     Raises:
         JaxmarkError: if the file's folder does not exist, or the target is itself a folder.
@@ -72,4 +115,12 @@ def replacing(target: Path) -> Iterator[Path]:
             yield draft
         except JaxmarkError as error:
             raise JaxmarkError(str(error).replace(os.fspath(draft), os.fspath(target))) from error
-        draft.replace(real)
+        others = {
+            os.fspath(file.relative_to(folder)): file.read_bytes()
+            for file in Path(folder).rglob("*")
+            if file.is_file() and file != draft
+        }
+        if others:
+            write_together(real, draft.read_bytes(), others)
+        else:
+            draft.replace(real)

@@ -2,14 +2,19 @@
 
 import re
 from codecs import BOM_UTF8
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Int64
+from scipy import sparse
+from scipy.sparse import csgraph
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.normals import Transported
-from jaxmark.files.source import Source, Texture, fan, ranges
+from jaxmark.files.source import Part, Source, Texture, fan, ranges, unique_names
 from jaxmark.files.text import Text, TextNumbers, unix, without_comments
+
+_MAX_NAME = 200  # bytes of an object's name
 
 
 def parse(data: bytes) -> Source:
@@ -49,6 +54,10 @@ def parse(data: bytes) -> Source:
         )
     triangles = fan(sizes)
     source = Source(data, coordinates, index[triangles])
+    objects = first[_keyword(text, first, b"o")]
+    if len(objects) > 1:
+        owner = np.repeat(np.searchsorted(objects, lines), sizes - 2)  # 0 before the first object
+        source.parts = _objects(text, source.faces, owner, objects, len(vertices))
     second = text.seek("/", np.minimum(slash + 1, ends), ends)
     source.texture = lambda: _texture(text, first, count, lines, sizes, slash + 1, second)
     if len(normals):
@@ -60,6 +69,49 @@ def parse(data: bytes) -> Source:
         used[(used < 0) | (used >= len(normals))] = -1  # a wrong index of a normal is no reason to refuse the file
         source.normals = Transported(numbers, used[triangles])
     return source
+
+
+def _objects(
+    text: Text,
+    faces: Int64[np.ndarray, "faces 3"],
+    owner: Int64[np.ndarray, " faces"],
+    objects: Int64[np.ndarray, " objects"],
+    size: int,
+) -> Sequence[Part]:
+    """The objects of a file, those together that share vertices; none if that leaves fewer than two.
+
+    Args:
+        text: the file.
+        faces: all faces.
+        owner: number of the object that each face is in, from 1; 0 before the first object.
+        objects: the first token of the lines that name objects.
+        size: number of vertices.
+    """
+    count = len(objects) + 1
+    links = np.repeat(owner, 3), count + faces.ravel()
+    graph = sparse.coo_array((np.ones(faces.size, np.int8), links), (count + size, count + size))
+    group = csgraph.connected_components(graph, directed=False)[1][owner]
+    groups, inverse = np.unique(group, return_inverse=True)
+    if len(groups) < 2:
+        return ()
+    order = np.argsort(inverse, kind="stable")
+    ends = np.cumsum(np.bincount(inverse))
+    starts = ends - np.bincount(inverse)
+    names = unique_names(_name(text, objects, int(owner[order[start]])) for start in starts)
+    parts = []
+    for name, start, end in zip(names, starts, ends, strict=True):
+        places, local = np.unique(faces[order[start:end]], return_inverse=True)
+        parts.append(Part(name, places, local.reshape(-1, 3)))
+    return sorted(parts, key=lambda part: int(part.places[0]))
+
+
+def _name(text: Text, objects: Int64[np.ndarray, " objects"], number: int) -> str:
+    """The name of an object: what follows on its line."""
+    if number == 0:
+        return "object 0"
+    begin = int(text.ends[objects[number - 1]])
+    line = text.buffer[begin : begin + _MAX_NAME].tobytes().splitlines()
+    return (line[0].strip().decode("utf-8", "replace") if line else "") or f"object {number}"
 
 
 def _texture(

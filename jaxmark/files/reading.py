@@ -2,7 +2,10 @@
 
 import errno
 import os
+from collections.abc import Callable
 from pathlib import Path
+
+from jaxmark.errors import JaxmarkError
 
 
 def read_file(path: str | os.PathLike, most: int | None = None) -> bytes:
@@ -25,3 +28,23 @@ def read_file(path: str | os.PathLike, most: int | None = None) -> bytes:
     if most is not None and found.st_size > most:
         raise OSError(errno.EFBIG, f"it has {found.st_size} bytes, more than {most}", os.fspath(path))
     return target.read_bytes()
+
+
+def read_beside(folder: Path) -> Callable[[str], bytes]:
+    """A function that reads files by their paths relative to a folder, and none outside of it.
+
+    It raises a `JaxmarkError`, half a sentence, for what cannot be read.
+    """
+
+    def read(path: str) -> bytes:
+        try:
+            inside = os.path.realpath(folder)
+            target = os.path.realpath(Path(inside) / path)
+            if os.path.commonpath([inside, target]) != inside:
+                raise JaxmarkError(f"the file {ascii(path)[:80]} that it refers to is outside of its folder")
+            return read_file(target)
+        except (OSError, ValueError) as error:
+            said = getattr(error, "strerror", None) or str(error)
+            raise JaxmarkError(f"the file {ascii(path)[:80]} that it refers to cannot be read: {said}") from None
+
+    return read

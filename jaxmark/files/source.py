@@ -1,7 +1,7 @@
 """Parsed mesh files, which can be written again with other positions and otherwise the same bytes."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -33,8 +33,8 @@ class Numbers(Protocol):
         """The edits that write new values; numbers that did not change are not touched."""
         ...
 
-    def spacing(self, values: Float64[np.ndarray, "rows 3"]) -> float:
-        """The largest step between neighbouring numbers that can be written at the new values."""
+    def spacing(self, values: Float64[np.ndarray, "rows 3"], rows: Int64[np.ndarray, " some"]) -> float:
+        """The largest step between neighbouring numbers that can be written at the new values of some rows."""
         ...
 
     def advice(self, step: float) -> str:
@@ -66,6 +66,22 @@ def no_texture() -> Texture:
     return None
 
 
+class Part(NamedTuple):
+    """One mesh of a file that may hold several."""
+
+    name: str  # unique in the file
+    places: Int64[np.ndarray, " points"]  # its points, as rows of the file's positions
+    faces: Int64[np.ndarray, "faces 3"]  # indices into `places`
+
+
+class Patched(NamedTuple):
+    """A file with other positions."""
+
+    file: bytes
+    beside: Mapping[str, bytes] = {}  # other files that belong to it, by path relative to its folder
+    remarks: tuple[str, ...] = ()  # what could not stay as it was
+
+
 @dataclass
 class Source:
     """One parsed file.
@@ -76,6 +92,8 @@ class Source:
         faces: `[F, 3]` zero-based indices into the positions; polygons are split into triangles.
         normals: the normals that follow the positions, if the file has any.
         texture: reads the texture coordinates of each face's corners, NaN where there are none; None without any.
+        parts: the meshes in the file that can be marked; empty if there is just one in it.
+        left: the others by name, and why they cannot.
     """
 
     data: bytes
@@ -83,6 +101,13 @@ class Source:
     faces: Int64[np.ndarray, "faces 3"]
     normals: Normals | None = None
     texture: Callable[[], Texture] = no_texture
+    parts: Sequence[Part] = ()
+    left: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def file(self) -> bytes:
+        """The file as it was read."""
+        return self.data
 
     @property
     def positions(self) -> Float64[np.ndarray, "points 3"]:
@@ -97,13 +122,31 @@ class Source:
             edits += self.normals.numbers.edits(moved)
         return edits
 
-    def patch(self, positions: Float64[np.ndarray, "points 3"]) -> bytes:
-        """The file's bytes with these positions; whatever is no coordinate or normal stays byte for byte.
+    def patch(self, positions: Float64[np.ndarray, "points 3"], name: str) -> Patched:
+        """The file with these positions; whatever is no coordinate or normal stays byte for byte.
+
+        Args:
+            positions: the new ones.
+            name: name of the file that is written, without its suffix; files beside it are named after it.
 
         Raises:
             JaxmarkError: if a position does not fit the file's number type.
         """
-        return splice(self.data, self.edits(positions))
+        return Patched(splice(self.data, self.edits(positions)))
+
+    def companions(self) -> Sequence[str]:
+        """The paths of other files that this one refers to, relative to its folder."""
+        return ()
+
+
+def unique_names(names: Iterable[str]) -> list[str]:
+    """Names of which no two are the same."""
+    count: dict[str, int] = {}
+    unique: list[str] = []
+    for name in names:
+        count[name] = count.get(name, 0) + 1
+        unique.append(name if count[name] == 1 else f"{name} #{count[name]}")
+    return unique
 
 
 def changed(old: Float64[np.ndarray, "rows 3"], new: Float64[np.ndarray, "rows 3"]) -> Bool[np.ndarray, "rows 3"]:

@@ -199,15 +199,16 @@ class TextNumbers:
         differs = read != self.values.reshape(-1)[moved]
         return [Edits(self._starts[moved[differs]], self._ends[moved[differs]], tokens[differs].tolist())]
 
-    def spacing(self, values: Float64[np.ndarray, "rows 3"]) -> float:
+    def spacing(self, values: Float64[np.ndarray, "rows 3"], rows: Int64[np.ndarray, " some"]) -> float:
         """The largest step of the last digit of numbers that change, or of double precision if that is larger."""
         style = self._style
-        moved = changed(self.values, values).reshape(-1)
-        size = np.abs(values.reshape(-1))
+        moved = changed(self.values[rows], values[rows]).reshape(-1)
+        exponent = style.exponent.reshape(-1, 3)[rows].reshape(-1)
+        size = np.abs(values[rows].reshape(-1))
         steps = [float(np.spacing(size.max(initial=0.0)))]
-        if (moved & ~style.exponent).any():
+        if (moved & ~exponent).any():
             steps.append(10.0**-style.decimals)
-        largest = size[moved & style.exponent].max(initial=0.0)
+        largest = size[moved & exponent].max(initial=0.0)
         if largest > 0:
             steps.append(float(10.0 ** (np.floor(np.log10(largest)) - style.mantissa)))
         return max(steps)

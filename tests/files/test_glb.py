@@ -80,10 +80,9 @@ def test_one_vertex_and_its_bounds_change(tmp_path: Path) -> None:
     source = written(tmp_path, "a.glb", RICH)
     text, bin_ = split(patched(source, shifted(load_mesh(source), 3, [-0.5, 0, -0.25])))
     old, _ = split(RICH)
-    smaller = old.replace('"min": [\n    5,\n    0,\n    0\n   ]', '"min": [4.5,0.0,-0.25]')
+    smaller = old.replace('"min": [\n    5,\n    0,\n    0\n   ]', '"min": [\n    4.5,\n    0.0,\n    -0.25\n   ]')
     assert smaller != old
     assert text.rstrip(" ") == smaller.rstrip(" ")
-    assert len(text) == len(old)  # there was room
     moved = bytearray(BIN)
     struct.pack_into("<3f", moved, 92, 4.5, 0, -0.25)
     assert bin_ == bytes(moved)
@@ -131,24 +130,22 @@ def _set(*path: str | int, value: Any) -> Callable[[dict[str, Any]], None]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d["meshes"].append(d["meshes"][0]), "2 meshes"),
-        (_set("meshes", value=[]), "0 meshes"),
-        (_set("nodes", 1, "mesh", value=0), "instances"),
-        (_set("meshes", 0, "primitives", 0, "mode", value=5), "mode 5"),
+        (_set("meshes", value=[]), "no meshes"),
+        (_set("meshes", 0, "primitives", 0, "mode", value=7), "mode 7"),
         (_set("accessors", 0, "sparse", value={}), "sparse"),
-        (_set("accessors", 0, "componentType", value=5122), "quantised"),
+        (_set("accessors", 0, "componentType", value=5125), "three numbers"),
         (_set("meshes", 0, "primitives", 1, "extensions", value={"KHR_draco_mesh_compression": {}}), "KHR_draco"),
         (_set("bufferViews", 2, "extensions", value={"EXT_meshopt_compression": {}}), "EXT_meshopt"),
-        (_set("buffers", 0, "uri", value="data.bin"), "external"),
+        (_set("buffers", 0, "uri", value="data.bin"), "data.bin"),
         (_set("accessors", 1, "byteOffset", value=8), "shares bytes"),
         (_set("accessors", 2, "bufferView", value=2), "does not lie|shares bytes"),
         (_set("accessors", 0, "count", value=4), "does not lie"),
-        (_set("accessors", 0, "count", value=10**15), "does not lie"),
+        (_set("accessors", 0, "count", value=10**15), "elements"),
         (_set("accessors", 0, "count", value=-1), "count"),
         (_set("accessors", 0, "bufferView", value=True), "bufferView"),
         (_set("bufferViews", 0, "byteStride", value=4), "does not lie"),
         (_set("accessors", 3, "count", value=2), "multiple of three"),
-        (_set("accessors", 3, "bufferView", value=2), "shares bytes"),
+        (_set("accessors", 3, "bufferView", value=2), "refers to vertex"),
         (_set("meshes", 0, "primitives", 0, "attributes", value={}), "POSITION"),
         (_set("meshes", 0, "primitives", 0, "attributes", "POSITION", value=99), r"accessors\[99\]"),
         (_set("meshes", 0, "primitives", value="no"), "list of objects"),

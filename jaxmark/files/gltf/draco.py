@@ -1,0 +1,173 @@
+"""Primitives that are compressed with Draco: decoded, and encoded again. Needs the extra `files`."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int64, Shaped
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.extras import require
+from jaxmark.files.gltf.document import COMPONENTS, Document, whole
+
+EXTENSION = "KHR_draco_mesh_compression"
+_POSITION_BITS = 24  # as fine as single precision
+_MAX_EXPANSION = 2_000  # numbers for each byte; Draco's best on regular meshes is some hundreds
+
+
+@dataclass
+class Compressed:
+    """The content of a compressed primitive."""
+
+    view: int  # index of the buffer view
+    ids: dict[str, int]  # of the attributes in it, by name
+    attributes: dict[str, Shaped[np.ndarray, "points width"]]  # in the component types of their accessors
+    faces: Int64[np.ndarray, "faces 3"]
+
+
+def decompress(document: Document, primitive: dict[str, Any], where: str) -> Compressed | None:
+    """Decode a primitive; None if it is not compressed.
+
+    Raises:
+        JaxmarkError: if the decoder is missing, or finds something else than the document promises.
+    """
+    extensions = primitive.get("extensions")
+    if not isinstance(extensions, dict) or EXTENSION not in extensions:
+        return None
+    extension, attributes = extensions[EXTENSION], primitive.get("attributes")
+    named = extension.get("attributes") if isinstance(extension, dict) else None
+    if not isinstance(named, dict) or not isinstance(attributes, dict) or not named.keys() <= attributes.keys():
+        raise JaxmarkError(f"The extension {EXTENSION} of {where} is damaged.")
+    view = whole(extension, "bufferView", where)
+    begin, length = document.view(view)
+    forms = {name: document.form(whole(attributes, name, where)) for name in named}
+    # What is announced must be possible, before the decoder reserves memory for it.
+    for _, width, _, count in forms.values():
+        if width * count > _MAX_EXPANSION * length:
+            raise JaxmarkError(f"{where} announces {count} points in {length} bytes.")
+    decoder = require("DracoPy", "files")
+    try:
+        found = decoder.decode(document.container.data[begin : begin + length])
+        by_id = {item["unique_id"]: np.asarray(item["data"]) for item in found.attributes}
+        faces = np.asarray(found.faces, np.int64).reshape(-1, 3)
+    except Exception as error:  # the decoder has several kinds of its own
+        raise JaxmarkError(f"{where} cannot be decoded by Draco: {error}.") from None
+    decoded, ids = {}, {}
+    for name, (dtype, width, _, count) in forms.items():
+        ids[name] = whole(named, name, where)
+        data = by_id.get(ids[name])
+        if data is None or data.reshape(len(data), -1).shape != (count, width):
+            raise JaxmarkError(f"{where} holds other numbers of {name} than the document says.")
+        decoded[name] = np.ascontiguousarray(data.reshape(count, width).astype(dtype))
+    if "POSITION" not in decoded or ((faces < 0) | (faces >= len(decoded["POSITION"]))).any():
+        raise JaxmarkError(f"{where} holds no positions, or faces of other points.")
+    return Compressed(view, ids, decoded, faces)
+
+
+def compress(
+    attributes: dict[str, Shaped[np.ndarray, "points width"]], faces: Int64[np.ndarray, "faces 3"]
+) -> tuple[bytes, dict[str, int]] | None:
+    """Encode a primitive, points and faces in their order, all but positions without loss.
+
+    Returns:
+        The bytes, and the identifiers of the attributes in them; None where the encoder cannot do that.
+    """
+    points = attributes["POSITION"]
+    others = {name: data for name, data in attributes.items() if name != "POSITION"}
+    if points.dtype.kind != "f" or any(data.dtype.kind == "i" for data in others.values()):
+        return None  # it knows no signed integers
+    ids = {"POSITION": 0, **{name: index for index, name in enumerate(others, 1)}}
+    codec = require("DracoPy", "files")
+    try:
+        coded = codec.encode(
+            points,
+            faces.astype(np.uint32),
+            quantization_bits=_POSITION_BITS,
+            preserve_order=True,
+            generic_attributes={ids[name]: data for name, data in others.items()} or None,
+        )
+        back = codec.decode(coded)
+        found = {item["unique_id"]: np.asarray(item["data"]) for item in back.attributes}
+        kept = np.array_equal(back.faces, faces) and np.array_equal(np.shape(back.points), points.shape)
+        kept &= np.array_equal(found[0], back.points)
+        for name, data in others.items():
+            kept &= np.array_equal(found[ids[name]].reshape(data.shape), data)
+    except Exception:  # whatever it does not know
+        return None
+    return (bytes(coded), ids) if kept else None
+
+
+def write(
+    document: dict[str, Any],
+    contents: list[bytes | None],
+    primitive: dict[str, Any],
+    old: Compressed,
+    attributes: dict[str, Shaped[np.ndarray, "points width"]],
+) -> bool:
+    """Write changed attributes of a compressed primitive into a document and its buffers.
+
+    The bytes that were there are overwritten, for they hold the primitive as it was.
+
+    Args:
+        document: the document to change.
+        contents: the buffers to change.
+        primitive: the primitive in that document.
+        old: what it was.
+        attributes: what it shall be.
+
+    Returns:
+        Whether it is still compressed; the encoder does not know all types.
+    """
+    view = document["bufferViews"][old.view]
+    buffer = view["buffer"]
+    begin, length = view.get("byteOffset", 0), view["byteLength"]
+    content = bytearray(contents[buffer] or b"")
+    content[begin : begin + length] = bytes(length)
+    coded = compress(attributes, old.faces)
+    if coded is not None:
+        blob, ids = coded
+        if len(blob) <= length:
+            content[begin : begin + len(blob)] = blob
+        else:
+            content += bytes(-len(content) % 4)
+            view["byteOffset"] = len(content)
+            content += blob
+        view["byteLength"] = len(blob)
+        primitive["extensions"][EXTENSION]["attributes"] = ids
+    else:
+        arrays = [(primitive["attributes"][name], data) for name, data in attributes.items()]
+        corners = old.faces.ravel()
+        if "indices" in primitive:
+            component = document["accessors"][primitive["indices"]]["componentType"]
+            arrays.append((primitive["indices"], corners.astype(COMPONENTS[component])))
+        for accessor, data in arrays:
+            rows = data.reshape(len(data), -1)
+            size = rows.shape[1] * rows.dtype.itemsize
+            stride = -(-size // 4) * 4 if data.ndim > 1 else size  # vertex attributes begin at multiples of four
+            padded = np.zeros((len(rows), stride), np.uint8)
+            padded[:, :size] = np.ascontiguousarray(rows).view(np.uint8).reshape(len(rows), -1)
+            content += bytes(-len(content) % 4)
+            new = {"buffer": buffer, "byteOffset": len(content), "byteLength": padded.size}
+            if stride != size:
+                new["byteStride"] = stride
+            document["bufferViews"].append(new)
+            document["accessors"][accessor]["bufferView"] = len(document["bufferViews"]) - 1
+            document["accessors"][accessor].pop("byteOffset", None)
+            content += padded.tobytes()
+        del primitive["extensions"][EXTENSION]
+        if not primitive["extensions"]:
+            del primitive["extensions"]
+    contents[buffer] = bytes(content)
+    return coded is not None
+
+
+def forget_unused(document: dict[str, Any]) -> None:
+    """Remove the extension from the lists of those that a document uses, if no primitive is compressed any more."""
+    for mesh in document.get("meshes", []):
+        if any(EXTENSION in primitive.get("extensions", {}) for primitive in mesh.get("primitives", [])):
+            return
+    for key in ("extensionsUsed", "extensionsRequired"):
+        if EXTENSION in document.get(key, []):
+            document[key] = [name for name in document[key] if name != EXTENSION]
+            if not document[key]:
+                del document[key]
