@@ -12,7 +12,7 @@ import jaxmark as jm
 from jaxmark.alignment.alignment import align
 from jaxmark.alignment.original import make_original
 from jaxmark.app import report
-from jaxmark.app.batch import power
+from jaxmark.app.telling import power
 from jaxmark.watermark.coding.keys import commitment
 from jaxmark.watermark.deposit import Deposit
 from tests.samples import bumpy_sphere

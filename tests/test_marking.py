@@ -65,7 +65,7 @@ def test_reading_back_means_the_message(sphere: Mesh, key: jm.Key, scheme):
     assert marker.reads(marked, MESSAGE)
     assert not marker.reads(marked, b"somebody")
     assert not marker.reads(sphere, MESSAGE)
-    with pytest.raises(jm.JaxmarkError, match="do not read back"):
+    with pytest.raises(jm.JaxmarkError, match="does not read back"):
         marker.check(sphere, MESSAGE)
 
 

@@ -1,36 +1,30 @@
 """Mark and read mesh files, one at a time."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
 
 from jaxmark import distortion
 from jaxmark.alignment.alignment import Align
 from jaxmark.alignment.original import shift_of
 from jaxmark.app.dossier import Case, file_hash, save_dossier
 from jaxmark.app.mistakes import guess_mistakes, is_original
+from jaxmark.app.programs import release_programs
 from jaxmark.app.report import save_report
+from jaxmark.app.scene import mark_scene, pick
+from jaxmark.app.telling import Told, describe, told_payload, told_survival
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import SUFFIXES, load_mesh, load_texture, save_mesh
+from jaxmark.files import SUFFIXES, load_mesh, load_scene, load_texture, save_mesh
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.budget import Visibility
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.deposit import Deposit
-from jaxmark.watermark.marking import Detection, Marker, detect_any, make_marker, make_markers
+from jaxmark.watermark.marking import Marker, detect_any, make_marker, make_markers
 from jaxmark.watermark.record import Record
+from jaxmark.watermark.scenes import SceneDetection, SceneRecord, detect_scene, load_record, pair
 from jaxmark.watermark.schemes import DEFAULT_SCHEME
 from jaxmark.watermark.tracing import make_tracer
-
-
-class Told(NamedTuple):
-    """The outcome for one file."""
-
-    answer: dict[str, Any]  # for programs: values for JSON, except that numbers may not be finite
-    said: str  # for people: one sentence
-    done: bool = True  # False if nothing was detected, or the file was refused
 
 
 def mesh_files(folder: Path) -> list[Path]:
@@ -60,8 +54,9 @@ def mark_file(
     budget: float | None = None,
     limits: Mapping[str, float] | None = None,
     visibility: Visibility | None = None,
-    noise: float,
+    noise: float | None,
     scheme: str = DEFAULT_SCHEME,
+    meshes: Sequence[str] = (),
 ) -> Told:
     """Mark a mesh file, and write the marked file and its record, both or neither.
 
@@ -70,26 +65,49 @@ def mark_file(
         marked: path of the marked file, with the same suffix.
         record: path of the mark's record.
         key: the key to mark with.
-        message: the message to write; None if `recipient` is given.
+        message: the message to write, empty for a presence mark; None if `recipient` is given.
         recipient: identifier of the recipient of this copy; None if `message` is given.
         budget: see `embed`.
         limits: see `embed`.
         visibility: see `embed`.
         noise: see `embed`.
         scheme: name of the scheme.
+        meshes: names of the meshes to mark, of several in the file; by default all that can carry the message.
 
     Raises:
         JaxmarkError: see `embed`; also if the mark does not read from the written file, whose numbers are rounded.
     """
-    mesh = load_mesh(original)
     if (message is None) == (recipient is None):
-        raise JaxmarkError("Give either --message or --recipient.")
-    marker = None
+        raise JaxmarkError("Give --message, --presence or --recipient, one of them.")
+    scene = pick(load_scene(original), meshes, original)
+    if len(scene.meshes) + len(scene.left) > 1:
+        if message is None:
+            raise JaxmarkError("Fingerprints are for files of one mesh; save the meshes of this one apart.")
+        try:
+            return mark_scene(
+                original,
+                marked,
+                record,
+                scene,
+                message,
+                key=key,
+                budget=budget,
+                limits=limits,
+                visibility=visibility,
+                noise=noise,
+                scheme=scheme,
+            )
+        except JaxmarkError:
+            # The objects of an OBJ file lie in the same coordinates, and together they may carry what none can alone.
+            if original.suffix.lower() != ".obj" or meshes:
+                raise
+    mesh = load_mesh(original)
+    marker, survives = None, None
     if message is not None:
         marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
         result, info = marker.embed(message, budget, limits=limits, visibility=visibility, noise=noise, read_back=False)
         prepared = marker.original
-        said, reads = f"{info.record.bits} bits", lambda mesh: marker.reads(mesh, message)
+        said, reads = told_payload(info.record.bits), lambda mesh: marker.reads(mesh, message)
     else:
         if scheme != DEFAULT_SCHEME:
             raise JaxmarkError(f"Fingerprints are carried by the scheme {DEFAULT_SCHEME!r}, not {scheme!r}.")
@@ -108,6 +126,8 @@ def mark_file(
                 f"Rounded to the numbers of {original}, the mark no longer reads; use a larger budget, or a file with"
                 " more digits."
             )
+        if marker is not None and message is not None:
+            survives = marker.tried(written, message, info.survives)
         write_atomically(record_draft, info.record.to_json().encode())
     texture = load_texture(original)
     drift = None if texture is None else distortion.texture_drift(mesh, written, texture)
@@ -118,11 +138,14 @@ def mark_file(
         "bits": info.record.bits,
         "scheme": info.record.scheme,
         "content": info.record.content,
+        "survives": None if survives is None else survives._asdict(),
         "texture_drift": drift,
         "record": str(record),
         "marked": str(marked),
     }
     text = f"{said} → {marked}, RMS {change.rms:.3g} and max {change.max:.3g} of the diagonal; record → {record}"
+    if survives is not None:
+        text += f"; it survives {told_survival(survives)}"
     if drift is not None:
         text += f"; a texture of 2,048 x 2,048 drifts by {drift:.2g} texels"
     return Told(answer, text)
@@ -141,7 +164,8 @@ class FileReader:
     deposit: Deposit | None = None  # that holds the records' digests
     obtained: str = ""  # when and where the suspects were got
     guesses: bool = True  # whether to look for a mistake where nothing is detected, which takes several times as long
-    _last: tuple[tuple[Path, Path | None], list[Marker]] | None = field(default=None, init=False, repr=False)
+    meshes: Sequence[str] = ()  # names of the original's meshes to read; by default all
+    _last: tuple[tuple[Path, str | None], list[Marker]] | None = field(default=None, init=False, repr=False)
 
     def read(
         self,
@@ -163,8 +187,16 @@ class FileReader:
         Raises:
             JaxmarkError: see `detect`; also if the record is not in the deposit, or a dossier is asked for an estimate.
         """
-        mesh = load_mesh(suspect)
-        markers = self._markers(original, record, mesh)
+        known = None if record is None else load_record(record)
+        if known is not None and self.scheme not in (None, scheme_of(known)):
+            raise JaxmarkError(f"--scheme {self.scheme} contradicts the record, which says {scheme_of(known)}.")
+        case = self._case(suspect, original, known)
+        if isinstance(case, SceneDetection):
+            if report is not None or dossier is not None:
+                raise JaxmarkError("Reports and dossiers are about one mesh; pick it by --mesh.")
+            return self._tell_scene(case, known, suspect)
+        mesh, original_mesh, known = case
+        markers = self._markers(original_mesh, original, known, mesh)
         found = detect_any(markers, mesh, self.message, align=self.how)
         marker = next(marker for marker in markers if marker.choices.version == found.version)
         aligned = found.alignment
@@ -220,42 +252,92 @@ class FileReader:
             answer["dossier"] = str(dossier)
         return Told(answer, describe(found, detected, self.alpha, dated, remarks), detected)
 
-    def _markers(self, original: Path, record_file: Path | None, suspect: Mesh) -> list[Marker]:
-        if self._last is None or self._last[0] != (original, record_file):
-            record = None if record_file is None else Record.load(record_file)
-            if record is not None and self.scheme not in (None, record.scheme):
-                raise JaxmarkError(f"--scheme {self.scheme} contradicts the record, which says {record.scheme}.")
+    def _case(
+        self, suspect: Path, original: Path, record: Record | SceneRecord | None
+    ) -> tuple[Mesh, Mesh, Record | None] | SceneDetection:
+        """What is to be read: a suspect's mesh, the original's and its record; or several, which are read at once."""
+        if isinstance(record, Record):  # of the whole file
+            return load_mesh(suspect), load_mesh(original), record
+        originals = pick(load_scene(original), self.meshes, original).meshes
+        if record is not None:
+            picked = {name: one for name, one in record.meshes.items() if not self.meshes or name in self.meshes}
+            if not picked:
+                raise JaxmarkError(f"The record is of {', '.join(map(repr, record.meshes))}, none of which was picked.")
+            record = SceneRecord(picked)
+            originals = {name: mesh for name, mesh in originals.items() if name in picked}
+        suspects = load_scene(suspect).meshes
+        if len(originals) == 1:
+            ((name, mesh),) = originals.items()
+            other = pair(originals, suspects).get(name)
+            found = load_mesh(suspect) if other is None else suspects[other]
+            return found, mesh, None if record is None else record.meshes[name]
+        return detect_scene(
+            suspects,
+            originals=originals,
+            key=self.key,
+            record=record,
+            bits=self.bits,
+            message=self.message,
+            scheme=self.scheme or DEFAULT_SCHEME,
+            how=self.how,
+            after=release_programs,
+        )
+
+    def _tell_scene(self, found: SceneDetection, record: Record | SceneRecord | None, suspect: Path) -> Told:
+        """Tell what the meshes of a file prove."""
+        united, detected = found.united, found.detected(self.alpha)
+        answer = {
+            "detected": detected,
+            "log10_p": united.log10_p,
+            "log10_p_undated": united.log10_p_undated,
+            "log10_p_fitted": united.log10_p_fitted,
+            "proof": not united.doubts,
+            "doubts": list(united.doubts),
+            "remarks": list(united.remarks),
+            "version": united.version,
+            "suspect_sha256": file_hash(suspect),
+            "obtained": self.obtained or None,
+            "message": None if united.message is None else united.message.hex(),
+            "meshes": {
+                name: {
+                    "detected": one.detected(self.alpha),
+                    "log10_p": one.log10_p,
+                    "message": None if one.message is None else one.message.hex(),
+                    "coverage": one.coverage,
+                    "method": one.alignment.method,
+                    "residual": one.alignment.residual,
+                }
+                for name, one in found.meshes.items()
+            },
+            "left": dict(found.left),
+        }
+        dated = None
+        if record is not None:
+            answer["record_digest"] = record.digest()
+            if self.deposit is not None:
+                dated = self.deposit.log10_p(united.log10_p, record, claimed=self.message is not None)
+                answer["log10_p_deposited"] = dated
+        alone = sum(one.detected(self.alpha) for one in found.meshes.values())
+        remarks = [*united.remarks, f"{alone} of {len(found.meshes) + len(found.left)} meshes prove it alone."]
+        return Told(answer, describe(united, detected, self.alpha, dated, remarks), detected)
+
+    def _markers(self, mesh: Mesh, original: Path, record: Record | None, suspect: Mesh) -> list[Marker]:
+        place = original, None if record is None else record.digest()
+        if self._last is None or self._last[0] != place:
             bits = self.bits
             if bits is None and record is None and self.message is not None:
                 bits = 8 * len(self.message)
             scheme = self.scheme or DEFAULT_SCHEME
-            mesh = load_mesh(original)
             try:
                 markers = make_markers(mesh, self.key, bits=bits, record=record, scheme=scheme)
             except JaxmarkError as error:
                 if record is not None and is_original(suspect, record, self.key):
                     raise JaxmarkError(f"{error} The suspect is that mesh: exchange the two files.") from None
                 raise
-            self._last = (original, record_file), markers
+            self._last = place, markers
         return self._last[1]
 
 
-def power(log10_p: float) -> str:
-    """A bound as a power of ten, which rounding makes no smaller."""
-    return f"10^{math.ceil(10 * log10_p - 1e-9) / 10 + 0.0:.1f}"
-
-
-def describe(found: Detection, detected: bool, alpha: float, dated: float | None, remarks: Sequence[str]) -> str:
-    """What was found, in words."""
-    read = f"message {found.message.hex()}" if found.message is not None else "no message could be read"
-    said = f"{'detected' if detected else 'nothing detected'}: {read}; "
-    if found.doubts:
-        said += f"false-positive probability about {power(found.log10_p)}, an estimate: {'; '.join(found.doubts)}"
-    else:
-        said += (
-            f"false-positive probability at most {power(found.log10_p)} if key, original, message and record were fixed"
-            f" before the suspect existed, {power(found.log10_p_undated)} if nothing dates them"
-        )
-        if dated is not None:
-            said += f", {power(dated)} if the deposit is older than the suspect"
-    return " ".join([f"{said} (--alpha {alpha:g})", *remarks])
+def scheme_of(record: Record | SceneRecord) -> str:
+    """Name of the scheme of a record."""
+    return record.scheme if isinstance(record, Record) else next(iter(record.meshes.values())).scheme

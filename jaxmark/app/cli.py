@@ -19,12 +19,14 @@ import click
 
 from jaxmark import distortion
 from jaxmark.alignment.alignment import Align
-from jaxmark.app.batch import FileReader, Told, mark_file, mesh_files, power
+from jaxmark.app.batch import FileReader, mark_file, mesh_files
+from jaxmark.app.programs import release_programs
+from jaxmark.app.telling import Told, power
 from jaxmark.attacks import ATTACKS, chain, get_attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.study_file import load_study
 from jaxmark.extras import require
-from jaxmark.files import load_mesh, save_mesh
+from jaxmark.files import load_mesh, load_scene, save_mesh, save_scene
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import same_connectivity
 from jaxmark.watermark.budget import VISIBILITY, Visibility, make_budget
@@ -32,6 +34,7 @@ from jaxmark.watermark.coding.keys import Key, commitment, load_key, new_key, sa
 from jaxmark.watermark.deposit import Deposit, make_deposit
 from jaxmark.watermark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity
 from jaxmark.watermark.record import RECORD_SUFFIX, Record
+from jaxmark.watermark.scenes import load_record
 from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES
 from jaxmark.watermark.tracing import identify
 
@@ -82,6 +85,9 @@ _NOISE = click.option(
     show_default=True,
     help="Noise that the message must survive: half width, relative to the mean distance of vertices to the centre.",
 )
+_MESHES = click.option(
+    "--mesh", "meshes", multiple=True, help="Of a file of several meshes, one to use, by name; may be repeated."
+)
 _ALIGN = click.option(
     "--align",
     "how",
@@ -131,7 +137,7 @@ def cli() -> None:
       jaxmark attack marked.ply suspect.ply noise 0.001
       jaxmark detect suspect.ply --original model.ply --key owner.key
 
-    Meshes are OBJ, PLY, OFF, STL or GLB. Keep the key secret, and keep the original: detection needs both.
+    Meshes are OBJ, PLY, OFF, STL, GLB or glTF. Keep the key secret, and keep the original: detection needs both.
     """  # noqa: D301
 
 
@@ -153,11 +159,18 @@ def keygen(keyfile: Path, as_json: bool) -> None:
 @click.argument("marked", type=_MESH)
 @_KEY
 @click.option("--message", type=_Hexadecimal(), help="Hexadecimal digits; 16 of them are 64 bits.")
+@click.option("--presence", is_flag=True, help="Instead of a message: say nothing but that the mark is there.")
 @click.option("--recipient", help="Instead of a message: the recipient of this copy, for `jaxmark identify`.")
 @_BUDGET
 @_LIMIT
 @_VISIBILITY
-@_NOISE
+@click.option(
+    "--noise",
+    type=float,
+    help="Noise that the message must survive with half of the vertices lost: half width, relative to the mean distance"
+    " of vertices to the centre.  [default: none; what it survives is told]",
+)
+@_MESHES
 @click.option(
     "--scheme",
     type=click.Choice(list(SCHEMES)),
@@ -172,11 +185,13 @@ def embed_command(
     marked: Path,
     key_file: Path,
     message: bytes | None,
+    presence: bool,
     recipient: str | None,
     budget: float | None,
     limits: tuple[tuple[str, float], ...],
     visibility: Visibility | None,
-    noise: float,
+    noise: float | None,
+    meshes: tuple[str, ...],
     scheme: str,
     record_file: Path | None,
     as_json: bool,
@@ -186,17 +201,22 @@ def embed_command(
     Only positions change (and normals, where the file has them); materials, colours, groups and comments stay byte by
     byte. A record is written beside MARKED: it holds no secret, and with it nothing about the mark needs remembering.
 
+    Of a file of several meshes, all are marked that can carry the message; the others are left alone and named.
+
     For a folder, each file gets a line of output, and a refused file does not stop the others.
     """
+    if presence and message is not None:
+        raise JaxmarkError("Give either --message or --presence.")
     mark = partial(
         mark_file,
-        message=message,
+        message=b"" if presence else message,
         recipient=recipient,
         budget=budget,
         limits=dict(limits) or None,
         visibility=visibility,
         noise=noise,
         scheme=scheme,
+        meshes=meshes,
     )
     _check_distinct(original=original, marked=marked)
     if not original.is_dir():
@@ -223,12 +243,14 @@ def embed_command(
     type=_Hexadecimal(),
     help="A message that you claim is there; it can be proven even where it cannot be read.",
 )
+@click.option("--presence", is_flag=True, help="Claim that a presence mark is there; its record says so, too.")
 @click.option(
     "--record",
     "record_file",
     type=_MESH,
     help="The mark's record, which gives scheme and payload, and binds key and original.",
 )
+@_MESHES
 @click.option(
     "--scheme",
     type=click.Choice(list(SCHEMES)),
@@ -247,7 +269,9 @@ def detect_command(
     key_file: Path,
     bits: int | None,
     message: bytes | None,
+    presence: bool,
     record_file: Path | None,
+    meshes: tuple[str, ...],
     scheme: str | None,
     how: Align,
     deposit_file: Path | None,
@@ -263,6 +287,9 @@ def detect_command(
     made without the key, as long as key, original, record and a claimed message were fixed before it existed. A second
     figure is for claims that nothing dates; a deposit dates them.
 
+    Of files of several meshes, each mesh is compared with the one that looks like it, and what all of them prove is
+    united.
+
     With its record, an original will do as you have it now: saved again in another format, rounded, moved, reordered.
 
     For a folder, each file gets a line of output, and the exit status is the worst of all. --original and --record may
@@ -271,8 +298,19 @@ def detect_command(
     deposit = None if deposit_file is None else Deposit.load(deposit_file)
     if deposit is not None and record_file is None:
         raise JaxmarkError("A deposit dates records: give the --record that is in it, too.")
+    if presence and (message is not None or bits):
+        raise JaxmarkError("A presence mark has no message; leave out --message and --bits, or --presence.")
     reader = FileReader(
-        _key(key_file), bits, message, scheme, how, alpha, deposit, obtained, guesses=not suspect.is_dir()
+        _key(key_file),
+        0 if presence else bits,
+        message,
+        scheme,
+        how,
+        alpha,
+        deposit,
+        obtained,
+        guesses=not suspect.is_dir(),
+        meshes=meshes,
     )
     if suspect.is_dir():
         _each(
@@ -360,7 +398,7 @@ def deposit_command(records: tuple[Path, ...], output: Path, as_json: bool) -> N
     keep the answer. `jaxmark detect --deposit OUTPUT` then counts a dated claim in full, less log10 of their number.
     """
     _check_distinct(output=output, **{f"record {place}": path for place, path in enumerate(records)})
-    found = make_deposit(Record.load(path).digest() for path in records)
+    found = make_deposit(load_record(path).digest() for path in records)
     request = output.with_name(output.name + ".tsq")
     with replacing(request) as draft:
         write_atomically(draft, found.timestamp_request())
@@ -395,6 +433,9 @@ def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int
     steps = _steps(words)
     _check_outputs(source, target)
     _check_distinct(IN=source, OUT=target)
+    scene = load_scene(source)
+    if len(scene.meshes) > 1 and source.suffix.lower() != ".obj":  # whose objects lie in the same coordinates
+        return _attack_scene(source, target, steps, seed, as_json)
     mesh = load_mesh(source)
     with replacing(target) as draft:
         attacked = chain(mesh, steps, seed=seed)
@@ -406,6 +447,23 @@ def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int
     size = f"{len(attacked.vertices)} vertices and {len(attacked.faces)} faces"
     how = f"RMS {change['rms']:.3g} of the diagonal" if same else f"a mesh of {size}"
     _answer(as_json, {**answer, **change}, f"{said} → {target}, {how}")
+
+
+def _attack_scene(source: Path, target: Path, steps: list[tuple[str, float]], seed: int, as_json: bool) -> None:
+    """Attack each mesh of a file; they keep their connectivity, as their file has it."""
+    meshes = load_scene(source).meshes
+    attacked = {name: chain(mesh, steps, seed=seed) for name, mesh in meshes.items()}
+    said = " + ".join(f"{kind} {strength:g}" for kind, strength in steps)
+    for name, mesh in meshes.items():
+        if not same_connectivity(mesh, attacked[name]):
+            raise JaxmarkError(f"{said} changes faces, which a file of several meshes keeps; save them apart.")
+    with replacing(target) as draft:
+        save_scene(attacked, draft, like=source)
+        after = load_scene(draft).meshes
+    sizes = {name: distortion.displacement_size(mesh, after[name])._asdict() for name, mesh in meshes.items()}
+    answer = {"attacks": steps, "seed": seed, "meshes": sizes}
+    largest = max(one["rms"] for one in sizes.values())
+    _answer(as_json, answer, f"{said} → {target}, {len(meshes)} meshes, RMS up to {largest:.3g} of their diagonals")
 
 
 def _steps(words: tuple[str, ...]) -> list[tuple[str, float]]:
@@ -567,6 +625,7 @@ def _each(folder: Path, as_json: bool, work: Callable[[Path], Told]) -> NoReturn
             told = work(file)
         except Exception as error:
             told, status = Told({"refused": _sentence(error)}, f"refused. {_sentence(error)}", False), 2
+        release_programs()
         status = max(status, 0 if told.done else 1)
         _answer(as_json, {"file": file.name, **told.answer}, f"{file.name}: {told.said}")
     sys.exit(status)

@@ -24,6 +24,7 @@ __all__ = [
     "load_mesh",
     "load_scene",
     "load_texture",
+    "number_check",
     "save_mesh",
     "save_scene",
     "write_atomically",
@@ -185,6 +186,22 @@ def save_scene(meshes: Mapping[str, Mesh], path: str | os.PathLike, *, like: str
             raise JaxmarkError(f"{os.fspath(like)} has no mesh {name!r} with these vertices and faces.")
         positions[part.places] = mesh.vertices
     return _save(source, positions, path, like)
+
+
+def number_check(like: str | os.PathLike) -> Callable[[str, Mesh], None]:
+    """A function that checks whether a file's numbers are fine enough for a mesh, by name, with other vertices.
+
+    It raises a `JaxmarkError` if they are not, see `save_mesh`.
+    """
+    source = _read(like)
+    places = {part.name: part.places for part in source.parts} or {_ONLY: np.arange(len(source.positions))}
+
+    def check(name: str, mesh: Mesh) -> None:
+        positions = source.positions.copy()
+        positions[places[name]] = mesh.vertices
+        _check_spacing(source, positions, places[name])
+
+    return check
 
 
 def _parser(path: str | os.PathLike) -> _Parser:

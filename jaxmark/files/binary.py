@@ -8,6 +8,8 @@ from jaxtyping import Float64, Int64, Shaped
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.source import Edits, Numbers, Overlay, changed
 
+_MAX_CLIPPED = 1e-3  # of the range of integers
+
 
 def gather(data: bytes, offsets: Int64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.ndarray, "..."]:
     """Read the numbers of a type at byte offsets, which must lie inside the data."""
@@ -19,7 +21,7 @@ def gather(data: bytes, offsets: Int64[np.ndarray, "..."], dtype: np.dtype) -> S
 
 
 def encode(values: Float64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.ndarray, "..."]:
-    """Convert finite numbers to a type, rounded to nearest.
+    """Convert finite numbers to a type, rounded to nearest; integers that are hardly out of range, to its end.
 
     Raises:
         JaxmarkError: if a number is beyond the type's range.
@@ -31,6 +33,10 @@ def encode(values: Float64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.nda
     else:
         limits = np.iinfo(dtype)
         rounded = np.rint(values)
+        # What lies at the end of the range may be moved beyond it, by next to nothing.
+        over = _MAX_CLIPPED * (float(limits.max) - float(limits.min))
+        rounded = np.where(rounded > limits.max + over, rounded, np.minimum(rounded, limits.max))
+        rounded = np.where(rounded < limits.min - over, rounded, np.maximum(rounded, limits.min))
         fits = (rounded >= limits.min) & (rounded <= limits.max)
         coded = np.where(fits, rounded, 0).astype(dtype)
     if not fits.all():

@@ -80,6 +80,7 @@ class Patched(NamedTuple):
     file: bytes
     beside: Mapping[str, bytes] = {}  # other files that belong to it, by path relative to its folder
     remarks: tuple[str, ...] = ()  # what could not stay as it was
+    companions: tuple[str, ...] = ()  # paths of files that it refers to and that did not change
 
 
 @dataclass
@@ -133,10 +134,6 @@ class Source:
             JaxmarkError: if a position does not fit the file's number type.
         """
         return Patched(splice(self.data, self.edits(positions)))
-
-    def companions(self) -> Sequence[str]:
-        """The paths of other files that this one refers to, relative to its folder."""
-        return ()
 
 
 def unique_names(names: Iterable[str]) -> list[str]:

@@ -13,16 +13,16 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.graphs import Weighting, from_mesh
 from jaxmark.spectral.laplacian import Laplacian, Lowering
 
-_MIN_STEP = 16  # between two sizes
+_MIN_SIZE = 256
+_MAX_DOUBLED_SIZE = 2**12  # up to this, sizes double: running takes next to no time
 _MAX_PADDED_SIZE = 2**17  # beyond this, running takes longer than compiling
 
 
 def common_size(count: int) -> int:
-    """Round a size up to one of four per octave; beyond 2^17, return it as it is.
-
-    From 65 on, at most a fifth of the result is padding.
-    """
-    step = max(_MIN_STEP, 1 << max(count - 1, 1).bit_length() >> 3)
+    """Round a size up to a power of two from 2^8 on, beyond 2^12 to one of four per octave; from 2^17 on, keep it."""
+    step = 1 << max(count - 1, 1).bit_length() >> 3
+    if count <= _MAX_DOUBLED_SIZE:
+        step = max(_MIN_SIZE, 8 * step)
     return count if count > _MAX_PADDED_SIZE else -(-count // step) * step
 
 

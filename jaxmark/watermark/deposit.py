@@ -12,10 +12,10 @@ import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.reading import read_file
-from jaxmark.watermark.record import Record
 
 _MAX_FILE_BYTES = 2**30  # of a record of some hundred million points, or as many digests
 _FORMAT = "jaxmark-deposit"
@@ -24,6 +24,25 @@ _FORMAT = "jaxmark-deposit"
 # certificate.
 _REQUEST_HEAD = bytes.fromhex("30390201013031300d060960864801650304020105000420")
 _REQUEST_TAIL = bytes.fromhex("0101ff")
+
+
+@runtime_checkable
+class Dated(Protocol):
+    """A record, of one mesh or of several."""
+
+    @property
+    def bits(self) -> int:
+        """Size of the payload in bits."""
+        ...
+
+    @property
+    def told(self) -> str:
+        """What it commits to; empty if to nothing."""
+        ...
+
+    def digest(self) -> str:
+        """What is deposited of it."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -41,7 +60,7 @@ class Deposit:
             level = [hashlib.sha256(b"\1" + b"".join(pair)).digest() if len(pair) == 2 else pair[0] for pair in pairs]
         return hashlib.sha256(f"jaxmark/deposit/{len(self.digests)}/".encode() + level[0]).hexdigest()
 
-    def log10_p(self, log10_p: float, record: Record, *, claimed: bool) -> float:
+    def log10_p(self, log10_p: float, record: Dated, *, claimed: bool) -> float:
         """log10 of the bound for a claim by one of these records, if the deposit is older than the suspect.
 
         Args:

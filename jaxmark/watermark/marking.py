@@ -36,10 +36,21 @@ _SAME_SHAPE = 0.01  # distance of shapes, over their size, below which an origin
 # Shares of the probability. Whoever reads may choose how to align, and sees whether the claimed message reads or
 # another one; what is usual keeps nearly all of it.
 ALIGN_SHARES = {"auto": 0.97, "same": 0.01, "similarity": 0.01, "affine": 0.01}
-_CLAIM_SHARE = 0.97
+CLAIM_SHARE = 0.97
 _HAND_SHARE = 0.97  # of the hand that fits a surface better
 NOISE = 0.005  # half width over the mean distance to the centre: the strongest noise of the SMI 2010 protocol
 COVERAGE = 0.5  # share of the vertices that may be left
+_MAX_TRIED_NOISE = 0.05  # beyond which no shape is left
+
+
+class Survival(NamedTuple):
+    """The strongest uniform noise that a mark survives: half width over the mean distance of vertices to the centre.
+
+    It is infinite for schemes whose readers have no model of noise.
+    """
+
+    whole: float  # if all vertices are left
+    half: float  # if half of them are lost
 
 
 class EmbedInfo(NamedTuple):
@@ -49,6 +60,7 @@ class EmbedInfo(NamedTuple):
     max: float  # the largest such displacement
     beta: float  # strength: the factor on the carrier's unit displacement, in diagonals
     record: Record  # what the owner needs to read the mark again
+    survives: Survival = Survival(0.0, 0.0)  # as predicted; `Marker.tried` tries it
 
 
 class Detection(NamedTuple):
@@ -115,7 +127,7 @@ class Marker:
         *,
         limits: Limits | None = None,
         visibility: Visibility | None = None,
-        noise: float = NOISE,
+        noise: float | None = None,
         read_back: bool = True,
     ) -> tuple[Mesh, EmbedInfo]:
         """Embed a message of exactly the payload's size in the original; see `embed`.
@@ -124,15 +136,45 @@ class Marker:
         """
         self.check_size(message)
         bounds = make_budget(budget, limits, visibility)
-        if not 0 <= noise < math.inf:
+        if noise is not None and not 0 <= noise < math.inf:
             raise JaxmarkError(f"The noise to survive is a number of at least 0, got {noise}.")
         marked, info = self.write(self.codeword(message), bounds, told=message)
         # A budget without limits is met up to rounding, so its own number is used.
         reached = info.rms if bounds.limits else bounds.rms or 0.0
-        self._check_capacity(reached, Conditions(bounds, noise, COVERAGE))
+        room = Capacity(self.original, self.scheme, {self.bits: self.reader})
+        if noise is not None:
+            self._check_capacity(room, reached, Conditions(bounds, noise, COVERAGE))
+        noises = (room.noise(self.bits, reached, Conditions(bounds, 1.0, share)) for share in (1.0, COVERAGE))
+        info = info._replace(survives=Survival(*noises))
         if read_back:
             self.check(marked, message)
         return marked, info
+
+    def tried(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival:
+        """Try what a mark survives: add noise, lose half of the points, and read; the prediction where it reads.
+
+        Where it does not, less noise is tried; 0 if not even a tenth of what was predicted.
+
+        Args:
+            marked: the marked mesh, in the original's order.
+            message: its message.
+            predicted: from `EmbedInfo`.
+        """
+        found, rng = alignment.align(self.original, marked, "same"), np.random.default_rng(0)
+        points, used = self.original.positions, self.original.used
+        radius = float(np.linalg.norm(points[used] - points[used].mean(axis=0), axis=1).mean())
+        unit = radius * rng.uniform(-1, 1, points.shape)
+        near = points[:, 0] <= np.median(points[used, 0])  # half of the mesh, as if it was cut
+        tried = []
+        for noise, seen in zip(predicted, (np.ones_like(near), near), strict=True):
+            strengths = [share * min(noise, _MAX_TRIED_NOISE) for share in (1.0, 0.7, 0.5, 0.3, 0.1)]
+            suspects = (
+                found._replace(displacement=found.displacement + strength * unit, weights=found.weights * seen)
+                for strength in strengths
+            )
+            reads = (strength for strength, one in zip(strengths, suspects, strict=True) if self._reads(one, message))
+            tried.append(next(reads, 0.0) if noise > 0 else 0.0)
+        return Survival(*tried)
 
     def check(self, marked: Mesh, message: bytes) -> None:
         """Check that a message can be read from a marked mesh that was not attacked.
@@ -142,9 +184,9 @@ class Marker:
         """
         if not self.reads(marked, message):
             raise JaxmarkError(
-                f"This mesh ({int(self.original.used.sum())} points) cannot carry {self.bits} bits with the scheme"
-                f" {self.scheme.name!r}: they do not read back, even unattacked. Use a shorter message, or a finer or"
-                " less regular mesh."
+                f"This mesh ({int(self.original.used.sum())} points) cannot carry {self._payload} with the scheme"
+                f" {self.scheme.name!r}: it does not read back, even unattacked. Use a larger budget, a shorter message"
+                " or a presence mark, or a finer or less regular mesh."
             )
 
     def reads(self, marked: Mesh, message: bytes) -> bool:
@@ -153,10 +195,19 @@ class Marker:
         Plain correlations nearly always read a keyed mark that was not attacked. They are tried first, because
         weighting the bands and joint decoding are most of the work of `detect`.
         """
-        observed = self.observe(alignment.align(self.original, marked, "same"))
+        aligned = alignment.align(self.original, marked, "same")
+        observed = self.observe(aligned)
         # `Reader.glance` stands for the scheme's own detector, not for any other.
         quick = self.glance(observed) if self.detector is self.scheme.detector else None
-        return quick == message or self.decode(self.soft_values(self.reader.receive(observed))) == message
+        if quick == message and message:
+            return True
+        return self._reads(aligned, message)
+
+    def _reads(self, aligned: Alignment, message: bytes) -> bool:
+        """Whether a message is read, or without one a presence proven, from a suspect as it was aligned."""
+        if not self.bits:
+            return self._detect(aligned, b"", None, 1.0).detected()
+        return self.decode(self.soft_values(self.receive(aligned))) == message
 
     def glance(self, seen: Observation) -> bytes | None:
         """Read what was hardly attacked with little computation, see `Reader.glance`; None if nothing reads so."""
@@ -175,6 +226,8 @@ class Marker:
         A suspect that is read with several keys needs to be aligned only once: pass the result of
         `jaxmark.alignment.alignment.align` in its place.
         """
+        if not self.bits:
+            message = b""  # presence is all that can be claimed
         if message is not None:
             self.check_claim(message)
         if isinstance(suspect, Alignment):
@@ -221,10 +274,10 @@ class Marker:
         if fixed is None:
             return self._with_evidence(found, received, decoded, share=share)
         if decoded is None or decoded.message == fixed:
-            share *= _CLAIM_SHARE
+            share *= CLAIM_SHARE
             return self._with_evidence(found, received, decoded, fixed=fixed, tagged=claimed is None, share=share)
         # The claim is refuted, but not that the mark is there: its owner wrote several messages, or means another copy.
-        other = self._with_evidence(found, received, decoded, share=share * (1 - _CLAIM_SHARE))
+        other = self._with_evidence(found, received, decoded, share=share * (1 - CLAIM_SHARE))
         remark = f"Another message of this key reads than the one {'claimed' if claimed else 'in the record'}."
         if claimed:
             there = self._fitted_beside(received, claimed, decoded.message)
@@ -360,20 +413,33 @@ class Marker:
             raise JaxmarkError(f"weights must be {len(point)} finite numbers, not negative, one for each vertex.")
         return np.bincount(point, given) / np.bincount(point)
 
-    def _check_capacity(self, reached: float, conditions: Conditions) -> None:
+    @property
+    def _payload(self) -> str:
+        return f"a message of {self.bits} bits" if self.bits else "a presence mark"
+
+    def _check_capacity(self, room: Capacity, reached: float, conditions: Conditions) -> None:
         """Check that the payload is readable under these conditions at an RMS displacement of `reached` diagonals."""
-        room = Capacity(self.original, self.scheme, {self.bits: self.reader})
         least = room.least_budget(self.bits, conditions)
         if least <= reached:
             return
         most = room.bits(conditions)
         mend = "Use a shorter message"
         if math.isfinite(least):
-            mend += f", or a budget of at least {math.ceil(1e6 * least) / 1e6:g}"
+            mend += f", or a budget of at least {_rounded_up(least):g}{self._seen_at(_rounded_up(least), conditions)}"
         raise JaxmarkError(
             f"This mesh ({int(self.original.used.sum())} points) carries at most {most} bits at"
             f" {conditions.budget}, with noise of {conditions.noise:g} and half of it lost, not {self.bits}. {mend}."
         )
+
+    def _seen_at(self, budget: float, conditions: Conditions) -> str:
+        """How far a mark of a size would exceed the limits, as half a sentence."""
+        if not (limits := conditions.budget.limits):
+            return ""
+        word = np.random.default_rng(0).choice([-1.0, 1.0], self.code_bits)
+        marked, _ = self.write(word, make_budget(min(budget, 0.5)))
+        seen = distortion.measure(self.original.mesh, marked, limits.keys())
+        told = ", ".join(f"{distortion.name_of(metric)} would be {seen[metric] or 0:.2g}" for metric in limits)
+        return f" (at which {told})"
 
     def check_claim(self, message: bytes) -> None:
         """Check that a message may be claimed: that it has the payload's size, and is the one in the record, if any.
@@ -414,7 +480,8 @@ def make_marker(
             point (see `jaxmark.geometry.canonical`), move together; a vertex that no face uses stays where it is. With
             a record, a copy that was saved again will do: rounded, reordered, moved or scaled.
         key: 32 bytes, from `new_key`.
-        bits: size of the payload in bits, a multiple of 8; by default the record's, else 64.
+        bits: size of the payload in bits, a multiple of 8; by default the record's, else 64. With 0, the mark says
+            nothing but that it is there.
         record: the record of an earlier mark, which fixes scheme and payload size; original and key must be those that
             it was made with.
         scheme: a name (`"keyed"`, `"host"`, `"eigen"`), which a record overrides; or a scheme of
@@ -431,7 +498,7 @@ def make_marker(
     """
     key = Key(key)
     if record is not None:
-        record.check("message", key)
+        record.check("message" if record.bits else "presence", key)
         if bits not in (None, record.bits):
             raise JaxmarkError(f"The payload is {record.bits} bits by the record, not {bits}.")
         bits = record.bits
@@ -445,15 +512,16 @@ def make_marker(
     ready, doubts = recall(original, key, record, used)
     scheme = get_scheme(scheme, version=used)
     payload = DEFAULT_BITS if bits is None else bits
-    code_bits = scheme.code_length(ready, payload)
-    choices = bind_mark(key, ready, scheme, payload, "message", used, record=record)
+    code_bits = scheme.code_length(ready, payload) if payload else 1
+    content: Content = "message" if payload else "presence"
+    choices = bind_mark(key, ready, scheme, payload, content, used, record=record)
     carrier = scheme.carrier(ready, choices, payload, code_bits)
     if not isinstance(scheme, tuple(SCHEMES.values())):
         doubts += (f"the scheme {scheme.name!r} is not one of this library",)
     if detector not in (None, scheme.detector):
         doubts += ("the detector is not the scheme's own",)
     return Marker(
-        ready, choices, payload, scheme, carrier, code_bits, detector or scheme.detector, record=record, doubts=doubts
+        ready, choices, payload, scheme, carrier, code_bits, detector or scheme.detector, content, record, doubts
     )
 
 
@@ -537,6 +605,12 @@ def _matches_record(scheme: Scheme, record: Record) -> bool:
     return (scheme.name, parameters_of(scheme)) == (record.scheme, dict(record.parameters))
 
 
+def _rounded_up(value: float) -> float:
+    """A number to four digits, none of which makes it smaller."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 3)
+    return math.ceil(value / unit * (1 + 1e-9)) * unit
+
+
 def embed(
     mesh: Mesh,
     message: bytes,
@@ -545,17 +619,19 @@ def embed(
     budget: float | None = None,
     limits: Limits | None = None,
     visibility: Visibility | None = None,
-    noise: float = NOISE,
+    noise: float | None = None,
     scheme: str | Scheme = DEFAULT_SCHEME,
 ) -> tuple[Mesh, EmbedInfo]:
     """Embed a message in the vertex positions of a mesh.
 
     The mark is as strong as budget and limits allow; by default it is so weak that people do not notice it. The message
-    is read back before the mesh is returned, and a mesh that cannot carry it is refused.
+    is read back before the mesh is returned, and a mesh that cannot carry it is refused. What noise it survives
+    (`EmbedInfo.survives`) depends on the mesh: much on scans, little on models of some hundred points.
 
     Args:
         mesh: the original.
-        message: any bytes, at least one.
+        message: any bytes; none for a presence mark, which says nothing but that it is there, and fits where messages
+            do not.
         key: 32 bytes, from `new_key`.
         budget: RMS displacement of the welded vertices that faces use, unweighted, relative to the diagonal of their
             axis-aligned bounding box: 0.0008 is 0.08 % of it. It is met exactly, unless a limit is reached first.
@@ -563,17 +639,18 @@ def embed(
             `distortion.Comparison`; or that metrics of your own may, by function (see `distortion.measure`).
         visibility: how well people may see the mark: `"hidden"`, the default if budget and limits are not given;
             `"careful look"`, seen beside the original; `"visible"`. See `jaxmark.watermark.budget.VISIBILITY`.
-        noise: the noise that the message must survive when half of the vertices are lost, see `capacity`; 0 requires
-            only that there are enough dimensions. It has no effect for schemes whose readers have no model of noise,
-            such as `host` and `eigen`.
+        noise: a demand: the noise that the message must survive when half of the vertices are lost, see `capacity`; 0
+            requires only that there are enough dimensions. By default nothing is demanded but that the message reads.
+            It has no effect for schemes whose readers have no model of noise, such as `host` and `eigen`.
         scheme: a name or a scheme, see `make_marker`.
 
     Returns:
         The marked mesh (float64 vertices, same faces) and how it was marked.
 
     Raises:
-        JaxmarkError: if the mesh, key, budget or payload is unusable, or the mesh cannot carry so many bits; the
-            error then states the largest payload, and the least budget if there is one.
+        JaxmarkError: if the mesh, key, budget or payload is unusable, or the message does not read back; or if what
+            `noise` demands cannot be met: the error then states the largest payload, and the least budget if there is
+            one.
     """
     if not isinstance(message, bytes):
         raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
@@ -655,7 +732,7 @@ def detect(
         original: the unmarked mesh.
         key: 32 bytes.
         bits: size of the payload in bits, a multiple of 8; by default the record's, else the claimed message's, else
-            64.
+            64. With 0, presence is claimed.
         message: the message that is claimed to be in the suspect; None to read without a claim.
         record: the record of the mark, see `make_marker`.
         scheme: the scheme that the mark was embedded with, if there is no record.

@@ -51,8 +51,11 @@ def least_energy(bits: int, error: float = 1e-3) -> float:
 def needed_energy(bits: int) -> float:
     """E/N0 with which a payload of `bits` bits is read in noise alone, except for about one message in a thousand.
 
-    The code needs `_CODE_GAP_DB` more than the least energy for message and tag.
+    The code needs `_CODE_GAP_DB` more than the least energy for message and tag. Without a payload, presence is to be
+    proven at 1e-6 by a score that noise lowers by three standard deviations.
     """
+    if bits == 0:
+        return (math.sqrt(2 * math.log(1e6)) + 3) ** 2 / 2
     return 10 ** (_CODE_GAP_DB / 10) * least_energy(bits + TAG_BITS)
 
 
@@ -75,7 +78,7 @@ def needed_dimensions(bits: int) -> float:
     2^bits exp(-n/2) is at most 1e-6 for n = 1.39 bits + 28. The code needs two dimensions for each bit of message and
     tag.
     """
-    return max(2 * math.log(2) * bits + 28, 2.0 * (bits + TAG_BITS))
+    return max(2 * math.log(2) * bits + 28, 2.0 * (bits + TAG_BITS) if bits else 0.0)
 
 
 class Conditions(NamedTuple):
@@ -141,6 +144,20 @@ class Capacity:
             return worth(math.exp(2 * logarithm) * ratio, dimensions) - needed
 
         return math.exp(optimize.root_scalar(excess, bracket=(-100.0, 100.0)).root)
+
+    def noise(self, bits: int, reached: float, conditions: Conditions) -> float:
+        """Predict the strongest noise in which a payload is readable at an RMS displacement, as in `Conditions`.
+
+        Args:
+            bits: size of the payload in bits.
+            reached: the displacement, in diagonals.
+            conditions: the coverage; neither budget nor noise matters.
+
+        Returns:
+            The noise; 0 if the payload needs more dimensions, infinite without a model of noise.
+        """
+        least = self.least_budget(bits, conditions._replace(noise=1.0))  # which grows as the noise does
+        return reached / least if least > 0 else math.inf
 
     def _radius(self) -> float:
         """Mean distance of the points that faces use to their centre, in diagonals."""

@@ -23,10 +23,14 @@ from jaxmark.watermark.coding.keys import KEY_BYTES, SCHEME_VERSION, VERSIONS, C
 
 _MAX_FILE_BYTES = 2**30  # of a record of some hundred million points, or as many digests
 _FORMAT = "jaxmark-record"
-_READERS = {"message": "detect", "fingerprint": "identify"}  # the function that reads each content
+_READERS = {
+    "message": "detect",
+    "presence": "detect",
+    "fingerprint": "identify",
+}  # the function that reads each content
 RECORD_SUFFIX = ".jaxmark.json"  # is appended to the name of the marked file
 
-Content = Literal["message", "fingerprint"]
+Content = Literal["message", "presence", "fingerprint"]
 
 # The fields in files of version 1, and those that version 2 added.
 _FIRST_FIELDS = {
@@ -126,25 +130,43 @@ class Record:
         Raises:
             JaxmarkError: if the file cannot be read, is no record, or has a version that this jaxmark does not know.
         """
-        try:
-            data = json.loads(read_file(path, _MAX_FILE_BYTES))
-        except OSError as error:
-            raise JaxmarkError(f"The record {path} cannot be read: {error.strerror}.") from None
-        except (ValueError, RecursionError):
-            data = None
-        if not isinstance(data, dict) or data.pop("format", None) != _FORMAT:
-            raise JaxmarkError(f"{path} is not a record of jaxmark.")
+        return cls.of(read_json(path), path)
+
+    @classmethod
+    def of(cls, data: Any, where: str | os.PathLike[str]) -> "Record":
+        """Make a record of a file's JSON.
+
+        Raises:
+            JaxmarkError: see `load`.
+        """
+        if not isinstance(data, dict) or data.get("format") != _FORMAT:
+            raise JaxmarkError(f"{where} is not a record of jaxmark.")
+        data = {name: value for name, value in data.items() if name != "format"}
         if data.get("version") not in VERSIONS:
             raise JaxmarkError(
-                f"The record {path} is of version {data.get('version')}; this jaxmark reads versions"
+                f"The record {where} is of version {data.get('version')}; this jaxmark reads versions"
                 f" {' and '.join(map(str, sorted(VERSIONS)))}."
             )
         types = _FIRST_FIELDS if data["version"] == 1 else _FIRST_FIELDS | _LATER_FIELDS
         if data.keys() != types.keys() or any(type(data[name]) is not kind for name, kind in types.items()):
-            raise JaxmarkError(f"The record {path} is damaged: its fields are not those of a record.")
+            raise JaxmarkError(f"The record {where} is damaged: its fields are not those of a record.")
         if data["content"] not in _READERS:
-            raise JaxmarkError(f"The record {path} is of a {data['content']}, which this jaxmark does not know.")
+            raise JaxmarkError(f"The record {where} is of a {data['content']}, which this jaxmark does not know.")
         return cls(**data)
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """Read the JSON of a record file; None if it holds none.
+
+    Raises:
+        JaxmarkError: if the file cannot be read.
+    """
+    try:
+        return json.loads(read_file(path, _MAX_FILE_BYTES))
+    except OSError as error:
+        raise JaxmarkError(f"The record {path} cannot be read: {error.strerror}.") from None
+    except (ValueError, RecursionError):
+        return None
 
 
 def commit(told: bytes, choices: Choices) -> str:

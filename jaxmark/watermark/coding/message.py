@@ -22,15 +22,17 @@ def code_length(bits: int, places: int, spread: int) -> int:
     """Choose the number of code bits for a payload: the largest power of two that the carrier has room for and needs.
 
     Args:
-        bits: size of the payload in bits, a positive multiple of 8.
+        bits: size of the payload in bits, a multiple of 8; 0 for a mark that says nothing but that it is there.
         places: number of code bits that the carrier has room for.
         spread: number of code bits for each bit of message and tag, beyond which more are of no use.
 
     Raises:
         JaxmarkError: if the payload is no positive multiple of 8, or too large for the places.
     """
-    if bits <= 0 or bits % 8:
-        raise JaxmarkError(f"The payload must be a positive multiple of 8 bits, got {bits}.")
+    if bits == 0:
+        return 1
+    if bits < 0 or bits % 8:
+        raise JaxmarkError(f"The payload must be a multiple of 8 bits, got {bits}.")
     information = bits + TAG_BITS
     length = 1 << (max(1, min(places, spread * information)).bit_length() - 1)
     if information > length:
@@ -49,6 +51,8 @@ def encode(message: bytes, choices: Choices, length: int) -> Float64[np.ndarray,
         choices: the keyed choices of the mark.
         length: number of code bits, from `code_length`.
     """
+    if not message:
+        return np.ones(1)  # a tag tells messages apart, and here is none to tell
     payload = np.unpackbits(np.frombuffer(message, np.uint8))
     return 1.0 - 2.0 * polar.encode(np.concatenate([payload, _tag(message, choices)]), length)
 
@@ -63,6 +67,8 @@ class Decoded(NamedTuple):
 def decode(scores: Float[np.ndarray, " length"], bits: int, choices: Choices) -> Decoded | None:
     """Decode the most plausible message whose keyed tag fits; None if there is none among the first `CANDIDATES`.
 
+    A mark without a payload has no message.
+
     A suspect that is independent of the key passes at a rank of at most r with probability at most r · 2^-TAG_BITS.
 
     Args:
@@ -70,6 +76,8 @@ def decode(scores: Float[np.ndarray, " length"], bits: int, choices: Choices) ->
         bits: size of the payload in bits.
         choices: the keyed choices of the mark.
     """
+    if bits == 0:
+        return None
     for rank, word in enumerate(_list_candidates(scores, bits, CANDIDATES), 1):
         message = np.packbits(word[:bits]).tobytes()
         if np.array_equal(word[bits:], _tag(message, choices)):
