@@ -1,4 +1,4 @@
-"""Read and write mesh files: OBJ, PLY, OFF, STL, GLB and glTF.
+"""Read and write mesh files: OBJ, PLY, OFF, STL, GLB, glTF and 3MF.
 
 A file is saved by patching the one that it was loaded from: whatever is no position or normal stays byte for byte.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import gltf, obj, off, ply, stl
+from jaxmark.files import gltf, obj, off, ply, stl, threemf
 from jaxmark.files.atomic import write_atomically, write_together
 from jaxmark.files.reading import read_beside, read_file
 from jaxmark.files.source import Patched, Source, Texture
@@ -46,6 +46,7 @@ _FORMATS: dict[str, _Parser] = {
     ".stl": _alone(stl.parse),
     ".glb": gltf.parse,
     ".gltf": gltf.parse,
+    ".3mf": _alone(threemf.parse),
 }
 SUFFIXES = tuple(_FORMATS)
 # A file's numbers keep a displacement well enough if its RMS is at least this many times their spacing.
@@ -64,12 +65,12 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
     """Read a mesh from a file, in the format that its suffix names.
 
     Vertices are the file's own, in its order: none are merged or dropped, and isolated ones are kept. An STL file has
-    three vertices of its own for each facet. A GLB or glTF file gives local coordinates; transformations of nodes are
-    not applied. Several meshes in a file follow each other as one; `load_scene` tells them apart. Polygons are split
-    into triangles (v0, v1, v2), (v0, v2, v3), …, for computing only.
+    three vertices of its own for each facet. A GLB, glTF or 3MF file gives local coordinates; transformations of nodes,
+    components and built items are not applied. Several meshes in a file follow each other as one; `load_scene` tells
+    them apart. Polygons are split into triangles (v0, v1, v2), (v0, v2, v3), …, for computing only.
 
     Args:
-        path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary), GLB or glTF file.
+        path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary), GLB, glTF or 3MF file.
 
     Returns:
         NumPy arrays: float64 vertices in the file's units, int64 faces.
@@ -81,9 +82,9 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
 
 
 def load_scene(path: str | os.PathLike) -> Scene:
-    """Read the meshes of a file: those of a GLB or glTF file, or the objects of an OBJ file.
+    """Read the meshes of a file: those of a GLB or glTF file, or the objects of an OBJ or 3MF file.
 
-    Objects that share vertices are one mesh, and so are meshes that share positions. Instances and other nodes that
+    Objects of OBJ that share vertices are one mesh, and so are meshes that share positions. Instances and other nodes that
     show the same mesh are not told apart. Files of other formats have one mesh.
 
     Args:
@@ -131,8 +132,8 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | 
         mesh: the mesh to write.
         path: the file to write, in the format that its suffix names. It may be the same file as `like`.
         like: the file that the mesh was loaded from. Only the numbers of vertices that moved change, their normals
-            follow, and everything else stays byte for byte. Without it a new file is written: exact in OBJ and OFF,
-            in single precision in PLY, STL and GLB. Files that a glTF file refers to come along: a buffer that changes
+            follow, and everything else stays byte for byte. Without it a new file is written: exact in OBJ, OFF
+            and 3MF, in single precision in PLY, STL and GLB. Files that a glTF file refers to come along: a buffer that changes
             is named after the new file, the others are copied where they are not there already.
 
     Raises:

@@ -75,7 +75,9 @@ class Text:
         self, char: str, starts: Int64[np.ndarray, " spans"], ends: Int64[np.ndarray, " spans"]
     ) -> Int64[np.ndarray, " spans"]:
         """The offset of a character's first occurrence, in either case, in each span; the span's end if it has none."""
-        hits = np.flatnonzero((self.buffer == ord(char.lower())) | (self.buffer == ord(char.upper())))
+        low, high = (int(starts.min()), int(ends.max())) if len(starts) else (0, 0)  # a file may have many such parts
+        part = self.buffer[low:high]
+        hits = low + np.flatnonzero((part == ord(char.lower())) | (part == ord(char.upper())))
         found = np.append(hits, len(self.buffer))[np.searchsorted(hits, starts)]
         return np.minimum(found, ends)
 
@@ -125,6 +127,17 @@ class Text:
         if len(long):
             raise self.error(starts[long[0]], "a whole number of more than 18 digits cannot be an index or a count")
         return np.array(self._converted(int, starts, ends), dtype=np.int64)
+
+
+class Spans(Text):
+    """A text file in which tokens are at known places, with anything between them."""
+
+    def __init__(self, data: bytes, starts: Int64[np.ndarray, " tokens"], ends: Int64[np.ndarray, " tokens"]) -> None:
+        """Take byte spans that ascend as the tokens."""
+        self._lines = unix(data)
+        self.buffer = np.frombuffer(data + b"\n", np.uint8)
+        self.starts = starts
+        self.ends = ends
 
 
 class Style(NamedTuple):

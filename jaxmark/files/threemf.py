@@ -1,0 +1,195 @@
+"""Parse 3MF: ZIP archives of models in XML."""
+
+import posixpath
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import NamedTuple
+from urllib.parse import unquote
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.files.binary import JoinedNumbers
+from jaxmark.files.source import Part, Patched, Source, splice, unique_names
+from jaxmark.files.text import Spans, TextNumbers
+from jaxmark.files.threemf_xml import RawMesh, Triples, read_model, read_relationships
+from jaxmark.files.zipped import Archive, Member
+
+_MODEL = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
+_DEFAULT = "3D/3dmodel.model"
+# What relationships of encrypted content are called; namespaces alone are declared by programs that encrypt nothing.
+_SECURED = (b"schemas.microsoft.com/3dmanufacturing/2019/04/keystore", b"package/2006/relationships/encryptedfile")
+_SIGNED = b"package/2006/relationships/digital-signature/"
+_SIGNATURES = ("_xmlsignatures/", "package/services/digital-signature/")
+
+
+class _Object(NamedTuple):
+    name: str
+    numbers: TextNumbers
+    faces: Int64[np.ndarray, "faces 3"]
+
+
+class _Model(NamedTuple):
+    member: Member
+    data: bytes
+    objects: Sequence[_Object]
+
+
+def parse(data: bytes) -> Source:
+    """Read the meshes of all objects, in all models of the archive.
+
+    Positions are those of the objects: transformations of components and of what is built are not applied, so an object
+    that is used several times is there once.
+
+    Raises:
+        JaxmarkError: if the archive or a model cannot be read, is encrypted, or has no mesh that can be marked.
+    """
+    archive = Archive(data)
+    signed = _is_signed(archive)
+    found: list[tuple[Member, bytes, list[RawMesh]]] = []
+    for member in _model_members(archive):
+        content = archive.read(member)
+        with _of(member):
+            found.append((member, content, read_model(content)))
+    names = iter(unique_names(mesh.name for _, _, meshes in found for mesh in meshes))
+    models: list[_Model] = []
+    left: dict[str, str] = {}
+    for member, content, meshes in found:
+        with _of(member):
+            models.append(_Model(member, content, _read_objects(content, meshes, names, left)))
+    objects = [item for model in models for item in model.objects]
+    if not objects:
+        raise JaxmarkError(_nothing(left))
+    ends = np.cumsum([len(item.numbers.values) for item in objects])
+    starts = [0, *ends.tolist()]
+    faces = np.concatenate([start + item.faces for start, item in zip(starts, objects, strict=False)])
+    source = _ThreemfSource(
+        data, JoinedNumbers([item.numbers for item in objects]), faces, archive=archive, models=models, signed=signed
+    )
+    if len(objects) + len(left) > 1:
+        source.parts = [
+            Part(item.name, np.arange(start, end), item.faces)
+            for item, start, end in zip(objects, starts, ends, strict=False)
+        ]
+        source.left = left
+    return source
+
+
+@contextmanager
+def _of(member: Member) -> Iterator[None]:
+    """Say of which member something is refused."""
+    try:
+        yield
+    except JaxmarkError as error:
+        raise JaxmarkError(f"{member.shown}: {error}") from error
+
+
+def _nothing(left: Mapping[str, str]) -> str:
+    """Why there is no mesh to be marked."""
+    if not left:
+        return "The file has no object with a mesh."
+    if len(left) == 1:
+        return f"The mesh {next(iter(left))!r} cannot be marked: {next(iter(left.values()))}."
+    told = "; ".join(f"{name!r}: {reason}" for name, reason in list(left.items())[:3])
+    return f"None of its {len(left)} meshes can be marked: {told}{'; …' if len(left) > 3 else ''}."
+
+
+def _is_signed(archive: Archive) -> bool:
+    """Whether the archive has a signature, which a mark would break.
+
+    Raises:
+        JaxmarkError: if parts of it are encrypted.
+    """
+    signed = any(member.name.casefold().startswith(_SIGNATURES) for member in archive.members)
+    for member in archive.members:
+        if member.name.casefold().endswith(".rels"):
+            content = archive.read(member)
+            if any(word in content for word in _SECURED):
+                raise JaxmarkError("Parts of the file are encrypted (Secure Content); save it without.")
+            signed |= _SIGNED in content
+    return signed
+
+
+def _model_members(archive: Archive) -> list[Member]:
+    """The members that are models, in the order of the archive."""
+    root = _DEFAULT
+    relationships = archive.find("_rels/.rels")
+    if relationships is not None:
+        with _of(relationships):
+            targets = [target for kind, target in read_relationships(archive.read(relationships)) if kind == _MODEL]
+        if targets:
+            root = posixpath.normpath("/" + unquote(targets[0])).lstrip("/")
+    first = archive.find(root)
+    if first is None:
+        raise JaxmarkError(f"The archive has no model {ascii(root)[:80]}; is it a 3MF file?")
+    return [
+        member
+        for member in archive.members
+        # Beside each file, some systems put one of their own, whose name begins so.
+        if member is first or (member.name.casefold().endswith(".model") and "/._" not in "/" + member.name)
+    ]
+
+
+def _read_objects(
+    content: bytes, meshes: Sequence[RawMesh], names: Iterator[str], left: dict[str, str]
+) -> list[_Object]:
+    """Read the numbers of a model's meshes; those that cannot be marked are put into `left`."""
+    none = Triples(np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int64))
+    lists = [mesh.lists.get(kind, none) for mesh in meshes for kind in ("vertices", "triangles")]
+    starts = np.concatenate([none.starts, *(triples.starts for triples in lists)]).ravel()
+    ends = np.concatenate([none.ends, *(triples.ends for triples in lists)]).ravel()
+    # Attributes may come in any order, but tokens are numbered as they are in the file.
+    order = np.argsort(starts, kind="stable")
+    text = Spans(content, starts[order], ends[order])
+    tokens = np.empty_like(order)
+    tokens[order] = np.arange(len(order))
+    pieces = iter(np.split(tokens.reshape(-1, 3), np.cumsum([len(triples.starts) for triples in lists])))
+    objects = []
+    for _ in meshes:
+        name, numbers, index = next(names), TextNumbers(text, next(pieces)), next(pieces)
+        flat = np.sort(index.ravel())
+        faces = np.empty(index.size, np.int64)
+        faces[np.argsort(index.ravel(), kind="stable")] = text.ints(text.starts[flat], text.ends[flat])
+        faces = faces.reshape(-1, 3)
+        outside = ((faces < 0) | (faces >= len(numbers.values))).any(axis=1)
+        if not len(faces):
+            left[name] = "it has no triangles"
+        elif outside.any():
+            bad = int(np.argmax(outside))
+            left[name] = (
+                f"its triangle {bad} (zero-based) refers to vertices {faces[bad].tolist()}, but it has"
+                f" {len(numbers.values)}, numbered from 0"
+            )
+        else:
+            objects.append(_Object(name, numbers, faces))
+    return objects
+
+
+@dataclass(kw_only=True)
+class _ThreemfSource(Source):
+    """A source whose positions are in packed members of an archive."""
+
+    archive: Archive
+    models: Sequence[_Model]
+    signed: bool
+
+    def patch(self, positions: Float64[np.ndarray, "points 3"], name: str) -> Patched:
+        """See `Source.patch`; members whose positions do not change stay as they are packed."""
+        contents: dict[str, bytes] = {}
+        start = 0
+        for model in self.models:
+            edits = []
+            for item in model.objects:
+                end = start + len(item.numbers.values)
+                edits += item.numbers.edits(positions[start:end])
+                start = end
+            content = splice(model.data, edits)
+            if content != model.data:
+                contents[model.member.name] = content
+        if not contents:
+            return Patched(self.data)
+        if self.signed:
+            raise JaxmarkError("The file is signed, and a mark would break the signature; mark it before it is signed.")
+        return Patched(self.archive.replaced(contents))
