@@ -88,16 +88,16 @@ _Body = _Tokens | _Bytes
 def parse(data: bytes) -> Source:
     """Read the positions, the faces and, if they are floats, the normals `nx ny nz`, in any order of the elements.
 
+    Triangle strips are faces as well, and follow those of the element face.
+
     Raises:
-        JaxmarkError: if the header or the body cannot be read, the file ends too early, or the faces are strips.
+        JaxmarkError: if the header or the body cannot be read, or the file ends too early.
     """
     order, elements, start = _header(data)
     names = [element.name for element in elements]
-    for name in ("vertex", "face"):
+    for name in ("vertex", *_SURFACES):
         if names.count(name) > 1:
             raise JaxmarkError(f"The header declares the element {name} more than once.")
-    if "tristrips" in names:
-        raise JaxmarkError("Triangle strips (the element tristrips) are not supported; save the file with faces.")
     body: _Body = _Tokens(data, start) if order == "=" else _Bytes(data)
     at = 0 if order == "=" else start
     columns: dict[str, dict[str, _Column]] = {}
@@ -108,12 +108,7 @@ def parse(data: bytes) -> Source:
     coordinates = _triples(body, declared, columns, ("x", "y", "z"))
     if coordinates is None:
         raise JaxmarkError("The header declares no element vertex with the numbers x, y and z.")
-    faces = np.zeros((0, 3), np.int64)
-    name = next((name for name in ("vertex_indices", "vertex_index") if name in declared.get("face", {})), None)
-    if name is not None:
-        faces = _faces(body, declared["face"][name], columns["face"][name])
-    elif columns.get("face"):
-        raise JaxmarkError("The element face has no list vertex_indices or vertex_index.")
+    faces = np.concatenate([_surface(body, declared, columns, element) for element in _SURFACES])
     normals = _triples(body, declared, columns, ("nx", "ny", "nz"))
     if normals is None or any(declared["vertex"][axis].type.kind != "f" for axis in ("nx", "ny", "nz")):
         return Source(data, coordinates, faces)
@@ -253,16 +248,52 @@ def _triples(
     return body.triples(np.stack([columns["vertex"][name].starts for name in names], axis=1), types)
 
 
+def _surface(
+    body: _Body, declared: dict[str, dict[str, _Property]], columns: dict[str, dict[str, _Column]], element: str
+) -> Int64[np.ndarray, "faces 3"]:
+    """The triangles of the element face or tristrips; none if it is not declared, or has no properties."""
+    properties = declared.get(element, {})
+    name = next((name for name in ("vertex_indices", "vertex_index") if name in properties), None)
+    if name is None:
+        if properties:
+            raise JaxmarkError(f"The element {element} has no list vertex_indices or vertex_index.")
+        return np.zeros((0, 3), np.int64)
+    kind, column = properties[name], columns[element][name]
+    if kind.length is None or kind.type.kind == "f":
+        raise JaxmarkError(f"The indices of the element {element} must be a list of integers.")
+    return _SURFACES[element](body, kind, column)
+
+
+def _items(body: _Body, kind: _Property, column: _Column) -> Int64[np.ndarray, " items"]:
+    """Read all lists of a property, one after the other."""
+    item = ranges(np.zeros_like(column.sizes), column.sizes)
+    return body.integers(np.repeat(column.starts, column.sizes) + item * body.width(kind.type), kind.type)
+
+
 def _faces(body: _Body, kind: _Property, column: _Column) -> Int64[np.ndarray, "faces 3"]:
     """Read the faces of a list of indices, split into triangles."""
-    if kind.length is None or kind.type.kind == "f":
-        raise JaxmarkError("The indices of the element face must be a list of integers.")
     short = np.flatnonzero(column.sizes < 3)
     if len(short):
         raise JaxmarkError(
             f"Row {short[0]} (zero-based) of the element face has {column.sizes[short[0]]} corners; it needs at least"
             " three."
         )
-    item = ranges(np.zeros_like(column.sizes), column.sizes)
-    index = body.integers(np.repeat(column.starts, column.sizes) + item * body.width(kind.type), kind.type)
-    return index[fan(column.sizes)]
+    return _items(body, kind, column)[fan(column.sizes)]
+
+
+def _strips(body: _Body, kind: _Property, column: _Column) -> Int64[np.ndarray, "faces 3"]:
+    """Read triangle strips: every three indices in a row are a triangle, every other one turned round; -1 ends a strip.
+
+    Triangles that have a corner twice only lead a strip from one place to another, and are no faces.
+    """
+    index = np.insert(_items(body, kind, column), np.cumsum(column.sizes), -1)  # a row ends a strip as well
+    place = np.arange(len(index))
+    since = place - np.maximum.accumulate(np.where(index == -1, place + 1, 0))  # the place in the strip
+    first, second, third = index[:-2], index[1:-1], index[2:]
+    odd = since[:-2] % 2 == 1
+    faces = np.stack([np.where(odd, second, first), np.where(odd, first, second), third], axis=1)
+    real = (faces != -1).all(axis=1) & (first != second) & (second != third) & (third != first)
+    return faces[real]
+
+
+_SURFACES = {"face": _faces, "tristrips": _strips}  # the elements that hold triangles, and what reads them

@@ -123,6 +123,7 @@ def test_lists_of_vertices(tmp_path: Path) -> None:
 
 HEAD = b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
 FACE = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+STRIPS = b"element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
 BODY = b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 
 
@@ -147,10 +148,12 @@ BODY = b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
         (HEAD + FACE + BODY.replace(b"3 0 1 2", b"-3 0 1"), "length -3"),
         (HEAD + FACE + BODY.replace(b"3 0 1 2", b"3 0 1 5"), r"Face 0 .*\[0, 1, 5\]"),
         (HEAD + FACE + BODY.replace(b"1 0 0", b"1 o 0"), "line 11: 'o'"),
-        (
-            HEAD + b"element tristrips 1\nproperty list int int vertex_indices\nend_header\n0 0 0 1 0 0 0 1 0 0",
-            "strips",
-        ),
+        (HEAD + STRIPS.replace(b"int vertex", b"float vertex") + b"0 0 0 1 0 0 0 1 0 3 0 1 2", "tristrips .*integers"),
+        (HEAD + STRIPS.replace(b"_indices", b"s") + b"0 0 0 1 0 0 0 1 0 3 0 1 2", "tristrips has no list"),
+        (HEAD + STRIPS + b"0 0 0 1 0 0 0 1 0 4 0 1 2", "ends in row 0 .*tristrips"),
+        (HEAD + STRIPS + b"0 0 0 1 0 0 0 1 0 4 0 1 2 3", r"Face 1 .*\[2, 1, 3\]"),
+        (HEAD + STRIPS + b"0 0 0 1 0 0 0 1 0 3 0 -1 2", "no faces"),
+        (HEAD + STRIPS + b"0 0 0 1 0 0 0 1 0 0", "no faces"),
         (HEAD + b"end_header\n" + BODY, "no faces"),
     ],
 )
@@ -179,3 +182,69 @@ def test_rows_of_different_length_with_fractions(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"4 0 1 2 3 .9", b".4 0 1 2 3 .9"))
     with pytest.raises(JaxmarkError, match=r"'\.4' is not a whole number"):
         load_mesh(path)
+
+
+def striped(order: str, normals: bool) -> tuple[bytes, list[int]]:
+    """A grid of 3 by 3 points in two rows of strips, and the byte offset of each vertex; text if the order is empty.
+
+    The first row leads from one strip to another through triangles without area, the second has a restart in it.
+    """
+    rows = [[0, 3, 1, 4, 2, 5, 5, 3, 3, 6, 4, 7], [4, 7, 5, -1, 8, 5, 7, -1, 1, 2]]
+    name = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    names = ["x", "y", "z", "nx", "ny", "nz"][: 6 if normals else 3]
+    header = f"ply\nformat {name} 1.0\nelement vertex 9\n" + "".join(f"property float {name}\n" for name in names)
+    data = (header + "element tristrips 2\nproperty list int int vertex_indices\nend_header\n").encode()
+    offsets = []
+    for number in range(9):
+        offsets.append(len(data))
+        values = [number % 3, number // 3, 0.25, 0, 0, 1][: len(names)]
+        data += struct.pack(f"{order}{len(names)}f", *values) if order else b"%.2f " * len(names) % (*values,) + b"\n"
+    for row in rows:
+        form = " ".join(map(str, [len(row), *row])).encode() + b"\n"
+        data += struct.pack(f"{order}{len(row) + 1}i", len(row), *row) if order else form
+    return data, offsets
+
+
+@pytest.mark.parametrize("order", ["", "<", ">"])
+def test_strips(tmp_path: Path, order: str) -> None:
+    data, offsets = striped(order, normals=False)
+    source = written(tmp_path, "s.ply", data)
+    mesh = load_mesh(source)
+    first = [[0, 3, 1], [1, 3, 4], [1, 4, 2], [2, 4, 5], [3, 6, 4], [4, 6, 7]]
+    np.testing.assert_array_equal(mesh.faces[:4], first[:4])
+    turns = np.cross(*np.moveaxis(np.diff(mesh.vertices[mesh.faces], axis=1), 1, 0))[:, 2]
+    assert len(turns) == 8  # the grid has eight triangles, all of them turned the same way
+    np.testing.assert_array_equal(turns, -1)
+    assert {frozenset(face) for face in mesh.faces.tolist()} >= {frozenset(face) for face in first}
+    out = patched(source, shifted(mesh, 4, [0, 0, 0.5]))
+    if order:
+        expected = bytearray(data)
+        struct.pack_into(order + "f", expected, offsets[4] + 8, 0.75)
+        assert out == bytes(expected)
+    else:
+        assert out == data[: offsets[4]] + data[offsets[4] :].replace(b"0.25", b"0.75", 1)
+
+
+@pytest.mark.parametrize("order", ["", "<", ">"])
+def test_normals_of_strips_turn(tmp_path: Path, order: str) -> None:
+    data, offsets = striped(order, normals=True)
+    source = written(tmp_path, "s.ply", data)
+    x, y, z = np.asarray(load_mesh(source).vertices).T
+    out = patched(source, load_mesh(source)._replace(vertices=np.stack([z, y, 0 - x], axis=1)))
+    if order:
+        got = np.array([struct.unpack_from(order + "6f", out, offset) for offset in offsets])
+        assert (out[: offsets[0]], out[offsets[-1] + 24 :]) == (data[: offsets[0]], data[offsets[-1] + 24 :])
+    else:
+        lines = out.decode().splitlines()
+        got = np.array([line.split() for line in lines[12:21]], dtype=float)
+        assert (lines[:12], lines[21:]) == (data.decode().splitlines()[:12], data.decode().splitlines()[21:])
+    np.testing.assert_allclose(got, np.stack([z, y, 0 - x, x * 0 + 1, x * 0, x * 0], axis=1), atol=1e-6)
+
+
+def test_faces_and_strips(tmp_path: Path) -> None:
+    face = FACE.removesuffix(b"end_header\n")
+    for data in (HEAD + STRIPS.replace(b"end_header\n", FACE), HEAD + face + STRIPS):
+        strips_first = data.index(b"tristrips") < data.index(b"element face")
+        lists = [b"3 2 1 0\n", b"3 0 1 2\n"] if strips_first else [b"3 0 1 2\n", b"3 2 1 0\n"]
+        mesh = loaded(tmp_path, "b.ply", data + BODY.removesuffix(b"3 0 1 2\n") + b"".join(lists))
+        np.testing.assert_array_equal(mesh.faces, [[0, 1, 2], [2, 1, 0]])
