@@ -254,7 +254,7 @@ def _save(source: Source, positions: np.ndarray, path: str | os.PathLike, like: 
     here, there = Path(like).parent, Path(path).parent
     if os.path.realpath(here) != os.path.realpath(there):
         read = read_beside(here)
-        for companion in source.companions():
+        for companion in patched.companions:
             try:
                 beside[companion] = read(companion)
             except JaxmarkError:  # what is missing already, or lies elsewhere, is not ours to bring along
@@ -269,7 +269,7 @@ def _patched(source: Source, positions: np.ndarray, name: str) -> Patched:
     any_moved = False
     for places in [part.places for part in source.parts] or [every]:
         any_moved |= _check_spacing(source, positions, places)
-    return source.patch(positions, name) if any_moved else Patched(source.file)
+    return source.patch(positions if any_moved else source.positions, name)
 
 
 def _check_spacing(source: Source, positions: np.ndarray, places: Int64[np.ndarray, " points"]) -> bool:
