@@ -166,7 +166,7 @@ def test_copies_are_traced(workshop: Workshop):
         (("identify", "copy.ply", *who, "--alpha", "0"), "alpha"),
         (("identify", "copy.ply", *who[:-1], "absent.txt"), "absent.txt"),
         (("detect", "copy.ply", *DETECT, "--record", told["record"]), "identify reads it"),
-        (("embed", "model.ply", "o.ply", "--key", "owner.key"), "either --message or --recipient"),
+        (("embed", "model.ply", "o.ply", "--key", "owner.key"), "--message, --presence or --recipient"),
         (("embed", "model.ply", "o.ply", "--key", "owner.key", "--recipient", "x", "--scheme", "host"), "keyed"),
     ]:
         assert re.search(sentence, workshop.refused(*arguments))
@@ -216,7 +216,10 @@ def test_refusals_are_one_sentence_and_leave_nothing(workshop: Workshop):
         (("embed", "model.ply", "out.ply", *mark, "--budget", "nan"), "budget"),
         (("embed", "model.ply", "out.ply", *mark, "--scheme", "magic"), "magic"),
         (("embed", "model.ply", "out.ply", "--key", "owner.key", "--message", "xyz"), "hexadecimal"),
-        (("embed", "model.ply", "out.ply", *mark, "--budget", "2e-4"), "at most .* bits .*budget of at least 0.000"),
+        (
+            ("embed", "model.ply", "out.ply", *mark, "--budget", "2e-4", "--noise", "0.005"),
+            "at most .* bits .*budget of at least 0.000",
+        ),
         (("embed", "model.ply", "out.ply", *mark, "--noise", "-1"), "noise"),
         (("embed", "model.ply", "out.ply", "--key", "owner.key", "--message", "00" * 600), "at most"),
         (("capacity", "model.ply", "--coverage", "2"), "coverage"),

@@ -133,3 +133,26 @@ def test_who_is_asked_to_end_leaves_nothing(tmp_path: Path):
         there = {path.name for path in tmp_path.iterdir()} - {"me.key", "ball.obj"}
         assert there in (set(), {"marked.obj", "marked.obj.jaxmark.json"}), there
         assert "Traceback" not in said or number == signal.SIGINT
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e-160, 1e160, 1e300])
+def test_a_suspect_of_any_size_is_read(size: float, key: jm.Key):
+    mesh = bumpy_sphere(3)
+    marked, _ = jm.embed(mesh, b"ok", key)
+    suspect = marked._replace(vertices=size * np.asarray(marked.vertices))
+    found = jm.detect(suspect, original=mesh, key=key, bits=16)
+    assert found.message == b"ok"
+    assert found.detected()
+
+
+def test_zeros_beside_exponents_take_their_digits(tmp_path: Path):
+    mesh = bumpy_sphere(2)
+    rows = 1e-40 * np.asarray(mesh.vertices)
+    rows[0] = 0
+    lines = [" ".join("0.0" if number == 0 else f"{number:.9e}" for number in row) for row in rows]
+    text = "".join(f"v {line}\n" for line in lines) + "".join("f {} {} {}\n".format(*face) for face in mesh.faces + 1)
+    (tmp_path / "a.obj").write_text(text)
+    before = jm.load_mesh(tmp_path / "a.obj")
+    moved = before._replace(vertices=np.asarray(before.vertices) + 1e-44)
+    jm.save_mesh(moved, tmp_path / "b.obj", like=tmp_path / "a.obj")
+    np.testing.assert_allclose(jm.load_mesh(tmp_path / "b.obj").vertices, moved.vertices, rtol=1e-8, atol=0)

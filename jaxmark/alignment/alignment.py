@@ -32,7 +32,7 @@ from jaxmark.geometry.mesh import (
     weld,
     weld_mesh,
 )
-from jaxmark.geometry.pose import Points, Pose, affine, similarity
+from jaxmark.geometry.pose import IDENTITY, Points, Pose, affine, similarity
 from jaxmark.geometry.surfaces import Surface, on_rim
 
 Align = Literal["auto", "same", "similarity", "affine"]
@@ -45,6 +45,7 @@ _MAX_AGREEING_ROUNDS = 10  # rounds of fitting a map to the points that agree wi
 _MAX_FIT_POINTS = 50_000  # random points by which a map is found before all points refine it
 _COPIES_APART = 0.1  # distance of copies of a point, over the size of the suspect, above which its order is another
 _ROUNDING = 1e-12  # error of sums over all points, in diagonals; if no coordinate is off by more, the displacement is 0
+_SMALLEST = 1e-50  # size of a suspect, in its file's units, whose powers do not vanish
 _MAX_COMPONENTS = 4  # largest components of a suspect that are tried one by one
 _MIN_COVERAGE = 0.05  # share of the original that an alignment must show
 _FULL_COVERAGE = 0.95  # share of the original from which on no further pieces are looked for
@@ -99,8 +100,21 @@ def align(original: Original, suspect: Mesh, how: Align = "auto", *, hands: Sequ
     if how not in get_args(Align):
         raise JaxmarkError(f"A suspect is aligned by {', '.join(get_args(Align))}, not {how!r}.")
     start = time.perf_counter()
-    found = _align(original, host_mesh(suspect), how, hands)
-    return found._replace(seconds=time.perf_counter() - start, how=how)
+    suspect, back = _in_range(host_mesh(suspect))
+    found = _align(original, suspect, how, hands)
+    return found._replace(pose=back.then(found.pose), seconds=time.perf_counter() - start, how=how)
+
+
+def _in_range(suspect: Mesh) -> tuple[Mesh, Pose]:
+    """A suspect of a size whose powers do not overflow or vanish, and the map to it, mostly none."""
+    size = float(np.ptp(np.asarray(suspect.vertices), axis=0).max(initial=0.0))
+    if not 0 < size < np.inf or _SMALLEST < size < 1 / _SMALLEST:
+        return suspect, IDENTITY
+    # In two steps, as a factor may be out of range itself.
+    exponent = -int(np.floor(np.log2(size)))
+    half = np.ldexp(1.0, exponent // 2)
+    scaled = np.asarray(suspect.vertices) * half * np.ldexp(1.0, exponent - exponent // 2)
+    return suspect._replace(vertices=scaled), Pose(np.ldexp(1.0, min(exponent, 1000)) * np.eye(3), np.zeros(3))
 
 
 def _align(original: Original, suspect: Mesh, how: Align, hands: Sequence[bool]) -> Alignment:

@@ -1,11 +1,43 @@
-"""Compiled programs, of which a process can hold only so many."""
+"""Compiled programs: kept from one command to the next, and let go of before a process holds too many."""
 
+import os
 from pathlib import Path
 
 import jax
 
 _MAPS, _MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 _FULL = 0.5
+_FOLDER = "jaxmark"  # in the user's own folder for what may be deleted
+_MAX_BYTES = 2**29
+_MIN_SECONDS = 0.1  # of compiling, from which on a program is kept
+
+
+def keep_programs() -> None:
+    """Keep compiled programs for the next command on meshes of like size; compiling them takes most of its seconds.
+
+    They lie in a folder of the user's own, since nobody else must be able to put programs there. Another folder is
+    named by JAX_COMPILATION_CACHE_DIR.
+    """
+    if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        return
+    try:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / _FOLDER
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.stat()
+        if os.name == "posix" and (found.st_uid != os.getuid() or found.st_mode & 0o022):
+            return
+        kept = sorted(((file.stat().st_mtime, file.stat().st_size, file) for file in folder.iterdir()), reverse=True)
+        size = 0
+        for _, bytes_, file in kept:
+            size += bytes_
+            if size > _MAX_BYTES:
+                file.unlink(missing_ok=True)
+        if not os.access(folder, os.W_OK):
+            return
+    except (OSError, RuntimeError):  # no home, no room, or another command at the same work
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", _MIN_SECONDS)
 
 
 def release_programs() -> None:

@@ -7,6 +7,9 @@ def main() -> None:
     """Run the command line."""
     try:
         from jaxmark.app.cli import main as run
+        from jaxmark.app.programs import keep_programs
+
+        keep_programs()
     except KeyboardInterrupt:
         sys.stderr.write("jaxmark: Interrupted.\n")
         sys.exit(2)

@@ -149,14 +149,18 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | 
         data = encode_new(mesh, Path(path).suffix.lower(), lambda data: parse(data, read_beside(Path(path).parent)))
         write_atomically(path, data)
         return
-    source = _source_of(path, like)
+    _save_whole(mesh, _source_of(path, like), path, like)
+
+
+def _save_whole(mesh: Mesh, source: Source, path: str | os.PathLike, like: str | os.PathLike) -> tuple[str, ...]:
+    """Write all meshes of a file as one."""
     before = _whole(source, like)
     if len(mesh.vertices) != len(before.vertices) or not np.array_equal(mesh.faces, before.faces):
         raise JaxmarkError(
             f"The mesh ({len(mesh.vertices)} vertices, {len(mesh.faces)} faces) does not have the vertices and faces"
             f" of {os.fspath(like)} ({len(before.vertices)} vertices, {len(before.faces)} faces)."
         )
-    _save(source, np.asarray(mesh.vertices), path, like)
+    return _save(source, np.asarray(mesh.vertices), path, like)
 
 
 def save_scene(meshes: Mapping[str, Mesh], path: str | os.PathLike, *, like: str | os.PathLike) -> tuple[str, ...]:
@@ -177,8 +181,7 @@ def save_scene(meshes: Mapping[str, Mesh], path: str | os.PathLike, *, like: str
     if not source.parts:
         if [*meshes] != [_ONLY]:
             raise JaxmarkError(f"{os.fspath(like)} has one mesh, {_ONLY!r}, not {', '.join(map(repr, meshes))}.")
-        save_mesh(meshes[_ONLY], path, like=like)
-        return ()
+        return _save_whole(host_mesh(meshes[_ONLY]), source, path, like)
     positions = source.positions.copy()
     parts = {part.name: part for part in source.parts}
     for name, mesh in meshes.items():
@@ -255,7 +258,7 @@ def _save(source: Source, positions: np.ndarray, path: str | os.PathLike, like: 
     here, there = Path(like).parent, Path(path).parent
     if os.path.realpath(here) != os.path.realpath(there):
         read = read_beside(here)
-        for companion in source.companions():
+        for companion in patched.companions:
             try:
                 beside[companion] = read(companion)
             except JaxmarkError:  # what is missing already, or lies elsewhere, is not ours to bring along
@@ -270,7 +273,7 @@ def _patched(source: Source, positions: np.ndarray, name: str) -> Patched:
     any_moved = False
     for places in [part.places for part in source.parts] or [every]:
         any_moved |= _check_spacing(source, positions, places)
-    return source.patch(positions, name) if any_moved else Patched(source.file)
+    return source.patch(positions if any_moved else source.positions, name)
 
 
 def _check_spacing(source: Source, positions: np.ndarray, places: Int64[np.ndarray, " points"]) -> bool:

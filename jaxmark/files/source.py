@@ -106,11 +106,6 @@ class Source:
     left: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def file(self) -> bytes:
-        """The file as it was read."""
-        return self.data
-
-    @property
     def positions(self) -> Float64[np.ndarray, "points 3"]:
         """The positions in file order."""
         return self.coordinates.values

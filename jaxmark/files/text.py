@@ -185,6 +185,8 @@ class TextNumbers:
         if self._whole:
             return Style(np.zeros_like(exponent), capital, 0, 0)
         size = np.abs(np.nan_to_num(self.values.reshape(-1), posinf=0.0, neginf=0.0))
+        if exponent.any() and not size[~exponent].any():
+            exponent = np.ones_like(exponent)  # zeros without exponent tell nothing of the digits meant
         fixed = np.flatnonzero(~exponent)
         decimals = int(after[fixed].max(initial=0))
         mantissa = int(after[exponent].max(initial=0))

@@ -347,11 +347,6 @@ class _GltfSource(Source):
     moved: Sequence[_Moved]
     compressed: Sequence[_Primitive]
 
-    @property
-    def file(self) -> bytes:
-        """See `Source`; `data` are the buffers here."""
-        return self.container.file
-
     def patch(self, positions: Float64[np.ndarray, "points 3"], name: str) -> Patched:
         """See `Source`; a primitive that cannot be compressed as it was is written without."""
         container = self.container
@@ -384,11 +379,7 @@ class _GltfSource(Source):
         remarks = (
             (f"{', '.join(plain)}: written without Draco, whose encoder does not know all types",) if plain else ()
         )
-        return Patched(encoded.file, encoded.beside, remarks)
-
-    def companions(self) -> Sequence[str]:
-        """See `Source`."""
-        return self.container.companions()
+        return Patched(encoded.file, encoded.beside, remarks, encoded.companions)
 
     def _bound(self, accessor: dict[str, Any], positions: Float64[np.ndarray, "rows 3"], elements: Elements) -> None:
         """Bring the bounds of an accessor up to date; they are stored numbers, without their unit."""

@@ -57,12 +57,15 @@ class Container:
             name: name of the file that is written, without its suffix; changed buffers are named after it.
         """
         beside: dict[str, bytes] = {}
+        unchanged: list[str] = []
         chunk: bytes | None = None
         for index, (buffer, content) in enumerate(zip(self.buffers, contents, strict=True)):
             if isinstance(buffer, str) or content is None:
                 continue
             old = self.data[buffer.place.start : buffer.place.stop]
             if content == old:
+                if buffer.kind == "file":
+                    unchanged.append(buffer.head)
                 continue
             entry = document["buffers"][index] = {**document["buffers"][index]}
             if len(content) != len(old):
@@ -77,7 +80,7 @@ class Container:
                     path = f"{name}.{hashlib.sha256(content).hexdigest()[:8]}.bin"
                     entry["uri"] = quote(path)
                     beside[path] = content
-        return Encoded(self._file(rewrite(self.text, document), chunk), beside)
+        return Encoded(self._file(rewrite(self.text, document), chunk), beside, self._companions(unchanged))
 
     def _file(self, text: str, chunk: bytes | None) -> bytes:
         """The bytes of the file with another document and another binary chunk."""
@@ -97,15 +100,14 @@ class Container:
         total -= len(self.json) + len(self.file) - self.json.stop
         return struct.pack("<4sIIII", _MAGIC, version, total, len(coded), _JSON) + coded + after
 
-    def companions(self) -> list[str]:
-        """The paths of other files that the document refers to: buffers and images."""
-        paths = [buffer.head for buffer in self.buffers if not isinstance(buffer, str) and buffer.kind == "file"]
+    def _companions(self, paths: list[str]) -> tuple[str, ...]:
+        """The paths of these buffers, and of images."""
         images = self.document.get("images", [])
         for image in images if isinstance(images, list) else []:
             uri = image.get("uri") if isinstance(image, dict) else None
             if isinstance(uri, str) and not uri.startswith("data:") and "://" not in uri:
                 paths.append(unquote(uri))
-        return paths
+        return tuple(paths)
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,7 @@ class Encoded:
 
     file: bytes
     beside: dict[str, bytes]  # by path, relative to the file's folder
+    companions: tuple[str, ...]  # paths of the files that it refers to and that did not change
 
 
 def open_container(data: bytes, read: Read) -> Container:

@@ -76,7 +76,7 @@ def compress(
     others = {name: data for name, data in attributes.items() if name != "POSITION"}
     if points.dtype.kind != "f" or any(data.dtype.kind == "i" for data in others.values()):
         return None  # it knows no signed integers
-    ids = {"POSITION": 0, **{name: index for index, name in enumerate(others, 1)}}
+    ids = {name: index for index, name in enumerate(others)}
     codec = require("DracoPy", "files")
     try:
         coded = codec.encode(
@@ -88,8 +88,8 @@ def compress(
         )
         back = codec.decode(coded)
         found = {item["unique_id"]: np.asarray(item["data"]) for item in back.attributes}
-        kept = np.array_equal(back.faces, faces) and np.array_equal(np.shape(back.points), points.shape)
-        kept &= np.array_equal(found[0], back.points)
+        ids["POSITION"] = next(item["unique_id"] for item in back.attributes if item["attribute_type"] == 0)
+        kept = np.array_equal(back.faces, faces) and found[ids["POSITION"]].shape == points.shape
         for name, data in others.items():
             kept &= np.array_equal(found[ids[name]].reshape(data.shape), data)
     except Exception:  # whatever it does not know
