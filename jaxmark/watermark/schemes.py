@@ -161,7 +161,8 @@ class KeyedScheme(Scheme):
     more for each bit of message and tag, but ends at λ = 0.44 unless the payload needs more. With a profile, the mark
     is written in the bands to which the profile gives strengths, whatever the payload.
 
-    Dimensions are counted as on a regular triangle mesh, √3/2π · λ for each coordinate of each vertex. The nuisance
+    Dimensions are counted as on a regular triangle mesh, √3/2π · λ for each coordinate of each vertex; on point clouds,
+    by the number of neighbours. The nuisance
     that is projected off has at most a twelfth of them, apart from affine maps; with a narrow pass band, a sixth.
     """
 
@@ -306,7 +307,7 @@ class KeyedScheme(Scheme):
     def _dimensions(self, original: Original, passing: int) -> float:
         """Number of dimensions of the lowest `passing` bands."""
         edge = 1 - math.cos(math.pi * passing / self.bands)
-        share = min(1.0, math.sqrt(3) / (2 * math.pi) * edge)
+        share = min(1.0, original.density * edge)
         return self._channels * share * int(original.used.sum())
 
 
