@@ -1,4 +1,4 @@
-"""Read and write mesh files: OBJ, PLY, OFF, STL and GLB.
+"""Read and write mesh files: OBJ, PLY, OFF, STL and GLB; and point clouds: XYZ, LAS and LAZ, too.
 
 A mesh is saved by patching the file that it was loaded from: whatever is no position or normal stays byte for byte.
 """
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import glb, obj, off, ply, stl
+from jaxmark.files import glb, las, obj, off, ply, stl, xyz
 from jaxmark.files.atomic import write_atomically
 from jaxmark.files.reading import read_file
 from jaxmark.files.source import Source, Texture
@@ -24,6 +24,9 @@ _FORMATS: dict[str, Callable[[bytes], Source]] = {
     ".off": off.parse,
     ".stl": stl.parse,
     ".glb": glb.parse,
+    ".xyz": xyz.parse,
+    ".las": las.parse,
+    ".laz": las.parse,
 }
 SUFFIXES = tuple(_FORMATS)
 # A file's numbers keep a displacement well enough if its RMS is at least this many times their spacing.
@@ -35,10 +38,10 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
 
     Vertices are the file's own, in its order: none are merged or dropped, and isolated ones are kept. An STL file has
     three vertices of its own for each facet. A GLB file gives the local coordinates of its one mesh; transformations of
-    nodes are not applied. Polygons are split into triangles (v0, v1, v2), (v0, v2, v3), …, for computing only.
+    nodes are not applied. A file without faces is a point cloud, as XYZ, LAS and LAZ files are. Polygons are split into triangles (v0, v1, v2), (v0, v2, v3), …, for computing only.
 
     Args:
-        path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary) or GLB file.
+        path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary), GLB, XYZ (text), LAS or LAZ file.
 
     Returns:
         NumPy arrays: float64 vertices in the file's units, int64 faces.
@@ -74,7 +77,7 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | 
         path: the file to write, in the format that its suffix names. It may be the same file as `like`.
         like: the file that the mesh was loaded from. Only the numbers of vertices that moved change, their normals
             follow, and everything else stays byte for byte. Without it a new file is written: exact in OBJ and OFF,
-            in single precision in PLY, STL and GLB.
+            in single precision in PLY, STL and GLB; exact in XYZ, and none in LAS and LAZ.
 
     Raises:
         JaxmarkError: if `path` has another suffix than `like`, the mesh has other faces or another number of

@@ -18,6 +18,8 @@ _PLANE_POINTS = 12  # nearest points that a plane is fitted to
 _SIDE_POINTS = 80  # nearest samples whose mean is inside, by which normals are turned outside
 _BLOCK = 2**16  # points whose planes are fitted at a time
 _COUNTED_POINTS = 200_000  # random points by which the size of cells is chosen
+_ANCHORS = 20_000  # points that are enough to find a pose by
+_STRAY_POINTS, _STRAY_RATIO = 8, 3.0  # a stray is so many times further from so many others than the median point is
 _REACH = 2.0  # spacings beside a point to which its plane reaches; beyond, the point itself is the closest
 
 
@@ -76,9 +78,15 @@ class Cloud:
         """The plane around each point."""
         return planes(self.tree, self.points)
 
+    def without_strays(self) -> "Cloud":
+        """The points that are not much further from the nearest others than most: no floaters, nothing thrown off."""
+        apart = spacings(self.points, _STRAY_POINTS)
+        return Cloud(self.points[apart <= _STRAY_RATIO * np.median(apart)])
+
     def anchors(self) -> tuple[Points, Points]:
-        """The points, and unit normals there, of either side."""
-        return self.points, self.planes.normals
+        """Random ones of the points, and unit normals there, of either side."""
+        chosen = np.sort(np.random.default_rng(0).permutation(len(self.points))[:_ANCHORS])
+        return self.points[chosen], self.planes.normals[chosen]
 
     def closest(self, points: Points, pose: Pose = IDENTITY) -> tuple[Points, Int64[np.ndarray, " points"]]:
         """Find where the planes around the nearest points come closest; see `Surface.closest`.
