@@ -192,9 +192,7 @@ def _poses_of_points(
             yield pose, False
 
 
-def _by_nearest(
-    original: Original, mesh: Mesh, target: Cloud, source: Cloud, pose: Pose, by_affine: bool
-) -> Alignment:
+def _by_nearest(original: Original, mesh: Mesh, target: Cloud, source: Cloud, pose: Pose, by_affine: bool) -> Alignment:
     """Align a suspect in a pose, nearly, by the points that survive in it; if there are none, by planes."""
     used, size = np.flatnonzero(original.used), len(original.used)
     settled, partners = settle(target.points, source.points, pose)

@@ -95,7 +95,8 @@ def find_heights(x: Cloud, y: Points) -> Heights:
     other = Cloud(y)
     ratio = (x.spacing / max(other.spacing, 1e-300)) ** 2
     mine, theirs = (
-        int(np.clip(round(_PLANE_POINTS * by), _PLANE_POINTS, _MAX_PLANE_POINTS)) for by in (1 / max(ratio, 1e-9), ratio)
+        int(np.clip(round(_PLANE_POINTS * by), _PLANE_POINTS, _MAX_PLANE_POINTS))
+        for by in (1 / max(ratio, 1e-9), ratio)
     )
     points = x.points
     before, after = planes(x.tree, points, mine), planes(other.tree, points, theirs)

@@ -38,7 +38,8 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
 
     Vertices are the file's own, in its order: none are merged or dropped, and isolated ones are kept. An STL file has
     three vertices of its own for each facet. A GLB file gives the local coordinates of its one mesh; transformations of
-    nodes are not applied. A file without faces is a point cloud, as XYZ, LAS and LAZ files are. Polygons are split into triangles (v0, v1, v2), (v0, v2, v3), …, for computing only.
+    nodes are not applied. A file without faces is a point cloud, as XYZ, LAS and LAZ files are. Polygons are split into
+    triangles (v0, v1, v2), (v0, v2, v3), …, for computing only.
 
     Args:
         path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary), GLB, XYZ (text), LAS or LAZ file.

@@ -32,7 +32,9 @@ def encode_new(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> byt
     if suffix in (".stl", ".glb") and not len(faces):
         raise JaxmarkError(f"A new {suffix[1:].upper()} file holds faces; save the point cloud as PLY or XYZ.")
     if suffix in (".las", ".laz"):
-        raise JaxmarkError("A new LAS or LAZ file is not written; pass the one it came from as `like`, or use PLY or XYZ.")
+        raise JaxmarkError(
+            "A new LAS or LAZ file is not written; pass the one it came from as `like`, or use PLY or XYZ."
+        )
     if suffix in (".obj", ".off", ".xyz"):
         data = _text(vertices, faces, suffix)
     elif not len(faces):
@@ -70,7 +72,7 @@ def _points_as_ply(vertices: np.ndarray) -> bytes:
 
 
 def _text(vertices: np.ndarray, faces: np.ndarray, suffix: str) -> bytes:
-    """Encode OBJ, OFF or XYZ with the shortest digits that give exactly the same float64; trimesh writes fixed decimals."""
+    """Encode OBJ, OFF or XYZ with the shortest digits that give exactly the same float64; trimesh has fixed decimals."""
     obj = suffix == ".obj"
     head = [] if obj or suffix == ".xyz" else ["OFF", f"{len(vertices)} {len(faces)} 0"]
     point = "v {!r} {!r} {!r}" if obj else "{!r} {!r} {!r}"

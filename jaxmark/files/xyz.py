@@ -10,7 +10,8 @@ from jaxmark.files.text import Text, TextNumbers, blank, unix, without_comments
 def parse(data: bytes) -> Source:
     """Read the first three numbers of each line, between spaces, commas or semicolons; other columns are left alone.
 
-    A first line that holds only the number of points, or names of columns, and lines after `#` or `//` are passed over.
+    A first line that holds only the number of points, one of names of columns after it, and what stands after `#` or
+    `//` are passed over.
 
     Raises:
         JaxmarkError: if a line has fewer than three numbers; the message names the line.
@@ -18,7 +19,9 @@ def parse(data: bytes) -> Source:
     work = blank(rb"[,;]", blank(rb"//[^\n\r]*", without_comments(unix(data))))
     text = Text(data, work)
     first, count = text.lines()
-    if len(first) and (count[0] == 1 or not _begins_with_number(text.token(int(first[0])))):
+    if len(first) and count[0] == 1:
+        first, count = first[1:], count[1:]
+    if len(first) and not _begins_with_number(text.token(int(first[0]))):
         first, count = first[1:], count[1:]
     if not len(first):
         raise JaxmarkError("The file has no points: it needs a line with three numbers for each.")
