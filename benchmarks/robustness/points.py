@@ -1,9 +1,10 @@
-"""Marks in point clouds and Gaussian splats after each attack alone: python benchmarks/robustness/points.py [MESH ...]
+"""Marks in clouds and splats, after one attack or two: python benchmarks/robustness/points.py [MESH ...]
 
-64 bits are written into clouds of --points points, as hidden as by default: an RMS displacement of 0.02 % of the
-diagonal, or less. Without meshes, the clouds are a bumpy sphere, and a laser scan of a street that was made up: rings of
-points on ground, walls and cars, ever further apart, with noise in range. Points of meshes are sampled from their
-surfaces by area. The first table says how each cloud was marked:
+64 bits are written into clouds of --points points: with --budget, or as hidden as by default, which is an RMS
+displacement of 0.02 % of the diagonal, or less. Without meshes, the clouds are a
+bumpy sphere, and a laser scan of a street that was made up: rings of points on ground, walls and cars, ever further
+apart, with noise in range. Points of meshes are sampled from their surfaces by area. The first table says how each
+cloud was marked:
 
 bits, usual     what `jaxmark.capacity` says the cloud carries in noise of half a percent of its size, half of it lost
 RMS             of the displacement, over the diagonal
@@ -30,6 +31,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
@@ -43,9 +45,10 @@ from common.attacks import Own, attacked
 from common.marks import MESSAGE
 from common.tables import head, line, say
 
-ATTACKS = """none; diagonal-noise 0.001; diagonal-noise 0.002; noise 0.005; quantisation 9; quantisation 8; reordering 1;
-subsampling 0.5; subsampling 0.9; subsampling 0.5 + diagonal-noise 0.001; cropping 0.5; outliers 0.1 + reordering 1;
-floaters 0.2; merging 0; merging 0.001; resampling 1; turned; subsampling 0.5 + turned; cropping 0.5 + turned"""
+ATTACKS = """none; diagonal-noise 0.001; diagonal-noise 0.002; noise 0.005; quantisation 9; quantisation 8;
+reordering 1; subsampling 0.5; subsampling 0.9; subsampling 0.5 + diagonal-noise 0.001; cropping 0.5;
+outliers 0.1 + reordering 1; floaters 0.2; merging 0; merging 0.001; resampling 1; turned; subsampling 0.5 + turned;
+cropping 0.5 + turned"""
 SIDE = 512  # pixels of a picture
 
 Points = Float64[np.ndarray, "points 3"]
@@ -94,9 +97,10 @@ def street(count: int) -> Mesh:
             first = np.nan_to_num(np.minimum(near, far), nan=-np.inf).max(axis=1)
             last = np.nan_to_num(np.maximum(near, far), nan=np.inf).min(axis=1)
             reach = np.where((first > 0) & (first < last), np.minimum(reach, first), reach)
-        points = way * (reach + 0.01 * random.normal(size=len(reach)))[:, None]
-        points[:, 2] += 0.3 * np.sin(0.2 * points[:, 0]) * (reach == ground)
-        found.append(points[reach < 60])
+        seen = reach < 60
+        points = way[seen] * (reach[seen] + 0.01 * random.normal(size=seen.sum()))[:, None]
+        points[:, 2] += 0.3 * np.sin(0.2 * points[:, 0]) * (reach == ground)[seen]
+        found.append(points)
     scanned = np.concatenate(found)
     return make_cloud(scanned[np.sort(random.permutation(len(scanned))[:count])])
 
@@ -129,8 +133,6 @@ def reading(marker: jm.watermark.Marker, suspects: Callable[[int], Mesh], seeds:
 def dress(mesh: Mesh) -> Splats:
     """Flat Gaussians on a cloud, about as wide as it is sparse, with a pattern of colours and some noise."""
     random, points = np.random.default_rng(2), np.asarray(mesh.vertices)
-    from scipy.spatial import KDTree
-
     apart = np.clip(spacings(points, 3), 0, 3 * np.median(spacings(points, 3)))
     sizes = apart[:, None] * [0.6, 0.6, 0.1] * random.uniform(0.7, 1.3, points.shape)
     normals = planes(KDTree(points), points).normals
@@ -222,6 +224,7 @@ def main() -> None:
     parser = make_parser(__doc__)
     add_meshes(parser, nargs="*")
     parser.add_argument("--points", type=int, default=50_000, help="points of each cloud; %(default)s")
+    parser.add_argument("--budget", type=float, help="RMS displacement over the diagonal; by default, marks are hidden")
     parser.add_argument("--seeds", type=int, default=1, help="attacks of each kind; %(default)s")
     parser.add_argument("--attacks", default=ATTACKS, help="kinds and strengths; %(default)s")
     parser.add_argument("--splats", action="store_true", help="render splats, and prune them")
@@ -236,7 +239,7 @@ def main() -> None:
     for name, cloud in clouds.items():
         markers[name] = jm.make_marker(cloud, key, bits=8 * len(MESSAGE))
         start = time.perf_counter()
-        marked[name], info = markers[name].embed(MESSAGE, noise=0)
+        marked[name], info = markers[name].embed(MESSAGE, arguments.budget, noise=0)
         took = time.perf_counter() - start
         across = jm.compare(cloud, marked[name]).point_to_plane
         apart = spacings(np.asarray(cloud.vertices)).mean() / diagonal(cloud)
@@ -246,7 +249,11 @@ def main() -> None:
     for steps in " ".join(arguments.attacks.split()).split("; "):
         say(steps)
         cells = [
-            reading(markers[name], lambda seed, mesh=marked[name]: attacked(mesh, steps, seed, OWN), arguments.seeds)
+            reading(
+                markers[name],
+                lambda seed, mesh=marked[name], steps=steps: attacked(mesh, steps, seed, OWN),
+                arguments.seeds,
+            )
             for name in clouds
         ]
         print(line(steps, *cells), flush=True)

@@ -1,8 +1,9 @@
 """Align a suspect with the original, to find the displacement of each point; on the host, without the key.
 
-Points of clouds are recognised by their order, else by being mutually nearest in a pose. Of meshes, vertices are recognised by
-their order, else by the connectivity around them. Else the suspect's surface is brought onto the original's. An affine attack moves the mark with the host, so that its map is inverted first, by least squares on
-the points that agree with it. Points that lie far off were cut away, replaced or lost, and are masked. A suspect that
+Points of clouds are recognised by their order, else by being mutually nearest in a pose. Of meshes, vertices are
+recognised by their order, else by the connectivity around them. Else the suspect's surface is brought onto the
+original's. An affine attack moves the mark with the host, so that its map is inverted first, by least squares on the
+points that agree with it. Points that lie far off were cut away, replaced or lost, and are masked. A suspect that
 was mirrored is read as it was before: any of these maps mirrors where that fits better.
 """
 

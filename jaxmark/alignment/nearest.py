@@ -28,6 +28,9 @@ _MAX_PLANE_POINTS = 60  # of the denser one, whose plane is about as wide
 _MAX_GAP = 4.0  # spacings of the sparser cloud, beyond which a place is a hole
 
 
+Others = Float64[np.ndarray, "others 3"]  # points of a suspect
+
+
 class Partners(NamedTuple):
     """Points of a suspect that are taken for the original's."""
 
@@ -44,7 +47,7 @@ class Heights(NamedTuple):
     known: Bool[np.ndarray, " points"]  # whether the suspect has a surface there
 
 
-def find_partners(x: Points, y: Points) -> Partners:
+def find_partners(x: Points, y: Others) -> Partners:
     """Find the points of a suspect that are mutually nearest to those of the original.
 
     Args:
@@ -62,7 +65,7 @@ def find_partners(x: Points, y: Points) -> Partners:
     return Partners(place, mutual & (distance <= _REACH * apart), bool(surviving))
 
 
-def settle(x: Points, y: Points, pose: Pose) -> tuple[Pose, Partners]:
+def settle(x: Points, y: Others, pose: Pose) -> tuple[Pose, Partners]:
     """Improve a pose by the points that are mutually nearest, until these stay the same.
 
     Args:
@@ -83,7 +86,7 @@ def settle(x: Points, y: Points, pose: Pose) -> tuple[Pose, Partners]:
     return pose, partners
 
 
-def find_heights(x: Cloud, y: Points) -> Heights:
+def find_heights(x: Cloud, y: Others) -> Heights:
     """Measure how far a suspect's surface is above the original's at each of the original's points.
 
     Both surfaces are planes through nearest points, about as wide, so that what bends or roughens both cancels.

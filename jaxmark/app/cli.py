@@ -131,7 +131,8 @@ def cli() -> None:
       jaxmark attack marked.ply suspect.ply noise 0.001
       jaxmark detect suspect.ply --original model.ply --key owner.key
 
-    Meshes are OBJ, PLY, OFF, STL or GLB; point clouds PLY, OBJ, OFF, XYZ, LAS or LAZ. Keep the key secret, and keep the original: detection needs both.
+    Meshes are OBJ, PLY, OFF, STL or GLB, and point clouds PLY, XYZ, LAS or LAZ, too. Keep the key secret, and keep the
+    original: detection needs both.
     """  # noqa: D301
 
 

@@ -226,7 +226,8 @@ def measure(original: Mesh, distorted: Mesh, metrics: Collection[Metric]) -> dic
         original: any mesh with an area, or a point cloud.
         distorted: another one.
         metrics: names in `METRICS` or `RENDERED`, for clouds in `OF_POINTS`, or functions from (original, distorted) to
-            a number that is 0 for equal meshes and rises with distortion. Functions are called with the meshes as given, in float64.
+            a number that is 0 for equal meshes and rises with distortion. Functions are called with the meshes as
+            given, in float64.
 
     Returns:
         The value of each metric; None if a named one needs meshes of the same connectivity and these differ in it.
@@ -256,8 +257,8 @@ def compare(original: Mesh, distorted: Mesh, metrics: Collection[str] | None = N
 
     Raises:
         JaxmarkError: if there is no such metric, it needs faces and a cloud has none, a mesh has no area or is unusable
-            (see `make_mesh`, `diagonal`), or libigl is missing: mrms, hausdorff, msdm2 and curvature need it, and so do metrics of pictures, which need
-            the extra `render`.
+            (see `make_mesh`, `diagonal`), or libigl is missing: mrms, hausdorff, msdm2 and curvature need it, and so do
+            metrics of pictures, which need the extra `render`.
     """
     found = measure(original, distorted, metrics_of(original, distorted) if metrics is None else metrics)
     return Comparison(*(found.get(name) for name in Comparison._fields))

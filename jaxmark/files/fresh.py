@@ -72,7 +72,7 @@ def _points_as_ply(vertices: np.ndarray) -> bytes:
 
 
 def _text(vertices: np.ndarray, faces: np.ndarray, suffix: str) -> bytes:
-    """Encode OBJ, OFF or XYZ with the shortest digits that give exactly the same float64; trimesh has fixed decimals."""
+    """Encode OBJ, OFF or XYZ with the shortest digits that give exactly the same float64; trimesh fixes decimals."""
     obj = suffix == ".obj"
     head = [] if obj or suffix == ".xyz" else ["OFF", f"{len(vertices)} {len(faces)} 0"]
     point = "v {!r} {!r} {!r}" if obj else "{!r} {!r} {!r}"

@@ -26,8 +26,8 @@ _REACH = 2.0  # spacings beside a point to which its plane reaches; beyond, the 
 class Planes(NamedTuple):
     """Planes through the nearest of some points, one for each place."""
 
-    centres: Points  # means of the nearest points
-    normals: Points  # unit vectors, of either side
+    centres: Float64[np.ndarray, "places 3"]  # means of the nearest points
+    normals: Float64[np.ndarray, "places 3"]  # unit vectors, of either side
     reach: Float64[np.ndarray, " places"]  # distance of the nearest point from the place
 
 

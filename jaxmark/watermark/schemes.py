@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Float64
 
 from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, vertex_normals
+from jaxmark.geometry.mesh import Mesh, check_faces, vertex_normals
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark.carriers import Carrier, KeyedCarrier, ModulatedCarrier, eigenspaces, host_bands, make_chips
@@ -219,6 +219,7 @@ class KeyedScheme(Scheme):
         chips = make_chips(choices, original.chip_places, code_bits, channels=self._channels, count=original.count)
         carrier = KeyedCarrier(host, chips, profile=self.strengths(original, bits).astype(dtype))
         if self.direction == "normals":
+            check_faces("A mark along normals", original.points)
             normals = vertex_normals(Mesh(original.positions, original.points.faces))
             carrier = carrier._replace(normals=original.to_traced(normals))
         return carrier._replace(masking=self.mask(original))

@@ -151,7 +151,10 @@ BODY = b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
             HEAD + b"element tristrips 1\nproperty list int int vertex_indices\nend_header\n0 0 0 1 0 0 0 1 0 0",
             "strips",
         ),
-        (HEAD + b"end_header\n" + BODY, "no faces"),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n",
+            "no vertices",
+        ),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path: Path, data: bytes, message: str) -> None:
