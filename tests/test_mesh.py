@@ -16,7 +16,7 @@ CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     ("vertices", "faces", "sentence"),
     [
         (CORNERS[:, :2], TRIANGLE, r"\[N, 3\]"),
-        (CORNERS, np.zeros((0, 3), int), "no faces"),
+        (np.zeros((0, 3)), np.zeros((0, 3), int), "no vertices"),
         (CORNERS, TRIANGLE.astype(float), "integers"),
         (CORNERS, np.array([[0, 1]]), "split polygons"),
         (CORNERS, np.array([[0, 1, 3]]), r"Face 0 .*\[0, 1, 3\]"),

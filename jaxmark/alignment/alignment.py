@@ -1,23 +1,27 @@
 """Align a suspect with the original, to find the displacement of each point; on the host, without the key.
 
-Vertices are recognised by their order, else by the connectivity around them; else the suspect's surface is brought onto
-the original's. An affine attack moves the mark with the host, so that its map is inverted first, by least squares on
-the points that agree with it. Points that lie far off were cut away, replaced or lost, and are masked. A suspect that
+Points of clouds are recognised by their order, else by being mutually nearest in a pose. Of meshes, vertices are
+recognised by their order, else by the connectivity around them. Else the suspect's surface is brought onto the
+original's. An affine attack moves the mark with the host, so that its map is inverted first, by least squares on the
+points that agree with it. Points that lie far off were cut away, replaced or lost, and are masked. A suspect that
 was mirrored is read as it was before: any of these maps mirrors where that fits better.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int64
 
+from jaxmark.alignment.nearest import find_heights, settle
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, residual
-from jaxmark.alignment.registration import BOTH_HANDS, refine, register_part, register_whole
+from jaxmark.alignment.registration import BOTH_HANDS, SETTINGS, refine, register_part, register_whole
 from jaxmark.alignment.replay import replay_smoothing, replay_smoothing_of_points
 from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.clouds import Cloud
 from jaxmark.geometry.connectivity import matching_vertices
 from jaxmark.geometry.mesh import (
     Mesh,
@@ -36,6 +40,7 @@ from jaxmark.geometry.pose import IDENTITY, Points, Pose, affine, similarity
 from jaxmark.geometry.surfaces import Surface, on_rim
 
 Align = Literal["auto", "same", "similarity", "affine"]
+Method = Literal["same", "connectivity", "points", "surface"]
 
 # A point is masked if it is off by more than the distance (in diagonals), and by more than the multiple of the 40 %
 # quantile of all points' distances. A suspect whose residual exceeds the distance is not aligned.
@@ -49,6 +54,8 @@ _SMALLEST = 1e-50  # size of a suspect, in its file's units, whose powers do not
 _MAX_COMPONENTS = 4  # largest components of a suspect that are tried one by one
 _MIN_COVERAGE = 0.05  # share of the original that an alignment must show
 _FULL_COVERAGE = 0.95  # share of the original from which on no further pieces are looked for
+_MIN_IN_PLACE = 0.5  # share of a cloud's points that must be in order, or near their place in the file
+_SAMPLES_PER_POINT = 2  # points sampled from a surface for each of an original cloud, which they are compared with
 _MIN_PIECE_POINTS, _MIN_PIECE_SHARE = 100, 0.01  # a piece with a map of its own shows this much of the original
 
 
@@ -59,7 +66,7 @@ class Alignment(NamedTuple):
     weights: Float64[np.ndarray, " points"]  # 1; 0 where a point is masked or no face uses it
     normals: Float64[np.ndarray, "points 3"] | None  # if given, only displacements along these unit vectors are known
     nuisance: Float[np.ndarray, "points columns"] | None  # displacements by smoothing, if that explains much
-    method: Literal["same", "connectivity", "surface"]  # recognition of vertices: by order, by connectivity, or none
+    method: Method  # recognition of vertices: by order, by connectivity, as nearest points of clouds, or none
     pose: Pose  # from the suspect's coordinates to the original's, as in their files
     residual: float  # root mean square displacement of the points with weight 1, in diagonals
     seconds: float  # duration of the alignment
@@ -88,7 +95,8 @@ def align(original: Original, suspect: Mesh, how: Align = "auto", *, hands: Sequ
         suspect: any mesh.
         how: `"same"` demands the original's vertices and faces in the same order; `"similarity"` and `"affine"` align
             surfaces, up to such a map; `"auto"` takes the first way that works: vertices by their order, vertices by
-            connectivity, surfaces up to a similarity. Each map may mirror, and faces may be turned round.
+            connectivity, surfaces up to a similarity; for point clouds, points by their order, else the nearest ones
+            where they are or up to a similarity. Each map may mirror, and faces may be turned round.
         hands: whether the pose of a surface may be one that does not mirror, one that mirrors, or either; the surface
             of a shape that is nearly its own mirror image does not tell.
 
@@ -124,12 +132,12 @@ def _align(original: Original, suspect: Mesh, how: Align, hands: Sequence[bool])
             "The original's file has another order than the one that was marked, so that vertices cannot be compared in"
             " order; align by 'auto'."
         )
+    if len(suspect.faces) == 0 or len(mesh.faces) == 0:
+        return _align_points(original, mesh, suspect, how, hands)
     alike = how == "auto" and original.in_order and same_connectivity(suspect, original.mesh)
     alike = alike and _has_copies_together(original, suspect)
     if how == "same" or alike:
-        x = np.asarray(original.positions, np.float64)
-        y, back = x + residual(original, suspect), _file(original).inverse()
-        return _by_points(original, mesh, y, original.used, np.asarray(mesh.faces), "same", back)
+        return _in_order(original, mesh, suspect)
     welded = weld_mesh(suspect, weld(suspect.vertices))
     if how == "auto":
         # If a suspect has no copies of points, the welded mesh is the suspect itself.
@@ -148,6 +156,77 @@ def _align(original: Original, suspect: Mesh, how: Align, hands: Sequence[bool])
                 faces = faces[(faces >= 0).all(axis=1)]
                 return _by_points(original, mesh, scale(y), found, faces, "connectivity", scale)
     return _by_surfaces(original, Surface(mesh), welded, how == "affine", hands)
+
+
+def _in_order(original: Original, mesh: Mesh, suspect: Mesh) -> Alignment:
+    """Align a suspect whose vertices are the original's, one by one."""
+    x = np.asarray(original.positions, np.float64)
+    y, back = x + residual(original, suspect), _file(original).inverse()
+    return _by_points(original, mesh, y, original.used, np.asarray(mesh.faces), "same", back)
+
+
+def _align_points(original: Original, mesh: Mesh, suspect: Mesh, how: Align, hands: Sequence[bool]) -> Alignment:
+    """Align a suspect where it or the original is a point cloud: the faces of the other one tell nothing."""
+    if how == "same":
+        return _in_order(original, mesh, suspect)
+    if how == "auto" and original.in_order and len(suspect.vertices) == len(original.mesh.vertices):
+        found = _in_order(original, mesh, suspect._replace(faces=original.mesh.faces))
+        if found.residual <= _FAR_DISTANCE and _coverage(original, found) >= _MIN_IN_PLACE:
+            return found
+    points = np.asarray(suspect.vertices, np.float64)[used_vertices(suspect)]
+    if len(suspect.faces):
+        sampled = Surface(suspect).sample(_SAMPLES_PER_POINT * int(original.used.sum())).points
+        points = np.concatenate([points, sampled])
+    target, source = Cloud(np.asarray(mesh.vertices)[original.used]), Cloud(points)
+    least = np.inf
+    for pose, placed in _poses_of_points(original, target, source, how, hands):
+        found = _by_nearest(original, mesh, target, source, pose, how == "affine")
+        coverage = _coverage(original, found)
+        if coverage >= (_MIN_IN_PLACE if placed and found.method == "surface" else _MIN_COVERAGE):
+            if found.residual <= _FAR_DISTANCE:
+                return found
+            least = min(least, found.residual)
+    raise JaxmarkError(
+        "The suspect could not be aligned: in no pose are its points near the original's"
+        + (f", but {100 * least:.2g} % of the diagonal away" if least < np.inf else "")
+        + ". Bring it into the original's pose and cut off what does not belong to it."
+    )
+
+
+def _poses_of_points(
+    original: Original, target: Cloud, source: Cloud, how: Align, hands: Sequence[bool]
+) -> Iterator[tuple[Pose, bool]]:
+    """Poses of a cloud to try, and whether they are where its file has it: most attacks leave it there."""
+    if how == "auto" and False in hands:
+        yield _file(original).inverse(), True
+    # Clouds of few points are further apart than surfaces, wherever both lie.
+    settings = replace(SETTINGS, whole_distance=max(SETTINGS.whole_distance, 2 * target.spacing))
+    dense = source.without_strays()
+    for register in (register_whole, register_part):
+        if (pose := register(target, dense, hands, settings=settings)) is not None:
+            yield pose, False
+
+
+def _by_nearest(original: Original, mesh: Mesh, target: Cloud, source: Cloud, pose: Pose, by_affine: bool) -> Alignment:
+    """Align a suspect in a pose, nearly, by the points that survive in it; if there are none, by planes."""
+    used, size = np.flatnonzero(original.used), len(original.used)
+    settled, partners = settle(target.points, source.points, pose)
+    if partners.surviving and partners.known.sum() >= max(4, _MIN_COVERAGE * len(used)):
+        y, known = np.zeros((size, 3)), np.zeros(size, bool)
+        y[used], known[used] = settled(source.points[partners.place]), partners.known
+        return _by_points(original, mesh, y, known, np.zeros((0, 3), np.int64), "points", settled)
+    pose = refine(source, *target.anchors(), pose, by_affine=by_affine)
+    heights = find_heights(target, pose(source.points))
+    displacement, normals, seen = np.zeros((size, 3)), np.zeros((size, 3)), np.zeros(size, bool)
+    displacement[used], normals[used] = heights.height[:, None] * heights.normals, heights.normals
+    seen[used] = heights.known
+    if seen.any():
+        seen &= _agreeing(np.linalg.norm(displacement, axis=1), seen)
+    displacement[~seen] = 0
+    residual = _rms(displacement[seen])
+    return Alignment(
+        displacement, seen.astype(float), normals, None, "surface", pose.then(_file(original)), residual, 0.0
+    )
 
 
 def _with_faces_of(mesh: Mesh, suspect: Mesh) -> Mesh:
@@ -191,7 +270,7 @@ def _by_points(
     y: Points,
     known: Bool[np.ndarray, " points"],
     faces: Int64[np.ndarray, "faces 3"],
-    method: Literal["same", "connectivity"],
+    method: Literal["same", "connectivity", "points"],
     before: Pose,
 ) -> Alignment:
     """Align a suspect by its recognised points.

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial import KDTree
 
-from jaxmark.geometry.mesh import Mesh, unit
+from jaxmark.geometry.mesh import unit
 from jaxmark.geometry.pose import Points, Pose, similarity
-from jaxmark.geometry.surfaces import sample
+from jaxmark.geometry.surfaces import Shape
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ FEATURE_SETTINGS = FeatureSettings()
 
 
 def poses_by_features(
-    original: Mesh,
-    suspect: Mesh,
+    original: Shape,
+    suspect: Shape,
     count: int,
     hands: Sequence[bool] = (False, True),
     *,
@@ -48,7 +48,7 @@ def poses_by_features(
     """Find the likeliest similarities that bring a suspect, whole or in part, onto an original.
 
     Args:
-        original: the original's mesh, about 1 in size.
+        original: the original's shape, about 1 in size.
         suspect: in any pose and scale, with at least a fifth of the original's area.
         count: largest number of poses for each hand.
         hands: which poses are looked for: those that mirror (True), those that do not (False), or both.
@@ -57,7 +57,7 @@ def poses_by_features(
     Returns:
         The poses, hand by hand, by descending number of matches that confirm them.
     """
-    target, source = sample(original, settings.points), sample(suspect, settings.points)
+    target, source = original.sample(settings.points), suspect.sample(settings.points)
     wanted = descriptors(target.points, target.normals, settings.radius, settings=settings)
     random, found = {mirrored: np.random.default_rng(0) for mirrored in hands}, {mirrored: [] for mirrored in hands}
     for share in settings.share_ratio ** np.arange(settings.shares):

@@ -1,5 +1,6 @@
 """Prepare an original for embedding and detection, on the host: float64 in, the computing dtype out."""
 
+import math
 from dataclasses import dataclass
 
 import jax
@@ -34,6 +35,16 @@ class Original:
     operator: Laplacian  # the Laplacian of the points, traced
     positions: Float64[np.ndarray, "points 3"]  # points, centred as a whole, in diagonals
     signal: Float[Array, "rows 3"]  # points, centred per connected component, in diagonals, traced
+
+    @property
+    def density(self) -> float:
+        """Dimensions of each coordinate below a small λ, over λ and the number of points.
+
+        Counted on regular triangles for meshes; for clouds, on points of which each is joined to all within a disc.
+        """
+        if len(self.points.faces):
+            return math.sqrt(3) / (2 * math.pi)
+        return 2 / float(np.mean(np.asarray(self.operator.degree)[: len(self.used)]))
 
     @property
     def moving(self) -> Bool[np.ndarray, " rows"]:

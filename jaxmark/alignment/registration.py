@@ -19,9 +19,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from jaxmark.alignment.features import FEATURE_SETTINGS, FeatureSettings, poses_by_features
-from jaxmark.geometry.mesh import unit, used_vertices, vertex_normals
+from jaxmark.geometry.mesh import unit
 from jaxmark.geometry.pose import IDENTITY, Points, Pose, similarity
-from jaxmark.geometry.surfaces import Surface, sample
+from jaxmark.geometry.surfaces import Shape
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ BOTH_HANDS = (False, True)
 
 
 def register_whole(
-    original: Surface,
-    suspect: Surface,
+    original: Shape,
+    suspect: Shape,
     hands: Sequence[bool] = BOTH_HANDS,
     *,
     settings: RegistrationSettings = SETTINGS,
@@ -76,29 +76,28 @@ def register_whole(
     Raises:
         JaxmarkError: if libigl is missing, or a surface has no area.
     """
-    target, source = (sample(surface.mesh, settings.samples).points for surface in (original, suspect))
+    target, source = (shape.sample(settings.samples).points for shape in (original, suspect))
     starts = _coarse(target, source, settings)
     if not starts:
         return None
-    used = np.flatnonzero(used_vertices(original.mesh))
-    chosen = used[np.random.default_rng(0).permutation(len(used))[: settings.fine_points]]
-    points, normals = np.asarray(original.mesh.vertices), vertex_normals(original.mesh)
+    points, normals = original.anchors()
+    chosen = np.random.default_rng(0).permutation(len(points))[: settings.fine_points]
     ends = []
     for mirrored in hands:
         alike = [start for start in starts if start.mirrors == mirrored]
         if len(alike) > 1:  # the principal axes of a shape that is nearly symmetric leave small features to decide
             count, features = settings.feature_poses, settings.features
-            alike += poses_by_features(original.mesh, suspect.mesh, count, [mirrored], settings=features)
+            alike += poses_by_features(original, suspect, count, [mirrored], settings=features)
             alike += _turned(suspect, target, source, alike, settings)
         ends += _best(suspect, points[chosen], normals[chosen], alike, settings)[:1]
     if not ends:
         return None
     _, best = min(ends, key=lambda end: _unlikeliness(end[0], end[1], settings))
-    return refine(suspect, points[used], normals[used], best, settings=settings)
+    return refine(suspect, points, normals, best, settings=settings)
 
 
 def _best(
-    surface: Surface, points: Points, normals: Points, starts: list[Pose], settings: RegistrationSettings
+    surface: Shape, points: Points, normals: Points, starts: list[Pose], settings: RegistrationSettings
 ) -> list[tuple[float, Pose]]:
     """Refine a surface's poses by few points, then the best of them by more; returns the distances that these leave."""
     ends: list[tuple[float, Pose]] = []
@@ -114,8 +113,8 @@ def _best(
 
 
 def register_part(
-    original: Surface,
-    suspect: Surface,
+    original: Shape,
+    suspect: Shape,
     hands: Sequence[bool] = BOTH_HANDS,
     *,
     settings: RegistrationSettings = SETTINGS,
@@ -134,12 +133,10 @@ def register_part(
     Raises:
         JaxmarkError: if libigl is missing, or a surface has no area.
     """
-    points, normals, _ = sample(suspect.mesh, settings.samples)
+    points, normals, _ = suspect.sample(settings.samples)
     fine, rounds = slice(settings.fine_points), settings.comparison_rounds
     ends = []
-    for start in poses_by_features(
-        original.mesh, suspect.mesh, settings.feature_poses, hands, settings=settings.features
-    ):
+    for start in poses_by_features(original, suspect, settings.feature_poses, hands, settings=settings.features):
         # Every point of a part has its place on the original, but not the other way round: the original is brought
         # onto the part, and that map is inverted.
         posed, along = start(points), unit(normals @ start.matrix.T)
@@ -161,14 +158,14 @@ def _unlikeliness(distance: float, pose: Pose, settings: RegistrationSettings) -
     return distance * (settings.mirror_ratio if pose.mirrors else 1)
 
 
-def _distance(surface: Surface, points: Points, pose: Pose, settings: RegistrationSettings) -> float:
+def _distance(surface: Shape, points: Points, pose: Pose, settings: RegistrationSettings) -> float:
     """Mean distance of points from a surface, where points that are lost count as a bounded distance."""
     distance = np.linalg.norm(surface.closest(points, pose)[0] - points, axis=1)
     return float(np.mean(np.minimum(distance, settings.lost_distance)))
 
 
 def refine(
-    surface: Surface,
+    surface: Shape,
     points: Points,
     normals: Points,
     pose: Pose,
@@ -253,7 +250,7 @@ def _axes(target: Points, source: Points) -> list[Pose]:
 
 
 def _turned(
-    suspect: Surface, target: Points, source: Points, starts: list[Pose], settings: RegistrationSettings
+    suspect: Shape, target: Points, source: Points, starts: list[Pose], settings: RegistrationSettings
 ) -> list[Pose]:
     """Turn poses about the axis of a round shape, upright and upside down, and keep the turns that fit locally best.
 

@@ -29,7 +29,7 @@ from jaxmark.extras import require
 from jaxmark.files import load_mesh, load_scene, save_mesh, save_scene
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import same_connectivity
-from jaxmark.watermark.budget import VISIBILITY, Visibility, make_budget
+from jaxmark.watermark.budget import VISIBILITY, Visibility, make_budget, visibility_of
 from jaxmark.watermark.coding.keys import Key, commitment, load_key, new_key, save_key
 from jaxmark.watermark.deposit import Deposit, make_deposit
 from jaxmark.watermark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity
@@ -137,7 +137,8 @@ def cli() -> None:
       jaxmark attack marked.ply suspect.ply noise 0.001
       jaxmark detect suspect.ply --original model.ply --key owner.key
 
-    Meshes are OBJ, PLY, OFF, STL, GLB or glTF. Keep the key secret, and keep the original: detection needs both.
+    Meshes are OBJ, PLY, OFF, STL, GLB, glTF or 3MF; point clouds PLY, XYZ, LAS or LAZ, too. Keep the key secret, and
+    keep the original: detection needs both.
     """  # noqa: D301
 
 
@@ -488,14 +489,16 @@ def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> N
     """Measure how DISTORTED differs from ORIGINAL, by all metrics.
 
     rms, max, mrms, hausdorff and gl are relative to the original's bounding-box diagonal, dame is in radians, shading
-    in just noticeable differences; the others lie between 0 and 1. flip and ssim compare pictures, which takes many
+    in just noticeable differences, point_to_plane in distances of nearest points; the others lie between 0 and 1. Of
+    point clouds, only rms, max and point_to_plane are known. flip and ssim compare pictures, which takes many
     seconds, and are left out without --pictures. Needs the extra `align`, with --pictures `render`.
     """
-    metrics = distortion.METRICS + distortion.RENDERED * pictures
-    compared = distortion.compare(load_mesh(original), load_mesh(distorted), metrics)._asdict()
+    first, second = load_mesh(original), load_mesh(distorted)
+    metrics = distortion.metrics_of(first, second) + distortion.RENDERED * pictures
+    compared = distortion.compare(first, second, metrics)._asdict()
     found = {name: compared[name] for name in metrics}
     lines = [
-        f"{name:<9} {'needs the same connectivity' if value is None else f'{value:.6g}'}"
+        f"{name:<14} {'needs the same connectivity' if value is None else f'{value:.6g}'}"
         for name, value in found.items()
     ]
     _answer(as_json, found, "\n".join(lines))
@@ -521,8 +524,9 @@ def capacity_command(
     as_json: bool,
 ) -> None:
     """Say how many bits the keyed scheme can hide in MESH so that they survive noise and the loss of vertices."""
-    bounds = make_budget(budget, dict(limits) or None, visibility)
-    bits = capacity(load_mesh(mesh), bounds.rms, limits=bounds.limits, noise=noise, coverage=coverage)
+    loaded = load_mesh(mesh)
+    bounds = make_budget(budget, dict(limits) or None, visibility, named=visibility_of(loaded))
+    bits = capacity(loaded, bounds.rms, limits=bounds.limits, noise=noise, coverage=coverage)
     answer = {"bits": bits, "budget": bounds.rms, "limits": bounds.limits, "noise": noise, "coverage": coverage}
     _answer(as_json, answer, f"{bits} bits at {bounds}, noise {noise:g}, coverage {coverage:g}")
 

@@ -1,4 +1,4 @@
-"""Cropping: vertices are lost together with their faces, and the others stay exactly where they were; host side."""
+"""Cropping: vertices or points are lost, with their faces, and the others stay exactly where they were; host side."""
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, PRNGKeyArray
@@ -95,11 +95,13 @@ def _nearest(mesh: Mesh, among: Int64[np.ndarray, " among"], centre: int, count:
 
 
 def _remove(mesh: Mesh, lost: Int64[np.ndarray, " lost"]) -> Mesh:
-    """Remove vertices and the faces that use them; refuse if no face is left."""
+    """Remove vertices and the faces that use them; refuse if no face is left, or of a cloud no point."""
     kept: Bool[np.ndarray, " vertices"] = np.ones(len(mesh.vertices), bool)
     kept[lost] = False
     faces = np.asarray(mesh.faces)
     left = faces[kept[faces].all(axis=1)]
+    if len(faces) == 0 and kept.any():
+        return Mesh(np.asarray(mesh.vertices)[kept], faces)
     if len(left) == 0:
         raise JaxmarkError(f"Without {len(lost)} of the vertices no face of the mesh would be left; cut out fewer.")
     return mesh if len(left) == len(faces) else compact(Mesh(mesh.vertices, left))

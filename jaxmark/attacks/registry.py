@@ -11,6 +11,7 @@ from jaxtyping import Array, Float64, Key, PRNGKeyArray
 from jaxmark.attacks._affine import affine, similarity
 from jaxmark.attacks._cropping import cropping, holes, region_cropping
 from jaxmark.attacks._jamming import jamming
+from jaxmark.attacks._points import floaters, merging, outliers, resampling, subsampling
 from jaxmark.attacks._quantisation import quantisation
 from jaxmark.attacks._simplification import simplification
 from jaxmark.attacks.bilateral import bilateral_smoothing
@@ -32,6 +33,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import (
     Mesh,
     Weld,
+    check_faces,
     compact,
     diagonal,
     host_mesh,
@@ -49,6 +51,7 @@ class Attack(NamedTuple):
     unit: str  # what its strength is, in words
     strengths: tuple[float, ...]  # usual strengths, weak ones first
     host: bool = False  # NumPy or another program; else traced, and given the mesh centred and at unit diagonal
+    faces: bool = False  # whether it needs faces, so that point clouds are refused
 
 
 #: All attacks of the library, by their names.
@@ -62,13 +65,17 @@ ATTACKS: Mapping[str, Attack] = {
         "standard deviation of a coordinate over the mean distance to the centre",
         (0.0003, 0.0006, 0.002, 0.003, 0.006),
     ),
-    "smoothing": Attack(laplacian_smoothing, "steps of 0.1", (5, 10, 30, 50, 100)),
-    "taubin": Attack(taubin_smoothing, "pairs of steps 0.5, -0.53", (5, 10, 20, 50, 100)),
-    "cotangent-smoothing": Attack(cotangent_smoothing, "time of diffusion by cotangents", (0.5, 1, 3, 5, 10)),
-    "bilateral": Attack(bilateral_smoothing, "iterations", (1, 2, 5, 10, 20)),
-    "low-pass": Attack(low_pass, "share of the spectrum, removed from the top", (0.3, 0.5, 0.7, 0.8, 0.9)),
-    "band-stop": Attack(band_stop, "width in λ of the band that is removed, from 0.02 up", (0.02, 0.05, 0.1, 0.2, 0.4)),
-    "jamming": Attack(jamming, "RMS over the diagonal", (0.0001, 0.0002, 0.0005, 0.001, 0.002)),
+    "smoothing": Attack(laplacian_smoothing, "steps of 0.1", (5, 10, 30, 50, 100), faces=True),
+    "taubin": Attack(taubin_smoothing, "pairs of steps 0.5, -0.53", (5, 10, 20, 50, 100), faces=True),
+    "cotangent-smoothing": Attack(
+        cotangent_smoothing, "time of diffusion by cotangents", (0.5, 1, 3, 5, 10), faces=True
+    ),
+    "bilateral": Attack(bilateral_smoothing, "iterations", (1, 2, 5, 10, 20), faces=True),
+    "low-pass": Attack(low_pass, "share of the spectrum, removed from the top", (0.3, 0.5, 0.7, 0.8, 0.9), faces=True),
+    "band-stop": Attack(
+        band_stop, "width in λ of the band that is removed, from 0.02 up", (0.02, 0.05, 0.1, 0.2, 0.4), faces=True
+    ),
+    "jamming": Attack(jamming, "RMS over the diagonal", (0.0001, 0.0002, 0.0005, 0.001, 0.002), faces=True),
     "quantisation": Attack(quantisation, "bits per coordinate", (11, 10, 9, 8, 7)),
     "similarity": Attack(
         similarity, "shift over the diagonal, and scale up or down less 1; any rotation", (0.1, 0.3, 1, 3, 9)
@@ -77,14 +84,16 @@ ATTACKS: Mapping[str, Attack] = {
     "warp": Attack(warp, "RMS over the diagonal", (0.002, 0.005, 0.01, 0.02, 0.04)),
     "bending": Attack(bending, "degrees", (2, 5, 10, 20, 45)),
     "twisting": Attack(twisting, "degrees over the whole length", (2, 5, 10, 20, 45)),
-    "edge-flips": Attack(edge_flips, "share of the edges", (0.01, 0.03, 0.1, 0.2, 0.3), host=True),
-    "midpoint": Attack(midpoint, "steps", (1, 2, 3)),
-    "sqrt3": Attack(sqrt3, "steps", (1, 2, 3)),
-    "loop": Attack(loop, "steps", (1, 2, 3)),
-    "simplification": Attack(simplification, "share of the edges", (0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.975), host=True),
-    "isotropic": Attack(isotropic, "edge length over the mean one", (0.5, 0.7, 1, 1.4, 2), host=True),
-    "iso-surface": Attack(iso_surface, "cells along the longest side", (200, 150, 100, 70, 50), host=True),
-    "poisson": Attack(poisson, "depth of the octree", (8, 7, 6, 5), host=True),
+    "edge-flips": Attack(edge_flips, "share of the edges", (0.01, 0.03, 0.1, 0.2, 0.3), host=True, faces=True),
+    "midpoint": Attack(midpoint, "steps", (1, 2, 3), faces=True),
+    "sqrt3": Attack(sqrt3, "steps", (1, 2, 3), faces=True),
+    "loop": Attack(loop, "steps", (1, 2, 3), faces=True),
+    "simplification": Attack(
+        simplification, "share of the edges", (0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.975), host=True, faces=True
+    ),
+    "isotropic": Attack(isotropic, "edge length over the mean one", (0.5, 0.7, 1, 1.4, 2), host=True, faces=True),
+    "iso-surface": Attack(iso_surface, "cells along the longest side", (200, 150, 100, 70, 50), host=True, faces=True),
+    "poisson": Attack(poisson, "depth of the octree", (8, 7, 6, 5), host=True, faces=True),
     "cropping": Attack(cropping, "share of the vertices, beyond a plane", (0.1, 0.3, 0.5, 0.7, 0.8), host=True),
     "region-cropping": Attack(
         region_cropping, "share of the vertices, in one region", (0.1, 0.3, 0.5, 0.7, 0.8), host=True
@@ -92,26 +101,45 @@ ATTACKS: Mapping[str, Attack] = {
     "holes": Attack(holes, "share of the vertices, in ten regions", (0.02, 0.05, 0.1, 0.2, 0.3), host=True),
     "reordering": Attack(reordering, "share of the vertices and of the faces", (0.01, 0.1, 0.3, 1), host=True),
     "added-geometry": Attack(
-        adding_geometry, "size of a ring and of a box over the diagonal", (0.25, 0.5, 1, 2), host=True
+        adding_geometry, "size of a ring and of a box over the diagonal", (0.25, 0.5, 1, 2), host=True, faces=True
     ),
-    "mosaic": Attack(mosaic, "shift of eight pieces over the diagonal", (0.01, 0.03, 0.1, 0.3, 1), host=True),
-    "missing-pieces": Attack(missing_pieces, "share of eight pieces", (0.125, 0.25, 0.5, 0.75), host=True),
+    "mosaic": Attack(
+        mosaic, "shift of eight pieces over the diagonal", (0.01, 0.03, 0.1, 0.3, 1), host=True, faces=True
+    ),
+    "missing-pieces": Attack(missing_pieces, "share of eight pieces", (0.125, 0.25, 0.5, 0.75), host=True, faces=True),
     "digits": Attack(digits, "significant decimal digits of a coordinate", (7, 6, 5, 4, 3), host=True),
     "float-bits": Attack(float_bits, "bits of a coordinate, 64, 32 or 16", (32, 16), host=True),
-    "soup": Attack(soup, "times through a binary STL file", (1, 2), host=True),
+    "soup": Attack(soup, "times through a binary STL file", (1, 2), host=True, faces=True),
     "arap": Attack(
-        as_rigid_as_possible, "drag of one end sideways over the diagonal", (0.02, 0.05, 0.1, 0.2, 0.4), host=True
+        as_rigid_as_possible,
+        "drag of one end sideways over the diagonal",
+        (0.02, 0.05, 0.1, 0.2, 0.4),
+        host=True,
+        faces=True,
     ),
-    "plane-fitting": Attack(plane_fitting, "degrees between normals of a flat region", (1, 2, 5, 10), host=True),
+    "plane-fitting": Attack(
+        plane_fitting, "degrees between normals of a flat region", (1, 2, 5, 10), host=True, faces=True
+    ),
     "primitive-fitting": Attack(
-        primitive_fitting, "degrees between normals of a flat region", (1, 2, 5, 10), host=True
+        primitive_fitting, "degrees between normals of a flat region", (1, 2, 5, 10), host=True, faces=True
     ),
     "mirror-averaging": Attack(
-        mirror_averaging, "share of the way to the mean with the mirror image", (0.25, 0.5, 0.75, 1), host=True
+        mirror_averaging,
+        "share of the way to the mean with the mirror image",
+        (0.25, 0.5, 0.75, 1),
+        host=True,
+        faces=True,
     ),
     "instance-averaging": Attack(
-        instance_averaging, "share of the way to the mean of all instances", (0.25, 0.5, 0.75, 1), host=True
+        instance_averaging, "share of the way to the mean of all instances", (0.25, 0.5, 0.75, 1), host=True, faces=True
     ),
+    "subsampling": Attack(subsampling, "share of a cloud's points, at random", (0.1, 0.3, 0.5, 0.7, 0.9), host=True),
+    "outliers": Attack(outliers, "share of a cloud's points, thrown off", (0.01, 0.03, 0.1, 0.3), host=True),
+    "floaters": Attack(floaters, "points added anywhere over a cloud's own", (0.01, 0.03, 0.1, 0.3), host=True),
+    "merging": Attack(
+        merging, "half width of a second scan's noise over the diagonal", (0, 0.0005, 0.001, 0.002), host=True
+    ),
+    "resampling": Attack(resampling, "points sampled anew over a cloud's own", (2, 1, 0.5, 0.25), host=True),
 }
 
 
@@ -176,6 +204,7 @@ def attack_each(meshes: Sequence[Mesh], kind: Kind, strength: float, *, seeds: S
     entry, meshes = get_attack(kind), [host_mesh(mesh) for mesh in meshes]
     _check_strength(strength)
     welded = weld(meshes[0].vertices)
+    _check_kind(entry, meshes[0])
     if entry.host or not all(
         same_connectivity(mesh, meshes[0]) and np.array_equal(weld(mesh.vertices).point, welded.point)
         for mesh in meshes[1:]
@@ -204,6 +233,7 @@ def _check_strength(strength: float) -> None:
 
 def _apply(mesh: Mesh, entry: Attack, strength: float, key: PRNGKeyArray) -> Mesh:
     """Apply an attack to the welded points of a mesh."""
+    _check_kind(entry, mesh)
     welded = weld(mesh.vertices)
     points = weld_mesh(mesh, welded)
     if entry.host:
@@ -212,6 +242,13 @@ def _apply(mesh: Mesh, entry: Attack, strength: float, key: PRNGKeyArray) -> Mes
         small = _normalise(points)
         found = small.back(entry.apply(small.mesh, strength, key))
     return _restore_copies(mesh, welded, points, found)
+
+
+def _check_kind(entry: Attack, mesh: Mesh) -> None:
+    """Refuse a point cloud where an attack needs faces."""
+    if entry.faces:
+        names = (name for name, other in ATTACKS.items() if other is entry)
+        check_faces(f"The attack {next(names, entry.apply.__name__)!r}", mesh)
 
 
 def _apply_to_all(
@@ -236,6 +273,8 @@ def _apply_to_all(
 def _restore_copies(mesh: Mesh, welded: Weld, points: Mesh, found: Mesh) -> Mesh:
     """Turn an attack's result on welded points into a mesh with its copies, if it still has the same points."""
     found = Mesh(np.asarray(found.vertices, np.float64), np.asarray(found.faces, np.int64))
+    if len(points.faces) and not len(found.faces):
+        raise JaxmarkError("The attack leaves no faces of the mesh; make it weaker.")
     still = found.vertices.shape == points.vertices.shape and np.array_equal(found.vertices, points.vertices)
     if not (same_connectivity(found, points) or (still and len(found.faces) == len(points.faces))):
         return compact(host_mesh(found))

@@ -5,6 +5,7 @@ differentiate.
 """
 
 from jaxmark.distortion._compare import METRICS as METRICS
+from jaxmark.distortion._compare import OF_POINTS as OF_POINTS
 from jaxmark.distortion._compare import RENDERED as RENDERED
 from jaxmark.distortion._compare import Comparison as Comparison
 from jaxmark.distortion._compare import DisplacementSize as DisplacementSize
@@ -13,6 +14,7 @@ from jaxmark.distortion._compare import Reference as Reference
 from jaxmark.distortion._compare import compare as compare
 from jaxmark.distortion._compare import displacement_size as displacement_size
 from jaxmark.distortion._compare import measure as measure
+from jaxmark.distortion._compare import metrics_of as metrics_of
 from jaxmark.distortion._compare import name_of as name_of
 from jaxmark.distortion._compare import shading_at_vertices as shading_at_vertices
 from jaxmark.distortion._curvature import curvature as curvature

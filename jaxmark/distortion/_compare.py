@@ -16,6 +16,7 @@ from jaxmark.distortion._shading import Hiding, make_hiding, shading, vertex_mea
 from jaxmark.distortion._stretch import stretch
 from jaxmark.distortion.dihedral import Hinges, dame, make_hinges
 from jaxmark.distortion.displacement import maximum, rms
+from jaxmark.distortion.point_planes import PointPlanes, make_point_planes, point_to_plane
 from jaxmark.distortion.rendered import flip, ssim
 from jaxmark.distortion.roughness import fmpd, local_roughness
 from jaxmark.distortion.surface import SurfaceDistance, surface_distance
@@ -24,6 +25,7 @@ from jaxmark.geometry.mesh import (
     Mesh,
     Weld,
     area,
+    check_faces,
     compact,
     diagonal,
     displacement,
@@ -54,7 +56,8 @@ class DisplacementSize(NamedTuple):
 class Comparison(NamedTuple):
     """Distortions of a mesh, by all metrics; lengths are over the original's bounding-box diagonal.
 
-    A metric is None if it was not asked for, or if it needs meshes of the same connectivity and these differ in it.
+    A metric is None if it was not asked for, or if it needs meshes of the same connectivity and these differ in it; of
+    point clouds, also if it needs faces.
     """
 
     rms: float | None  # displacement of the welded vertices that faces use, root mean square, unweighted
@@ -69,6 +72,7 @@ class Comparison(NamedTuple):
     curvature: float | None  # change of curvature tensors, 0 to 1 (in the manner of Torkhani et al.)
     stretch: float | None  # change of length that 1 % of the edges exceed, over their lengths
     shading: float | None  # visible turn of normals that 1 % of the area exceed, in just noticeable differences
+    point_to_plane: float | None  # displacement across the surface that 5 % of the points exceed, over their spacing
     flip: float | None = None  # difference of pictures by FLIP that 1 % of their pixels exceed, 0 to 1; see `RENDERED`
     ssim: float | None = None  # likewise by structural similarity, as 1 - SSIM
 
@@ -93,7 +97,7 @@ class Reference:
         """Prepare an original.
 
         Args:
-            original: any mesh with an area.
+            original: any mesh with an area, or a point cloud.
 
         Raises:
             JaxmarkError: see `compare`.
@@ -108,13 +112,17 @@ class Reference:
         """The distinct points of a mesh that faces use, moved and scaled as the original is to unit size."""
         scaled = mesh._replace(vertices=(np.asarray(mesh.vertices, np.float64) - self.centre) / self.length)
         scaled = _plain(scaled, points)
-        if not 0 < area(scaled) < np.inf:
+        if len(scaled.faces) and not 0 < area(scaled) < np.inf:
             raise JaxmarkError(f"The {name} has an area of {area(scaled):g}; its shape cannot be compared.")
         return scaled
 
     @cached_property
     def hinges(self) -> Hinges:
         return make_hinges(self.faces)
+
+    @cached_property
+    def around(self) -> PointPlanes:
+        return make_point_planes(np.asarray(self.mesh.vertices))
 
     @cached_property
     def hiding(self) -> Hiding:
@@ -126,6 +134,9 @@ class Reference:
         known = {**_METRICS, **_RENDERED}
         if unknown := [name for name in names if name not in known]:
             raise JaxmarkError(f"There is no metric {unknown[0]!r}; there are {', '.join(known)}.")
+        for name in names:
+            if name not in OF_POINTS:
+                check_faces(f"The metric {name!r}", self.given)
         pair = _Pair(self, distorted)
         wanted = {name for name in names if pair.same or name in _ANY_CONNECTIVITY}
         found: dict[Metric, float | None] = {}
@@ -156,6 +167,11 @@ class _Pair:
     def moved(self) -> DisplacementSize:
         return displacement_size(*self.given)
 
+    @property
+    def shift(self) -> Float[np.ndarray, "points 3"]:
+        first, second = (np.asarray(mesh.vertices, np.float64) for mesh in self.meshes)
+        return second - first
+
     @cached_property
     def surfaces(self) -> SurfaceDistance:
         return surface_distance(*self.meshes)
@@ -183,6 +199,7 @@ _METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
     "curvature": _Pair.tensor_distance,
     "stretch": lambda pair: stretch(pair.x, pair.y, pair.reference.hinges.edges),
     "shading": lambda pair: shading(pair.x, pair.y, pair.reference.hiding),
+    "point_to_plane": lambda pair: point_to_plane(pair.shift, pair.reference.around),
 }
 _RENDERED: Mapping[str, Callable[[_Pair], float]] = {
     "flip": lambda pair: flip(pair.meshes[0], pair.meshes[1]).high,
@@ -192,17 +209,25 @@ _RENDERED: Mapping[str, Callable[[_Pair], float]] = {
 METRICS = tuple(_METRICS)
 #: Names of the metrics of pictures: many seconds each, and so only computed where they are asked for.
 RENDERED = tuple(_RENDERED)
+#: Names of the metrics that need no faces: those of point clouds.
+OF_POINTS = ("rms", "max", "point_to_plane")
 _ANY_CONNECTIVITY = {"mrms", "hausdorff", "fmpd", "msdm2", *RENDERED}
+
+
+def metrics_of(original: Mesh, distorted: Mesh) -> tuple[str, ...]:
+    """The names in `METRICS` that two meshes can be compared by: if one is a point cloud, those in `OF_POINTS`."""
+    return METRICS if len(original.faces) and len(distorted.faces) else OF_POINTS
 
 
 def measure(original: Mesh, distorted: Mesh, metrics: Collection[Metric]) -> dict[Metric, float | None]:
     """Measure how far a mesh was distorted, by metrics by name and by functions of your own.
 
     Args:
-        original: any mesh with an area.
-        distorted: another mesh with an area.
-        metrics: names in `METRICS` or `RENDERED`, or functions from (original, distorted) to a number that is 0 for
-            equal meshes and rises with distortion. Functions are called with the meshes as given, in float64.
+        original: any mesh with an area, or a point cloud.
+        distorted: another one.
+        metrics: names in `METRICS` or `RENDERED`, for clouds in `OF_POINTS`, or functions from (original, distorted) to
+            a number that is 0 for equal meshes and rises with distortion. Functions are called with the meshes as
+            given, in float64.
 
     Returns:
         The value of each metric; None if a named one needs meshes of the same connectivity and these differ in it.
@@ -218,23 +243,24 @@ def name_of(metric: Metric) -> str:
     return metric if isinstance(metric, str) else getattr(metric, "__name__", repr(metric))
 
 
-def compare(original: Mesh, distorted: Mesh, metrics: Collection[str] = METRICS) -> Comparison:
+def compare(original: Mesh, distorted: Mesh, metrics: Collection[str] | None = None) -> Comparison:
     """Measure how far a mesh was distorted, by named metrics; all of them take seconds for 35,000 vertices.
 
     Vertices at the same position count as one point; if the connectivity is the same, the original's positions decide
     for both meshes.
 
     Args:
-        original: any mesh with an area.
-        distorted: another mesh with an area.
-        metrics: names in `METRICS` or `RENDERED`; the other metrics are None.
+        original: any mesh with an area, or a point cloud.
+        distorted: another one.
+        metrics: names in `METRICS` or `RENDERED`, by default all of `METRICS`, for clouds of `OF_POINTS`; the other
+            metrics are None.
 
     Raises:
-        JaxmarkError: if there is no such metric, a mesh has no area or is unusable (see `make_mesh`, `diagonal`), or
-            libigl is missing: mrms, hausdorff, msdm2 and curvature need it, and so do metrics of pictures, which need
-            the extra `render`.
+        JaxmarkError: if there is no such metric, it needs faces and a cloud has none, a mesh has no area or is unusable
+            (see `make_mesh`, `diagonal`), or libigl is missing: mrms, hausdorff, msdm2 and curvature need it, and so do
+            metrics of pictures, which need the extra `render`.
     """
-    found = measure(original, distorted, metrics)
+    found = measure(original, distorted, metrics_of(original, distorted) if metrics is None else metrics)
     return Comparison(*(found.get(name) for name in Comparison._fields))
 
 
@@ -250,6 +276,7 @@ def shading_at_vertices(original: Mesh, distorted: Mesh) -> Float[np.ndarray, " 
     Raises:
         JaxmarkError: if the connectivity differs, or see `compare`.
     """
+    check_faces("Shading", original)
     reference = Reference(original)
     pair, hiding = _Pair(reference, distorted), reference.hiding
     if not pair.same:

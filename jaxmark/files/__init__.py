@@ -1,4 +1,4 @@
-"""Read and write mesh files: OBJ, PLY, OFF, STL, GLB, glTF and 3MF.
+"""Read and write mesh files: OBJ, PLY, OFF, STL, GLB, glTF and 3MF; and point clouds: XYZ, LAS and LAZ, too.
 
 A file is saved by patching the one that it was loaded from: whatever is no position or normal stays byte for byte.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import gltf, obj, off, ply, stl, threemf
+from jaxmark.files import gltf, las, obj, off, ply, stl, threemf, xyz
 from jaxmark.files.atomic import write_atomically, write_together
 from jaxmark.files.reading import read_beside, read_file
 from jaxmark.files.source import Patched, Source, Texture
@@ -47,6 +47,9 @@ _FORMATS: dict[str, _Parser] = {
     ".glb": gltf.parse,
     ".gltf": gltf.parse,
     ".3mf": _alone(threemf.parse),
+    ".xyz": _alone(xyz.parse),
+    ".las": _alone(las.parse),
+    ".laz": _alone(las.parse),
 }
 SUFFIXES = tuple(_FORMATS)
 # A file's numbers keep a displacement well enough if its RMS is at least this many times their spacing.
@@ -67,10 +70,12 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
     Vertices are the file's own, in its order: none are merged or dropped, and isolated ones are kept. An STL file has
     three vertices of its own for each facet. A GLB, glTF or 3MF file gives local coordinates; transformations of nodes,
     components and built items are not applied. Several meshes in a file follow each other as one; `load_scene` tells
-    them apart. Polygons are split into triangles (v0, v1, v2), (v0, v2, v3), …, for computing only.
+    them apart. A file without faces is a point cloud, as XYZ, LAS and LAZ files are. Polygons are split into triangles
+    (v0, v1, v2), (v0, v2, v3), …, for computing only.
 
     Args:
-        path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary), GLB, glTF or 3MF file.
+        path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary), GLB, glTF, 3MF, XYZ (text), LAS or LAZ
+            file.
 
     Returns:
         NumPy arrays: float64 vertices in the file's units, int64 faces.
@@ -84,7 +89,7 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
 def load_scene(path: str | os.PathLike) -> Scene:
     """Read the meshes of a file: those of a GLB or glTF file, or the objects of an OBJ or 3MF file.
 
-    Objects of OBJ that share vertices are one mesh, and so are meshes that share positions. Instances and other nodes that
+    Objects of OBJ that share vertices are one mesh, and so are meshes that share positions. Instances, other nodes that
     show the same mesh are not told apart. Files of other formats have one mesh.
 
     Args:
@@ -132,9 +137,10 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | 
         mesh: the mesh to write.
         path: the file to write, in the format that its suffix names. It may be the same file as `like`.
         like: the file that the mesh was loaded from. Only the numbers of vertices that moved change, their normals
-            follow, and everything else stays byte for byte. Without it a new file is written: exact in OBJ, OFF
-            and 3MF, in single precision in PLY, STL and GLB. Files that a glTF file refers to come along: a buffer that changes
-            is named after the new file, the others are copied where they are not there already.
+            follow, and everything else stays byte for byte. Without it a new file is written: exact in OBJ, OFF, XYZ
+            and 3MF, in single precision in PLY, STL and GLB; none in LAS, LAZ and glTF. Files that a glTF file refers
+            to come along: a buffer that changes is named after the new file, the others are copied where they are not
+            there already.
 
     Raises:
         JaxmarkError: if `path` has another suffix than `like`, the mesh has other faces or another number of

@@ -12,6 +12,7 @@ from jaxmark.files.source import Source
 from jaxmark.geometry.mesh import Mesh
 
 # As a share of the bounding-box diagonal; marks move vertices by about ten times that or more.
+_CLOUDS = (".xyz", ".las", ".laz")  # formats without faces
 _MAX_ROUNDING = 1e-5
 
 
@@ -28,32 +29,56 @@ def encode_new(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> byt
             of the diagonal of the bounding box, as it does far from the origin.
     """
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    if suffix in (".obj", ".off"):
+    if suffix in _CLOUDS and len(faces):
+        raise JaxmarkError(f"{suffix[1:].upper()} files hold points without faces; save the mesh as PLY or OBJ.")
+    if suffix in (".stl", ".glb") and not len(faces):
+        raise JaxmarkError(f"A new {suffix[1:].upper()} file holds faces; save the point cloud as PLY or XYZ.")
+    if suffix in (".las", ".laz"):
+        raise JaxmarkError(
+            "A new LAS or LAZ file is not written; pass the one it came from as `like`, or use PLY or XYZ."
+        )
+    if suffix in (".obj", ".off", ".xyz"):
         data = _text(vertices, faces, suffix)
     elif suffix == ".3mf":
         data = _threemf(vertices, faces)
+    elif not len(faces):
+        data, vertices = _points_as_ply(vertices), _single(vertices, suffix)
     else:
         with np.errstate(all="ignore"):
             data = bytes(trimesh.Trimesh(vertices, faces, process=False).export(file_type=suffix[1:]))  # type: ignore[arg-type]
             if suffix == ".stl":
                 vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
-            exact, vertices = vertices, vertices.astype(np.float32).astype(np.float64)
-            error = np.abs(exact - vertices).max()
-            if not error <= _MAX_ROUNDING * np.linalg.norm(np.ptp(exact, axis=0)):
-                raise JaxmarkError(
-                    f"The single precision numbers of {suffix[1:].upper()} files would move vertices by {error:.3g},"
-                    " too far for this mesh; centre it on the origin, or use OBJ or OFF, which are written exactly."
-                )
+            vertices = _single(vertices, suffix)
     back = parse(data)
     if not (np.array_equal(back.positions, vertices) and np.array_equal(back.faces, faces)):
         raise JaxmarkError(f"The mesh does not survive being written as {suffix}; use another format.")
     return data
 
 
+def _single(vertices: np.ndarray, suffix: str) -> np.ndarray:
+    """Round to single precision; refused where that moves vertices too far."""
+    rounded = vertices.astype(np.float32).astype(np.float64)
+    error = np.abs(vertices - rounded).max()
+    if not error <= _MAX_ROUNDING * np.linalg.norm(np.ptp(vertices, axis=0)):
+        raise JaxmarkError(
+            f"The single precision numbers of {suffix[1:].upper()} files would move vertices by {error:.3g},"
+            " too far for this mesh; centre it on the origin, or use OBJ or OFF, which are written exactly."
+        )
+    return rounded
+
+
+def _points_as_ply(vertices: np.ndarray) -> bytes:
+    """Encode a point cloud, which trimesh would write with a face element for viewers of meshes."""
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    lines += [f"property float {axis}" for axis in "xyz"]
+    with np.errstate(all="ignore"):
+        return "\n".join([*lines, "end_header", ""]).encode() + vertices.astype("<f4").tobytes()
+
+
 def _text(vertices: np.ndarray, faces: np.ndarray, suffix: str) -> bytes:
-    """Encode OBJ or OFF with the shortest digits that give exactly the same float64; trimesh writes fixed decimals."""
+    """Encode OBJ, OFF or XYZ with the shortest digits that give exactly the same float64; trimesh fixes decimals."""
     obj = suffix == ".obj"
-    head = [] if obj else ["OFF", f"{len(vertices)} {len(faces)} 0"]
+    head = [] if obj or suffix == ".xyz" else ["OFF", f"{len(vertices)} {len(faces)} 0"]
     point = "v {!r} {!r} {!r}" if obj else "{!r} {!r} {!r}"
     face = "f {} {} {}" if obj else "3 {} {} {}"
     points = [point.format(*row) for row in vertices.tolist()]
@@ -73,7 +98,8 @@ def _threemf(vertices: np.ndarray, faces: np.ndarray) -> bytes:
         f'<Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>\n',
         "_rels/.rels": f'<Relationships xmlns="{package}/relationships">'
         f'<Relationship Target="/3D/3dmodel.model" Id="rel0" Type="{core}/2013/01/3dmodel"/></Relationships>\n',
-        "3D/3dmodel.model": f'<model unit="millimeter" xmlns="{core}/core/2015/02">\n<resources>\n<object id="1">\n<mesh>\n'
+        "3D/3dmodel.model": f'<model unit="millimeter" xmlns="{core}/core/2015/02">\n'
+        f'<resources>\n<object id="1">\n<mesh>\n'
         f"<vertices>\n{points}</vertices>\n<triangles>\n{triangles}</triangles>\n</mesh>\n</object>\n</resources>\n"
         '<build>\n<item objectid="1"/>\n</build>\n</model>\n',
     }

@@ -16,7 +16,8 @@ _LIST = re.compile(rb"<(?:[\w.-]+:)?(?:vertices|triangles)(?=[\s/>])[^>]*>")
 _TAG = re.compile(rb"<[^\s/>]+")
 _ATTRIBUTE = re.compile(rb"""\s+([^\s=]+)\s*=\s*(?:"\s*([^"]*?)\s*"|'\s*([^']*?)\s*')""")
 _VALUE = rb'"[^"<&\x00-\x1f\x7f-\xff]*+"'
-# Possessive, so that nothing is tried twice; white space inside of values, odd quotes and comments are left to the parser.
+# Possessive, so that nothing is tried twice; white space inside of values, odd quotes and comments are left to the
+# parser.
 _PLAIN = (
     rb"(?:\s*+<%(row)s\s++%(first)s=%(value)s\s++%(second)s=%(value)s\s++%(third)s=%(value)s"
     rb"(?:\s++(?!xmlns|(?:%(first)s|%(second)s|%(third)s)=)[A-Za-z_][\w.:-]*+=%(value)s)*+"

@@ -50,14 +50,14 @@ def rounded(mesh: Mesh, spacing: float) -> Canonical:
 
     Faces begin at their lowest corner and are sorted, and those without three different corners are left out: neither
     tells anything of the order in a file, nor of what a format leaves out. The hash covers the spacing, the points that
-    faces use, and the faces.
+    faces use, and the faces; of a point cloud, all points and no faces.
 
     Args:
         mesh: any mesh.
         spacing: distance of the grid's planes, in units of the mesh; a power of two.
 
     Raises:
-        JaxmarkError: if no face is left.
+        JaxmarkError: if the mesh has faces, but none is left.
     """
     cells = np.rint(np.asarray(mesh.vertices, np.float64) / spacing) * spacing + 0.0  # turns -0.0 into 0.0
     order = np.lexsort(cells.T[::-1])
@@ -68,11 +68,12 @@ def rounded(mesh: Mesh, spacing: float) -> Canonical:
     corners = point[np.asarray(mesh.faces)]
     a, b, c = corners.T
     corners = corners[(a != b) & (b != c) & (c != a)]
-    if not len(corners):
+    if len(mesh.faces) and not len(corners):
         raise JaxmarkError(
             "No face of the mesh has three corners that differ by more than rounding; it has no surface."
         )
-    used = np.zeros(int(fresh.sum()), bool)
+    # A cloud, which never had faces, uses all of its points.
+    used = np.full(int(fresh.sum()), len(mesh.faces) == 0)
     used[corners] = True
     place = np.empty(len(used), np.int64)
     place[np.argsort(~used, kind="stable")] = np.arange(len(used))

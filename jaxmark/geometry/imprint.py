@@ -100,7 +100,15 @@ def restore(copy: Mesh, imprint: Imprint) -> Restored:
 
 
 def _moments(mesh: Mesh) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, "3 3"]]:
-    """Centre and covariance of a surface: unlike those of its vertices, they do not depend on what is welded."""
+    """Centre and covariance of a surface: unlike those of its vertices, they do not depend on what is welded.
+
+    Those of a cloud are of its distinct points, as it has nothing else.
+    """
+    if len(mesh.faces) == 0:
+        vertices = np.asarray(mesh.vertices, np.float64)
+        points = vertices[weld(vertices).first]
+        middle = points.mean(axis=0)
+        return middle, (points - middle).T @ (points - middle) / len(points)
     corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
     start = corners[0, 0]  # keeps the digits of a mesh that is far from the origin
     a, b, c = np.moveaxis(corners - start, 1, 0)

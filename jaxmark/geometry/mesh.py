@@ -1,4 +1,4 @@
-"""Triangle meshes as arrays, checked once on the host.
+"""Triangle meshes and point clouds as arrays, checked once on the host.
 
 A `Mesh` is plain data: it goes through `jit`, `vmap` and `grad`. Everything in this module except the type itself
 runs on the host with NumPy, keeps float64, and says what is wrong before anything is traced.
@@ -18,7 +18,7 @@ from jaxmark.errors import JaxmarkError
 
 
 class Mesh(NamedTuple):
-    """A triangle mesh.
+    """A triangle mesh; without faces, a point cloud, all of whose points count as used.
 
     Build one with `make_mesh` or `load_mesh`, which validate; the type itself checks nothing, because transformed
     code rebuilds it with tracers.
@@ -41,21 +41,23 @@ def make_mesh(vertices: ArrayLike, faces: ArrayLike) -> Mesh:
     Args:
         vertices: `[N, 3]` finite numbers; kept in float64.
         faces: `[F, 3]` integers, zero-based, each in `[0, N)`. Degenerate faces, duplicate vertices, isolated
-            vertices, boundaries and non-manifold edges are all accepted.
+            vertices, boundaries and non-manifold edges are all accepted. Without any, the mesh is a point cloud.
 
     Returns:
         A mesh of NumPy arrays: float64 vertices, int64 faces.
 
     Raises:
-        JaxmarkError: if a shape is wrong, there is no vertex or no face, a coordinate is not finite, or an index is
-            not an integer or out of range.
+        JaxmarkError: if a shape is wrong, there is no vertex, a coordinate is not finite, or an index is not an
+            integer or out of range.
     """
     points = np.asarray(vertices)
     triangles = np.asarray(faces)
     if points.ndim != 2 or points.shape[1] != 3:
         raise JaxmarkError(f"vertices must be an array [N, 3], got shape {points.shape}.")
+    if not len(points):
+        raise JaxmarkError("The mesh has no vertices; there is nothing to mark, measure or read.")
     if triangles.size == 0:
-        raise JaxmarkError("The mesh has no faces; a point cloud has no graph to filter on.")
+        triangles = np.zeros((0, 3), np.int64)
     if triangles.ndim != 2 or triangles.shape[1] != 3:
         raise JaxmarkError(f"faces must be an array [F, 3], got shape {triangles.shape}; split polygons first.")
     if not np.issubdtype(triangles.dtype, np.integer):
@@ -84,6 +86,20 @@ def host_mesh(mesh: Mesh) -> Mesh:
     """Convert a mesh of any arrays to validated NumPy arrays; raises as `make_mesh` does, and for traced arrays."""
     check_concrete("This", mesh.vertices, mesh.faces)
     return make_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def check_faces(name: str, mesh: Mesh) -> None:
+    """Refuse a point cloud, for functions of surfaces.
+
+    Args:
+        name: what needs faces, as a sentence begins with it.
+        mesh: any mesh.
+
+    Raises:
+        JaxmarkError: if the mesh has no faces.
+    """
+    if len(mesh.faces) == 0:
+        raise JaxmarkError(f"{name} needs faces, and a point cloud of {len(mesh.vertices)} points has none; mesh it.")
 
 
 def check_concrete(name: str, *values: Any) -> None:
@@ -227,14 +243,16 @@ def components(mesh: Mesh) -> list[Mesh]:
 
 
 def used_vertices(mesh: Mesh) -> Bool[np.ndarray, " vertices"]:
-    """Mask of the vertices that faces use; the others are no part of the surface."""
+    """Mask of the vertices that faces use; the others are no part of the surface. A cloud uses all of its points."""
+    if len(mesh.faces) == 0:
+        return np.ones(len(mesh.vertices), bool)
     used = np.zeros(len(mesh.vertices), bool)
     used[np.asarray(mesh.faces)] = True
     return used
 
 
 def compact(mesh: Mesh) -> Mesh:
-    """Remove the vertices that no face uses; the others keep their order."""
+    """Remove the vertices that no face uses; the others keep their order, and a cloud keeps all of its points."""
     used = used_vertices(mesh)
     return Mesh(np.asarray(mesh.vertices)[used], (np.cumsum(used) - 1)[np.asarray(mesh.faces)])
 

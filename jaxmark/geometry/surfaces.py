@@ -4,15 +4,40 @@ Closest points come from libigl, which agrees with brute force at any scale of c
 """
 
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
-from jaxmark.geometry.mesh import Mesh, area, boundary_vertices, unit, vertex_normals
+from jaxmark.geometry.mesh import Mesh, area, boundary_vertices, unit, used_vertices, vertex_normals
 from jaxmark.geometry.pose import IDENTITY, Points, Pose
+
+
+class Samples(NamedTuple):
+    """Points sampled from a surface."""
+
+    points: Points
+    normals: Points  # at the points, unit length
+    area: float  # the surface's area, in the mesh's units squared
+
+
+@runtime_checkable
+class Shape(Protocol):
+    """What registration brings onto each other: the surface of a mesh, or the points of a cloud."""
+
+    def anchors(self) -> tuple[Points, Points]:
+        """Points of the shape itself, and unit normals there."""
+        ...
+
+    def closest(self, points: Points, pose: Pose = IDENTITY) -> tuple[Points, Int64[np.ndarray, " points"]]:
+        """The closest places on the shape, placed by a pose, and what of the shape each lies on."""
+        ...
+
+    def sample(self, count: int) -> Samples:
+        """Points all over the shape, in random order and the same at every call."""
+        ...
 
 
 class Surface:
@@ -45,13 +70,14 @@ class Surface:
         _, face, closest = self._tree.squared_distance(*self._arrays, queries)
         return pose(np.asarray(closest).reshape(-1, 3)), np.asarray(face).ravel().astype(np.int64)
 
+    def anchors(self) -> tuple[Points, Points]:
+        """The vertices that faces use, and unit normals there."""
+        used = used_vertices(self.mesh)
+        return np.asarray(self.mesh.vertices)[used], vertex_normals(self.mesh)[used]
 
-class Samples(NamedTuple):
-    """Points sampled from a surface."""
-
-    points: Points
-    normals: Points  # at the points, unit length
-    area: float  # the surface's area, in the mesh's units squared
+    def sample(self, count: int) -> Samples:
+        """Sample points, see `sample`."""
+        return sample(self.mesh, count)
 
 
 def sample(mesh: Mesh, count: int) -> Samples:

@@ -242,7 +242,7 @@ def from_points(
             f"Each of {len(positions)} points has up to {len(positions) - 1} neighbours, not {neighbours}."
         )
     _check_name("weights are", weights, PointWeighting)
-    pairs, reach = _nearest(positions, neighbours)
+    pairs, reach = nearest_pairs(positions, neighbours)
     if weights == "valence":
         return graph_laplacian(pairs, len(positions), lowering=lowering)
     lengths = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
@@ -254,7 +254,9 @@ def from_points(
     return graph_laplacian(pairs, len(positions), 1 / lengths, lowering=lowering)
 
 
-def _nearest(positions: Float64[np.ndarray, "points axes"], count: int) -> tuple[Int64[np.ndarray, "edges 2"], float]:
+def nearest_pairs(
+    positions: Float64[np.ndarray, "points axes"], count: int
+) -> tuple[Int64[np.ndarray, "edges 2"], float]:
     """Pairs of points one of which is among the nearest of the other, and the mean distance of the last of these."""
     found = KDTree(positions).query(positions, count + 1)
     distance, nearest = (np.asarray(part) for part in found)

@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Shaped
 
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.spectral.graphs import Weighting, from_mesh
-from jaxmark.spectral.laplacian import Laplacian, Lowering
+from jaxmark.spectral.graphs import Weighting, from_mesh, nearest_pairs
+from jaxmark.spectral.laplacian import Laplacian, Lowering, graph_laplacian
 
 _MIN_SIZE = 256
 _MAX_DOUBLED_SIZE = 2**12  # up to this, sizes double: running takes next to no time
+_NEIGHBOURS = 10  # nearest points that each point of a cloud is joined to, at least
 _MAX_PADDED_SIZE = 2**17  # beyond this, running takes longer than compiling
 
 
@@ -35,12 +36,19 @@ def pad_rows(rows: Shaped[np.ndarray, " rows *columns"], count: int, value: floa
 def common_laplacian(mesh: Mesh, weights: Weighting = "valence", lowering: Lowering = "auto") -> Laplacian:
     """`from_mesh`, padded with isolated vertices and with edges past the last vertex.
 
+    A mesh without faces is a cloud: its points are joined to the nearest ones, as `from_points` does, by edges of
+    weight 1 whatever the weights asked for.
+
     Pad signals to the operator's size, such as by `pad_rows`.
 
     Raises:
         JaxmarkError: see `from_mesh`.
     """
     vertices = np.asarray(mesh.vertices, np.float64)
+    if len(mesh.faces) == 0:
+        pairs, _ = nearest_pairs(vertices, min(_NEIGHBOURS, len(vertices) - 1))
+        # Where one point is near to another, the other mostly is near to the one.
+        return pad_edges(graph_laplacian(pairs, common_size(len(vertices)), lowering=lowering), 0.75 * _NEIGHBOURS)
     padded = mesh._replace(vertices=pad_rows(vertices, common_size(len(vertices))))
     # A closed surface of triangles has about three edges per vertex.
     return pad_edges(from_mesh(padded, weights, lowering=lowering), 3)

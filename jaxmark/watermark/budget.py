@@ -26,6 +26,14 @@ VISIBILITY: Mapping[Visibility, Mapping[str, float]] = {
     "careful look": {"shading": 2.5, "dame": 0.02, "stretch": 0.15},
     "visible": {"shading": 6.0, "dame": 0.05, "stretch": 0.25},
 }
+#: The same for point clouds, which have no faces that shade: hidden is an RMS displacement of 0.02 % of the diagonal,
+#: or less where points are so dense that 5 % of them would move across their surface by more than 0.15 of the distance
+#: between nearest points.
+CLOUD_VISIBILITY: Mapping[Visibility, Mapping[str, float]] = {
+    "hidden": {"rms": 2e-4, "point_to_plane": 0.15},
+    "careful look": {"rms": 5e-4, "point_to_plane": 0.4},
+    "visible": {"rms": 1e-3, "point_to_plane": 1.0},
+}
 _MAX_RMS = 0.01  # displacement in diagonals, if only limits are given; a larger one is no watermark
 _FIRST_RMS = 2e-4  # displacement in diagonals that is tried first
 _MIN_LIMIT_SHARE = 0.99  # share of a limit that is as good as all of it
@@ -56,13 +64,25 @@ class Written(NamedTuple):
     moved: distortion.DisplacementSize  # size of the displacement that was reached
 
 
-def make_budget(rms: float | None = None, limits: Limits | None = None, visibility: Visibility | None = None) -> Budget:
-    """Make a budget; if no argument is given, the mark is hidden.
+def visibility_of(mesh: Mesh) -> Mapping[Visibility, Mapping[str, float]]:
+    """The limits by what people see of such a mesh: `VISIBILITY`, or of a point cloud `CLOUD_VISIBILITY`."""
+    return VISIBILITY if len(mesh.faces) else CLOUD_VISIBILITY
+
+
+def make_budget(
+    rms: float | None = None,
+    limits: Limits | None = None,
+    visibility: Visibility | None = None,
+    *,
+    named: Mapping[Visibility, Mapping[str, float]] = VISIBILITY,
+) -> Budget:
+    """Make a budget; if no argument is given but `named`, the mark is hidden.
 
     Args:
         rms: RMS displacement relative to the bounding box's diagonal, in (0, 1).
         limits: the largest values of metrics, by their names in `distortion.METRICS` or by functions of your own.
         visibility: a name in `VISIBILITY`, whose limits hold beside the others given.
+        named: the limits that names stand for, see `visibility_of`.
 
     Raises:
         JaxmarkError: if there is no such metric, or a number is out of range.
@@ -71,9 +91,9 @@ def make_budget(rms: float | None = None, limits: Limits | None = None, visibili
         raise JaxmarkError(f"The budget is relative to the bounding box's diagonal and in (0, 1), got {rms}.")
     if rms is None and limits is None and visibility is None:
         visibility = "hidden"
-    if visibility is not None and visibility not in VISIBILITY:
-        raise JaxmarkError(f"visibility is one of {', '.join(map(repr, VISIBILITY))}, not {visibility!r}.")
-    wanted: dict[Metric, float] = {**VISIBILITY[visibility]} if visibility is not None else {}
+    if visibility is not None and visibility not in named:
+        raise JaxmarkError(f"visibility is one of {', '.join(map(repr, named))}, not {visibility!r}.")
+    wanted: dict[Metric, float] = {**named[visibility]} if visibility is not None else {}
     for metric, value in (limits or {}).items():
         wanted[metric] = min(value, wanted.get(metric, math.inf))
     checked: dict[Metric, float] = {}

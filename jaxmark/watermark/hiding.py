@@ -1,4 +1,7 @@
-"""Where a displacement is hidden, and in which direction: along planes, cylinders and edges more than across them."""
+"""Where a displacement is hidden, and in which direction: along planes, cylinders and edges more than across them.
+
+Points of a cloud have no faces that shade: they hide by how far they are apart.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +11,7 @@ from scipy import sparse
 
 from jaxmark.alignment.original import Original
 from jaxmark.distortion import Hiding, make_hiding
+from jaxmark.geometry.clouds import spacings
 from jaxmark.geometry.mesh import Mesh, area, edges, face_normals, open_sides, unit
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import filter
@@ -20,6 +24,9 @@ _BENT = np.radians(2)  # angle between faces from which on a surface may hide as
 _MIN_HIDDEN = 0.12  # of what a plane hides
 _LEAST_BEND = 1e-4  # radians that the flattest faces hide in the mean of those around
 _AVERAGING_SCALE = 2  # bends are averaged over 2^2 steps of diffusion
+_SPACING_POINTS = 8  # nearest points whose mean distance says how dense a cloud is
+_LEAST_SPACING, _MOST_SPACING = 0.25, 2.0  # over the median: what denser and looser parts count as
+_SPACING_SCALE = 5  # spacings are averaged over 2^5 steps of diffusion
 
 
 def hiding_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
@@ -34,6 +41,8 @@ def hiding_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     A plane beside something rough hides nothing: what a face hides is capped by the second largest angle to its
     neighbours, which is 0 on planes and cylinders up to their rims.
 
+    A point of a cloud may move in all directions, as far as it is from the nearest others.
+
     Args:
         original: the mesh to mark. Nothing else decides: no key, no message.
 
@@ -42,6 +51,8 @@ def hiding_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
         displacement whose coordinates are independent.
     """
     points, faces = original.positions, np.asarray(original.points.faces)
+    if len(faces) == 0:
+        return _by_spacing(original)
     mesh, size = Mesh(points, faces), len(points)
     with jax.ensure_compile_time_eval():  # carriers may be made in traced code
         hiding = make_hiding(points, faces, _BAND + 1)
@@ -81,6 +92,16 @@ def hiding_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     matrices = (vectors / np.sqrt(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
     matrices[~free] = 0
     return matrices / np.sqrt(np.mean(np.sum(matrices[original.used] ** 2, axis=(1, 2))) / 3)
+
+
+def _by_spacing(original: Original) -> Float64[np.ndarray, "points 3 3"]:
+    """How far points of a cloud are apart, relative to all, without what would turn low frequencies into high ones."""
+    apart = spacings(original.positions, _SPACING_POINTS)
+    apart = np.clip(apart / (np.median(apart) or 1.0), _LEAST_SPACING, _MOST_SPACING)
+    with jax.ensure_compile_time_eval():
+        average = diffusion(_SPACING_SCALE + 1, 2**_SPACING_SCALE + 1)[_SPACING_SCALE]
+        factor = original.to_host(filter(original.operator, average, original.to_traced(apart)))
+    return (factor / np.sqrt(np.mean(factor**2)))[:, None, None] * np.eye(3)
 
 
 def _bends(hiding: Hiding) -> Float64[np.ndarray, " faces"]:

@@ -21,7 +21,7 @@ from jaxmark.geometry.canonical import Canonical
 from jaxmark.geometry.imprint import Imprint, make_imprint, restore
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark import evidence
-from jaxmark.watermark.budget import Budget, Limits, Visibility, make_budget, write
+from jaxmark.watermark.budget import Budget, Limits, Visibility, make_budget, visibility_of, write
 from jaxmark.watermark.carriers.carrier import Carrier, Reader, Received
 from jaxmark.watermark.coding.keys import SCHEME_VERSION, VERSIONS, Choices, Key, bind, commitment
 from jaxmark.watermark.coding.message import TAG_BITS, Decoded, decode, encode
@@ -135,7 +135,7 @@ class Marker:
         Pass `read_back=False` if you verify the written file yourself.
         """
         self.check_size(message)
-        bounds = make_budget(budget, limits, visibility)
+        bounds = make_budget(budget, limits, visibility, named=visibility_of(self.original.mesh))
         if noise is not None and not 0 <= noise < math.inf:
             raise JaxmarkError(f"The noise to survive is a number of at least 0, got {noise}.")
         marked, info = self.write(self.codeword(message), bounds, told=message)
@@ -697,7 +697,8 @@ def capacity(
         raise JaxmarkError(
             f"capacity needs a noise of at least 0 and a coverage in (0, 1], got {noise:g} and {coverage:g}."
         )
-    conditions = Conditions(make_budget(budget, limits, visibility), noise, coverage)
+    bounds = make_budget(budget, limits, visibility, named=visibility_of(mesh))
+    conditions = Conditions(bounds, noise, coverage)
     return Capacity(make_original(mesh), get_scheme(scheme)).bits(conditions)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Float64
 
 from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, vertex_normals
+from jaxmark.geometry.mesh import Mesh, check_faces, vertex_normals
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark.carriers import Carrier, KeyedCarrier, ModulatedCarrier, eigenspaces, host_bands, make_chips
@@ -161,7 +161,8 @@ class KeyedScheme(Scheme):
     more for each bit of message and tag, but ends at λ = 0.44 unless the payload needs more. With a profile, the mark
     is written in the bands to which the profile gives strengths, whatever the payload.
 
-    Dimensions are counted as on a regular triangle mesh, √3/2π · λ for each coordinate of each vertex. The nuisance
+    Dimensions are counted as on a regular triangle mesh, √3/2π · λ for each coordinate of each vertex; on point clouds,
+    by the number of neighbours. The nuisance
     that is projected off has at most a twelfth of them, apart from affine maps; with a narrow pass band, a sixth.
     """
 
@@ -218,6 +219,7 @@ class KeyedScheme(Scheme):
         chips = make_chips(choices, original.chip_places, code_bits, channels=self._channels, count=original.count)
         carrier = KeyedCarrier(host, chips, profile=self.strengths(original, bits).astype(dtype))
         if self.direction == "normals":
+            check_faces("A mark along normals", original.points)
             normals = vertex_normals(Mesh(original.positions, original.points.faces))
             carrier = carrier._replace(normals=original.to_traced(normals))
         return carrier._replace(masking=self.mask(original))
@@ -306,7 +308,7 @@ class KeyedScheme(Scheme):
     def _dimensions(self, original: Original, passing: int) -> float:
         """Number of dimensions of the lowest `passing` bands."""
         edge = 1 - math.cos(math.pi * passing / self.bands)
-        share = min(1.0, math.sqrt(3) / (2 * math.pi) * edge)
+        share = min(1.0, original.density * edge)
         return self._channels * share * int(original.used.sum())
 
 

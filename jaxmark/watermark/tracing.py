@@ -13,7 +13,7 @@ from jaxmark.alignment.alignment import Align
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark import evidence
-from jaxmark.watermark.budget import Limits, Visibility, make_budget
+from jaxmark.watermark.budget import Limits, Visibility, make_budget, visibility_of
 from jaxmark.watermark.coding.keys import KEY_BYTES, SCHEME_VERSION, Key
 from jaxmark.watermark.marking import ALIGN_SHARES, EmbedInfo, Marker, bind_mark, recall, versions_of
 from jaxmark.watermark.record import Record
@@ -48,7 +48,7 @@ class Tracer:
         choices = self.marker.choices
         if self.marker.code_bits >= _MIN_SLOTS:
             word = codewords([recipient], choices, biases(choices, self.marker.code_bits))[0]
-            bounds = make_budget(budget, limits, visibility)
+            bounds = make_budget(budget, limits, visibility, named=visibility_of(self.marker.original.mesh))
             marked, info = self.marker.write(word.astype(float), bounds, told=recipient.encode())
             if self.finds(marked, recipient):
                 return marked, info

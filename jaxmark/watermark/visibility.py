@@ -10,6 +10,7 @@ from jaxmark import distortion
 from jaxmark.alignment.original import Original, displace
 from jaxmark.distortion import Metric
 from jaxmark.distortion.roughness import MAX_ROUGHNESS, MIN_ROUGHNESS, POWER
+from jaxmark.geometry.mesh import check_faces
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.precision import matmul
@@ -94,7 +95,11 @@ def masking(original: Original) -> Float[Array, " rows"]:
     Rough regions hide displacement that is visible in smooth ones. The model is that of FMPD (Wang, Torkhani,
     Montanvert, "A fast roughness-based approach to the assessment of 3D mesh visual quality", Computers & Graphics
     36(7), 2012): local roughness, clipped to 5e-4 … 0.2, raised to the power 0.15.
+
+    Raises:
+        JaxmarkError: if the original is a point cloud.
     """
+    check_faces("Masking by roughness", original.points)
     positions = jnp.asarray(original.positions, original.signal.dtype)
     rough = distortion.local_roughness(positions, np.asarray(original.points.faces)).roughness
     hidden = np.where(original.used, np.clip(np.asarray(rough), MIN_ROUGHNESS, MAX_ROUGHNESS) ** POWER, 0)

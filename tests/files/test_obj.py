@@ -112,7 +112,6 @@ def test_classic_mac_line_ends(tmp_path: Path) -> None:
         (b"v 1 2 3.0.0\nf 1 2 3\n", "line 4.*'3.0.0'"),
         (b"v 1 2 \x00\nf 1 2 3\n", "line 4"),
         (b"v 1 2 nan\nf 1 2 3\n", "Vertex 3 .*finite"),
-        (b"", ".*no faces"),
     ],
 )
 def test_what_is_wrong_is_said_with_its_line(tmp_path: Path, text: bytes, message: str) -> None:

@@ -85,7 +85,7 @@ def test_headers(tmp_path: Path, header: bytes) -> None:
         (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n2 0 1\n", "line 6.*three corners"),
         (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", "line 6.*vertex 3"),
         (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 1.5\n", "line 6.*'1.5'"),
-        (b"OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n", "no faces"),
+        (b"OFF\n0 0 0\n", "no vertices"),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path: Path, data: bytes, message: str) -> None:

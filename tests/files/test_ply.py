@@ -152,9 +152,11 @@ BODY = b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
         (HEAD + STRIPS.replace(b"_indices", b"s") + b"0 0 0 1 0 0 0 1 0 3 0 1 2", "tristrips has no list"),
         (HEAD + STRIPS + b"0 0 0 1 0 0 0 1 0 4 0 1 2", "ends in row 0 .*tristrips"),
         (HEAD + STRIPS + b"0 0 0 1 0 0 0 1 0 4 0 1 2 3", r"Face 1 .*\[2, 1, 3\]"),
-        (HEAD + STRIPS + b"0 0 0 1 0 0 0 1 0 3 0 -1 2", "no faces"),
-        (HEAD + STRIPS + b"0 0 0 1 0 0 0 1 0 0", "no faces"),
-        (HEAD + b"end_header\n" + BODY, "no faces"),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 0\n"
+            b"property float x\nproperty float y\nproperty float z\nend_header\n",
+            "no vertices",
+        ),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path: Path, data: bytes, message: str) -> None:

@@ -71,10 +71,10 @@ def test_text(tmp_path: Path) -> None:
     [
         (b"", "byte 0"),
         (b"\0" * 83, "byte 83"),
-        (b"\0" * 84, "no faces"),
+        (b"\0" * 84, "no vertices"),
         (b"\0" * 80 + b"\xff\xff\xff\xff" + b"\0" * 50, "4294967295 facets .* 134"),
         (binary([([0, 0, 1], TRIANGLE, 0)], b"x")[:-1], "1 facets has 134 bytes, but the file has 133"),
-        (b"solid x\nendsolid", "no faces"),
+        (b"solid x\nendsolid", "no vertices"),
         (ASCII[:-40], "ends inside facet 1|line 10"),
         (ASCII.replace(b"vertex 1.000", b"vertx 1.000"), "line 5: 'vertex'"),
         (ASCII.replace(b"vertex 1.000", b"vertex one"), "line 5: 'one'"),

@@ -23,7 +23,8 @@ RELATIONS = (
 )
 # Everything that XML allows: prefixes, either quote, attributes in any order, comments, CDATA, other namespaces.
 MODEL = (
-    b'\xef\xbb\xbf<?xml version="1.0" encoding="utf-8"?>\r\n<!-- <vertices><vertex x="9" y="9" z="9"/></vertices> -->\r\n'
+    b'\xef\xbb\xbf<?xml version="1.0" encoding="utf-8"?>\r\n<!-- <vertices><vertex x="9" y="9" z="9"/></vertices> -->'
+    b"\r\n"
     b"<c:model unit='inch' xmlns:c='" + CORE + b"' xmlns:s='other'>\r\n<c:metadata name='Title'>"
     b'<![CDATA[<object><mesh><vertices><vertex x="8"/>]]></c:metadata><c:resources>\r\n'
     b'<c:object name="caf\xc3\xa9 &amp; &#10;tea" id="1"><c:mesh>\r\n<c:vertices>'
@@ -33,9 +34,12 @@ MODEL = (
     b'<c:triangles><c:triangle v1="0" v2="1" v3="2" pid="1" p1="0"/><c:triangle v3="3" v1="0" v2=\'2\'/></c:triangles>'
     b"<s:vertices><c:vertex x='3' y='3' z='3'/></s:vertices></c:mesh></c:object>\r\n"
     b'<c:object id="2"><c:mesh><c:vertices>\n<c:vertex x="1e0" y="-1.5E+00" z="0"/><c:vertex x="0" y="2" z="0"/>'
-    b'<c:vertex x="0" y="0" z="3.25"/>\n</c:vertices><c:triangles><c:triangle v1="0" v2="1" v3="2"/></c:triangles></c:mesh>'
-    b'</c:object><c:object id="3" name="flat"><c:mesh><c:vertices><c:vertex x="0" y="0" z="0"/></c:vertices><c:triangles/>'
-    b'</c:mesh></c:object><c:object id="4"><c:components><c:component objectid="2" transform="1 0 0 0 1 0 0 0 1 9 9 9"/>'
+    b'<c:vertex x="0" y="0" z="3.25"/>\n</c:vertices><c:triangles><c:triangle v1="0" v2="1" v3="2"/>'
+    b"</c:triangles></c:mesh>"
+    b'</c:object><c:object id="3" name="flat"><c:mesh><c:vertices><c:vertex x="0" y="0" z="0"/></c:vertices>'
+    b"<c:triangles/>"
+    b'</c:mesh></c:object><c:object id="4"><c:components>'
+    b'<c:component objectid="2" transform="1 0 0 0 1 0 0 0 1 9 9 9"/>'
     b"</c:components></c:object></c:resources><c:build><c:item objectid='1'/><c:item objectid='4'/></c:build></c:model>"
 )
 PLAIN = (
@@ -163,9 +167,7 @@ def streamed(wide: bool, signature: bytes, stored: bool) -> bytes:
 @pytest.mark.parametrize("wide", [False, True])
 @pytest.mark.parametrize("signature", [b"PK\7\x08", b""])
 @pytest.mark.parametrize("stored", [False, True])
-def test_archives_written_as_streams_and_large_ones(
-    tmp_path: Path, wide: bool, signature: bytes, stored: bool
-) -> None:
+def test_archives_written_as_streams_and_large_ones(tmp_path: Path, wide: bool, signature: bytes, stored: bool) -> None:
     data = streamed(wide, signature, stored)
     source = written(tmp_path, "s.3mf", data)
     out = patched(source, shifted(load_mesh(source), 1, [9, 0, 0.25]))
@@ -184,8 +186,8 @@ def test_plain_and_odd_spelling_read_alike(tmp_path: Path) -> None:
     """The same mesh in the two ways in which lists are read."""
     rng = np.random.default_rng(0)
     points, faces = rng.normal(size=(50, 3)), rng.integers(0, 50, (80, 3))
-    rows = "".join('<vertex x="%.6f" y="%.6f" z="%.6f" />\n' % (*row,) for row in points)
-    triangles = "".join('<triangle v1="%d" v2="%d" v3="%d" pid="1" e:v1="2"/>' % (*row,) for row in faces)
+    rows = "".join('<vertex x="{:.6f}" y="{:.6f}" z="{:.6f}" />\n'.format(*row) for row in points)
+    triangles = "".join('<triangle v1="{}" v2="{}" v3="{}" pid="1" e:v1="2"/>'.format(*row) for row in faces)
     text = f'<model xmlns="{CORE.decode()}" xmlns:e="e"><object id="1"><mesh><vertices>{rows}</vertices><triangles>'
     plain = f"{text}{triangles}</triangles></mesh></object></model>".encode()
     expected = make_mesh(np.round(points, 6), faces)
@@ -198,7 +200,7 @@ def test_plain_and_odd_spelling_read_alike(tmp_path: Path) -> None:
             np.testing.assert_array_equal(mesh.faces, expected.faces)
             moved = noisy(mesh, 0.1)
             out = contents(patched(source, moved))["3D/3dmodel.model"]
-            rows = "".join('<vertex x="%.6f" y="%.6f" z="%.6f" />\n' % (*row,) for row in np.asarray(moved.vertices))
+            rows = "".join('<vertex x="{:.6f}" y="{:.6f}" z="{:.6f}" />\n'.format(*row) for row in moved.vertices)
             start = model.index(b"<vertices>") + 10
             if number == 0:
                 assert out == model[:start] + rows.encode() + model[model.index(b"</vertices>") :]
