@@ -76,7 +76,7 @@ def test_a_folder_without_meshes_leaves_no_folder(tmp_path: Path, monkeypatch, c
     arguments = ["embed", tmp_path / "empty", tmp_path / "out", "--key", tmp_path / "me.key"]
     assert run(arguments, monkeypatch, capsys) == (
         2,
-        f"jaxmark: The folder {tmp_path / 'empty'} has no mesh file (.obj, .ply, .off, .stl, .glb, .gltf).\n",
+        f"jaxmark: The folder {tmp_path / 'empty'} has no mesh file (.obj, .ply, .off, .stl, .glb, .gltf, .3mf, .xyz, .las, .laz).\n",
     )
     assert not (tmp_path / "out").exists()
 

@@ -115,7 +115,8 @@ def align(original: Original, suspect: Mesh, how: Align = "auto", *, hands: Sequ
 
 def _in_range(suspect: Mesh) -> tuple[Mesh, Pose]:
     """A suspect of a size whose powers do not overflow or vanish, and the map to it, mostly none."""
-    size = float(np.ptp(np.asarray(suspect.vertices), axis=0).max(initial=0.0))
+    vertices = np.asarray(suspect.vertices)
+    size = float(np.quantile(np.abs(vertices - np.median(vertices, axis=0)).max(axis=1), 0.6))  # of most points
     if not 0 < size < np.inf or _SMALLEST < size < 1 / _SMALLEST:
         return suspect, IDENTITY
     # In two steps, as a factor may be out of range itself.

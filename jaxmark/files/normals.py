@@ -54,7 +54,7 @@ class Transported:
         entries = self.corners[once]
         count = len(self.numbers.values)
         with np.errstate(all="ignore"):
-            sums = [np.bincount(entries, vectors[rows, axis], count) for axis in range(3)]
+            sums = [np.bincount(entries, vectors[rows, axis], count).astype(float) for axis in range(3)]
         return unit(np.stack(sums, axis=1))
 
     def moved(
