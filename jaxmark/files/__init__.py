@@ -84,8 +84,8 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
 def load_scene(path: str | os.PathLike) -> Scene:
     """Read the meshes of a file: those of a GLB or glTF file, or the objects of an OBJ or 3MF file.
 
-    Objects of OBJ that share vertices are one mesh, and so are meshes that share positions. Instances and other nodes that
-    show the same mesh are not told apart. Files of other formats have one mesh.
+    Objects of OBJ that share vertices are one mesh, and so are meshes that share positions. Instances and other nodes
+    that show the same mesh are not told apart. Files of other formats have one mesh.
 
     Args:
         path: see `load_mesh`.
@@ -132,9 +132,9 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | 
         mesh: the mesh to write.
         path: the file to write, in the format that its suffix names. It may be the same file as `like`.
         like: the file that the mesh was loaded from. Only the numbers of vertices that moved change, their normals
-            follow, and everything else stays byte for byte. Without it a new file is written: exact in OBJ, OFF
-            and 3MF, in single precision in PLY, STL and GLB. Files that a glTF file refers to come along: a buffer that changes
-            is named after the new file, the others are copied where they are not there already.
+            follow, and everything else stays byte for byte. Without it a new file is written: exact in OBJ, OFF and
+            3MF, in single precision in PLY, STL and GLB. Files that a glTF file refers to come along: a buffer that
+            changes is named after the new file, the others are copied where they are not there already.
 
     Raises:
         JaxmarkError: if `path` has another suffix than `like`, the mesh has other faces or another number of

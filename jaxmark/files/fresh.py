@@ -73,8 +73,8 @@ def _threemf(vertices: np.ndarray, faces: np.ndarray) -> bytes:
         f'<Default Extension="model" ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>\n',
         "_rels/.rels": f'<Relationships xmlns="{package}/relationships">'
         f'<Relationship Target="/3D/3dmodel.model" Id="rel0" Type="{core}/2013/01/3dmodel"/></Relationships>\n',
-        "3D/3dmodel.model": f'<model unit="millimeter" xmlns="{core}/core/2015/02">\n<resources>\n<object id="1">\n<mesh>\n'
-        f"<vertices>\n{points}</vertices>\n<triangles>\n{triangles}</triangles>\n</mesh>\n</object>\n</resources>\n"
+        "3D/3dmodel.model": f'<model unit="millimeter" xmlns="{core}/core/2015/02">\n<resources>\n<object id="1">\n'
+        f"<mesh>\n<vertices>\n{points}</vertices>\n<triangles>\n{triangles}</triangles>\n</mesh>\n</object>\n</resources>\n"
         '<build>\n<item objectid="1"/>\n</build>\n</model>\n',
     }
     packed = io.BytesIO()

@@ -12,11 +12,11 @@ from jaxmark.errors import JaxmarkError
 _ENCODINGS = ("utf-8", "utf8", "us-ascii", "ascii")
 _COLUMNS = {"vertices": (b"x", b"y", b"z"), "triangles": (b"v1", b"v2", b"v3")}
 _ROWS = {"vertices": "vertex", "triangles": "triangle"}
-_LIST = re.compile(rb"<(?:[\w.-]+:)?(?:vertices|triangles)(?=[\s/>])[^>]*>")
+_LIST = re.compile(rb"<(?:[\w.-]+:)?(?:vertices|triangles)(?=[\s/>])[^<>]*>")
 _TAG = re.compile(rb"<[^\s/>]+")
-_ATTRIBUTE = re.compile(rb"""\s+([^\s=]+)\s*=\s*(?:"\s*([^"]*?)\s*"|'\s*([^']*?)\s*')""")
+_ATTRIBUTE = re.compile(rb"""\s+([^\s=]+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
 _VALUE = rb'"[^"<&\x00-\x1f\x7f-\xff]*+"'
-# Possessive, so that nothing is tried twice; white space inside of values, odd quotes and comments are left to the parser.
+# Possessive, so that nothing is tried twice. Comments, single quotes and the like are left to the parser.
 _PLAIN = (
     rb"(?:\s*+<%(row)s\s++%(first)s=%(value)s\s++%(second)s=%(value)s\s++%(third)s=%(value)s"
     rb"(?:\s++(?!xmlns|(?:%(first)s|%(second)s|%(third)s)=)[A-Za-z_][\w.:-]*+=%(value)s)*+"
@@ -213,5 +213,7 @@ class _Model:
                 if name not in attributes:
                     line = self._data.count(b"\n", 0, at) + 1
                     raise JaxmarkError(f"line {line}: a {_ROWS[kind]} has no {name.decode()}.")
-                spans[row, column] = attributes[name]
+                start, end = attributes[name]
+                value = self._data[start:end]
+                spans[row, column] = end - len(value.lstrip()), start + len(value.rstrip())
         return Triples(spans[..., 0], spans[..., 1])
