@@ -231,6 +231,7 @@ SECURED = RELATIONS.replace(b"2013/01/3dmodel", b"2019/04/keystore")
         (model_with((b'y="1.0"', b"")), "a vertex has no y"),
         (model_with((b'v3="2"', b'v4="2"')), "a triangle has no v3"),
         (model_with((b'y="1.0"', b'y="one"')), "'3D/3dmodel.model': line 1: 'one' is not a number"),
+        (model_with((b'y="1.0"', b'y="1 0"')), "line 1: '1 0' is not a number"),
         (model_with((b'y="1.0"', b'y="&#49;"')), "'&#49;' is not a number"),
         (model_with((b'y="1.0"', b'y=""')), "a number is missing"),
         (model_with((b'y="1.0"', b'y="inf"')), "not a finite number"),
