@@ -270,6 +270,7 @@ ONE = packed({"3D/3dmodel.model": PLAIN})
         (changed(ONE, b"PK\1\2", 42, "<I", 3), "not where it should be"),
         (changed(ONE, b"PK\1\2", 0, "<I", 3), "not where it should be"),
         (changed(ONE, b"PK\5\6", 4, "<H", 3), "volumes"),
+        (changed(ONE, b"PK\5\6", 10, "<H", 0), "not where it should be"),
         (changed(ONE, b"PK\5\6", 16, "<I", 2**32 - 1), "not where it should be"),
         (changed(ONE, b"PK\3\4", 60, "<Q", 2**64 - 1), "cannot be unpacked|damaged"),
     ],
