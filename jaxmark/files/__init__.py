@@ -89,8 +89,8 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
 def load_scene(path: str | os.PathLike) -> Scene:
     """Read the meshes of a file: those of a GLB or glTF file, or the objects of an OBJ or 3MF file.
 
-    Objects of OBJ that share vertices are one mesh, and so are meshes that share positions. Instances, other nodes that
-    show the same mesh are not told apart. Files of other formats have one mesh.
+    Objects of OBJ that share vertices are one mesh, and so are meshes that share positions. Instances and other nodes
+    that show the same mesh are not told apart. Files of other formats have one mesh.
 
     Args:
         path: see `load_mesh`.

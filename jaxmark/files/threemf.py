@@ -123,7 +123,7 @@ def _model_members(archive: Archive) -> list[Member]:
             root = posixpath.normpath("/" + unquote(targets[0])).lstrip("/")
     first = archive.find(root)
     if first is None:
-        raise JaxmarkError(f"The archive has no model {ascii(root)[:80]}; is it a 3MF file?")
+        raise JaxmarkError(f"The archive has no model {ascii(root)[:80]}, so it is no whole 3MF file.")
     return [
         member
         for member in archive.members

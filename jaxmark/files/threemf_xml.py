@@ -12,14 +12,13 @@ from jaxmark.errors import JaxmarkError
 _ENCODINGS = ("utf-8", "utf8", "us-ascii", "ascii")
 _COLUMNS = {"vertices": (b"x", b"y", b"z"), "triangles": (b"v1", b"v2", b"v3")}
 _ROWS = {"vertices": "vertex", "triangles": "triangle"}
-_LIST = re.compile(rb"<(?:[\w.-]+:)?(?:vertices|triangles)(?=[\s/>])[^>]*>")
+_LIST = re.compile(rb"<(?:[\w.-]+:)?(?:vertices|triangles)(?=[\s/>])[^<>]*>")
 _TAG = re.compile(rb"<[^\s/>]+")
-_ATTRIBUTE = re.compile(rb"""\s+([^\s=]+)\s*=\s*(?:"\s*([^"]*?)\s*"|'\s*([^']*?)\s*')""")
-_VALUE = rb'"[^"<&\x00-\x1f\x7f-\xff]*+"'
-# Possessive, so that nothing is tried twice; white space inside of values, odd quotes and comments are left to the
-# parser.
+_ATTRIBUTE = re.compile(rb"""\s+([^\s=]+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
+_WORD, _VALUE = rb'"[^"<&\x00-\x20\x7f-\xff]*+"', rb'"[^"<&\x00-\x1f\x7f-\xff]*+"'
+# Possessive, so that nothing is tried twice. Comments, single quotes and the like are left to the parser.
 _PLAIN = (
-    rb"(?:\s*+<%(row)s\s++%(first)s=%(value)s\s++%(second)s=%(value)s\s++%(third)s=%(value)s"
+    rb"(?:\s*+<%(row)s\s++%(first)s=%(word)s\s++%(second)s=%(word)s\s++%(third)s=%(word)s"
     rb"(?:\s++(?!xmlns|(?:%(first)s|%(second)s|%(third)s)=)[A-Za-z_][\w.:-]*+=%(value)s)*+"
     rb"\s*+(?:/>|>\s*+</%(row)s>))*+\s*+"
 )
@@ -148,6 +147,11 @@ class _Model:
                 at = end
         self._parser.feed(data, at, len(data), final=True)
 
+    def _error(self, at: int, what: str) -> JaxmarkError:
+        """The exception for an error at a byte offset, whose line it names."""
+        line = self._data.count(b"\n", 0, at) + 1
+        return JaxmarkError(f"line {line}: {what}.")
+
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         space, _, local = name.rpartition(" ")
         if self._space is None:
@@ -167,8 +171,7 @@ class _Model:
             self._list_at = self._parser.at
             self._rows = []
             if self._list in self.meshes[-1].lists:
-                line = self._data.count(b"\n", 0, self._list_at) + 1
-                raise JaxmarkError(f"line {line}: a mesh has its {self._list} twice.")
+                raise self._error(self._list_at, f"a mesh has its {self._list} twice")
 
     def _end(self, name: str) -> None:
         closed = self._path.pop()
@@ -182,9 +185,11 @@ class _Model:
         opened = _TAG.match(self._data, self._list_at)
         assert opened is not None, "the parser found a tag here"
         prefix = opened[0][1 : -len(kind)]
-        words = dict(zip((b"first", b"second", b"third"), _COLUMNS[kind], strict=True))
+        columns = dict(zip((b"first", b"second", b"third"), _COLUMNS[kind], strict=True))
         row = re.escape(prefix + _ROWS[kind].encode())
-        matched = re.compile(_PLAIN % {b"row": row, b"value": _VALUE, **words}).match(self._data, start)
+        matched = re.compile(_PLAIN % {b"row": row, b"word": _WORD, b"value": _VALUE, **columns}).match(
+            self._data, start
+        )
         if matched is None or not self._data.startswith(b"</" + opened[0][1:], matched.end()):
             return start
         quotes = start + np.flatnonzero(self._buffer[start : matched.end()] == ord('"'))
@@ -212,7 +217,10 @@ class _Model:
                     attributes[tag[1]] = tag.span(2 if tag[3] is None else 3)
             for column, name in enumerate(_COLUMNS[kind]):
                 if name not in attributes:
-                    line = self._data.count(b"\n", 0, at) + 1
-                    raise JaxmarkError(f"line {line}: a {_ROWS[kind]} has no {name.decode()}.")
-                spans[row, column] = attributes[name]
+                    raise self._error(at, f"a {_ROWS[kind]} has no {name.decode()}")
+                start, end = attributes[name]
+                value = self._data[start:end]
+                if len(value.split()) > 1:
+                    raise self._error(start, f"{value[:40].decode('ascii', 'backslashreplace')!r} is not a number")
+                spans[row, column] = end - len(value.lstrip()), start + len(value.rstrip())
         return Triples(spans[..., 0], spans[..., 1])

@@ -97,7 +97,7 @@ class Archive:
         for _ in range(count):
             member, at = self._entry(at)
             self.members.append(member)
-        if at > self._end:
+        if at > self._end or self.data[at : at + 4] == b"PK\1\2":  # more entries than were counted
             raise _broken(at)
         self._check()
         self._by_name = {member.name.casefold(): member for member in self.members}

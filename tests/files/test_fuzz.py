@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
-from tests.files import test_glb, test_obj, test_off, test_ply, test_stl
+from tests.files import test_glb, test_obj, test_off, test_ply, test_stl, test_threemf
 
 SEEDS = {
     "rich.obj": test_obj.RICH,
@@ -21,7 +21,12 @@ SEEDS = {
     "text.stl": test_stl.ASCII,
     "binary.stl": test_stl.binary([([0, -1, 0], [0, 0, 0, 1, 0, 0, 0, 0, 1], 7)]),
     "rich.glb": test_glb.RICH,
+    "rich.3mf": test_threemf.packed({"3D/3dmodel.model": test_threemf.FINE, "last.txt": b"the end"}),
+    "stream.3mf": test_threemf.streamed(True, b"PK\7\x08", True, test_threemf.FINE),
+    "model.3mf": test_threemf.FINE,
 }
+# Whose bytes are changed before they are packed, as archives notice any change.
+PACKED = {"model.3mf": lambda model: test_threemf.packed({"3D/3dmodel.model": model})}
 BITS = [b"", b" ", b"\n", b"-", b"0", b"9" * 30, b"1e999", b"nan", b"-0", b"\\\n", b"/", b"_", b"\0", b"\xff" * 4, b"#"]
 CHANGE = st.tuples(st.floats(0, 1), st.integers(0, 6), st.sampled_from(BITS) | st.binary(max_size=4))
 
@@ -40,7 +45,8 @@ def test_mutated_files(folder: Path, name: str, changes: list[tuple[float, int, 
         at = int(where * len(data))
         data = data[:at] + put + data[at + removed :]
     path = folder / name
-    path.write_bytes(data[: int(kept * len(data))])
+    data = data[: int(kept * len(data))]
+    path.write_bytes(PACKED[name](data) if name in PACKED else data)
     try:
         mesh = load_mesh(path)
         noise = np.random.default_rng(0).normal(size=np.shape(mesh.vertices))
