@@ -152,7 +152,7 @@ BODY = b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
             "strips",
         ),
         (
-            b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n",
+            (HEAD.replace(b"vertex 3", b"vertex 0") + b"end_header\n", "no vertices"),
             "no vertices",
         ),
     ],
