@@ -151,10 +151,7 @@ BODY = b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
             HEAD + b"element tristrips 1\nproperty list int int vertex_indices\nend_header\n0 0 0 1 0 0 0 1 0 0",
             "strips",
         ),
-        (
-            (HEAD.replace(b"vertex 3", b"vertex 0") + b"end_header\n", "no vertices"),
-            "no vertices",
-        ),
+        (HEAD.replace(b"vertex 3", b"vertex 0") + b"end_header\n", "no vertices"),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path: Path, data: bytes, message: str) -> None:

@@ -12,7 +12,7 @@ from tests.files.helpers import noisy
 from tests.meshes import MESHES, shared_mesh, shared_meshes
 
 REFUSED = {
-    *("empty.obj", "empty.ply", "notenoughindices.obj", "obj_points.obj", "ply_empty_header.ply", "stl_empty_bin.stl"),
+    *("empty.obj", "empty.ply", "notenoughindices.obj", "ply_empty_header.ply", "stl_empty_bin.stl"),
 }
 
 
