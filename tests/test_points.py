@@ -123,6 +123,10 @@ def test_a_hidden_mark_in_a_cloud_keeps_its_limits(host: Mesh, marked: Mesh, mar
 @pytest.mark.slow
 def test_the_capacity_of_a_cloud_is_kept(host: Mesh, key: jm.Key):
     bits = jm.capacity(host, noise=1e-3)
+<<<<<<< HEAD
+=======
+    assert bits >= 64
+>>>>>>> points
     jm.make_marker(host, key, bits=bits).embed(bytes(bits // 8), noise=1e-3)
     with pytest.raises(jm.JaxmarkError, match="carries at most"):
         jm.embed(host, bytes(bits // 8 + 50), key, noise=1e-3)
@@ -145,14 +149,14 @@ def test_points_across_a_plane():
     ("steps", "method"),
     [
         ([("diagonal-noise", 2e-4)], "same"),
-        ([("quantisation", 11)], "same"),
-        ([("outliers", 0.1)], "same"),
-        ([("reordering", 1)], "points"),
+        pytest.param([("quantisation", 11)], "same", marks=pytest.mark.slow),
+        pytest.param([("outliers", 0.1)], "same", marks=pytest.mark.slow),
+        pytest.param([("reordering", 1)], "points", marks=pytest.mark.slow),
         ([("subsampling", 0.5), ("diagonal-noise", 2e-4)], "points"),
         ([("cropping", 0.5)], "points"),
-        ([("floaters", 0.2)], "points"),
+        pytest.param([("floaters", 0.2)], "points", marks=pytest.mark.slow),
         ([("merging", 1e-3)], "points"),
-        ([("outliers", 0.1), ("reordering", 1)], "points"),
+        pytest.param([("outliers", 0.1), ("reordering", 1)], "points", marks=pytest.mark.slow),
     ],
     ids=lambda steps: steps if isinstance(steps, str) else "+".join(kind for kind, _ in steps),
 )
@@ -221,7 +225,9 @@ def test_another_sampling_shows_how_high_its_surface_is():
     outward = np.sign(np.sum(found.normals * x, axis=1))
     expected = 0.01 * np.abs(np.sum(found.normals * x, axis=1))
     assert found.known.mean() > 0.99
-    assert np.median(np.abs(found.height * outward - expected)) < 2e-4 * np.ptp(x)
+    error = found.height * outward - expected
+    assert np.abs(error.mean()) < 0.02 * expected.mean()
+    assert np.sqrt(np.mean(error**2)) < 0.15 * expected.mean()
 
 
 @pytest.mark.parametrize("turn", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -258,14 +264,38 @@ def splats(count: int) -> np.ndarray:
     return rows
 
 
-def test_splats_keep_all_but_their_positions(tmp_path: Path, key: jm.Key, monkeypatch, capsys):
-    """By the command line."""
-    rows = splats(4000)
+def splat_file(rows: np.ndarray) -> tuple[bytes, bytes]:
+    """Header and body."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     lines += [*(f"property float {name}" for name in rows.dtype.names or ()), "end_header", ""]
-    top = "\n".join(lines).encode()
+    return "\n".join(lines).encode(), rows.tobytes()
+
+
+def check_kept(data: bytes, rows: np.ndarray) -> None:
+    """Whatever is no position is byte for byte what it was."""
+    top, _ = splat_file(rows)
+    assert data.startswith(top)
+    found = np.frombuffer(data[len(top) :], rows.dtype)
+    for name in rows.dtype.names or ():
+        assert np.array_equal(found[name], rows[name]) == (name not in "xyz")
+
+
+def test_splats_keep_all_but_their_positions(tmp_path: Path):
+    rows, path = splats(300), tmp_path / "splats.ply"
+    path.write_bytes(b"".join(splat_file(rows)))
+    mesh = jm.load_mesh(path)
+    np.testing.assert_array_equal(mesh.vertices, np.column_stack([rows[axis] for axis in "xyz"]))
+    moved = mesh._replace(vertices=mesh.vertices + 1e-3)
+    jm.save_mesh(moved, tmp_path / "moved.ply", like=path)
+    check_kept((tmp_path / "moved.ply").read_bytes(), rows)
+    np.testing.assert_allclose(jm.load_mesh(tmp_path / "moved.ply").vertices, moved.vertices, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_splats_by_the_command_line(tmp_path: Path, key: jm.Key, monkeypatch, capsys):
+    rows = splats(4000)
     path, shown = tmp_path / "splats.ply", tmp_path / "marked.ply"
-    path.write_bytes(top + rows.tobytes())
+    path.write_bytes(b"".join(splat_file(rows)))
     jm.save_key(key, tmp_path / "key")
 
     def run(*arguments: object) -> dict:
@@ -277,11 +307,7 @@ def test_splats_keep_all_but_their_positions(tmp_path: Path, key: jm.Key, monkey
 
     assert run("capacity", path, "--noise", 1e-3, "--coverage", 1)["limits"] == CLOUD_VISIBILITY["hidden"]
     run("embed", path, shown, "--key", tmp_path / "key", "--message", MESSAGE.hex(), "--noise", 0)
-    data = shown.read_bytes()
-    assert data.startswith(top)
-    found = np.frombuffer(data[len(top) :], rows.dtype)
-    for name in rows.dtype.names or ():
-        assert np.array_equal(found[name], rows[name]) == (name not in "xyz")
+    check_kept(shown.read_bytes(), rows)
     run("attack", shown, tmp_path / "less.ply", "subsampling", 0.3)
     answer = run("detect", tmp_path / "less.ply", "--original", path, "--key", tmp_path / "key")
     assert answer["message"] == MESSAGE.hex()
@@ -354,7 +380,7 @@ def test_laser_scans_keep_all_but_their_positions(suffix: str, tmp_path: Path):
         before, after = (np.frombuffer(one.read_bytes(), np.uint8) for one in (path, tmp_path / "moved.las"))
         records = np.ones(len(before), bool)
         records[179:227] = False
-        start, size = scan.header.offset_to_point_data, scan.header.point_format.size
+        start, size = int.from_bytes(path.read_bytes()[96:100], "little"), scan.header.point_format.size
         records[(start + size * np.arange(500)[:, None] + np.arange(12)).ravel()] = False
         np.testing.assert_array_equal(before[records], after[records])
     with pytest.raises(jm.JaxmarkError, match="scale of at most"):

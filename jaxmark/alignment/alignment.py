@@ -179,14 +179,20 @@ def _align_points(original: Original, mesh: Mesh, suspect: Mesh, how: Align, han
         sampled = Surface(suspect).sample(_SAMPLES_PER_POINT * int(original.used.sum())).points
         points = np.concatenate([points, sampled])
     target, source = Cloud(np.asarray(mesh.vertices)[original.used]), Cloud(points)
-    least = np.inf
+    least, fitting = np.inf, []
     for pose, placed in _poses_of_points(original, target, source, how, hands):
         found = _by_nearest(original, mesh, target, source, pose, how == "affine")
-        coverage = _coverage(original, found)
-        if coverage >= (_MIN_IN_PLACE if placed and found.method == "surface" else _MIN_COVERAGE):
-            if found.residual <= _FAR_DISTANCE:
-                return found
-            least = min(least, found.residual)
+        if _coverage(original, found) < (_MIN_IN_PLACE if placed and found.method == "surface" else _MIN_COVERAGE):
+            continue
+        least = min(least, found.residual)
+        # A flat cloud lies near itself in many poses: other ones are tried unless its own points are found, or its
+        # surface is nearer than points are to each other.
+        if found.residual <= (target.spacing if found.method == "surface" else _FAR_DISTANCE):
+            return found
+        if found.residual <= _FAR_DISTANCE:
+            fitting.append(found)
+    if fitting:
+        return min(fitting, key=lambda one: one.residual)
     raise JaxmarkError(
         "The suspect could not be aligned: in no pose are its points near the original's"
         + (f", but {100 * least:.2g} % of the diagonal away" if least < np.inf else "")

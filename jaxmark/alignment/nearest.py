@@ -22,6 +22,7 @@ _MIN_EXCESS = 1.3  # of points so close, over how many another sampling of the s
 _SEEN = 3.0  # spacings within which a suspect shows a point, or another one in its place
 _MIN_SURVIVING = 0.01  # share of the original's points that must be so close
 _MAX_ROUNDS = 8  # of pairing points and moving the suspect onto its partners
+_FIRST_REACH, _APPROACHES = 8.0, 30  # spacings, and rounds, of coming nearer
 _MIN_PAIRS = 10  # that a pose is fitted to
 _PLANE_POINTS = 12  # of the sparser cloud, that a plane is fitted to
 _MAX_PLANE_POINTS = 60  # of the denser one, whose plane is about as wide
@@ -47,12 +48,13 @@ class Heights(NamedTuple):
     known: Bool[np.ndarray, " points"]  # whether the suspect has a surface there
 
 
-def find_partners(x: Points, y: Others) -> Partners:
+def find_partners(x: Points, y: Others, reach: float = _REACH) -> Partners:
     """Find the points of a suspect that are mutually nearest to those of the original.
 
     Args:
         x: the original's points.
         y: the suspect's, in the original's pose.
+        reach: times the local spacing, the distance of partners at most.
     """
     apart = spacings(x, _SPACING_POINTS)
     distance, place = (np.asarray(part) for part in KDTree(y).query(x))
@@ -62,7 +64,7 @@ def find_partners(x: Points, y: Others) -> Partners:
     # 1.67 c² others lie within the share c of that distance.
     chance = seen * -np.expm1(-_CHANCE * _CLOSE**2 * len(y) / max(seen * len(x), 1))
     surviving = close >= max(_MIN_SURVIVING, _MIN_EXCESS * chance)
-    return Partners(place, mutual & (distance <= _REACH * apart), bool(surviving))
+    return Partners(place, mutual & (distance <= reach * apart), bool(surviving))
 
 
 def settle(x: Points, y: Others, pose: Pose) -> tuple[Pose, Partners]:
@@ -74,6 +76,11 @@ def settle(x: Points, y: Others, pose: Pose) -> tuple[Pose, Partners]:
         pose: from the suspect's coordinates to the original's, nearly.
     """
     partners = find_partners(x, pose(y))
+    if not partners.surviving:  # unless few points are near their own, the pose may be off by some spacings
+        found = _approach(x, y, pose)
+        nearer = find_partners(x, found(y))
+        if nearer.surviving:
+            pose, partners = found, nearer
     for _ in range(_MAX_ROUNDS):
         known = np.flatnonzero(partners.known)
         if len(known) < _MIN_PAIRS:
@@ -84,6 +91,17 @@ def settle(x: Points, y: Others, pose: Pose) -> tuple[Pose, Partners]:
         if np.array_equal(before.known, partners.known) and np.array_equal(before.place, partners.place):
             break
     return pose, partners
+
+
+def _approach(x: Points, y: Others, pose: Pose) -> Pose:
+    """Move a suspect onto the points that are mutually nearest, first far ones, then ever nearer ones."""
+    for reach in np.geomspace(_FIRST_REACH, _REACH, _APPROACHES):
+        partners = find_partners(x, pose(y), reach)
+        known = np.flatnonzero(partners.known)
+        if len(known) < _MIN_PAIRS:
+            break
+        pose = pose.then(similarity(pose(y[partners.place[known]]), x[known]))
+    return pose
 
 
 def find_heights(x: Cloud, y: Others) -> Heights:
@@ -102,7 +120,8 @@ def find_heights(x: Cloud, y: Others) -> Heights:
         for by in (1 / max(ratio, 1e-9), ratio)
     )
     points = x.points
-    before, after = planes(x.tree, points, mine), planes(other.tree, points, theirs)
+    # Each of the original's points is among its own nearest, which makes a plane narrower by about two of them.
+    before, after = planes(x.tree, points, mine + 2), planes(other.tree, points, theirs)
     normals = before.normals
     turned = np.sum(normals * after.normals, axis=1)
     first = np.sum((before.centres - points) * normals, axis=1)

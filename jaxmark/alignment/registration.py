@@ -52,6 +52,7 @@ class RegistrationSettings:
 
 
 SETTINGS = RegistrationSettings()
+Others = Float64[np.ndarray, "others 3"]  # points of a suspect, where those of an original are there, too
 BOTH_HANDS = (False, True)
 
 
@@ -212,7 +213,7 @@ def refine(
     return pose
 
 
-def _coarse(target: Points, source: Points, settings: RegistrationSettings) -> list[Pose]:
+def _coarse(target: Points, source: Others, settings: RegistrationSettings) -> list[Pose]:
     """Find the likeliest distinct poses of each hand by principal axes and closest points; none if all fit badly."""
     forward, backward = KDTree(target), KDTree(source)
     coarse, fine = slice(settings.coarse_points), slice(settings.fine_points)
@@ -238,7 +239,7 @@ def _coarse(target: Points, source: Points, settings: RegistrationSettings) -> l
     return [pose for alike in distinct.values() for pose in alike[: settings.distinct_poses]]
 
 
-def _axes(target: Points, source: Points) -> list[Pose]:
+def _axes(target: Points, source: Others) -> list[Pose]:
     """The poses that bring the source's principal axes onto the target's, in all 48 ways, of which half mirror."""
     (target_mean, wide, onto), (source_mean, size, of) = (_principal(points) for points in (target, source))
     starts = []
@@ -250,7 +251,7 @@ def _axes(target: Points, source: Points) -> list[Pose]:
 
 
 def _turned(
-    suspect: Shape, target: Points, source: Points, starts: list[Pose], settings: RegistrationSettings
+    suspect: Shape, target: Points, source: Others, starts: list[Pose], settings: RegistrationSettings
 ) -> list[Pose]:
     """Turn poses about the axis of a round shape, upright and upside down, and keep the turns that fit locally best.
 
@@ -285,7 +286,7 @@ def _principal(points: Points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _closest_points(
-    pose: Pose, target: Points, source: Points, forward: KDTree, backward: KDTree, settings: RegistrationSettings
+    pose: Pose, target: Points, source: Others, forward: KDTree, backward: KDTree, settings: RegistrationSettings
 ) -> tuple[Pose, float]:
     """Improve a similarity, of either hand, by trimmed iterative closest points, from source to target and back.
 
@@ -303,7 +304,7 @@ def _closest_points(
 
 
 def _closest_pairs(
-    pose: Pose, target: Points, source: Points, forward: KDTree, backward: KDTree, settings: RegistrationSettings
+    pose: Pose, target: Points, source: Others, forward: KDTree, backward: KDTree, settings: RegistrationSettings
 ) -> tuple[Float64[np.ndarray, "pairs 3"], Float64[np.ndarray, "pairs 3"], float]:
     """Pair points with the closest ones of the other surface, and keep the closest pairs.
 

@@ -64,6 +64,8 @@ class Transported:
         faces: Int64[np.ndarray, "faces 3"],
     ) -> Float64[np.ndarray, "rows 3"]:
         """The turned normals; a normal that no face uses, or only faces without area, stays."""
+        if not len(faces):
+            return self.numbers.values
         before, after = self._mean(old, faces), self._mean(new, faces)
         normals = self.numbers.values
         with np.errstate(all="ignore"):

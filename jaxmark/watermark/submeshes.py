@@ -16,7 +16,7 @@ from jaxmark.alignment import alignment
 from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, edges, host_mesh, used_vertices, weld, weld_mesh
+from jaxmark.geometry.mesh import Mesh, check_faces, edges, host_mesh, used_vertices, weld, weld_mesh
 from jaxmark.spectral.laplacian import adjacency
 from jaxmark.watermark.marking import Detection, EmbedInfo, Marker, make_marker
 from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme
@@ -100,6 +100,7 @@ def make_part_marker(
     Raises:
         JaxmarkError: if a feature is not a vertex that faces use, or is given twice; or see `make_marker`.
     """
+    check_faces("Marking part by part", original)
     ready = make_original(original)
     chosen = farthest_vertices(ready.mesh, features) if isinstance(features, int) else np.asarray(features)
     label, markers = parts(ready.mesh, chosen), []
