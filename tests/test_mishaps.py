@@ -14,6 +14,7 @@ import pytest
 import jaxmark as jm
 from jaxmark.app.cli import main
 from jaxmark.evaluation.cells import load_finished
+from jaxmark.files import SUFFIXES
 from jaxmark.files.atomic import replacing
 from jaxmark.watermark.record import Record
 from tests.samples import bumpy_sphere
@@ -76,7 +77,7 @@ def test_a_folder_without_meshes_leaves_no_folder(tmp_path: Path, monkeypatch, c
     arguments = ["embed", tmp_path / "empty", tmp_path / "out", "--key", tmp_path / "me.key"]
     assert run(arguments, monkeypatch, capsys) == (
         2,
-        f"jaxmark: The folder {tmp_path / 'empty'} has no mesh file (.obj, .ply, .off, .stl, .glb, .gltf, .3mf, .xyz, .las, .laz).\n",
+        f"jaxmark: The folder {tmp_path / 'empty'} has no mesh file ({', '.join(SUFFIXES)}).\n",
     )
     assert not (tmp_path / "out").exists()
 

@@ -123,10 +123,7 @@ def test_a_hidden_mark_in_a_cloud_keeps_its_limits(host: Mesh, marked: Mesh, mar
 @pytest.mark.slow
 def test_the_capacity_of_a_cloud_is_kept(host: Mesh, key: jm.Key):
     bits = jm.capacity(host, noise=1e-3)
-<<<<<<< HEAD
-=======
     assert bits >= 64
->>>>>>> points
     jm.make_marker(host, key, bits=bits).embed(bytes(bits // 8), noise=1e-3)
     with pytest.raises(jm.JaxmarkError, match="carries at most"):
         jm.embed(host, bytes(bits // 8 + 50), key, noise=1e-3)

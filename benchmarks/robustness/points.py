@@ -1,8 +1,4 @@
-<<<<<<< HEAD
-"""Marks in clouds and splats, after one attack or two: python benchmarks/robustness/points.py [MESH ...].
-=======
 """Marks in point clouds and splats, after attacks one by one: python benchmarks/robustness/points.py MESH ...
->>>>>>> points
 
 64 bits are written into clouds of --points points: with --budget, or as hidden as by default, which is an RMS
 displacement of 0.02 % of the diagonal, or less. Without meshes, the clouds are a

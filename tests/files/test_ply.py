@@ -153,17 +153,10 @@ BODY = b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
         (HEAD + STRIPS + b"0 0 0 1 0 0 0 1 0 4 0 1 2", "ends in row 0 .*tristrips"),
         (HEAD + STRIPS + b"0 0 0 1 0 0 0 1 0 4 0 1 2 3", r"Face 1 .*\[2, 1, 3\]"),
         (
-<<<<<<< HEAD
             b"ply\nformat ascii 1.0\nelement vertex 0\n"
             b"property float x\nproperty float y\nproperty float z\nend_header\n",
             "no vertices",
         ),
-=======
-            HEAD + b"element tristrips 1\nproperty list int int vertex_indices\nend_header\n0 0 0 1 0 0 0 1 0 0",
-            "strips",
-        ),
-        (HEAD.replace(b"vertex 3", b"vertex 0") + b"end_header\n", "no vertices"),
->>>>>>> points
     ],
 )
 def test_what_is_wrong_is_said(tmp_path: Path, data: bytes, message: str) -> None:
