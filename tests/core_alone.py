@@ -18,6 +18,30 @@ LONGEST_IMPORT = 1.0  # s, beside JAX's own
 REMESHING = {"simplification": 0.5, "isotropic": 1, "iso-surface": 20, "poisson": 5, "arap": 0.05}
 
 
+def _draco() -> bytes:
+    """A file that says that it is compressed with Draco."""
+    document = {
+        "asset": {"version": "2.0"},
+        "meshes": [
+            {
+                "primitives": [
+                    {
+                        "attributes": {"POSITION": 0},
+                        "extensions": {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}},
+                    }
+                ]
+            }
+        ],
+        "accessors": [{"componentType": 5126, "count": 3, "type": "VEC3"}],
+        "bufferViews": [{"buffer": 0, "byteLength": 5}],
+        "buffers": [{"byteLength": 5, "uri": "data:;base64,RFJBQ08="}],
+    }
+    return json.dumps(document).encode()
+
+
+DRACO = _draco()
+
+
 def run(folder: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Python as a user calls it, from a folder where only the installed package is found."""
     return subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
@@ -83,6 +107,12 @@ def needing(folder: str) -> Iterator[tuple[str, str, Callable[[], object]]]:
     yield "pictures of studies", "plot", lambda: Results(()).plot()
     yield "tables of studies", "study", lambda: Results(()).frame()
     yield "closest points", "align", lambda: Surface(mesh).closest(mesh.vertices)
+    draco = Path(folder, "draco.gltf")
+    draco.write_bytes(DRACO)
+    yield "Draco", "files", lambda: jm.load_mesh(draco)
+    laser = Path(folder, "scan.las")
+    laser.write_bytes(b"LASF")
+    yield "laser scans", "files", lambda: jm.load_mesh(laser)
     yield "modules of learned filters", "learned", lambda: learned.ChebConv
     yield "the sample mesh", "attacks", sample_mesh
     for name, strength in REMESHING.items():

@@ -18,7 +18,7 @@ from jaxmark.files.atomic import write_atomically
 from jaxmark.geometry.mesh import Mesh, compact, host_mesh, weld, weld_mesh
 from jaxmark.geometry.raster import Frame
 from jaxmark.plot import Rendering, exaggerate, render
-from jaxmark.watermark.budget import VISIBILITY, Budget, make_budget
+from jaxmark.watermark.budget import VISIBILITY, Budget, make_budget, visibility_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser
@@ -30,6 +30,7 @@ SIZE = 270  # pixels
 SIDE = (20.0, 30.0)  # elevation and azimuth of the eye
 CLOSE = 0.85  # of the frame in which meshes are seen whole from everywhere
 GRAYS = 48
+FACETED = 300  # points of shapes with large facets
 
 
 def strip(meshes: list[Mesh], frame: Frame) -> np.ndarray:
@@ -67,15 +68,16 @@ def main() -> None:
     arguments.output.mkdir(parents=True, exist_ok=True)
     meshes = {path.stem: load(parser, path) for path in arguments.meshes}
     meshes |= {name: make(arguments.points) for name, make in SHAPES.items()}
+    meshes |= {f"faceted_{name}": SHAPES[name](FACETED) for name in ("torus", "sphere")}
     for name, given in meshes.items():
         say(name)
         mesh = host_mesh(compact(weld_mesh(given, weld(given.vertices))))
         frame = Frame.of(mesh)
-        frame, result = frame._replace(width=CLOSE * frame.width), marked(mesh, make_budget())
+        frame, result = frame._replace(width=CLOSE * frame.width), marked(mesh, make_budget(named=visibility_of(mesh)))
         more = exaggerate(jm.make_marker(mesh, KEY).original, result).mesh
         save(strip([mesh, result, more], frame), arguments.output / f"visibility_{name}.png")
         if name in arguments.levels:
-            levels = [marked(mesh, make_budget(visibility=level)) for level in VISIBILITY]
+            levels = [marked(mesh, make_budget(visibility=level, named=visibility_of(mesh))) for level in VISIBILITY]
             save(strip([mesh, *levels], frame), arguments.output / f"visibility_levels_{name}.png")
 
 

@@ -12,7 +12,7 @@ from jaxmark import distortion
 from jaxmark.alignment.original import Original, displace, shift_of
 from jaxmark.distortion import Metric, name_of
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, diagonal
+from jaxmark.geometry.mesh import Mesh, diagonal, edges
 
 Visibility = Literal["hidden", "careful look", "visible"]
 
@@ -34,6 +34,7 @@ CLOUD_VISIBILITY: Mapping[Visibility, Mapping[str, float]] = {
     "careful look": {"rms": 5e-4, "point_to_plane": 0.4},
     "visible": {"rms": 1e-3, "point_to_plane": 1.0},
 }
+_FACET, _MOST_OF_FACETS = 0.02, 2.5  # mean edge over the diagonal beyond which a model is one of facets
 _MAX_RMS = 0.01  # displacement in diagonals, if only limits are given; a larger one is no watermark
 _FIRST_RMS = 2e-4  # displacement in diagonals that is tried first
 _MIN_LIMIT_SHARE = 0.99  # share of a limit that is as good as all of it
@@ -65,8 +66,18 @@ class Written(NamedTuple):
 
 
 def visibility_of(mesh: Mesh) -> Mapping[Visibility, Mapping[str, float]]:
-    """The limits by what people see of such a mesh: `VISIBILITY`, or of a point cloud `CLOUD_VISIBILITY`."""
-    return VISIBILITY if len(mesh.faces) else CLOUD_VISIBILITY
+    """The limits by what people see of such a mesh: `VISIBILITY`, or of a point cloud `CLOUD_VISIBILITY`.
+
+    On a model of large facets, a change of angles is a change of few and large areas, which people see less well than
+    of many small ones: the limit of DAME grows with the mean edge where that is longer than 2 % of the diagonal, up to
+    two and a half times, 0.02 for what is hidden. What shading allows stays; `docs/visibility.md` has pictures.
+    """
+    if not len(mesh.faces):
+        return CLOUD_VISIBILITY
+    points, pairs = np.asarray(mesh.vertices, np.float64), edges(mesh.faces)
+    length = np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1).mean() / diagonal(mesh)
+    factor = min(max(length / _FACET, 1.0), _MOST_OF_FACETS)
+    return {name: {**limits, "dame": factor * limits["dame"]} for name, limits in VISIBILITY.items()}
 
 
 def make_budget(

@@ -231,7 +231,7 @@ class Marker:
         A suspect that is read with several keys needs to be aligned only once: pass the result of
         `jaxmark.alignment.alignment.align` in its place.
         """
-        if not self.bits:
+        if not self.bits and message is None:
             message = b""  # presence is all that can be claimed
         if message is not None:
             self.check_claim(message)
@@ -697,9 +697,10 @@ def capacity(
         raise JaxmarkError(
             f"capacity needs a noise of at least 0 and a coverage in (0, 1], got {noise:g} and {coverage:g}."
         )
-    bounds = make_budget(budget, limits, visibility, named=visibility_of(mesh))
+    original = make_original(mesh)
+    bounds = make_budget(budget, limits, visibility, named=visibility_of(original.mesh))
     conditions = Conditions(bounds, noise, coverage)
-    return Capacity(make_original(mesh), get_scheme(scheme)).bits(conditions)
+    return Capacity(original, get_scheme(scheme)).bits(conditions)
 
 
 def detect(
