@@ -6,6 +6,7 @@ Run by itself in a bare environment into which the package was installed; pytest
 import importlib.metadata
 import importlib.resources
 import importlib.util
+import json
 import platform
 import statistics
 import subprocess
