@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from jaxmark.geometry.mesh import unit
 from jaxmark.geometry.pose import Points, Pose, similarity
-from jaxmark.geometry.surfaces import Shape
+from jaxmark.geometry.surfaces import Geometry
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ FEATURE_SETTINGS = FeatureSettings()
 
 
 def poses_by_features(
-    original: Shape,
-    suspect: Shape,
+    original: Geometry,
+    suspect: Geometry,
     count: int,
     hands: Sequence[bool] = (False, True),
     *,

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from jaxmark.alignment.features import FEATURE_SETTINGS, FeatureSettings, poses_by_features
 from jaxmark.geometry.mesh import unit
 from jaxmark.geometry.pose import IDENTITY, Points, Pose, similarity
-from jaxmark.geometry.surfaces import Shape
+from jaxmark.geometry.surfaces import Geometry
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ BOTH_HANDS = (False, True)
 
 
 def register_whole(
-    original: Shape,
-    suspect: Shape,
+    original: Geometry,
+    suspect: Geometry,
     hands: Sequence[bool] = BOTH_HANDS,
     *,
     settings: RegistrationSettings = SETTINGS,
@@ -98,7 +98,7 @@ def register_whole(
 
 
 def _best(
-    surface: Shape, points: Points, normals: Points, starts: list[Pose], settings: RegistrationSettings
+    surface: Geometry, points: Points, normals: Points, starts: list[Pose], settings: RegistrationSettings
 ) -> list[tuple[float, Pose]]:
     """Refine a surface's poses by few points, then the best of them by more; returns the distances that these leave."""
     ends: list[tuple[float, Pose]] = []
@@ -114,8 +114,8 @@ def _best(
 
 
 def register_part(
-    original: Shape,
-    suspect: Shape,
+    original: Geometry,
+    suspect: Geometry,
     hands: Sequence[bool] = BOTH_HANDS,
     *,
     settings: RegistrationSettings = SETTINGS,
@@ -159,14 +159,14 @@ def _unlikeliness(distance: float, pose: Pose, settings: RegistrationSettings) -
     return distance * (settings.mirror_ratio if pose.mirrors else 1)
 
 
-def _distance(surface: Shape, points: Points, pose: Pose, settings: RegistrationSettings) -> float:
+def _distance(surface: Geometry, points: Points, pose: Pose, settings: RegistrationSettings) -> float:
     """Mean distance of points from a surface, where points that are lost count as a bounded distance."""
     distance = np.linalg.norm(surface.closest(points, pose)[0] - points, axis=1)
     return float(np.mean(np.minimum(distance, settings.lost_distance)))
 
 
 def refine(
-    surface: Shape,
+    surface: Geometry,
     points: Points,
     normals: Points,
     pose: Pose,
@@ -251,7 +251,7 @@ def _axes(target: Points, source: Others) -> list[Pose]:
 
 
 def _turned(
-    suspect: Shape, target: Points, source: Others, starts: list[Pose], settings: RegistrationSettings
+    suspect: Geometry, target: Points, source: Others, starts: list[Pose], settings: RegistrationSettings
 ) -> list[Pose]:
     """Turn poses about the axis of a round shape, upright and upside down, and keep the turns that fit locally best.
 

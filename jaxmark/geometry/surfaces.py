@@ -24,7 +24,7 @@ class Samples(NamedTuple):
 
 
 @runtime_checkable
-class Shape(Protocol):
+class Geometry(Protocol):
     """What registration brings onto each other: the surface of a mesh, or the points of a cloud."""
 
     def anchors(self) -> tuple[Points, Points]:
