@@ -61,6 +61,11 @@ def run(arguments: list[object], seconds: float, memory: float) -> tuple[int, di
     return done.returncode, answer, done.stderr.strip()
 
 
+def is_foreign(said: str) -> bool:
+    """Whether something else than a refusal was said."""
+    return "Unexpected" in said or "Traceback" in said
+
+
 def differences(source: Path, marked: Path, most: float) -> str:
     """What trimesh sees that should not be; nothing if all is well.
 
@@ -105,19 +110,20 @@ def try_file(path: Path, seconds: float, memory: float) -> dict[str, Any]:
         call = functools.partial(run, seconds=seconds, memory=memory)
         status, told, said = call(["embed", path, marked, "--key", key, "--message", MESSAGE.hex()])
         if status != 0:
-            outcome = "refused" if status == 2 and "Unexpected" not in said and "Traceback" not in said else "wrong"
+            outcome = "wrong" if status != 2 or is_foreign(said) else "refused"
             return found | {"outcome": outcome, "why": said[-600:], "seconds": time.monotonic() - begin}
         found |= {"meshes": len(told.get("meshes", [0])), "left": len(told.get("left", [])), "max": told["max"]}
         read = ["--original", path, "--key", key, "--record", told["record"]]
         status, seen, said = call(["detect", marked, *read])
         alone = [one["detected"] for one in seen.get("meshes", {}).values()]
         good = status == 0 and seen.get("message") == MESSAGE.hex() and all(alone)
-        found["why"] = said[-600:] or differences(path, marked, told["max"])
+        found["why"] = (said[-600:] if is_foreign(said) else "") or differences(path, marked, told["max"])
         survives = [one["survives"] for one in told["meshes"].values()] if "meshes" in told else [told["survives"]]
         noise = min(one["whole"] for one in survives) / 2
         if good and noise > 0:
             status, _, said = call(["attack", marked, suspect, "noise", noise])
-            found["why"] = found["why"] or said
+            if status and is_foreign(said):
+                found["why"] = found["why"] or said
             status, seen, _ = call(["detect", suspect, *read])
             found["attacked"] = status == 0 and seen.get("message") == MESSAGE.hex()
         found["noise"] = 2 * noise

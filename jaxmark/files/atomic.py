@@ -1,13 +1,49 @@
 """Write files that appear whole or not at all."""
 
 import os
+import platform
+import re
 import secrets
+import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 from jaxmark.errors import JaxmarkError
+
+_PREFIX = ".jaxmark-"  # of what is written before it gets its name
+
+
+def _own_prefix() -> str:
+    """The prefix of this process's drafts, by which others see whether it still runs."""
+    return f"{_PREFIX}{re.sub('[^A-Za-z0-9]', '_', platform.node())}-{os.getpid()}-"
+
+
+def _clear_drafts(folder: Path) -> None:
+    """Delete drafts of processes of this machine that were killed before they could do so themselves."""
+    if os.name != "posix":  # elsewhere nobody can be asked without being disturbed
+        return
+    own = re.compile(_own_prefix().replace(f"-{os.getpid()}-", r"-(\d+)-") + ".*")
+    for draft in folder.glob(_PREFIX + "*"):
+        found = own.fullmatch(draft.name)
+        if found is None or _runs(int(found[1])):
+            continue
+        if draft.is_dir():
+            shutil.rmtree(draft, ignore_errors=True)
+        else:
+            draft.unlink(missing_ok=True)
+
+
+def _runs(process: int) -> bool:
+    """Whether there is a process of this number."""
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # it is somebody else's
+        return True
+    return True
 
 
 def write_atomically(path: str | os.PathLike, data: bytes, *, mode: int | None = None) -> None:
@@ -32,7 +68,8 @@ def write_atomically(path: str | os.PathLike, data: bytes, *, mode: int | None =
             raise JaxmarkError(f"Cannot write {os.fspath(path)}: the folder {target.parent} does not exist.")
         if target.exists() and not target.is_file():
             raise JaxmarkError(f"Cannot write {os.fspath(path)}: it is not an ordinary file.")
-        temporary = target.parent / f".{secrets.token_hex(8)}.tmp"
+        _clear_drafts(target.parent)
+        temporary = target.parent / f"{_own_prefix()}{secrets.token_hex(8)}.tmp"
         descriptor = os.open(
             temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), mode or 0o666
         )
@@ -109,7 +146,8 @@ def replacing(target: Path) -> Iterator[Path]:
     if target.is_dir():
         raise JaxmarkError(f"{target} is a folder; name a file.")
     real = Path(os.path.realpath(target))
-    with tempfile.TemporaryDirectory(prefix=".jaxmark-", dir=real.parent) as folder:
+    _clear_drafts(real.parent)
+    with tempfile.TemporaryDirectory(prefix=_own_prefix(), dir=real.parent) as folder:
         draft = Path(folder) / target.name
         try:
             yield draft

@@ -1,9 +1,12 @@
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files import atomic
 from jaxmark.files.atomic import write_atomically
 
 
@@ -63,3 +66,19 @@ def test_a_symbolic_link_stays_one(tmp_path: Path) -> None:
     write_atomically(tmp_path / "link", b"after")
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "real").read_bytes() == b"after"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="only there can a process be asked whether it runs")
+def test_drafts_of_killed_processes_are_cleared(tmp_path: Path) -> None:
+    child = subprocess.Popen([sys.executable, "-c", ""])
+    child.wait()
+    mine = atomic._own_prefix()
+    dead = mine.replace(f"-{os.getpid()}-", f"-{child.pid}-")
+    (tmp_path / f"{dead}folder").mkdir()
+    (tmp_path / f"{dead}folder" / "marked.ply").write_text("draft")
+    (tmp_path / f"{dead}file.tmp").write_text("draft")
+    others = [f"{mine}file.tmp", ".jaxmark-elsewhere-1-file.tmp", ".jaxmark-notes", "marked.ply"]
+    for name in others:
+        (tmp_path / name).write_text("not ours to delete")
+    write_atomically(tmp_path / "out.ply", b"out")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*others, "out.ply"])
