@@ -81,6 +81,7 @@ def differences(source: Path, marked: Path, most: float) -> str:
     after = trimesh.load_scene(marked, process=False).geometry
     if list(before) != list(after):
         return f"other meshes: {list(before)[:3]} and {list(after)[:3]}"
+    whole = float(np.linalg.norm(np.ptp(np.concatenate([one.vertices for one in before.values()]), axis=0)))
     for name, old in before.items():
         new = after[name]
         if np.shape(old.vertices) != np.shape(new.vertices):
@@ -91,11 +92,10 @@ def differences(source: Path, marked: Path, most: float) -> str:
             texture, again = (getattr(one.visual, "uv", None) for one in (old, new))
             if texture is not None and not (again is not None and np.array_equal(texture, again)):
                 return f"{name}: other texture coordinates"
-        # A part of a mesh is smaller than the mesh, whose diagonal counts.
+        # A part of a mesh is smaller than the mesh, whose diagonal counts, and that is smaller than all of the file.
         moved = np.linalg.norm(np.asarray(old.vertices) - new.vertices, axis=1).max(initial=0.0)
-        whole = max(float(one.scale) for one in before.values())
         if moved > 1.05 * most * whole + 1e-6 * whole:
-            return f"{name}: moved by {moved / whole:.2g} of the largest diagonal"
+            return f"{name}: moved by {moved / whole:.2g} of the file's diagonal"
     return ""
 
 
