@@ -119,9 +119,9 @@ def test_code_length():
     assert code_length(64, 128, 12) == code_length(64, 255, 12) == 128
 
 
-@pytest.mark.parametrize("bits", [0, -8, 12, 1])
+@pytest.mark.parametrize("bits", [-8, 12, 1])
 def test_payloads_of_no_whole_bytes_are_refused(bits: int):
-    with pytest.raises(jm.JaxmarkError, match="positive multiple of 8"):
+    with pytest.raises(jm.JaxmarkError, match="multiple of 8"):
         code_length(bits, 4096, 12)
 
 

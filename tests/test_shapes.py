@@ -22,8 +22,8 @@ def test_common_sizes_are_few_and_not_much_larger():
     counts = np.arange(1, 2**17 + 2)
     sizes = np.array([common_size(int(count)) for count in counts])
     assert (sizes >= counts).all()
-    assert len(np.unique(sizes[counts <= 2**12])) == 5
-    assert (sizes <= 1.25 * counts)[counts > 2**12].all()
+    assert len(np.unique(sizes[counts <= 2**11])) == 4
+    assert (sizes <= 1.25 * counts)[counts > 2**11].all()
     assert sizes[-1] == counts[-1]
     octave = sizes[(counts > 2**12) & (counts <= 2**13)]
     assert len(np.unique(octave)) == 4

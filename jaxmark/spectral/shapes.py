@@ -14,13 +14,13 @@ from jaxmark.spectral.graphs import Weighting, from_mesh, nearest_pairs
 from jaxmark.spectral.laplacian import Laplacian, Lowering, graph_laplacian
 
 _MIN_SIZE = 256
-_MAX_DOUBLED_SIZE = 2**12  # up to this, sizes double: running takes next to no time
+_MAX_DOUBLED_SIZE = 2**11  # up to this, sizes double: running takes next to no time
 _NEIGHBOURS = 10  # nearest points that each point of a cloud is joined to, at least
 _MAX_PADDED_SIZE = 2**17  # beyond this, running takes longer than compiling
 
 
 def common_size(count: int) -> int:
-    """Round a size up to a power of two from 2^8 on, beyond 2^12 to one of four per octave; from 2^17 on, keep it."""
+    """Round a size up to a power of two from 2^8 on, beyond 2^11 to one of four per octave; from 2^17 on, keep it."""
     step = 1 << max(count - 1, 1).bit_length() >> 3
     if count <= _MAX_DOUBLED_SIZE:
         step = max(_MIN_SIZE, 8 * step)
