@@ -138,7 +138,7 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | 
         path: the file to write, in the format that its suffix names. It may be the same file as `like`.
         like: the file that the mesh was loaded from. Only the numbers of vertices that moved change, their normals
             follow, and everything else stays byte for byte. Without it a new file is written: exact in OBJ, OFF, XYZ
-            and 3MF, in single precision in PLY, STL and GLB; none in LAS, LAZ and glTF. Files that a glTF file refers
+            and 3MF, in single precision in PLY, STL, GLB and glTF; none in LAS and LAZ. Files that a glTF file refers
             to come along: a buffer that changes is named after the new file, the others are copied where they are not
             there already.
 

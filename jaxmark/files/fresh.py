@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import trimesh
+from trimesh.exchange.gltf import export_gltf
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.source import Source
@@ -31,7 +32,7 @@ def encode_new(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> byt
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if suffix in _CLOUDS and len(faces):
         raise JaxmarkError(f"{suffix[1:].upper()} files hold points without faces; save the mesh as PLY or OBJ.")
-    if suffix in (".stl", ".glb") and not len(faces):
+    if suffix in (".stl", ".glb", ".gltf", ".3mf") and not len(faces):
         raise JaxmarkError(f"A new {suffix[1:].upper()} file holds faces; save the point cloud as PLY or XYZ.")
     if suffix in (".las", ".laz"):
         raise JaxmarkError(
@@ -45,7 +46,11 @@ def encode_new(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> byt
         data, vertices = _points_as_ply(vertices), _single(vertices, suffix)
     else:
         with np.errstate(all="ignore"):
-            data = bytes(trimesh.Trimesh(vertices, faces, process=False).export(file_type=suffix[1:]))  # type: ignore[arg-type]
+            whole = trimesh.Trimesh(vertices, faces, process=False)
+            if suffix == ".gltf":
+                (data,) = export_gltf(trimesh.Scene(whole), embed_buffers=True).values()
+            else:
+                data = bytes(whole.export(file_type=suffix[1:]))  # type: ignore[arg-type]
             if suffix == ".stl":
                 vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
             vertices = _single(vertices, suffix)

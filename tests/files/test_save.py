@@ -11,7 +11,7 @@ from jaxmark.files import load_mesh, save_mesh
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from tests.files.helpers import noisy, shifted, written
 
-SUFFIXES = [".obj", ".off", ".ply", ".stl", ".glb"]
+SUFFIXES = [".obj", ".off", ".ply", ".stl", ".glb", ".gltf", ".3mf"]
 # Doubled vertices, an isolated one, a degenerate face, numbers of all sizes.
 MESH = make_mesh(
     [[1 / 3, 0, 0], [1, 1e-12, 0], [0, 1, 2 / 7], [1 / 3, 0, 0], [-7.7, 0.1, 1e-5]], [[0, 1, 2], [3, 2, 1], [1, 1, 2]]
@@ -27,7 +27,7 @@ def test_new_files_hold_the_mesh(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"new{suffix}"
     save_mesh(MESH, path)
     mesh = load_mesh(path)
-    exact = suffix in (".obj", ".off")
+    exact = suffix in (".obj", ".off", ".3mf")
     np.testing.assert_array_equal(soup(mesh), soup(MESH) if exact else soup(MESH).astype(np.float32))
     if suffix != ".stl":
         assert len(mesh.vertices) == 5
