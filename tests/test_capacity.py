@@ -203,23 +203,24 @@ def test_what_is_stated_is_kept(thousand: Mesh, known: Capacity, key: jm.Key):
     """A refusal names a payload and a budget, and both are accepted as they stand."""
     most = jm.capacity(thousand, 8e-4)
     assert most == known.bits(USUAL)
-    jm.embed(thousand, bytes(most // 8), key, budget=8e-4)
+    noise = USUAL.noise
+    jm.embed(thousand, bytes(most // 8), key, budget=8e-4, noise=noise)
     larger = bytes(most // 8 + 1)
     with pytest.raises(jm.JaxmarkError) as refusal:
-        jm.embed(thousand, larger, key, budget=8e-4)
+        jm.embed(thousand, larger, key, budget=8e-4, noise=noise)
     stated = re.search(r"at most (\d+) bits .* not (\d+)\. .*at least ([0-9.e-]+\d)\.$", str(refusal.value))
     assert stated is not None
     assert int(stated[1]) == most
     assert int(stated[2]) == most + 8
     least = known.least_budget(most + 8, USUAL)
     assert float(stated[3]) == pytest.approx(least, rel=0.05)
-    jm.embed(thousand, larger, key, budget=float(stated[3]))
+    jm.embed(thousand, larger, key, budget=float(stated[3]), noise=noise)
     with pytest.raises(jm.JaxmarkError, match="carries at most"):
-        jm.embed(thousand, larger, key, budget=0.99 * least)
+        jm.embed(thousand, larger, key, budget=0.99 * least, noise=noise)
     # Where nothing but the noise asked for is too much, less of it is accepted.
     jm.embed(thousand, larger, key, budget=8e-4, noise=0.99 * 0.005 * 8e-4 / least)
     with pytest.raises(jm.JaxmarkError, match=r"Use a shorter message\.$"):
-        jm.embed(thousand, bytes(110), key, budget=8e-4)
+        jm.embed(thousand, bytes(110), key, budget=8e-4, noise=noise)
 
 
 @pytest.mark.parametrize("bits", [16, 24, 48])

@@ -142,7 +142,7 @@ def test_capacity_is_what_embed_takes(workshop: Workshop):
     for size, status in ((bits, 0), (bits + 8, 2)):
         code, _, err = workshop(
             *("embed", "model.ply", "full.ply", "--key", "owner.key", "--message", "5a" * (size // 8), "--json"),
-            *budget,
+            *(*budget, "--noise", "0.005"),
         )
         assert code == status, err
     assert f"at most {bits} bits" in err
