@@ -49,7 +49,7 @@ def mark(mesh: Mesh, scheme: Scheme, bits: int, budget: float, noise: float | No
     rng = np.random.default_rng([bits, seed])
     marker, message = jm.make_marker(mesh, rng.bytes(32), bits=bits, scheme=scheme), rng.bytes(bits // 8)
     try:
-        return Subject(marker, marker.embed(message, budget)[0], message, NOISE)
+        return Subject(marker, marker.embed(message, budget, noise=NOISE)[0], message, NOISE)
     except jm.JaxmarkError:
         if noise is None:
             raise
