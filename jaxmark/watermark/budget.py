@@ -77,7 +77,7 @@ def visibility_of(mesh: Mesh) -> Mapping[Visibility, Mapping[str, float]]:
     points, pairs = np.asarray(mesh.vertices, np.float64), edges(mesh.faces)
     length = np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1).mean() / diagonal(mesh)
     factor = min(max(length / _FACET, 1.0), _MOST_OF_FACETS)
-    return {name: {**limits, "dame": factor * limits["dame"]} for name, limits in VISIBILITY.items()}
+    return {name: {**limits, "dame": round(factor * limits["dame"], 4)} for name, limits in VISIBILITY.items()}
 
 
 def make_budget(
