@@ -408,7 +408,7 @@ def test_faces_whose_corners_coincide_have_no_angles():
     faces = np.array([[0, 1, 2], [1, 3, 2], [3, 3, 2], [3, 3, 3]])
     hinges, plain = make_hinges(faces), make_hinges(faces[:2])
     assert len(hinges.edges) == len(plain.edges) == 5
-    both = (plain.edges == [1, 2]).all(axis=1)
+    both = np.all(plain.edges == [1, 2], axis=1)
     assert plain.inner[both] == hinges.inner[both] == 1
     for name in ("left", "right"):
         assert getattr(plain, name)[both] == getattr(hinges, name)[both]
