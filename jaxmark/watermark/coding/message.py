@@ -4,11 +4,10 @@ The message and its tag are one polar codeword (`jaxmark.watermark.coding.polar`
 candidates; the tag, from a subkey of its own, tells which of them is the message, if any.
 """
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int8
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.coding import polar
@@ -43,25 +42,29 @@ def code_length(bits: int, places: int, spread: int) -> int:
     return length
 
 
-def encode(message: bytes, choices: Choices, length: int) -> Float64[np.ndarray, " length"]:
+def encode(
+    message: bytes, choices: Choices, length: int, tag_bits: int = TAG_BITS
+) -> Float64[np.ndarray, " length"]:
     """Encode a message and its keyed tag as a codeword of signs: a code bit 0 is +1, a 1 is -1.
 
     Args:
         message: the payload.
         choices: the keyed choices of the mark.
         length: number of code bits, from `code_length`.
+        tag_bits: size of the tag.
     """
     if not message:
         return np.ones(1)  # a tag tells messages apart, and here is none to tell
     payload = np.unpackbits(np.frombuffer(message, np.uint8))
-    return 1.0 - 2.0 * polar.encode(np.concatenate([payload, _tag(message, choices)]), length)
+    return 1.0 - 2.0 * polar.encode(np.concatenate([payload, _tag(message, choices, tag_bits)]), length)
 
 
 class Decoded(NamedTuple):
     """A message whose keyed tag fits."""
 
     message: bytes
-    rank: int  # how many messages were tried, this one included; its tag fits by chance with probability rank · 2^-28
+    rank: int  # how many messages were tried, this one included; its tag fits by chance with rank · 2^-(size of tag)
+    row: int = 0  # which of several readings it is from
 
 
 def decode(scores: Float[np.ndarray, " length"], bits: int, choices: Choices) -> Decoded | None:
@@ -76,12 +79,31 @@ def decode(scores: Float[np.ndarray, " length"], bits: int, choices: Choices) ->
         bits: size of the payload in bits.
         choices: the keyed choices of the mark.
     """
+    return decode_any(scores[None], bits, choices)
+
+
+def decode_any(
+    scores: Float[np.ndarray, "rows length"], bits: int, choices: Choices, tag_bits: int = TAG_BITS
+) -> Decoded | None:
+    """Decode the first message whose keyed tag fits, of several readings: their most plausible messages come first.
+
+    Args:
+        scores: soft values of the code bits in each reading, see `decode`.
+        bits: size of the payload in bits.
+        choices: the keyed choices of the mark.
+        tag_bits: size of the tag.
+    """
     if bits == 0:
         return None
-    for rank, word in enumerate(_list_candidates(scores, bits, CANDIDATES), 1):
-        message = np.packbits(word[:bits]).tobytes()
-        if np.array_equal(word[bits:], _tag(message, choices)):
-            return Decoded(message, rank)
+    rank = 0
+    for words in np.swapaxes(_list_candidates(scores, bits + tag_bits), 0, 1):
+        for row, word in enumerate(words):
+            if not np.any(scores[row]):
+                continue
+            rank += 1
+            message = np.packbits(word[:bits]).tobytes()
+            if np.array_equal(word[bits:], _tag(message, choices, tag_bits)):
+                return Decoded(message, rank, row)
     return None
 
 
@@ -95,18 +117,20 @@ def guess(scores: Float[np.ndarray, " length"], bits: int) -> bytes | None:
     Returns:
         The message; None if all scores are 0.
     """
-    word = next(iter(_list_candidates(scores, bits, CANDIDATES)), None)
-    return None if word is None else np.packbits(word[:bits]).tobytes()
-
-
-def _list_candidates(scores: Float[np.ndarray, " length"], bits: int, candidates: int) -> Iterable[np.ndarray]:
-    """List messages with their tags, the most plausible first; none if all scores are 0."""
     if not np.any(scores):
-        return ()
-    return polar.decode(scores[None] / np.abs(scores).max(), bits + TAG_BITS, candidates)[0]
+        return None
+    return np.packbits(_list_candidates(scores[None], bits + TAG_BITS)[0, 0, :bits]).tobytes()
 
 
-def _tag(message: bytes, choices: Choices) -> np.ndarray:
+def _list_candidates(
+    scores: Float[np.ndarray, "rows length"], information: int
+) -> Int8[np.ndarray, "rows candidates information"]:
+    """List messages with their tags for each reading, the most plausible first."""
+    size = np.abs(scores).max(axis=1, keepdims=True)
+    return polar.decode(scores / np.where(size > 0, size, 1), information, CANDIDATES)
+
+
+def _tag(message: bytes, choices: Choices, tag_bits: int) -> np.ndarray:
     """The keyed tag of a message, as bits 0 or 1."""
-    digest = choices.derive("tag", -(-TAG_BITS // 8), message)
-    return np.unpackbits(np.frombuffer(digest, np.uint8))[:TAG_BITS]
+    digest = choices.derive("tag", -(-tag_bits // 8), message)
+    return np.unpackbits(np.frombuffer(digest, np.uint8))[:tag_bits]

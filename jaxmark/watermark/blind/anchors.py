@@ -1,0 +1,235 @@
+"""What a surface shows at the points of a fixed lattice: how it is curved there, as a difference of two averages.
+
+A mesh is first brought to a pose of its own, which any meshing of the same shape has. At each point of a cubic lattice
+that lies near the surface, an anchor, two Gaussian averages of the surface's points are taken, one twice as wide as the
+other; their difference along the averaged normal is the anchor's value. Values hardly depend on the meshing.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float64, Int, Int64
+from scipy.spatial import cKDTree
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh, check_faces, compact, diagonal, open_sides, weld, weld_mesh
+from jaxmark.geometry.moments import Moments, surface_moments, volume_moments
+from jaxmark.geometry.pose import Pose
+from jaxmark.spectral.shapes import common_size, pad_rows
+
+SPACING = 3.4  # of the lattice, in widths of the narrow Gaussian
+_WIDER = 2.0  # width of the wide Gaussian over the narrow one
+_CUT = 3.2  # widths of the wide Gaussian at which it is cut off
+_PIECE_AREA, _PIECE_SIDE = 0.2, 0.35  # of pieces at most, in squared widths and widths of the narrow Gaussian
+_TINY = 1e-12  # area that is nothing
+_SIZE_BY_VOLUME, _SIZE_BY_AREA = 0.25, 0.29  # root of the trace of the covariance: the diagonal is then about 1
+_MAX_OPEN = 0.01  # share of open sides up to which a surface encloses a volume
+_NEAREST = 0.5  # distance from the surface, over the lattice's spacing, up to which a lattice point is an anchor
+_MIN_COHERENCE = 0.5  # length of the mean normal: where it is less, sheets mix
+_MIN_MASS = 0.2  # area under the narrow Gaussian, over a plane's, from which an anchor counts
+
+
+def encloses(mesh: Mesh) -> bool:
+    """Whether a surface encloses a volume: whether nearly all sides have another one along them, that runs back."""
+    return bool(open_sides(mesh.faces).mean() <= _MAX_OPEN)
+
+
+def moments_of(mesh: Mesh) -> Moments:
+    """Moments of what a mesh encloses, or of its surface if it is open, in units of the mesh."""
+    middle = np.asarray(mesh.vertices).mean(axis=0)
+    corners = (np.asarray(mesh.vertices) - middle)[np.asarray(mesh.faces)]
+    found = volume_moments(corners) if encloses(mesh) else surface_moments(corners)
+    return found._replace(centre=found.centre + middle)
+
+
+class Placed(NamedTuple):
+    """A mesh in the pose of its own: lengths are about its diagonal, axes along its main axes."""
+
+    mesh: Mesh
+    pose: Pose  # from the units of the file to it
+    moments: Moments  # in it
+    outwards: float  # 1 where normals point outwards, -1 where inwards
+
+
+def place(mesh: Mesh) -> Placed:
+    """Bring a mesh to its own pose: to its centre and main axes, the longest first, and to a size of about 1.
+
+    Along each axis it may look either way: whoever compares two shapes tries all.
+
+    Raises:
+        JaxmarkError: if it is a point cloud, or has no extent.
+    """
+    check_faces("A mark without an original", mesh)
+    mesh = compact(weld_mesh(mesh, weld(mesh.vertices)))
+    diagonal(mesh)  # refuses what has no extent
+    found = moments_of(mesh)
+    variances, axes = np.linalg.eigh(found.covariance)
+    size = _SIZE_BY_VOLUME if encloses(mesh) else _SIZE_BY_AREA
+    if not variances.sum() > 0:
+        raise JaxmarkError("This shape encloses no volume, by which its pose could be told; mend its faces.")
+    turn = axes[:, ::-1].T
+    turn *= np.linalg.det(turn)
+    scale = size / np.sqrt(variances.sum())
+    pose = Pose(scale * turn, -scale * turn @ found.centre)
+    moved = Moments(abs(found.mass) * scale**3, np.zeros(3), scale**2 * turn @ found.covariance @ turn.T)
+    outwards = -1.0 if encloses(mesh) and found.mass < 0 else 1.0
+    return Placed(Mesh(pose(np.asarray(mesh.vertices)), mesh.faces), pose, moved, outwards)
+
+
+class Surface(NamedTuple):
+    """Pieces of a surface, all about as small, however large its faces are; traced."""
+
+    points: Float[Array, "pieces 3"]  # the centre of each
+    normals: Float[Array, "pieces 3"]  # as long as its area, if it is plane
+    area: Float[Array, " pieces"]
+
+
+class Pieces(NamedTuple):
+    """How a surface is cut into pieces: faces are cut where they are large, and put together where they are small."""
+
+    corners: Int[np.ndarray, "samples 3"]  # vertices of the face that each sample is of
+    shares: Float64[np.ndarray, "samples 3"]  # of each corner in the sample's position
+    part: Float64[np.ndarray, " samples"]  # of the face's area that the sample stands for
+    piece: Int[np.ndarray, " samples"]  # number of the piece that it belongs to, ascending
+    room: Bool[np.ndarray, " pieces"]  # of no other use than its length
+
+    def of(self, vertices: Float[Array, "vertices 3"]) -> Surface:
+        """The pieces for vertices anywhere."""
+        a, b, c = (vertices[self.corners[:, corner]] for corner in range(3))
+        shares = jnp.asarray(self.shares, vertices.dtype)
+        points = shares[:, :1] * a + shares[:, 1:2] * b + shares[:, 2:] * c
+        normals = jnp.cross(b - a, c - a) * (jnp.asarray(self.part, vertices.dtype) / 2)[:, None]
+        # The small number keeps roots and divisions, and their derivatives, finite where there is nothing.
+        area = jnp.sqrt(jnp.sum(normals**2, axis=1) + _TINY**2)
+        columns = jnp.concatenate([area[:, None] * points, normals, area[:, None]], axis=1)
+        sums = jax.ops.segment_sum(columns, self.piece, len(self.room), indices_are_sorted=True)
+        total = jnp.maximum(sums[:, 6], _TINY)
+        return Surface(sums[:, :3] / total[:, None], sums[:, 3:6], total)
+
+
+def cut(mesh: Mesh, width: float) -> Pieces:
+    """Cut a surface into pieces much smaller than a Gaussian of this width; the same at every call."""
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    normals = np.cross(b - a, c - a)
+    sizes = np.linalg.norm(normals, axis=1) / 2
+    faces, normals, sizes = (x[sizes > 0] for x in (faces, normals, sizes))
+    count = np.maximum(np.ceil(sizes / (_PIECE_AREA * width**2)), 1).astype(np.int64)
+    face = np.repeat(np.arange(len(faces)), count)
+    number = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
+    # Multiples of the plastic number's powers cover a triangle evenly (Roberts, "The unreasonable effectiveness of
+    # quasirandom sequences", 2018).
+    u, v = (number * 0.7548776662466927 + 0.5) % 1, (number * 0.5698402909980532 + 0.5) % 1
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    single = count[face] == 1
+    u[single] = v[single] = 1 / 3
+    shares = np.stack([1 - u - v, u, v], axis=1)
+    points = np.einsum("sk,skc->sc", shares, vertices[faces[face]])
+    # Pieces do not mix sheets: the faces of each look the same way in all coordinates.
+    cube = np.floor(points / (_PIECE_SIDE * width)).astype(np.int64)
+    keys = np.concatenate([cube, normals[face] > 0], axis=1)
+    _, piece = np.unique(keys, axis=0, return_inverse=True)
+    order = np.argsort(piece.ravel(), kind="stable")
+    room = np.zeros(common_size(int(piece.max(initial=0)) + 1), bool)
+    whole = common_size(len(order))
+    return Pieces(
+        pad_rows(faces[face][order], whole),
+        pad_rows(shares[order], whole),
+        pad_rows(1 / count[face][order], whole),
+        pad_rows(piece.ravel()[order], whole, len(room)),
+        room,
+    )
+
+
+class Anchors(NamedTuple):
+    """The lattice points near a surface, and the pieces around each; arrays are padded to common sizes."""
+
+    cells: Int64[np.ndarray, "anchors 3"]  # the lattice point's indices
+    places: Float64[np.ndarray, "anchors 3"]  # its position
+    around: Int[np.ndarray, "anchors around"]  # numbers of the pieces around it; -1 for none
+
+
+def make_anchors(surface: Surface, width: float) -> Anchors:
+    """Find the lattice points near a surface, and the pieces around each.
+
+    Args:
+        surface: its pieces.
+        width: of the narrow Gaussian.
+    """
+    spacing = SPACING * width
+    points = np.asarray(surface.points, np.float64)
+    there = np.flatnonzero(np.asarray(surface.area) > _TINY)
+    cells = np.unique(np.round(points[there] / spacing).astype(np.int64), axis=0)
+    tree = cKDTree(points[there])
+    near = tree.query(cells * spacing, distance_upper_bound=0.75 * spacing)[0]
+    cells = cells[np.isfinite(near)]
+    lists = tree.query_ball_point(cells * spacing, _CUT * _WIDER * width, workers=-1)
+    around = np.full((-(-len(cells) // 64) * 64, common_size(max(map(len, lists), default=1))), -1, np.int32)
+    for row, found in zip(around, lists, strict=False):
+        row[: len(found)] = there[found]
+    return Anchors(*(pad_rows(x, len(around)) for x in (cells, cells * spacing)), around)
+
+
+class Shown(NamedTuple):
+    """What a surface shows at anchors."""
+
+    values: Float[Array, " anchors"]  # difference of the averages along the normal
+    good: Bool[Array, " anchors"]  # whether the lattice point is near a surface of one sheet
+
+
+@jax.jit
+def look(
+    surface: Surface,
+    anchors: Anchors,
+    shift: Float[Array, "anchors 3"],
+    width: Float[Array, ""],
+    undone: Float[Array, ""],
+) -> Shown:
+    """Take the averages around each anchor, moved by `shift`.
+
+    Args:
+        surface: its pieces.
+        anchors: from `make_anchors`.
+        shift: how far each anchor is moved.
+        width: of the narrow Gaussian.
+        undone: blur that the surface had already, as a share of the narrow Gaussian's variance: that much less is
+            blurred.
+    """
+    narrow, wide = width**2 * (1 - undone), width**2 * (_WIDER**2 - undone)
+    dtype, there = surface.points.dtype, anchors.around >= 0
+    at = jnp.asarray(anchors.places, dtype) + shift
+    offset = surface.points[anchors.around] - at[:, None]
+    square = jnp.sum(offset**2, axis=-1)
+    cut_off = jnp.exp(-((_CUT * _WIDER * width) ** 2) / 2 / wide)
+    share = jnp.where(there, jnp.maximum(jnp.exp(-square / 2 / wide) - cut_off, 0), 0)
+    area = surface.area[anchors.around]
+    inner, outer = jnp.where(there, area * jnp.exp(-square / 2 / narrow), 0), area * share
+
+    def mean(weights: Float[Array, "anchors around"]) -> Float[Array, "anchors 3"]:
+        return jnp.einsum("as,asc->ac", weights, offset) / (weights.sum(axis=1) + _TINY)[:, None]
+
+    normal = jnp.einsum("as,asc->ac", share, surface.normals[anchors.around])
+    length = jnp.sqrt(jnp.sum(normal**2, axis=1) + _TINY**2)
+    normal = normal / length[:, None]
+    close, far = mean(inner), mean(outer)
+    away = jnp.abs(jnp.sum(close * normal, axis=1))
+    coherent = length > _MIN_COHERENCE * outer.sum(axis=1)
+    good = (away < _NEAREST * SPACING * width) & coherent & (inner.sum(axis=1) > _MIN_MASS * 2 * jnp.pi * narrow)
+    return Shown(jnp.sum((close - far) * normal, axis=1), good)
+
+
+@jax.jit
+def slopes(
+    surface: Surface, anchors: Anchors, width: Float[Array, ""], undone: Float[Array, ""]
+) -> tuple[Shown, Float[Array, "anchors 3"]]:
+    """What a surface shows, and how the values change as anchors move."""
+
+    def total(shift: Float[Array, "anchors 3"]) -> tuple[Float[Array, ""], Shown]:
+        shown = look(surface, anchors, shift, width, undone)
+        return shown.values.sum(), shown
+
+    nowhere = jnp.zeros(anchors.places.shape, surface.points.dtype)
+    gradient, shown = jax.grad(total, has_aux=True)(nowhere)
+    return shown, gradient

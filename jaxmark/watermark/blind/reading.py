@@ -1,0 +1,236 @@
+"""Reading without the original, and what it proves.
+
+**The bound.** An anchor's phase is its value over the step, less its offset δ; c is the cosine of a whole turn of it.
+With the key's sign (-1)^b, of another subkey, and the code bit a of the anchor's slot, the score is S = Σ a (-1)^b c.
+Whatever is chosen by the suspect and the offsets (the pose, the step, which anchors count) knows nothing of the signs:
+given all of it, S is a sum of independent signs times c, and P(S ≥ t) ≤ exp(-t²/(2 Σ c²)) (Hoeffding 1963). The
+denominator is that of the pose at hand: a search that makes all c² large pays for it there. Readings whose scores are
+compared are paid for one by one, whether they were looked at or not.
+
+That holds for any suspect independent of the key. Every work that was marked under the key is not: there is no hash of
+a geometry in the key's choices, as their reader has no original.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.pose import Pose
+from jaxmark.watermark import evidence
+from jaxmark.watermark.blind.dither import make_dither
+from jaxmark.watermark.blind.search import TURNS, VIEWS_PER_WIDTH, View, moved, search, turned, views
+from jaxmark.watermark.coding.keys import SCHEME_VERSION, Choices, Key, bind
+from jaxmark.watermark.coding.message import Decoded, decode_any, encode
+from jaxmark.watermark.record import Record
+
+NAME = "field"
+WIDTHS = (0.018, 0.0125, 0.025)  # of the narrow Gaussian, about in diagonals
+STEPS = tuple(1e-4 * 2 ** (rung / 2) for rung in range(11))  # of the lattice of values, in the same unit
+TAG_BITS = 40
+_CODE_SPREAD = 2  # code bits for each bit of message and tag, at least
+_CHANGES = 2  # changes of pose that are read: none, and the best by the offsets
+_SURE = -12.0  # log10 of a probability from which on no other way of looking is tried
+
+
+class Reading(NamedTuple):
+    """One way in which a suspect may be read: a view, a turn, a step and a change of pose."""
+
+    view: View
+    turn: int
+    step: float
+    pilot: float  # how well the offsets fit, see `Found`
+    soft: Float64[np.ndarray, " code"]  # soft values of the code bits
+    square: float  # Σ c²
+    anchors: int  # that count
+
+
+class BlindDetection(NamedTuple):
+    """The result of reading a suspect without the original."""
+
+    message: bytes | None  # the message that was read; None unless its keyed tag fits
+    log10_p: float  # log10 of a bound on the false-positive probability, in [-77, 0], if all that is claimed is dated
+    log10_p_undated: float  # the same if nothing is: for the best message of any of 2^64 keys
+    log10_p_fitted: float  # log10 of that probability if the score were Gaussian: an estimate, which decides nothing
+    scores: Float64[np.ndarray, " code"]  # soft values of the code bits, scaled to root mean square 1
+    anchors: int  # number of values that were read
+    agreement: float  # mean cosine of their phases, 1 if all are exactly where the mark put them
+    width: float  # of the averages, about in diagonals
+    step: float  # of the lattice of values, in the same unit
+    pose: Pose  # from the suspect's file to where it was read
+    version: int  # version of the keyed choices that were read with
+    doubts: tuple[str, ...] = ()  # why the probabilities are estimates, not proofs; empty if they are proofs
+    remarks: tuple[str, ...] = ()  # what else the suspect looks like
+
+    def detected(self, alpha: float = 1e-6) -> bool:
+        """Whether the false-positive probability is at most `alpha`, if all that is claimed is dated.
+
+        Raises:
+            JaxmarkError: if `alpha` is not in (0, 1).
+        """
+        if not 0 < alpha < 1:
+            raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
+        return self.log10_p <= math.log10(alpha)
+
+
+def context(key: bytes, bits: int) -> Choices:
+    """The keyed choices of a mark: they are bound to no original, as its reader has none."""
+    content = "message" if bits else "presence"
+    return bind(key, b"", {"scheme": NAME, "content": content, "bits": bits})
+
+
+def code_length(bits: int) -> int:
+    """Number of code bits for a payload: the least power of two that is twice as long as message and tag.
+
+    Raises:
+        JaxmarkError: if the payload is not a multiple of 8 bits, or negative.
+    """
+    if bits < 0 or bits % 8:
+        raise JaxmarkError(f"The payload must be a multiple of 8 bits, got {bits}.")
+    return 1 << math.ceil(math.log2(_CODE_SPREAD * (bits + TAG_BITS))) if bits else 1
+
+
+def codeword(message: bytes, choices: Choices) -> Float64[np.ndarray, " code"]:
+    """The code bits of a message and its keyed tag, each -1 or +1."""
+    return encode(message, choices, code_length(8 * len(message)), TAG_BITS)
+
+
+def detect(
+    suspect: Mesh,
+    key: bytes,
+    bits: int,
+    message: bytes | None = None,
+    record: Record | None = None,
+    widths: Sequence[float] = WIDTHS,
+    steps: Sequence[float] = STEPS,
+) -> BlindDetection:
+    """Read a suspect without its original.
+
+    Args:
+        suspect: any mesh.
+        key: 32 bytes.
+        bits: size of the payload in bits.
+        message: the message that is claimed to be in it; None to read without a claim.
+        record: the record of the mark, which was checked; it fixes the message, if it commits to one.
+        widths: of the averages, to try.
+        steps: of the lattice of values, to try.
+
+    Raises:
+        JaxmarkError: if the suspect is a point cloud, or has no extent.
+    """
+    choices, length = context(Key(key), bits), code_length(bits)
+    claimed = b"" if message is None and not bits else message
+    tries = len(widths) * VIEWS_PER_WIDTH * len(TURNS) * len(steps) * _CHANGES
+    best: BlindDetection | None = None
+    waiting: list[View] = []
+    for view in views(suspect, widths):
+        waiting.append(view)
+        if len(waiting) < len(widths) and view.undone == 0:
+            continue
+        readings = [one for view in waiting for one in _readings(view, choices, length, np.asarray(steps))]
+        waiting = []
+        found = _weigh(readings, choices, bits, claimed, record, tries)
+        best = found if best is None else min(best, found, key=lambda one: (one.message is None, one.log10_p))
+        if best.log10_p <= _SURE and (best.message is not None or claimed is not None):
+            break
+    assert best is not None
+    return best
+
+
+def _readings(
+    view: View, choices: Choices, length: int, steps: Float64[np.ndarray, " steps"]
+) -> list[Reading]:
+    """All ways of reading a view."""
+    good = np.flatnonzero(view.good)
+    if not len(good):
+        return []
+    dtype = view.values.dtype
+    dithers = [make_dither(choices, turned(view.cells[good], turn), length) for turn in TURNS]
+    offsets = np.zeros((len(TURNS), len(view.good)))
+    offsets[:, good] = [dither.offset for dither in dithers]
+    found = search(
+        view.values, view.changes, jnp.asarray(view.good, dtype), jnp.asarray(offsets, dtype), jnp.asarray(steps, dtype)
+    )
+    changes, pilots = np.asarray(found.change, np.float64), np.asarray(found.pilot, np.float64)
+    readings = []
+    for turn, dither in enumerate(dithers):
+        for rung, step in enumerate(steps):
+            for change, pilot in ((np.zeros(7), 0.0), (changes[turn, rung], float(pilots[turn, rung]))):
+                cosine = np.cos(2 * np.pi * (moved(view, change)[good] / step - dither.offset))
+                soft = np.bincount(dither.slot, dither.sign * cosine, length)
+                readings.append(Reading(view, turn, float(step), pilot, soft, float(cosine @ cosine), len(good)))
+    return readings
+
+
+def _weigh(
+    readings: Sequence[Reading],
+    choices: Choices,
+    bits: int,
+    claimed: bytes | None,
+    record: Record | None,
+    tries: int,
+) -> BlindDetection:
+    """What readings prove, of so many that might have been tried."""
+    if not readings:
+        return _nothing(choices, code_length(bits))
+    order = sorted(range(len(readings)), key=lambda place: -readings[place].pilot)
+    readings = [readings[place] for place in order]
+    soft = np.stack([one.soft for one in readings])
+    decoded = None if claimed == b"" else decode_any(soft, bits, choices, TAG_BITS)
+    fixed = claimed
+    if decoded is not None and decoded.message != claimed:
+        told = record is not None and bool(record.told) and record.commits_to(decoded.message, choices)
+        fixed = decoded.message if told else None
+    if decoded is None and fixed is None:
+        return _nothing(choices, code_length(bits), readings[0])
+    message = fixed if fixed is not None else decoded.message if decoded is not None else b""
+    word = codeword(message, choices)
+    # Readings are compared by what their scores prove.
+    score, norm = soft @ word, np.sqrt([one.square for one in readings])
+    chosen = int(np.argmax(np.maximum(score, 0) / np.maximum(norm, 1e-300)))
+    paid = math.log10(tries)
+    unknown = 0 if fixed is not None else bits
+    proofs = [min(0.0, evidence.log10_p_read(score[chosen], norm[chosen], unknown) + paid)]
+    if decoded is not None and claimed is None:
+        proofs.append(evidence.log10_p_tag(TAG_BITS, decoded.rank))
+    late = min(0.0, evidence.log10_p_read(score[chosen], norm[chosen], bits) + paid)
+    reading = readings[chosen]
+    remarks = []
+    if decoded is not None and claimed not in (None, decoded.message):
+        remarks.append(f"Another message of this key reads than the one {'claimed' if claimed else 'in the record'}.")
+    if reading.view.undone:
+        remarks.append(f"It was read after {reading.view.undone} steps of smoothing were undone.")
+    if TURNS[reading.turn].prod() < 0:
+        remarks.append("It is the mirror image of what was marked.")
+    return _nothing(choices, len(word), reading)._replace(
+        message=None if decoded is None else decoded.message,
+        log10_p=evidence.any_of(*proofs),
+        log10_p_undated=evidence.undated(late),
+        log10_p_fitted=min(0.0, evidence.log10_p_fitted(score[chosen], norm[chosen], unknown) + paid),
+        agreement=float(score[chosen] / reading.anchors),
+        remarks=tuple(remarks),
+    )
+
+
+def _nothing(choices: Choices, length: int, reading: Reading | None = None) -> BlindDetection:
+    """A detection that proves nothing, of a reading."""
+    if reading is None:
+        pose = Pose(np.eye(3), np.zeros(3))
+        return BlindDetection(None, 0.0, 0.0, 0.0, np.zeros(length), 0, 0.0, 0.0, 0.0, pose, choices.version)
+    scores = reading.soft / (np.sqrt(np.mean(reading.soft**2)) or 1.0)
+    return BlindDetection(
+        None,
+        *(0.0, 0.0, 0.0),
+        scores,
+        reading.anchors,
+        0.0,
+        reading.view.width,
+        reading.step,
+        reading.view.pose,
+        choices.version,
+    )
