@@ -20,7 +20,8 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.budget import Visibility
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.deposit import Deposit
-from jaxmark.watermark.marking import Marker, detect_any, make_marker, make_markers
+from jaxmark.watermark.everyday import prepare
+from jaxmark.watermark.marking import Marker, detect_any, make_markers
 from jaxmark.watermark.record import Record
 from jaxmark.watermark.scenes import SceneDetection, SceneRecord, detect_scene, load_record, pair
 from jaxmark.watermark.schemes import DEFAULT_SCHEME
@@ -104,10 +105,11 @@ def mark_file(
     mesh = load_mesh(original)
     marker, survives = None, None
     if message is not None:
-        marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
+        marker = prepare(mesh, key, 8 * len(message), scheme)
         result, info = marker.embed(message, budget, limits=limits, visibility=visibility, noise=noise, read_back=False)
+        marker = reader = marker.with_record(info.record)
         prepared = marker.original
-        said, reads = told_payload(info.record.bits), lambda mesh: marker.reads(mesh, message)
+        said, reads = told_payload(info.record.bits), lambda mesh: reader.reads(mesh, message)
     else:
         if scheme != DEFAULT_SCHEME:
             raise JaxmarkError(f"Fingerprints are carried by the scheme {DEFAULT_SCHEME!r}, not {scheme!r}.")

@@ -20,6 +20,7 @@ import click
 from jaxmark import distortion
 from jaxmark.alignment.alignment import Align
 from jaxmark.app.batch import FileReader, mark_file, mesh_files
+from jaxmark.app.blind import BlindReader
 from jaxmark.app.programs import release_programs
 from jaxmark.app.telling import Told, power
 from jaxmark.attacks import ATTACKS, chain, get_attack
@@ -32,10 +33,11 @@ from jaxmark.geometry.mesh import same_connectivity
 from jaxmark.watermark.budget import VISIBILITY, Visibility, make_budget, visibility_of
 from jaxmark.watermark.coding.keys import Key, commitment, load_key, new_key, save_key
 from jaxmark.watermark.deposit import Deposit, make_deposit
+from jaxmark.watermark.everyday import NAMES, blind_scheme
 from jaxmark.watermark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity
 from jaxmark.watermark.record import RECORD_SUFFIX, Record
 from jaxmark.watermark.scenes import load_record
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES
+from jaxmark.watermark.schemes import DEFAULT_SCHEME
 from jaxmark.watermark.tracing import identify
 
 
@@ -138,7 +140,7 @@ def cli() -> None:
       jaxmark detect suspect.ply --original model.ply --key owner.key
 
     Meshes are OBJ, PLY, OFF, STL, GLB, glTF or 3MF; point clouds PLY, XYZ, LAS or LAZ, too. Keep the key secret, and
-    keep the original: detection needs both.
+    keep the original: detection needs both, but for marks of the scheme `field`.
     """  # noqa: D301
 
 
@@ -174,10 +176,10 @@ def keygen(keyfile: Path, as_json: bool) -> None:
 @_MESHES
 @click.option(
     "--scheme",
-    type=click.Choice(list(SCHEMES)),
+    type=click.Choice(NAMES),
     default=DEFAULT_SCHEME,
     show_default=True,
-    help="Scheme that carries the bits.",
+    help="Scheme that carries the bits; marks of `field` are read without the original.",
 )
 @click.option("--record", "record_file", type=_MESH, help=f"File for the record.  [default: MARKED{RECORD_SUFFIX}]")
 @_JSON
@@ -236,7 +238,7 @@ def embed_command(
 
 @cli.command(name="detect")
 @click.argument("suspect", type=_MESH)
-@click.option("--original", type=_MESH, required=True, help="The unmarked mesh.")
+@click.option("--original", type=_MESH, help="The unmarked mesh; marks of the scheme `field` are read without it.")
 @_KEY
 @click.option("--bits", type=int, help=f"Payload, a multiple of 8.  [default: the record's, else {DEFAULT_BITS}]")
 @click.option(
@@ -254,8 +256,8 @@ def embed_command(
 @_MESHES
 @click.option(
     "--scheme",
-    type=click.Choice(list(SCHEMES)),
-    help=f"Without a record: scheme that carries the bits.  [default: {DEFAULT_SCHEME}]",
+    type=click.Choice(NAMES),
+    help=f"Without a record: scheme that carries the bits.  [default: {DEFAULT_SCHEME}, without --original field]",
 )
 @_ALIGN
 @click.option("--deposit", "deposit_file", type=_MESH, help="Deposit that dates the record, from `jaxmark deposit`.")
@@ -266,7 +268,7 @@ def embed_command(
 @_JSON
 def detect_command(
     suspect: Path,
-    original: Path,
+    original: Path | None,
     key_file: Path,
     bits: int | None,
     message: bytes | None,
@@ -291,6 +293,8 @@ def detect_command(
     Of files of several meshes, each mesh is compared with the one that looks like it, and what all of them prove is
     united.
 
+    Without --original, marks of the scheme `field` are read.
+
     With its record, an original will do as you have it now: saved again in another format, rounded, moved, reordered.
 
     For a folder, each file gets a line of output, and the exit status is the worst of all. --original and --record may
@@ -301,9 +305,27 @@ def detect_command(
         raise JaxmarkError("A deposit dates records: give the --record that is in it, too.")
     if presence and (message is not None or bits):
         raise JaxmarkError("A presence mark has no message; leave out --message and --bits, or --presence.")
+    payload = 0 if presence else bits
+    if original is None or (scheme is not None and blind_scheme(scheme) is not None):
+        if scheme is not None and blind_scheme(scheme) is None:
+            raise JaxmarkError(f"The scheme {scheme!r} is read beside the original; give --original.")
+        if how != "auto" or report is not None or dossier is not None:
+            raise JaxmarkError("--align, --report and --dossier are for reading beside the original; give --original.")
+        blind = BlindReader(_key(key_file), payload, message, alpha, deposit, obtained, meshes)
+        if suspect.is_dir():
+            _each(
+                suspect,
+                as_json,
+                lambda file: blind.read(
+                    file, None if record_file is None else _member(record_file, file.name + RECORD_SUFFIX)
+                ),
+            )
+        told = blind.read(suspect, record_file)
+        _answer(as_json, told.answer, told.said)
+        sys.exit(0 if told.done else 1)
     reader = FileReader(
         _key(key_file),
-        0 if presence else bits,
+        payload,
         message,
         scheme,
         how,

@@ -11,6 +11,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import Scene, load_scene, number_check, save_scene
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.blind.field import FieldMarker
 from jaxmark.watermark.budget import Visibility
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.marking import EmbedInfo, Marker, Survival
@@ -69,15 +70,15 @@ def mark_scene(
     Raises:
         JaxmarkError: if no mesh can carry the message; see `embed_scene`.
     """
-    markers: dict[str, Marker] = {}
+    markers: dict[str, Marker | FieldMarker] = {}
     fine_enough = number_check(original)
 
-    def check(name: str, marker: Marker, result: Mesh, info: EmbedInfo) -> EmbedInfo:
+    def check(name: str, marker: Marker | FieldMarker, result: Mesh, info: EmbedInfo) -> EmbedInfo:
         """Check that the file's numbers are fine enough for a mark, and what it survives."""
         release_programs()
         fine_enough(name, result)
-        markers[name] = marker
-        return info._replace(survives=marker.tried(result, message, info.survives))
+        markers[name] = marker.with_record(info.record)
+        return info._replace(survives=markers[name].tried(result, message, info.survives))
 
     meshes, info = embed_scene(
         scene.meshes,
@@ -131,7 +132,7 @@ def mark_scene(
     return Told(answer, "\n".join([text, *remarks]))
 
 
-def _moved(marker: Marker, written: Mesh) -> dict[str, float]:
+def _moved(marker: Marker | FieldMarker, written: Mesh) -> dict[str, float]:
     """How far a mesh was moved, in its diagonals."""
     change = distortion.DisplacementSize.of(shift_of(marker.original, written)[marker.original.used])
     return {"rms": change.rms, "max": change.max}

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from jaxmark.watermark.blind.reading import BlindDetection
 from jaxmark.watermark.marking import Detection, Survival
 
 
@@ -35,7 +36,9 @@ def told_survival(survives: Survival) -> str:
     return f"noise of {whole} of the mean distance to the centre, {half} with half of the vertices lost"
 
 
-def describe(found: Detection, detected: bool, alpha: float, dated: float | None, remarks: Sequence[str]) -> str:
+def describe(
+    found: Detection | BlindDetection, detected: bool, alpha: float, dated: float | None, remarks: Sequence[str]
+) -> str:
     """What was found, in words."""
     read = f"message {found.message.hex()}" if found.message is not None else "no message could be read"
     said = f"{'detected' if detected else 'nothing detected'}: {read}; "

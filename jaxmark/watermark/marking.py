@@ -150,6 +150,10 @@ class Marker:
             self.check(marked, message)
         return marked, info
 
+    def with_record(self, record: Record) -> "Marker":
+        """The marker that reads a mark it has just made; a blind scheme's then knows what was chosen."""
+        return self
+
     def tried(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival:
         """Try what a mark survives: add noise, lose half of the points, and read; the prediction where it reads.
 
@@ -616,53 +620,6 @@ def _rounded_up(value: float) -> float:
     return math.ceil(value / unit * (1 + 1e-9)) * unit
 
 
-def embed(
-    mesh: Mesh,
-    message: bytes,
-    key: bytes,
-    *,
-    budget: float | None = None,
-    limits: Limits | None = None,
-    visibility: Visibility | None = None,
-    noise: float | None = None,
-    scheme: str | Scheme = DEFAULT_SCHEME,
-) -> tuple[Mesh, EmbedInfo]:
-    """Embed a message in the vertex positions of a mesh.
-
-    The mark is as strong as budget and limits allow; by default it is so weak that people do not notice it. The message
-    is read back before the mesh is returned, and a mesh that cannot carry it is refused. What noise it survives
-    (`EmbedInfo.survives`) depends on the mesh: much on scans, little on models of some hundred points.
-
-    Args:
-        mesh: the original.
-        message: any bytes; none for a presence mark, which says nothing but that it is there, and fits where messages
-            do not.
-        key: 32 bytes, from `new_key`.
-        budget: RMS displacement of the welded vertices that faces use, unweighted, relative to the diagonal of their
-            axis-aligned bounding box: 0.0008 is 0.08 % of it. It is met exactly, unless a limit is reached first.
-        limits: the largest values that metrics of `distortion.METRICS` may reach, by name, in the units of
-            `distortion.Comparison`; or that metrics of your own may, by function (see `distortion.measure`).
-        visibility: how well people may see the mark: `"hidden"`, the default if budget and limits are not given;
-            `"careful look"`, seen beside the original; `"visible"`. See `jaxmark.watermark.budget.VISIBILITY`.
-        noise: a demand: the noise that the message must survive when half of the vertices are lost, see `capacity`; 0
-            requires only that there are enough dimensions. By default nothing is demanded but that the message reads.
-            It has no effect for schemes whose readers have no model of noise, such as `host` and `eigen`.
-        scheme: a name or a scheme, see `make_marker`.
-
-    Returns:
-        The marked mesh (float64 vertices, same faces) and how it was marked.
-
-    Raises:
-        JaxmarkError: if the mesh, key, budget or payload is unusable, or the message does not read back; or if what
-            `noise` demands cannot be met: the error then states the largest payload, and the least budget if there is
-            one.
-    """
-    if not isinstance(message, bytes):
-        raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
-    marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
-    return marker.embed(message, budget, limits=limits, visibility=visibility, noise=noise)
-
-
 def capacity(
     mesh: Mesh,
     budget: float | None = None,
@@ -701,64 +658,6 @@ def capacity(
     bounds = make_budget(budget, limits, visibility, named=visibility_of(original.mesh))
     conditions = Conditions(bounds, noise, coverage)
     return Capacity(original, get_scheme(scheme)).bits(conditions)
-
-
-def detect(
-    suspect: Mesh,
-    *,
-    original: Mesh,
-    key: bytes,
-    bits: int | None = None,
-    message: bytes | None = None,
-    record: Record | None = None,
-    scheme: str | Scheme = DEFAULT_SCHEME,
-    detector: Detector | None = None,
-    weights: ArrayLike | None = None,
-    align: Align = "auto",
-) -> Detection:
-    """Read a mark from a suspect, and compute what the reading proves.
-
-    The suspect is first aligned with the original (`jaxmark.alignment.alignment.align`); points that are far off are
-    masked. Without `message`, the message that is read counts only if its keyed tag fits. Two kinds of proof are then
-    tried, and each is paid for: the tag, and the union bound over all messages, or over the one that the record commits
-    to. With `message`, log10_p is Hoeffding's bound for that message (see `evidence.log10_p_claimed`), which can prove
-    a mark whose message can no longer be read. If another message is read, the claim is refuted, not the mark: log10_p
-    is that of the message that was read, and a remark says so. The score is taken for each way of weighting the suspect
-    (see `detectors.claims`), and each is paid for, too; so are ways of aligning other than `"auto"`, and, without a
-    record, both versions of the keyed choices.
-
-    All bounds hold for any suspect independent of the key, provided that key, original, message and record were fixed
-    before the suspect existed (if nothing shows that, log10_p_undated counts); that weights depend on suspect and
-    original only; and that the score is the plain correlation of the codeword: joint decoding may choose the codeword,
-    but does not enter the score. A mesh marked under the same key is not independent of it: once its message can no
-    longer be read, a claim of a message that has many bits in common with it may pass. Where the program cannot vouch
-    for a condition, `doubts` says why, and the figures are estimates.
-
-    Args:
-        suspect: any mesh: moved, reordered, cropped, remeshed.
-        original: the unmarked mesh.
-        key: 32 bytes.
-        bits: size of the payload in bits, a multiple of 8; by default the record's, else the claimed message's, else
-            64. With 0, presence is claimed.
-        message: the message that is claimed to be in the suspect; None to read without a claim.
-        record: the record of the mark, see `make_marker`.
-        scheme: the scheme that the mark was embedded with, if there is no record.
-        detector: a detector, see `make_marker`.
-        weights: one number for each vertex of the original, not negative: how far to trust what the suspect shows of
-            it, 0 for not at all; **must not depend on the key**.
-        align: how the suspect is aligned: `"auto"`, `"same"`, `"similarity"` or `"affine"`.
-
-    Returns:
-        The result of the reading; a suspect identical to the original gives log10_p = 0.
-
-    Raises:
-        JaxmarkError: see `make_marker`; also if the suspect cannot be aligned, or the claimed message has another size
-            than the payload, or is not the one that the record commits to.
-    """
-    if bits is None and record is None and isinstance(message, bytes):
-        bits = 8 * len(message)
-    markers = make_markers(original, key, bits=bits, record=record, scheme=scheme, detector=detector)
-    return detect_any(markers, suspect, message, weights, align)
 
 
 def make_markers(

@@ -20,9 +20,11 @@ from jaxmark.alignment.alignment import Align, align
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, same_connectivity
 from jaxmark.watermark import evidence
+from jaxmark.watermark.blind.field import FieldMarker, FieldScheme
 from jaxmark.watermark.budget import Limits, Visibility
 from jaxmark.watermark.coding.keys import canonical_json
 from jaxmark.watermark.detectors import claims
+from jaxmark.watermark.everyday import prepare
 from jaxmark.watermark.marking import ALIGN_SHARES, CLAIM_SHARE, Detection, EmbedInfo, Marker, make_marker
 from jaxmark.watermark.record import Record, read_json
 from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme
@@ -105,8 +107,8 @@ def embed_scene(
     limits: Limits | None = None,
     visibility: Visibility | None = None,
     noise: float | None = None,
-    scheme: str | Scheme = DEFAULT_SCHEME,
-    after: Callable[[str, Marker, Mesh, EmbedInfo], EmbedInfo] = lambda name, marker, marked, info: info,
+    scheme: str | Scheme | FieldScheme = DEFAULT_SCHEME,
+    after: Callable[[str, Marker | FieldMarker, Mesh, EmbedInfo], EmbedInfo] = lambda name, marker, marked, info: info,
 ) -> tuple[dict[str, Mesh], SceneInfo]:
     """Embed one message in each mesh of a file that can carry it.
 
@@ -133,7 +135,7 @@ def embed_scene(
     left: dict[str, str] = {}
     for name, mesh in meshes.items():
         try:
-            marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
+            marker = prepare(mesh, key, 8 * len(message), scheme)
             result, info = marker.embed(message, budget, limits=limits, visibility=visibility, noise=noise)
             info = after(name, marker, result, info)
         except JaxmarkError as error:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int, Int64
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces, compact, diagonal, open_sides, weld, weld_mesh
@@ -162,14 +162,14 @@ def make_anchors(surface: Surface, width: float) -> Anchors:
     points = np.asarray(surface.points, np.float64)
     there = np.flatnonzero(np.asarray(surface.area) > _TINY)
     cells = np.unique(np.round(points[there] / spacing).astype(np.int64), axis=0)
-    tree = cKDTree(points[there])
-    near = tree.query(cells * spacing, distance_upper_bound=0.75 * spacing)[0]
-    cells = cells[np.isfinite(near)]
+    tree = KDTree(points[there])
+    near, _ = tree.query(cells * spacing, distance_upper_bound=0.75 * spacing)
+    cells = cells[np.isfinite(np.asarray(near))]
     lists = tree.query_ball_point(cells * spacing, _CUT * _WIDER * width, workers=-1)
     around = np.full((-(-len(cells) // 64) * 64, common_size(max(map(len, lists), default=1))), -1, np.int32)
     for row, found in zip(around, lists, strict=False):
         row[: len(found)] = there[found]
-    return Anchors(*(pad_rows(x, len(around)) for x in (cells, cells * spacing)), around)
+    return Anchors(pad_rows(cells, len(around)), pad_rows(cells * spacing, len(around)), around)
 
 
 class Shown(NamedTuple):

@@ -6,7 +6,7 @@ part of the way). The host itself is no noise then, so the original is not neede
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, NamedTuple
 
@@ -17,11 +17,11 @@ from jaxtyping import Array, Float, Float64
 from jaxmark import distortion
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh, check_faces
 from jaxmark.watermark.blind.anchors import cut, encloses, look, make_anchors, place
 from jaxmark.watermark.blind.dither import Dither, make_dither
+from jaxmark.watermark.blind.reading import NAME, STEPS, WIDTHS, code_length, codeword, context, detect
 from jaxmark.watermark.blind.writing import Shape, improve, measure
-from jaxmark.watermark.blind.reading import NAME, STEPS, WIDTHS, codeword, context, detect
 from jaxmark.watermark.budget import Budget, Limits, Visibility, make_budget, visibility_of, write
 from jaxmark.watermark.coding.keys import Choices, Key, commitment
 from jaxmark.watermark.hiding import hiding_directions
@@ -33,6 +33,7 @@ _LEAST_ALPHA = 0.6  # part of the way to the lattice that is gone at least; up t
 _FIRST_STEP = 0.05  # of the lattice of values, in widths, that is tried first
 _LEAST_AREA = 0.2  # of the mean: what vertices of smaller area count as
 _ROUNDS = 2  # of Gauss and Newton
+_TRIED = (1.0, 0.7, 0.5, 0.3)  # shares of a predicted noise that are tried
 _SMOOTHED = 10  # steps of smoothing that widths are chosen by, besides noise
 
 
@@ -60,7 +61,7 @@ class Host(NamedTuple):
     closed: bool
 
     @property
-    def count(self) -> int:
+    def size(self) -> int:
         """Number of anchors that are written."""
         return int(self.good.sum())
 
@@ -128,9 +129,7 @@ class Writer:
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
         around = np.bincount(faces.ravel(), np.repeat(area, 3), len(points))
         mean = around[self.original.used].mean()
-        return self.original.to_traced(
-            np.where(self.original.used, mean / np.maximum(around, _LEAST_AREA * mean), 0)
-        )
+        return self.original.to_traced(np.where(self.original.used, mean / np.maximum(around, _LEAST_AREA * mean), 0))
 
     def off(self, host: Host, dither: Dither, word: Float64[np.ndarray, " code"], step: float) -> np.ndarray:
         """How far each value is from the nearest number that its dither and code bit allow, in steps."""
@@ -148,14 +147,10 @@ class Writer:
         wanted = (jnp.asarray(targets, dtype), host.pose)
         counted = jnp.asarray(host.good, dtype)
         for _ in range(rounds):
-            moved = improve(
-                host.shape, vertices, moved, self._free, self._mask, wanted, counted, closed=host.closed
-            )
+            moved = improve(host.shape, vertices, moved, self._free, self._mask, wanted, counted, closed=host.closed)
         return original.to_host(moved)
 
-    def write(
-        self, word: Float64[np.ndarray, " code"], choices: Choices, budget: Budget
-    ) -> Written:
+    def write(self, word: Float64[np.ndarray, " code"], choices: Choices, budget: Budget) -> Written:
         """Write a codeword with the width that is predicted to be read best, as far as a budget allows.
 
         Raises:
@@ -185,7 +180,7 @@ class Writer:
     ) -> tuple[float, Host, Dither, float, float, float] | None:
         """What a width promises, and the step and the part of the way that a budget allows with it."""
         host = self.host(width)
-        if not host.count:
+        if not host.size:
             return None
         dither = make_dither(choices, host.shape.anchors.cells, len(word))
         # How far a mark of one step displaces is how far any does, times its step: what is off is uniform.
@@ -205,7 +200,7 @@ class Writer:
     def survives(self, written: Written, bits: int) -> Survival:
         """Predict the strongest noise in which a mark reads: until nρ² is what the payload needs; cut, it does not."""
         host = self.host(written.width)
-        kept = host.count * np.sinc(1 - min(written.alpha, 1.0)) ** 2 / needed_energy(bits)
+        kept = host.size * np.sinc(1 - min(written.alpha, 1.0)) ** 2 / needed_energy(bits)
         if kept <= 1:
             return Survival(0.0, 0.0)
         spread = self._spreads(host)[0] / NOISE  # for each unit of noise
@@ -215,7 +210,7 @@ class Writer:
         """Predicted nρ² after each of the reference disturbances; ρ is the mean cosine of what is off."""
         compensated = float(np.sinc(1 - alpha))
         return tuple(
-            host.count * (compensated * math.exp(-2 * (math.pi * spread / step) ** 2)) ** 2
+            host.size * (compensated * math.exp(-2 * (math.pi * spread / step) ** 2)) ** 2
             for spread in self._spreads(host)
         )
 
@@ -289,32 +284,62 @@ class FieldMarker:
         ).sealed(self.key)
         info = EmbedInfo(written.moved.rms, written.moved.max, written.alpha * written.step, record, survives)
         if read_back:
-            self.check(written.mesh, message, record)
+            self.with_record(record).check(written.mesh, message)
         return written.mesh, info
 
-    def check(self, marked: Mesh, message: bytes, record: Record) -> None:
+    def with_record(self, record: Record) -> "FieldMarker":
+        """The marker that reads a mark it has just made, with the width and step that were chosen."""
+        return replace(self, scheme=parameters_in(record))
+
+    def check(self, marked: Mesh, message: bytes) -> None:
         """Check that a message can be read from a marked mesh that was not attacked.
 
         Raises:
             JaxmarkError: if it cannot be read.
         """
-        if not self.reads(marked, message, record):
+        if not self.reads(marked, message):
             raise JaxmarkError(
-                f"This mesh ({int(self.original.used.sum())} points) cannot carry {self.bits} bits with the scheme"
-                f" {self.scheme.name!r}: it does not read back, even unattacked. Use a larger budget, a shorter message"
-                " or a presence mark, or the scheme 'keyed'."
+                f"This mesh ({int(self.original.used.sum())} points) cannot carry"
+                f" {f'{self.bits} bits' if self.bits else 'a presence mark'} with the scheme {self.scheme.name!r}: it"
+                " does not read back, even unattacked. Use a larger budget, a shorter message or the scheme 'keyed'."
             )
 
-    def reads(self, marked: Mesh, message: bytes, record: Record) -> bool:
-        """Whether a message is read, or without one a presence proven, with a mark's record."""
-        parameters = record.parameters
-        found = detect(
-            marked, self.key, self.bits, None, record, widths=(parameters["width"],), steps=(parameters["step"],)
-        )
+    def reads(self, marked: Mesh, message: bytes) -> bool:
+        """Whether a message is read, or without one a presence proven."""
+        found = detect(marked, self.key, self.bits, widths=self.scheme.widths, steps=self.scheme.steps)
         return found.message == message if message else found.detected()
+
+    def tried(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival:
+        """Try what a mark survives: add noise, and read; see `Marker.tried`."""
+        points, rng = np.asarray(marked.vertices, np.float64), np.random.default_rng(0)
+        size = radius_of(self.original) * self.original.diagonal
+        unit = size * rng.uniform(-1, 1, self.original.positions.shape)[self.original.weld.point]
+        for share in _TRIED:
+            noise = share * predicted.whole
+            if noise and self.reads(Mesh(points + noise * unit, marked.faces), message):
+                return Survival(noise, 0.0)
+        return Survival(0.0, 0.0)
+
+
+def parameters_in(record: Record) -> FieldScheme:
+    """The scheme with the width and the step that a record names.
+
+    Raises:
+        JaxmarkError: if it names none that are on the ladders.
+    """
+    width, step = (record.parameters.get(name) for name in ("width", "step"))
+    if record.scheme != NAME or width not in WIDTHS or step not in STEPS:
+        raise JaxmarkError(f"The record is not one of the scheme {NAME!r} that this jaxmark reads.")
+    return FieldScheme((width,), (step,))
 
 
 def make_field_marker(original: Mesh, key: bytes, *, bits: int = DEFAULT_BITS, scheme: FieldScheme) -> FieldMarker:
-    """Prepare an original for marks that are read without it."""
+    """Prepare an original for marks that are read without it.
+
+    Raises:
+        JaxmarkError: if the mesh or the key is unusable, or the payload is not a multiple of 8 bits.
+    """
+    code_length(bits)
+    check_faces("A mark that is read without the original", original)
     ready = make_original(original)
     return FieldMarker(ready, Key(key), bits, scheme, Writer(ready, scheme))

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
@@ -25,8 +25,8 @@ from jaxmark.geometry.pose import Pose
 from jaxmark.watermark import evidence
 from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.search import TURNS, VIEWS_PER_WIDTH, View, moved, search, turned, views
-from jaxmark.watermark.coding.keys import SCHEME_VERSION, Choices, Key, bind
-from jaxmark.watermark.coding.message import Decoded, decode_any, encode
+from jaxmark.watermark.coding.keys import Choices, Key, bind
+from jaxmark.watermark.coding.message import decode_any, encode
 from jaxmark.watermark.record import Record
 
 NAME = "field"
@@ -142,9 +142,7 @@ def detect(
     return best
 
 
-def _readings(
-    view: View, choices: Choices, length: int, steps: Float64[np.ndarray, " steps"]
-) -> list[Reading]:
+def _readings(view: View, choices: Choices, length: int, steps: Float64[np.ndarray, " steps"]) -> list[Reading]:
     """All ways of reading a view."""
     good = np.flatnonzero(view.good)
     if not len(good):

@@ -61,7 +61,8 @@ def unsmoothed(mesh: Mesh, steps: int) -> Mesh:
         left = (1 - _STEP_SIZE * (place + 1)) ** steps
         return (1 - (1 - left) ** (_REFINEMENTS + 1)) / left
 
-    series = np.polynomial.chebyshev.chebinterpolate(gain, _DEGREE)
+    places = np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
+    series = np.polynomial.chebyshev.chebfit(places, gain(places), _DEGREE)
     operator = common_laplacian(mesh)
     middle = np.asarray(mesh.vertices).mean(axis=0)
     rows = jnp.asarray(pad_rows(np.asarray(mesh.vertices) - middle, len(operator.degree)), jnp.result_type(float))

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from jax.scipy.sparse.linalg import cg
+from jaxtyping import Array, Float, Int
 
 from jaxmark.geometry.moments import Moments, surface_moments, volume_moments
 from jaxmark.spectral.precision import matmul
@@ -24,7 +24,7 @@ class Shape(NamedTuple):
 
     matrix: Float[Array, "3 3"]  # to the mesh's own pose
     shift: Float[Array, " 3"]
-    faces: Float[Array, "faces 3"]
+    faces: Int[Array | np.ndarray, "faces 3"]
     pieces: Pieces
     anchors: Anchors
     width: Float[Array, ""]  # of the narrow Gaussian

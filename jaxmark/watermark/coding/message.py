@@ -42,9 +42,7 @@ def code_length(bits: int, places: int, spread: int) -> int:
     return length
 
 
-def encode(
-    message: bytes, choices: Choices, length: int, tag_bits: int = TAG_BITS
-) -> Float64[np.ndarray, " length"]:
+def encode(message: bytes, choices: Choices, length: int, tag_bits: int = TAG_BITS) -> Float64[np.ndarray, " length"]:
     """Encode a message and its keyed tag as a codeword of signs: a code bit 0 is +1, a 1 is -1.
 
     Args:
