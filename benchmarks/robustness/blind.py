@@ -170,7 +170,7 @@ def main() -> None:
     options = parser.parse_args()
     for path in options.meshes:
         mesh = load(parser, path)
-        points = int(weld(mesh.vertices).point.max()) + 1
+        points = len(weld(mesh.vertices).first)
         print(f"\n## {path.name}, {points:,} points, {options.limits} limits\n")
         print(f"{8 * len(MESSAGE)} bits and their tag need nρ² = {NEEDED:.0f}.\n", flush=True)
         measure(mesh, LIMITS[options.limits], options.keys, " ".join(options.attacks.split()).split("; "))
