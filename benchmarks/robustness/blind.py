@@ -18,6 +18,7 @@ above the table: by the capacity, no code for message and tag manages with less.
 unmarked mesh, attacked or not, and the marked ones under other keys.
 """
 
+import argparse
 import math
 import sys
 import time
@@ -49,6 +50,7 @@ quantisation 8; quantisation 7; midpoint 1; sqrt3 1; loop 1; simplification 0.9;
 simplification 0.975; isotropic 1; isotropic 2; iso-surface 100; similarity 3; bending 5;
 cropping 0.1"""
 CONTROLS = ("none", "noise 0.005")  # what the unmarked mesh goes through
+NAMES = ("read", "log10 p", "agreement", "seconds")
 NEEDED = math.log(2) * (8 * len(MESSAGE) + TAG_BITS)  # of nρ², by the capacity where ρ is small: nρ² nats
 
 
@@ -135,15 +137,9 @@ def copies(mesh: Mesh, limits: dict[str, float] | None, count: int) -> Iterator[
         yield Copy(key, marked, info)
 
 
-def measure(mesh: Mesh, limits: dict[str, float] | None, keys: int, attacks: list[str]) -> None:
-    """Mark a mesh, attack, read, and print a table."""
-    try:
-        marked = list(copies(mesh, limits, keys))
-    except jm.JaxmarkError as refusal:
-        print(f"Not marked: {refusal}", flush=True)
-        return
-    names = ("read", "log10 p", "agreement", "seconds")
-    print(f"\n{head('attack', *names, 'predicted')}", flush=True)
+def measure(mesh: Mesh, marked: list[Copy], attacks: list[str]) -> None:
+    """Attack what was marked, read it, and print a table."""
+    print(f"\n{head('attack', *NAMES, 'predicted')}", flush=True)
     for steps in attacks:
         try:
             cells = [read(attacked(one.marked, steps, seed), one.key) for seed, one in enumerate(marked)]
@@ -152,7 +148,11 @@ def measure(mesh: Mesh, limits: dict[str, float] | None, keys: int, attacks: lis
             print(line(steps, f"failed: {refusal}"), flush=True)
             continue
         print(row(steps, cells, f"{predicted:.0f}"), flush=True)
-    print(f"\n{head('control', *names)}")
+
+
+def control(mesh: Mesh, marked: list[Copy]) -> None:
+    """Read what nobody should find a mark in, and print a table."""
+    print(f"\n{head('control', *NAMES)}")
     for steps in CONTROLS:
         cells = [read(attacked(mesh, steps, seed), one.key) for seed, one in enumerate(marked)]
         print(row(f"unmarked, {steps}", cells), flush=True)
@@ -167,13 +167,21 @@ def main() -> None:
     parser.add_argument("--keys", type=int, default=2, help="keys, each with attacks of its own; %(default)s")
     parser.add_argument("--limits", choices=LIMITS, default="perceptual", help="%(default)s")
     parser.add_argument("--attacks", default=ATTACKS, help="kinds and strengths; %(default)s")
+    parser.add_argument("--controls", action=argparse.BooleanOptionalAction, default=True)
     options = parser.parse_args()
     for path in options.meshes:
         mesh = load(parser, path)
         points = len(weld(mesh.vertices).first)
         print(f"\n## {path.name}, {points:,} points, {options.limits} limits\n")
         print(f"{8 * len(MESSAGE)} bits and their tag need nρ² = {NEEDED:.0f}.\n", flush=True)
-        measure(mesh, LIMITS[options.limits], options.keys, " ".join(options.attacks.split()).split("; "))
+        try:
+            marked = list(copies(mesh, LIMITS[options.limits], options.keys))
+        except jm.JaxmarkError as refusal:
+            print(f"Not marked: {refusal}", flush=True)
+            continue
+        measure(mesh, marked, " ".join(options.attacks.split()).split("; "))
+        if options.controls:
+            control(mesh, marked)
 
 
 if __name__ == "__main__":
