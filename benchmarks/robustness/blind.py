@@ -13,9 +13,9 @@ predicted   nρ² after the attack, by the unmarked mesh: n anchors are found, �
 For the prediction, the unmarked mesh is attacked, and its anchors' values, after the best small change of pose, are
 compared with those that they had: with σ the root mean square of their changes and α the part of the way to the lattice
 that the mark went, ρ = sinc(1 - α) exp(-2 (πσ/step)²), times the share of the suspect's anchors that were there before.
-The best of all ways of looking at the suspect counts, as it does for the reader. What 64 bits need of it is printed
-above the table: by the capacity, no code for message and tag manages with less. Below the table are controls: the
-unmarked mesh, attacked or not, and the marked ones under other keys.
+The best of all ways of looking at the suspect counts, as it does for the reader. What 64 bits and their tag need of it
+by the capacity of many weak anchors is printed above the table; few good ones get by with less. Below the table are
+controls: the unmarked mesh, attacked or not, and the marked ones under other keys.
 """
 
 import argparse
@@ -173,7 +173,7 @@ def main() -> None:
         mesh = load(parser, path)
         points = len(weld(mesh.vertices).first)
         print(f"\n## {path.name}, {points:,} points, {options.limits} limits\n")
-        print(f"{8 * len(MESSAGE)} bits and their tag need nρ² = {NEEDED:.0f}.\n", flush=True)
+        print(f"{8 * len(MESSAGE)} bits and their tag need nρ² of about {NEEDED:.0f}.\n", flush=True)
         try:
             marked = list(copies(mesh, LIMITS[options.limits], options.keys))
         except jm.JaxmarkError as refusal:
