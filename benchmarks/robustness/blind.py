@@ -30,7 +30,8 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh, weld
-from jaxmark.watermark.blind.reading import TAG_BITS
+from jaxmark.watermark.blind.field import FieldScheme
+from jaxmark.watermark.blind.reading import TAG_BITS, WIDTHS
 from jaxmark.watermark.blind.search import TURNS, View, views
 from jaxmark.watermark.marking import EmbedInfo
 
@@ -60,6 +61,7 @@ class Copy(NamedTuple):
     key: bytes
     marked: Mesh
     info: EmbedInfo
+    scheme: FieldScheme
 
 
 class Cell(NamedTuple):
@@ -71,11 +73,11 @@ class Cell(NamedTuple):
     seconds: float
 
 
-def read(suspect: Mesh, key: bytes) -> Cell:
+def read(suspect: Mesh, key: bytes, scheme: FieldScheme) -> Cell:
     """Read by the key and the suspect alone."""
     start = time.perf_counter()
     try:
-        found = jm.detect(suspect, key=key)
+        found = jm.detect(suspect, key=key, scheme=scheme)
     except jm.JaxmarkError:
         return Cell(False, 0.0, 0.0, time.perf_counter() - start)
     return Cell(found.message == MESSAGE, found.log10_p, found.agreement, time.perf_counter() - start)
@@ -122,11 +124,11 @@ def row(name: str, cells: list[Cell], *more: object) -> str:
     )
 
 
-def copies(mesh: Mesh, limits: dict[str, float] | None, count: int) -> Iterator[Copy]:
+def copies(mesh: Mesh, scheme: FieldScheme, limits: dict[str, float] | None, count: int) -> Iterator[Copy]:
     """Mark a mesh with several keys, and say how."""
     for seed in range(count):
         key, start = np.random.default_rng([seed, 64]).bytes(32), time.perf_counter()
-        marked, info = jm.embed(mesh, MESSAGE, key, scheme="field", limits=limits)
+        marked, info = jm.embed(mesh, MESSAGE, key, scheme=scheme, limits=limits)
         seconds, found = time.perf_counter() - start, jm.compare(mesh, marked, ("mrms", "msdm"))
         print(
             f"Key {seed}: RMS {info.rms:.2e}, MRMS {found.mrms:.2e}, MSDM {found.msdm:.3f}, width"
@@ -134,7 +136,7 @@ def copies(mesh: Mesh, limits: dict[str, float] | None, count: int) -> Iterator[
             f" predicted to survive noise {info.survives.whole:.4f}, {seconds:.0f} s.",
             flush=True,
         )
-        yield Copy(key, marked, info)
+        yield Copy(key, marked, info, scheme)
 
 
 def measure(mesh: Mesh, marked: list[Copy], attacks: list[str]) -> None:
@@ -142,7 +144,7 @@ def measure(mesh: Mesh, marked: list[Copy], attacks: list[str]) -> None:
     print(f"\n{head('attack', *NAMES, 'predicted')}", flush=True)
     for steps in attacks:
         try:
-            cells = [read(attacked(one.marked, steps, seed), one.key) for seed, one in enumerate(marked)]
+            cells = [read(attacked(one.marked, steps, seed), one.key, one.scheme) for seed, one in enumerate(marked)]
             predicted = predict(mesh, steps, marked[0].info)
         except jm.JaxmarkError as refusal:
             print(line(steps, f"failed: {refusal}"), flush=True)
@@ -154,9 +156,9 @@ def control(mesh: Mesh, marked: list[Copy]) -> None:
     """Read what nobody should find a mark in, and print a table."""
     print(f"\n{head('control', *NAMES)}")
     for steps in CONTROLS:
-        cells = [read(attacked(mesh, steps, seed), one.key) for seed, one in enumerate(marked)]
+        cells = [read(attacked(mesh, steps, seed), one.key, one.scheme) for seed, one in enumerate(marked)]
         print(row(f"unmarked, {steps}", cells), flush=True)
-    cells = [read(one.marked, bytes(reversed(one.key))) for one in marked]
+    cells = [read(one.marked, bytes(reversed(one.key)), one.scheme) for one in marked]
     print(row("another key", cells), flush=True)
 
 
@@ -166,6 +168,7 @@ def main() -> None:
     add_meshes(parser)
     parser.add_argument("--keys", type=int, default=2, help="keys, each with attacks of its own; %(default)s")
     parser.add_argument("--limits", choices=LIMITS, default="perceptual", help="%(default)s")
+    parser.add_argument("--widths", type=float, nargs="+", default=WIDTHS, help="of the scheme; %(default)s")
     parser.add_argument("--attacks", default=ATTACKS, help="kinds and strengths; %(default)s")
     parser.add_argument("--controls", action=argparse.BooleanOptionalAction, default=True)
     options = parser.parse_args()
@@ -175,7 +178,7 @@ def main() -> None:
         print(f"\n## {path.name}, {points:,} points, {options.limits} limits\n")
         print(f"{8 * len(MESSAGE)} bits and their tag need nρ² of about {NEEDED:.0f}.\n", flush=True)
         try:
-            marked = list(copies(mesh, LIMITS[options.limits], options.keys))
+            marked = list(copies(mesh, FieldScheme(tuple(options.widths)), LIMITS[options.limits], options.keys))
         except jm.JaxmarkError as refusal:
             print(f"Not marked: {refusal}", flush=True)
             continue
