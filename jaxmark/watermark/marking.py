@@ -190,8 +190,8 @@ class Marker:
         if not self.reads(marked, message):
             raise JaxmarkError(
                 f"This mesh ({int(self.original.used.sum())} points) cannot carry {self._payload} with the scheme"
-                f" {self.scheme.name!r}: it does not read back, even unattacked. Use a larger budget, a shorter message"
-                " or a presence mark, or a finer or less regular mesh."
+                f" {self.scheme.name!r}: it does not read back, even unattacked. Use a larger budget,"
+                f"{' a shorter message or a presence mark,' if self.bits else ''} or a finer or less regular mesh."
             )
 
     def reads(self, marked: Mesh, message: bytes) -> bool:
