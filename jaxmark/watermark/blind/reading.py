@@ -191,12 +191,12 @@ def _weigh(
     # Readings are compared by what their scores prove.
     score, norm = soft @ word, np.sqrt([one.square for one in readings])
     chosen = int(np.argmax(np.maximum(score, 0) / np.maximum(norm, 1e-300)))
-    paid = math.log10(tries)
+    paid = math.log2(tries)
     unknown = 0 if fixed is not None else bits
-    proofs = [min(0.0, evidence.log10_p_read(score[chosen], norm[chosen], unknown) + paid)]
+    proofs = [evidence.log10_p_read(score[chosen], norm[chosen], unknown + paid)]
     if decoded is not None and claimed is None:
         proofs.append(evidence.log10_p_tag(TAG_BITS, decoded.rank))
-    late = min(0.0, evidence.log10_p_read(score[chosen], norm[chosen], bits) + paid)
+    late = evidence.log10_p_read(score[chosen], norm[chosen], bits + paid)
     reading = readings[chosen]
     remarks = []
     if decoded is not None and claimed not in (None, decoded.message):
@@ -209,7 +209,7 @@ def _weigh(
         message=None if decoded is None else decoded.message,
         log10_p=evidence.any_of(*proofs),
         log10_p_undated=evidence.undated(late),
-        log10_p_fitted=min(0.0, evidence.log10_p_fitted(score[chosen], norm[chosen], unknown) + paid),
+        log10_p_fitted=evidence.log10_p_fitted(score[chosen], norm[chosen], unknown + paid),
         agreement=float(score[chosen] / reading.anchors),
         remarks=tuple(remarks),
     )
