@@ -34,8 +34,8 @@ from jaxmark.geometry.mesh import same_connectivity
 from jaxmark.watermark.budget import VISIBILITY, Visibility, make_budget, visibility_of
 from jaxmark.watermark.coding.keys import Key, commitment, load_key, new_key, save_key
 from jaxmark.watermark.deposit import Deposit, make_deposit
-from jaxmark.watermark.everyday import NAMES, blind_scheme
-from jaxmark.watermark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity
+from jaxmark.watermark.everyday import NAMES, blind_scheme, capacity
+from jaxmark.watermark.marking import COVERAGE, DEFAULT_BITS, NOISE
 from jaxmark.watermark.record import RECORD_SUFFIX, Record
 from jaxmark.watermark.scenes import load_record
 from jaxmark.watermark.schemes import DEFAULT_SCHEME
@@ -543,6 +543,9 @@ def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> N
 @click.option(
     "--coverage", type=float, default=COVERAGE, show_default=True, help="Share of the vertices that may be left."
 )
+@click.option(
+    "--scheme", type=click.Choice(NAMES), default=DEFAULT_SCHEME, show_default=True, help="Scheme that carries them."
+)
 @_JSON
 def capacity_command(
     mesh: Path,
@@ -551,12 +554,13 @@ def capacity_command(
     visibility: Visibility | None,
     noise: float,
     coverage: float,
+    scheme: str,
     as_json: bool,
 ) -> None:
-    """Say how many bits the keyed scheme can hide in MESH so that they survive noise and the loss of vertices."""
+    """Say how many bits can be hidden in MESH so that they survive noise and the loss of vertices."""
     loaded = load_mesh(mesh)
     bounds = make_budget(budget, dict(limits) or None, visibility, named=visibility_of(loaded))
-    bits = capacity(loaded, bounds.rms, limits=bounds.limits, noise=noise, coverage=coverage)
+    bits = capacity(loaded, bounds.rms, limits=bounds.limits, noise=noise, coverage=coverage, scheme=scheme)
     answer = {"bits": bits, "budget": bounds.rms, "limits": bounds.limits, "noise": noise, "coverage": coverage}
     said = f"{bits} bits at {bounds}, noise {noise:g}, coverage {coverage:g}"
     _answer(as_json, answer, said if bits else f"{said}; `embed` says what less a mark in it survives")

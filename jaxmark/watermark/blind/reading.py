@@ -35,6 +35,7 @@ STEPS = tuple(1e-4 * 2 ** (rung / 2) for rung in range(11))  # of the lattice of
 TAG_BITS = 40
 _CODE_SPREAD = 2  # code bits for each bit of message and tag, at least
 _CHANGES = 2  # changes of pose that are read: none, and the best by the offsets
+_CANDIDATES = 16  # messages of each reading whose tags are tried
 _SURE = -12.0  # log10 of a probability from which on no other way of looking is tried
 
 
@@ -179,7 +180,7 @@ def _weigh(
     order = sorted(range(len(readings)), key=lambda place: -readings[place].pilot)
     readings = [readings[place] for place in order]
     soft = np.stack([one.soft for one in readings])
-    decoded = None if claimed == b"" else decode_any(soft, bits, choices, TAG_BITS)
+    decoded = None if claimed == b"" else decode_any(soft, bits, choices, TAG_BITS, _CANDIDATES)
     fixed = claimed
     if decoded is not None and decoded.message != claimed:
         told = record is not None and bool(record.told) and record.commits_to(decoded.message, choices)
