@@ -222,16 +222,28 @@ def look(
     return Shown(jnp.sum((close - far) * normal, axis=1), good)
 
 
+class Changes(NamedTuple):
+    """What a surface shows, and how that changes as it is moved and scaled by a little."""
+
+    shown: Shown
+    slope: Float[Array, "anchors 3"]  # of the values, as anchors move
+    growth: Float[Array, " anchors"]  # of the values, as anchors spread by a factor and the surface keeps its size
+
+
 @jax.jit
-def slopes(
-    surface: Surface, anchors: Anchors, width: Float[Array, ""], undone: Float[Array, ""]
-) -> tuple[Shown, Float[Array, "anchors 3"]]:
-    """What a surface shows, and how the values change as anchors move."""
+def changes(surface: Surface, anchors: Anchors, width: Float[Array, ""], undone: Float[Array, ""]) -> Changes:
+    """Look at a surface, and see how that changes as it is moved and scaled by a little.
+
+    Anchors that spread by a factor are the same as a surface that shrinks: averages widen, too, and the values are in
+    the larger unit.
+    """
+    nowhere = jnp.zeros(anchors.places.shape, surface.points.dtype)
 
     def total(shift: Float[Array, "anchors 3"]) -> tuple[Float[Array, ""], Shown]:
         shown = look(surface, anchors, shift, width, undone)
         return shown.values.sum(), shown
 
-    nowhere = jnp.zeros(anchors.places.shape, surface.points.dtype)
-    gradient, shown = jax.grad(total, has_aux=True)(nowhere)
-    return shown, gradient
+    slope, shown = jax.grad(total, has_aux=True)(nowhere)
+    _, widened = jax.jvp(lambda size: look(surface, anchors, nowhere, size, undone).values, (width,), (width,))
+    spread = jnp.sum(slope * jnp.asarray(anchors.places, slope.dtype), axis=1)
+    return Changes(shown, slope, spread + widened - shown.values)
