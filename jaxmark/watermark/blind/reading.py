@@ -68,6 +68,11 @@ class BlindDetection(NamedTuple):
     doubts: tuple[str, ...] = ()  # why the probabilities are estimates, not proofs; empty if they are proofs
     remarks: tuple[str, ...] = ()  # what else the suspect looks like
 
+    @property
+    def premises(self) -> str:
+        """What must have been fixed before the suspect existed; a mesh marked under the same key is no such suspect."""
+        return "key, message and record"
+
     def detected(self, alpha: float = 1e-6) -> bool:
         """Whether the false-positive probability is at most `alpha`, if all that is claimed is dated.
 

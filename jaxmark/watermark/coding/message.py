@@ -77,15 +77,15 @@ def decode(scores: Float[np.ndarray, " length"], bits: int, choices: Choices) ->
         bits: size of the payload in bits.
         choices: the keyed choices of the mark.
     """
-    return decode_any(scores[None], bits, choices)
+    return decode_any(scores[None], bits, choices, TAG_BITS, CANDIDATES)
 
 
 def decode_any(
     scores: Float[np.ndarray, "rows length"],
     bits: int,
     choices: Choices,
-    tag_bits: int = TAG_BITS,
-    candidates: int = CANDIDATES,
+    tag_bits: int,
+    candidates: int,
 ) -> Decoded | None:
     """Decode the first message whose keyed tag fits, of several readings: their most plausible messages come first.
 
