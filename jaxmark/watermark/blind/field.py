@@ -35,6 +35,7 @@ _FIRST_STEP = 0.05  # of the lattice of values, in widths, that is tried first
 _LEAST_AREA = 0.2  # of the mean: what vertices of smaller area count as
 _MIN_GAP = 0.02  # difference of the variances along two axes, over the largest, from which on they are told apart
 _ROUNDS = 2  # of Gauss and Newton
+_SPARE = 1.3  # energy that a width should leave, over what the payload needs
 _TRIED = (1.0, 0.7, 0.5, 0.3)  # shares of a predicted noise that are tried
 _SMOOTHED = 10  # steps of smoothing that widths are chosen by, besides noise
 
@@ -185,8 +186,11 @@ class Writer:
         choices: Choices,
         budget: Budget,
         reference: distortion.Reference,
+        bits: int,
     ) -> Plan:
         """Choose the width that is predicted to be read best, and how strong a budget allows the mark to be.
+
+        Of the widths that leave room for the payload, the one of most energy after noise or smoothing is taken.
 
         Raises:
             JaxmarkError: if there is nothing to write in, or the budget allows not even the least step.
@@ -198,13 +202,15 @@ class Writer:
                 f"This mesh, or the budget for it, leaves the scheme {self.scheme.name!r} nothing to write in; use a"
                 " larger budget, a smoother mesh or the scheme 'keyed'."
             )
-        return max(fitting, key=lambda one: min(self.energies(one)))
+        enough = _SPARE * needed(bits)
+        return max(fitting, key=lambda one: (one.energy(0.0) >= enough, min(self.energies(one))))
 
     def write(
         self,
         word: Float64[np.ndarray, " code"],
         choices: Choices,
         budget: Budget,
+        bits: int,
         reference: distortion.Reference | None = None,
     ) -> Written:
         """Write a codeword as far as a budget allows.
@@ -213,13 +219,14 @@ class Writer:
             word: the code bits, ±1.
             choices: the keyed choices.
             budget: the bounds to keep.
+            bits: size of the payload in bits.
             reference: what limits are measured against, if not the original.
 
         Raises:
             JaxmarkError: see `plan`.
         """
         reference = reference or distortion.Reference(self.original.mesh)
-        plan = self.plan(word, choices, budget, reference)
+        plan = self.plan(word, choices, budget, reference, bits)
         targets = plan.host.values - plan.alpha * plan.step * self.off(plan.host, plan.dither, word, plan.step)
         shift = self.shift(plan.host, targets, _ROUNDS)
         written = write(self.original, shift, budget, reference)
@@ -271,7 +278,7 @@ class Writer:
         choices = context(bytes(KEY_BYTES), DEFAULT_BITS)
         word = codeword(bytes(DEFAULT_BITS // 8), choices)
         try:
-            plan = self.plan(word, choices, budget, distortion.Reference(self.original.mesh))
+            plan = self.plan(word, choices, budget, distortion.Reference(self.original.mesh), 0)
         except JaxmarkError:
             return 0
         energy, bits = plan.energy(self._spreads(plan.host)[0] * noise / NOISE), 0
@@ -335,7 +342,7 @@ class FieldMarker:
         bounds = make_budget(budget, limits, visibility, named=visibility_of(self.original.mesh))
         choices = context(self.key, self.bits)
         word = codeword(message, choices)
-        written = self.writer.write(word, choices, bounds, reference)
+        written = self.writer.write(word, choices, bounds, self.bits, reference)
         survives = self.writer.survives(written.plan, self.bits)
         if noise is not None and survives.whole < noise:
             raise JaxmarkError(
