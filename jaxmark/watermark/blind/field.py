@@ -200,7 +200,7 @@ class Writer:
         if not fitting:
             raise JaxmarkError(
                 f"This mesh, or the budget for it, leaves the scheme {self.scheme.name!r} nothing to write in; use a"
-                " larger budget, a smoother mesh or the scheme 'keyed'."
+                " larger budget or the scheme 'keyed'."
             )
         enough = _SPARE * needed(bits)
         return max(fitting, key=lambda one: (one.energy(0.0) >= enough, min(self.energies(one))))
@@ -352,14 +352,14 @@ class FieldMarker:
         record = Record(
             scheme=self.scheme.name,
             bits=self.bits,
-            beta=written.plan.alpha,
+            beta=float(written.plan.alpha),
             original="",
             key=commitment(self.key),
             parameters={"width": written.plan.width, "step": written.plan.step},
             content="message" if self.bits else "presence",
             told=commit(message, choices) if message else "",
         ).sealed(self.key)
-        info = EmbedInfo(written.moved.rms, written.moved.max, written.plan.alpha, record, survives)
+        info = EmbedInfo(written.moved.rms, written.moved.max, record.beta, record, survives)
         if read_back:
             self.with_record(record).check(written.mesh, message)
         return written.mesh, info

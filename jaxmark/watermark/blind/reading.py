@@ -13,6 +13,7 @@ a geometry in the key's choices, as their reader has no original.
 
 import math
 from collections.abc import Sequence
+from itertools import groupby
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -37,7 +38,8 @@ TAG_BITS = 40
 _CODE_SPREAD = 2  # code bits for each bit of message and tag, at least
 _CHANGES = 2  # changes of pose that are read: none, and the best by the offsets
 _CANDIDATES = 16  # messages of each reading whose tags are tried
-_SURE = -12.0  # log10 of a probability from which on no other way of looking is tried
+# log10 of a probability from which on no other way of looking is tried, where a message reads and where none does.
+_SURE, _SURE_UNREAD = -12.0, -40.0
 
 
 class Reading(NamedTuple):
@@ -134,18 +136,13 @@ def detect(
     claimed = b"" if message is None and not bits else message
     tries = len(widths) * VIEWS_PER_WIDTH * len(TURNS) * len(steps) * _CHANGES
     best: BlindDetection | None = None
-    waiting: list[View] = []
     before = 0  # messages whose tags were tried already
-    for view in views(suspect, widths):
-        waiting.append(view)
-        if len(waiting) < len(widths) and view.undone == 0:
-            continue
-        readings = [one for view in waiting for one in _readings(view, choices, length, np.asarray(steps))]
-        waiting = []
+    for _, group in groupby(views(suspect, widths), key=lambda view: view.undone):
+        readings = [one for view in group for one in _readings(view, choices, length, np.asarray(steps))]
         found = _weigh(readings, choices, bits, claimed, record, tries, before)
         before += len(readings) * _CANDIDATES
         best = found if best is None else min(best, found, key=lambda one: (one.message is None, one.log10_p))
-        if best.log10_p <= _SURE and (best.message is not None or claimed is not None):
+        if best.log10_p <= (_SURE if best.message is not None else _SURE_UNREAD):
             break
     assert best is not None
     return best
