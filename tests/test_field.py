@@ -194,7 +194,7 @@ def test_smoothing_is_undone_as_by_rounds(shape: Mesh):
     np.testing.assert_allclose(found, rounds, atol=2e-5)
 
 
-@pytest.mark.parametrize("claimed", [None, MESSAGE])
+@pytest.mark.parametrize("claimed", [pytest.param(None, marks=pytest.mark.slow), MESSAGE])
 def test_nothing_is_detected_where_nothing_is(shape: Mesh, marked, key: jm.Key, claimed):
     mesh, info = marked
     assert not jm.detect(shape, key=key, message=claimed, record=info.record).detected(1e-3)
