@@ -79,7 +79,7 @@ def place(mesh: Mesh) -> Placed:
     return Placed(Mesh(pose(np.asarray(mesh.vertices)), mesh.faces), pose, moved, outwards)
 
 
-class Surface(NamedTuple):
+class Patches(NamedTuple):
     """Pieces of a surface, all about as small, however large its faces are; traced."""
 
     points: Float[Array, "pieces 3"]  # the centre of each
@@ -96,7 +96,7 @@ class Pieces(NamedTuple):
     piece: Int[np.ndarray, " samples"]  # number of the piece that it belongs to, ascending
     room: Bool[np.ndarray, " pieces"]  # of no other use than its length
 
-    def of(self, vertices: Float[Array, "vertices 3"]) -> Surface:
+    def of(self, vertices: Float[Array, "vertices 3"]) -> Patches:
         """The pieces for vertices anywhere."""
         a, b, c = (vertices[self.corners[:, corner]] for corner in range(3))
         shares = jnp.asarray(self.shares, vertices.dtype)
@@ -107,7 +107,7 @@ class Pieces(NamedTuple):
         columns = jnp.concatenate([area[:, None] * points, normals, area[:, None]], axis=1)
         sums = jax.ops.segment_sum(columns, self.piece, len(self.room), indices_are_sorted=True)
         total = jnp.maximum(sums[:, 6], _TINY)
-        return Surface(sums[:, :3] / total[:, None], sums[:, 3:6], total)
+        return Patches(sums[:, :3] / total[:, None], sums[:, 3:6], total)
 
 
 def cut(mesh: Mesh, width: float) -> Pieces:
@@ -153,7 +153,7 @@ class Anchors(NamedTuple):
     around: Int[np.ndarray, "anchors around"]  # numbers of the pieces around it; -1 for none
 
 
-def make_anchors(surface: Surface, width: float) -> Anchors:
+def make_anchors(surface: Patches, width: float) -> Anchors:
     """Find the lattice points near a surface, and the pieces around each.
 
     Args:
@@ -183,7 +183,7 @@ class Shown(NamedTuple):
 
 @jax.jit
 def look(
-    surface: Surface,
+    surface: Patches,
     anchors: Anchors,
     shift: Float[Array, "anchors 3"],
     width: Float[Array, ""],
@@ -231,7 +231,7 @@ class Changes(NamedTuple):
 
 
 @jax.jit
-def changes(surface: Surface, anchors: Anchors, width: Float[Array, ""], undone: Float[Array, ""]) -> Changes:
+def changes(surface: Patches, anchors: Anchors, width: Float[Array, ""], undone: Float[Array, ""]) -> Changes:
     """Look at a surface, and see how that changes as it is moved and scaled by a little.
 
     Anchors that spread by a factor are the same as a surface that shrinks: averages widen, too, and the values are in
