@@ -203,7 +203,7 @@ class Writer:
                 " larger budget or the scheme 'keyed'."
             )
         enough = _SPARE * needed(bits)
-        return max(fitting, key=lambda one: (one.energy(0.0) >= enough, min(self.energies(one))))
+        return max(fitting, key=lambda one: (min(one.energy(0.0), enough), min(self.energies(one))))
 
     def write(
         self,

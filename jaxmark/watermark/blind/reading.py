@@ -37,7 +37,7 @@ STEPS = tuple(1e-4 * 2 ** (rung / 2) for rung in range(11))  # of the lattice of
 TAG_BITS = 40
 _CODE_SPREAD = 2  # code bits for each bit of message and tag, at least
 _CHANGES = 2  # changes of pose that are read: none, and the best by the offsets
-_CANDIDATES = 16  # messages of each reading whose tags are tried
+_CANDIDATES = 32  # messages of each reading whose tags are tried
 # log10 of a probability from which on no other way of looking is tried, where a message reads and where none does.
 _SURE, _SURE_UNREAD = -12.0, -40.0
 
