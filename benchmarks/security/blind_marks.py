@@ -36,6 +36,7 @@ from jaxmark.watermark.blind import reading
 from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.field import FieldScheme, Host, Writer
 from jaxmark.watermark.budget import make_budget
+from jaxmark.watermark.marking import EmbedInfo
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser
@@ -81,8 +82,8 @@ def simulate(way: str, pairs: int, rng: np.random.Generator) -> Scores:
     else:
         phase = rng.random(shape, np.float32)
     cosine = np.cos(np.float32(2 * np.pi) * (phase - offset))
-    score = np.sum(sign * cosine, axis=2, dtype=np.float64)
-    norm = np.sqrt(np.sum(cosine**2, axis=2, dtype=np.float64))
+    score = np.asarray(np.sum(sign * cosine, axis=2), np.float64)
+    norm = np.sqrt(np.asarray(np.sum(cosine**2, axis=2), np.float64))
     best = np.argmax(score / norm, axis=1)
     rows = np.arange(pairs)
     return Scores(score[rows, best], norm[rows, best], np.full(pairs, math.sqrt(ANCHORS / 2)))
@@ -91,7 +92,9 @@ def simulate(way: str, pairs: int, rng: np.random.Generator) -> Scores:
 def stated(scores: Float64[np.ndarray, " pairs"], norms: Float64[np.ndarray, " pairs"]) -> Float64[np.ndarray, " some"]:
     """log10 p of each pair that may state one as small as the first level."""
     near = np.flatnonzero(scores > NEAR * norms)
-    return np.array([evidence.log10_p_claimed(scores[pair], norms[pair]) for pair in near])
+    return np.array(
+        [evidence.log10_p_claimed(score, norm) for score, norm in zip(scores[near], norms[near], strict=True)]
+    )
 
 
 def bound(pairs: int) -> Iterator[Row]:
@@ -106,7 +109,8 @@ def bound(pairs: int) -> Iterator[Row]:
             found["Σ c²"].append(stated(scores.score, scores.norm))
             found["n"].append(stated(scores.score, scores.blind))
         say(name, "simulated")
-        yield {"search": name, "pairs": count, "bound by": "expected"} | {f"{p:.0e}": p * count for p in LEVELS}
+        expected = {f"{p:.0e}": f"{p * count:,g}" for p in LEVELS}
+        yield {"search": name, "pairs": count, "bound by": "(expected)"} | expected
         for by, parts in found.items():
             values = np.concatenate(parts) + math.log10(tried)
             hits = {f"{p:.0e}": int(np.sum(values <= math.log10(p))) for p in LEVELS}
@@ -141,14 +145,16 @@ class Marked(NamedTuple):
     name: str
     mesh: Mesh
     marked: Mesh
-    info: jm.EmbedInfo
+    info: EmbedInfo
 
     @property
     def width(self) -> float:
+        """Of the averages, in the unit of its own pose."""
         return self.info.record.parameters["width"]
 
     @property
     def step(self) -> float:
+        """Of the lattice of values, in the same unit."""
         return self.info.record.parameters["step"]
 
 
@@ -156,9 +162,7 @@ def mark(name: str, mesh: Mesh) -> Marked:
     """Mark within the limits."""
     marked, info = jm.embed(mesh, MESSAGE, KEY, scheme=reading.NAME, limits=LIMITS)
     found = Marked(name, mesh, marked, info)
-    say(
-        f"{name}: marked, RMS {info.rms:.2e}, width {found.width:g}, step {found.step:.2e}, alpha {info.record.beta:.2f}"
-    )
+    say(f"{name}: RMS {info.rms:.2e}, width {found.width:g}, step {found.step:.2e}, alpha {info.record.beta:.2f}")
     return found
 
 
@@ -173,14 +177,17 @@ class Seen(NamedTuple):
 
     @property
     def good(self) -> Bool[np.ndarray, " anchors"]:
+        """Whether an anchor is one that is written."""
         return self.host.good > 0
 
     @property
     def cells(self) -> Int64[np.ndarray, "anchors 3"]:
+        """Indices of the anchors in the lattice of points."""
         return self.host.shape.anchors.cells
 
     @property
     def phases(self) -> Float64[np.ndarray, " anchors"]:
+        """Values in steps."""
         return self.host.values / self.step
 
 
@@ -218,12 +225,16 @@ def read(suspect: Mesh, key: jm.Key = KEY, message: bytes = MESSAGE) -> Row:
     return {"log10 p": found.log10_p, "reads": "yes" if found.message == message else "no"}
 
 
+def either_way(seen: Seen) -> Float64[np.ndarray, " anchors"]:
+    """A sign for each anchor, by chance."""
+    return np.random.default_rng(0).choice([-1.0, 1.0], len(seen.good))
+
+
 def erasure(work: Marked) -> Iterator[Row]:
     """Move all values by shares of a step, all the same way or each either way by chance."""
     yield {"mesh": work.name, "attack": "none"} | read(work.marked)
     seen = look(work.marked, work.width, work.step)
-    ways = np.random.default_rng(0).choice([-1.0, 1.0], len(seen.good))
-    for name, way in {"one way": np.ones(len(seen.good)), "either way": ways}.items():
+    for name, way in {"one way": np.ones(len(seen.good)), "either way": either_way(seen)}.items():
         for share in SHARES:
             erased = moved(seen, share * way)
             row: Row = {"mesh": work.name, "attack": f"{share:g} of a step, {name}"}
@@ -317,7 +328,7 @@ def averaging(work: Marked, counts: Sequence[int]) -> Iterator[Row]:
         shift = lattice_of(works[:count], cells)
         known = good & np.isfinite(shift)
         off = from_half(seen.phases - np.where(known, shift, 0))
-        change = np.where(known, np.where(off < 0, -1, 1) * (1 / 4 - np.abs(off)), 1 / 4)
+        change = np.where(known, np.where(off < 0, -1, 1) * (1 / 4 - np.abs(off)), either_way(seen) / 4)
         row: Row = {"mesh": work.name, "works": count, "anchors": int(good.sum()), "known": int(known.sum())}
         error = from_half((shift - truth)[known])
         row["error, steps"] = float(np.sqrt(np.mean(error**2))) if count else ""
