@@ -176,7 +176,6 @@ def test_nothing_found_is_status_1(workshop: Workshop):
     workshop.embed()
     workshop.json("keygen", "other.key")
     for suspect, key, options in [
-        ("model.ply", "owner.key", []),
         ("marked.ply", "other.key", []),
         ("marked.ply", "owner.key", ["--bits", "32"]),
         ("marked.ply", "owner.key", ["--alpha", "1e-80"]),

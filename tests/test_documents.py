@@ -29,7 +29,7 @@ PAGES = {
 }
 README = PAGES["README.md"]
 LONG = ("docs/tutorial.md", "docs/submeshes.md", "docs/how-to/extend.md")  # compiled for themselves, and need libigl
-SLOW = (*LONG, "docs/filters.md", "docs/how-to/strength.md", "docs/how-to/pictures.md")
+SLOW = (*LONG, "docs/blind.md", "docs/filters.md", "docs/how-to/strength.md", "docs/how-to/pictures.md")
 FRONTS = ("README.md", "docs/index.md")
 # These have tests of their own.
 APART = (*FRONTS, "docs/robustness.md", "docs/how-to/arrays.md", "docs/how-to/recipients.md", "docs/how-to/study.md")

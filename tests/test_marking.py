@@ -18,6 +18,10 @@ MESSAGE = bytes.fromhex("0123456789abcdef")
 SCHEMES = ["keyed", "host", "eigen"]
 
 
+#: All schemes; `host` takes long to compile.
+MOSTLY_QUICK = [pytest.param(name, marks=pytest.mark.slow if name == "host" else ()) for name in SCHEMES]
+
+
 @pytest.fixture(scope="module")
 def sphere() -> Mesh:
     """2562 vertices: enough for 64 bits by each scheme."""
@@ -26,7 +30,12 @@ def sphere() -> Mesh:
 
 @pytest.mark.parametrize(
     ("scheme", "dtype"),
-    [("keyed", "float32"), ("keyed", "float64"), ("host", "float32"), ("eigen", "float32")],
+    [
+        ("keyed", "float32"),
+        ("keyed", "float64"),
+        pytest.param("host", "float32", marks=pytest.mark.slow),
+        ("eigen", "float32"),
+    ],
     indirect=["dtype"],
 )
 def test_round_trip_within_the_budget(sphere: Mesh, key: jm.Key, scheme, dtype):
@@ -48,7 +57,7 @@ def test_round_trip_within_the_budget(sphere: Mesh, key: jm.Key, scheme, dtype):
     assert jm.detect(marked, original=sphere, key=jm.new_key(), scheme=scheme, message=MESSAGE).log10_p > -6
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("scheme", MOSTLY_QUICK)
 def test_precisions_read_each_other(sphere: Mesh, key: jm.Key, scheme):
     marked, _ = jm.embed(sphere, MESSAGE, key, scheme=scheme)
     with jax.enable_x64(True):
@@ -122,7 +131,7 @@ def test_golden_displacement(key: jm.Key):
         np.testing.assert_allclose(shift, golden, atol=0.02)
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("scheme", MOSTLY_QUICK)
 def test_a_mark_far_from_the_origin_and_at_any_scale(key: jm.Key, scheme):
     sphere = bumpy_sphere(4)
     for factor, offset in ((1e-20, 0.0), (1e20, 0.0), (1.0, 1e6)):

@@ -132,7 +132,7 @@ def test_defences(marked, key: jm.Key):
     assert noise.std() == pytest.approx(1, abs=0.2)
 
 
-@pytest.mark.parametrize("make", SCORED)
+@pytest.mark.parametrize("make", [estimated_gradient, pytest.param(random_search, marks=pytest.mark.slow)])
 def test_answers_beat_chance(marked, make):
     marker, mesh = marked
     score = score_oracle(marker, MESSAGE)

@@ -135,6 +135,19 @@ def test_pairs(originals):
     assert scenes.pair(originals, {"only": other["left"]}) == dict.fromkeys(NAMES, "only")
 
 
+def test_meshes_of_one_connectivity_are_paired_by_shape(sphere: Mesh):
+    """As rocks made from one template are, whatever the names and the order say."""
+    rocks = {
+        name: sphere._replace(vertices=np.asarray(sphere.vertices) * [1, 1, size])
+        for name, size in zip("abc", (1, 2, 3), strict=True)
+    }
+    turned = {name: moved(mesh, TURN) for name, mesh in rocks.items()}
+    assert scenes.pair(rocks, {"c": turned["a"], "x": turned["c"], "a": turned["b"]}) == {"a": "c", "b": "a", "c": "x"}
+    # Names tell equal shapes apart.
+    equal = {name: moved(rocks["a"], TURN, 0.001 * place) for place, name in enumerate("abc")}
+    assert scenes.pair(dict.fromkeys("abc", rocks["a"]), equal) == dict(zip("abc", "abc", strict=True))
+
+
 def exported(folder: Path, meshes: dict[str, Mesh], name: str) -> Path:
     scene = trimesh.Scene({name: trimesh.Trimesh(*mesh, process=False) for name, mesh in meshes.items()})
     scene.export(folder / name)

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
+from types import FrameType
 from typing import Any, NoReturn, get_args
 
 import click
@@ -33,8 +34,8 @@ from jaxmark.geometry.mesh import same_connectivity
 from jaxmark.watermark.budget import VISIBILITY, Visibility, make_budget, visibility_of
 from jaxmark.watermark.coding.keys import Key, commitment, load_key, new_key, save_key
 from jaxmark.watermark.deposit import Deposit, make_deposit
-from jaxmark.watermark.everyday import NAMES, blind_scheme
-from jaxmark.watermark.marking import COVERAGE, DEFAULT_BITS, NOISE, capacity
+from jaxmark.watermark.everyday import NAMES, blind_scheme, capacity
+from jaxmark.watermark.marking import COVERAGE, DEFAULT_BITS, NOISE
 from jaxmark.watermark.record import RECORD_SUFFIX, Record
 from jaxmark.watermark.scenes import load_record
 from jaxmark.watermark.schemes import DEFAULT_SCHEME
@@ -76,6 +77,8 @@ class _Limit(click.ParamType):
         except ValueError:
             self.fail(f"{value!r} is no limit: give a metric and a number, e.g. dame=0.008.", param, ctx)
 
+
+_ASK_AGAIN = 5  # seconds until a process that was asked to end is asked again
 
 _MESH = click.Path(path_type=Path)
 _KEY = click.option("--key", "key_file", type=_MESH, required=True, help="Key file, from `jaxmark keygen`.")
@@ -457,7 +460,9 @@ def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int
     _check_outputs(source, target)
     _check_distinct(IN=source, OUT=target)
     scene = load_scene(source)
-    if len(scene.meshes) > 1 and source.suffix.lower() != ".obj":  # whose objects lie in the same coordinates
+    if (
+        len(scene.meshes) + len(scene.left) > 1 and source.suffix.lower() != ".obj"
+    ):  # whose objects lie in the same coordinates
         return _attack_scene(source, target, steps, seed, as_json)
     mesh = load_mesh(source)
     with replacing(target) as draft:
@@ -474,7 +479,8 @@ def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int
 
 def _attack_scene(source: Path, target: Path, steps: list[tuple[str, float]], seed: int, as_json: bool) -> None:
     """Attack each mesh of a file; they keep their connectivity, as their file has it."""
-    meshes = load_scene(source).meshes
+    scene = load_scene(source)
+    meshes = scene.meshes
     attacked = {name: chain(mesh, steps, seed=seed) for name, mesh in meshes.items()}
     said = " + ".join(f"{kind} {strength:g}" for kind, strength in steps)
     for name, mesh in meshes.items():
@@ -484,9 +490,11 @@ def _attack_scene(source: Path, target: Path, steps: list[tuple[str, float]], se
         save_scene(attacked, draft, like=source)
         after = load_scene(draft).meshes
     sizes = {name: distortion.displacement_size(mesh, after[name])._asdict() for name, mesh in meshes.items()}
-    answer = {"attacks": steps, "seed": seed, "meshes": sizes}
+    answer = {"attacks": steps, "seed": seed, "meshes": sizes, "left": scene.left}
     largest = max(one["rms"] for one in sizes.values())
-    _answer(as_json, answer, f"{said} → {target}, {len(meshes)} meshes, RMS up to {largest:.3g} of their diagonals")
+    lines = [f"{said} → {target}, {len(meshes)} meshes, RMS up to {largest:.3g} of their diagonals"]
+    lines += [f"left alone: {name!r}: {reason}" for name, reason in scene.left.items()]
+    _answer(as_json, answer, "\n".join(lines))
 
 
 def _steps(words: tuple[str, ...]) -> list[tuple[str, float]]:
@@ -535,6 +543,9 @@ def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> N
 @click.option(
     "--coverage", type=float, default=COVERAGE, show_default=True, help="Share of the vertices that may be left."
 )
+@click.option(
+    "--scheme", type=click.Choice(NAMES), default=DEFAULT_SCHEME, show_default=True, help="Scheme that carries them."
+)
 @_JSON
 def capacity_command(
     mesh: Path,
@@ -543,14 +554,16 @@ def capacity_command(
     visibility: Visibility | None,
     noise: float,
     coverage: float,
+    scheme: str,
     as_json: bool,
 ) -> None:
-    """Say how many bits the keyed scheme can hide in MESH so that they survive noise and the loss of vertices."""
+    """Say how many bits can be hidden in MESH so that they survive noise and the loss of vertices."""
     loaded = load_mesh(mesh)
     bounds = make_budget(budget, dict(limits) or None, visibility, named=visibility_of(loaded))
-    bits = capacity(loaded, bounds.rms, limits=bounds.limits, noise=noise, coverage=coverage)
+    bits = capacity(loaded, bounds.rms, limits=bounds.limits, noise=noise, coverage=coverage, scheme=scheme)
     answer = {"bits": bits, "budget": bounds.rms, "limits": bounds.limits, "noise": noise, "coverage": coverage}
-    _answer(as_json, answer, f"{bits} bits at {bounds}, noise {noise:g}, coverage {coverage:g}")
+    said = f"{bits} bits at {bounds}, noise {noise:g}, coverage {coverage:g}"
+    _answer(as_json, answer, said if bits else f"{said}; `embed` says what less a mark in it survives")
 
 
 @cli.command()
@@ -609,8 +622,7 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
 
 def main() -> None:
     """Run the command line; refused input ends with exit status 2 and one sentence."""
-    # A request to end is an exception as others are, after which no draft is left.
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    signal.signal(signal.SIGTERM, _end)
     try:
         cli(standalone_mode=False)
     except click.exceptions.Exit as end:
@@ -619,6 +631,17 @@ def main() -> None:
         _refuse("Interrupted.")
     except Exception as error:  # status 1 would say "nothing detected"
         _refuse(_sentence(error))
+
+
+def _end(number: int, frame: FrameType | None) -> NoReturn:
+    """End as by an exception, after which no draft is left.
+
+    Python drops an exception in callbacks of its garbage collector, as JAX has one: the alarm asks again.
+    """
+    if hasattr(signal, "alarm"):
+        signal.signal(signal.SIGALRM, _end)
+        signal.alarm(_ASK_AGAIN)
+    sys.exit(128 + signal.SIGTERM)
 
 
 def _sentence(error: Exception) -> str:

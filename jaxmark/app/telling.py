@@ -46,7 +46,7 @@ def describe(
         said += f"false-positive probability about {power(found.log10_p)}, an estimate: {'; '.join(found.doubts)}"
     else:
         said += (
-            f"false-positive probability at most {power(found.log10_p)} if key, original, message and record were fixed"
+            f"false-positive probability at most {power(found.log10_p)} if {found.premises} were fixed"
             f" before the suspect existed, {power(found.log10_p_undated)} if nothing dates them"
         )
         if dated is not None:

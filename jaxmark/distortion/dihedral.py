@@ -33,7 +33,8 @@ def make_hinges(faces: Int[Array | np.ndarray, "faces 3"]) -> Hinges:
     pairs = edges(faces)
     base = int(faces.max(initial=0)) + 1
     start, end, apex = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel(), np.roll(faces, -2, axis=1).T.ravel()
-    whole = start != end  # a side of a face without area may join a point to itself
+    # A face whose corners coincide has no sides, only an edge that it runs along twice.
+    whole = (start != end) & (end != apex) & (apex != start)
     start, end, apex = start[whole], end[whole], apex[whole]
     which = np.searchsorted(pairs @ [base, 1], np.minimum(start, end) * base + np.maximum(start, end))
     count = np.bincount(which, minlength=len(pairs))

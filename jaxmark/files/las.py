@@ -14,6 +14,9 @@ from jaxmark.files.source import Edits, Overlay, Patched, Source, changed
 
 _BOX = 179  # byte offset of the header's bounding box: largest and smallest x, then y, then z, as doubles
 _INTEGER = np.dtype("<i4")
+_HEADER_BYTES, _HEADER_BYTES_1_4 = 227, 375
+_RECORD_BYTES, _EXTENDED_BYTES = 54, 60  # of a variable length record at least, and of one behind the points
+_MAX_PACKING = 2_000  # bytes of points for each byte of a LAZ file; scans have 5 to 20, made ones some hundreds
 
 
 class ScaledNumbers:
@@ -26,7 +29,8 @@ class ScaledNumbers:
         self._integers = integers
         self.scales, self.offsets = (np.asarray(part, np.float64) for part in (header.scales, header.offsets))
         self._start, self._size = int(header.offset_to_point_data), int(header.point_format.size)
-        self.values = integers * self.scales + self.offsets
+        with np.errstate(over="ignore", invalid="ignore"):  # numbers that are not finite are refused later
+            self.values = integers * self.scales + self.offsets
 
     def integers(self, values: Float64[np.ndarray, "rows 3"]) -> Int64[np.ndarray, "rows 3"]:
         """The integers of new values; those of numbers that did not change stay.
@@ -95,7 +99,37 @@ def parse(data: bytes) -> Source:
 
 def _read(data: bytes) -> Any:
     laspy = require("laspy", "files")
+    _check_counts(data)
     try:
         return laspy.read(io.BytesIO(data))
     except Exception as error:  # laspy and its decoders raise what they like where bytes are wrong
-        raise JaxmarkError(f"This is no LAS or LAZ file that laspy reads: {' '.join(str(error).split())}.") from error
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise JaxmarkError(f"This is no LAS or LAZ file that laspy reads: {reason}.") from error
+
+
+def _check_counts(data: bytes) -> None:
+    """Refuse a header that counts more than the file can hold, which laspy believes.
+
+    Raises:
+        JaxmarkError: if it does.
+    """
+    if len(data) < _HEADER_BYTES:
+        raise JaxmarkError(f"This is no LAS or LAZ file: it has {len(data)} bytes, and a header alone more.")
+    minor, kind = data[25], data[104]
+    begin, points = int.from_bytes(data[94:96], "little"), int.from_bytes(data[96:100], "little")
+    records, size = int.from_bytes(data[100:104], "little"), int.from_bytes(data[105:107], "little")
+    count = int.from_bytes(data[107:111], "little")
+    later = extended = 0
+    if minor >= 4 and len(data) >= _HEADER_BYTES_1_4:
+        later, extended = int.from_bytes(data[235:243], "little"), int.from_bytes(data[243:247], "little")
+        count = max(count, int.from_bytes(data[247:255], "little"))
+    held = len(data) * (_MAX_PACKING if kind & 0x80 else 1)  # of compressed points, the highest bit is set
+    if (
+        begin + _RECORD_BYTES * records > min(points, len(data))
+        or (extended and later + _EXTENDED_BYTES * extended > len(data))
+        or count * size > held
+    ):
+        raise JaxmarkError(
+            f"This LAS or LAZ file is damaged: its header counts {count} points and {records + extended} other records,"
+            f" more than its {len(data)} bytes hold."
+        )

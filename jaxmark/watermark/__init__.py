@@ -13,13 +13,13 @@ from jaxmark.watermark.coding.keys import Key as Key
 from jaxmark.watermark.coding.keys import load_key as load_key
 from jaxmark.watermark.coding.keys import new_key as new_key
 from jaxmark.watermark.coding.keys import save_key as save_key
+from jaxmark.watermark.everyday import capacity as capacity
 from jaxmark.watermark.everyday import detect as detect
 from jaxmark.watermark.everyday import embed as embed
 from jaxmark.watermark.marking import Detection as Detection
 from jaxmark.watermark.marking import EmbedInfo as EmbedInfo
 from jaxmark.watermark.marking import Marker as Marker
 from jaxmark.watermark.marking import Survival as Survival
-from jaxmark.watermark.marking import capacity as capacity
 from jaxmark.watermark.marking import make_marker as make_marker
 from jaxmark.watermark.record import Record as Record
 from jaxmark.watermark.scenes import SceneDetection as SceneDetection

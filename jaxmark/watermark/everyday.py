@@ -4,26 +4,44 @@ Informed schemes are read beside the original (`jaxmark.watermark.marking`), bli
 (`jaxmark.watermark.blind`).
 """
 
+import math
 from collections.abc import Mapping
 from typing import overload
 
 from numpy.typing import ArrayLike
 
+from jaxmark import distortion
 from jaxmark.alignment.alignment import Align
+from jaxmark.alignment.original import make_original
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind import reading
 from jaxmark.watermark.blind.field import FieldMarker, FieldScheme, make_field_marker, parameters_in
 from jaxmark.watermark.blind.reading import BlindDetection
-from jaxmark.watermark.budget import Limits, Visibility
-from jaxmark.watermark.coding.keys import Key
+from jaxmark.watermark.budget import Budget, Limits, Visibility, make_budget, visibility_of
+from jaxmark.watermark.coding.keys import KEY_BYTES, Key
 from jaxmark.watermark.detectors import Detector
-from jaxmark.watermark.marking import DEFAULT_BITS, Detection, EmbedInfo, Marker, detect_any, make_marker, make_markers
+from jaxmark.watermark.marking import (
+    COVERAGE,
+    DEFAULT_BITS,
+    NOISE,
+    Detection,
+    EmbedInfo,
+    Marker,
+    Survival,
+    detect_any,
+    make_marker,
+    make_markers,
+)
+from jaxmark.watermark.payload import Capacity, Conditions
 from jaxmark.watermark.record import Record
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES, Scheme
+from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES, KeyedScheme, Scheme, get_scheme
 
 #: The schemes that are read without the original.
 BLIND_SCHEMES: Mapping[str, type[FieldScheme]] = {FieldScheme.name: FieldScheme}
+#: Two marks in one mesh, with and without the original to read.
+BOTH = (KeyedScheme.name, FieldScheme.name)
+_INFORMED_SHARE = 0.6  # of the displacement that is allowed, for the informed mark of both
 NAMES = (*SCHEMES, *BLIND_SCHEMES)  # of all schemes
 
 
@@ -34,6 +52,17 @@ def blind_scheme(scheme: str | Scheme | FieldScheme) -> FieldScheme | None:
     return BLIND_SCHEMES[scheme]() if isinstance(scheme, str) and scheme in BLIND_SCHEMES else None
 
 
+def informed_scheme(scheme: str | Scheme | FieldScheme) -> str | Scheme:
+    """The scheme, which must be one that is read beside the original.
+
+    Raises:
+        JaxmarkError: if it is not.
+    """
+    if isinstance(scheme, FieldScheme) or (isinstance(scheme, str) and scheme not in SCHEMES):
+        raise JaxmarkError(f"There is no informed scheme {scheme!r}; the schemes are {', '.join(NAMES)}.")
+    return scheme
+
+
 def prepare(mesh: Mesh, key: bytes, bits: int, scheme: str | Scheme | FieldScheme) -> Marker | FieldMarker:
     """Prepare an original for marking, with a scheme of either kind.
 
@@ -42,10 +71,7 @@ def prepare(mesh: Mesh, key: bytes, bits: int, scheme: str | Scheme | FieldSchem
     """
     blind = blind_scheme(scheme)
     if blind is None:
-        if isinstance(scheme, str) and scheme not in SCHEMES:
-            raise JaxmarkError(f"There is no scheme {scheme!r}; there are {', '.join(NAMES)}.")
-        assert not isinstance(scheme, FieldScheme)
-        return make_marker(mesh, key, bits=bits, scheme=scheme)
+        return make_marker(mesh, key, bits=bits, scheme=informed_scheme(scheme))
     return make_field_marker(mesh, key, bits=bits, scheme=blind)
 
 
@@ -58,7 +84,7 @@ def embed(
     limits: Limits | None = None,
     visibility: Visibility | None = None,
     noise: float | None = None,
-    scheme: str | Scheme | FieldScheme = DEFAULT_SCHEME,
+    scheme: str | Scheme | FieldScheme | tuple[str, str] = DEFAULT_SCHEME,
 ) -> tuple[Mesh, EmbedInfo]:
     """Embed a message in the vertex positions of a mesh.
 
@@ -80,7 +106,9 @@ def embed(
         noise: a demand: the noise that the message must survive when half of the vertices are lost, see `capacity`; 0
             requires only that there are enough dimensions. By default nothing is demanded but that the message reads.
             It has no effect for schemes whose readers have no model of noise, such as `host` and `eigen`.
-        scheme: a name or a scheme, see `make_marker`; or `"field"`, whose marks are read without the original.
+        scheme: a name or a scheme, see `make_marker`; or `"field"`, whose marks are read without the original; or
+            `("keyed", "field")` for both marks, each within a part of the same bounds. The record is then the first
+            one's.
 
     Returns:
         The marked mesh (float64 vertices, same faces) and how it was marked.
@@ -92,8 +120,72 @@ def embed(
     """
     if not isinstance(message, bytes):
         raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
+    if isinstance(scheme, tuple):
+        if scheme != BOTH:
+            raise JaxmarkError(f"Two marks in one mesh are {BOTH}, not {scheme}.")
+        return _embed_both(
+            mesh, message, key, make_budget(budget, limits, visibility, named=visibility_of(mesh)), noise
+        )
     marker = prepare(mesh, key, 8 * len(message), scheme)
     return marker.embed(message, budget, limits=limits, visibility=visibility, noise=noise)
+
+
+def _embed_both(mesh: Mesh, message: bytes, key: bytes, bounds: Budget, noise: float | None) -> tuple[Mesh, EmbedInfo]:
+    """Embed a message twice, to be read beside the original and without it; bounds are on both marks together."""
+    informed = prepare(mesh, key, 8 * len(message), BOTH[0])
+    _, alone = informed.embed(message, bounds.rms, limits=bounds.limits, read_back=False)
+    first, info = informed.embed(message, _INFORMED_SHARE * alone.rms, noise=noise, read_back=False)
+    rest = None if bounds.rms is None else math.sqrt(bounds.rms**2 - info.rms**2)
+    blind = make_field_marker(first, key, bits=8 * len(message), scheme=FieldScheme())
+    marked, other = blind.embed(message, rest, limits=bounds.limits, reference=distortion.Reference(mesh))
+    informed.check(marked, message)
+    change = distortion.displacement_size(mesh, marked)
+    survives = Survival(other.survives.whole, info.survives.half)
+    return marked, info._replace(rms=change.rms, max=change.max, survives=survives)
+
+
+def capacity(
+    mesh: Mesh,
+    budget: float | None = None,
+    *,
+    limits: Limits | None = None,
+    visibility: Visibility | None = None,
+    noise: float = NOISE,
+    coverage: float = COVERAGE,
+    scheme: str | Scheme | FieldScheme = DEFAULT_SCHEME,
+) -> int:
+    """Compute how many bits a mesh can carry, by the energy and the dimensions of a mark that projection leaves.
+
+    For schemes whose readers have no model of noise, such as `host` and `eigen`, only the number of code bits counts.
+    Marks of `field` do not survive the loss of parts, so that coverage has no meaning for them.
+
+    Args:
+        mesh: the original.
+        budget: RMS displacement, see `embed`.
+        limits: limits on metrics, see `embed`; how much displacement they allow is tried for each payload size.
+        visibility: see `embed`.
+        noise: half width of uniform noise on each coordinate, relative to the mean distance of the vertices to their
+            centre; by default the strongest of the SMI 2010 protocol (Wang et al.), 0.5 %.
+        coverage: share of the vertices that may be left.
+        scheme: a name or a scheme, see `make_marker`.
+
+    Returns:
+        The largest payload in bits, a multiple of 8; 0 if not even 8.
+
+    Raises:
+        JaxmarkError: if the mesh is unusable or a number is out of range.
+    """
+    if not (0 <= noise < math.inf and 0 < coverage <= 1):
+        raise JaxmarkError(
+            f"capacity needs a noise of at least 0 and a coverage in (0, 1], got {noise:g} and {coverage:g}."
+        )
+    if (blind := blind_scheme(scheme)) is not None:
+        field = make_field_marker(mesh, bytes(KEY_BYTES), scheme=blind)
+        return field.writer.capacity(make_budget(budget, limits, visibility, named=visibility_of(mesh)), noise)
+    original = make_original(mesh)
+    bounds = make_budget(budget, limits, visibility, named=visibility_of(original.mesh))
+    conditions = Conditions(bounds, noise, coverage)
+    return Capacity(original, get_scheme(informed_scheme(scheme))).bits(conditions)
 
 
 @overload
@@ -192,7 +284,7 @@ def detect(
         return read_blind(suspect, key, bits=bits, message=message, record=record, scheme=blind)
     if original is None:
         raise JaxmarkError(f"The scheme {named!r} is read beside the original; give it, or mark with 'field'.")
-    informed = DEFAULT_SCHEME if scheme is None or isinstance(scheme, FieldScheme) else scheme
+    informed = informed_scheme(scheme or DEFAULT_SCHEME)
     markers = make_markers(original, key, bits=bits, record=record, scheme=informed, detector=detector)
     return detect_any(markers, suspect, message, weights, align)
 

@@ -78,13 +78,14 @@ def share_of(log10_p: float, share: float) -> float:
     return _clip(log10_p - math.log10(share))
 
 
-def log10_p_read(score: ArrayLike, norm: ArrayLike, bits: int) -> float:
+def log10_p_read(score: ArrayLike, norm: ArrayLike, bits: float) -> float:
     """log10 of a bound on the probability that any of 2^bits possible codewords scores so high (union bound).
 
     Args:
         score: S, the plain linear correlation of the codeword that was read.
         norm: ‖a‖ of the same vector a that the signs multiply.
-        bits: size of the payload in bits, without the tag, which the message determines.
+        bits: size of the payload in bits, without the tag, which the message determines; and the logarithm to base 2
+            of how many other choices were tried, if any were.
 
     Returns:
         A finite number in [-77, 0].
@@ -109,7 +110,7 @@ def any_of(*log10_p: float) -> float:
     return _clip(min(log10_p) + math.log10(len(log10_p)))
 
 
-def log10_p_fitted(score: ArrayLike, norm: ArrayLike, bits: int = 0) -> float:
+def log10_p_fitted(score: ArrayLike, norm: ArrayLike, bits: float = 0) -> float:
     """log10 of the probability if S were Gaussian with standard deviation ‖a‖: close to the true one, but no bound.
 
     Args:

@@ -77,6 +77,11 @@ class Detection(NamedTuple):
     doubts: tuple[str, ...] = ()  # why the probabilities are estimates, not proofs; empty if they are proofs
     remarks: tuple[str, ...] = ()  # what else the suspect looks like
 
+    @property
+    def premises(self) -> str:
+        """What must have been fixed before the suspect existed."""
+        return "key, original, message and record"
+
     def detected(self, alpha: float = 1e-6) -> bool:
         """Whether the false-positive probability is at most `alpha`, if all that is claimed is dated.
 
@@ -190,8 +195,8 @@ class Marker:
         if not self.reads(marked, message):
             raise JaxmarkError(
                 f"This mesh ({int(self.original.used.sum())} points) cannot carry {self._payload} with the scheme"
-                f" {self.scheme.name!r}: it does not read back, even unattacked. Use a larger budget, a shorter message"
-                " or a presence mark, or a finer or less regular mesh."
+                f" {self.scheme.name!r}: it does not read back, even unattacked. Use a larger budget,"
+                f"{' a shorter message or a presence mark,' if self.bits else ''} or a finer or less regular mesh."
             )
 
     def reads(self, marked: Mesh, message: bytes) -> bool:
@@ -618,46 +623,6 @@ def _rounded_up(value: float) -> float:
     """A number to four digits, none of which makes it smaller."""
     unit = 10.0 ** (math.floor(math.log10(value)) - 3)
     return math.ceil(value / unit * (1 + 1e-9)) * unit
-
-
-def capacity(
-    mesh: Mesh,
-    budget: float | None = None,
-    *,
-    limits: Limits | None = None,
-    visibility: Visibility | None = None,
-    noise: float = NOISE,
-    coverage: float = COVERAGE,
-    scheme: str | Scheme = DEFAULT_SCHEME,
-) -> int:
-    """Compute how many bits a mesh can carry, by the energy and the dimensions of a mark that projection leaves.
-
-    For schemes whose readers have no model of noise, such as `host` and `eigen`, only the number of code bits counts.
-
-    Args:
-        mesh: the original.
-        budget: RMS displacement, see `embed`.
-        limits: limits on metrics, see `embed`; how much displacement they allow is tried for each payload size.
-        visibility: see `embed`.
-        noise: half width of uniform noise on each coordinate, relative to the mean distance of the vertices to their
-            centre; by default the strongest of the SMI 2010 protocol (Wang et al.), 0.5 %.
-        coverage: share of the vertices that may be left.
-        scheme: a name or a scheme, see `make_marker`.
-
-    Returns:
-        The largest payload in bits, a multiple of 8; 0 if not even 8.
-
-    Raises:
-        JaxmarkError: if the mesh is unusable or a number is out of range.
-    """
-    if not (0 <= noise < math.inf and 0 < coverage <= 1):
-        raise JaxmarkError(
-            f"capacity needs a noise of at least 0 and a coverage in (0, 1], got {noise:g} and {coverage:g}."
-        )
-    original = make_original(mesh)
-    bounds = make_budget(budget, limits, visibility, named=visibility_of(original.mesh))
-    conditions = Conditions(bounds, noise, coverage)
-    return Capacity(original, get_scheme(scheme)).bits(conditions)
 
 
 def make_markers(

@@ -168,6 +168,15 @@ def test_what_cannot_be_used_is_named_and_the_others_are_read(tmp_path: Path) ->
     assert "sparse" in left["ball"]
 
 
+def test_numbers_that_are_referred_to_too_often_are_refused(tmp_path: Path) -> None:
+    document, data = scene()
+    for mesh in document["meshes"]:
+        mesh["primitives"] *= 10_000
+    (tmp_path / "many.glb").write_bytes(glb(json.dumps(document), data))
+    with pytest.raises(JaxmarkError, match="read the same bytes too often"):
+        load_scene(tmp_path / "many.glb")
+
+
 @pytest.mark.parametrize("mode", [5, 6])
 def test_strips_and_fans_are_those_of_another_program(tmp_path: Path, mode: int) -> None:
     points = np.random.default_rng(0).normal(size=(7, 3)).astype("<f4")

@@ -14,6 +14,7 @@ COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _COMPRESSED = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 _MAX_COUNT = 2**31
+_MAX_READS = 16  # elements that are read for each byte of a file, on average; accessors may share bytes
 
 
 class Elements(NamedTuple):
@@ -36,6 +37,7 @@ class Document:
     def __init__(self, container: Container) -> None:
         self.container = container
         self._lists: dict[str, list[dict[str, Any]]] = {}
+        self._reads = 0
 
     def items(self, kind: str) -> list[dict[str, Any]]:
         """A list of objects at the top of the document, empty if absent."""
@@ -68,6 +70,9 @@ class Document:
         """Where the elements of an accessor stand, which must lie inside its buffer."""
         where = f"accessors[{index}]"
         dtype, width, unit, count = self.form(index)
+        self._reads += count
+        if self._reads > _MAX_READS * len(self.container.data) + 2**20:
+            raise JaxmarkError(f"{where} and others read the same bytes too often; save the file with other software.")
         accessor = self.item("accessors", index)
         if "sparse" in accessor:
             raise JaxmarkError(f"{where} is sparse, which is not supported.")

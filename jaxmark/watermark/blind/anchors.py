@@ -23,6 +23,7 @@ SPACING = 3.4  # of the lattice, in widths of the narrow Gaussian
 _WIDER = 2.0  # width of the wide Gaussian over the narrow one
 _CUT = 3.2  # widths of the wide Gaussian at which it is cut off
 _PIECE_AREA, _PIECE_SIDE = 0.2, 0.35  # of pieces at most, in squared widths and widths of the narrow Gaussian
+_ROUND = 128  # anchors are padded to multiples of it
 _TINY = 1e-12  # area that is nothing
 _SIZE_BY_VOLUME, _SIZE_BY_AREA = 0.25, 0.29  # root of the trace of the covariance: the diagonal is then about 1
 _MAX_OPEN = 0.01  # share of open sides up to which a surface encloses a volume
@@ -78,7 +79,7 @@ def place(mesh: Mesh) -> Placed:
     return Placed(Mesh(pose(np.asarray(mesh.vertices)), mesh.faces), pose, moved, outwards)
 
 
-class Surface(NamedTuple):
+class Patches(NamedTuple):
     """Pieces of a surface, all about as small, however large its faces are; traced."""
 
     points: Float[Array, "pieces 3"]  # the centre of each
@@ -95,7 +96,7 @@ class Pieces(NamedTuple):
     piece: Int[np.ndarray, " samples"]  # number of the piece that it belongs to, ascending
     room: Bool[np.ndarray, " pieces"]  # of no other use than its length
 
-    def of(self, vertices: Float[Array, "vertices 3"]) -> Surface:
+    def of(self, vertices: Float[Array, "vertices 3"]) -> Patches:
         """The pieces for vertices anywhere."""
         a, b, c = (vertices[self.corners[:, corner]] for corner in range(3))
         shares = jnp.asarray(self.shares, vertices.dtype)
@@ -106,7 +107,7 @@ class Pieces(NamedTuple):
         columns = jnp.concatenate([area[:, None] * points, normals, area[:, None]], axis=1)
         sums = jax.ops.segment_sum(columns, self.piece, len(self.room), indices_are_sorted=True)
         total = jnp.maximum(sums[:, 6], _TINY)
-        return Surface(sums[:, :3] / total[:, None], sums[:, 3:6], total)
+        return Patches(sums[:, :3] / total[:, None], sums[:, 3:6], total)
 
 
 def cut(mesh: Mesh, width: float) -> Pieces:
@@ -115,7 +116,8 @@ def cut(mesh: Mesh, width: float) -> Pieces:
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     normals = np.cross(b - a, c - a)
     sizes = np.linalg.norm(normals, axis=1) / 2
-    faces, normals, sizes = (x[sizes > 0] for x in (faces, normals, sizes))
+    sound = sizes > 0
+    faces, normals, sizes = faces[sound], normals[sound], sizes[sound]
     count = np.maximum(np.ceil(sizes / (_PIECE_AREA * width**2)), 1).astype(np.int64)
     face = np.repeat(np.arange(len(faces)), count)
     number = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
@@ -151,7 +153,7 @@ class Anchors(NamedTuple):
     around: Int[np.ndarray, "anchors around"]  # numbers of the pieces around it; -1 for none
 
 
-def make_anchors(surface: Surface, width: float) -> Anchors:
+def make_anchors(surface: Patches, width: float) -> Anchors:
     """Find the lattice points near a surface, and the pieces around each.
 
     Args:
@@ -166,7 +168,7 @@ def make_anchors(surface: Surface, width: float) -> Anchors:
     near, _ = tree.query(cells * spacing, distance_upper_bound=0.75 * spacing)
     cells = cells[np.isfinite(np.asarray(near))]
     lists = tree.query_ball_point(cells * spacing, _CUT * _WIDER * width, workers=-1)
-    around = np.full((-(-len(cells) // 64) * 64, common_size(max(map(len, lists), default=1))), -1, np.int32)
+    around = np.full((-(-len(cells) // _ROUND) * _ROUND, common_size(max(map(len, lists), default=1))), -1, np.int32)
     for row, found in zip(around, lists, strict=False):
         row[: len(found)] = there[found]
     return Anchors(pad_rows(cells, len(around)), pad_rows(cells * spacing, len(around)), around)
@@ -181,7 +183,7 @@ class Shown(NamedTuple):
 
 @jax.jit
 def look(
-    surface: Surface,
+    surface: Patches,
     anchors: Anchors,
     shift: Float[Array, "anchors 3"],
     width: Float[Array, ""],
@@ -220,16 +222,28 @@ def look(
     return Shown(jnp.sum((close - far) * normal, axis=1), good)
 
 
+class Changes(NamedTuple):
+    """What a surface shows, and how that changes as it is moved and scaled by a little."""
+
+    shown: Shown
+    slope: Float[Array, "anchors 3"]  # of the values, as anchors move
+    growth: Float[Array, " anchors"]  # of the values, as anchors spread by a factor and the surface keeps its size
+
+
 @jax.jit
-def slopes(
-    surface: Surface, anchors: Anchors, width: Float[Array, ""], undone: Float[Array, ""]
-) -> tuple[Shown, Float[Array, "anchors 3"]]:
-    """What a surface shows, and how the values change as anchors move."""
+def changes(surface: Patches, anchors: Anchors, width: Float[Array, ""], undone: Float[Array, ""]) -> Changes:
+    """Look at a surface, and see how that changes as it is moved and scaled by a little.
+
+    Anchors that spread by a factor are the same as a surface that shrinks: averages widen, too, and the values are in
+    the larger unit.
+    """
+    nowhere = jnp.zeros(anchors.places.shape, surface.points.dtype)
 
     def total(shift: Float[Array, "anchors 3"]) -> tuple[Float[Array, ""], Shown]:
         shown = look(surface, anchors, shift, width, undone)
         return shown.values.sum(), shown
 
-    nowhere = jnp.zeros(anchors.places.shape, surface.points.dtype)
-    gradient, shown = jax.grad(total, has_aux=True)(nowhere)
-    return shown, gradient
+    slope, shown = jax.grad(total, has_aux=True)(nowhere)
+    _, widened = jax.jvp(lambda size: look(surface, anchors, nowhere, size, undone).values, (width,), (width,))
+    spread = jnp.sum(slope * jnp.asarray(anchors.places, slope.dtype), axis=1)
+    return Changes(shown, slope, spread + widened - shown.values)

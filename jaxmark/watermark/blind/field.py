@@ -20,10 +20,11 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces
 from jaxmark.watermark.blind.anchors import cut, encloses, look, make_anchors, place
 from jaxmark.watermark.blind.dither import Dither, make_dither
-from jaxmark.watermark.blind.reading import NAME, STEPS, WIDTHS, code_length, codeword, context, detect
+from jaxmark.watermark.blind.reading import NAME, STEPS, TAG_BITS, WIDTHS, code_length, codeword, context, detect
 from jaxmark.watermark.blind.writing import Shape, improve, measure
 from jaxmark.watermark.budget import Budget, Limits, Visibility, make_budget, visibility_of, write
-from jaxmark.watermark.coding.keys import Choices, Key, commitment
+from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key, commitment
+from jaxmark.watermark.coding.message import TAG_BITS as _TAG_BITS
 from jaxmark.watermark.hiding import hiding_directions
 from jaxmark.watermark.marking import DEFAULT_BITS, NOISE, EmbedInfo, Survival
 from jaxmark.watermark.payload import needed_energy
@@ -32,7 +33,9 @@ from jaxmark.watermark.record import Record, commit
 _LEAST_ALPHA = 0.6  # part of the way to the lattice that is gone at least; up to √2 of it, as steps are so far apart
 _FIRST_STEP = 0.05  # of the lattice of values, in widths, that is tried first
 _LEAST_AREA = 0.2  # of the mean: what vertices of smaller area count as
+_MIN_GAP = 0.02  # difference of the variances along two axes, over the largest, from which on they are told apart
 _ROUNDS = 2  # of Gauss and Newton
+_SPARE = 1.3  # energy that a width should leave, over what the payload needs
 _TRIED = (1.0, 0.7, 0.5, 0.3)  # shares of a predicted noise that are tried
 _SMOOTHED = 10  # steps of smoothing that widths are chosen by, besides noise
 
@@ -70,6 +73,12 @@ def make_host(original: Original, width: float) -> Host:
     """Look at an original by anchors of one width."""
     faces = np.asarray(original.points.faces)
     placed = place(Mesh(original.positions, faces))
+    variances = np.diag(placed.moments.covariance)
+    if (-np.diff(variances) < _MIN_GAP * variances[0]).any():
+        raise JaxmarkError(
+            "This shape is as wide in one direction as in another, or nearly, so that its pose cannot be told without"
+            " the original; use the scheme 'keyed'."
+        )
     closed, dtype = encloses(original.points), original.signal.dtype
     pieces = cut(Mesh(placed.pose(original.positions), faces), width)
     surface = pieces.of(jnp.asarray(placed.pose(original.positions), dtype))
@@ -91,14 +100,35 @@ def make_host(original: Original, width: float) -> Host:
     return Host(shape, np.asarray(shown.values, np.float64), pose, good, closed)
 
 
+class Plan(NamedTuple):
+    """How a mark is written in one original."""
+
+    width: float  # of the narrow Gaussian
+    step: float  # of the lattice of values
+    alpha: float  # part of the way to the lattice that is gone
+    host: Host
+    dither: Dither
+
+    def energy(self, spread: float) -> float:
+        """Predicted nρ², where ρ is the mean cosine of what n values are off, after something that spreads them.
+
+        What is off is uniform over the rest of the way, and then Gaussian.
+        """
+        kept = float(np.sinc(1 - min(self.alpha, 1.0))) * math.exp(-2 * (math.pi * spread / self.step) ** 2)
+        return self.host.size * kept**2
+
+
 class Written(NamedTuple):
     """A displacement that writes a codeword, as far as a budget allows."""
 
     mesh: Mesh
     moved: distortion.DisplacementSize
-    width: float
-    step: float
-    alpha: float  # part of the way to the lattice that was gone
+    plan: Plan
+
+
+def needed(bits: int) -> float:
+    """nρ² with which a payload is read: the energy that it needs with the longer tag of blind marks."""
+    return needed_energy(bits + TAG_BITS - _TAG_BITS) if bits else needed_energy(0)
 
 
 class Writer:
@@ -150,25 +180,57 @@ class Writer:
             moved = improve(host.shape, vertices, moved, self._free, self._mask, wanted, counted, closed=host.closed)
         return original.to_host(moved)
 
-    def write(self, word: Float64[np.ndarray, " code"], choices: Choices, budget: Budget) -> Written:
-        """Write a codeword with the width that is predicted to be read best, as far as a budget allows.
+    def plan(
+        self,
+        word: Float64[np.ndarray, " code"],
+        choices: Choices,
+        budget: Budget,
+        reference: distortion.Reference,
+        bits: int,
+    ) -> Plan:
+        """Choose the width that is predicted to be read best, and how strong a budget allows the mark to be.
+
+        Of the widths that leave room for the payload, the one of most energy after noise or smoothing is taken.
 
         Raises:
             JaxmarkError: if there is nothing to write in, or the budget allows not even the least step.
         """
-        reference = distortion.Reference(self.original.mesh)
         found = [self._try(width, word, choices, budget, reference) for width in self.scheme.widths]
         fitting = [one for one in found if one is not None]
         if not fitting:
             raise JaxmarkError(
-                "This mesh, or the budget for it, leaves the scheme 'field' nothing to write in: its surface has no"
-                " parts as smooth as that; use a larger budget, a smoother mesh or the scheme 'keyed'."
+                f"This mesh, or the budget for it, leaves the scheme {self.scheme.name!r} nothing to write in; use a"
+                " larger budget or the scheme 'keyed'."
             )
-        _, host, dither, width, step, alpha = max(fitting, key=lambda one: one[0])
-        targets = host.values - alpha * step * self.off(host, dither, word, step)
-        shift = self.shift(host, targets, _ROUNDS)
+        enough = _SPARE * needed(bits)
+        return max(fitting, key=lambda one: (one.energy(0.0) >= enough, min(self.energies(one))))
+
+    def write(
+        self,
+        word: Float64[np.ndarray, " code"],
+        choices: Choices,
+        budget: Budget,
+        bits: int,
+        reference: distortion.Reference | None = None,
+    ) -> Written:
+        """Write a codeword as far as a budget allows.
+
+        Args:
+            word: the code bits, ±1.
+            choices: the keyed choices.
+            budget: the bounds to keep.
+            bits: size of the payload in bits.
+            reference: what limits are measured against, if not the original.
+
+        Raises:
+            JaxmarkError: see `plan`.
+        """
+        reference = reference or distortion.Reference(self.original.mesh)
+        plan = self.plan(word, choices, budget, reference, bits)
+        targets = plan.host.values - plan.alpha * plan.step * self.off(plan.host, plan.dither, word, plan.step)
+        shift = self.shift(plan.host, targets, _ROUNDS)
         written = write(self.original, shift, budget, reference)
-        return Written(written.mesh, written.moved, width, step, alpha * written.scale)
+        return Written(written.mesh, written.moved, plan._replace(alpha=plan.alpha * written.scale))
 
     def _try(
         self,
@@ -177,8 +239,8 @@ class Writer:
         choices: Choices,
         budget: Budget,
         reference: distortion.Reference,
-    ) -> tuple[float, Host, Dither, float, float, float] | None:
-        """What a width promises, and the step and the part of the way that a budget allows with it."""
+    ) -> Plan | None:
+        """The step, and the part of the way, that a budget allows with a width; None if not even the least step."""
         host = self.host(width)
         if not host.size:
             return None
@@ -191,28 +253,38 @@ class Writer:
             return None
         allowed = first * write(self.original, shift, budget, reference).scale
         steps = [step for step in self.scheme.steps if allowed / step >= _LEAST_ALPHA]
-        if not steps:
-            return None
-        step = max(steps)
-        alpha = min(allowed / step, 1.0)
-        return min(self.energy(host, step, alpha)), host, dither, width, step, alpha
+        return Plan(width, max(steps), min(allowed / max(steps), 1.0), host, dither) if steps else None
 
-    def survives(self, written: Written, bits: int) -> Survival:
+    def energies(self, plan: Plan) -> tuple[float, float]:
+        """Predicted nρ² after each of the reference disturbances, see `Plan.energy`."""
+        noise, smoothing = self._spreads(plan.host)
+        return plan.energy(noise), plan.energy(smoothing)
+
+    def survives(self, plan: Plan, bits: int) -> Survival:
         """Predict the strongest noise in which a mark reads: until nρ² is what the payload needs; cut, it does not."""
-        host = self.host(written.width)
-        kept = host.size * np.sinc(1 - min(written.alpha, 1.0)) ** 2 / needed_energy(bits)
+        kept = plan.energy(0.0) / needed(bits)
         if kept <= 1:
             return Survival(0.0, 0.0)
-        spread = self._spreads(host)[0] / NOISE  # for each unit of noise
-        return Survival(float(written.step * math.sqrt(math.log(kept)) / (2 * math.pi * spread)), 0.0)
+        spread = self._spreads(plan.host)[0] / NOISE  # for each unit of noise
+        return Survival(float(plan.step * math.sqrt(math.log(kept)) / (2 * math.pi * spread)), 0.0)
 
-    def energy(self, host: Host, step: float, alpha: float) -> tuple[float, ...]:
-        """Predicted nρ² after each of the reference disturbances; ρ is the mean cosine of what is off."""
-        compensated = float(np.sinc(1 - alpha))
-        return tuple(
-            host.size * (compensated * math.exp(-2 * (math.pi * spread / step) ** 2)) ** 2
-            for spread in self._spreads(host)
-        )
+    def capacity(self, budget: Budget, noise: float) -> int:
+        """The largest payload in bits, a multiple of 8, that is predicted to read in noise; 0 if not even 8.
+
+        Args:
+            budget: bounds on the distortion by the mark.
+            noise: half width of uniform noise over the mean distance of the vertices to their centre.
+        """
+        choices = context(bytes(KEY_BYTES), DEFAULT_BITS)
+        word = codeword(bytes(DEFAULT_BITS // 8), choices)
+        try:
+            plan = self.plan(word, choices, budget, distortion.Reference(self.original.mesh), 0)
+        except JaxmarkError:
+            return 0
+        energy, bits = plan.energy(self._spreads(plan.host)[0] * noise / NOISE), 0
+        while needed(bits + 8) <= energy and code_length(bits + 8) <= plan.host.size:
+            bits += 8
+        return bits
 
     def _spreads(self, host: Host) -> tuple[float, float]:
         """Spread of the anchors' values by noise and by smoothing of the original; see `_disturbances`."""
@@ -260,13 +332,18 @@ class FieldMarker:
         visibility: Visibility | None = None,
         noise: float | None = None,
         read_back: bool = True,
+        reference: distortion.Reference | None = None,
     ) -> tuple[Mesh, EmbedInfo]:
-        """Embed a message of exactly the payload's size in the original; see `embed`."""
+        """Embed a message of exactly the payload's size in the original; see `embed`.
+
+        Pass `read_back=False` if you verify the written file yourself, and `reference` if limits are against another
+        mesh than the original.
+        """
         bounds = make_budget(budget, limits, visibility, named=visibility_of(self.original.mesh))
         choices = context(self.key, self.bits)
         word = codeword(message, choices)
-        written = self.writer.write(word, choices, bounds)
-        survives = self.writer.survives(written, self.bits)
+        written = self.writer.write(word, choices, bounds, self.bits, reference)
+        survives = self.writer.survives(written.plan, self.bits)
         if noise is not None and survives.whole < noise:
             raise JaxmarkError(
                 f"This mark would survive noise of {survives.whole:.2g}, not {noise:g}; use a larger budget, a shorter"
@@ -275,14 +352,14 @@ class FieldMarker:
         record = Record(
             scheme=self.scheme.name,
             bits=self.bits,
-            beta=written.alpha,
+            beta=float(written.plan.alpha),
             original="",
             key=commitment(self.key),
-            parameters={"width": written.width, "step": written.step},
+            parameters={"width": written.plan.width, "step": written.plan.step},
             content="message" if self.bits else "presence",
             told=commit(message, choices) if message else "",
         ).sealed(self.key)
-        info = EmbedInfo(written.moved.rms, written.moved.max, written.alpha * written.step, record, survives)
+        info = EmbedInfo(written.moved.rms, written.moved.max, record.beta, record, survives)
         if read_back:
             self.with_record(record).check(written.mesh, message)
         return written.mesh, info

@@ -13,6 +13,7 @@ a geometry in the key's choices, as their reader has no original.
 
 import math
 from collections.abc import Sequence
+from itertools import groupby
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -27,6 +28,7 @@ from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.search import TURNS, VIEWS_PER_WIDTH, View, moved, search, turned, views
 from jaxmark.watermark.coding.keys import Choices, Key, bind
 from jaxmark.watermark.coding.message import decode_any, encode
+from jaxmark.watermark.marking import CLAIM_SHARE
 from jaxmark.watermark.record import Record
 
 NAME = "field"
@@ -35,7 +37,9 @@ STEPS = tuple(1e-4 * 2 ** (rung / 2) for rung in range(11))  # of the lattice of
 TAG_BITS = 40
 _CODE_SPREAD = 2  # code bits for each bit of message and tag, at least
 _CHANGES = 2  # changes of pose that are read: none, and the best by the offsets
-_SURE = -12.0  # log10 of a probability from which on no other way of looking is tried
+_CANDIDATES = 16  # messages of each reading whose tags are tried
+# log10 of a probability from which on no other way of looking is tried, where a message reads and where none does.
+_SURE, _SURE_UNREAD = -12.0, -40.0
 
 
 class Reading(NamedTuple):
@@ -66,6 +70,11 @@ class BlindDetection(NamedTuple):
     version: int  # version of the keyed choices that were read with
     doubts: tuple[str, ...] = ()  # why the probabilities are estimates, not proofs; empty if they are proofs
     remarks: tuple[str, ...] = ()  # what else the suspect looks like
+
+    @property
+    def premises(self) -> str:
+        """What must have been fixed before the suspect existed; a mesh marked under the same key is no such suspect."""
+        return "key, message and record"
 
     def detected(self, alpha: float = 1e-6) -> bool:
         """Whether the false-positive probability is at most `alpha`, if all that is claimed is dated.
@@ -127,16 +136,13 @@ def detect(
     claimed = b"" if message is None and not bits else message
     tries = len(widths) * VIEWS_PER_WIDTH * len(TURNS) * len(steps) * _CHANGES
     best: BlindDetection | None = None
-    waiting: list[View] = []
-    for view in views(suspect, widths):
-        waiting.append(view)
-        if len(waiting) < len(widths) and view.undone == 0:
-            continue
-        readings = [one for view in waiting for one in _readings(view, choices, length, np.asarray(steps))]
-        waiting = []
-        found = _weigh(readings, choices, bits, claimed, record, tries)
+    before = 0  # messages whose tags were tried already
+    for _, group in groupby(views(suspect, widths), key=lambda view: view.undone):
+        readings = [one for view in group for one in _readings(view, choices, length, np.asarray(steps))]
+        found = _weigh(readings, choices, bits, claimed, record, tries, before)
+        before += len(readings) * _CANDIDATES
         best = found if best is None else min(best, found, key=lambda one: (one.message is None, one.log10_p))
-        if best.log10_p <= _SURE and (best.message is not None or claimed is not None):
+        if best.log10_p <= (_SURE if best.message is not None else _SURE_UNREAD):
             break
     assert best is not None
     return best
@@ -172,18 +178,21 @@ def _weigh(
     claimed: bytes | None,
     record: Record | None,
     tries: int,
+    before: int,
 ) -> BlindDetection:
-    """What readings prove, of so many that might have been tried."""
+    """What readings prove, of so many that might have been tried, after the tags of so many messages were tried."""
     if not readings:
         return _nothing(choices, code_length(bits))
     order = sorted(range(len(readings)), key=lambda place: -readings[place].pilot)
     readings = [readings[place] for place in order]
     soft = np.stack([one.soft for one in readings])
-    decoded = None if claimed == b"" else decode_any(soft, bits, choices, TAG_BITS)
-    fixed = claimed
+    decoded = None if claimed == b"" else decode_any(soft, bits, choices, TAG_BITS, _CANDIDATES)
+    told = record is not None and bool(record.told)
+    fixed, share = claimed, 1.0
     if decoded is not None and decoded.message != claimed:
-        told = record is not None and bool(record.told) and record.commits_to(decoded.message, choices)
-        fixed = decoded.message if told else None
+        fixed = decoded.message if told and record and record.commits_to(decoded.message, choices) else None
+    if claimed or told:  # what was fixed beforehand has nearly all of the probability, any other message the rest
+        share = CLAIM_SHARE if fixed is not None else 1 - CLAIM_SHARE
     if decoded is None and fixed is None:
         return _nothing(choices, code_length(bits), readings[0])
     message = fixed if fixed is not None else decoded.message if decoded is not None else b""
@@ -191,15 +200,15 @@ def _weigh(
     # Readings are compared by what their scores prove.
     score, norm = soft @ word, np.sqrt([one.square for one in readings])
     chosen = int(np.argmax(np.maximum(score, 0) / np.maximum(norm, 1e-300)))
-    paid = math.log10(tries)
+    paid = math.log2(tries)
     unknown = 0 if fixed is not None else bits
-    proofs = [min(0.0, evidence.log10_p_read(score[chosen], norm[chosen], unknown) + paid)]
+    proofs = [evidence.log10_p_read(score[chosen], norm[chosen], unknown + paid)]
     if decoded is not None and claimed is None:
-        proofs.append(evidence.log10_p_tag(TAG_BITS, decoded.rank))
-    late = min(0.0, evidence.log10_p_read(score[chosen], norm[chosen], bits) + paid)
+        proofs.append(evidence.log10_p_tag(TAG_BITS, before + decoded.rank))
+    late = evidence.log10_p_read(score[chosen], norm[chosen], bits + paid)
     reading = readings[chosen]
     remarks = []
-    if decoded is not None and claimed not in (None, decoded.message):
+    if fixed is None and (claimed or told):
         remarks.append(f"Another message of this key reads than the one {'claimed' if claimed else 'in the record'}.")
     if reading.view.undone:
         remarks.append(f"It was read after {reading.view.undone} steps of smoothing were undone.")
@@ -207,9 +216,9 @@ def _weigh(
         remarks.append("It is the mirror image of what was marked.")
     return _nothing(choices, len(word), reading)._replace(
         message=None if decoded is None else decoded.message,
-        log10_p=evidence.any_of(*proofs),
-        log10_p_undated=evidence.undated(late),
-        log10_p_fitted=min(0.0, evidence.log10_p_fitted(score[chosen], norm[chosen], unknown) + paid),
+        log10_p=evidence.share_of(evidence.any_of(*proofs), share),
+        log10_p_undated=evidence.undated(evidence.share_of(late, share)),
+        log10_p_fitted=evidence.log10_p_fitted(score[chosen], norm[chosen], unknown + paid),
         agreement=float(score[chosen] / reading.anchors),
         remarks=tuple(remarks),
     )

@@ -18,7 +18,7 @@ from jaxmark.geometry.pose import Pose
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.precision import matmul
 from jaxmark.spectral.shapes import common_laplacian, pad_rows
-from jaxmark.watermark.blind.anchors import cut, make_anchors, place, slopes
+from jaxmark.watermark.blind.anchors import changes, cut, make_anchors, place
 
 _UNDONE_STEPS = (0, 10, 30, 50)  # of smoothing, by a tenth of the way to the neighbours' mean each
 _BLURS = (0.0, 0.2)  # of a suspect as it is, in shares of the narrow Gaussian's variance
@@ -43,7 +43,7 @@ class View(NamedTuple):
     cells: Int64[np.ndarray, "anchors 3"]  # indices of the anchors in the lattice, as the suspect lies
     values: Float[Array, " anchors"]
     good: Bool[np.ndarray, " anchors"]  # whether an anchor counts; padding does not
-    changes: Float[Array, "anchors seven"]  # of the values by turns about the axes, shifts along them, and growth
+    changes: Float[Array, "anchors seven"]  # of the values, by turns about the axes, shifts along them, and growth
     width: float  # of the narrow Gaussian
     pose: Pose  # from the suspect's file to where it was looked at
     undone: int  # steps of smoothing that were undone
@@ -91,12 +91,11 @@ def views(suspect: Mesh, widths: Sequence[float]) -> Iterator[View]:
             surface = surface._replace(normals=surface.normals * placed.outwards)
             anchors = make_anchors(surface, width)
             for blur in _BLURS if steps == 0 else _BLURS[:1]:
-                shown, slope = slopes(surface, anchors, jnp.asarray(width, dtype), jnp.asarray(blur, dtype))
+                found = changes(surface, anchors, jnp.asarray(width, dtype), jnp.asarray(blur, dtype))
                 at = jnp.asarray(anchors.places, dtype)
-                growth = jnp.sum(slope * at, axis=1, keepdims=True) - shown.values[:, None]
-                changes = jnp.concatenate([jnp.cross(at, slope), slope, growth], axis=1)
-                good = np.asarray(shown.good) & (anchors.around[:, 0] >= 0)
-                yield View(anchors.cells, shown.values, good, changes, width, placed.pose, steps)
+                by = jnp.concatenate([jnp.cross(at, found.slope), found.slope, found.growth[:, None]], axis=1)
+                good = np.asarray(found.shown.good) & (anchors.around[:, 0] >= 0)
+                yield View(anchors.cells, found.shown.values, good, by, width, placed.pose, steps)
 
 
 class Found(NamedTuple):

@@ -77,11 +77,15 @@ def decode(scores: Float[np.ndarray, " length"], bits: int, choices: Choices) ->
         bits: size of the payload in bits.
         choices: the keyed choices of the mark.
     """
-    return decode_any(scores[None], bits, choices)
+    return decode_any(scores[None], bits, choices, TAG_BITS, CANDIDATES)
 
 
 def decode_any(
-    scores: Float[np.ndarray, "rows length"], bits: int, choices: Choices, tag_bits: int = TAG_BITS
+    scores: Float[np.ndarray, "rows length"],
+    bits: int,
+    choices: Choices,
+    tag_bits: int,
+    candidates: int,
 ) -> Decoded | None:
     """Decode the first message whose keyed tag fits, of several readings: their most plausible messages come first.
 
@@ -90,18 +94,18 @@ def decode_any(
         bits: size of the payload in bits.
         choices: the keyed choices of the mark.
         tag_bits: size of the tag.
+        candidates: number of messages of each reading whose tags are tried.
     """
-    if bits == 0:
+    rows = np.flatnonzero(np.any(scores, axis=1))
+    if bits == 0 or not len(rows):
         return None
-    rank = 0
-    for words in np.swapaxes(_list_candidates(scores, bits + tag_bits), 0, 1):
-        for row, word in enumerate(words):
-            if not np.any(scores[row]):
-                continue
-            rank += 1
-            message = np.packbits(word[:bits]).tobytes()
-            if np.array_equal(word[bits:], _tag(message, choices, tag_bits)):
-                return Decoded(message, rank, row)
+    words = _list_candidates(scores[rows], bits + tag_bits, candidates)
+    words = np.swapaxes(words, 0, 1).reshape(-1, bits + tag_bits)
+    messages, tags = np.packbits(words[:, :bits], axis=1), np.packbits(words[:, bits:], axis=1)
+    for rank, (message, tag) in enumerate(zip(messages, tags, strict=True), 1):
+        said = message.tobytes()
+        if tag.tobytes() == np.packbits(_tag(said, choices, tag_bits)).tobytes():
+            return Decoded(said, rank, int(rows[(rank - 1) % len(rows)]))
     return None
 
 
@@ -117,15 +121,15 @@ def guess(scores: Float[np.ndarray, " length"], bits: int) -> bytes | None:
     """
     if not np.any(scores):
         return None
-    return np.packbits(_list_candidates(scores[None], bits + TAG_BITS)[0, 0, :bits]).tobytes()
+    return np.packbits(_list_candidates(scores[None], bits + TAG_BITS, CANDIDATES)[0, 0, :bits]).tobytes()
 
 
 def _list_candidates(
-    scores: Float[np.ndarray, "rows length"], information: int
+    scores: Float[np.ndarray, "rows length"], information: int, candidates: int
 ) -> Int8[np.ndarray, "rows candidates information"]:
     """List messages with their tags for each reading, the most plausible first."""
     size = np.abs(scores).max(axis=1, keepdims=True)
-    return polar.decode(scores / np.where(size > 0, size, 1), information, CANDIDATES)
+    return polar.decode(scores / np.where(size > 0, size, 1), information, candidates)
 
 
 def _tag(message: bytes, choices: Choices, tag_bits: int) -> np.ndarray:

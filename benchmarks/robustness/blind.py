@@ -1,0 +1,191 @@
+"""Marks that are read without their originals, after attacks: python benchmarks/robustness/blind.py MESH...
+
+With each of --keys keys, 64 bits are written with the scheme `field` within --limits: the two of the protocol of SMI
+2010 (see smi2010.py), or hidden as by default. Each suspect is read with key and suspect alone. A table for each mesh
+has a line for each attack, written as soon as it is known:
+
+read        in how many of the copies the exact message was read
+log10 p     of the false-positive probability, the worst and the best of the copies
+agreement   mean cosine of the anchors' phases, the least of the copies
+seconds     of the slowest reading
+predicted   nρ² after the attack, by the unmarked mesh: n anchors are found, ρ is the mean cosine that is left of them
+
+For the prediction, the unmarked mesh is attacked, and its anchors' values, after the best small change of pose, are
+compared with those that they had: with σ the root mean square of their changes and α the part of the way to the lattice
+that the mark went, ρ = sinc(1 - α) exp(-2 (πσ/step)²), times the share of the suspect's anchors that were there before.
+The best of all ways of looking at the suspect counts, as it does for the reader. What 64 bits and their tag need of it
+by the capacity of many weak anchors is printed above the table; few good ones get by with less. Below the table are
+controls: the unmarked mesh, attacked or not, and the marked ones under other keys.
+"""
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+import jaxmark as jm
+from jaxmark.geometry.mesh import Mesh, weld
+from jaxmark.watermark.blind.field import FieldScheme
+from jaxmark.watermark.blind.reading import TAG_BITS, WIDTHS
+from jaxmark.watermark.blind.search import TURNS, View, views
+from jaxmark.watermark.marking import EmbedInfo
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from common.arguments import add_meshes, load, make_parser
+from common.attacks import attacked
+from common.marks import MESSAGE
+from common.tables import head, line
+
+LIMITS: dict[str, dict[str, float] | None] = {
+    "perceptual": {"msdm": 0.20, "mrms": 8e-4},
+    "geometric": {"msdm": 0.30, "mrms": 2e-4},
+    "hidden": None,
+}
+ATTACKS = """none; noise 0.001; noise 0.003; noise 0.005; smoothing 10; smoothing 30; smoothing 50; quantisation 9;
+quantisation 8; quantisation 7; midpoint 1; sqrt3 1; loop 1; simplification 0.9; simplification 0.95;
+simplification 0.975; isotropic 1; isotropic 2; iso-surface 100; similarity 3; bending 5;
+cropping 0.1"""
+CONTROLS = ("none", "noise 0.005")  # what the unmarked mesh goes through
+NAMES = ("read", "log10 p", "agreement", "seconds")
+NEEDED = math.log(2) * (8 * len(MESSAGE) + TAG_BITS)  # of nρ², by the capacity where ρ is small: nρ² nats
+
+
+class Copy(NamedTuple):
+    """A mesh that was marked with a key, and how."""
+
+    key: bytes
+    marked: Mesh
+    info: EmbedInfo
+    scheme: FieldScheme
+
+
+class Cell(NamedTuple):
+    """What one reading gave."""
+
+    read: bool
+    log10_p: float
+    agreement: float
+    seconds: float
+
+
+def read(suspect: Mesh, key: bytes, scheme: FieldScheme) -> Cell:
+    """Read by the key and the suspect alone."""
+    start = time.perf_counter()
+    try:
+        found = jm.detect(suspect, key=key, scheme=scheme)
+    except jm.JaxmarkError:
+        return Cell(False, 0.0, 0.0, time.perf_counter() - start)
+    return Cell(found.message == MESSAGE, found.log10_p, found.agreement, time.perf_counter() - start)
+
+
+def left(before: View, after: View, step: float) -> float:
+    """Sum of the cosines that an attack leaves of anchors exactly on the lattice, after the best small change of pose.
+
+    The shape may look the other way along its axes: the way that leaves most counts.
+    """
+    known = {tuple(before.cells[one]): float(before.values[one]) for one in np.flatnonzero(before.good)}
+    best = 0.0
+    for turn in TURNS[:4]:
+        rows = [one for one in np.flatnonzero(after.good) if tuple(after.cells[one] * turn) in known]
+        slopes = np.asarray(after.changes, np.float64)[rows]
+        freedom = len(rows) - slopes.shape[1]
+        if freedom <= 0:
+            continue
+        moved = [float(after.values[one]) - known[tuple(after.cells[one] * turn)] for one in rows]
+        off = np.array(moved) - slopes @ np.linalg.lstsq(slopes, np.array(moved), rcond=None)[0]
+        best = max(best, len(rows) * math.exp(-2 * (math.pi / step) ** 2 * float(off @ off) / freedom))
+    return best
+
+
+def predict(mesh: Mesh, steps: str, info: EmbedInfo) -> float:
+    """Predicted nρ² of a mark after an attack, by what the attack does to the unmarked mesh."""
+    width, step = info.record.parameters["width"], info.record.parameters["step"]
+    before = next(views(mesh, [width]))
+    compensated = np.sinc(1 - min(info.record.beta, 1.0))
+    found = [(left(before, after, step), after.good.sum()) for after in views(attacked(mesh, steps, 0), [width])]
+    return max(float((compensated * cosines) ** 2 / max(count, 1)) for cosines, count in found)
+
+
+def row(name: str, cells: list[Cell], *more: object) -> str:
+    """A line of the table: of an attack and its strength, or a control."""
+    p = [f"{worst(one.log10_p for one in cells):.0f}" for worst in (max, min)]
+    return line(
+        name,
+        f"{sum(cell.read for cell in cells)}/{len(cells)}",
+        " … ".join(dict.fromkeys(p)),
+        f"{min(cell.agreement for cell in cells):.2f}",
+        f"{max(cell.seconds for cell in cells):.0f}",
+        *more,
+    )
+
+
+def copies(mesh: Mesh, scheme: FieldScheme, limits: dict[str, float] | None, count: int) -> Iterator[Copy]:
+    """Mark a mesh with several keys, and say how."""
+    for seed in range(count):
+        key, start = np.random.default_rng([seed, 64]).bytes(32), time.perf_counter()
+        marked, info = jm.embed(mesh, MESSAGE, key, scheme=scheme, limits=limits)
+        seconds, found = time.perf_counter() - start, jm.compare(mesh, marked, ("mrms", "msdm"))
+        print(
+            f"Key {seed}: RMS {info.rms:.2e}, MRMS {found.mrms:.2e}, MSDM {found.msdm:.3f}, width"
+            f" {info.record.parameters['width']}, step {info.record.parameters['step']:.2e}, α {info.record.beta:.2f},"
+            f" predicted to survive noise {info.survives.whole:.4f}, {seconds:.0f} s.",
+            flush=True,
+        )
+        yield Copy(key, marked, info, scheme)
+
+
+def measure(mesh: Mesh, marked: list[Copy], attacks: list[str]) -> None:
+    """Attack what was marked, read it, and print a table."""
+    print(f"\n{head('attack', *NAMES, 'predicted')}", flush=True)
+    for steps in attacks:
+        try:
+            cells = [read(attacked(one.marked, steps, seed), one.key, one.scheme) for seed, one in enumerate(marked)]
+            predicted = predict(mesh, steps, marked[0].info)
+        except jm.JaxmarkError as refusal:
+            print(line(steps, f"failed: {refusal}"), flush=True)
+            continue
+        print(row(steps, cells, f"{predicted:.0f}"), flush=True)
+
+
+def control(mesh: Mesh, marked: list[Copy]) -> None:
+    """Read what nobody should find a mark in, and print a table."""
+    print(f"\n{head('control', *NAMES)}")
+    for steps in CONTROLS:
+        cells = [read(attacked(mesh, steps, seed), one.key, one.scheme) for seed, one in enumerate(marked)]
+        print(row(f"unmarked, {steps}", cells), flush=True)
+    cells = [read(one.marked, bytes(reversed(one.key)), one.scheme) for one in marked]
+    print(row("another key", cells), flush=True)
+
+
+def main() -> None:
+    """Mark, attack, read, and print the tables."""
+    parser = make_parser(__doc__)
+    add_meshes(parser)
+    parser.add_argument("--keys", type=int, default=2, help="keys, each with attacks of its own; %(default)s")
+    parser.add_argument("--limits", choices=LIMITS, default="perceptual", help="%(default)s")
+    parser.add_argument("--widths", type=float, nargs="+", default=WIDTHS, help="of the scheme; %(default)s")
+    parser.add_argument("--attacks", default=ATTACKS, help="kinds and strengths; %(default)s")
+    parser.add_argument("--controls", action=argparse.BooleanOptionalAction, default=True)
+    options = parser.parse_args()
+    for path in options.meshes:
+        mesh = load(parser, path)
+        points = len(weld(mesh.vertices).first)
+        print(f"\n## {path.name}, {points:,} points, {options.limits} limits\n")
+        print(f"{8 * len(MESSAGE)} bits and their tag need nρ² of about {NEEDED:.0f}.\n", flush=True)
+        try:
+            marked = list(copies(mesh, FieldScheme(tuple(options.widths)), LIMITS[options.limits], options.keys))
+        except jm.JaxmarkError as refusal:
+            print(f"Not marked: {refusal}", flush=True)
+            continue
+        measure(mesh, marked, " ".join(options.attacks.split()).split("; "))
+        if options.controls:
+            control(mesh, marked)
+
+
+if __name__ == "__main__":
+    main()
