@@ -34,8 +34,7 @@ from jaxmark.geometry.mesh import Mesh, diagonal
 from jaxmark.watermark import evidence
 from jaxmark.watermark.blind import reading
 from jaxmark.watermark.blind.dither import make_dither
-from jaxmark.watermark.blind.field import FieldScheme, Host, Writer
-from jaxmark.watermark.budget import make_budget
+from jaxmark.watermark.blind.field import FieldScheme, Host, Writer, make_field_marker
 from jaxmark.watermark.marking import EmbedInfo
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -290,14 +289,13 @@ def version(mesh: Mesh, seed: int) -> Mesh:
 
 def versions(work: Marked, count: int) -> Iterator[Seen]:
     """Versions of a work, marked as strongly as it is under its key, each with a message of its own."""
-    choices, budget = reading.context(KEY, 8 * len(MESSAGE)), make_budget(work.info.rms)
     for number in range(count):
-        original = make_original(version(work.mesh, number + 1))
-        writer = Writer(original, FieldScheme((work.width,), (work.step,)))
         message = np.random.default_rng(number).bytes(len(MESSAGE))
-        written = writer.write(reading.codeword(message, choices), choices, budget)
-        say(f"version {number}: alpha {written.alpha:.2f}")
-        yield look(written.mesh, work.width, work.step)
+        scheme = FieldScheme((work.width,), (work.step,))
+        marker = make_field_marker(version(work.mesh, number + 1), KEY, bits=8 * len(message), scheme=scheme)
+        marked, info = marker.embed(message, work.info.rms, read_back=False)
+        say(f"version {number}: alpha {info.record.beta:.2f}")
+        yield look(marked, work.width, work.step)
 
 
 def lattice_of(works: Sequence[Seen], cells: Int64[np.ndarray, "cells 3"]) -> Float64[np.ndarray, " cells"]:
