@@ -14,7 +14,7 @@ from jaxmark.alignment.original import make_original
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.moments import surface_moments, volume_moments
 from jaxmark.spectral.graphs import from_mesh
-from jaxmark.watermark import EmbedInfo, FieldScheme, evidence
+from jaxmark.watermark import EmbedInfo, FieldScheme
 from jaxmark.watermark.blind import reading
 from jaxmark.watermark.blind.anchors import cut, look, make_anchors, place
 from jaxmark.watermark.blind.dither import make_dither
@@ -263,23 +263,3 @@ def test_commands_without_the_original(shape: Mesh, tmp_path: Path, monkeypatch,
     assert workshop("detect", "model.ply", *key, *record)[0] == 1
     assert "give --original" in workshop.refused("detect", "marked.ply", *key, "--align", "same")
     assert "give --original" in workshop.refused("detect", "marked.ply", *key, "--scheme", "keyed")
-
-
-@pytest.mark.parametrize("climbed", [False, True])
-def test_the_bound_holds_for_whatever_the_offsets_choose(climbed: bool):
-    """Suspects that are independent of the signs, but may know the offsets: all phases at δ or half a step beside it.
-
-    As a control, the bound with the number of anchors in the denominator would not hold for these.
-    """
-    rng, pairs, anchors = np.random.default_rng(0), 200_000, 64
-    cosine = np.sign(rng.uniform(-1, 1, (pairs, anchors)))
-    if not climbed:
-        cosine = np.cos(2 * np.pi * rng.uniform(size=(pairs, anchors)))
-    score = np.sum(rng.choice([-1.0, 1.0], (pairs, anchors)) * cosine, axis=1)
-    norm = np.linalg.norm(cosine, axis=1)
-    for nominal in (0.1, 0.01, 0.001):
-        least = np.sqrt(-2 * np.log(nominal))  # of score over norm: see `log10_p_claimed`, which takes one pair
-        assert evidence.log10_p_claimed(least, 1.0) == pytest.approx(np.log10(nominal), abs=1e-6)
-        assert np.mean(score >= least * norm) <= nominal
-        counted = np.mean(score >= np.sqrt(-anchors * np.log(nominal)))
-        assert (counted > nominal) == (climbed and nominal < 0.1)
