@@ -13,8 +13,9 @@ from jaxmark.alignment import make_original
 from jaxmark.app.demo import sample_mesh
 from jaxmark.plot.figures import COLOURS, Picture, finish, panels
 from jaxmark.watermark.blind.dither import make_dither
-from jaxmark.watermark.blind.field import FieldScheme, Host, make_host
+from jaxmark.watermark.blind.field import FieldScheme
 from jaxmark.watermark.blind.reading import codeword, context
+from jaxmark.watermark.blind.scheme import Host
 
 MESSAGE = b"jaxmark!"
 SCHEME = FieldScheme(widths=(0.018,))  # one of three widths, so that this takes a minute; usually "field" will do
@@ -43,7 +44,7 @@ for name, suspect in suspects.items():
     found = jm.detect(suspect, key=key, scheme=SCHEME)
     print(f"{name:<51} {found.message!r} log10 p {found.log10_p:6.1f}  agreement {found.agreement:.2f}")
     assert found.message == MESSAGE
-known = FieldScheme((width,), (step,))  # less to try
+known = SCHEME.fixed(width, step)  # less to try
 for name, suspect, tried in (("unmarked", mesh, key), ("marked, another key", marked, jm.new_key())):
     found = jm.detect(suspect, key=tried, scheme=known)
     print(f"{name:<51} detected: {found.detected()}")
@@ -58,16 +59,18 @@ for name, suspect, tried in (("unmarked", mesh, key), ("marked, another key", ma
 
 
 # %%
+choices = context(key, 8 * len(MESSAGE), SCHEME.name)
+
+
 def phases(host: Host) -> np.ndarray:
     """How far each value is from what key and message allow, in steps."""
-    choices = context(key, 8 * len(MESSAGE))
     word = codeword(MESSAGE, choices)
-    dither = make_dither(choices, host.shape.anchors.cells, len(word))
+    dither = make_dither(choices, SCHEME.name, host.names, len(word))
     off = (host.values / step - dither.offset - np.where(dither.sign * word[dither.slot] < 0, 0.5, 0))[host.good > 0]
     return off - np.round(off)
 
 
-before, after = (phases(make_host(make_original(one), width)) for one in (mesh, marked))
+before, after = (phases(SCHEME.host(make_original(one), width, choices)) for one in (mesh, marked))
 figure, axes = panels(2, 4.5, 3.0, sharey=True)
 for panel, title, off in zip(axes, ("original", "marked"), (before, after), strict=True):
     panel.hist(off, bins=np.linspace(-0.5, 0.5, 41), color=COLOURS[0])

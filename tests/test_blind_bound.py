@@ -56,7 +56,7 @@ def test_the_number_of_anchors_as_denominator_breaks_where_a_search_climbed():
 
 def test_offsets_are_uniform_and_signs_fair_and_independent_of_them():
     cells = np.stack(np.meshgrid(*[np.arange(-7, 7)] * 3), axis=-1).reshape(-1, 3)
-    dither = make_dither(context(bytes(32), 64), cells, 256)
+    dither = make_dither(context(bytes(32), 64, "field"), "field", cells, 256)
     count = len(cells)
     assert 0 <= dither.offset.min() < 0.005
     assert 0.495 < dither.offset.max() < 0.5

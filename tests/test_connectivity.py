@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 import jaxmark as jm
-from jaxmark.geometry.connectivity import _MIN_RINGS, _Rings, matching_vertices
+from jaxmark.geometry.connectivity import _MIN_RINGS, Rings, matching_vertices
 from jaxmark.geometry.mesh import Mesh, boundary_vertices, edges, make_mesh
 from tests.meshes import shared_mesh
 from tests.samples import bumpy_sphere, exact_sheet
@@ -96,7 +96,7 @@ def test_colours_tell_apart_what_their_definition_does():
     near = [np.concatenate([pairs[pairs[:, 0] == v, 1], pairs[pairs[:, 1] == v, 0]]) for v in range(size)]
     incident = np.bincount(np.ravel(mesh.faces), minlength=size)
     expected = [(len(near[v]), int(incident[v])) for v in range(size)]
-    rings = _Rings(mesh)
+    rings = Rings(mesh)
     for _ in range(_MIN_RINGS + 2):
         expected = [(expected[v], tuple(sorted(expected[u] for u in near[v]))) for v in range(size)]
         names = {name: place for place, name in enumerate(dict.fromkeys(expected))}

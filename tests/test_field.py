@@ -18,10 +18,11 @@ from jaxmark.watermark import EmbedInfo, FieldScheme
 from jaxmark.watermark.blind import reading
 from jaxmark.watermark.blind.anchors import cut, look, make_anchors, place
 from jaxmark.watermark.blind.dither import make_dither
-from jaxmark.watermark.blind.field import Writer, make_host
+from jaxmark.watermark.blind.field import TURNS, unsmoothed
 from jaxmark.watermark.blind.reading import context
-from jaxmark.watermark.blind.search import TURNS, moved, unsmoothed, views
-from jaxmark.watermark.blind.writing import measure
+from jaxmark.watermark.blind.scheme import measure
+from jaxmark.watermark.blind.search import moved
+from jaxmark.watermark.blind.writing import Writer
 from tests.samples import bumpy_sphere
 from tests.test_cli import MESSAGE as CLI_MESSAGE
 from tests.test_cli import Workshop
@@ -29,6 +30,7 @@ from tests.test_cli import Workshop
 MESSAGE = bytes.fromhex("c0ffee42")
 WIDTH = 0.025
 SCHEME = FieldScheme(widths=(WIDTH,))
+CHOICES = context(bytes(range(32)), 32, "field")
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +104,7 @@ def test_values_do_not_depend_on_the_meshing_nor_on_the_pose(shape: Mesh, other:
 
 @pytest.mark.parametrize("axis", range(7))
 def test_changes_of_pose_are_derivatives(shape: Mesh, axis: int):
-    view = next(views(shape, (WIDTH,)))
+    view = next(SCHEME.views(shape, CHOICES))
     change = 1e-3 * np.eye(7)[axis]
     points = np.asarray(place(shape).mesh.vertices)
     # The suspect lies off by the inverse of the change, so that anchors see what they would after it.
@@ -115,26 +117,26 @@ def test_changes_of_pose_are_derivatives(shape: Mesh, axis: int):
 
 def test_the_displacement_gives_anchors_their_values_and_keeps_the_pose(shape: Mesh):
     original = make_original(shape)
-    host = make_host(original, 2 * WIDTH)
+    host = SCHEME.host(original, 2 * WIDTH, CHOICES)
     wanted = host.values + 2e-4 * np.random.default_rng(0).uniform(-1, 1, len(host.values))
-    shift = Writer(original, SCHEME).shift(host, wanted, 2)
+    shift = Writer(original, SCHEME, CHOICES).shift(host, wanted, 2)
     points = original.to_traced(original.positions + shift)
-    values, pose = measure(host.shape, points, closed=True)
+    values, pose = measure(host.shape, points)
     good = host.good > 0
     assert np.abs(np.asarray(values) - wanted)[good].max() < 1e-5
-    np.testing.assert_allclose(pose, host.pose, atol=1e-6)
+    np.testing.assert_allclose(pose, host.held, atol=1e-6)
     assert np.sqrt(np.mean(np.sum(shift**2, axis=1))) < 2e-4
 
 
 def test_measuring_has_derivatives(shape: Mesh, dtype: np.dtype):
     """Along the normals, against differences."""
     original = make_original(shape)
-    host = make_host(original, 2 * WIDTH)
+    host = SCHEME.host(original, 2 * WIDTH, CHOICES)
     points = original.to_traced(original.positions)
     along = jnp.asarray(np.random.default_rng(0).normal(size=points.shape), dtype)
 
     def total(size: jax.Array) -> jax.Array:
-        values, _ = measure(host.shape, points + size * along, closed=True)
+        values, _ = measure(host.shape, points + size * along)
         return jnp.sum(jnp.where(host.good > 0, values, 0) ** 2)
 
     step = dtype.type(1e-4 if dtype == np.float32 else 1e-6)
@@ -147,15 +149,15 @@ def test_measuring_has_derivatives(shape: Mesh, dtype: np.dtype):
 def test_choices_of_cells(key: jm.Key):
     """Each cell has its own, uniform and independent as far as a thousand of them tell."""
     cells = np.array([[x, y, z] for x in range(-5, 5) for y in range(-5, 5) for z in range(-5, 5)])
-    found = make_dither(context(key, 32), cells, 128)
+    found = make_dither(CHOICES, "field", cells, 128)
     assert 0 <= found.offset.min() <= found.offset.max() < 0.5
     assert abs(found.offset.mean() - 0.25) < 0.02
     assert abs(found.sign.mean()) < 0.12
     assert abs(np.corrcoef(found.offset, found.sign)[0, 1]) < 0.12
     assert np.bincount(found.slot, minlength=128).max() < 25
-    some = make_dither(context(key, 32), cells[::-1][:10], 128)
+    some = make_dither(CHOICES, "field", cells[::-1][:10], 128)
     np.testing.assert_array_equal(some.offset, found.offset[::-1][:10])
-    assert not np.array_equal(make_dither(context(key, 64), cells, 128).offset, found.offset)
+    assert not np.array_equal(make_dither(context(key, 64, "field"), "field", cells, 128).offset, found.offset)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -199,7 +201,7 @@ def test_nothing_is_detected_where_nothing_is(shape: Mesh, marked, key: jm.Key, 
     mesh, info = marked
     assert not jm.detect(shape, key=key, message=claimed, record=info.record).detected(1e-3)
     step = info.record.parameters["step"]
-    assert not reading.detect(mesh, jm.Key(bytes(32)), 32, claimed, None, (0.025,), (step,)).detected(1e-3)
+    assert not reading.detect(mesh, jm.Key(bytes(32)), 32, SCHEME.fixed(WIDTH, step), claimed).detected(1e-3)
 
 
 @pytest.mark.slow

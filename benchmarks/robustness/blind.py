@@ -1,6 +1,6 @@
 """Marks that are read without their originals, after attacks: python benchmarks/robustness/blind.py MESH...
 
-With each of --keys keys, 64 bits are written with the scheme `field` within --limits: the two of the protocol of SMI
+With each of --keys keys, 64 bits are written with --scheme within --limits: the two of the protocol of SMI
 2010 (see smi2010.py), or hidden as by default. Each suspect is read with key and suspect alone. A table for each mesh
 has a line for each attack, written as soon as it is known:
 
@@ -30,9 +30,9 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh, weld
-from jaxmark.watermark.blind.field import FieldScheme
-from jaxmark.watermark.blind.reading import TAG_BITS, WIDTHS
-from jaxmark.watermark.blind.search import TURNS, View, views
+from jaxmark.watermark.blind.reading import TAG_BITS, context
+from jaxmark.watermark.blind.scheme import BlindScheme, View
+from jaxmark.watermark.everyday import BLIND_SCHEMES
 from jaxmark.watermark.marking import EmbedInfo
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -49,7 +49,7 @@ LIMITS: dict[str, dict[str, float] | None] = {
 ATTACKS = """none; noise 0.001; noise 0.003; noise 0.005; smoothing 10; smoothing 30; smoothing 50; quantisation 9;
 quantisation 8; quantisation 7; midpoint 1; sqrt3 1; loop 1; simplification 0.9; simplification 0.95;
 simplification 0.975; isotropic 1; isotropic 2; iso-surface 100; similarity 3; bending 5;
-cropping 0.1"""
+cropping 0.1; cropping 0.5; cropping 0.7; region-cropping 0.5; region-cropping 0.7"""
 CONTROLS = ("none", "noise 0.005")  # what the unmarked mesh goes through
 NAMES = ("read", "log10 p", "agreement", "seconds")
 NEEDED = math.log(2) * (8 * len(MESSAGE) + TAG_BITS)  # of nρ², by the capacity where ρ is small: nρ² nats
@@ -61,7 +61,7 @@ class Copy(NamedTuple):
     key: bytes
     marked: Mesh
     info: EmbedInfo
-    scheme: FieldScheme
+    scheme: BlindScheme
 
 
 class Cell(NamedTuple):
@@ -73,7 +73,7 @@ class Cell(NamedTuple):
     seconds: float
 
 
-def read(suspect: Mesh, key: bytes, scheme: FieldScheme) -> Cell:
+def read(suspect: Mesh, key: bytes, scheme: BlindScheme) -> Cell:
     """Read by the key and the suspect alone."""
     start = time.perf_counter()
     try:
@@ -84,30 +84,32 @@ def read(suspect: Mesh, key: bytes, scheme: FieldScheme) -> Cell:
 
 
 def left(before: View, after: View, step: float) -> float:
-    """Sum of the cosines that an attack leaves of anchors exactly on the lattice, after the best small change of pose.
+    """Sum of the cosines that an attack leaves of anchors exactly on the lattice, after the best small change.
 
     The shape may look the other way along its axes: the way that leaves most counts.
     """
-    known = {tuple(before.cells[one]): float(before.values[one]) for one in np.flatnonzero(before.good)}
+    known = {tuple(before.names[0, one]): float(before.values[one]) for one in np.flatnonzero(before.good)}
     best = 0.0
-    for turn in TURNS[:4]:
-        rows = [one for one in np.flatnonzero(after.good) if tuple(after.cells[one] * turn) in known]
+    for names, mirrored in zip(after.names, after.mirrored, strict=True):
+        rows = [one for one in np.flatnonzero(after.good) if not mirrored and tuple(names[one]) in known]
         slopes = np.asarray(after.changes, np.float64)[rows]
         freedom = len(rows) - slopes.shape[1]
         if freedom <= 0:
             continue
-        moved = [float(after.values[one]) - known[tuple(after.cells[one] * turn)] for one in rows]
-        off = np.array(moved) - slopes @ np.linalg.lstsq(slopes, np.array(moved), rcond=None)[0]
+        moved = np.array([float(after.values[one]) - known[tuple(names[one])] for one in rows])
+        off = moved + slopes @ np.linalg.lstsq(slopes, -moved, rcond=None)[0]
         best = max(best, len(rows) * math.exp(-2 * (math.pi / step) ** 2 * float(off @ off) / freedom))
     return best
 
 
-def predict(mesh: Mesh, steps: str, info: EmbedInfo) -> float:
+def predict(mesh: Mesh, steps: str, one: Copy) -> float:
     """Predicted nρ² of a mark after an attack, by what the attack does to the unmarked mesh."""
-    width, step = info.record.parameters["width"], info.record.parameters["step"]
-    before = next(views(mesh, [width]))
-    compensated = np.sinc(1 - min(info.record.beta, 1.0))
-    found = [(left(before, after, step), after.good.sum()) for after in views(attacked(mesh, steps, 0), [width])]
+    step, choices = one.info.record.parameters["step"], context(one.key, 8 * len(MESSAGE), one.scheme.name)
+    scheme = one.scheme.fixed(one.info.record.parameters["width"], step)
+    before = next(scheme.views(mesh, choices))
+    compensated = np.sinc(1 - min(one.info.record.beta, 1.0))
+    looks = scheme.views(attacked(mesh, steps, 0), choices)
+    found = [(left(before, after, step), after.good.sum()) for after in looks]
     return max(float((compensated * cosines) ** 2 / max(count, 1)) for cosines, count in found)
 
 
@@ -124,7 +126,7 @@ def row(name: str, cells: list[Cell], *more: object) -> str:
     )
 
 
-def copies(mesh: Mesh, scheme: FieldScheme, limits: dict[str, float] | None, count: int) -> Iterator[Copy]:
+def copies(mesh: Mesh, scheme: BlindScheme, limits: dict[str, float] | None, count: int) -> Iterator[Copy]:
     """Mark a mesh with several keys, and say how."""
     for seed in range(count):
         key, start = np.random.default_rng([seed, 64]).bytes(32), time.perf_counter()
@@ -145,7 +147,7 @@ def measure(mesh: Mesh, marked: list[Copy], attacks: list[str]) -> None:
     for steps in attacks:
         try:
             cells = [read(attacked(one.marked, steps, seed), one.key, one.scheme) for seed, one in enumerate(marked)]
-            predicted = predict(mesh, steps, marked[0].info)
+            predicted = predict(mesh, steps, marked[0])
         except jm.JaxmarkError as refusal:
             print(line(steps, f"failed: {refusal}"), flush=True)
             continue
@@ -168,17 +170,18 @@ def main() -> None:
     add_meshes(parser)
     parser.add_argument("--keys", type=int, default=2, help="keys, each with attacks of its own; %(default)s")
     parser.add_argument("--limits", choices=LIMITS, default="perceptual", help="%(default)s")
-    parser.add_argument("--widths", type=float, nargs="+", default=WIDTHS, help="of the scheme; %(default)s")
+    parser.add_argument("--scheme", choices=BLIND_SCHEMES, default="field", help="%(default)s")
     parser.add_argument("--attacks", default=ATTACKS, help="kinds and strengths; %(default)s")
     parser.add_argument("--controls", action=argparse.BooleanOptionalAction, default=True)
     options = parser.parse_args()
+    scheme = BLIND_SCHEMES[options.scheme]
     for path in options.meshes:
         mesh = load(parser, path)
         points = len(weld(mesh.vertices).first)
         print(f"\n## {path.name}, {points:,} points, {options.limits} limits\n")
         print(f"{8 * len(MESSAGE)} bits and their tag need nρ² of about {NEEDED:.0f}.\n", flush=True)
         try:
-            marked = list(copies(mesh, FieldScheme(tuple(options.widths)), LIMITS[options.limits], options.keys))
+            marked = list(copies(mesh, scheme, LIMITS[options.limits], options.keys))
         except jm.JaxmarkError as refusal:
             print(f"Not marked: {refusal}", flush=True)
             continue

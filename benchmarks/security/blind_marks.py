@@ -21,6 +21,7 @@ RMS is that of the attack over that of the mark, MSDM that of the attack alone. 
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,7 +35,11 @@ from jaxmark.geometry.mesh import Mesh, diagonal
 from jaxmark.watermark import evidence
 from jaxmark.watermark.blind import reading
 from jaxmark.watermark.blind.dither import make_dither
-from jaxmark.watermark.blind.field import FieldScheme, Host, Writer, make_field_marker
+from jaxmark.watermark.blind.field import FieldScheme
+from jaxmark.watermark.blind.marker import make_blind_marker
+from jaxmark.watermark.blind.scheme import Host
+from jaxmark.watermark.blind.writing import Writer
+from jaxmark.watermark.everyday import BLIND_SCHEMES
 from jaxmark.watermark.marking import EmbedInfo
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -52,6 +57,7 @@ NEAR = 2.0  # score over norm from which a probability may be as small as the fi
 SHARES = (1 / 8, 3 / 16, 1 / 4)  # of a step, by which values are moved
 ROUNDS = 2  # of Gauss and Newton, as the library writes
 WAVES, WAVE_LENGTH, WAVE_SIZE = 4, 0.4, 2e-3  # of the warps that tell versions of a shape apart, in diagonals
+SCHEME = FieldScheme()  # that is attacked
 OTHER = jm.Key(bytes(reversed(range(32))))
 
 
@@ -121,15 +127,16 @@ def key_of(number: int) -> jm.Key:
 
 
 def unmarked(meshes: Mapping[str, Mesh], keys: int) -> Iterator[Row]:
-    """The smallest probability that is read from meshes without a mark."""
-    for name, mesh in meshes.items():
+    """The smallest probability that is read from meshes without a mark, by each scheme."""
+    for (name, mesh), scheme in product(meshes.items(), BLIND_SCHEMES.values()):
         claimed, read = [], []
         for number in range(keys):
-            claimed.append(reading.detect(mesh, key_of(number), 8 * len(MESSAGE), MESSAGE).log10_p)
-            read.append(reading.detect(mesh, key_of(number), 8 * len(MESSAGE)))
+            claimed.append(reading.detect(mesh, key_of(number), 8 * len(MESSAGE), scheme, MESSAGE).log10_p)
+            read.append(reading.detect(mesh, key_of(number), 8 * len(MESSAGE), scheme))
             say(name, number, claimed[-1], read[-1].log10_p)
         yield {
             "mesh": name,
+            "scheme": scheme.name,
             "keys": keys,
             "claimed": min(claimed),
             "read": min(one.log10_p for one in read),
@@ -159,7 +166,7 @@ class Marked(NamedTuple):
 
 def mark(name: str, mesh: Mesh) -> Marked:
     """Mark within the limits."""
-    marked, info = jm.embed(mesh, MESSAGE, KEY, scheme=reading.NAME, limits=LIMITS)
+    marked, info = jm.embed(mesh, MESSAGE, KEY, scheme=SCHEME, limits=LIMITS)
     found = Marked(name, mesh, marked, info)
     say(f"{name}: RMS {info.rms:.2e}, width {found.width:g}, step {found.step:.2e}, alpha {info.record.beta:.2f}")
     return found
@@ -182,7 +189,7 @@ class Seen(NamedTuple):
     @property
     def cells(self) -> Int64[np.ndarray, "anchors 3"]:
         """Indices of the anchors in the lattice of points."""
-        return self.host.shape.anchors.cells
+        return self.host.names
 
     @property
     def phases(self) -> Float64[np.ndarray, " anchors"]:
@@ -193,7 +200,7 @@ class Seen(NamedTuple):
 def look(mesh: Mesh, width: float, step: float) -> Seen:
     """Look at a mesh by its anchors, without a key."""
     original = make_original(mesh)
-    writer = Writer(original, FieldScheme((width,), (step,)))
+    writer = Writer(original, SCHEME.fixed(width, step), reading.context(KEY, 8 * len(MESSAGE), SCHEME.name))
     return Seen(mesh, original, writer, writer.host(width), step)
 
 
@@ -243,7 +250,7 @@ def erasure(work: Marked) -> Iterator[Row]:
 def remarking(work: Marked) -> Iterator[Row]:
     """Mark a marked work again under another key."""
     second = MESSAGE[::-1]
-    again, _ = jm.embed(work.marked, second, OTHER, scheme=reading.NAME, limits=LIMITS)
+    again, _ = jm.embed(work.marked, second, OTHER, scheme=SCHEME, limits=LIMITS)
     both = cost(work.marked, again, work.info.rms)
     yield {"mesh": work.name, "mark": "first"} | both | read(again)
     yield {"mesh": work.name, "mark": "second"} | both | read(again, OTHER, second)
@@ -291,8 +298,8 @@ def versions(work: Marked, count: int) -> Iterator[Seen]:
     """Versions of a work, marked as strongly as it is under its key, each with a message of its own."""
     for number in range(count):
         message = np.random.default_rng(number).bytes(len(MESSAGE))
-        scheme = FieldScheme((work.width,), (work.step,))
-        marker = make_field_marker(version(work.mesh, number + 1), KEY, bits=8 * len(message), scheme=scheme)
+        scheme = SCHEME.fixed(work.width, work.step)
+        marker = make_blind_marker(version(work.mesh, number + 1), KEY, bits=8 * len(message), scheme=scheme)
         marked, info = marker.embed(message, work.info.rms, read_back=False)
         say(f"version {number}: alpha {info.record.beta:.2f}")
         yield look(marked, work.width, work.step)
@@ -320,7 +327,7 @@ def averaging(work: Marked, counts: Sequence[int]) -> Iterator[Row]:
     """Move a work's values halfway between where other works of its key show the lattice."""
     seen = look(work.marked, work.width, work.step)
     cells, good = seen.cells, seen.good
-    truth = make_dither(reading.context(KEY, 8 * len(MESSAGE)), cells, 1).offset
+    truth = make_dither(seen.writer.choices, SCHEME.name, cells, 1).offset
     works = list(versions(work, max(counts, default=0)))
     for count in (0, *counts):
         shift = lattice_of(works[:count], cells)

@@ -17,10 +17,11 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import SUFFIXES, load_mesh, load_scene, load_texture, save_mesh
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.budget import Visibility
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.deposit import Deposit
-from jaxmark.watermark.everyday import prepare
+from jaxmark.watermark.everyday import AnyScheme, also, name_of, prepare
 from jaxmark.watermark.marking import Marker, detect_any, make_markers
 from jaxmark.watermark.record import Record
 from jaxmark.watermark.scenes import SceneDetection, SceneRecord, detect_scene, load_record, pair
@@ -56,7 +57,7 @@ def mark_file(
     limits: Mapping[str, float] | None = None,
     visibility: Visibility | None = None,
     noise: float | None,
-    scheme: str = DEFAULT_SCHEME,
+    scheme: AnyScheme = DEFAULT_SCHEME,
     meshes: Sequence[str] = (),
 ) -> Told:
     """Mark a mesh file, and write the marked file and its record, both or neither.
@@ -72,7 +73,7 @@ def mark_file(
         limits: see `embed`.
         visibility: see `embed`.
         noise: see `embed`.
-        scheme: name of the scheme.
+        scheme: see `embed`.
         meshes: names of the meshes to mark, of several in the file; by default all that can carry the message.
 
     Raises:
@@ -138,7 +139,7 @@ def mark_file(
         "rms": change.rms,
         "max": change.max,
         "bits": info.record.bits,
-        "scheme": info.record.scheme,
+        "scheme": name_of(scheme),
         "content": info.record.content,
         "survives": None if survives is None else survives._asdict(),
         "texture_drift": drift,
@@ -167,6 +168,7 @@ class FileReader:
     obtained: str = ""  # when and where the suspects were got
     guesses: bool = True  # whether to look for a mistake where nothing is detected, which takes several times as long
     meshes: Sequence[str] = ()  # names of the original's meshes to read; by default all
+    also: Sequence[BlindScheme] = ()  # schemes of marks that are read besides, to unite what all prove
     _last: tuple[tuple[Path, str | None], list[Marker]] | None = field(default=None, init=False, repr=False)
 
     def read(
@@ -196,10 +198,14 @@ class FileReader:
         if isinstance(case, SceneDetection):
             if report is not None or dossier is not None:
                 raise JaxmarkError("Reports and dossiers are about one mesh; pick it by --mesh.")
+            if self.also:
+                raise JaxmarkError("Several schemes are read in files of one mesh; pick it by --mesh.")
             return self._tell_scene(case, known, suspect)
         mesh, original_mesh, known = case
         markers = self._markers(original_mesh, original, known, mesh)
         found = detect_any(markers, mesh, self.message, align=self.how)
+        if self.also:
+            found = also(found, self.also, mesh, self.key, markers[0].bits, self.message)
         marker = next(marker for marker in markers if marker.choices.version == found.version)
         aligned = found.alignment
         if report is not None:

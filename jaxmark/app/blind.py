@@ -13,6 +13,7 @@ from jaxmark.files import load_mesh, load_scene
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark import evidence
 from jaxmark.watermark.blind.reading import BlindDetection
+from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.deposit import Deposit
 from jaxmark.watermark.everyday import blind_scheme, read_blind
@@ -31,6 +32,7 @@ class BlindReader:
     deposit: Deposit | None = None  # that holds the records' digests
     obtained: str = ""  # when and where the suspects were got
     meshes: Sequence[str] = ()  # names of the suspect's meshes to read; by default all
+    scheme: BlindScheme | None = None  # for marks without a record; by default any
 
     def read(self, suspect: Path, record: Path | None = None) -> Told:
         """Read one file: as one mesh, or each of its meshes, whose number is paid for.
@@ -56,7 +58,7 @@ class BlindReader:
             remarks.append(f"{alone} of {len(tried)} meshes prove it alone.")
         answer = {
             "detected": detected,
-            "scheme": "field",
+            "scheme": best.scheme,
             "log10_p": best.log10_p,
             "log10_p_undated": best.log10_p_undated,
             "log10_p_fitted": best.log10_p_fitted,
@@ -87,4 +89,5 @@ class BlindReader:
         if record is not None and blind_scheme(record.scheme) is None:
             raise JaxmarkError(f"The record says that the scheme is {record.scheme!r}, which needs --original.")
         release_programs()
-        return read_blind(mesh, self.key, bits=self.bits, message=self.message, record=record)
+        scheme = self.scheme if record is None else None
+        return read_blind(mesh, self.key, bits=self.bits, message=self.message, record=record, scheme=scheme)

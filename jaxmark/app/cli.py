@@ -33,13 +33,29 @@ from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import same_connectivity
 from jaxmark.watermark.budget import VISIBILITY, Visibility, make_budget, visibility_of
 from jaxmark.watermark.coding.keys import Key, commitment, load_key, new_key, save_key
+from jaxmark.watermark.combined import check_combined
 from jaxmark.watermark.deposit import Deposit, make_deposit
-from jaxmark.watermark.everyday import NAMES, blind_scheme, capacity
+from jaxmark.watermark.everyday import BLIND_SCHEMES, NAMES, blind_scheme, capacity
 from jaxmark.watermark.marking import COVERAGE, DEFAULT_BITS, NOISE
 from jaxmark.watermark.record import RECORD_SUFFIX, Record
 from jaxmark.watermark.scenes import load_record
-from jaxmark.watermark.schemes import DEFAULT_SCHEME
+from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES
 from jaxmark.watermark.tracing import identify
+
+
+class _Schemes(click.ParamType):
+    """The name of a scheme, or an informed and blind ones with commas between."""
+
+    name = "scheme"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
+        """Convert names to a tuple."""
+        names: tuple[str, ...] = value if isinstance(value, tuple) else tuple(value.split(","))
+        if unknown := [name for name in names if name not in NAMES]:
+            self.fail(f"{unknown[0]!r} is not one of {', '.join(map(repr, NAMES))}.", param, ctx)
+        if len(names) > 1:
+            check_combined(names, tuple(SCHEMES), tuple(BLIND_SCHEMES))
+        return names
 
 
 class _Hexadecimal(click.ParamType):
@@ -143,7 +159,7 @@ def cli() -> None:
       jaxmark detect suspect.ply --original model.ply --key owner.key
 
     Meshes are OBJ, PLY, OFF, STL, GLB, glTF or 3MF; point clouds PLY, XYZ, LAS or LAZ, too. Keep the key secret, and
-    keep the original: detection needs both, but for marks of the scheme `field`.
+    keep the original: detection needs both, but for marks of `field` and `local`.
     """  # noqa: D301
 
 
@@ -179,10 +195,12 @@ def keygen(keyfile: Path, as_json: bool) -> None:
 @_MESHES
 @click.option(
     "--scheme",
-    type=click.Choice(NAMES),
+    "schemes",
+    type=_Schemes(),
     default=DEFAULT_SCHEME,
     show_default=True,
-    help="Scheme that carries the bits; marks of `field` are read without the original.",
+    help=f"Scheme that carries the bits, of {', '.join(NAMES)}; marks of `field` and `local` are read without the"
+    " original. Several with commas between, such as keyed,field, mark for both.",
 )
 @click.option("--record", "record_file", type=_MESH, help=f"File for the record.  [default: MARKED{RECORD_SUFFIX}]")
 @_JSON
@@ -198,7 +216,7 @@ def embed_command(
     visibility: Visibility | None,
     noise: float | None,
     meshes: tuple[str, ...],
-    scheme: str,
+    schemes: tuple[str, ...],
     record_file: Path | None,
     as_json: bool,
 ) -> None:
@@ -221,7 +239,7 @@ def embed_command(
         limits=dict(limits) or None,
         visibility=visibility,
         noise=noise,
-        scheme=scheme,
+        scheme=schemes[0] if len(schemes) == 1 else schemes,
         meshes=meshes,
     )
     _check_distinct(original=original, marked=marked)
@@ -241,7 +259,7 @@ def embed_command(
 
 @cli.command(name="detect")
 @click.argument("suspect", type=_MESH)
-@click.option("--original", type=_MESH, help="The unmarked mesh; marks of the scheme `field` are read without it.")
+@click.option("--original", type=_MESH, help="The unmarked mesh; marks of `field` and `local` are read without it.")
 @_KEY
 @click.option("--bits", type=int, help=f"Payload, a multiple of 8.  [default: the record's, else {DEFAULT_BITS}]")
 @click.option(
@@ -259,8 +277,10 @@ def embed_command(
 @_MESHES
 @click.option(
     "--scheme",
-    type=click.Choice(NAMES),
-    help=f"Without a record: scheme that carries the bits.  [default: {DEFAULT_SCHEME}, without --original field]",
+    "schemes",
+    type=_Schemes(),
+    help="Without a record: scheme that carries the bits; several as in `embed`, to unite what they prove."
+    f"  [default: {DEFAULT_SCHEME}, without --original any blind one]",
 )
 @_ALIGN
 @click.option("--deposit", "deposit_file", type=_MESH, help="Deposit that dates the record, from `jaxmark deposit`.")
@@ -278,7 +298,7 @@ def detect_command(
     presence: bool,
     record_file: Path | None,
     meshes: tuple[str, ...],
-    scheme: str | None,
+    schemes: tuple[str, ...] | None,
     how: Align,
     deposit_file: Path | None,
     obtained: str,
@@ -296,7 +316,7 @@ def detect_command(
     Of files of several meshes, each mesh is compared with the one that looks like it, and what all of them prove is
     united.
 
-    Without --original, marks of the scheme `field` are read.
+    Without --original, marks of the schemes `field` and `local` are read.
 
     With its record, an original will do as you have it now: saved again in another format, rounded, moved, reordered.
 
@@ -309,12 +329,15 @@ def detect_command(
     if presence and (message is not None or bits):
         raise JaxmarkError("A presence mark has no message; leave out --message and --bits, or --presence.")
     payload = 0 if presence else bits
-    if original is None or (scheme is not None and blind_scheme(scheme) is not None):
-        if scheme is not None and blind_scheme(scheme) is None:
-            raise JaxmarkError(f"The scheme {scheme!r} is read beside the original; give --original.")
+    named = list(schemes or ())
+    blind_ones = [scheme for name in named if (scheme := blind_scheme(name)) is not None]
+    if original is None or len(named) == len(blind_ones) == 1:
+        if named and not blind_ones:
+            raise JaxmarkError(f"The scheme {named[0]!r} is read beside the original; give --original.")
         if how != "auto" or report is not None or dossier is not None:
             raise JaxmarkError("--align, --report and --dossier are for reading beside the original; give --original.")
-        blind = BlindReader(_key(key_file), payload, message, alpha, deposit, obtained, meshes)
+        only = blind_ones[0] if len(blind_ones) == 1 else None
+        blind = BlindReader(_key(key_file), payload, message, alpha, deposit, obtained, meshes, only)
         if suspect.is_dir():
             _each(
                 suspect,
@@ -330,13 +353,14 @@ def detect_command(
         _key(key_file),
         payload,
         message,
-        scheme,
+        named[0] if named else None,
         how,
         alpha,
         deposit,
         obtained,
         guesses=not suspect.is_dir(),
         meshes=meshes,
+        also=blind_ones,
     )
     if suspect.is_dir():
         _each(

@@ -11,10 +11,10 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import Scene, load_scene, number_check, save_scene
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.blind.field import FieldMarker
 from jaxmark.watermark.budget import Visibility
 from jaxmark.watermark.coding.keys import Key
-from jaxmark.watermark.marking import EmbedInfo, Marker, Survival
+from jaxmark.watermark.everyday import AnyMarker, AnyScheme, name_of
+from jaxmark.watermark.marking import EmbedInfo, Survival
 from jaxmark.watermark.scenes import embed_scene
 
 _MOST_TOLD = 5  # meshes that are named in a sentence
@@ -50,7 +50,7 @@ def mark_scene(
     limits: Mapping[str, float] | None,
     visibility: Visibility | None,
     noise: float | None,
-    scheme: str,
+    scheme: AnyScheme,
 ) -> Told:
     """Mark the meshes of a file that can carry a message, and write the marked file and its record, both or neither.
 
@@ -65,15 +65,15 @@ def mark_scene(
         limits: see `embed`.
         visibility: see `embed`.
         noise: see `embed`.
-        scheme: name of the scheme.
+        scheme: see `embed`.
 
     Raises:
         JaxmarkError: if no mesh can carry the message; see `embed_scene`.
     """
-    markers: dict[str, Marker | FieldMarker] = {}
+    markers: dict[str, AnyMarker] = {}
     fine_enough = number_check(original)
 
-    def check(name: str, marker: Marker | FieldMarker, result: Mesh, info: EmbedInfo) -> EmbedInfo:
+    def check(name: str, marker: AnyMarker, result: Mesh, info: EmbedInfo) -> EmbedInfo:
         """Check that the file's numbers are fine enough for a mark, and what it survives."""
         release_programs()
         fine_enough(name, result)
@@ -111,7 +111,7 @@ def mark_scene(
         "rms": max(one["rms"] for one in each.values()),
         "max": max(one["max"] for one in each.values()),
         "bits": info.record.bits,
-        "scheme": scheme,
+        "scheme": name_of(scheme),
         "content": "message" if message else "presence",
         "meshes": each,
         "left": left,
@@ -132,7 +132,7 @@ def mark_scene(
     return Told(answer, "\n".join([text, *remarks]))
 
 
-def _moved(marker: Marker | FieldMarker, written: Mesh) -> dict[str, float]:
+def _moved(marker: AnyMarker, written: Mesh) -> dict[str, float]:
     """How far a mesh was moved, in its diagonals."""
     change = distortion.DisplacementSize.of(shift_of(marker.original, written)[marker.original.used])
     return {"rms": change.rms, "max": change.max}

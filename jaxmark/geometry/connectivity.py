@@ -26,7 +26,7 @@ def matching_vertices(mesh: Mesh, other: Mesh) -> Int64[np.ndarray, " vertices"]
         For each vertex of `mesh`, the index of the matching vertex of `other`, or -1.
     """
     found = np.full(len(mesh.vertices), -1)
-    mine, theirs = _Rings(mesh), _Rings(other)
+    mine, theirs = Rings(mesh), Rings(other)
     for ring in range(1, _MAX_RINGS + 1):
         first, second = mine.grow(), theirs.grow()
         if ring >= _MIN_RINGS:
@@ -48,7 +48,7 @@ def matching_vertices(mesh: Mesh, other: Mesh) -> Int64[np.ndarray, " vertices"]
     return _spread(found, corners, wanted, apexes, mine.valence, theirs.valence)
 
 
-class _Rings:
+class Rings:
     """Colours of a mesh's vertices, by neighbourhoods that grow ring by ring."""
 
     def __init__(self, mesh: Mesh) -> None:

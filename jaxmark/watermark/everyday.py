@@ -5,21 +5,25 @@ Informed schemes are read beside the original (`jaxmark.watermark.marking`), bli
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import overload
 
 from numpy.typing import ArrayLike
 
-from jaxmark import distortion
 from jaxmark.alignment.alignment import Align
 from jaxmark.alignment.original import make_original
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark import evidence
 from jaxmark.watermark.blind import reading
-from jaxmark.watermark.blind.field import FieldMarker, FieldScheme, make_field_marker, parameters_in
+from jaxmark.watermark.blind.field import FieldScheme
+from jaxmark.watermark.blind.local import LocalScheme
+from jaxmark.watermark.blind.marker import BlindMarker, make_blind_marker, parameters_in
 from jaxmark.watermark.blind.reading import BlindDetection
-from jaxmark.watermark.budget import Budget, Limits, Visibility, make_budget, visibility_of
+from jaxmark.watermark.blind.scheme import BlindScheme
+from jaxmark.watermark.budget import Limits, Visibility, make_budget, visibility_of
 from jaxmark.watermark.coding.keys import KEY_BYTES, Key
+from jaxmark.watermark.combined import CombinedMarker, check_combined, unite
 from jaxmark.watermark.detectors import Detector
 from jaxmark.watermark.marking import (
     COVERAGE,
@@ -28,51 +32,61 @@ from jaxmark.watermark.marking import (
     Detection,
     EmbedInfo,
     Marker,
-    Survival,
     detect_any,
     make_marker,
     make_markers,
 )
 from jaxmark.watermark.payload import Capacity, Conditions
 from jaxmark.watermark.record import Record
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES, KeyedScheme, Scheme, get_scheme
+from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES, Scheme, get_scheme
 
-#: The schemes that are read without the original.
-BLIND_SCHEMES: Mapping[str, type[FieldScheme]] = {FieldScheme.name: FieldScheme}
-#: Two marks in one mesh, with and without the original to read.
-BOTH = (KeyedScheme.name, FieldScheme.name)
-_INFORMED_SHARE = 0.6  # of the displacement that is allowed, for the informed mark of both
+#: The schemes that are read without the original, the soonest read first.
+BLIND_SCHEMES: Mapping[str, BlindScheme] = {LocalScheme.name: LocalScheme(), FieldScheme.name: FieldScheme()}
 NAMES = (*SCHEMES, *BLIND_SCHEMES)  # of all schemes
+#: A scheme of either kind, or the names of an informed one and blind ones, which mark one mesh together.
+AnyScheme = str | Scheme | BlindScheme | tuple[str, ...]
+AnyMarker = Marker | BlindMarker | CombinedMarker
 
 
-def blind_scheme(scheme: str | Scheme | FieldScheme) -> FieldScheme | None:
+def name_of(scheme: AnyScheme) -> str:
+    """The name of a scheme, or of several with commas between."""
+    if isinstance(scheme, tuple):
+        return ",".join(scheme)
+    return scheme if isinstance(scheme, str) else scheme.name
+
+
+def blind_scheme(scheme: str | Scheme | BlindScheme) -> BlindScheme | None:
     """The blind scheme of this name, or that it is; None if it is an informed one."""
-    if isinstance(scheme, FieldScheme):
+    if isinstance(scheme, BlindScheme):
         return scheme
-    return BLIND_SCHEMES[scheme]() if isinstance(scheme, str) and scheme in BLIND_SCHEMES else None
+    return BLIND_SCHEMES.get(scheme) if isinstance(scheme, str) else None
 
 
-def informed_scheme(scheme: str | Scheme | FieldScheme) -> str | Scheme:
+def informed_scheme(scheme: str | Scheme | BlindScheme) -> str | Scheme:
     """The scheme, which must be one that is read beside the original.
 
     Raises:
         JaxmarkError: if it is not.
     """
-    if isinstance(scheme, FieldScheme) or (isinstance(scheme, str) and scheme not in SCHEMES):
+    if isinstance(scheme, BlindScheme) or (isinstance(scheme, str) and scheme not in SCHEMES):
         raise JaxmarkError(f"There is no informed scheme {scheme!r}; the schemes are {', '.join(NAMES)}.")
     return scheme
 
 
-def prepare(mesh: Mesh, key: bytes, bits: int, scheme: str | Scheme | FieldScheme) -> Marker | FieldMarker:
-    """Prepare an original for marking, with a scheme of either kind.
+def prepare(mesh: Mesh, key: bytes, bits: int, scheme: AnyScheme) -> AnyMarker:
+    """Prepare an original for marking, with a scheme of either kind or several.
 
     Raises:
-        JaxmarkError: see `make_marker`.
+        JaxmarkError: see `make_marker` and `check_combined`.
     """
+    if isinstance(scheme, tuple):
+        check_combined(scheme, tuple(SCHEMES), tuple(BLIND_SCHEMES))
+        informed = make_marker(mesh, key, bits=bits, scheme=scheme[0])
+        return CombinedMarker(informed, tuple(BLIND_SCHEMES[name] for name in scheme[1:]))
     blind = blind_scheme(scheme)
     if blind is None:
         return make_marker(mesh, key, bits=bits, scheme=informed_scheme(scheme))
-    return make_field_marker(mesh, key, bits=bits, scheme=blind)
+    return make_blind_marker(mesh, key, bits=bits, scheme=blind)
 
 
 def embed(
@@ -84,7 +98,7 @@ def embed(
     limits: Limits | None = None,
     visibility: Visibility | None = None,
     noise: float | None = None,
-    scheme: str | Scheme | FieldScheme | tuple[str, str] = DEFAULT_SCHEME,
+    scheme: AnyScheme = DEFAULT_SCHEME,
 ) -> tuple[Mesh, EmbedInfo]:
     """Embed a message in the vertex positions of a mesh.
 
@@ -106,9 +120,9 @@ def embed(
         noise: a demand: the noise that the message must survive when half of the vertices are lost, see `capacity`; 0
             requires only that there are enough dimensions. By default nothing is demanded but that the message reads.
             It has no effect for schemes whose readers have no model of noise, such as `host` and `eigen`.
-        scheme: a name or a scheme, see `make_marker`; or `"field"`, whose marks are read without the original; or
-            `("keyed", "field")` for both marks, each within a part of the same bounds. The record is then the first
-            one's.
+        scheme: a name or a scheme, see `make_marker`; or `"field"` or `"local"`, whose marks are read without the
+            original, after any remeshing or from any part; or several names, as `("keyed", "field")`, for marks within
+            one set of bounds, of which the first is informed and has the record.
 
     Returns:
         The marked mesh (float64 vertices, same faces) and how it was marked.
@@ -120,28 +134,8 @@ def embed(
     """
     if not isinstance(message, bytes):
         raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
-    if isinstance(scheme, tuple):
-        if scheme != BOTH:
-            raise JaxmarkError(f"Two marks in one mesh are {BOTH}, not {scheme}.")
-        return _embed_both(
-            mesh, message, key, make_budget(budget, limits, visibility, named=visibility_of(mesh)), noise
-        )
     marker = prepare(mesh, key, 8 * len(message), scheme)
     return marker.embed(message, budget, limits=limits, visibility=visibility, noise=noise)
-
-
-def _embed_both(mesh: Mesh, message: bytes, key: bytes, bounds: Budget, noise: float | None) -> tuple[Mesh, EmbedInfo]:
-    """Embed a message twice, to be read beside the original and without it; bounds are on both marks together."""
-    informed = prepare(mesh, key, 8 * len(message), BOTH[0])
-    _, alone = informed.embed(message, bounds.rms, limits=bounds.limits, read_back=False)
-    first, info = informed.embed(message, _INFORMED_SHARE * alone.rms, noise=noise, read_back=False)
-    rest = None if bounds.rms is None else math.sqrt(bounds.rms**2 - info.rms**2)
-    blind = make_field_marker(first, key, bits=8 * len(message), scheme=FieldScheme())
-    marked, other = blind.embed(message, rest, limits=bounds.limits, reference=distortion.Reference(mesh))
-    informed.check(marked, message)
-    change = distortion.displacement_size(mesh, marked)
-    survives = Survival(other.survives.whole, info.survives.half)
-    return marked, info._replace(rms=change.rms, max=change.max, survives=survives)
 
 
 def capacity(
@@ -152,7 +146,7 @@ def capacity(
     visibility: Visibility | None = None,
     noise: float = NOISE,
     coverage: float = COVERAGE,
-    scheme: str | Scheme | FieldScheme = DEFAULT_SCHEME,
+    scheme: str | Scheme | BlindScheme = DEFAULT_SCHEME,
 ) -> int:
     """Compute how many bits a mesh can carry, by the energy and the dimensions of a mark that projection leaves.
 
@@ -180,7 +174,7 @@ def capacity(
             f"capacity needs a noise of at least 0 and a coverage in (0, 1], got {noise:g} and {coverage:g}."
         )
     if (blind := blind_scheme(scheme)) is not None:
-        field = make_field_marker(mesh, bytes(KEY_BYTES), scheme=blind)
+        field = make_blind_marker(mesh, bytes(KEY_BYTES), scheme=blind)
         return field.writer.capacity(make_budget(budget, limits, visibility, named=visibility_of(mesh)), noise)
     original = make_original(mesh)
     bounds = make_budget(budget, limits, visibility, named=visibility_of(original.mesh))
@@ -197,7 +191,7 @@ def detect(
     bits: int | None = None,
     message: bytes | None = None,
     record: Record | None = None,
-    scheme: str | Scheme = DEFAULT_SCHEME,
+    scheme: str | Scheme | tuple[str, ...] = DEFAULT_SCHEME,
     detector: Detector | None = None,
     weights: ArrayLike | None = None,
     align: Align = "auto",
@@ -212,7 +206,7 @@ def detect(
     bits: int | None = None,
     message: bytes | None = None,
     record: Record | None = None,
-    scheme: str | Scheme | FieldScheme = FieldScheme.name,
+    scheme: str | Scheme | BlindScheme | None = None,
 ) -> BlindDetection: ...
 
 
@@ -224,14 +218,14 @@ def detect(
     bits: int | None = None,
     message: bytes | None = None,
     record: Record | None = None,
-    scheme: str | Scheme | FieldScheme | None = None,
+    scheme: AnyScheme | None = None,
     detector: Detector | None = None,
     weights: ArrayLike | None = None,
     align: Align = "auto",
 ) -> Detection | BlindDetection:
     """Read a mark from a suspect, and compute what the reading proves.
 
-    Without `original`, marks of the scheme `field` are read, and a `BlindDetection` is returned. Its bound holds for
+    Without `original`, marks of the blind schemes are read, and a `BlindDetection` is returned. Its bound holds for
     any suspect independent of the key: see `jaxmark.watermark.blind.reading`. The rest is about reading beside it.
 
     The suspect is first aligned with the original (`jaxmark.alignment.alignment.align`); points that are far off are
@@ -259,7 +253,8 @@ def detect(
         message: the message that is claimed to be in the suspect; None to read without a claim.
         record: the record of the mark, see `make_marker`.
         scheme: the scheme that the mark was embedded with, if there is no record; by default `"keyed"` beside an
-            original, `"field"` without one.
+            original, any blind one without it. Several names for marks that were embedded together: what they prove is
+            united.
         detector: a detector, see `make_marker`.
         weights: one number for each vertex of the original, not negative: how far to trust what the suspect shows of
             it, 0 for not at all; **must not depend on the key**.
@@ -274,11 +269,13 @@ def detect(
     """
     if bits is None and record is None and isinstance(message, bytes):
         bits = 8 * len(message)
-    named = (
-        record.scheme if record is not None else scheme or (FieldScheme.name if original is None else DEFAULT_SCHEME)
-    )
-    blind = blind_scheme(named)
-    if blind is not None:
+    others: list[BlindScheme] = []
+    if isinstance(scheme, tuple):
+        check_combined(scheme, tuple(SCHEMES), tuple(BLIND_SCHEMES))
+        others, scheme = [BLIND_SCHEMES[name] for name in scheme[1:]], scheme[0]
+    named = scheme if record is None else record.scheme
+    blind = None if named is None else blind_scheme(named)
+    if blind is not None or (named is None and original is None):
         if (detector, weights, align) != (None, None, "auto"):
             raise JaxmarkError("A blind mark is read without alignment, weights or a detector; leave them out.")
         return read_blind(suspect, key, bits=bits, message=message, record=record, scheme=blind)
@@ -286,7 +283,19 @@ def detect(
         raise JaxmarkError(f"The scheme {named!r} is read beside the original; give it, or mark with 'field'.")
     informed = informed_scheme(scheme or DEFAULT_SCHEME)
     markers = make_markers(original, key, bits=bits, record=record, scheme=informed, detector=detector)
-    return detect_any(markers, suspect, message, weights, align)
+    found = detect_any(markers, suspect, message, weights, align)
+    return also(found, others, suspect, key, markers[0].bits, message) if others else found
+
+
+def also(
+    found: Detection, schemes: Sequence[BlindScheme], suspect: Mesh, key: bytes, bits: int, message: bytes | None
+) -> Detection:
+    """Read blind marks of the same message, too, and unite what all of them prove.
+
+    Raises:
+        JaxmarkError: see `detect`.
+    """
+    return unite(found, [read_blind(suspect, key, bits=bits, message=message, scheme=scheme) for scheme in schemes])
 
 
 def read_blind(
@@ -296,25 +305,41 @@ def read_blind(
     bits: int | None = None,
     message: bytes | None = None,
     record: Record | None = None,
-    scheme: FieldScheme | None = None,
+    scheme: BlindScheme | None = None,
 ) -> BlindDetection:
-    """Read a mark of the scheme `field` without the original; see `detect`.
+    """Read a mark without the original, of a scheme or else of any of `BLIND_SCHEMES`, all paid for; see `detect`.
 
     Raises:
         JaxmarkError: see `detect`.
     """
-    tried = scheme or FieldScheme()
+    tried = [scheme] if scheme is not None else list(BLIND_SCHEMES.values())
     if record is not None:
         record.check("message" if record.bits else "presence", key)
         if bits not in (None, record.bits):
             raise JaxmarkError(f"The payload is {record.bits} bits by the record, not {bits}.")
-        bits, tried = record.bits, parameters_in(record)
+        blind = blind_scheme(record.scheme)
+        if blind is None:
+            raise JaxmarkError(
+                f"The record says that the scheme is {record.scheme!r}, which is read beside the original."
+            )
+        bits, tried = record.bits, [parameters_in(record, blind)]
     payload = DEFAULT_BITS if bits is None else bits
     if message is not None:
         if not isinstance(message, bytes):
             raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
         if 8 * len(message) != payload:
             raise JaxmarkError(f"The message has {8 * len(message)} bits, but the payload is {payload} bits.")
-        if record is not None and record.told and not record.commits_to(message, reading.context(Key(key), payload)):
+    if record is not None and record.told and message is not None:
+        choices = reading.context(Key(key), payload, record.scheme)
+        if not record.commits_to(message, choices):
             raise JaxmarkError("The record commits to another message than the one claimed; claim that, or none.")
-    return reading.detect(suspect, Key(key), payload, message, record, tried.widths, tried.steps)
+    found: list[BlindDetection] = []
+    for one in tried:
+        found.append(reading.detect(suspect, Key(key), payload, one, message, record))
+        if reading.is_sure(found[-1]):
+            break
+    best = min(found, key=lambda one: (one.message is None, one.log10_p))
+    return best._replace(
+        log10_p=evidence.share_of(best.log10_p, 1 / len(tried)),
+        log10_p_undated=evidence.share_of(best.log10_p_undated, 1 / len(tried)),
+    )

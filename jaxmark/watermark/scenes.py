@@ -21,11 +21,10 @@ from jaxmark.alignment.alignment import Align, align
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark import evidence
-from jaxmark.watermark.blind.field import FieldMarker, FieldScheme
 from jaxmark.watermark.budget import Limits, Visibility
 from jaxmark.watermark.coding.keys import canonical_json
 from jaxmark.watermark.detectors import claims
-from jaxmark.watermark.everyday import prepare
+from jaxmark.watermark.everyday import AnyMarker, AnyScheme, prepare
 from jaxmark.watermark.marking import ALIGN_SHARES, CLAIM_SHARE, Detection, EmbedInfo, Marker, make_marker
 from jaxmark.watermark.record import Record, read_json
 from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme
@@ -111,8 +110,8 @@ def embed_scene(
     limits: Limits | None = None,
     visibility: Visibility | None = None,
     noise: float | None = None,
-    scheme: str | Scheme | FieldScheme = DEFAULT_SCHEME,
-    after: Callable[[str, Marker | FieldMarker, Mesh, EmbedInfo], EmbedInfo] = lambda name, marker, marked, info: info,
+    scheme: AnyScheme = DEFAULT_SCHEME,
+    after: Callable[[str, AnyMarker, Mesh, EmbedInfo], EmbedInfo] = lambda name, marker, marked, info: info,
 ) -> tuple[dict[str, Mesh], SceneInfo]:
     """Embed one message in each mesh of a file that can carry it.
 

@@ -25,15 +25,13 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.pose import Pose
 from jaxmark.watermark import evidence
 from jaxmark.watermark.blind.dither import make_dither
-from jaxmark.watermark.blind.search import TURNS, VIEWS_PER_WIDTH, View, moved, search, turned, views
+from jaxmark.watermark.blind.scheme import BlindScheme, View
+from jaxmark.watermark.blind.search import moved, search
 from jaxmark.watermark.coding.keys import Choices, Key, bind
 from jaxmark.watermark.coding.message import decode_any, encode
 from jaxmark.watermark.marking import CLAIM_SHARE
 from jaxmark.watermark.record import Record
 
-NAME = "field"
-WIDTHS = (0.018, 0.0125, 0.025)  # of the narrow Gaussian, about in diagonals
-STEPS = tuple(1e-4 * 2 ** (rung / 2) for rung in range(11))  # of the lattice of values, in the same unit
 TAG_BITS = 40
 _CODE_SPREAD = 2  # code bits for each bit of message and tag, at least
 _CHANGES = 2  # changes of pose that are read: none, and the best by the offsets
@@ -57,6 +55,7 @@ class Reading(NamedTuple):
 class BlindDetection(NamedTuple):
     """The result of reading a suspect without the original."""
 
+    scheme: str  # name of the scheme that it was read with
     message: bytes | None  # the message that was read; None unless its keyed tag fits
     log10_p: float  # log10 of a bound on the false-positive probability, in [-77, 0], if all that is claimed is dated
     log10_p_undated: float  # the same if nothing is: for the best message of any of 2^64 keys
@@ -64,8 +63,8 @@ class BlindDetection(NamedTuple):
     scores: Float64[np.ndarray, " code"]  # soft values of the code bits, scaled to root mean square 1
     anchors: int  # number of values that were read
     agreement: float  # mean cosine of their phases, 1 if all are exactly where the mark put them
-    width: float  # of the averages, about in diagonals
-    step: float  # of the lattice of values, in the same unit
+    width: float  # of the averages, in the scheme's unit
+    step: float  # of the lattice of values, in the scheme's unit
     pose: Pose  # from the suspect's file to where it was read
     version: int  # version of the keyed choices that were read with
     doubts: tuple[str, ...] = ()  # why the probabilities are estimates, not proofs; empty if they are proofs
@@ -87,10 +86,10 @@ class BlindDetection(NamedTuple):
         return self.log10_p <= math.log10(alpha)
 
 
-def context(key: bytes, bits: int) -> Choices:
+def context(key: bytes, bits: int, scheme: str) -> Choices:
     """The keyed choices of a mark: they are bound to no original, as its reader has none."""
     content = "message" if bits else "presence"
-    return bind(key, b"", {"scheme": NAME, "content": content, "bits": bits})
+    return bind(key, b"", {"scheme": scheme, "content": content, "bits": bits})
 
 
 def code_length(bits: int) -> int:
@@ -113,10 +112,9 @@ def detect(
     suspect: Mesh,
     key: bytes,
     bits: int,
+    scheme: BlindScheme,
     message: bytes | None = None,
     record: Record | None = None,
-    widths: Sequence[float] = WIDTHS,
-    steps: Sequence[float] = STEPS,
 ) -> BlindDetection:
     """Read a suspect without its original.
 
@@ -124,55 +122,73 @@ def detect(
         suspect: any mesh.
         key: 32 bytes.
         bits: size of the payload in bits.
+        scheme: the widths and steps to try.
         message: the message that is claimed to be in it; None to read without a claim.
         record: the record of the mark, which was checked; it fixes the message, if it commits to one.
-        widths: of the averages, to try.
-        steps: of the lattice of values, to try.
 
     Raises:
         JaxmarkError: if the suspect is a point cloud, or has no extent.
     """
-    choices, length = context(Key(key), bits), code_length(bits)
+    choices, length = context(Key(key), bits, scheme.name), code_length(bits)
     claimed = b"" if message is None and not bits else message
-    tries = len(widths) * VIEWS_PER_WIDTH * len(TURNS) * len(steps) * _CHANGES
-    best: BlindDetection | None = None
+    tries = len(scheme.widths) * scheme.looks * len(scheme.steps) * _CHANGES
+    best = _nothing(scheme, choices, length)
     before = 0  # messages whose tags were tried already
-    for _, group in groupby(views(suspect, widths), key=lambda view: view.undone):
-        readings = [one for view in group for one in _readings(view, choices, length, np.asarray(steps))]
-        found = _weigh(readings, choices, bits, claimed, record, tries, before)
+    for _, group in groupby(scheme.views(suspect, choices), key=lambda view: view.undone):
+        readings = [one for view in group for one in _readings(view, scheme, choices, length)]
+        if not readings:
+            continue
+        found = _weigh(readings, scheme, choices, bits, claimed, record, tries, before)
         before += len(readings) * _CANDIDATES
-        best = found if best is None else min(best, found, key=lambda one: (one.message is None, one.log10_p))
-        if best.log10_p <= (_SURE if best.message is not None else _SURE_UNREAD):
+        best = min(best, found, key=lambda one: (one.message is None, one.log10_p, -one.anchors))
+        if is_sure(best):
             break
-    assert best is not None
     return best
 
 
-def _readings(view: View, choices: Choices, length: int, steps: Float64[np.ndarray, " steps"]) -> list[Reading]:
-    """All ways of reading a view."""
+def is_sure(found: BlindDetection) -> bool:
+    """Whether so much is proven that nothing else needs to be tried."""
+    return found.log10_p <= (_SURE if found.message is not None else _SURE_UNREAD)
+
+
+def _readings(view: View, scheme: BlindScheme, choices: Choices, length: int) -> list[Reading]:
+    """All ways of reading a view.
+
+    Anchors of one name have one sign: the mean of their cosines is one term of the score.
+    """
     good = np.flatnonzero(view.good)
     if not len(good):
         return []
-    dtype = view.values.dtype
-    dithers = [make_dither(choices, turned(view.cells[good], turn), length) for turn in TURNS]
-    offsets = np.zeros((len(TURNS), len(view.good)))
-    offsets[:, good] = [dither.offset for dither in dithers]
+    dtype, steps = view.values.dtype, np.asarray(scheme.steps)
+    offsets, lists = np.zeros(view.names.shape[:2]), []
+    for turn, names in enumerate(view.names):
+        names, place = np.unique(names[good], axis=0, return_inverse=True)
+        dither = make_dither(choices, scheme.name, names, length)
+        offsets[turn, good] = dither.offset[place.ravel()]
+        lists.append((dither, place.ravel()))
     found = search(
-        view.values, view.changes, jnp.asarray(view.good, dtype), jnp.asarray(offsets, dtype), jnp.asarray(steps, dtype)
+        view.values,
+        view.changes,
+        jnp.asarray(view.good, dtype),
+        jnp.asarray(offsets, dtype),
+        jnp.asarray(steps, dtype),
+        jnp.asarray(view.spread, dtype),
     )
     changes, pilots = np.asarray(found.change, np.float64), np.asarray(found.pilot, np.float64)
     readings = []
-    for turn, dither in enumerate(dithers):
+    for turn, (dither, place) in enumerate(lists):
         for rung, step in enumerate(steps):
-            for change, pilot in ((np.zeros(7), 0.0), (changes[turn, rung], float(pilots[turn, rung]))):
-                cosine = np.cos(2 * np.pi * (moved(view, change)[good] / step - dither.offset))
+            for change, pilot in ((np.zeros(len(view.spread)), 0.0), (changes[turn, rung], float(pilots[turn, rung]))):
+                cosines = np.cos(2 * np.pi * (moved(view, change)[good] / step - offsets[turn, good]))
+                cosine = np.bincount(place, cosines) / np.bincount(place)
                 soft = np.bincount(dither.slot, dither.sign * cosine, length)
-                readings.append(Reading(view, turn, float(step), pilot, soft, float(cosine @ cosine), len(good)))
+                readings.append(Reading(view, turn, float(step), pilot, soft, float(cosine @ cosine), len(cosine)))
     return readings
 
 
 def _weigh(
     readings: Sequence[Reading],
+    scheme: BlindScheme,
     choices: Choices,
     bits: int,
     claimed: bytes | None,
@@ -181,8 +197,6 @@ def _weigh(
     before: int,
 ) -> BlindDetection:
     """What readings prove, of so many that might have been tried, after the tags of so many messages were tried."""
-    if not readings:
-        return _nothing(choices, code_length(bits))
     order = sorted(range(len(readings)), key=lambda place: -readings[place].pilot)
     readings = [readings[place] for place in order]
     soft = np.stack([one.soft for one in readings])
@@ -194,7 +208,7 @@ def _weigh(
     if claimed or told:  # what was fixed beforehand has nearly all of the probability, any other message the rest
         share = CLAIM_SHARE if fixed is not None else 1 - CLAIM_SHARE
     if decoded is None and fixed is None:
-        return _nothing(choices, code_length(bits), readings[0])
+        return _nothing(scheme, choices, code_length(bits), readings[0])
     message = fixed if fixed is not None else decoded.message if decoded is not None else b""
     word = codeword(message, choices)
     # Readings are compared by what their scores prove.
@@ -212,9 +226,9 @@ def _weigh(
         remarks.append(f"Another message of this key reads than the one {'claimed' if claimed else 'in the record'}.")
     if reading.view.undone:
         remarks.append(f"It was read after {reading.view.undone} steps of smoothing were undone.")
-    if TURNS[reading.turn].prod() < 0:
+    if reading.view.mirrored[reading.turn]:
         remarks.append("It is the mirror image of what was marked.")
-    return _nothing(choices, len(word), reading)._replace(
+    return _nothing(scheme, choices, len(word), reading)._replace(
         message=None if decoded is None else decoded.message,
         log10_p=evidence.share_of(evidence.any_of(*proofs), share),
         log10_p_undated=evidence.undated(evidence.share_of(late, share)),
@@ -224,13 +238,15 @@ def _weigh(
     )
 
 
-def _nothing(choices: Choices, length: int, reading: Reading | None = None) -> BlindDetection:
+def _nothing(scheme: BlindScheme, choices: Choices, length: int, reading: Reading | None = None) -> BlindDetection:
     """A detection that proves nothing, of a reading."""
     if reading is None:
         pose = Pose(np.eye(3), np.zeros(3))
-        return BlindDetection(None, 0.0, 0.0, 0.0, np.zeros(length), 0, 0.0, 0.0, 0.0, pose, choices.version)
+        zeros = np.zeros(length)
+        return BlindDetection(scheme.name, None, 0.0, 0.0, 0.0, zeros, 0, 0.0, 0.0, 0.0, pose, choices.version)
     scores = reading.soft / (np.sqrt(np.mean(reading.soft**2)) or 1.0)
     return BlindDetection(
+        scheme.name,
         None,
         *(0.0, 0.0, 0.0),
         scores,

@@ -1,62 +1,53 @@
-"""The least displacement that gives anchors their values and leaves a mesh's own pose where it is."""
+"""The least displacement that gives anchors their values, as far as a budget allows.
 
-from functools import partial
+Each anchor's value is brought to a lattice of numbers that its keyed dither and its code bit shift (dither modulation:
+Chen, Wornell, "Quantization index modulation", IEEE Trans. Inf. Theory 47, 2001, with distortion compensation: only a
+part of the way). The host itself is no noise then, so the original is not needed for reading.
+"""
+
+import math
+from functools import cached_property
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.sparse.linalg import cg
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Float64
 
-from jaxmark.geometry.moments import Moments, surface_moments, volume_moments
-from jaxmark.spectral.precision import matmul
-from jaxmark.watermark.blind.anchors import Anchors, Pieces, look
+from jaxmark import distortion
+from jaxmark.alignment.original import Original
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.blind.dither import Dither, make_dither
+from jaxmark.watermark.blind.reading import TAG_BITS, code_length, codeword
+from jaxmark.watermark.blind.scheme import BlindScheme, Host, Measured, measure
+from jaxmark.watermark.budget import Budget, write
+from jaxmark.watermark.coding.keys import Choices
+from jaxmark.watermark.coding.message import TAG_BITS as _TAG_BITS
+from jaxmark.watermark.hiding import hiding_directions
+from jaxmark.watermark.marking import DEFAULT_BITS, NOISE, Survival
+from jaxmark.watermark.payload import needed_energy
 from jaxmark.watermark.visibility import apply_mask
 
 _RIDGE = 3e-3  # of the mean square of a row: values that contradict each other are met halfway
-_POSE_RIDGE = 1e-4  # of the pose's rows, which are scaled to the others' size
+_HELD_RIDGE = 1e-4  # of the rows of what is held, which are scaled to the others' size
 _STEPS, _TOLERANCE = 60, 1e-2  # of conjugate gradients
+_LEAST_ALPHA = 0.6  # part of the way to the lattice that is gone at least; up to √2 of it, as steps are so far apart
+_ROUNDS = 2  # of Gauss and Newton
+_SPARE = 1.3  # energy that a width should leave, over what the payload needs
+_SMOOTHED = 10  # steps of smoothing that widths are chosen by, besides noise
 
 
-class Shape(NamedTuple):
-    """What the values of a mesh are computed from, but its vertices; a pytree."""
-
-    matrix: Float[Array, "3 3"]  # to the mesh's own pose
-    shift: Float[Array, " 3"]
-    faces: Int[Array | np.ndarray, "faces 3"]
-    pieces: Pieces
-    anchors: Anchors
-    width: Float[Array, ""]  # of the narrow Gaussian
-    outwards: Float[Array, ""]  # 1 where normals point outwards, -1 where inwards
-
-
-@partial(jax.jit, static_argnames="closed")
-def measure(
-    shape: Shape, vertices: Float[Array, "rows 3"], *, closed: bool
-) -> tuple[Float[Array, " anchors"], Float[Array, " nine"]]:
-    """Values of the anchors, and the centre and covariance of the mesh, in its own pose as it was."""
-    placed = matmul(vertices, shape.matrix.T) + shape.shift
-    nowhere = jnp.zeros(shape.anchors.places.shape, vertices.dtype)
-    surface = shape.pieces.of(placed)
-    surface = surface._replace(normals=surface.normals * shape.outwards)
-    values = look(surface, shape.anchors, nowhere, shape.width, jnp.zeros_like(shape.width)).values
-    found: Moments = (volume_moments if closed else surface_moments)(placed[shape.faces])
-    upper = jnp.triu_indices(3)
-    return values, jnp.concatenate([found.centre, found.covariance[upper]])
-
-
-@partial(jax.jit, static_argnames="closed")
+@jax.jit
 def improve(
-    shape: Shape,
+    shape: Measured,
     vertices: Float[Array, "rows 3"],
     moved: Float[Array, "rows 3"],
     free: Float[Array, " rows"],
     mask: Float[Array, "rows 3 3"],
-    targets: tuple[Float[Array, " anchors"], Float[Array, " nine"]],
+    targets: tuple[Float[Array, " anchors"], Float[Array, " held"]],
     counted: Float[Array, " anchors"],
-    *,
-    closed: bool,
 ) -> Float[Array, "rows 3"]:
     """One step of Gauss and Newton towards the least displacement whose values are `targets`.
 
@@ -66,29 +57,235 @@ def improve(
         moved: their displacement so far.
         free: how far each vertex moves for its part in a value: the inverse of its area.
         mask: of displacements, see `apply_mask`.
-        targets: the values, and the pose, to reach.
+        targets: the values, and what is held, to reach.
         counted: 1 for each anchor whose value is to be reached, else 0.
-        closed: whether the mesh encloses a volume.
     """
-    (values, pose), push = jax.linearize(partial(measure, shape, closed=closed), vertices + moved)
+    (values, held), push = jax.linearize(shape.measure, vertices + moved)
     pull = jax.linear_transpose(push, vertices)
 
-    def rows(of: tuple[Float[Array, " anchors"], Float[Array, " nine"]]) -> Float[Array, "rows 3"]:
+    def rows(of: tuple[Float[Array, " anchors"], Float[Array, " held"]]) -> Float[Array, "rows 3"]:
         (back,) = pull((counted * of[0], of[1]))
         return apply_mask(mask, free[:, None] * apply_mask(mask, back))
 
-    nine, none = jnp.eye(len(pose), dtype=vertices.dtype), jnp.zeros_like(values)
-    # The pose's rows are made as long as the others are on average, by which conjugate gradients converge soon.
+    each, none = jnp.eye(len(held), dtype=vertices.dtype), jnp.zeros_like(values)
+    # Rows of what is held are made as long as the others are on average, by which conjugate gradients converge soon.
     signs = jnp.where(jnp.arange(len(values)) * 7919 % 13 % 2 == 0, 1.0, -1.0).astype(values.dtype)
-    energy = jnp.vdot(counted * signs, push(rows((signs, jnp.zeros_like(pose))))[0]) / counted.sum()
-    length = jax.vmap(lambda one: jnp.vdot(one, push(rows((none, one)))[1]))(nine)
+    energy = jnp.vdot(counted * signs, push(rows((signs, jnp.zeros_like(held))))[0]) / counted.sum()
+    length = jax.vmap(lambda one: jnp.vdot(one, push(rows((none, one)))[1]))(each)
     factor = jnp.sqrt(energy / length)
 
-    def gram(of: tuple[Float[Array, " anchors"], Float[Array, " nine"]]) -> tuple[Array, Array]:
+    def gram(of: tuple[Float[Array, " anchors"], Float[Array, " held"]]) -> tuple[Array, Array]:
         there = push(rows((of[0], factor * of[1])))
-        return counted * there[0] + _RIDGE * energy * of[0], factor * there[1] + _POSE_RIDGE * energy * of[1]
+        return counted * there[0] + _RIDGE * energy * of[0], factor * there[1] + _HELD_RIDGE * energy * of[1]
 
     before = push(moved)
-    wanted = (counted * (targets[0] - values + before[0]), factor * (targets[1] - pose + before[1]))
+    wanted = (counted * (targets[0] - values + before[0]), factor * (targets[1] - held + before[1]))
     found, _ = cg(gram, wanted, tol=_TOLERANCE, maxiter=_STEPS)
     return rows((found[0], factor * found[1]))
+
+
+class Plan(NamedTuple):
+    """How a mark is written in one original."""
+
+    width: float  # of the narrow Gaussian
+    step: float  # of the lattice of values
+    alpha: float  # part of the way to the lattice that is gone
+    size: float  # RMS of the displacement, in diagonals
+    host: Host
+    dither: Dither
+
+    def energy(self, spread: float) -> float:
+        """Predicted nρ², where ρ is the mean cosine of what n values are off, after something that spreads them.
+
+        What is off is uniform over the rest of the way, and then Gaussian.
+        """
+        kept = float(np.sinc(1 - min(self.alpha, 1.0))) * math.exp(-2 * (math.pi * spread / self.step) ** 2)
+        return self.host.size * kept**2
+
+
+class Written(NamedTuple):
+    """A displacement that writes a codeword, as far as a budget allows."""
+
+    mesh: Mesh
+    moved: distortion.DisplacementSize
+    plan: Plan
+
+
+def needed(bits: int) -> float:
+    """nρ² with which a payload is read: the energy that it needs with the longer tag of blind marks."""
+    return needed_energy(bits + TAG_BITS - _TAG_BITS) if bits else needed_energy(0)
+
+
+class Writer:
+    """Writes codewords with the keyed choices of one mark in one original; looks at it once for each width."""
+
+    def __init__(self, original: Original, scheme: BlindScheme, choices: Choices) -> None:
+        self.original, self.scheme, self.choices = original, scheme, choices
+        self._hosts: dict[float, Host] = {}
+
+    def host(self, width: float) -> Host:
+        """The original as its anchors of one width show it."""
+        if width not in self._hosts:
+            self._hosts[width] = self.scheme.host(self.original, width, self.choices)
+        return self._hosts[width]
+
+    @cached_property
+    def _mask(self) -> Float[Array, "rows 3 3"]:
+        original = self.original
+        if self.scheme.hiding:
+            return original.to_traced(hiding_directions(original))
+        return original.to_traced(np.tile(np.eye(3), (len(original.used), 1, 1)))
+
+    def off(self, host: Host, dither: Dither, word: Float64[np.ndarray, " code"], step: float) -> np.ndarray:
+        """How far each value is from the nearest number that its dither and code bit allow, in steps."""
+        sign = dither.sign * word[dither.slot]
+        away = host.values / step - dither.offset - np.where(sign < 0, 0.5, 0)
+        return away - np.round(away)
+
+    def shift(
+        self, host: Host, targets: Float64[np.ndarray, " anchors"], rounds: int
+    ) -> Float64[np.ndarray, "points 3"]:
+        """The least displacement by which anchors show these values, in diagonals."""
+        original = self.original
+        vertices, dtype = original.to_traced(original.positions), original.signal.dtype
+        moved = jnp.zeros_like(vertices)
+        wanted = (jnp.asarray(targets, dtype), host.held)
+        counted = jnp.asarray(host.good, dtype)
+        for _ in range(rounds):
+            moved = improve(host.shape, vertices, moved, host.free, self._mask, wanted, counted)
+        return original.to_host(moved)
+
+    def plan(
+        self,
+        word: Float64[np.ndarray, " code"],
+        budget: Budget,
+        reference: distortion.Reference,
+        bits: int,
+    ) -> Plan:
+        """Choose the width that is predicted to be read best, and how strong a budget allows the mark to be.
+
+        Of the widths that leave room for the payload, the one of most energy after noise or smoothing is taken.
+
+        Raises:
+            JaxmarkError: if there is nothing to write in, or the budget allows not even the least step.
+        """
+        found = [self._try(width, word, budget, reference) for width in self.scheme.widths]
+        fitting = [one for one in found if one is not None]
+        if not fitting:
+            raise JaxmarkError(
+                f"This mesh, or the budget for it, leaves the scheme {self.scheme.name!r} nothing to write in; use a"
+                " larger budget or the scheme 'keyed'."
+            )
+        enough = _SPARE * needed(bits)
+        return max(fitting, key=lambda one: (min(one.energy(0.0), enough), min(self.energies(one))))
+
+    def write(
+        self,
+        word: Float64[np.ndarray, " code"],
+        budget: Budget,
+        bits: int,
+        reference: distortion.Reference | None = None,
+    ) -> Written:
+        """Write a codeword as far as a budget allows.
+
+        Args:
+            word: the code bits, ±1.
+            budget: the bounds to keep.
+            bits: size of the payload in bits.
+            reference: what limits are measured against, if not the original.
+
+        Raises:
+            JaxmarkError: see `plan`.
+        """
+        reference = reference or distortion.Reference(self.original.mesh)
+        plan = self.plan(word, budget, reference, bits)
+        targets = plan.host.values - plan.alpha * plan.step * self.off(plan.host, plan.dither, word, plan.step)
+        shift = self.shift(plan.host, targets, _ROUNDS)
+        written = write(self.original, shift, budget, reference)
+        return Written(written.mesh, written.moved, plan._replace(alpha=plan.alpha * written.scale))
+
+    def _try(
+        self,
+        width: float,
+        word: Float64[np.ndarray, " code"],
+        budget: Budget,
+        reference: distortion.Reference,
+    ) -> Plan | None:
+        """The step, and the part of the way, that a budget allows with a width; None if not even the least step."""
+        host = self.host(width)
+        if not host.size:
+            return None
+        dither = make_dither(self.choices, self.scheme.name, host.names, len(word))
+        # How far a mark of one step displaces is how far any does, times its step: what is off is uniform.
+        first = host.step
+        shift = self.shift(host, host.values - first * self.off(host, dither, word, first), 1)
+        size = float(distortion.rms(shift[self.original.used]))
+        if not (math.isfinite(size) and size > 0):
+            return None
+        allowed = first * write(self.original, shift, budget, reference).scale
+        steps = [step for step in self.scheme.steps if allowed / step >= _LEAST_ALPHA]
+        if not steps:
+            return None
+        alpha = min(allowed / max(steps), 1.0)
+        return Plan(width, max(steps), alpha, size * alpha * max(steps) / first, host, dither)
+
+    def energies(self, plan: Plan) -> tuple[float, float]:
+        """Predicted nρ² after each of the reference disturbances, see `Plan.energy`."""
+        noise, smoothing = self._spreads(plan.host)
+        return plan.energy(noise), plan.energy(smoothing)
+
+    def survives(self, plan: Plan, bits: int) -> Survival:
+        """Predict the strongest noise in which a mark reads: until nρ² is what the payload needs.
+
+        Half of the vertices have half of the anchors, or none if the scheme needs the whole shape.
+        """
+        spread = self._spreads(plan.host)[0] / NOISE  # for each unit of noise
+
+        def strongest(share: float) -> float:
+            kept = share * plan.energy(0.0) / needed(bits)
+            return float(plan.step * math.sqrt(math.log(kept)) / (2 * math.pi * spread)) if kept > 1 else 0.0
+
+        return Survival(strongest(1.0), strongest(0.5 if self.scheme.in_parts else 0.0))
+
+    def capacity(self, budget: Budget, noise: float) -> int:
+        """The largest payload in bits, a multiple of 8, that is predicted to read in noise; 0 if not even 8.
+
+        Args:
+            budget: bounds on the distortion by the mark.
+            noise: half width of uniform noise over the mean distance of the vertices to their centre.
+        """
+        word = codeword(bytes(DEFAULT_BITS // 8), self.choices)
+        try:
+            plan = self.plan(word, budget, distortion.Reference(self.original.mesh), 0)
+        except JaxmarkError:
+            return 0
+        energy, bits = plan.energy(self._spreads(plan.host)[0] * noise / NOISE), 0
+        while needed(bits + 8) <= energy and code_length(bits + 8) <= plan.host.size:
+            bits += 8
+        return bits
+
+    def _spreads(self, host: Host) -> tuple[float, float]:
+        """Spread of the anchors' values by noise and by smoothing of the original; see `_disturbances`."""
+        before = host.values[host.good > 0]
+        spreads = []
+        for points in self._disturbances:
+            values, _ = measure(host.shape, points)
+            after = np.asarray(values, np.float64)[host.good > 0]
+            spreads.append(float(np.sqrt(np.mean((after - before) ** 2))))
+        return spreads[0], spreads[1]
+
+    @cached_property
+    def _disturbances(self) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3"]]:
+        """The original with noise of `NOISE`, and after `_SMOOTHED` steps of smoothing."""
+        original, points = self.original, self.original.positions
+        noise = np.random.default_rng(0).uniform(-1, 1, points.shape) * original.used[:, None]
+        smoothed = original.to_traced(points)
+        for _ in range(_SMOOTHED):
+            smoothed = smoothed - 0.1 * original.operator.apply(smoothed)
+        return original.to_traced(points + NOISE * radius_of(original) * noise), smoothed
+
+
+def radius_of(original: Original) -> float:
+    """Mean distance of the points that faces use to their centre, in diagonals."""
+    points = original.positions[original.used]
+    return float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean())

@@ -1,0 +1,146 @@
+"""Several marks in one mesh: one to be read beside the original, and others without it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from jaxmark import distortion
+from jaxmark.alignment.original import Original
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark import evidence
+from jaxmark.watermark.blind.marker import BlindMarker, make_blind_marker
+from jaxmark.watermark.blind.reading import BlindDetection
+from jaxmark.watermark.blind.scheme import BlindScheme
+from jaxmark.watermark.budget import Limits, Visibility, make_budget, visibility_of
+from jaxmark.watermark.marking import Detection, EmbedInfo, Marker, Survival
+from jaxmark.watermark.record import Record
+
+_LEAST_SHARE, _MOST_SHARE = 0.3, 0.9  # of what is allowed, for a mark that is not the last
+
+
+@dataclass(frozen=True, eq=False)
+class CombinedMarker:
+    """Marks one original with an informed scheme and blind ones, within one set of bounds; see `Marker`.
+
+    What each mark alone survives within the bounds says how to share these: so that all survive as much noise. Marks
+    are written one after another, the informed one first, and the last has what the others left.
+    """
+
+    informed: Marker
+    blind: tuple[BlindScheme, ...]
+
+    @property
+    def original(self) -> Original:
+        """The mesh that is marked."""
+        return self.informed.original
+
+    def embed(
+        self,
+        message: bytes,
+        budget: float | None = None,
+        *,
+        limits: Limits | None = None,
+        visibility: Visibility | None = None,
+        noise: float | None = None,
+        read_back: bool = True,
+    ) -> tuple[Mesh, EmbedInfo]:
+        """Embed a message in each way; the record is that of the informed mark. See `Marker.embed`."""
+        mesh = self.original.mesh
+        bounds = make_budget(budget, limits, visibility, named=visibility_of(mesh))
+        reference = distortion.Reference(mesh)
+        _, alone = self.informed.embed(message, bounds.rms, limits=bounds.limits, read_back=False)
+        sizes, survived = [alone.rms], [alone.survives.whole]
+        for scheme in self.blind:
+            plan = self._blind(mesh, scheme).plan(message, bounds, reference)
+            sizes.append(plan.rms)
+            survived.append(plan.survives.whole)
+        shares = _share(survived)
+        marked, info = self.informed.embed(message, shares[0] * sizes[0], noise=noise, read_back=False)
+        survives, total = [info.survives], dict(bounds.limits)
+        if bounds.rms is not None:
+            total["rms"] = bounds.rms
+        for place, scheme in enumerate(self.blind, 1):
+            own = None if place == len(self.blind) else shares[place] * sizes[place]
+            marked, other = self._blind(marked, scheme).embed(
+                message, own, limits=total, read_back=False, reference=reference
+            )
+            survives.append(other.survives)
+        if read_back:
+            self.check(marked, message)
+        change = distortion.displacement_size(mesh, marked)
+        least = Survival(min(one.whole for one in survives), max(one.half for one in survives))
+        return marked, info._replace(rms=change.rms, max=change.max, survives=least)
+
+    def with_record(self, record: Record) -> "CombinedMarker":
+        """See `Marker.with_record`."""
+        return replace(self, informed=self.informed.with_record(record))
+
+    def reads(self, marked: Mesh, message: bytes) -> bool:
+        """Whether each mark reads; see `Marker.reads`."""
+        return self.informed.reads(marked, message) and all(one.reads(marked, message) for one in self._blinds)
+
+    def check(self, marked: Mesh, message: bytes) -> None:
+        """Check that each mark reads.
+
+        Raises:
+            JaxmarkError: if one does not.
+        """
+        self.informed.check(marked, message)
+        for one in self._blinds:
+            one.check(marked, message)
+
+    def tried(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival:
+        """Try what all marks survive, or with half of the points lost, one of them; see `Marker.tried`."""
+        tried = [one.tried(marked, message, predicted) for one in (self.informed, *self._blinds)]
+        return Survival(min(one.whole for one in tried), max(one.half for one in tried))
+
+    @property
+    def _blinds(self) -> list[BlindMarker]:
+        return [self._blind(self.original.mesh, scheme) for scheme in self.blind]
+
+    def _blind(self, mesh: Mesh, scheme: BlindScheme) -> BlindMarker:
+        return make_blind_marker(mesh, self.informed.key, bits=self.informed.bits, scheme=scheme)
+
+
+def _share(survived: Sequence[float]) -> list[float]:
+    """Share the bounds so that all marks survive as much, which grows with a mark's size; squares add up to 1."""
+    if not all(0 < one < math.inf for one in survived):
+        return [math.sqrt(1 / len(survived))] * len(survived)
+    norm = math.sqrt(sum(one**-2 for one in survived))
+    return [min(max(1 / one / norm, _LEAST_SHARE), _MOST_SHARE) for one in survived]
+
+
+def unite(informed: Detection, blind: Sequence[BlindDetection]) -> Detection:
+    """What all marks of a mesh prove together, as a detection beside the original.
+
+    Their signs are independent of each other, and so are the probabilities that they state. The probability that a
+    product of n such is at most q is q Σ (-ln q)^i/i! over i < n (Fisher 1932). Of the undated ones the least counts,
+    times their number.
+    """
+    log10_q = informed.log10_p + sum(one.log10_p for one in blind)
+    nats = -log10_q * math.log(10)
+    total = sum(nats**power / math.factorial(power) for power in range(len(blind) + 1))
+    message = next((one.message for one in (informed, *blind) if one.message is not None), None)
+    told = tuple(f"The mark of {one.scheme!r} alone proves 10^{one.log10_p:.1f}." for one in blind)
+    return informed._replace(
+        message=message,
+        log10_p=evidence.share_of(log10_q, 1 / total),
+        log10_p_undated=evidence.any_of(informed.log10_p_undated, *(one.log10_p_undated for one in blind)),
+        remarks=(*informed.remarks, *told),
+    )
+
+
+def check_combined(schemes: Sequence[str], informed: Sequence[str], blind: Sequence[str]) -> None:
+    """Check the names of schemes that are to mark one mesh together.
+
+    Raises:
+        JaxmarkError: unless the first is informed and the others are blind, each once.
+    """
+    if len(schemes) < 2 or schemes[0] not in informed or any(name not in blind for name in schemes[1:]):
+        raise JaxmarkError(
+            f"Several marks in one mesh are an informed one ({', '.join(informed)}) and then blind ones"
+            f" ({', '.join(blind)}), not {', '.join(schemes)}."
+        )
+    if len(set(schemes)) < len(schemes):
+        raise JaxmarkError(f"Each scheme marks a mesh once, but one is twice among {', '.join(schemes)}.")
