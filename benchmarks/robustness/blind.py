@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh, weld
@@ -83,20 +84,28 @@ def read(suspect: Mesh, key: bytes, scheme: BlindScheme) -> Cell:
     return Cell(found.message == MESSAGE, found.log10_p, found.agreement, time.perf_counter() - start)
 
 
+def named(names: np.ndarray, good: np.ndarray, values: ArrayLike) -> dict[tuple[int, ...], float]:
+    """The values of what counts and has a name that nothing else has."""
+    some, first, count = np.unique(names[good], axis=0, return_index=True, return_counts=True)
+    there = np.asarray(values)[good][first]
+    return {tuple(some[one].tolist()): float(there[one]) for one in np.flatnonzero(count == 1)}
+
+
 def left(before: View, after: View, step: float) -> float:
     """Sum of the cosines that an attack leaves of anchors exactly on the lattice, after the best small change.
 
     The shape may look the other way along its axes: the way that leaves most counts.
     """
-    known = {tuple(before.names[0, one]): float(before.values[one]) for one in np.flatnonzero(before.good)}
+    known = named(before.names[0], before.good, before.values)
     best = 0.0
     for names, mirrored in zip(after.names, after.mirrored, strict=True):
-        rows = [one for one in np.flatnonzero(after.good) if not mirrored and tuple(names[one]) in known]
+        there = named(names, after.good, np.arange(len(names)))
+        rows = [int(there[name]) for name in there.keys() & known.keys() if not mirrored]
         slopes = np.asarray(after.changes, np.float64)[rows]
         freedom = len(rows) - slopes.shape[1]
         if freedom <= 0:
             continue
-        moved = np.array([float(after.values[one]) - known[tuple(names[one])] for one in rows])
+        moved = np.array([float(after.values[one]) - known[tuple(names[one].tolist())] for one in rows])
         off = moved + slopes @ np.linalg.lstsq(slopes, -moved, rcond=None)[0]
         best = max(best, len(rows) * math.exp(-2 * (math.pi / step) ** 2 * float(off @ off) / freedom))
     return best

@@ -13,6 +13,7 @@ from jaxmark.attacks import Kind, attack, get_attack
 from jaxmark.distortion import Comparison, compare
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.blind.marker import BlindMarker
 from jaxmark.watermark.coding.message import guess
 from jaxmark.watermark.marking import Marker
 
@@ -68,20 +69,20 @@ class Breaking(NamedTuple):
 NOTHING = Reading(False, False, 0.5, 0.0)  # the reading of a refused suspect
 
 
-def read(marker: Marker, suspect: Mesh | Alignment, message: bytes) -> Reading:
-    """Read a suspect, and compare what is read with the message.
+def read(marker: Marker | BlindMarker, suspect: Mesh | Alignment, message: bytes) -> Reading:
+    """Read a suspect as it is or as its marker aligns it, and compare what is read with the message.
 
     Raises:
         JaxmarkError: if the suspect cannot be aligned.
     """
-    found = marker.detect(suspect)
-    said = found.message or guess(found.scores, marker.bits)
+    found = marker.detect(suspect)  # pyright: ignore[reportArgumentType] (what the marker's own `align` gave)
+    said = found.message or guess(found.scores, marker.bits, marker.tag_bits)
     wrong = 0.5 if said is None else float(np.mean(_bits(said) != _bits(message)))
     return Reading(found.message == message, found.message not in (None, message), wrong, found.log10_p)
 
 
 def robustness(
-    marker: Marker,
+    marker: Marker | BlindMarker,
     marked: Mesh,
     message: bytes,
     kind: Kind,
@@ -122,7 +123,7 @@ def robustness(
 
 
 def minimum_distortion(
-    marker: Marker,
+    marker: Marker | BlindMarker,
     marked: Mesh,
     message: bytes,
     kind: Kind,

@@ -13,7 +13,7 @@ from functools import lru_cache, partial
 from itertools import product
 from typing import Any
 
-from jaxmark.alignment.alignment import Alignment, align
+from jaxmark.alignment.alignment import Alignment
 from jaxmark.attacks import Attack, attack_each, get_attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation._rates import LOG10_LEVEL, Control, Row
@@ -24,10 +24,13 @@ from jaxmark.files import load_mesh
 from jaxmark.files.reading import read_file
 from jaxmark.geometry.hashing import geometry_hash
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.blind.marker import BlindMarker
+from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.budget import Budget, Visibility, make_budget
 from jaxmark.watermark.coding.keys import Key
-from jaxmark.watermark.marking import DEFAULT_BITS, Marker, make_marker
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme, get_scheme, parameters_of
+from jaxmark.watermark.everyday import prepare_alone, scheme_named
+from jaxmark.watermark.marking import DEFAULT_BITS, Marker
+from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme, parameters_of
 
 _SEEDS_PER_CELL = 5  # attacked by one call
 
@@ -42,7 +45,8 @@ class Study:
 
     meshes: Mapping[str, str | os.PathLike[str] | Mesh]  # files, or meshes, by their names
     attacks: Mapping[str, Sequence[float] | Attack]  # strengths by name in `ATTACKS`, or attacks of your own
-    schemes: Sequence[str] | Mapping[str, str | Scheme] = (DEFAULT_SCHEME,)  # names, or schemes of your own by any name
+    #: Names, or schemes of your own by any name.
+    schemes: Sequence[str] | Mapping[str, str | Scheme | BlindScheme] = (DEFAULT_SCHEME,)
     payloads: Sequence[int] = (DEFAULT_BITS,)
     budgets: Sequence[float | Visibility | Mapping[str, float]] = ("hidden",)  # RMS, names, or limits; see `embed`
     seeds: int = 5  # number of seeds: 0, 1, …
@@ -103,9 +107,9 @@ class Study:
         return Results(tuple(row for cell in done for row in self._rows(cell)))
 
     @property
-    def _schemes(self) -> dict[str, Scheme]:
+    def _schemes(self) -> dict[str, Scheme | BlindScheme]:
         given = self.schemes if isinstance(self.schemes, Mapping) else {name: name for name in self.schemes}
-        return {name: get_scheme(scheme) for name, scheme in given.items()}
+        return {name: scheme_named(scheme) for name, scheme in given.items()}
 
     @property
     def _budgets(self) -> dict[str, Budget]:
@@ -163,7 +167,7 @@ class _Point:
 
     cell: Cell  # identifies the point
     mesh: str | os.PathLike[str] | Mesh = field(compare=False)
-    scheme: Scheme = field(compare=False)
+    scheme: Scheme | BlindScheme = field(compare=False)
     bits: int = field(compare=False)
     budget: Budget = field(compare=False)
 
@@ -218,7 +222,7 @@ def _read(
         if not isinstance(found, str):
             try:
                 marker = _marker(point, key)
-                found = align(marker.original, found) if isinstance(found, Mesh) else found
+                found = marker.align(found) if isinstance(found, Mesh) else found
                 reading = read(marker, found, _message(seed, point.bits))
             except JaxmarkError as error:
                 found = str(error)
@@ -227,9 +231,9 @@ def _read(
 
 
 @lru_cache(maxsize=_SEEDS_PER_CELL + 1)  # the keys that a cell reads with
-def _marker(point: _Point, seed: int) -> Marker:
+def _marker(point: _Point, seed: int) -> Marker | BlindMarker:
     mesh = point.mesh if isinstance(point.mesh, Mesh) else load_mesh(point.mesh)
-    return make_marker(mesh, Key(_derive(seed, "key", 32)), bits=point.bits, scheme=point.scheme)
+    return prepare_alone(mesh, Key(_derive(seed, "key", 32)), point.bits, point.scheme)
 
 
 @lru_cache(maxsize=_SEEDS_PER_CELL)

@@ -69,8 +69,30 @@ def informed_scheme(scheme: str | Scheme | BlindScheme) -> str | Scheme:
         JaxmarkError: if it is not.
     """
     if isinstance(scheme, BlindScheme) or (isinstance(scheme, str) and scheme not in SCHEMES):
-        raise JaxmarkError(f"There is no informed scheme {scheme!r}; the schemes are {', '.join(NAMES)}.")
+        kind = "informed scheme" if scheme in NAMES else "scheme"
+        raise JaxmarkError(f"There is no {kind} {scheme!r}; the schemes are {', '.join(NAMES)}.")
     return scheme
+
+
+def scheme_named(scheme: str | Scheme | BlindScheme) -> Scheme | BlindScheme:
+    """The scheme of this name, of either kind, or that it is.
+
+    Raises:
+        JaxmarkError: if there is none.
+    """
+    return blind_scheme(scheme) or get_scheme(informed_scheme(scheme))
+
+
+def prepare_alone(mesh: Mesh, key: bytes, bits: int, scheme: str | Scheme | BlindScheme) -> Marker | BlindMarker:
+    """Prepare an original for marking with one scheme of either kind.
+
+    Raises:
+        JaxmarkError: see `make_marker`.
+    """
+    blind = blind_scheme(scheme)
+    if blind is None:
+        return make_marker(mesh, key, bits=bits, scheme=informed_scheme(scheme))
+    return make_blind_marker(mesh, key, bits=bits, scheme=blind)
 
 
 def prepare(mesh: Mesh, key: bytes, bits: int, scheme: AnyScheme) -> AnyMarker:
@@ -83,10 +105,7 @@ def prepare(mesh: Mesh, key: bytes, bits: int, scheme: AnyScheme) -> AnyMarker:
         check_combined(scheme, tuple(SCHEMES), tuple(BLIND_SCHEMES))
         informed = make_marker(mesh, key, bits=bits, scheme=scheme[0])
         return CombinedMarker(informed, tuple(BLIND_SCHEMES[name] for name in scheme[1:]))
-    blind = blind_scheme(scheme)
-    if blind is None:
-        return make_marker(mesh, key, bits=bits, scheme=informed_scheme(scheme))
-    return make_blind_marker(mesh, key, bits=bits, scheme=blind)
+    return prepare_alone(mesh, key, bits, scheme)
 
 
 def embed(

@@ -223,6 +223,15 @@ class Marker:
             return self._detect(aligned, b"", None, 1.0).detected()
         return self.decode(self.soft_values(self.receive(aligned))) == message
 
+    @property
+    def tag_bits(self) -> int:
+        """Size of the keyed tag that follows the message."""
+        return TAG_BITS
+
+    def align(self, suspect: Mesh) -> Alignment:
+        """Bring a suspect back to the original, which `detect` takes in its place, with whatever key."""
+        return alignment.align(self.original, suspect)
+
     def glance(self, seen: Observation) -> bytes | None:
         """Read what was hardly attacked with little computation, see `Reader.glance`; None if nothing reads so."""
         quick = self.reader.glance(seen)

@@ -54,6 +54,13 @@ _FIELDS_OF_VERSION_1: Mapping[str, Mapping[str, Any]] = {"keyed": {"hiding": Fal
 
 
 @runtime_checkable
+class Fields(Protocol):
+    """Any dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+
+@runtime_checkable
 class Scheme(Protocol):
     """A dataclass that makes a carrier for an original, a key and a payload; the record of a mark stores its fields.
 
@@ -415,7 +422,7 @@ def get_scheme(
     return SCHEMES[scheme](**{**before, **given})
 
 
-def parameters_of(scheme: Scheme) -> dict[str, Any]:
+def parameters_of(scheme: Fields) -> dict[str, Any]:
     """The fields of a scheme, as a record stores them."""
     return asdict(scheme)
 

@@ -9,7 +9,7 @@ from jaxmark import distortion
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces
-from jaxmark.watermark.blind.reading import code_length, codeword, context, detect
+from jaxmark.watermark.blind.reading import TAG_BITS, BlindDetection, code_length, codeword, context, detect
 from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.blind.writing import Writer, radius_of
 from jaxmark.watermark.budget import Budget, Limits, Visibility, make_budget, visibility_of
@@ -91,6 +91,19 @@ class BlindMarker:
         """The marker that reads a mark it has just made, with the width and step that were chosen."""
         return replace(self, scheme=parameters_in(record, self.scheme))
 
+    @property
+    def tag_bits(self) -> int:
+        """Size of the keyed tag that follows the message."""
+        return TAG_BITS
+
+    def align(self, suspect: Mesh) -> Mesh:
+        """Leave a suspect as it is: nothing is known that it could be aligned with."""
+        return suspect
+
+    def detect(self, suspect: Mesh, message: bytes | None = None) -> BlindDetection:
+        """Read a suspect, with a claimed message or without, see `jaxmark.watermark.blind.reading.detect`."""
+        return detect(suspect, self.key, self.bits, self.scheme, message)
+
     def check(self, marked: Mesh, message: bytes) -> None:
         """Check that a message can be read from a marked mesh that was not attacked.
 
@@ -106,7 +119,7 @@ class BlindMarker:
 
     def reads(self, marked: Mesh, message: bytes) -> bool:
         """Whether a message is read, or without one a presence proven."""
-        found = detect(marked, self.key, self.bits, self.scheme)
+        found = self.detect(marked)
         return found.message == message if message else found.detected()
 
     def tried(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival:

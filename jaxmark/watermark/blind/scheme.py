@@ -1,7 +1,7 @@
 """What a blind scheme is: what it shows of an original to write in, and of a suspect to read."""
 
 from collections.abc import Iterator
-from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -66,6 +66,7 @@ class BlindScheme(Protocol):
     """A frozen dataclass of public ladders: whoever reads without a record tries all of them."""
 
     name: ClassVar[str]  # in records and on the command line
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def widths(self) -> tuple[float, ...]:

@@ -109,19 +109,20 @@ def decode_any(
     return None
 
 
-def guess(scores: Float[np.ndarray, " length"], bits: int) -> bytes | None:
+def guess(scores: Float[np.ndarray, " length"], bits: int, tag_bits: int = TAG_BITS) -> bytes | None:
     """Decode the most plausible message, whatever its tag, as a receiver without tags would.
 
     Args:
         scores: soft values, see `decode`.
         bits: size of the payload in bits.
+        tag_bits: size of the tag.
 
     Returns:
         The message; None if all scores are 0.
     """
     if not np.any(scores):
         return None
-    return np.packbits(_list_candidates(scores[None], bits + TAG_BITS, CANDIDATES)[0, 0, :bits]).tobytes()
+    return np.packbits(_list_candidates(scores[None], bits + tag_bits, CANDIDATES)[0, 0, :bits]).tobytes()
 
 
 def _list_candidates(
