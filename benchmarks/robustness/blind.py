@@ -135,15 +135,17 @@ def row(name: str, cells: list[Cell], *more: object) -> str:
     )
 
 
-def copies(mesh: Mesh, scheme: BlindScheme, limits: dict[str, float] | None, count: int) -> Iterator[Copy]:
-    """Mark a mesh with several keys, and say how."""
+def copies(
+    mesh: Mesh, scheme: BlindScheme, together: tuple[str, ...], limits: dict[str, float] | None, count: int
+) -> Iterator[Copy]:
+    """Mark a mesh with several keys, with a scheme or several together, and say how."""
     for seed in range(count):
         key, start = np.random.default_rng([seed, 64]).bytes(32), time.perf_counter()
-        marked, info = jm.embed(mesh, MESSAGE, key, scheme=scheme, limits=limits)
+        marked, info = jm.embed(mesh, MESSAGE, key, scheme=together or scheme, limits=limits)
         seconds, found = time.perf_counter() - start, jm.compare(mesh, marked, ("mrms", "msdm"))
+        how = "" if together else ", width {width}, step {step:.2e}".format(**info.record.parameters)
         print(
-            f"Key {seed}: RMS {info.rms:.2e}, MRMS {found.mrms:.2e}, MSDM {found.msdm:.3f}, width"
-            f" {info.record.parameters['width']}, step {info.record.parameters['step']:.2e}, α {info.record.beta:.2f},"
+            f"Key {seed}: RMS {info.rms:.2e}, MRMS {found.mrms:.2e}, MSDM {found.msdm:.3f}{how}, α {info.record.beta:.2f},"
             f" predicted to survive noise {info.survives.whole:.4f}, {seconds:.0f} s.",
             flush=True,
         )
@@ -156,11 +158,11 @@ def measure(mesh: Mesh, marked: list[Copy], attacks: list[str]) -> None:
     for steps in attacks:
         try:
             cells = [read(attacked(one.marked, steps, seed), one.key, one.scheme) for seed, one in enumerate(marked)]
-            predicted = predict(mesh, steps, marked[0])
+            predicted = f"{predict(mesh, steps, marked[0]):.0f}" if "width" in marked[0].info.record.parameters else ""
         except jm.JaxmarkError as refusal:
             print(line(steps, f"failed: {refusal}"), flush=True)
             continue
-        print(row(steps, cells, f"{predicted:.0f}"), flush=True)
+        print(row(steps, cells, predicted), flush=True)
 
 
 def control(mesh: Mesh, marked: list[Copy]) -> None:
@@ -180,23 +182,26 @@ def main() -> None:
     parser.add_argument("--keys", type=int, default=2, help="keys, each with attacks of its own; %(default)s")
     parser.add_argument("--limits", choices=LIMITS, default="perceptual", help="%(default)s")
     parser.add_argument("--scheme", choices=BLIND_SCHEMES, default="field", help="%(default)s")
+    parser.add_argument("--together", nargs="+", default=[], help="mark with these schemes, and read the blind ones")
     parser.add_argument("--attacks", default=ATTACKS, help="kinds and strengths; %(default)s")
     parser.add_argument("--controls", action=argparse.BooleanOptionalAction, default=True)
     options = parser.parse_args()
-    scheme = BLIND_SCHEMES[options.scheme]
+    scheme, steps = BLIND_SCHEMES[options.scheme], " ".join(options.attacks.split()).split("; ")
     for path in options.meshes:
         mesh = load(parser, path)
         points = len(weld(mesh.vertices).first)
         print(f"\n## {path.name}, {points:,} points, {options.limits} limits\n")
         print(f"{8 * len(MESSAGE)} bits and their tag need nρ² of about {NEEDED:.0f}.\n", flush=True)
         try:
-            marked = list(copies(mesh, scheme, LIMITS[options.limits], options.keys))
+            marked = list(copies(mesh, scheme, tuple(options.together), LIMITS[options.limits], options.keys))
         except jm.JaxmarkError as refusal:
             print(f"Not marked: {refusal}", flush=True)
             continue
-        measure(mesh, marked, " ".join(options.attacks.split()).split("; "))
-        if options.controls:
-            control(mesh, marked)
+        for name in options.together[1:] or [options.scheme]:
+            print(f"\nRead by `{name}`:")
+            measure(mesh, [one._replace(scheme=BLIND_SCHEMES[name]) for one in marked], steps)
+            if options.controls:
+                control(mesh, marked)
 
 
 if __name__ == "__main__":

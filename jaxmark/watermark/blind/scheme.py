@@ -43,8 +43,8 @@ class Host(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Number of anchors that are written."""
-        return int(self.good.sum())
+        """Number of anchors that are written; those of one name count once."""
+        return len(np.unique(self.names[self.good > 0], axis=0))
 
 
 class View(NamedTuple):
