@@ -145,8 +145,8 @@ def copies(
         seconds, found = time.perf_counter() - start, jm.compare(mesh, marked, ("mrms", "msdm"))
         how = "" if together else ", width {width}, step {step:.2e}".format(**info.record.parameters)
         print(
-            f"Key {seed}: RMS {info.rms:.2e}, MRMS {found.mrms:.2e}, MSDM {found.msdm:.3f}{how}, α {info.record.beta:.2f},"
-            f" predicted to survive noise {info.survives.whole:.4f}, {seconds:.0f} s.",
+            f"Key {seed}: RMS {info.rms:.2e}, MRMS {found.mrms:.2e}, MSDM {found.msdm:.3f}{how}, α"
+            f" {info.record.beta:.2f}, predicted to survive noise {info.survives.whole:.4f}, {seconds:.0f} s.",
             flush=True,
         )
         yield Copy(key, marked, info, scheme)
