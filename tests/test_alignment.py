@@ -427,6 +427,7 @@ def rippled_ball() -> Mesh:
     return make_mesh(vertices * (1 + 0.02 * waves), np.asarray(hull.faces))
 
 
+@pytest.mark.slow
 def test_what_cannot_be_aligned_is_refused(original: Original):
     for other in (bumpy_sphere(4, 3), make_mesh(*tetrahedron())):
         with pytest.raises(jm.JaxmarkError, match="could not be aligned"):

@@ -57,6 +57,7 @@ def test_inversion_fails_only_by_the_hash(published, forged):
     assert jm.detect(mesh, original=forged, key=FORGER, bits=16).message is None
 
 
+@pytest.mark.slow
 def test_going_round_does_not_help(published):
     """The forged original is made anew for the hash of the last one: it never settles."""
     mesh, _ = published

@@ -150,6 +150,7 @@ def test_capacity_is_what_embed_takes(workshop: Workshop):
     assert workshop.json("capacity", "model.ply", *budget, "--noise", "0.01")["bits"] < bits
 
 
+@pytest.mark.slow
 def test_copies_are_traced(workshop: Workshop):
     Path("names.txt").write_text("alice\nbob\n\ncarol\n")
     told = workshop.json("embed", "model.ply", "copy.ply", "--key", "owner.key", "--recipient", "bob")
@@ -172,6 +173,7 @@ def test_copies_are_traced(workshop: Workshop):
         assert re.search(sentence, workshop.refused(*arguments))
 
 
+@pytest.mark.slow
 def test_nothing_found_is_status_1(workshop: Workshop):
     workshop.embed()
     workshop.json("keygen", "other.key")

@@ -196,7 +196,8 @@ def test_smoothing_is_undone_as_by_rounds(shape: Mesh):
     np.testing.assert_allclose(found, rounds, atol=2e-5)
 
 
-@pytest.mark.parametrize("claimed", [pytest.param(None, marks=pytest.mark.slow), MESSAGE])
+@pytest.mark.slow
+@pytest.mark.parametrize("claimed", [None, MESSAGE])
 def test_nothing_is_detected_where_nothing_is(shape: Mesh, marked, key: jm.Key, claimed):
     mesh, info = marked
     assert not jm.detect(shape, key=key, message=claimed, record=info.record).detected(1e-3)
@@ -221,6 +222,7 @@ def test_a_claimed_message_is_proven_or_refuted(marked, key: jm.Key):
         jm.detect(mesh, key=key, record=info.record, message=bytes(4))
 
 
+@pytest.mark.slow
 def test_presence_is_a_mark(shape: Mesh, key: jm.Key):
     mesh, info = jm.embed(shape, b"", key, budget=3e-4, scheme=SCHEME)
     assert info.record.content == "presence"

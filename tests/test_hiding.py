@@ -148,6 +148,7 @@ def test_carriers_are_made_in_traced_code(key: jm.Key):
     np.testing.assert_allclose(written(original.signal), expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_planes_stay_plane(key: jm.Key):
     """By default: what is written on a box is read, and its sides stay where they are."""
     mesh = box()
@@ -197,6 +198,7 @@ def test_visibility_has_names():
         make_budget(visibility="invisible")  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.slow
 def test_what_bands_show_is_measured_as_they_are_hidden():
     mesh, family = box(), KeyedScheme(bands=16).family()
     original = make_original(mesh)

@@ -145,6 +145,7 @@ def test_equal_surroundings_count_once(key: jm.Key):
     np.testing.assert_allclose(readings[1].square, readings[0].square, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_several_marks_are_read_each_alone_and_united(key: jm.Key):
     mesh, schemes = rough_sphere(4000), ("keyed", "local")
     marked, info = jm.embed(mesh, MESSAGE, key, budget=2e-3, scheme=schemes)

@@ -48,6 +48,7 @@ def test_oracles_say_what_the_detector_says(marked, strength):
         assert decide_by_score(score_oracle(marker, MESSAGE), alpha)(suspect) == wanted
 
 
+@pytest.mark.slow
 def test_what_is_refused_is_not_detected(marked):
     marker, _ = marked
     other = jm.make_mesh(np.eye(3), np.array([[0, 1, 2]]))

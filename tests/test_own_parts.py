@@ -119,6 +119,7 @@ def test_its_capacity_is_what_it_has_code_bits_for():
         jm.make_marker(mesh, jm.new_key(), bits=most + 8, scheme=PatchScheme())
 
 
+@pytest.mark.slow
 def test_enemies_attack_it(marked):
     marker, mesh = marked
     before = owner_sees(marker, mesh)

@@ -25,6 +25,7 @@ def noisy(mesh: Mesh, noise: float, seed: int) -> Mesh:
     )
 
 
+@pytest.mark.slow
 def test_what_a_mark_survives_is_as_said(key: jm.Key):
     mesh = bumpy_sphere(3)
     marker = jm.make_marker(mesh, key, bits=16)

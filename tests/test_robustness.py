@@ -73,6 +73,7 @@ def test_refusals(marked):
         jm.robustness(*marked, MESSAGE, "melting")
 
 
+@pytest.mark.slow
 def test_the_least_that_breaks_a_mark_lies_between_what_does_and_what_does_not(marked):
     marker, mesh = marked
     wide = jm.attacks.ATTACKS["noise"]._replace(strengths=(0.001, 0.3))

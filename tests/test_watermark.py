@@ -129,6 +129,7 @@ def test_the_completed_bound_3_holds(seed, x64):
     assert np.asarray(correlation_bound(jnp.asarray(sequences), jnp.asarray(attack), 0.9, beta)).max() < 0
 
 
+@pytest.mark.slow
 def test_evidence_is_what_a_detection_says(x64):
     """The pure function in nats, against the bound that is printed, which pays for other ways to align and to claim."""
     marker = jm.make_marker(bumpy_sphere(3), jm.Key(bytes(32)), bits=16)
