@@ -15,7 +15,7 @@ from jaxmark.plot.figures import COLOURS, Picture, finish, panels
 from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.field import FieldScheme
 from jaxmark.watermark.blind.reading import codeword, context
-from jaxmark.watermark.blind.scheme import Host
+from jaxmark.watermark.blind.scheme import AnchoredHost
 
 MESSAGE = b"jaxmark!"
 SCHEME = FieldScheme(widths=(0.018,))  # one of three widths, so that this takes a minute; usually "field" will do
@@ -62,7 +62,7 @@ for name, suspect, tried in (("unmarked", mesh, key), ("marked, another key", ma
 choices = context(key, 8 * len(MESSAGE), SCHEME.name)
 
 
-def phases(host: Host) -> np.ndarray:
+def phases(host: AnchoredHost) -> np.ndarray:
     """How far each value is from what key and message allow, in steps."""
     word = codeword(MESSAGE, choices)
     dither = make_dither(choices, SCHEME.name, host.names, len(word))

@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh, weld
 from jaxmark.watermark.blind.reading import TAG_BITS, context
-from jaxmark.watermark.blind.scheme import BlindScheme, View
+from jaxmark.watermark.blind.scheme import BlindScheme, Look
 from jaxmark.watermark.everyday import BLIND_SCHEMES
 from jaxmark.watermark.marking import EmbedInfo
 
@@ -91,7 +91,7 @@ def named(names: np.ndarray, good: np.ndarray, values: ArrayLike) -> dict[tuple[
     return {tuple(some[one].tolist()): float(there[one]) for one in np.flatnonzero(count == 1)}
 
 
-def left(before: View, after: View, step: float) -> float:
+def left(before: Look, after: Look, step: float) -> float:
     """Sum of the cosines that an attack leaves of anchors exactly on the lattice, after the best small change.
 
     The shape may look the other way along its axes: the way that leaves most counts.

@@ -37,7 +37,7 @@ from jaxmark.watermark.blind import reading
 from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.field import FieldScheme
 from jaxmark.watermark.blind.marker import make_blind_marker
-from jaxmark.watermark.blind.scheme import Host
+from jaxmark.watermark.blind.scheme import AnchoredHost
 from jaxmark.watermark.blind.writing import Writer
 from jaxmark.watermark.everyday import BLIND_SCHEMES
 from jaxmark.watermark.marking import EmbedInfo
@@ -178,7 +178,7 @@ class Seen(NamedTuple):
     mesh: Mesh
     original: Original
     writer: Writer
-    host: Host
+    host: AnchoredHost
     step: float
 
     @property

@@ -21,7 +21,7 @@ from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.precision import matmul
 from jaxmark.spectral.shapes import common_laplacian, pad_rows
 from jaxmark.watermark.blind.anchors import Anchors, Pieces, changes, cut, encloses, look, make_anchors, place
-from jaxmark.watermark.blind.scheme import Host, View, measure
+from jaxmark.watermark.blind.scheme import AnchoredHost, Look, measure
 from jaxmark.watermark.coding.keys import Choices
 
 _LEAST_AREA = 0.2  # of the mean: what vertices of smaller area count as
@@ -67,7 +67,7 @@ class FieldScheme:
         """See `BlindScheme`."""
         return replace(self, widths=(width,), steps=(step,))
 
-    def host(self, original: Original, width: float, choices: Choices) -> Host:
+    def host(self, original: Original, width: float, choices: Choices) -> AnchoredHost:
         """See `BlindScheme`.
 
         Raises:
@@ -101,9 +101,9 @@ class FieldScheme:
         good = np.asarray(shown.good & (anchors.around[:, 0] >= 0), np.float64)
         _, pose = measure(shape, original.to_traced(original.positions))
         values, free = np.asarray(shown.values, np.float64), _inverse_areas(original)
-        return Host(shape, anchors.cells, values, pose, good, free, _FIRST_STEP * width)
+        return AnchoredHost(shape, anchors.cells, values, pose, good, free, _FIRST_STEP * width)
 
-    def views(self, suspect: Mesh, choices: Choices) -> Iterator[View]:
+    def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:
         """See `BlindScheme`.
 
         Raises:
@@ -123,7 +123,7 @@ class FieldScheme:
                     found = changes(surface, anchors, jnp.asarray(width, dtype), jnp.asarray(blur, dtype))
                     at = jnp.asarray(anchors.places, dtype)
                     by = jnp.concatenate([jnp.cross(at, found.slope), found.slope, found.growth[:, None]], axis=1)
-                    yield View(
+                    yield Look(
                         anchors.cells * TURNS[:, None],
                         found.shown.values,
                         np.asarray(found.shown.good) & (anchors.around[:, 0] >= 0),

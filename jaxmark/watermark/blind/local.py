@@ -24,7 +24,7 @@ from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.laplacian import Laplacian
 from jaxmark.spectral.shapes import common_laplacian, common_size, pad_rows
 from jaxmark.watermark.blind.dither import make_words
-from jaxmark.watermark.blind.scheme import Host, View, measure
+from jaxmark.watermark.blind.scheme import AnchoredHost, Look, measure
 from jaxmark.watermark.coding.keys import Choices
 
 _RINGS = 5  # of neighbours that a colour depends on
@@ -66,16 +66,16 @@ class LocalScheme:
         """See `BlindScheme`."""
         return replace(self, widths=(width,), steps=(step,))
 
-    def host(self, original: Original, width: float, choices: Choices) -> Host:
+    def host(self, original: Original, width: float, choices: Choices) -> AnchoredHost:
         """See `BlindScheme`."""
         anchors = _anchors(original.points, choices)
         shape = _shape(original.points, original.operator, anchors, int(width), 0)
         values, held = measure(shape, original.to_traced(original.positions))
         good = (anchors.vertices >= 0).astype(np.float64)
         free = original.to_traced(original.used.astype(np.float64))
-        return Host(shape, anchors.names, np.asarray(values, np.float64), held, good, free, _FIRST_STEP)
+        return AnchoredHost(shape, anchors.names, np.asarray(values, np.float64), held, good, free, _FIRST_STEP)
 
-    def views(self, suspect: Mesh, choices: Choices) -> Iterator[View]:
+    def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:
         """See `BlindScheme`.
 
         Raises:
@@ -90,7 +90,7 @@ class LocalScheme:
         for shorter in _SHORTER:
             for width in self.widths:
                 values, _ = measure(_shape(suspect, operator, anchors, int(width), shorter), at)
-                yield View(
+                yield Look(
                     anchors.names[None],
                     values,
                     anchors.vertices >= 0,
@@ -141,7 +141,7 @@ def _anchors(points: Mesh, choices: Choices) -> _Anchors:
     return _Anchors(pad_rows(found, count, -1), pad_rows(names[found][:, None], count))
 
 
-class Neighbourhoods(NamedTuple):
+class Surroundings(NamedTuple):
     """What the values of a mesh are computed from, but its vertices; a pytree."""
 
     operator: Laplacian
@@ -168,12 +168,12 @@ class Neighbourhoods(NamedTuple):
         return (values / jnp.maximum(size, tiny))[self.anchors], jnp.zeros(0, vertices.dtype)
 
 
-def _shape(points: Mesh, operator: Laplacian, anchors: _Anchors, power: int, shorter: int) -> Neighbourhoods:
+def _shape(points: Mesh, operator: Laplacian, anchors: _Anchors, power: int, shorter: int) -> Surroundings:
     """Prepare a mesh for averages of a power, shorter by some."""
     faces, rows = np.asarray(points.faces), len(operator.degree)
     used = np.zeros(rows, bool)
     used[faces.ravel()] = True
-    return Neighbourhoods(
+    return Surroundings(
         operator,
         pad_rows(faces, common_size(len(faces))),
         np.maximum(anchors.vertices, 0),

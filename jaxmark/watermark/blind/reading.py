@@ -25,7 +25,7 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.pose import Pose
 from jaxmark.watermark import evidence
 from jaxmark.watermark.blind.dither import make_dither
-from jaxmark.watermark.blind.scheme import BlindScheme, View
+from jaxmark.watermark.blind.scheme import BlindScheme, Look
 from jaxmark.watermark.blind.search import moved, search
 from jaxmark.watermark.coding.keys import Choices, Key, bind
 from jaxmark.watermark.coding.message import decode_any, encode
@@ -43,7 +43,7 @@ _SURE, _SURE_UNREAD = -12.0, -40.0
 class Reading(NamedTuple):
     """One way in which a suspect may be read: a view, a turn, a step and a change of pose."""
 
-    view: View
+    view: Look
     turn: int
     step: float
     pilot: float  # how well the offsets fit, see `Found`
@@ -151,7 +151,7 @@ def is_sure(found: BlindDetection) -> bool:
     return found.log10_p <= (_SURE if found.message is not None else _SURE_UNREAD)
 
 
-def _readings(view: View, scheme: BlindScheme, choices: Choices, length: int) -> list[Reading]:
+def _readings(view: Look, scheme: BlindScheme, choices: Choices, length: int) -> list[Reading]:
     """All ways of reading a view.
 
     Anchors of one name have one sign: the mean of their cosines is one term of the score.

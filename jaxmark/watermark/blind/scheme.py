@@ -30,7 +30,7 @@ def measure(
     return shape.measure(vertices)
 
 
-class Host(NamedTuple):
+class AnchoredHost(NamedTuple):
     """An original as its anchors of one width show it."""
 
     shape: Measured
@@ -47,7 +47,7 @@ class Host(NamedTuple):
         return len(np.unique(self.names[self.good > 0], axis=0))
 
 
-class View(NamedTuple):
+class Look(NamedTuple):
     """One way of looking at a suspect; independent of the key's signs."""
 
     names: Int64[np.ndarray, "turns anchors parts"]  # of the anchors, for each way in which the suspect may lie
@@ -97,11 +97,11 @@ class BlindScheme(Protocol):
         """The scheme with one width and step."""
         ...
 
-    def host(self, original: Original, width: float, choices: Choices) -> Host:
+    def host(self, original: Original, width: float, choices: Choices) -> AnchoredHost:
         """Look at an original by anchors of one width."""
         ...
 
-    def views(self, suspect: Mesh, choices: Choices) -> Iterator[View]:
+    def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:
         """Look at a suspect in all ways, the likeliest first.
 
         Raises:

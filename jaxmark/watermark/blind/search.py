@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64
 
 from jaxmark.spectral.precision import matmul
-from jaxmark.watermark.blind.scheme import View
+from jaxmark.watermark.blind.scheme import Look
 
 _STARTS, _CLIMBS, _STEPS = 256, 4, 6  # random changes; how many climb, and how far
 
@@ -39,7 +39,7 @@ def search(
 
     Args:
         values: of a view.
-        changes: of its values, in the order of `View`.
+        changes: of its values, in the order of `Look`.
         good: 1 for each anchor that counts, else 0.
         offsets: δ of each anchor, for each turn.
         steps: of the lattice of values.
@@ -73,6 +73,6 @@ def search(
     return Found(jnp.swapaxes(change, 0, 1), pilot.T)
 
 
-def moved(view: View, change: Float64[np.ndarray, " changes"]) -> Float64[np.ndarray, " anchors"]:
+def moved(view: Look, change: Float64[np.ndarray, " changes"]) -> Float64[np.ndarray, " anchors"]:
     """Values of a view after a small change."""
     return np.asarray(view.values, np.float64) + np.asarray(view.changes, np.float64) @ change

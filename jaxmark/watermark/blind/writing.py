@@ -21,7 +21,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.dither import Dither, make_dither
 from jaxmark.watermark.blind.reading import TAG_BITS, code_length, codeword
-from jaxmark.watermark.blind.scheme import BlindScheme, Host, Measured, measure
+from jaxmark.watermark.blind.scheme import AnchoredHost, BlindScheme, Measured, measure
 from jaxmark.watermark.budget import Budget, write
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import TAG_BITS as _TAG_BITS
@@ -91,7 +91,7 @@ class Plan(NamedTuple):
     step: float  # of the lattice of values
     alpha: float  # part of the way to the lattice that is gone
     size: float  # RMS of the displacement, in diagonals
-    host: Host
+    host: AnchoredHost
     dither: Dither
 
     def energy(self, spread: float) -> float:
@@ -121,9 +121,9 @@ class Writer:
 
     def __init__(self, original: Original, scheme: BlindScheme, choices: Choices) -> None:
         self.original, self.scheme, self.choices = original, scheme, choices
-        self._hosts: dict[float, Host] = {}
+        self._hosts: dict[float, AnchoredHost] = {}
 
-    def host(self, width: float) -> Host:
+    def host(self, width: float) -> AnchoredHost:
         """The original as its anchors of one width show it."""
         if width not in self._hosts:
             self._hosts[width] = self.scheme.host(self.original, width, self.choices)
@@ -136,14 +136,14 @@ class Writer:
             return original.to_traced(hiding_directions(original))
         return original.to_traced(np.tile(np.eye(3), (len(original.used), 1, 1)))
 
-    def off(self, host: Host, dither: Dither, word: Float64[np.ndarray, " code"], step: float) -> np.ndarray:
+    def off(self, host: AnchoredHost, dither: Dither, word: Float64[np.ndarray, " code"], step: float) -> np.ndarray:
         """How far each value is from the nearest number that its dither and code bit allow, in steps."""
         sign = dither.sign * word[dither.slot]
         away = host.values / step - dither.offset - np.where(sign < 0, 0.5, 0)
         return away - np.round(away)
 
     def shift(
-        self, host: Host, targets: Float64[np.ndarray, " anchors"], rounds: int
+        self, host: AnchoredHost, targets: Float64[np.ndarray, " anchors"], rounds: int
     ) -> Float64[np.ndarray, "points 3"]:
         """The least displacement by which anchors show these values, in diagonals."""
         original = self.original
@@ -264,7 +264,7 @@ class Writer:
             bits += 8
         return bits
 
-    def _spreads(self, host: Host) -> tuple[float, float]:
+    def _spreads(self, host: AnchoredHost) -> tuple[float, float]:
         """Spread of the anchors' values by noise and by smoothing of the original; see `_disturbances`."""
         before = host.values[host.good > 0]
         spreads = []
