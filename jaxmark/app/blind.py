@@ -11,8 +11,7 @@ from jaxmark.app.telling import Told, describe
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, load_scene
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark import evidence
-from jaxmark.watermark.blind.reading import BlindDetection
+from jaxmark.watermark.blind.reading import BlindDetection, best_of
 from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.deposit import Deposit
@@ -46,11 +45,7 @@ class BlindReader:
         several = len(scene.meshes) > 1
         tried = list(scene.meshes.values()) if several else [load_mesh(suspect)]
         found = [self._read(mesh, one) for mesh in tried for one in records]
-        best = min(found, key=lambda one: (one.message is None, one.log10_p))
-        best = best._replace(
-            log10_p=evidence.share_of(best.log10_p, 1 / len(found)),
-            log10_p_undated=evidence.share_of(best.log10_p_undated, 1 / len(found)),
-        )
+        best = best_of(found, len(found))
         detected = best.detected(self.alpha)
         remarks = list(best.remarks)
         if several:

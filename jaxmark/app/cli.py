@@ -33,13 +33,12 @@ from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import same_connectivity
 from jaxmark.watermark.budget import VISIBILITY, Visibility, make_budget, visibility_of
 from jaxmark.watermark.coding.keys import Key, commitment, load_key, new_key, save_key
-from jaxmark.watermark.combined import check_combined
 from jaxmark.watermark.deposit import Deposit, make_deposit
-from jaxmark.watermark.everyday import BLIND_SCHEMES, NAMES, blind_scheme, capacity
+from jaxmark.watermark.everyday import NAMES, blind_scheme, capacity, split
 from jaxmark.watermark.marking import COVERAGE, DEFAULT_BITS, NOISE
 from jaxmark.watermark.record import RECORD_SUFFIX, Record
 from jaxmark.watermark.scenes import load_record
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES
+from jaxmark.watermark.schemes import DEFAULT_SCHEME
 from jaxmark.watermark.tracing import identify
 
 
@@ -54,7 +53,7 @@ class _Schemes(click.ParamType):
         if unknown := [name for name in names if name not in NAMES]:
             self.fail(f"{unknown[0]!r} is not one of {', '.join(map(repr, NAMES))}.", param, ctx)
         if len(names) > 1:
-            check_combined(names, tuple(SCHEMES), tuple(BLIND_SCHEMES))
+            split(names)  # refuses what cannot mark one mesh together
         return names
 
 

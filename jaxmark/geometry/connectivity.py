@@ -70,6 +70,14 @@ class Rings:
         self._colours = mix(self._colours * np.uint64(3) + around)
         return self._colours
 
+    def least(self, numbers: Int64[np.ndarray, " vertices"]) -> Int64[np.ndarray, " vertices"]:
+        """The least number of each vertex and its neighbours."""
+        found = numbers.copy()
+        if len(self._neighbour):
+            around = np.minimum.reduceat(numbers[self._neighbour], self._start)
+            found[self._linked] = np.minimum(numbers[self._linked], around)
+        return found
+
 
 def _unique(colours: Colours) -> Int64[np.ndarray, " unique"]:
     """Vertices whose colour no other vertex has."""

@@ -3,10 +3,10 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from jaxmark import distortion
 from jaxmark.alignment.original import Original
-from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark import evidence
 from jaxmark.watermark.blind.marker import BlindMarker, make_blind_marker
@@ -51,8 +51,8 @@ class CombinedMarker:
         reference = distortion.Reference(mesh)
         _, alone = self.informed.embed(message, bounds.rms, limits=bounds.limits, read_back=False)
         sizes, survived = [alone.rms], [alone.survives.whole]
-        for scheme in self.blind:
-            plan = self._blind(mesh, scheme).plan(message, bounds, reference)
+        for marker in self._blinds:
+            plan = marker.plan(message, bounds, reference)
             sizes.append(plan.rms)
             survived.append(plan.survives.whole)
         shares = _share(survived)
@@ -95,7 +95,7 @@ class CombinedMarker:
         tried = [one.tried(marked, message, predicted) for one in (self.informed, *self._blinds)]
         return Survival(min(one.whole for one in tried), max(one.half for one in tried))
 
-    @property
+    @cached_property
     def _blinds(self) -> list[BlindMarker]:
         return [self._blind(self.original.mesh, scheme) for scheme in self.blind]
 
@@ -129,18 +129,3 @@ def unite(informed: Detection, blind: Sequence[BlindDetection]) -> Detection:
         log10_p_undated=evidence.any_of(informed.log10_p_undated, *(one.log10_p_undated for one in blind)),
         remarks=(*informed.remarks, *told),
     )
-
-
-def check_combined(schemes: Sequence[str], informed: Sequence[str], blind: Sequence[str]) -> None:
-    """Check the names of schemes that are to mark one mesh together.
-
-    Raises:
-        JaxmarkError: unless the first is informed and the others are blind, each once.
-    """
-    if len(schemes) < 2 or schemes[0] not in informed or any(name not in blind for name in schemes[1:]):
-        raise JaxmarkError(
-            f"Several marks in one mesh are an informed one ({', '.join(informed)}) and then blind ones"
-            f" ({', '.join(blind)}), not {', '.join(schemes)}."
-        )
-    if len(set(schemes)) < len(schemes):
-        raise JaxmarkError(f"Each scheme marks a mesh once, but one is twice among {', '.join(schemes)}.")

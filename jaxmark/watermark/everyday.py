@@ -14,7 +14,6 @@ from jaxmark.alignment.alignment import Align
 from jaxmark.alignment.original import make_original
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark import evidence
 from jaxmark.watermark.blind import reading
 from jaxmark.watermark.blind.field import FieldScheme
 from jaxmark.watermark.blind.local import LocalScheme
@@ -23,7 +22,7 @@ from jaxmark.watermark.blind.reading import BlindDetection
 from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.budget import Limits, Visibility, make_budget, visibility_of
 from jaxmark.watermark.coding.keys import KEY_BYTES, Key
-from jaxmark.watermark.combined import CombinedMarker, check_combined, unite
+from jaxmark.watermark.combined import CombinedMarker, unite
 from jaxmark.watermark.detectors import Detector
 from jaxmark.watermark.marking import (
     COVERAGE,
@@ -74,6 +73,22 @@ def informed_scheme(scheme: str | Scheme | BlindScheme) -> str | Scheme:
     return scheme
 
 
+def split(schemes: tuple[str, ...]) -> tuple[str, tuple[BlindScheme, ...]]:
+    """The informed scheme and the blind ones that mark one mesh together, by their names.
+
+    Raises:
+        JaxmarkError: unless the first is informed and the others are blind, each once.
+    """
+    if len(schemes) < 2 or schemes[0] not in SCHEMES or any(name not in BLIND_SCHEMES for name in schemes[1:]):
+        raise JaxmarkError(
+            f"Several marks in one mesh are an informed one ({', '.join(SCHEMES)}) and then blind ones"
+            f" ({', '.join(BLIND_SCHEMES)}), not {', '.join(schemes)}."
+        )
+    if len(set(schemes)) < len(schemes):
+        raise JaxmarkError(f"Each scheme marks a mesh once, but one is twice among {', '.join(schemes)}.")
+    return schemes[0], tuple(BLIND_SCHEMES[name] for name in schemes[1:])
+
+
 def scheme_named(scheme: str | Scheme | BlindScheme) -> Scheme | BlindScheme:
     """The scheme of this name, of either kind, or that it is.
 
@@ -99,12 +114,11 @@ def prepare(mesh: Mesh, key: bytes, bits: int, scheme: AnyScheme) -> AnyMarker:
     """Prepare an original for marking, with a scheme of either kind or several.
 
     Raises:
-        JaxmarkError: see `make_marker` and `check_combined`.
+        JaxmarkError: see `make_marker` and `split`.
     """
     if isinstance(scheme, tuple):
-        check_combined(scheme, tuple(SCHEMES), tuple(BLIND_SCHEMES))
-        informed = make_marker(mesh, key, bits=bits, scheme=scheme[0])
-        return CombinedMarker(informed, tuple(BLIND_SCHEMES[name] for name in scheme[1:]))
+        informed, blind = split(scheme)
+        return CombinedMarker(make_marker(mesh, key, bits=bits, scheme=informed), blind)
     return prepare_alone(mesh, key, bits, scheme)
 
 
@@ -288,10 +302,9 @@ def detect(
     """
     if bits is None and record is None and isinstance(message, bytes):
         bits = 8 * len(message)
-    others: list[BlindScheme] = []
+    others: tuple[BlindScheme, ...] = ()
     if isinstance(scheme, tuple):
-        check_combined(scheme, tuple(SCHEMES), tuple(BLIND_SCHEMES))
-        others, scheme = [BLIND_SCHEMES[name] for name in scheme[1:]], scheme[0]
+        scheme, others = split(scheme)
     named = scheme if record is None else record.scheme
     blind = None if named is None else blind_scheme(named)
     if blind is not None or (named is None and original is None):
@@ -357,8 +370,4 @@ def read_blind(
         found.append(reading.detect(suspect, Key(key), payload, one, message, record))
         if reading.is_sure(found[-1]):
             break
-    best = min(found, key=lambda one: (one.message is None, one.log10_p))
-    return best._replace(
-        log10_p=evidence.share_of(best.log10_p, 1 / len(tried)),
-        log10_p_undated=evidence.share_of(best.log10_p_undated, 1 / len(tried)),
-    )
+    return reading.best_of(found, len(tried))

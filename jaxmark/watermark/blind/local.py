@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Float64, Int, Int64
 
 from jaxmark.alignment.original import Original
 from jaxmark.geometry.connectivity import Rings
-from jaxmark.geometry.mesh import Mesh, check_faces, compact, diagonal, edges, open_sides, weld, weld_mesh
+from jaxmark.geometry.mesh import Mesh, check_faces, compact, diagonal, open_sides, weld, weld_mesh
 from jaxmark.geometry.pose import Pose
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.laplacian import Laplacian
@@ -112,10 +112,6 @@ class _Anchors(NamedTuple):
 
 def _anchors(points: Mesh, choices: Choices) -> _Anchors:
     """Find the vertices whose keyed hash is the least within some rings, and no other's, away from borders."""
-    pairs = edges(points.faces)
-    pairs = np.concatenate([pairs, pairs[:, ::-1]])
-    pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
-    linked, start = np.unique(pairs[:, 0], return_index=True)
     rings = Rings(points)
     names = [rings.grow() for _ in range(_RINGS)][-1].view(np.int64)
     known, place = np.unique(names, return_inverse=True)
@@ -124,8 +120,7 @@ def _anchors(points: Mesh, choices: Choices) -> _Anchors:
     def least(numbers: Int64[np.ndarray, " vertices"], count: int) -> Int64[np.ndarray, " vertices"]:
         """The least number within so many rings."""
         for _ in range(count):
-            numbers = numbers.copy()
-            numbers[linked] = np.minimum(numbers[linked], np.minimum.reduceat(numbers[pairs[:, 1]], start))
+            numbers = rings.least(numbers)
         return numbers
 
     # Where equal hashes are near, the first and the last of them differ, and neither is an anchor.
@@ -136,7 +131,7 @@ def _anchors(points: Mesh, choices: Choices) -> _Anchors:
     faces, alone_there = np.asarray(points.faces), open_sides(points.faces)
     border[faces[alone_there]] = border[np.roll(faces, -1, axis=1)[alone_there]] = -1
     inside = least(border, _BORDER) == 0
-    found = np.flatnonzero(alone & inside & np.isin(number, linked))
+    found = np.flatnonzero(alone & inside & (rings.valence > 0))
     count = common_size(max(len(found), 1))
     return _Anchors(pad_rows(found, count, -1), pad_rows(names[found][:, None], count))
 

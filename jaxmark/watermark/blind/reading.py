@@ -146,6 +146,15 @@ def detect(
     return best
 
 
+def best_of(found: Sequence[BlindDetection], tries: int) -> BlindDetection:
+    """Of several detections, one whose message reads, and then the one that proves most; all tries are paid for."""
+    best = min(found, key=lambda one: (one.message is None, one.log10_p))
+    return best._replace(
+        log10_p=evidence.share_of(best.log10_p, 1 / tries),
+        log10_p_undated=evidence.share_of(best.log10_p_undated, 1 / tries),
+    )
+
+
 def is_sure(found: BlindDetection) -> bool:
     """Whether so much is proven that nothing else needs to be tried."""
     return found.log10_p <= (_SURE if found.message is not None else _SURE_UNREAD)
