@@ -70,7 +70,7 @@ def phases(host: AnchoredHost) -> np.ndarray:
     return off - np.round(off)
 
 
-before, after = (phases(SCHEME.host(make_original(one), width, choices)) for one in (mesh, marked))
+before, after = (phases(SCHEME.hosts(make_original(one), choices)[width]) for one in (mesh, marked))
 figure, axes = panels(2, 4.5, 3.0, sharey=True)
 for panel, title, off in zip(axes, ("original", "marked"), (before, after), strict=True):
     panel.hist(off, bins=np.linspace(-0.5, 0.5, 41), color=COLOURS[0])

@@ -16,7 +16,7 @@ from jaxmark.geometry.moments import surface_moments, volume_moments
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.watermark import EmbedInfo, FieldScheme
 from jaxmark.watermark.blind import reading
-from jaxmark.watermark.blind.anchors import cut, look, make_anchors, place
+from jaxmark.watermark.blind.anchors import look, place, see
 from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.field import TURNS, unsmoothed
 from jaxmark.watermark.blind.reading import context
@@ -30,6 +30,7 @@ from tests.test_cli import Workshop
 MESSAGE = bytes.fromhex("c0ffee42")
 WIDTH = 0.025
 SCHEME = FieldScheme(widths=(WIDTH,), steps=FieldScheme().steps[6:10])  # fewer are sooner read
+HOSTS = dataclasses.replace(SCHEME, widths=(WIDTH, 2 * WIDTH)).hosts
 CHOICES = context(bytes(range(32)), 32, "field")
 
 
@@ -76,14 +77,12 @@ def test_moments_are_those_of_a_box():
 def seen(mesh: Mesh, points: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cells, values and which of them count, of a mesh in its own pose, or with points near to it."""
     placed = place(mesh)
-    pieces = cut(placed.mesh, WIDTH)
-    surface = pieces.of(jnp.asarray(placed.mesh.vertices))
-    anchors = make_anchors(surface, WIDTH)
+    pieces, surface, anchors = see(placed.mesh, (WIDTH,), np.dtype(np.float32))[WIDTH]
     if points is not None:
         surface = pieces.of(jnp.asarray(points))
     nowhere = jnp.zeros(anchors.places.shape)
     shown = look(surface, anchors, nowhere, jnp.float32(WIDTH), jnp.float32(0))
-    return anchors.cells, np.asarray(shown.values), np.asarray(shown.good) & (anchors.around[:, 0] >= 0)
+    return anchors.cells, np.asarray(shown.values), np.asarray(shown.good)
 
 
 @pytest.mark.parametrize("other", ["finer", "mirrored"])
@@ -117,7 +116,7 @@ def test_changes_of_pose_are_derivatives(shape: Mesh, axis: int):
 
 def test_the_displacement_gives_anchors_their_values_and_keeps_the_pose(shape: Mesh):
     original = make_original(shape)
-    host = SCHEME.host(original, 2 * WIDTH, CHOICES)
+    host = HOSTS(original, CHOICES)[2 * WIDTH]
     wanted = host.values + 2e-4 * np.random.default_rng(0).uniform(-1, 1, len(host.values))
     shift = Writer(original, SCHEME, CHOICES).shift(host, wanted, 2)
     points = original.to_traced(original.positions + shift)
@@ -131,7 +130,7 @@ def test_the_displacement_gives_anchors_their_values_and_keeps_the_pose(shape: M
 def test_measuring_has_derivatives(shape: Mesh, dtype: np.dtype):
     """Along the normals, against differences."""
     original = make_original(shape)
-    host = SCHEME.host(original, 2 * WIDTH, CHOICES)
+    host = HOSTS(original, CHOICES)[2 * WIDTH]
     points = original.to_traced(original.positions)
     along = jnp.asarray(np.random.default_rng(0).normal(size=points.shape), dtype)
 

@@ -62,7 +62,7 @@ def test_values_are_differences_of_averages_over_sizes(x64):
     """By powers of the dense matrix; scaling, turning and moving change nothing."""
     mesh = rough_sphere(1000)
     original = make_original(mesh)
-    host = LocalScheme().host(original, 8, CHOICES)
+    host = LocalScheme(widths=(8,)).hosts(original, CHOICES)[8]
     points = original.positions
     average = np.eye(len(points)) - laplacian_matrix(from_mesh(original.points)) / 2
     smooth, faces = np.linalg.matrix_power(average, 16) @ points, np.asarray(original.points.faces)
@@ -86,7 +86,7 @@ def test_values_are_differences_of_averages_over_sizes(x64):
 def test_measuring_has_derivatives(shape: Mesh, dtype: np.dtype):
     """As if normals and sizes were constants, which linear changes of the values show."""
     original = make_original(shape)
-    host = LocalScheme().host(original, 32, CHOICES)
+    host = LocalScheme().hosts(original, CHOICES)[32]
     points = original.to_traced(original.positions)
     along = jnp.asarray(1e-3 * np.random.default_rng(0).normal(size=points.shape), dtype)
     values, push = jax.linearize(lambda at: measure(host.shape, at)[0], points)

@@ -201,7 +201,7 @@ def look(mesh: Mesh, width: float, step: float) -> Seen:
     """Look at a mesh by its anchors, without a key."""
     original = make_original(mesh)
     writer = Writer(original, SCHEME.fixed(width, step), reading.context(KEY, 8 * len(MESSAGE), SCHEME.name))
-    return Seen(mesh, original, writer, writer.host(width), step)
+    return Seen(mesh, original, writer, writer.hosts[width], step)
 
 
 def moved(

@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxmark.geometry.mesh import edges
 
-_MAX_PAIRS_AT_ONCE = 2**24  # pairs of a centre and a vertex that one search keeps track of, a byte and an int32 each
+# Pairs of a centre and a vertex that one search keeps track of, a byte and an int32 each: what fits into caches.
+_MAX_PAIRS_AT_ONCE = 2**22
 
 
 class Neighbourhoods(NamedTuple):

@@ -36,7 +36,7 @@ CLOUD_VISIBILITY: Mapping[Visibility, Mapping[str, float]] = {
 }
 _FACET, _MOST_OF_FACETS = 0.02, 2.5  # mean edge over the diagonal beyond which a model is one of facets
 _MAX_RMS = 0.01  # displacement in diagonals, if only limits are given; a larger one is no watermark
-_FIRST_RMS = 2e-4  # displacement in diagonals that is tried first
+FIRST_RMS = 2e-4  # displacement in diagonals that is tried first
 _MIN_LIMIT_SHARE = 0.99  # share of a limit that is as good as all of it
 _SECANT_STEPS = 10  # then bisection, which cannot fail
 
@@ -124,6 +124,9 @@ def write(
     shift: Float64[np.ndarray, "points 3"],
     budget: Budget,
     reference: distortion.Reference | None = None,
+    *,
+    first: float = FIRST_RMS,
+    share: float = _MIN_LIMIT_SHARE,
 ) -> Written:
     """Displace an original as far as a budget allows: to the RMS exactly, or to limits within 1 %, never beyond.
 
@@ -132,6 +135,8 @@ def write(
         shift: displacement of each point, in diagonals, up to a common factor; not all zero.
         budget: the bounds to keep.
         reference: of the original's mesh, if there is one already: limits are measured against it.
+        first: RMS displacement in diagonals that is tried first, if there are limits.
+        share: of the limits, as good as all of them: with less, fewer displacements are tried.
 
     Raises:
         JaxmarkError: if the displacement is lost in rounding; if limits alone allow an RMS displacement of 0.01; or see
@@ -149,7 +154,7 @@ def write(
 
     rms = budget.rms or _MAX_RMS
     if budget.limits:
-        rms = _largest(limit_ratio, rms)
+        rms = _largest(limit_ratio, rms, first, share)
         if budget.rms is None and rms == _MAX_RMS:
             raise JaxmarkError(
                 f"Moved by {_MAX_RMS:g} of its diagonal, this mesh still keeps {budget}; give a budget, too."
@@ -161,28 +166,30 @@ def write(
     return Written(marked, rms / size, reached)
 
 
-def _largest(within: Callable[[float], float], most: float) -> float:
-    """Find the largest size, up to `most`, at which a rising function is at most 1; `_MIN_LIMIT_SHARE` will do.
+def _largest(
+    within: Callable[[float], float], most: float, first: float = FIRST_RMS, share: float = _MIN_LIMIT_SHARE
+) -> float:
+    """Find the largest size, up to `most`, at which a rising function is at most 1; `share` of that will do.
 
     Secant steps in logarithms, because metrics are nearly powers of the size; each step stays between a size that fits
     and one that does not.
     """
     low, high = 0.0, math.inf
-    size, slope, before = min(_FIRST_RMS, most), 1.0, None
+    size, slope, before = min(first, most), 1.0, None
     for tries in count():
         value = within(size)
         if value <= 1:
             low = size
-            if value >= _MIN_LIMIT_SHARE or size == most:
+            if value >= share or size == most:
                 return size
         else:
             high = size
-        if high <= low * (2 - _MIN_LIMIT_SHARE):
+        if high <= low * (2 - share):
             return low
         if before is not None and value > 0 and before[1] > 0 and size != before[0] and value != before[1]:
             slope = math.log(value / before[1]) / math.log(size / before[0])
         before = size, value
-        aim = (1 + _MIN_LIMIT_SHARE) / 2
+        aim = (1 + share) / 2
         guess = size * (aim / value) ** (1 / slope) if value > 0 and slope > 0.2 else most
         if tries >= _SECANT_STEPS or not low < guess < high:
             guess = math.sqrt(low * high) if low > 0 and high < math.inf else 2 * low if low else high / 4

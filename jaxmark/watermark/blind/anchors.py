@@ -5,6 +5,7 @@ that lies near the surface, an anchor, two Gaussian averages of the surface's po
 other; their difference along the averaged normal is the anchor's value. Values hardly depend on the meshing.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -17,13 +18,14 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces, compact, diagonal, open_sides, weld, weld_mesh
 from jaxmark.geometry.moments import Moments, surface_moments, volume_moments
 from jaxmark.geometry.pose import Pose
-from jaxmark.spectral.shapes import common_size, pad_rows
+from jaxmark.spectral.shapes import common_size
 
 SPACING = 3.4  # of the lattice, in widths of the narrow Gaussian
 _WIDER = 2.0  # width of the wide Gaussian over the narrow one
 _CUT = 3.2  # widths of the wide Gaussian at which it is cut off
 _PIECE_AREA, _PIECE_SIDE = 0.2, 0.35  # of pieces at most, in squared widths and widths of the narrow Gaussian
-_ROUND = 128  # anchors are padded to multiples of it
+_GROUP = 256  # pieces in a group
+_NO_PIECE = _NO_ANCHOR = 2**31 - 1  # what padding belongs to
 _TINY = 1e-12  # area that is nothing
 _SIZE_BY_VOLUME, _SIZE_BY_AREA = 0.25, 0.29  # root of the trace of the covariance: the diagonal is then about 1
 _MAX_OPEN = 0.01  # share of open sides up to which a surface encloses a volume
@@ -48,10 +50,10 @@ def moments_of(mesh: Mesh) -> Moments:
 class Placed(NamedTuple):
     """A mesh in the pose of its own: lengths are about its diagonal, axes along its main axes."""
 
-    mesh: Mesh
+    mesh: Mesh  # with faces that look outwards, if it encloses a volume
     pose: Pose  # from the units of the file to it
     moments: Moments  # in it
-    outwards: float  # 1 where normals point outwards, -1 where inwards
+    inside_out: bool  # whether its faces looked inwards, and were turned
 
 
 def place(mesh: Mesh) -> Placed:
@@ -75,8 +77,16 @@ def place(mesh: Mesh) -> Placed:
     scale = size / np.sqrt(variances.sum())
     pose = Pose(scale * turn, -scale * turn @ found.centre)
     moved = Moments(abs(found.mass) * scale**3, np.zeros(3), scale**2 * turn @ found.covariance @ turn.T)
-    outwards = -1.0 if encloses(mesh) and found.mass < 0 else 1.0
-    return Placed(Mesh(pose(np.asarray(mesh.vertices)), mesh.faces), pose, moved, outwards)
+    inside_out = encloses(mesh) and found.mass < 0
+    faces = np.asarray(mesh.faces)
+    return Placed(
+        Mesh(pose(np.asarray(mesh.vertices)), turned(faces) if inside_out else faces), pose, moved, inside_out
+    )
+
+
+def turned(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, "faces 3"]:
+    """Faces that look the other way."""
+    return faces[:, ::-1]
 
 
 class Patches(NamedTuple):
@@ -134,23 +144,23 @@ def cut(mesh: Mesh, width: float) -> Pieces:
     keys = np.concatenate([cube, normals[face] > 0], axis=1)
     _, piece = np.unique(keys, axis=0, return_inverse=True)
     order = np.argsort(piece.ravel(), kind="stable")
-    room = np.zeros(common_size(int(piece.max(initial=0)) + 1), bool)
-    whole = common_size(len(order))
-    return Pieces(
-        pad_rows(faces[face][order], whole),
-        pad_rows(shares[order], whole),
-        pad_rows(1 / count[face][order], whole),
-        pad_rows(piece.ravel()[order], whole, len(room)),
-        room,
-    )
+    room = np.zeros(int(piece.max(initial=0)) + 1, bool)
+    return Pieces(faces[face][order], shares[order], 1 / count[face][order], piece.ravel()[order], room)
+
+
+@jax.jit
+def patches(pieces: Pieces, vertices: Float[Array, "vertices 3"]) -> Patches:
+    """See `Pieces.of`."""
+    return pieces.of(vertices)
 
 
 class Anchors(NamedTuple):
-    """The lattice points near a surface, and the pieces around each; arrays are padded to common sizes."""
+    """The lattice points near a surface, and the pieces around each, in groups of one size."""
 
     cells: Int64[np.ndarray, "anchors 3"]  # the lattice point's indices
     places: Float64[np.ndarray, "anchors 3"]  # its position
-    around: Int[np.ndarray, "anchors around"]  # numbers of the pieces around it; -1 for none
+    around: Int[np.ndarray, "groups group"]  # numbers of pieces around one anchor; -1 for none
+    anchor: Int[np.ndarray, " groups"]  # number of this anchor, ascending; for padding, past the last
 
 
 def make_anchors(surface: Patches, width: float) -> Anchors:
@@ -168,10 +178,44 @@ def make_anchors(surface: Patches, width: float) -> Anchors:
     near, _ = tree.query(cells * spacing, distance_upper_bound=0.75 * spacing)
     cells = cells[np.isfinite(np.asarray(near))]
     lists = tree.query_ball_point(cells * spacing, _CUT * _WIDER * width, workers=-1)
-    around = np.full((-(-len(cells) // _ROUND) * _ROUND, common_size(max(map(len, lists), default=1))), -1, np.int32)
-    for row, found in zip(around, lists, strict=False):
-        row[: len(found)] = there[found]
-    return Anchors(pad_rows(cells, len(around)), pad_rows(cells * spacing, len(around)), around)
+    found = np.fromiter(map(len, lists), np.int64, len(lists))
+    groups = -(-found // _GROUP)
+    anchor = np.repeat(np.arange(len(cells)), groups)
+    first = _GROUP * (np.cumsum(groups) - groups) - (np.cumsum(found) - found)
+    around = np.full(_GROUP * len(anchor), -1, np.int32)
+    around[np.arange(found.sum()) + np.repeat(first, found)] = there[np.concatenate([*lists, []]).astype(np.int64)]
+    return Anchors(cells, cells * spacing, around.reshape(-1, _GROUP), anchor)
+
+
+class Seen(NamedTuple):
+    """A surface as anchors of one width see it."""
+
+    pieces: Pieces
+    surface: Patches
+    anchors: Anchors
+
+
+def see(mesh: Mesh, widths: Sequence[float], dtype: np.dtype) -> dict[float, Seen]:
+    """Cut a surface, and find the anchors near to it, for each width.
+
+    All are padded to the same common shapes, so that one compiled program serves them.
+    """
+    vertices = jnp.asarray(mesh.vertices, dtype)
+    pieces = [Pieces(*one) for one in _alike([cut(mesh, width) for width in widths], (0, 0, 0, _NO_PIECE, False))]
+    surfaces = [patches(one, vertices) for one in pieces]
+    anchors = [Anchors(*one) for one in _alike(list(map(make_anchors, surfaces, widths)), (0, 0, -1, _NO_ANCHOR))]
+    return dict(zip(widths, map(Seen, pieces, surfaces, anchors), strict=True))
+
+
+def _alike(several: Sequence[Pieces | Anchors], padding: tuple[float, ...]) -> list[tuple[np.ndarray, ...]]:
+    """Pad the arrays of one name to the largest, and that to a common size."""
+    named = []
+    for arrays, value in zip(zip(*several, strict=True), padding, strict=True):
+        rows, *columns = np.max([one.shape for one in arrays], axis=0)
+        shape = (common_size(int(rows)), *columns)
+        room = [[(0, most - own) for most, own in zip(shape, one.shape, strict=True)] for one in arrays]
+        named.append([np.pad(one, wide, constant_values=value) for one, wide in zip(arrays, room, strict=True)])
+    return list(zip(*named, strict=True))
 
 
 class Shown(NamedTuple):
@@ -202,23 +246,25 @@ def look(
     narrow, wide = width**2 * (1 - undone), width**2 * (_WIDER**2 - undone)
     dtype, there = surface.points.dtype, anchors.around >= 0
     at = jnp.asarray(anchors.places, dtype) + shift
-    offset = surface.points[anchors.around] - at[:, None]
+    offset = surface.points[anchors.around] - at[jnp.minimum(anchors.anchor, len(at) - 1)][:, None]
     square = jnp.sum(offset**2, axis=-1)
     cut_off = jnp.exp(-((_CUT * _WIDER * width) ** 2) / 2 / wide)
     share = jnp.where(there, jnp.maximum(jnp.exp(-square / 2 / wide) - cut_off, 0), 0)
     area = surface.area[anchors.around]
     inner, outer = jnp.where(there, area * jnp.exp(-square / 2 / narrow), 0), area * share
 
-    def mean(weights: Float[Array, "anchors around"]) -> Float[Array, "anchors 3"]:
-        return jnp.einsum("as,asc->ac", weights, offset) / (weights.sum(axis=1) + _TINY)[:, None]
+    def total(weights: Float[Array, "groups group"], of: Float[Array, "groups group 3"]) -> Float[Array, "groups 3"]:
+        return jnp.einsum("gp,gpc->gc", weights, of)
 
-    normal = jnp.einsum("as,asc->ac", share, surface.normals[anchors.around])
-    length = jnp.sqrt(jnp.sum(normal**2, axis=1) + _TINY**2)
-    normal = normal / length[:, None]
-    close, far = mean(inner), mean(outer)
+    sums = (total(share, surface.normals[anchors.around]), total(inner, offset), total(outer, offset))
+    columns = jnp.concatenate([*sums, inner.sum(axis=1)[:, None], outer.sum(axis=1)[:, None]], axis=1)
+    found = jax.ops.segment_sum(columns, anchors.anchor, len(at), indices_are_sorted=True)
+    normal, close, far, inside, outside = jnp.split(found, (3, 6, 9, 10), axis=1)
+    length = jnp.sqrt(jnp.sum(normal**2, axis=1, keepdims=True) + _TINY**2)
+    normal, close, far = normal / length, close / (inside + _TINY), far / (outside + _TINY)
     away = jnp.abs(jnp.sum(close * normal, axis=1))
-    coherent = length > _MIN_COHERENCE * outer.sum(axis=1)
-    good = (away < _NEAREST * SPACING * width) & coherent & (inner.sum(axis=1) > _MIN_MASS * 2 * jnp.pi * narrow)
+    coherent, solid = length > _MIN_COHERENCE * outside, inside > _MIN_MASS * 2 * jnp.pi * narrow
+    good = (away < _NEAREST * SPACING * width) & coherent[:, 0] & solid[:, 0]
     return Shown(jnp.sum((close - far) * normal, axis=1), good)
 
 

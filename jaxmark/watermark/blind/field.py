@@ -20,7 +20,7 @@ from jaxmark.geometry.moments import Moments, surface_moments, volume_moments
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.precision import matmul
 from jaxmark.spectral.shapes import common_laplacian, pad_rows
-from jaxmark.watermark.blind.anchors import Anchors, Pieces, changes, cut, encloses, look, make_anchors, place
+from jaxmark.watermark.blind.anchors import Anchors, Pieces, changes, encloses, look, place, see, turned
 from jaxmark.watermark.blind.scheme import AnchoredHost, Look, measure
 from jaxmark.watermark.coding.keys import Choices
 
@@ -67,7 +67,7 @@ class FieldScheme:
         """See `BlindScheme`."""
         return replace(self, widths=(width,), steps=(step,))
 
-    def host(self, original: Original, width: float, choices: Choices) -> AnchoredHost:
+    def hosts(self, original: Original, choices: Choices) -> dict[float, AnchoredHost]:
         """See `BlindScheme`.
 
         Raises:
@@ -81,27 +81,20 @@ class FieldScheme:
                 "This shape is as wide in one direction as in another, or nearly, so that its pose cannot be told"
                 " without the original; use the scheme 'keyed'."
             )
-        dtype = original.signal.dtype
-        pieces = cut(Mesh(placed.pose(original.positions), faces), width)
-        surface = pieces.of(jnp.asarray(placed.pose(original.positions), dtype))
-        surface = surface._replace(normals=surface.normals * placed.outwards)
-        anchors = make_anchors(surface, width)
-        shape = Shape(
-            jnp.asarray(placed.pose.matrix, dtype),
-            jnp.asarray(placed.pose.shift, dtype),
-            faces,
-            pieces,
-            anchors,
-            jnp.asarray(width, dtype),
-            jnp.asarray(placed.outwards, dtype),
-            encloses(original.points),
-        )
-        nowhere = jnp.zeros(anchors.places.shape, dtype)
-        shown = look(surface, anchors, nowhere, shape.width, jnp.zeros((), dtype))
-        good = np.asarray(shown.good & (anchors.around[:, 0] >= 0), np.float64)
-        _, pose = measure(shape, original.to_traced(original.positions))
-        values, free = np.asarray(shown.values, np.float64), _inverse_areas(original)
-        return AnchoredHost(shape, anchors.cells, values, pose, good, free, _FIRST_STEP * width)
+        dtype, rows = original.signal.dtype, original.to_traced(original.positions)
+        faces = turned(faces) if placed.inside_out else faces
+        matrix, shift = jnp.asarray(placed.pose.matrix, dtype), jnp.asarray(placed.pose.shift, dtype)
+        closed, free, found = encloses(original.points), _inverse_areas(original), {}
+        seen = see(Mesh(placed.pose(original.positions), faces), self.widths, dtype)
+        for width, (pieces, surface, anchors) in seen.items():
+            size = jnp.asarray(width, dtype)
+            shape = Shape(matrix, shift, faces, pieces, anchors, size, closed)
+            shown = look(surface, anchors, jnp.zeros(anchors.places.shape, dtype), size, jnp.zeros((), dtype))
+            good = np.asarray(shown.good, np.float64)
+            _, pose = measure(shape, rows)
+            values = np.asarray(shown.values, np.float64)
+            found[width] = AnchoredHost(shape, anchors.cells, values, pose, good, free, _FIRST_STEP * width)
+        return found
 
     def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:
         """See `BlindScheme`.
@@ -113,12 +106,7 @@ class FieldScheme:
         dtype = jnp.result_type(float)
         for steps in _UNDONE_STEPS:
             placed = place(unsmoothed(suspect, steps))
-            vertices = jnp.asarray(placed.mesh.vertices, dtype)
-            for width in self.widths:
-                pieces = cut(placed.mesh, width)
-                surface = pieces.of(vertices)
-                surface = surface._replace(normals=surface.normals * placed.outwards)
-                anchors = make_anchors(surface, width)
+            for width, (_, surface, anchors) in see(placed.mesh, self.widths, dtype).items():
                 for blur in _BLURS if steps == 0 else _BLURS[:1]:
                     found = changes(surface, anchors, jnp.asarray(width, dtype), jnp.asarray(blur, dtype))
                     at = jnp.asarray(anchors.places, dtype)
@@ -126,7 +114,7 @@ class FieldScheme:
                     yield Look(
                         anchors.cells * TURNS[:, None],
                         found.shown.values,
-                        np.asarray(found.shown.good) & (anchors.around[:, 0] >= 0),
+                        np.asarray(found.shown.good),
                         by,
                         _SPREAD,
                         width,
@@ -147,16 +135,13 @@ class Shape:
     pieces: Pieces
     anchors: Anchors
     width: Float[Array, ""]  # of the narrow Gaussian
-    outwards: Float[Array, ""]  # 1 where normals point outwards, -1 where inwards
     closed: bool = field(metadata={"static": True})  # whether the mesh encloses a volume
 
     def measure(self, vertices: Float[Array, "rows 3"]) -> tuple[Float[Array, " anchors"], Float[Array, " nine"]]:
         """Values of the anchors, and the centre and covariance of the mesh, in its own pose as it was."""
         placed = matmul(vertices, self.matrix.T) + self.shift
         nowhere = jnp.zeros(self.anchors.places.shape, vertices.dtype)
-        surface = self.pieces.of(placed)
-        surface = surface._replace(normals=surface.normals * self.outwards)
-        values = look(surface, self.anchors, nowhere, self.width, jnp.zeros_like(self.width)).values
+        values = look(self.pieces.of(placed), self.anchors, nowhere, self.width, jnp.zeros_like(self.width)).values
         found: Moments = (volume_moments if self.closed else surface_moments)(placed[self.faces])
         upper = jnp.triu_indices(3)
         return values, jnp.concatenate([found.centre, found.covariance[upper]])

@@ -66,14 +66,19 @@ class LocalScheme:
         """See `BlindScheme`."""
         return replace(self, widths=(width,), steps=(step,))
 
-    def host(self, original: Original, width: float, choices: Choices) -> AnchoredHost:
+    def hosts(self, original: Original, choices: Choices) -> dict[float, AnchoredHost]:
         """See `BlindScheme`."""
-        anchors = _anchors(original.points, choices)
-        shape = _shape(original.points, original.operator, anchors, int(width), 0)
-        values, held = measure(shape, original.to_traced(original.positions))
+        anchors, rows = _anchors(original.points, choices), original.to_traced(original.positions)
         good = (anchors.vertices >= 0).astype(np.float64)
         free = original.to_traced(original.used.astype(np.float64))
-        return AnchoredHost(shape, anchors.names, np.asarray(values, np.float64), held, good, free, _FIRST_STEP)
+        found = {}
+        for width in self.widths:
+            shape = _shape(original.points, original.operator, anchors, int(width), 0)
+            values, held = measure(shape, rows)
+            found[width] = AnchoredHost(
+                shape, anchors.names, np.asarray(values, np.float64), held, good, free, _FIRST_STEP
+            )
+        return found
 
     def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:
         """See `BlindScheme`.

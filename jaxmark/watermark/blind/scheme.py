@@ -97,8 +97,8 @@ class BlindScheme(Protocol):
         """The scheme with one width and step."""
         ...
 
-    def host(self, original: Original, width: float, choices: Choices) -> AnchoredHost:
-        """Look at an original by anchors of one width."""
+    def hosts(self, original: Original, choices: Choices) -> dict[float, AnchoredHost]:
+        """Look at an original by anchors of each width; all have arrays of the same shapes."""
         ...
 
     def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:

@@ -22,7 +22,7 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.dither import Dither, make_dither
 from jaxmark.watermark.blind.reading import TAG_BITS, code_length, codeword
 from jaxmark.watermark.blind.scheme import AnchoredHost, BlindScheme, Measured, measure
-from jaxmark.watermark.budget import Budget, write
+from jaxmark.watermark.budget import FIRST_RMS, Budget, write
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import TAG_BITS as _TAG_BITS
 from jaxmark.watermark.hiding import hiding_directions
@@ -35,6 +35,7 @@ _HELD_RIDGE = 1e-4  # of the rows of what is held, which are scaled to the other
 _STEPS, _TOLERANCE = 60, 1e-2  # of conjugate gradients
 _LEAST_ALPHA = 0.6  # part of the way to the lattice that is gone at least; up to √2 of it, as steps are so far apart
 _ROUNDS = 2  # of Gauss and Newton
+_ENOUGH = 0.9  # share of the limits that is enough to choose a width and a step by
 _SPARE = 1.3  # energy that a width should leave, over what the payload needs
 _SMOOTHED = 10  # steps of smoothing that widths are chosen by, besides noise
 
@@ -67,12 +68,13 @@ def improve(
         (back,) = pull((counted * of[0], of[1]))
         return apply_mask(mask, free[:, None] * apply_mask(mask, back))
 
-    each, none = jnp.eye(len(held), dtype=vertices.dtype), jnp.zeros_like(values)
     # Rows of what is held are made as long as the others are on average, by which conjugate gradients converge soon.
     signs = jnp.where(jnp.arange(len(values)) * 7919 % 13 % 2 == 0, 1.0, -1.0).astype(values.dtype)
-    energy = jnp.vdot(counted * signs, push(rows((signs, jnp.zeros_like(held))))[0]) / counted.sum()
-    length = jax.vmap(lambda one: jnp.vdot(one, push(rows((none, one)))[1]))(each)
-    factor = jnp.sqrt(energy / length)
+    firsts = jnp.zeros((1 + len(held), len(values)), values.dtype).at[0].set(counted * signs)
+    seconds = jnp.eye(1 + len(held), dtype=values.dtype)[:, 1:]
+    squares = jax.lax.map(lambda of: sum(map(jnp.vdot, of, push(rows(of)))), (firsts, seconds))
+    energy = squares[0] / counted.sum()
+    factor = jnp.sqrt(energy / squares[1:])
 
     def gram(of: tuple[Float[Array, " anchors"], Float[Array, " held"]]) -> tuple[Array, Array]:
         there = push(rows((of[0], factor * of[1])))
@@ -117,17 +119,15 @@ def needed(bits: int) -> float:
 
 
 class Writer:
-    """Writes codewords with the keyed choices of one mark in one original; looks at it once for each width."""
+    """Writes codewords with the keyed choices of one mark in one original; looks at it once."""
 
     def __init__(self, original: Original, scheme: BlindScheme, choices: Choices) -> None:
         self.original, self.scheme, self.choices = original, scheme, choices
-        self._hosts: dict[float, AnchoredHost] = {}
 
-    def host(self, width: float) -> AnchoredHost:
-        """The original as its anchors of one width show it."""
-        if width not in self._hosts:
-            self._hosts[width] = self.scheme.host(self.original, width, self.choices)
-        return self._hosts[width]
+    @cached_property
+    def hosts(self) -> dict[float, AnchoredHost]:
+        """The original as its anchors of each width show it."""
+        return self.scheme.hosts(self.original, self.choices)
 
     @cached_property
     def _mask(self) -> Float[Array, "rows 3 3"]:
@@ -169,8 +169,11 @@ class Writer:
         Raises:
             JaxmarkError: if there is nothing to write in, or the budget allows not even the least step.
         """
-        found = [self._try(width, word, budget, reference) for width in self.scheme.widths]
-        fitting = [one for one in found if one is not None]
+        fitting: list[Plan] = []
+        for width in self.scheme.widths:
+            first = fitting[-1].size if fitting else FIRST_RMS
+            plan = self._try(width, word, budget, reference, first)
+            fitting += [] if plan is None else [plan]
         if not fitting:
             raise JaxmarkError(
                 f"This mesh, or the budget for it, leaves the scheme {self.scheme.name!r} nothing to write in; use a"
@@ -201,7 +204,7 @@ class Writer:
         plan = self.plan(word, budget, reference, bits)
         targets = plan.host.values - plan.alpha * plan.step * self.off(plan.host, plan.dither, word, plan.step)
         shift = self.shift(plan.host, targets, _ROUNDS)
-        written = write(self.original, shift, budget, reference)
+        written = write(self.original, shift, budget, reference, first=plan.size)
         return Written(written.mesh, written.moved, plan._replace(alpha=plan.alpha * written.scale))
 
     def _try(
@@ -210,24 +213,27 @@ class Writer:
         word: Float64[np.ndarray, " code"],
         budget: Budget,
         reference: distortion.Reference,
+        first: float,
     ) -> Plan | None:
-        """The step, and the part of the way, that a budget allows with a width; None if not even the least step."""
-        host = self.host(width)
+        """The step, and the part of the way, that a budget allows with a width; None if not even the least step.
+
+        An RMS displacement of `first` diagonals is tried first.
+        """
+        host = self.hosts[width]
         if not host.size:
             return None
         dither = make_dither(self.choices, self.scheme.name, host.names, len(word))
         # How far a mark of one step displaces is how far any does, times its step: what is off is uniform.
-        first = host.step
-        shift = self.shift(host, host.values - first * self.off(host, dither, word, first), 1)
+        shift = self.shift(host, host.values - host.step * self.off(host, dither, word, host.step), 1)
         size = float(distortion.rms(shift[self.original.used]))
         if not (math.isfinite(size) and size > 0):
             return None
-        allowed = first * write(self.original, shift, budget, reference).scale
+        allowed = host.step * write(self.original, shift, budget, reference, first=first, share=_ENOUGH).scale
         steps = [step for step in self.scheme.steps if allowed / step >= _LEAST_ALPHA]
         if not steps:
             return None
         alpha = min(allowed / max(steps), 1.0)
-        return Plan(width, max(steps), alpha, size * alpha * max(steps) / first, host, dither)
+        return Plan(width, max(steps), alpha, size * alpha * max(steps) / host.step, host, dither)
 
     def energies(self, plan: Plan) -> tuple[float, float]:
         """Predicted nρ² after each of the reference disturbances, see `Plan.energy`."""
