@@ -4,6 +4,7 @@ A suspect that was smoothed is looked at as if some smoothing was undone; one th
 there already. The pose that it shows is nearly the one that was marked, up to the ways of looking along its axes.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
@@ -11,11 +12,11 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Float64, Int
 
 from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, compact, weld, weld_mesh
+from jaxmark.geometry.mesh import Mesh, compact, edges, weld, weld_mesh
 from jaxmark.geometry.moments import Moments, surface_moments, volume_moments
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.precision import matmul
@@ -30,6 +31,9 @@ _MIN_GAP = 0.02  # difference of the variances along two axes, over the largest,
 _UNDONE_STEPS = (0, 10, 30, 50)  # of smoothing, by a tenth of the way to the neighbours' mean each
 _BLURS = (0.0, 0.2)  # of a suspect as it is, in shares of the narrow Gaussian's variance
 _DEGREE = 64  # of the polynomial that undoes smoothing
+_SMOOTHING = 0.5  # share of the narrow Gaussian's width by which displacements are smoothed
+_LONGEST = 100.0  # steps of diffusion for that at most
+_TERMS = 3.7  # terms of a series over the root of the time of diffusion
 _REFINEMENTS = 8  # of the fixed point that it is
 _STEP_SIZE = 0.1
 #: Spread of small changes of pose that are tried: turns in radians, shifts and growth in sizes.
@@ -93,7 +97,8 @@ class FieldScheme:
             good = np.asarray(shown.good, np.float64)
             _, pose = measure(shape, rows)
             values = np.asarray(shown.values, np.float64)
-            found[width] = AnchoredHost(shape, anchors.cells, values, pose, good, free, _FIRST_STEP * width)
+            smoothing = _smoothing(original, width)
+            found[width] = AnchoredHost(shape, anchors.cells, values, pose, good, free, smoothing, _FIRST_STEP * width)
         return found
 
     def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:
@@ -155,6 +160,19 @@ def _inverse_areas(original: Original) -> Float[Array, " rows"]:
     around = np.bincount(faces.ravel(), np.repeat(area, 3), len(points))
     mean = around[original.used].mean()
     return original.to_traced(np.where(original.used, mean / np.maximum(around, _LEAST_AREA * mean), 0))
+
+
+def _smoothing(original: Original, width: float) -> Float64[np.ndarray, " terms"]:
+    """The series of diffusion by a share of a width, by which pieces of the surface do not show in displacements.
+
+    Diffusion exp(-tΔ) takes a step along an edge t times on average: a point goes √(t/2) edges along each direction.
+    """
+    ends = original.positions[edges(np.asarray(original.points.faces))]
+    edge = float(np.median(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)))
+    time = min(2 * (_SMOOTHING * width / edge) ** 2, _LONGEST)
+    degree = 4 * math.ceil(_TERMS * math.sqrt(time) / 4)
+    places = np.cos(np.pi * (np.arange(2 * degree + 1) + 0.5) / (2 * degree + 1))
+    return np.polynomial.chebyshev.chebfit(places, np.exp(-time * (places + 1)), degree)
 
 
 def unsmoothed(mesh: Mesh, steps: int) -> Mesh:

@@ -76,7 +76,7 @@ class LocalScheme:
             shape = _shape(original.points, original.operator, anchors, int(width), 0)
             values, held = measure(shape, rows)
             found[width] = AnchoredHost(
-                shape, anchors.names, np.asarray(values, np.float64), held, good, free, _FIRST_STEP
+                shape, anchors.names, np.asarray(values, np.float64), held, good, free, np.ones(1), _FIRST_STEP
             )
         return found
 

@@ -39,6 +39,7 @@ class AnchoredHost(NamedTuple):
     held: Float[Array, " held"]  # what a mark leaves as it is
     good: Float64[np.ndarray, " anchors"]  # 1 for each anchor that is written, else 0
     free: Float[Array, " rows"]  # how far each vertex moves for its part in a value
+    smoothing: Float64[np.ndarray, " terms"]  # Chebyshev series of the filter that displacements go through
     step: float  # of the lattice of values, which is tried first
 
     @property

@@ -19,6 +19,8 @@ from jaxmark import distortion
 from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.spectral.chebyshev import filter, transpose
+from jaxmark.spectral.laplacian import Laplacian
 from jaxmark.watermark.blind.dither import Dither, make_dither
 from jaxmark.watermark.blind.reading import TAG_BITS, code_length, codeword
 from jaxmark.watermark.blind.scheme import AnchoredHost, BlindScheme, Measured, measure
@@ -45,6 +47,8 @@ def improve(
     shape: Measured,
     vertices: Float[Array, "rows 3"],
     moved: Float[Array, "rows 3"],
+    operator: Laplacian,
+    smoothing: Float[Array | np.ndarray, " terms"],
     free: Float[Array, " rows"],
     mask: Float[Array, "rows 3 3"],
     targets: tuple[Float[Array, " anchors"], Float[Array, " held"]],
@@ -56,6 +60,8 @@ def improve(
         shape: of the mesh.
         vertices: its vertices where they were.
         moved: their displacement so far.
+        operator: the mesh's Laplacian.
+        smoothing: Chebyshev series of the filter that displacements go through, see `filter`.
         free: how far each vertex moves for its part in a value: the inverse of its area.
         mask: of displacements, see `apply_mask`.
         targets: the values, and what is held, to reach.
@@ -66,7 +72,8 @@ def improve(
 
     def rows(of: tuple[Float[Array, " anchors"], Float[Array, " held"]]) -> Float[Array, "rows 3"]:
         (back,) = pull((counted * of[0], of[1]))
-        return apply_mask(mask, free[:, None] * apply_mask(mask, back))
+        wanted = free[:, None] * transpose(operator, smoothing, apply_mask(mask, back))
+        return apply_mask(mask, filter(operator, smoothing, wanted))
 
     # Rows of what is held are made as long as the others are on average, by which conjugate gradients converge soon.
     signs = jnp.where(jnp.arange(len(values)) * 7919 % 13 % 2 == 0, 1.0, -1.0).astype(values.dtype)
@@ -152,7 +159,9 @@ class Writer:
         wanted = (jnp.asarray(targets, dtype), host.held)
         counted = jnp.asarray(host.good, dtype)
         for _ in range(rounds):
-            moved = improve(host.shape, vertices, moved, host.free, self._mask, wanted, counted)
+            moved = improve(
+                host.shape, vertices, moved, original.operator, host.smoothing, host.free, self._mask, wanted, counted
+            )
         return original.to_host(moved)
 
     def plan(
