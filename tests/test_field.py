@@ -1,6 +1,7 @@
 """Marks that are read without the original."""
 
 import dataclasses
+from itertools import product
 from pathlib import Path
 
 import jax
@@ -266,3 +267,35 @@ def test_commands_without_the_original(shape: Mesh, tmp_path: Path, monkeypatch,
     assert workshop("detect", "model.ply", *key, *record)[0] == 1
     assert "give --original" in workshop.refused("detect", "marked.ply", *key, "--align", "same")
     assert "give --original" in workshop.refused("detect", "marked.ply", *key, "--scheme", "keyed")
+
+
+def with_parts_inside_out(mesh: Mesh, share: float) -> Mesh:
+    """With small balls far away, inside out, whose second moments are a share of the shape's own.
+
+    Its pose would be many times as large as that of the shape alone.
+    """
+    ball, points = bumpy_sphere(1), np.asarray(mesh.vertices)
+    own, one = (volume_moments(np.asarray(part.vertices)[np.asarray(part.faces)]) for part in (mesh, ball))
+    faces, vertices = [np.asarray(mesh.faces)], [points]
+    for axis, sign in product(range(3), (-1, 1)):
+        size = np.cbrt(share * abs(own.mass) * own.covariance[axis, axis] / (2 * abs(one.mass) * 30**2))
+        vertices.append(own.centre + size * np.asarray(ball.vertices) + 30 * sign * np.eye(3)[axis])
+        faces.append(np.asarray(ball.faces)[:, ::-1] + sum(map(len, vertices[:-1])))
+    return Mesh(np.concatenate(vertices), np.concatenate(faces))
+
+
+@pytest.mark.parametrize(("share", "said"), [(0.9, "very large"), (1.1, "no volume")])
+def test_shapes_made_to_be_huge_in_their_pose_are_refused(shape: Mesh, share: float, said: str):
+    with pytest.raises(jm.JaxmarkError, match=said):
+        place(with_parts_inside_out(shape, share))
+
+
+def test_a_part_that_one_scheme_refuses_does_not_hide_what_another_proves(shape: Mesh, key: jm.Key):
+    marked, _ = jm.embed(shape, MESSAGE, key, budget=2e-3, scheme="local")
+    suspect = with_parts_inside_out(marked, 0.9)
+    alone = jm.detect(suspect, key=key, bits=32, scheme="local")
+    found = jm.detect(suspect, key=key, bits=32)
+    assert found.message == MESSAGE
+    assert found.log10_p == pytest.approx(alone.log10_p + np.log10(2), abs=1e-6)
+    with pytest.raises(jm.JaxmarkError, match="pose"):
+        jm.detect(suspect, key=key, bits=32, scheme="field")

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from jaxmark.app.dossier import file_hash
@@ -11,7 +12,7 @@ from jaxmark.app.telling import Told, describe
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, load_scene
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.blind.reading import BlindDetection, best_of
+from jaxmark.watermark.blind.reading import BlindDetection, best_of, try_each
 from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.deposit import Deposit
@@ -41,11 +42,14 @@ class BlindReader:
         """
         known = None if record is None else load_record(record)
         records = [known] if isinstance(known, Record) else [None] if known is None else list(known.meshes.values())
+        for one in records:
+            if one is not None and blind_scheme(one.scheme) is None:
+                raise JaxmarkError(f"The record says that the scheme is {one.scheme!r}, which needs --original.")
         scene = pick(load_scene(suspect), self.meshes, suspect)
         several = len(scene.meshes) > 1
         tried = list(scene.meshes.values()) if several else [load_mesh(suspect)]
-        found = [self._read(mesh, one) for mesh in tried for one in records]
-        best = best_of(found, len(found))
+        found = list(try_each(partial(self._read, mesh, one) for mesh in tried for one in records))
+        best = best_of(found, len(tried) * len(records))
         detected = best.detected(self.alpha)
         remarks = list(best.remarks)
         if several:
@@ -81,8 +85,6 @@ class BlindReader:
 
     def _read(self, mesh: Mesh, record: Record | None) -> BlindDetection:
         """Read one mesh."""
-        if record is not None and blind_scheme(record.scheme) is None:
-            raise JaxmarkError(f"The record says that the scheme is {record.scheme!r}, which needs --original.")
         release_programs()
         scheme = self.scheme if record is None else None
         return read_blind(mesh, self.key, bits=self.bits, message=self.message, record=record, scheme=scheme)

@@ -6,6 +6,7 @@ Informed schemes are read beside the original (`jaxmark.watermark.marking`), bli
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import overload
 
 from numpy.typing import ArrayLike
@@ -366,8 +367,10 @@ def read_blind(
         if not record.commits_to(message, choices):
             raise JaxmarkError("The record commits to another message than the one claimed; claim that, or none.")
     found: list[BlindDetection] = []
-    for one in tried:
-        found.append(reading.detect(suspect, Key(key), payload, one, message, record))
-        if reading.is_sure(found[-1]):
+    secret = Key(key)
+    reads = (partial(reading.detect, suspect, secret, payload, one, message, record) for one in tried)
+    for one in reading.try_each(reads):
+        found.append(one)
+        if reading.is_sure(one):
             break
     return reading.best_of(found, len(tried))

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Float64, Int, Int64
 from scipy.spatial import KDTree
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, check_faces, compact, diagonal, open_sides, weld, weld_mesh
+from jaxmark.geometry.mesh import Mesh, area, check_faces, compact, diagonal, open_sides, weld, weld_mesh
 from jaxmark.geometry.moments import Moments, surface_moments, volume_moments
 from jaxmark.geometry.pose import Pose
 from jaxmark.spectral.shapes import common_size
@@ -29,6 +29,7 @@ _NO_PIECE = _NO_ANCHOR = 2**31 - 1  # what padding belongs to
 _TINY = 1e-12  # area that is nothing
 _SIZE_BY_VOLUME, _SIZE_BY_AREA = 0.25, 0.29  # root of the trace of the covariance: the diagonal is then about 1
 _MAX_OPEN = 0.01  # share of open sides up to which a surface encloses a volume
+_MAX_AREA = 12.0  # of a surface in its own pose: about that of nine balls
 _NEAREST = 0.5  # distance from the surface, over the lattice's spacing, up to which a lattice point is an anchor
 _MIN_COHERENCE = 0.5  # length of the mean normal: where it is less, sheets mix
 _MIN_MASS = 0.2  # area under the narrow Gaussian, over a plane's, from which an anchor counts
@@ -70,8 +71,14 @@ def place(mesh: Mesh) -> Placed:
     found = moments_of(mesh)
     variances, axes = np.linalg.eigh(found.covariance)
     size = _SIZE_BY_VOLUME if encloses(mesh) else _SIZE_BY_AREA
-    if not variances.sum() > 0:
+    if not variances[0] > 0:
         raise JaxmarkError("This shape encloses no volume, by which its pose could be told; mend its faces.")
+    # Parts that are inside out count against the others, and would make any shape as large as one likes.
+    if size**2 * area(mesh) > _MAX_AREA * variances.sum():
+        raise JaxmarkError(
+            "This shape's surface is very large beside the volume that it encloses, so that its pose cannot be told;"
+            " mend its faces."
+        )
     turn = axes[:, ::-1].T
     turn *= np.linalg.det(turn)
     scale = size / np.sqrt(variances.sum())

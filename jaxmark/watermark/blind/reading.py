@@ -12,7 +12,7 @@ a geometry in the key's choices, as their reader has no original.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
 from typing import NamedTuple
 
@@ -144,6 +144,25 @@ def detect(
         if is_sure(best):
             break
     return best
+
+
+def try_each(reads: Iterable[Callable[[], BlindDetection]]) -> Iterator[BlindDetection]:
+    """Read in several ways. One that refuses proves nothing: else who adds a part that is refused would hide a mark.
+
+    Raises:
+        JaxmarkError: if all refuse.
+    """
+    refusals, refused = [], True
+    for read in reads:
+        try:
+            found = read()
+        except JaxmarkError as refusal:
+            refusals.append(refusal)
+            continue
+        refused = False
+        yield found
+    if refused and refusals:
+        raise refusals[0]
 
 
 def best_of(found: Sequence[BlindDetection], tries: int) -> BlindDetection:
