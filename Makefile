@@ -13,7 +13,8 @@ help:  ## list these commands
 demo: $(VENV)/.all  ## mark, attack and read a mesh: make demo [MESH=file]
 	$(BIN)/jaxmark demo $(MESH) --output demo-output
 
-test: lint types tests  ## everything that must hold before a change goes in
+test: lint  ## everything that must hold before a change goes in
+	@$(MAKE) --no-print-directory --jobs 2 types tests
 
 lint: $(VENV)/.dev  ## ruff: style and formatting
 	$(BIN)/ruff check .
@@ -40,7 +41,7 @@ docs: $(VENV)/.docs  ## all pages, in docs/_build/html
 $(VENV)/.%: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable '.[$*]'
+	$(BIN)/python -m pip install --quiet --no-compile --editable '.[$*]'
 	touch $@
 
 clean:  ## remove what these commands made

@@ -31,7 +31,7 @@ from tests.test_cli import Workshop
 MESSAGE = bytes.fromhex("c0ffee42")
 WIDTH = 0.025
 SCHEME = FieldScheme(widths=(WIDTH,), steps=FieldScheme().steps[6:10])  # fewer are sooner read
-HOSTS = dataclasses.replace(SCHEME, widths=(WIDTH, 2 * WIDTH)).hosts
+HOSTS = dataclasses.replace(SCHEME, widths=(2 * WIDTH,)).hosts
 CHOICES = context(bytes(range(32)), 32, "field")
 
 

@@ -34,7 +34,7 @@ def sphere() -> Mesh:
         ("keyed", "float32"),
         ("keyed", "float64"),
         pytest.param("host", "float32", marks=pytest.mark.slow),
-        ("eigen", "float32"),
+        pytest.param("eigen", "float32", marks=pytest.mark.slow),
     ],
     indirect=["dtype"],
 )

@@ -81,7 +81,7 @@ def test_nothing_seen_gives_nothing(key: jm.Key):
     assert decode(np.zeros(1024), 64, Choices(key, b"", 1)) is None
 
 
-@pytest.mark.parametrize(("candidates", "trials"), [(8, 1000), (CANDIDATES, 500)])
+@pytest.mark.parametrize(("candidates", "trials"), [pytest.param(8, 1000, marks=pytest.mark.slow), (CANDIDATES, 500)])
 def test_chance_passes_as_often_as_the_tag_says(
     key: jm.Key, monkeypatch: pytest.MonkeyPatch, candidates: int, trials: int
 ):

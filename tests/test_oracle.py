@@ -133,7 +133,8 @@ def test_defences(marked, key: jm.Key):
     assert noise.std() == pytest.approx(1, abs=0.2)
 
 
-@pytest.mark.parametrize("make", [estimated_gradient, pytest.param(random_search, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [estimated_gradient, random_search])
 def test_answers_beat_chance(marked, make):
     marker, mesh = marked
     score = score_oracle(marker, MESSAGE)

@@ -137,7 +137,10 @@ def face(level: int, one_sided: float) -> Mesh:
     return make_mesh(points / np.linalg.norm(np.ptp(points, axis=0)), ball.faces)
 
 
-@pytest.mark.parametrize(("one_sided", "mirror"), [(0.02, False), (0.02, True), (0.0, False)])
+@pytest.mark.parametrize(
+    ("one_sided", "mirror"),
+    [pytest.param(0.02, False, marks=pytest.mark.slow), (0.02, True), pytest.param(0.0, False, marks=pytest.mark.slow)],
+)
 def test_a_nearly_symmetric_shape_is_mirrored_only_if_that_fits_clearly_better(one_sided, mirror):
     """What a mark displaces, a pose of either hand leaves."""
     mesh, pose = face(3, one_sided), mirrored(anywhere(2)) if mirror else anywhere(2)
