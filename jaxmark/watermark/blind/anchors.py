@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Float64, Int, Int64
 from scipy.spatial import KDTree
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, area, check_faces, compact, diagonal, open_sides, weld, weld_mesh
+from jaxmark.geometry.mesh import Mesh, check_faces, compact, diagonal, open_sides, weld, weld_mesh
 from jaxmark.geometry.moments import Moments, surface_moments, volume_moments
 from jaxmark.geometry.pose import Pose
 from jaxmark.spectral.shapes import common_size
@@ -29,7 +29,8 @@ _NO_PIECE = _NO_ANCHOR = 2**31 - 1  # what padding belongs to
 _TINY = 1e-12  # area that is nothing
 _SIZE_BY_VOLUME, _SIZE_BY_AREA = 0.25, 0.29  # root of the trace of the covariance: the diagonal is then about 1
 _MAX_OPEN = 0.01  # share of open sides up to which a surface encloses a volume
-_MAX_AREA = 12.0  # of a surface in its own pose: about that of nine balls
+# Parts that are inside out count against the others, and could make any shape as large as one likes in its own pose.
+_MAX_SAMPLES, _MAX_ANCHORS, _MAX_AROUND = 2**22, 2**15, 2**23  # besides one for each face; pieces around all anchors
 _NEAREST = 0.5  # distance from the surface, over the lattice's spacing, up to which a lattice point is an anchor
 _MIN_COHERENCE = 0.5  # length of the mean normal: where it is less, sheets mix
 _MIN_MASS = 0.2  # area under the narrow Gaussian, over a plane's, from which an anchor counts
@@ -63,7 +64,7 @@ def place(mesh: Mesh) -> Placed:
     Along each axis it may look either way: whoever compares two shapes tries all.
 
     Raises:
-        JaxmarkError: if it is a point cloud, or has no extent.
+        JaxmarkError: if it is a point cloud, has no extent or encloses no volume.
     """
     check_faces("A mark without an original", mesh)
     mesh = compact(weld_mesh(mesh, weld(mesh.vertices)))
@@ -73,12 +74,6 @@ def place(mesh: Mesh) -> Placed:
     size = _SIZE_BY_VOLUME if encloses(mesh) else _SIZE_BY_AREA
     if not variances[0] > 0:
         raise JaxmarkError("This shape encloses no volume, by which its pose could be told; mend its faces.")
-    # Parts that are inside out count against the others, and would make any shape as large as one likes.
-    if size**2 * area(mesh) > _MAX_AREA * variances.sum():
-        raise JaxmarkError(
-            "This shape's surface is very large beside the volume that it encloses, so that its pose cannot be told;"
-            " mend its faces."
-        )
     turn = axes[:, ::-1].T
     turn *= np.linalg.det(turn)
     scale = size / np.sqrt(variances.sum())
@@ -128,13 +123,18 @@ class Pieces(NamedTuple):
 
 
 def cut(mesh: Mesh, width: float) -> Pieces:
-    """Cut a surface into pieces much smaller than a Gaussian of this width; the same at every call."""
+    """Cut a surface into pieces much smaller than a Gaussian of this width; the same at every call.
+
+    Raises:
+        JaxmarkError: if there are too many of them.
+    """
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     normals = np.cross(b - a, c - a)
     sizes = np.linalg.norm(normals, axis=1) / 2
     sound = sizes > 0
     faces, normals, sizes = faces[sound], normals[sound], sizes[sound]
+    _check(float(sizes.sum()) / (_PIECE_AREA * width**2), _MAX_SAMPLES)
     count = np.maximum(np.ceil(sizes / (_PIECE_AREA * width**2)), 1).astype(np.int64)
     face = np.repeat(np.arange(len(faces)), count)
     number = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
@@ -176,22 +176,36 @@ def make_anchors(surface: Patches, width: float) -> Anchors:
     Args:
         surface: its pieces.
         width: of the narrow Gaussian.
+
+    Raises:
+        JaxmarkError: if there are too many of them.
     """
     spacing = SPACING * width
     points = np.asarray(surface.points, np.float64)
     there = np.flatnonzero(np.asarray(surface.area) > _TINY)
     cells = np.unique(np.round(points[there] / spacing).astype(np.int64), axis=0)
+    _check(len(cells), _MAX_ANCHORS)
     tree = KDTree(points[there])
     near, _ = tree.query(cells * spacing, distance_upper_bound=0.75 * spacing)
     cells = cells[np.isfinite(np.asarray(near))]
+    found = np.asarray(tree.query_ball_point(cells * spacing, _CUT * _WIDER * width, workers=-1, return_length=True))
+    _check(int(found.sum()), _MAX_AROUND)
     lists = tree.query_ball_point(cells * spacing, _CUT * _WIDER * width, workers=-1)
-    found = np.fromiter(map(len, lists), np.int64, len(lists))
     groups = -(-found // _GROUP)
     anchor = np.repeat(np.arange(len(cells)), groups)
     first = _GROUP * (np.cumsum(groups) - groups) - (np.cumsum(found) - found)
     around = np.full(_GROUP * len(anchor), -1, np.int32)
     around[np.arange(found.sum()) + np.repeat(first, found)] = there[np.concatenate([*lists, []]).astype(np.int64)]
     return Anchors(cells, cells * spacing, around.reshape(-1, _GROUP), anchor)
+
+
+def _check(size: float, most: int) -> None:
+    """Refuse shapes that are too large in their own pose to be looked at."""
+    if not size <= most:
+        raise JaxmarkError(
+            "This shape's surface is too large beside the volume that it encloses for marks by its own pose; mend its"
+            " faces, or use another scheme."
+        )
 
 
 class Seen(NamedTuple):
@@ -206,6 +220,9 @@ def see(mesh: Mesh, widths: Sequence[float], dtype: np.dtype) -> dict[float, See
     """Cut a surface, and find the anchors near to it, for each width.
 
     All are padded to the same common shapes, so that one compiled program serves them.
+
+    Raises:
+        JaxmarkError: if the surface is too large.
     """
     vertices = jnp.asarray(mesh.vertices, dtype)
     pieces = [Pieces(*one) for one in _alike([cut(mesh, width) for width in widths], (0, 0, 0, _NO_PIECE, False))]
