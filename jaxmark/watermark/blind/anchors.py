@@ -30,7 +30,7 @@ _TINY = 1e-12  # area that is nothing
 _SIZE_BY_VOLUME, _SIZE_BY_AREA = 0.25, 0.29  # root of the trace of the covariance: the diagonal is then about 1
 _MAX_OPEN = 0.01  # share of open sides up to which a surface encloses a volume
 # Parts that are inside out count against the others, and could make any shape as large as one likes in its own pose.
-_MAX_SAMPLES, _MAX_ANCHORS, _MAX_AROUND = 2**22, 2**15, 2**25  # besides one for each face; pieces around all anchors
+_MAX_SAMPLES, _MAX_ANCHORS, _MAX_AROUND = 2**20, 2**15, 2**25  # besides one for each face; pieces around all anchors
 _NEAREST = 0.5  # distance from the surface, over the lattice's spacing, up to which a lattice point is an anchor
 _MIN_COHERENCE = 0.5  # length of the mean normal: where it is less, sheets mix
 _MIN_MASS = 0.2  # area under the narrow Gaussian, over a plane's, from which an anchor counts
