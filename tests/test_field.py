@@ -302,3 +302,11 @@ def test_a_part_that_one_scheme_refuses_does_not_hide_what_another_proves(shape:
     assert found.log10_p == pytest.approx(alone.log10_p + np.log10(2), abs=1e-6)
     with pytest.raises(jm.JaxmarkError, match="volume"):
         jm.detect(suspect, key=key, bits=32, scheme="field")
+
+
+@pytest.mark.slow
+def test_what_is_too_rough_when_smoothing_is_undone_is_left_out(shape: Mesh):
+    rough = jm.attack(shape, "noise", 0.2, seed=0)
+    undone = {view.undone for view in SCHEME.views(rough, CHOICES)}
+    assert 0 in undone
+    assert not undone >= {0, 10, 30, 50}

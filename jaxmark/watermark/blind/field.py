@@ -105,13 +105,19 @@ class FieldScheme:
         """See `BlindScheme`.
 
         Raises:
-            JaxmarkError: see `place`.
+            JaxmarkError: see `place` and `see`, of the suspect as it is.
         """
         suspect = compact(weld_mesh(suspect, weld(suspect.vertices)))
         dtype = jnp.result_type(float)
         for steps in _UNDONE_STEPS:
-            placed = place(unsmoothed(suspect, steps))
-            for width, (_, surface, anchors) in see(placed.mesh, self.widths, dtype).items():
+            try:
+                placed = place(unsmoothed(suspect, steps))
+                seen = see(placed.mesh, self.widths, dtype)
+            except JaxmarkError:
+                if steps == 0:
+                    raise
+                continue  # it was noise, not smoothing, and is too rough now to be looked at
+            for width, (_, surface, anchors) in seen.items():
                 for blur in _BLURS if steps == 0 else _BLURS[:1]:
                     found = changes(surface, anchors, jnp.asarray(width, dtype), jnp.asarray(blur, dtype))
                     at = jnp.asarray(anchors.places, dtype)
