@@ -18,6 +18,7 @@ from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, compact, edges, weld, weld_mesh
 from jaxmark.geometry.moments import Moments, surface_moments, volume_moments
+from jaxmark.spectral.bands import heat
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.precision import matmul
 from jaxmark.spectral.shapes import common_laplacian, pad_rows
@@ -176,9 +177,7 @@ def _smoothing(original: Original, width: float) -> Float64[np.ndarray, " terms"
     ends = original.positions[edges(np.asarray(original.points.faces))]
     edge = float(np.median(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)))
     time = min(2 * (_SMOOTHING * width / edge) ** 2, _LONGEST)
-    degree = 4 * math.ceil(_TERMS * math.sqrt(time) / 4)
-    places = np.cos(np.pi * (np.arange(2 * degree + 1) + 0.5) / (2 * degree + 1))
-    return np.polynomial.chebyshev.chebfit(places, np.exp(-time * (places + 1)), degree)
+    return heat([time], 4 * math.ceil(_TERMS * math.sqrt(time) / 4))[0]
 
 
 def unsmoothed(mesh: Mesh, steps: int) -> Mesh:
