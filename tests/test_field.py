@@ -310,3 +310,27 @@ def test_what_is_too_rough_when_smoothing_is_undone_is_left_out(shape: Mesh):
     undone = {view.undone for view in SCHEME.views(rough, CHOICES)}
     assert 0 in undone
     assert not undone >= {0, 10, 30, 50}
+
+
+@pytest.mark.slow
+def test_tuning_chooses_what_the_worst_attack_leaves_most_of(shape: Mesh):
+    ways = (("noise", 0.003), lambda mesh, seed: turned(mesh))
+    scheme = dataclasses.replace(SCHEME, widths=(WIDTH, 0.018))
+    tuned = jm.tune_blind(shape, ways, 6e-4, key=jax.random.key(0), bits=32, scheme=scheme)
+    assert tuned.energy.shape == (len(tuned.choices), 2)
+    chosen = tuned.choices.index((*tuned.scheme.widths, *tuned.scheme.steps))
+    assert tuned.worst == tuned.energy[chosen].min() > tuned.needed
+    narrow = np.array([width == 0.018 for width, _ in tuned.choices])
+    assert tuned.energy[narrow][0, 0] < tuned.energy[narrow][1, 0]  # larger steps survive more noise
+    # Another pose and order costs nothing, so that only the part of the way is left of it.
+    step = tuned.scheme.steps[0]
+    marked, info = jm.embed(shape, MESSAGE, jm.Key(bytes(32)), budget=6e-4, scheme=tuned.scheme)
+    anchors = jm.detect(marked, key=jm.Key(bytes(32)), bits=32, scheme=tuned.scheme).anchors
+    expected = anchors * np.sinc(1 - info.record.beta) ** 2
+    assert info.record.parameters["step"] == step
+    np.testing.assert_allclose(tuned.energy[chosen, 1], expected, rtol=0.1)
+
+
+def test_tuning_refuses_informed_schemes(shape: Mesh):
+    with pytest.raises(jm.JaxmarkError, match="there is tune"):
+        jm.tune_blind(shape, [("noise", 0.003)], key=jax.random.key(0), scheme="keyed")

@@ -27,12 +27,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh, weld
+from jaxmark.watermark.blind.prediction import best_energy, compare
 from jaxmark.watermark.blind.reading import TAG_BITS, context
-from jaxmark.watermark.blind.scheme import BlindScheme, Look
+from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.everyday import BLIND_SCHEMES
 from jaxmark.watermark.marking import EmbedInfo
 
@@ -84,42 +84,13 @@ def read(suspect: Mesh, key: bytes, scheme: BlindScheme) -> Cell:
     return Cell(found.message == MESSAGE, found.log10_p, found.agreement, time.perf_counter() - start)
 
 
-def named(names: np.ndarray, good: np.ndarray, values: ArrayLike) -> dict[tuple[int, ...], float]:
-    """The values of what counts and has a name that nothing else has."""
-    some, first, count = np.unique(names[good], axis=0, return_index=True, return_counts=True)
-    there = np.asarray(values)[good][first]
-    return {tuple(some[one].tolist()): float(there[one]) for one in np.flatnonzero(count == 1)}
-
-
-def left(before: Look, after: Look, step: float) -> float:
-    """Sum of the cosines that an attack leaves of anchors exactly on the lattice, after the best small change.
-
-    The shape may look the other way along its axes: the way that leaves most counts.
-    """
-    known = named(before.names[0], before.good, before.values)
-    best = 0.0
-    for names, mirrored in zip(after.names, after.mirrored, strict=True):
-        there = named(names, after.good, np.arange(len(names)))
-        rows = [int(there[name]) for name in there.keys() & known.keys() if not mirrored]
-        slopes = np.asarray(after.changes, np.float64)[rows]
-        freedom = len(rows) - slopes.shape[1]
-        if freedom <= 0:
-            continue
-        moved = np.array([float(after.values[one]) - known[tuple(names[one].tolist())] for one in rows])
-        off = moved + slopes @ np.linalg.lstsq(slopes, -moved, rcond=None)[0]
-        best = max(best, len(rows) * math.exp(-2 * (math.pi / step) ** 2 * float(off @ off) / freedom))
-    return best
-
-
 def predict(mesh: Mesh, steps: str, one: Copy) -> float:
     """Predicted nρ² of a mark after an attack, by what the attack does to the unmarked mesh."""
     step, choices = one.info.record.parameters["step"], context(one.key, 8 * len(MESSAGE), one.scheme.name)
     scheme = one.scheme.fixed(one.info.record.parameters["width"], step)
     before = next(scheme.views(mesh, choices))
-    compensated = np.sinc(1 - min(one.info.record.beta, 1.0))
     looks = scheme.views(attacked(mesh, steps, 0), choices)
-    found = [(left(before, after, step), after.good.sum()) for after in looks]
-    return max(float((compensated * cosines) ** 2 / max(count, 1)) for cosines, count in found)
+    return best_energy((way for after in looks for way in compare(before, after)), step, one.info.record.beta)
 
 
 def row(name: str, cells: list[Cell], *more: object) -> str:

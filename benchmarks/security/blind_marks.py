@@ -12,6 +12,14 @@ Tables in Markdown, by part; `--only` chooses some:
   copying    the phases of one marked work written in another shape, without the key
   averaging  the lattice of values estimated from several works of one key with different messages, and another work
              moved to halfway between
+  answers    values moved as a detector's answers tell: by so many scores, or by so many decisions at 1e-6; answers are
+             those of the right pose, the last reading is of the mesh
+  mixing     if each value were a keyed mixture of several neighbouring ones: how far all must be moved without the key
+             until nothing is left, in formulas, and how many mixtures keep all of their values
+  salts      seconds and evidence that a reader pays who tries so many lattices of one key
+  codes      if the lattice depended on the shape around each anchor, on its normal and on the sign of its curvature at
+             some scales: how many anchors have a clear code, and how many of these keep it, in attacked works and in
+             another shape that the mark is copied to
 
 RMS is that of the attack over that of the mark, MSDM that of the attack alone. Figures are of one seed.
 
@@ -20,22 +28,26 @@ RMS is that of the attack over that of the mark, MSDM that of the attack alone. 
 
 import math
 import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
+from scipy.special import jn_zeros
 
 import jaxmark as jm
 from jaxmark import distortion
 from jaxmark.alignment.original import Original, displace, make_original
-from jaxmark.geometry.mesh import Mesh, diagonal
+from jaxmark.geometry.mesh import Mesh, compact, diagonal, weld, weld_mesh
 from jaxmark.watermark import evidence
 from jaxmark.watermark.blind import reading
+from jaxmark.watermark.blind.anchors import place, see
 from jaxmark.watermark.blind.dither import make_dither
-from jaxmark.watermark.blind.field import FieldScheme
+from jaxmark.watermark.blind.field import TURNS, FieldScheme
 from jaxmark.watermark.blind.marker import make_blind_marker
 from jaxmark.watermark.blind.scheme import AnchoredHost
 from jaxmark.watermark.blind.writing import Writer
@@ -44,10 +56,22 @@ from jaxmark.watermark.marking import EmbedInfo
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser
+from common.attacks import attacked
 from common.marks import KEY, MESSAGE
 from common.tables import Row, say, table
 
-PARTS = ("bound", "unmarked", "erasure", "remarking", "copying", "averaging")
+PARTS = (
+    "bound",
+    "unmarked",
+    "erasure",
+    "remarking",
+    "copying",
+    "averaging",
+    "answers",
+    "mixing",
+    "salts",
+    "codes",
+)
 LIMITS = {"msdm": 0.2, "mrms": 8e-4}
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
 ANCHORS = 200  # of a simulated suspect
@@ -58,6 +82,15 @@ SHARES = (1 / 8, 3 / 16, 1 / 4)  # of a step, by which values are moved
 ROUNDS = 2  # of Gauss and Newton, as the library writes
 WAVES, WAVE_LENGTH, WAVE_SIZE = 4, 0.4, 2e-3  # of the warps that tell versions of a shape apart, in diagonals
 SCHEME = FieldScheme()  # that is attacked
+QUERIES = (0, 100, 300, 1000)  # that a detector answers
+PROBE = 0.05  # of a step, by which values are moved to see scores change
+THRESHOLD = -6.0  # log10 p from which a decision is "detected"
+SALTS = 16
+MIXED = (2, 4, 8)  # values in a mixture
+LOST = (0.01, 0.05, 0.1)  # shares of anchors
+CODED = ("noise 0.005", "smoothing 50", "quantisation 7", "simplification 0.95", "isotropic 1")
+SCALES = (2.0, 4.0, 8.0)  # of the curvature in a code, in widths
+GUARDS = (0.0, 0.2)  # of the usual size of what a sign is taken of, up to which a code is not clear
 OTHER = jm.Key(bytes(reversed(range(32))))
 
 
@@ -341,6 +374,165 @@ def averaging(work: Marked, counts: Sequence[int]) -> Iterator[Row]:
         yield row | cost(work.marked, erased, work.info.rms) | read(erased)
 
 
+class Detector:
+    """Answers for one work whose values are moved, seen in the right pose; counts its answers."""
+
+    def __init__(self, seen: Seen) -> None:
+        choices = seen.writer.choices
+        word = reading.codeword(MESSAGE, choices)
+        dither = make_dither(choices, SCHEME.name, seen.cells[seen.good], len(word))
+        self.phases = seen.phases[seen.good] - dither.offset
+        self.signs = dither.sign * word[dither.slot]
+        self.paid = math.log2(len(SCHEME.widths) * SCHEME.looks * len(SCHEME.steps) * 2)
+        self.asked = 0
+
+    def score(self, change: Float64[np.ndarray, " anchors"]) -> float:
+        """Mean cosine of the phases."""
+        self.asked += 1
+        return float(np.mean(self.signs * np.cos(2 * np.pi * (self.phases + change))))
+
+    def detects(self, change: Float64[np.ndarray, " anchors"]) -> bool:
+        """Whether the claimed message is proven."""
+        self.asked += 1
+        cosines = np.cos(2 * np.pi * (self.phases + change))
+        found = evidence.log10_p_read(float(self.signs @ cosines), float(np.linalg.norm(cosines)), self.paid)
+        return found <= THRESHOLD
+
+    def least(self, way: Float64[np.ndarray, " anchors"], most: float, rounds: int) -> float:
+        """How far values must go a way until no mark is detected, by halving; `most` if it is not detected there."""
+        low, high = 0.0, most
+        for _ in range(rounds):
+            middle = (low + high) / 2
+            low, high = (middle, high) if self.detects(middle * way) else (low, middle)
+        return high
+
+
+def by_scores(detector: Detector, queries: int, rng: np.random.Generator) -> Float64[np.ndarray, " anchors"]:
+    """Estimate which way each value's part of the score falls, by pairs of random moves; go there as far as needed."""
+    size = len(detector.phases)
+    slope = np.zeros(size)
+    while detector.asked + 2 <= queries:
+        probe = rng.choice([-PROBE, PROBE], size)
+        slope += (detector.score(probe) - detector.score(-probe)) * probe
+    way = -np.sign(slope) if queries else rng.choice([-1.0, 1.0], size)
+    return detector.least(way, 0.5, 8 if queries else 0) * way if queries else way / 4
+
+
+def by_decisions(detector: Detector, queries: int, rng: np.random.Generator) -> Float64[np.ndarray, " anchors"]:
+    """Erase, and turn the moves of random groups of values as long as no mark is detected; then move less."""
+    size = len(detector.phases)
+    way, far = rng.choice([-1.0, 1.0], size), 1 / 4
+    while detector.asked + 8 <= queries:
+        far = detector.least(way, far, 3)
+        other = np.where(rng.random(size) < 2 / math.sqrt(size), -way, way)
+        # A little nearer, so that what is turned must have helped.
+        way = way if detector.detects(0.98 * far * other) else other
+    return far * way
+
+
+def answers(work: Marked) -> Iterator[Row]:
+    """Move values as answers tell."""
+    seen = look(work.marked, work.width, work.step)
+    for (name, way), queries in product({"scores": by_scores, "decisions": by_decisions}.items(), QUERIES):
+        change = np.zeros(len(seen.good))
+        change[seen.good] = way(Detector(seen), queries, np.random.default_rng(0))
+        row: Row = {"mesh": work.name, "answers": name, "asked": queries, "moved, steps": float(np.abs(change).max())}
+        erased = moved(seen, change)
+        yield row | cost(work.marked, erased, work.info.rms) | read(erased)
+
+
+def mixing() -> Iterator[Row]:
+    """How far values must be moved until the mean cosine of keyed mixtures of several is zero, over a quarter step.
+
+    Of a move d of m values, a unit vector by chance shows the part u·d, and the mean of cos(2π u·d) is
+    Γ(m/2) J_(m/2-1)(x) (2/x)^(m/2-1) with x = 2π|d|: zero first at the first zero of that Bessel function.
+    """
+    yield {"mixed": 1, "least move": 1.0} | {f"whole at {share:g} lost": 1 - share for share in LOST}
+    for mixed in MIXED:
+        least = float(jn_zeros(mixed // 2 - 1, 1)[0]) / (2 * math.pi * math.sqrt(mixed)) / (1 / 4)
+        yield {"mixed": mixed, "least move": least} | {
+            f"whole at {share:g} lost": (1 - share) ** mixed for share in LOST
+        }
+
+
+def salts(name: str, mesh: Mesh) -> Iterator[Row]:
+    """What it takes to try several lattices; the suspect is looked at once."""
+    choices = reading.context(KEY, 8 * len(MESSAGE), SCHEME.name)
+    for _ in SCHEME.views(mesh, choices):  # compiles
+        break
+    reading.detect(mesh, KEY, 8 * len(MESSAGE), SCHEME)
+    start = time.perf_counter()
+    looks = list(SCHEME.views(mesh, choices))
+    looked = time.perf_counter() - start
+    start = time.perf_counter()
+    reading.detect(mesh, KEY, 8 * len(MESSAGE), SCHEME)
+    once = time.perf_counter() - start
+    for count in (1, SALTS):
+        seconds = looked + count * (once - looked)
+        yield {"mesh": name, "views": len(looks), "salts": count, "seconds": seconds, "log10 p": math.log10(count)}
+
+
+class Codes(NamedTuple):
+    """What the shape around the points of a lattice is like, roughly."""
+
+    cells: Int64[np.ndarray, "cells 3"]
+    normal: Float64[np.ndarray, "cells 3"]  # on average
+    curvature: Float64[np.ndarray, "cells scales"]  # differences of two averages along it
+
+    def of(self, guard: float) -> dict[tuple[int, ...], tuple[int, ...]]:
+        """The code of each cell where it is clear: the axis nearest to the normal, and signs."""
+        sizes = np.sort(np.abs(self.normal), axis=1)
+        clear = sizes[:, 2] - sizes[:, 1] >= guard
+        clear &= (np.abs(self.curvature) >= guard * np.sqrt(np.mean(self.curvature**2, axis=0))).all(axis=1)
+        axis = np.argmax(np.abs(self.normal), axis=1)
+        up = np.take_along_axis(self.normal, axis[:, None], axis=1) > 0
+        codes = np.concatenate([axis[:, None], up, self.curvature > 0], axis=1).astype(int)
+        return {tuple(self.cells[one].tolist()): tuple(codes[one].tolist()) for one in np.flatnonzero(clear)}
+
+    def turned(self, turn: Int64[np.ndarray, " 3"]) -> "Codes":
+        """As the shape looks the other way along some axes."""
+        return Codes(self.cells * turn, self.normal * turn, self.curvature)
+
+
+def codes_of(mesh: Mesh, width: float) -> Codes:
+    """Look at what is around each anchor of a width, at wider scales."""
+    placed = place(compact(weld_mesh(mesh, weld(mesh.vertices))))
+    _, surface, anchors = see(placed.mesh, (width,), jnp.result_type(float))[width]
+    there = np.asarray(surface.area) > 1e-12
+    area, points = np.asarray(surface.area)[there], np.asarray(surface.points)[there]
+    cells = anchors.cells[np.unique(anchors.anchor[anchors.anchor < len(anchors.cells)])]
+    places, normals = anchors.places[: len(cells)], np.asarray(surface.normals)[there]
+    square = np.sum((places[:, None] - points) ** 2, axis=2)
+
+    def average(scale: float, of: Float64[np.ndarray, "pieces 3"]) -> Float64[np.ndarray, "cells 3"]:
+        weights = np.exp(-square / 2 / (scale * width) ** 2)
+        return weights @ of / (weights @ area)[:, None]
+
+    normal = average(SCALES[0], normals)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    means = [average(scale, area[:, None] * points) for scale in (*SCALES, 2 * SCALES[-1])]
+    steps = pairwise(means)
+    return Codes(cells, normal, np.stack([np.sum((one - other) * normal, axis=1) for one, other in steps], axis=1))
+
+
+def codes(work: Marked) -> Iterator[Row]:
+    """How many anchors have a code, and keep it."""
+    before = codes_of(work.marked, work.width)
+    suspects = {steps: attacked(work.marked, steps, 0) for steps in CODED} | {"a version of it": version(work.mesh, 0)}
+    for name, suspect in suspects.items():
+        after, row = codes_of(suspect, work.width), {"mesh": work.name, "suspect": name}
+        for guard in GUARDS:
+            known = before.of(guard)
+            seen = [after.turned(turn).of(guard) for turn in TURNS[:4]]
+            same = max(sum(known.get(cell) == code for cell, code in one.items()) for one in seen)
+            row |= {
+                f"clear, guard {guard:g}": len(known) / len(before.cells),
+                f"kept, guard {guard:g}": same / len(known),
+            }
+        say(name, row)
+        yield row
+
+
 def show(title: str, rows: Iterator[Row]) -> None:
     """Print one part."""
     print(f"\n{title}\n\n{table(list(rows))}", flush=True)
@@ -360,7 +552,11 @@ def main() -> None:
         show("Pairs that state a probability at most so small", bound(arguments.pairs))
     if "unmarked" in parts:
         show("Unmarked meshes, smallest log10 p", unmarked(meshes, arguments.keys))
-    if not parts - {"bound", "unmarked"}:
+    if "mixing" in parts:
+        show("Mixtures of values", mixing())
+    if "salts" in parts:
+        show("Several lattices", (row for name, mesh in meshes.items() for row in salts(name, mesh)))
+    if not parts - {"bound", "unmarked", "mixing", "salts"}:
         return
     works = [mark(name, mesh) for name, mesh in meshes.items()]
     if "erasure" in parts:
@@ -373,6 +569,10 @@ def main() -> None:
     if "averaging" in parts:
         rows = (row for work in works for row in averaging(work, arguments.works))
         show("Erasure by works of one key", rows)
+    if "answers" in parts:
+        show("Erasure by answers", (row for work in works for row in answers(work)))
+    if "codes" in parts:
+        show("Codes of the shape around", (row for work in works for row in codes(work)))
 
 
 def targets(work: Marked, meshes: Mapping[str, Mesh]) -> Mapping[str, Mesh]:

@@ -1,6 +1,7 @@
 """Evaluation: what a mark survives, by robustness curves and by studies with controls, and how strong it should be.
 
-`pictures` draws their results; `tune` chooses the strengths of the bands for the attacks that a mark must survive.
+`pictures` draws their results; `tune` chooses the strengths of the bands for the attacks that a mark
+must survive, `tune_blind` width and step of a mark that is read without the original.
 """
 
 from jaxmark.evaluation import pictures as pictures
@@ -11,6 +12,8 @@ from jaxmark.evaluation._robustness import Reading as Reading
 from jaxmark.evaluation._robustness import Robustness as Robustness
 from jaxmark.evaluation._robustness import minimum_distortion as minimum_distortion
 from jaxmark.evaluation._robustness import robustness as robustness
+from jaxmark.evaluation.blind_tuning import TunedBlind as TunedBlind
+from jaxmark.evaluation.blind_tuning import tune_blind as tune_blind
 from jaxmark.evaluation.results import Results as Results
 from jaxmark.evaluation.study import Study as Study
 from jaxmark.evaluation.tuning import Tuned as Tuned

@@ -118,7 +118,7 @@ def tune(
     written = write(original, probe, bounds)
     mark = original.to_traced(written.scale * probe)
     numbers = np.asarray(jax.random.randint(key, (seeds,), 0, 2**31 - 1))
-    suspects = [[_apply(one, written.mesh, int(seed)) for seed in numbers] for one in attacks]
+    suspects = [[apply_attack(one, written.mesh, int(seed)) for seed in numbers] for one in attacks]
     seen = [[observation(original, align(original, suspect)) for suspect in row] for row in suspects]
 
     def measure_channels(profile: tuple[float, ...]) -> Channels:
@@ -384,7 +384,8 @@ def _mean(channels: list[Channels]) -> Channels:
     return jax.tree.map(lambda *values: jnp.mean(jnp.stack(values), axis=0), *channels)
 
 
-def _apply(attacker: Attacker, mesh: Mesh, seed: int) -> Mesh:
+def apply_attack(attacker: Attacker, mesh: Mesh, seed: int) -> Mesh:
+    """Apply an attack with a seed."""
     if callable(attacker):
         return attacker(mesh, seed)
     kind, strength = attacker

@@ -112,6 +112,21 @@ class Plan(NamedTuple):
         return self.host.size * kept**2
 
 
+class Allowance(NamedTuple):
+    """How much a budget allows to be written with anchors of one width."""
+
+    width: float  # of the narrow Gaussian
+    allowed: float  # the largest α · step
+    size: float  # RMS of the displacement then, in diagonals
+    host: AnchoredHost
+    dither: Dither
+
+    def plan(self, step: float) -> Plan:
+        """As far to the lattice of a step as is allowed."""
+        alpha = min(self.allowed / step, 1.0)
+        return Plan(self.width, step, alpha, self.size * alpha * step / self.allowed, self.host, self.dither)
+
+
 class Written(NamedTuple):
     """A displacement that writes a codeword, as far as a budget allows."""
 
@@ -123,6 +138,11 @@ class Written(NamedTuple):
 def needed(bits: int) -> float:
     """nρ² with which a payload is read: the energy that it needs with the longer tag of blind marks."""
     return needed_energy(bits + TAG_BITS - _TAG_BITS) if bits else needed_energy(0)
+
+
+def room(plan: Plan, bits: int) -> float:
+    """Energy that a plan has before any attack, as far as it matters for a payload; more than enough is no better."""
+    return min(plan.energy(0.0), _SPARE * needed(bits))
 
 
 class Writer:
@@ -178,18 +198,16 @@ class Writer:
         Raises:
             JaxmarkError: if there is nothing to write in, or the budget allows not even the least step.
         """
-        fitting: list[Plan] = []
-        for width in self.scheme.widths:
-            first = fitting[-1].size if fitting else FIRST_RMS
-            plan = self._try(width, word, budget, reference, first)
-            fitting += [] if plan is None else [plan]
+        fitting = []
+        for allowance in self.allowances(word, budget, reference):
+            if steps := self.steps(allowance):
+                fitting.append(allowance.plan(max(steps)))
         if not fitting:
             raise JaxmarkError(
                 f"This mesh, or the budget for it, leaves the scheme {self.scheme.name!r} nothing to write in; use a"
                 " larger budget or the scheme 'keyed'."
             )
-        enough = _SPARE * needed(bits)
-        return max(fitting, key=lambda one: (min(one.energy(0.0), enough), min(self.energies(one))))
+        return max(fitting, key=lambda one: (room(one, bits), min(self.energies(one))))
 
     def write(
         self,
@@ -216,33 +234,27 @@ class Writer:
         written = write(self.original, shift, budget, reference, first=plan.size)
         return Written(written.mesh, written.moved, plan._replace(alpha=plan.alpha * written.scale))
 
-    def _try(
-        self,
-        width: float,
-        word: Float64[np.ndarray, " code"],
-        budget: Budget,
-        reference: distortion.Reference,
-        first: float,
-    ) -> Plan | None:
-        """The step, and the part of the way, that a budget allows with a width; None if not even the least step.
+    def allowances(
+        self, word: Float64[np.ndarray, " code"], budget: Budget, reference: distortion.Reference
+    ) -> list[Allowance]:
+        """How much a budget allows with each width that there is anything to write with."""
+        found: list[Allowance] = []
+        for width, host in self.hosts.items():
+            if not host.size:
+                continue
+            dither = make_dither(self.choices, self.scheme.name, host.names, len(word))
+            # How far a mark of one step displaces is how far any does, times its step: what is off is uniform.
+            shift = self.shift(host, host.values - host.step * self.off(host, dither, word, host.step), 1)
+            size = float(distortion.rms(shift[self.original.used]))
+            if math.isfinite(size) and size > 0:
+                first = found[-1].size if found else FIRST_RMS
+                scale = write(self.original, shift, budget, reference, first=first, share=_ENOUGH).scale
+                found.append(Allowance(width, host.step * scale, size * scale, host, dither))
+        return found
 
-        An RMS displacement of `first` diagonals is tried first.
-        """
-        host = self.hosts[width]
-        if not host.size:
-            return None
-        dither = make_dither(self.choices, self.scheme.name, host.names, len(word))
-        # How far a mark of one step displaces is how far any does, times its step: what is off is uniform.
-        shift = self.shift(host, host.values - host.step * self.off(host, dither, word, host.step), 1)
-        size = float(distortion.rms(shift[self.original.used]))
-        if not (math.isfinite(size) and size > 0):
-            return None
-        allowed = host.step * write(self.original, shift, budget, reference, first=first, share=_ENOUGH).scale
-        steps = [step for step in self.scheme.steps if allowed / step >= _LEAST_ALPHA]
-        if not steps:
-            return None
-        alpha = min(allowed / max(steps), 1.0)
-        return Plan(width, max(steps), alpha, size * alpha * max(steps) / host.step, host, dither)
+    def steps(self, allowance: Allowance) -> list[float]:
+        """The steps that may be written with: all but those to which a budget does not allow to go far enough."""
+        return [step for step in self.scheme.steps if allowance.allowed / step >= _LEAST_ALPHA]
 
     def energies(self, plan: Plan) -> tuple[float, float]:
         """Predicted nρ² after each of the reference disturbances, see `Plan.energy`."""

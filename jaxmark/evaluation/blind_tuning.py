@@ -1,0 +1,111 @@
+"""The width and the step of a blind mark that leave most readable after the worst of several attacks."""
+
+from collections.abc import Sequence
+from itertools import groupby
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float64, PRNGKeyArray
+
+from jaxmark import distortion
+from jaxmark.errors import JaxmarkError
+from jaxmark.evaluation.tuning import Attacker, apply_attack
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.blind.marker import make_blind_marker
+from jaxmark.watermark.blind.prediction import Left, best_energy, compare
+from jaxmark.watermark.blind.reading import codeword
+from jaxmark.watermark.blind.scheme import BlindScheme, Look
+from jaxmark.watermark.blind.writing import needed, room
+from jaxmark.watermark.budget import Limits, make_budget
+from jaxmark.watermark.everyday import BLIND_SCHEMES, blind_scheme
+
+_PUBLIC_KEY = bytes(32)  # predictions hardly depend on the key
+
+
+class TunedBlind(NamedTuple):
+    """A blind scheme of the width and the step that are predicted to leave most after the worst attack."""
+
+    scheme: BlindScheme  # `embed` takes it; whoever reads needs no more than the scheme's name
+    worst: float  # nρ² after the worst of the attacks, as predicted
+    needed: float  # nρ² with which the payload is read
+    choices: tuple[tuple[float, float], ...]  # all widths and steps that the budget allows
+    energy: Float64[np.ndarray, "choices attacks"]  # predicted nρ² of each
+
+
+def tune_blind(
+    mesh: Mesh,
+    attacks: Sequence[Attacker],
+    budget: float | None = None,
+    *,
+    limits: Limits | None = None,
+    key: PRNGKeyArray,
+    bits: int = 64,
+    scheme: str | BlindScheme = "field",
+    seeds: int = 1,
+) -> TunedBlind:
+    """Choose width and step of a mark that is read without the original, for the attacks that it must survive.
+
+    The original is attacked, and looked at as a suspect is; how far its values are from what they were tells what would
+    be left of any mark. A wide average survives more smoothing, a narrow one gives more anchors; a large step survives
+    more noise, a small one is met more exactly within the same budget. All that a budget allows are compared; of those
+    that have room for the payload, the one of which the worst attack leaves most is chosen. If that is less than
+    needed, the mark is not expected to survive all of the attacks.
+
+    Args:
+        mesh: the original.
+        attacks: see `jaxmark.tune`.
+        budget: see `jaxmark.embed`.
+        limits: see `jaxmark.embed`.
+        key: a JAX random key for the attacks' random choices; not secret.
+        bits: size of the payload in bits.
+        scheme: a blind scheme, whose widths and steps are compared.
+        seeds: number of times that each attack is tried; predictions are averaged.
+
+    Raises:
+        JaxmarkError: if the mesh, an attack, the budget or a number is unusable, the scheme is no blind one, or the
+            budget leaves nothing to write in.
+    """
+    if not attacks or seeds < 1:
+        raise JaxmarkError(f"tune_blind needs at least one attack and one seed, got {len(attacks)} and {seeds}.")
+    blind = blind_scheme(scheme)
+    if blind is None:
+        raise JaxmarkError(
+            f"tune_blind tunes the schemes that are read without the original ({', '.join(BLIND_SCHEMES)}), not"
+            f" {scheme!r}; for the others there is tune."
+        )
+    writer = make_blind_marker(mesh, _PUBLIC_KEY, bits=bits, scheme=blind).writer
+    word = codeword(bytes(bits // 8), writer.choices)
+    allowances = writer.allowances(word, make_budget(budget, limits), distortion.Reference(writer.original.mesh))
+    plans = [one.plan(step) for one in allowances for step in writer.steps(one)]
+    if not plans:
+        raise JaxmarkError(f"This mesh, or the budget for it, leaves the scheme {blind.name!r} nothing to write in.")
+
+    def looks(suspect: Mesh) -> dict[float, list[Look]]:
+        found = sorted(blind.views(suspect, writer.choices), key=lambda look: look.width)
+        return {width: list(some) for width, some in groupby(found, key=lambda look: look.width)}
+
+    before = {width: some[0] for width, some in looks(mesh).items()}
+
+    def left(attacker: Attacker, seed: int) -> dict[float, list[Left]]:
+        seen = looks(apply_attack(attacker, mesh, seed))
+        return {width: [way for look in some for way in compare(before[width], look)] for width, some in seen.items()}
+
+    numbers = np.asarray(jax.random.randint(key, (seeds,), 0, 2**31 - 1))
+    found = [[left(one, int(seed)) for seed in numbers] for one in attacks]
+    energy = np.array(
+        [
+            [np.mean([best_energy(ways[plan.width], plan.step, plan.alpha) for ways in row]) for row in found]
+            for plan in plans
+        ]
+    )
+    # Few anchors that are met well do not carry a payload: first of all, there must be room for it.
+    worst = energy.min(axis=1)
+    chosen = max(range(len(plans)), key=lambda one: (room(plans[one], bits), worst[one]))
+    return TunedBlind(
+        blind.fixed(plans[chosen].width, plans[chosen].step),
+        float(worst[chosen]),
+        needed(bits),
+        tuple((plan.width, plan.step) for plan in plans),
+        energy,
+    )
