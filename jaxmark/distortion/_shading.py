@@ -41,7 +41,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxmark.distortion.roots import root
-from jaxmark.geometry.mesh import face_pairs
+from jaxmark.geometry.mesh import cross_product, face_pairs
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import band_components, filter
 from jaxmark.spectral.laplacian import Laplacian, graph_laplacian
@@ -60,6 +60,7 @@ _LUMINANCE = 100.0  # cd/m²
 _LEAST_CONTRAST = 0.006  # that is just seen, at the best frequency
 _MIN_SENSITIVITY = 1e-3  # to the shortest waves, over that to the best
 _MASKING_SLOPE, _MASKING_BEND = 0.0078 * 88.29, 4.207
+_FEW_TERMS = 25  # of a series: as many as the first four bands need
 _POOLING = 4  # exponent by which bands are summed
 _MIN_HEIGHT = 1e-5  # of a face over its longest side; flatter ones have no normal
 _MIN_AREA = 1e-3  # of a face over the mean, in its links
@@ -89,7 +90,7 @@ def make_hiding(
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     corners = vertices[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    cross = cross_product(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     double = np.linalg.norm(cross, axis=1)
     longest = np.max(np.sum((np.roll(corners, 1, axis=1) - corners) ** 2, axis=2), axis=1, initial=0)
     area = np.where(double > _MIN_HEIGHT * longest, double / 2, 0)
@@ -109,13 +110,9 @@ def make_hiding(
     diagonal = float(np.linalg.norm(np.ptp(used, axis=0))) if len(used) else 1.0
     lengths = np.sqrt(4 / math.sqrt(3) * size * mean) / diagonal  # of equilateral triangles' sides
     padded = jnp.asarray(pad_rows(normals, count)), jnp.asarray(pad_rows(lengths, count))
-    hidden = _hidden(links, *padded, bands)
-    contrast, local = (np.asarray(values, np.float64)[:, : len(faces)] for values in hidden)
-    sensitivity = _sensitivity(np.maximum(_WAVELENGTHS[:bands, None] * local, 1e-9))
-    masked = (1 + (_MASKING_SLOPE * contrast * sensitivity) ** _MASKING_BEND) ** (1 / _MASKING_BEND)
-    bare = 1 / sensitivity / math.tan(_INCIDENCE)
+    threshold, bare = (np.asarray(values)[:, : len(faces)] for values in _hidden(links, *padded, bands))
     share, bend = area / (area.sum() or 1.0), _second_largest(pairs, angle, len(faces))
-    return Hiding(faces.astype(np.int32), share, turned, links, masked * bare, bare, bend)
+    return Hiding(faces.astype(np.int32), share, turned, links, threshold, bare, bend)
 
 
 @jax.jit
@@ -181,13 +178,16 @@ def vertex_means(values: Float[Array, " faces"], hiding: Hiding, count: int) -> 
 
 def _second_largest(pairs: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     """The second largest of the values of the pairs that each of so many things is in; 0 where it is in but one."""
-    which, twice = pairs.T.ravel(), np.tile(values, 2)
-    order = np.lexsort((-twice, which))
-    first = np.searchsorted(which[order], np.arange(count))
-    in_two = np.bincount(which, minlength=count) > 1
-    found = np.zeros(count)
-    found[in_two] = twice[order][first[in_two] + 1]
-    return found
+    which, left = pairs.T.ravel(), np.tile(values, 2)
+    largest = np.full(count, -np.inf)
+    np.maximum.at(largest, which, left)
+    first = np.full(count, -1)
+    reaching = np.flatnonzero(left == largest[which])
+    first[which[reaching]] = reaching
+    left[first[first >= 0]] = -np.inf
+    second = np.full(count, -np.inf)
+    np.maximum.at(second, which, left)
+    return np.where(np.isfinite(second), second, 0)
 
 
 def _orient(pairs: np.ndarray, against: np.ndarray, count: int) -> np.ndarray:
@@ -215,36 +215,56 @@ def _normals(x: Array, hiding: Hiding) -> Array:
 @cache
 def _diffusions(count: int) -> Float[np.ndarray, "scales terms"]:
     """Chebyshev coefficients of the diffusions that divide so many bands."""
-    last = _SCALES[count - 1]
-    # The rest of the series is below 3e-5.
-    return diffusion(last + 1, round(3 * 2 ** (last / 2)) + 1)[list(_SCALES[:count])]
+    terms = [round(3 * 2 ** (scale / 2)) + 1 for scale in _SCALES[:count]]
+    series = diffusion(_SCALES[count - 1] + 1, terms[-1])[list(_SCALES[:count])]
+    # The rest of each series is below 3e-5.
+    return np.where(np.arange(terms[-1]) < np.array(terms)[:, None], series, 0)
 
 
 def _bands(links: Laplacian, x: Array, count: int) -> Array:
     """Split signals of faces into bands, from the shortest waves on; what diffusion leaves is in none of them."""
     passed = _diffusions(count)
     bands = _GAINS[:count, None] * (np.vstack([np.eye(1, passed.shape[1]), passed[:-1]]) - passed)
-    return band_components(links, jnp.asarray(bands, x.dtype), x)
+    # Most bands need but few of the terms.
+    parts = [band_components(links, jnp.asarray(some, x.dtype), x) for some in _by_length(bands)]
+    return jnp.concatenate(parts)
+
+
+def _by_length(series: Float[np.ndarray, "series terms"]) -> list[Float[np.ndarray, "some fewer"]]:
+    """Split series, the shortest first, into those of few terms, which end there, and the others."""
+    few = _FEW_TERMS
+    short = int((~series[:, few:].any(axis=1)).sum())
+    return [some for some in (series[:short, :few], series[short:]) if len(some)]
 
 
 @partial(jax.jit, static_argnames="count")
 def _hidden(links: Laplacian, normals: Array, length: Array, count: int) -> tuple[Array, Array]:
-    """Contrast of normals in each band, and the length of edges, both as means around each face."""
-    energy = jnp.sum(_bands(links, normals, count) ** 2, axis=2)
-    diffusions = jnp.asarray(_diffusions(count), energy.dtype)
-    around = filter(links, diffusions.T, energy.T).T
-    return math.tan(_INCIDENCE) * root(around), band_components(links, diffusions, length)
+    """Just noticeable turns in each band, and what they were if nothing hid them, by the means around each face."""
+    energy, dtype = jnp.sum(_bands(links, normals, count) ** 2, axis=2), normals.dtype
+    diffusions = _diffusions(count)
+    around, local, start = [], [], 0
+    for some in _by_length(diffusions):
+        rows = jnp.asarray(some, dtype)
+        around.append(filter(links, rows.T, energy[start : start + len(some)].T).T)
+        local.append(band_components(links, rows, length))
+        start += len(some)
+    contrast = math.tan(_INCIDENCE) * root(jnp.concatenate(around))
+    wavelengths = jnp.asarray(_WAVELENGTHS[:count, None], dtype) * jnp.concatenate(local)
+    sensitivity = _sensitivity(jnp.maximum(wavelengths, 1e-9))
+    masked = (1 + (_MASKING_SLOPE * contrast * sensitivity) ** _MASKING_BEND) ** (1 / _MASKING_BEND)
+    bare = 1 / sensitivity / math.tan(_INCIDENCE)
+    return masked * bare, bare
 
 
-def _sensitivity(wavelength: np.ndarray) -> np.ndarray:
+def _sensitivity(wavelength: Array) -> Array:
     """Inverse of the contrast that is just seen, of waves whose lengths are given in diagonals."""
-    cycles = np.maximum(1 / (wavelength * _SIZE), _BEST_FREQUENCY)
-    values = _barten(np.append(_BEST_FREQUENCY, cycles))
-    return np.maximum(values[1:].reshape(cycles.shape) / values[0], _MIN_SENSITIVITY) / _LEAST_CONTRAST
+    cycles = jnp.maximum(1 / (wavelength * _SIZE), _BEST_FREQUENCY)
+    values = _barten(cycles) / _barten(jnp.full((), _BEST_FREQUENCY, cycles.dtype))
+    return jnp.maximum(values, _MIN_SENSITIVITY) / _LEAST_CONTRAST
 
 
-def _barten(cycles: np.ndarray) -> np.ndarray:
+def _barten(cycles: Array) -> Array:
     """Barten's contrast sensitivity at so many cycles per degree."""
     peak = 540 * (1 + 0.7 / _LUMINANCE) ** -0.2 / (1 + 12 / (_SIZE * (1 + cycles / 3) ** 2))
-    fall = np.minimum(0.3 * (1 + 100 / _LUMINANCE) ** 0.15 * cycles, 600)
-    return peak * cycles * np.exp(-fall) * np.sqrt(1 + 0.06 * np.exp(fall))
+    kept = jnp.exp(-0.3 * (1 + 100 / _LUMINANCE) ** 0.15 * cycles)
+    return peak * cycles * jnp.sqrt(kept**2 + 0.06 * kept)
