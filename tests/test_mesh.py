@@ -6,7 +6,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, boundary_vertices, components, diagonal, edges, make_mesh, weld, weld_mesh
+from jaxmark.geometry.mesh import (
+    Mesh,
+    boundary_vertices,
+    components,
+    diagonal,
+    edges,
+    face_pairs,
+    make_mesh,
+    weld,
+    weld_mesh,
+)
 
 TRIANGLE = np.array([[0, 1, 2]])
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
@@ -92,3 +102,21 @@ def test_components_are_the_connected_parts():
     np.testing.assert_array_equal(first.vertices, both.vertices)
     parts = trimesh.Trimesh(both.vertices, both.faces, process=False).split(only_watertight=False)
     assert sorted(len(part.faces) for part in parts) == sorted([len(first.faces), len(second.faces)])
+
+
+def test_pairs_of_faces_are_those_that_alone_share_an_edge():
+    # Faces 0 and 1 share two edges, 1 and 2 run along theirs in the same direction, and three faces meet in 6-7.
+    faces = np.array(
+        [[0, 1, 2], [1, 0, 2], [0, 1, 3], [4, 5, 3], [5, 6, 3], [6, 7, 8], [7, 6, 9], [6, 7, 10], [2, 0, 11]]
+    )
+    sides = {}
+    for number, face in enumerate(faces):
+        for one, other in zip(face, np.roll(face, -1), strict=True):
+            sides.setdefault(frozenset((one, other)), []).append((number, (one, other)))
+    expected = {}
+    for found in sides.values():
+        if len(found) == 2:
+            (first, one), (second, other) = found
+            expected.setdefault((first, second), one == other)
+    pairs, against = face_pairs(faces)
+    assert dict(zip(map(tuple, pairs.tolist()), against.tolist(), strict=True)) == expected

@@ -30,7 +30,7 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh, weld
-from jaxmark.watermark.blind.prediction import best_energy, compare
+from jaxmark.watermark.blind.prediction import compare
 from jaxmark.watermark.blind.reading import TAG_BITS, context
 from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.everyday import BLIND_SCHEMES
@@ -90,7 +90,8 @@ def predict(mesh: Mesh, steps: str, one: Copy) -> float:
     scheme = one.scheme.fixed(one.info.record.parameters["width"], step)
     before = next(scheme.views(mesh, choices))
     looks = scheme.views(attacked(mesh, steps, 0), choices)
-    return best_energy((way for after in looks for way in compare(before, after)), step, one.info.record.beta)
+    ways = [way for after in looks for way in compare(before, after)]
+    return max((way.shown * way.cosine(step, one.info.record.beta) ** 2 for way in ways), default=0.0)
 
 
 def row(name: str, cells: list[Cell], *more: object) -> str:

@@ -13,10 +13,10 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.tuning import Attacker, apply_attack
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.marker import make_blind_marker
-from jaxmark.watermark.blind.prediction import Left, best_energy, compare
+from jaxmark.watermark.blind.prediction import Left, best_margin, compare
 from jaxmark.watermark.blind.reading import codeword
 from jaxmark.watermark.blind.scheme import BlindScheme, Look
-from jaxmark.watermark.blind.writing import needed, room
+from jaxmark.watermark.blind.writing import carried, sureness
 from jaxmark.watermark.budget import Limits, make_budget
 from jaxmark.watermark.everyday import BLIND_SCHEMES, blind_scheme
 
@@ -27,10 +27,9 @@ class TunedBlind(NamedTuple):
     """A blind scheme of the width and the step that are predicted to leave most after the worst attack."""
 
     scheme: BlindScheme  # `embed` takes it; whoever reads needs no more than the scheme's name
-    worst: float  # nρ² after the worst of the attacks, as predicted
-    needed: float  # nρ² with which the payload is read
+    worst: float  # margin after the worst of the attacks; messages read from about 1 on
     choices: tuple[tuple[float, float], ...]  # all widths and steps that the budget allows
-    energy: Float64[np.ndarray, "choices attacks"]  # predicted nρ² of each
+    margins: Float64[np.ndarray, "choices attacks"]  # predicted, see `jaxmark.watermark.blind.prediction.margin`
 
 
 def tune_blind(
@@ -48,9 +47,9 @@ def tune_blind(
 
     The original is attacked, and looked at as a suspect is; how far its values are from what they were tells what would
     be left of any mark. A wide average survives more smoothing, a narrow one gives more anchors; a large step survives
-    more noise, a small one is met more exactly within the same budget. All that a budget allows are compared; of those
-    that have room for the payload, the one of which the worst attack leaves most is chosen. If that is less than
-    needed, the mark is not expected to survive all of the attacks.
+    more noise, a small one is met more exactly within the same budget. All that a budget allows are compared, by how
+    many standard deviations the information that is left exceeds what payload and tag need. If that is negative after
+    the worst of the attacks, the mark is not expected to survive it.
 
     Args:
         mesh: the original.
@@ -93,19 +92,18 @@ def tune_blind(
 
     numbers = np.asarray(jax.random.randint(key, (seeds,), 0, 2**31 - 1))
     found = [[left(one, int(seed)) for seed in numbers] for one in attacks]
-    energy = np.array(
+    size = carried(bits)
+    margins = np.array(
         [
-            [np.mean([best_energy(ways[plan.width], plan.step, plan.alpha) for ways in row]) for row in found]
+            [np.mean([best_margin(ways[plan.width], plan.step, plan.alpha, size) for ways in row]) for row in found]
             for plan in plans
         ]
     )
-    # Few anchors that are met well do not carry a payload: first of all, there must be room for it.
-    worst = energy.min(axis=1)
-    chosen = max(range(len(plans)), key=lambda one: (room(plans[one], bits), worst[one]))
+    worst = margins.min(axis=1)
+    chosen = max(range(len(plans)), key=lambda one: (sureness(plans[one], bits), worst[one]))
     return TunedBlind(
         blind.fixed(plans[chosen].width, plans[chosen].step),
         float(worst[chosen]),
-        needed(bits),
         tuple((plan.width, plan.step) for plan in plans),
-        energy,
+        margins,
     )

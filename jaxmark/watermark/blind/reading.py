@@ -33,7 +33,7 @@ from jaxmark.watermark.marking import CLAIM_SHARE
 from jaxmark.watermark.record import Record
 
 TAG_BITS = 40
-_CODE_SPREAD = 2  # code bits for each bit of message and tag, at least
+_CODE_SPREAD = 4  # code bits for each bit of message and tag, at least: of few anchors, few share one then
 _CHANGES = 2  # changes of pose that are read: none, and the best by the offsets
 _CANDIDATES = 32  # messages of each reading whose tags are tried
 # log10 of a probability from which on no other way of looking is tried, where a message reads and where none does.
@@ -93,7 +93,7 @@ def context(key: bytes, bits: int, scheme: str) -> Choices:
 
 
 def code_length(bits: int) -> int:
-    """Number of code bits for a payload: the least power of two that is twice as long as message and tag.
+    """Number of code bits for a payload: the least power of two that is four times as long as message and tag.
 
     Raises:
         JaxmarkError: if the payload is not a multiple of 8 bits, or negative.

@@ -1,0 +1,163 @@
+"""Whole commands on files, with default options, stage by stage: python benchmarks/speed/commands.py MESH...
+
+`jaxmark embed` and `jaxmark detect` run as processes of their own, twice each with the same cache of compiled programs,
+which is empty before the first. A table has a line for each run: seconds of each stage without those in it, of the
+whole process, and the most memory that it held.
+
+start    until the command line is read: interpreter and imports
+read     of files, each time that one is read
+prepare  the original: welded, hashed, its Laplacian, where it hides a mark, the carrier
+limits   how visible trial displacements are
+write    the rest of writing the mark
+back     reading the written file, and trying what the mark survives
+save     the marked file
+align    the suspect beside the original
+receive  bands weighed, and what is proven
+other    what is left
+"""
+
+import argparse
+import importlib
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+BORN = time.time()
+# The functions of each stage: module, name, and stage.
+FUNCTIONS = (
+    ("jaxmark.app.batch", "load_scene", "read"),
+    ("jaxmark.app.batch", "load_mesh", "read"),
+    ("jaxmark.app.batch", "load_texture", "read"),
+    ("jaxmark.app.batch", "prepare", "prepare"),
+    ("jaxmark.app.batch", "make_markers", "prepare"),
+    ("jaxmark.distortion", "Reference.measure", "limits"),
+    ("jaxmark.watermark.marking", "Marker.embed", "write"),
+    ("jaxmark.watermark.marking", "Marker.reads", "back"),
+    ("jaxmark.watermark.marking", "Marker.tried", "back"),
+    ("jaxmark.app.batch", "save_mesh", "save"),
+    ("jaxmark.alignment.alignment", "align", "align"),
+    ("jaxmark.app.batch", "detect_any", "receive"),
+)
+STAGES = ("start", *dict.fromkeys(stage for *_, stage in FUNCTIONS), "other")
+
+
+class Watch:
+    """Seconds of each stage, without those of stages that run in it."""
+
+    def __init__(self) -> None:
+        self.seconds = dict.fromkeys(STAGES, 0.0)
+        self._running = ["start"]
+        # The interpreter's own start is counted from when the parent started it.
+        self._since = time.perf_counter() - (time.time() - float(os.environ.get("STARTED", BORN)))
+
+    def switch(self) -> None:
+        """Book what passed since the last switch on the stage that runs."""
+        now = time.perf_counter()
+        self.seconds[self._running[-1]] += now - self._since
+        self._since = now
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Run a stage."""
+        self.switch()
+        self._running.append(name)
+        try:
+            yield
+        finally:
+            self.switch()
+            self._running.pop()
+
+    def wrap(self, function: Callable[..., Any], name: str) -> Callable[..., Any]:
+        """The function as a stage."""
+
+        @wraps(function)
+        def watched(*arguments: Any, **options: Any) -> Any:
+            with self.stage(name):
+                return function(*arguments, **options)
+
+        return watched
+
+
+def run_inside(result: Path) -> None:
+    """Run the command line with its functions watched, and leave what was seen in a file."""
+    watch = Watch()
+    from jaxmark.app.start import main
+
+    for module, names, stage in FUNCTIONS:
+        *owners, name = names.split(".")
+        owner: Any = importlib.import_module(module)
+        for one in owners:
+            owner = getattr(owner, one)
+        setattr(owner, name, watch.wrap(getattr(owner, name), stage))
+    try:
+        with watch.stage("other"):
+            main()
+    finally:
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        result.write_text(json.dumps({"seconds": watch.seconds, "peak": peak}))
+
+
+def run(words: list[str], cache: Path) -> dict[str, Any]:
+    """Run one command as a process."""
+    result = cache / "stages.json"
+    program = [sys.executable, str(Path(__file__).resolve()), "--inside", str(result), *words]
+    start = time.time()
+    environment = {**os.environ, "XDG_CACHE_HOME": str(cache), "STARTED": str(start)}
+    done = subprocess.run(program, env=environment, capture_output=True, text=True)
+    if done.returncode > 1 or not result.exists():
+        raise SystemExit(f"jaxmark {' '.join(words)} ended with {done.returncode}: {done.stderr[-500:]}")
+    found = json.loads(result.read_text())
+    shown = {stage: round(found["seconds"][stage], 2) for stage in STAGES}
+    return {**shown, "seconds": time.time() - start, "peak, GB": found["peak"] / 1e9}
+
+
+def measure(mesh: Path, options: list[str]) -> Iterator[dict[str, Any]]:
+    """Mark and read one file, twice."""
+    from common.tables import say
+
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        key, marked = place / "owner.key", place / f"marked{mesh.suffix}"
+        run(["keygen", str(key)], place)
+        embed = ["embed", str(mesh), str(marked), "--key", str(key), "--message", "0123456789abcdef", *options]
+        record = Path(f"{marked}.jaxmark.json")
+        detect = ["detect", str(marked), "--original", str(mesh), "--key", str(key)]
+        for number, words in (("first", embed), ("second", embed), ("first", detect), ("second", detect)):
+            if words is embed:
+                marked.unlink(missing_ok=True)
+                record.unlink(missing_ok=True)
+            found = run(words, place)
+            say(mesh.name, words[0], number, f"{found['seconds']:.1f} s")
+            megabytes = mesh.stat().st_size / 1e6
+            yield {"mesh": mesh.name, "file, MB": megabytes, "command": words[0], "run": number, **found}
+
+
+def main() -> None:
+    """Print the table."""
+    from common.tables import table
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("meshes", nargs="+", type=Path, metavar="MESH")
+    parser.add_argument("--options", default="", help="more options of embed, in one word")
+    arguments = parser.parse_args()
+    rows = [row for mesh in arguments.meshes for row in measure(mesh, arguments.options.split())]
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--inside"]:
+        inside, sys.argv = Path(sys.argv[2]), ["jaxmark", *sys.argv[3:]]
+        run_inside(inside)
+    else:
+        main()
