@@ -16,7 +16,7 @@ from jaxmark.watermark.blind.marker import make_blind_marker
 from jaxmark.watermark.blind.prediction import Left, best_margin, compare
 from jaxmark.watermark.blind.reading import codeword
 from jaxmark.watermark.blind.scheme import BlindScheme, Look
-from jaxmark.watermark.blind.writing import carried, sureness
+from jaxmark.watermark.blind.writing import Plan, carried, sureness
 from jaxmark.watermark.budget import Limits, make_budget
 from jaxmark.watermark.everyday import BLIND_SCHEMES, blind_scheme
 
@@ -27,9 +27,9 @@ class TunedBlind(NamedTuple):
     """A blind scheme of the width and the step that are predicted to leave most after the worst attack."""
 
     scheme: BlindScheme  # `embed` takes it; whoever reads needs no more than the scheme's name
-    worst: float  # margin after the worst of the attacks; messages read from about 1 on
+    worst: float  # surplus after the worst of the attacks; if it is negative, messages are not expected to read
     choices: tuple[tuple[float, float], ...]  # all widths and steps that the budget allows
-    margins: Float64[np.ndarray, "choices attacks"]  # predicted, see `jaxmark.watermark.blind.prediction.margin`
+    surplus: Float64[np.ndarray, "choices attacks"]  # in nats, see `jaxmark.watermark.blind.prediction.margin`
 
 
 def tune_blind(
@@ -48,8 +48,8 @@ def tune_blind(
     The original is attacked, and looked at as a suspect is; how far its values are from what they were tells what would
     be left of any mark. A wide average survives more smoothing, a narrow one gives more anchors; a large step survives
     more noise, a small one is met more exactly within the same budget. All that a budget allows are compared, by how
-    many standard deviations the information that is left exceeds what payload and tag need. If that is negative after
-    the worst of the attacks, the mark is not expected to survive it.
+    much the information that is left exceeds what payload and tag need. If that is negative after the worst of the
+    attacks, the mark is not expected to survive it.
 
     Args:
         mesh: the original.
@@ -93,17 +93,17 @@ def tune_blind(
     numbers = np.asarray(jax.random.randint(key, (seeds,), 0, 2**31 - 1))
     found = [[left(one, int(seed)) for seed in numbers] for one in attacks]
     size = carried(bits)
-    margins = np.array(
-        [
-            [np.mean([best_margin(ways[plan.width], plan.step, plan.alpha, size) for ways in row]) for row in found]
-            for plan in plans
-        ]
-    )
-    worst = margins.min(axis=1)
+
+    def left_of(plan: Plan, row: list[dict[float, list[Left]]]) -> float:
+        ways = (one[plan.width] for one in row)
+        return float(np.mean([best_margin(some, plan.step, plan.alpha, size).surplus for some in ways]))
+
+    surplus = np.array([[left_of(plan, row) for row in found] for plan in plans])
+    worst = surplus.min(axis=1)
     chosen = max(range(len(plans)), key=lambda one: (sureness(plans[one], bits), worst[one]))
     return TunedBlind(
         blind.fixed(plans[chosen].width, plans[chosen].step),
         float(worst[chosen]),
         tuple((plan.width, plan.step) for plan in plans),
-        margins,
+        surplus,
     )

@@ -22,8 +22,20 @@ def mean_cosine(spread: float, step: float, alpha: float) -> float:
     return float(np.sinc(1 - min(alpha, 1.0))) * math.exp(-2 * (math.pi * spread / step) ** 2)
 
 
-def margin(count: int, cosine: float, bits: float) -> float:
-    """By how much the information in so many values exceeds what a payload needs, in standard deviations.
+class Margin(NamedTuple):
+    """By how much the information in some values exceeds what a payload needs, in nats; negative if it does not."""
+
+    surplus: float  # on average
+    deviation: float  # standard deviation
+
+    @property
+    def sure(self) -> float:
+        """The surplus in standard deviations, by which it is how likely that a message reads."""
+        return self.surplus / self.deviation
+
+
+def margin(count: int, cosine: float, bits: float) -> Margin:
+    """By how much the information in so many values exceeds what a payload needs.
 
     Each value carries a sign, and its phase is off by a wrapped normal with this mean cosine. That a message of k bits
     reads takes about nC - k ≥ √(nV) Q⁻¹(error), C and V being mean and variance of a value's information density
@@ -42,7 +54,7 @@ def margin(count: int, cosine: float, bits: float) -> float:
     mean = float(share @ density)
     variance = float(share @ (density - mean) ** 2)
     # One more keeps the result finite where nothing is left to chance.
-    return (count * mean - bits * math.log(2)) / math.sqrt(count * variance + 1)
+    return Margin(count * mean - bits * math.log(2), math.sqrt(count * variance + 1))
 
 
 class Left(NamedTuple):
@@ -71,7 +83,7 @@ def compare(before: Look, after: Look) -> Iterator[Left]:
             yield Left(len(rows), int(after.good.sum()), math.sqrt(float(off @ off) / freedom))
 
 
-def best_margin(ways: Iterable[Left], step: float, alpha: float, bits: float) -> float:
+def best_margin(ways: Iterable[Left], step: float, alpha: float, bits: float) -> Margin:
     """The margin with the best of all ways of looking, as the reader finds it."""
     return max((margin(way.shown, way.cosine(step, alpha), bits) for way in ways), default=margin(0, 0.0, bits))
 

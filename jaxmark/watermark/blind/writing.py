@@ -23,7 +23,7 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.chebyshev import filter, transpose
 from jaxmark.spectral.laplacian import Laplacian
 from jaxmark.watermark.blind.dither import Dither, make_dither
-from jaxmark.watermark.blind.prediction import margin, mean_cosine
+from jaxmark.watermark.blind.prediction import Margin, margin, mean_cosine
 from jaxmark.watermark.blind.reading import TAG_BITS, codeword
 from jaxmark.watermark.blind.scheme import AnchoredHost, BlindScheme, Measured, measure
 from jaxmark.watermark.budget import FIRST_RMS, Budget, write
@@ -104,8 +104,8 @@ class Plan(NamedTuple):
     host: AnchoredHost
     dither: Dither
 
-    def margin(self, spread: float, bits: int) -> float:
-        """By how many standard deviations a payload reads then, see `jaxmark.watermark.blind.prediction.margin`."""
+    def margin(self, spread: float, bits: int) -> Margin:
+        """By how much the information that is left after something that spreads values exceeds what is needed."""
         return margin(self.host.size, mean_cosine(spread, self.step, self.alpha), carried(bits))
 
 
@@ -139,7 +139,7 @@ def carried(bits: int) -> float:
 
 def sureness(plan: Plan, bits: int) -> float:
     """The margin without any attack, as far as it matters: what is sure is no better if it is surer."""
-    return min(plan.margin(0.0, bits), _SURE)
+    return min(plan.margin(0.0, bits).sure, _SURE)
 
 
 class Writer:
@@ -190,7 +190,7 @@ class Writer:
     ) -> Plan:
         """Choose the width that is predicted to be read best, and how strong a budget allows the mark to be.
 
-        Of the widths with which the payload surely reads, the one that is surest after noise or smoothing is taken.
+        Of the widths with which the payload surely reads, the one that noise or smoothing leaves most of is taken.
 
         Raises:
             JaxmarkError: if there is nothing to write in, or the budget allows not even the least step.
@@ -204,7 +204,7 @@ class Writer:
                 f"This mesh, or the budget for it, leaves the scheme {self.scheme.name!r} nothing to write in; use a"
                 " larger budget or the scheme 'keyed'."
             )
-        return max(fitting, key=lambda one: (sureness(one, bits), min(self._margins(one, bits))))
+        return max(fitting, key=lambda one: (sureness(one, bits), min(self._surpluses(one, bits))))
 
     def write(
         self,
@@ -253,9 +253,9 @@ class Writer:
         """The steps that may be written with: all but those to which a budget does not allow to go far enough."""
         return [step for step in self.scheme.steps if allowance.allowed / step >= _LEAST_ALPHA]
 
-    def _margins(self, plan: Plan, bits: int) -> list[float]:
-        """Margins after each of the reference disturbances."""
-        return [plan.margin(spread, bits) for spread in self._spreads(plan.host)]
+    def _surpluses(self, plan: Plan, bits: int) -> list[float]:
+        """Surplus of information after each of the reference disturbances."""
+        return [plan.margin(spread, bits).surplus for spread in self._spreads(plan.host)]
 
     def survives(self, plan: Plan, bits: int) -> Survival:
         """Predict the strongest noise in which a payload reads.
@@ -267,7 +267,7 @@ class Writer:
         def strongest(share: float) -> float:
             def spare(noise: float) -> float:
                 cosine = mean_cosine(noise * spread, plan.step, plan.alpha)
-                return margin(int(share * plan.host.size), cosine, carried(bits)) - _READS
+                return margin(int(share * plan.host.size), cosine, carried(bits)).sure - _READS
 
             if spare(0.0) <= 0:
                 return 0.0
@@ -288,7 +288,7 @@ class Writer:
         except JaxmarkError:
             return 0
         spread, bits = self._spreads(plan.host)[0] * noise / NOISE, 0
-        while plan.margin(spread, bits + 8) >= _SURE:
+        while plan.margin(spread, bits + 8).sure >= _SURE:
             bits += 8
         return bits
 
