@@ -286,3 +286,10 @@ def test_a_study_from_a_file(tmp_path, monkeypatch, capfd):
     assert [rate["read"] for rate in told["rates"]] == [1, 0, 0]
     assert len(Path("left/results.csv").read_text().splitlines()) == 4
     assert len([json.loads(line) for line in Path("left/results.jsonl").read_text().splitlines()]) == 1
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("part", ["meshes", "attacks"])
+def test_meshes_and_attacks_have_names(part):
+    with pytest.raises(jm.JaxmarkError, match=f"The {part} of a study have names: give them as a mapping, such as"):
+        study(**{part: ["noise"]})

@@ -265,6 +265,13 @@ def test_refusals(x64, unchecked):
         allocate(channels, jnp.asarray(cost), solver="newton")  # type: ignore[arg-type]
     with pytest.raises(jm.JaxmarkError, match="at least one attack"):
         tune(rough_sphere(300), [], key=jax.random.key(0))
+    for wrong in (0, jm.new_key()):
+        with pytest.raises(jm.JaxmarkError, match=r"tune needs a random key of JAX .* such as jax.random.key\(0\)"):
+            tune(rough_sphere(300), ATTACKS, key=wrong)  # type: ignore[arg-type]
+    with pytest.raises(jm.JaxmarkError, match="see tune_blind"):
+        tune(rough_sphere(300), ATTACKS, key=jax.random.key(0), scheme="field")
+    with pytest.raises(jm.JaxmarkError, match="name of ATTACKS or an Attack"):
+        jm.attack(rough_sphere(300), lambda mesh: mesh, 0.1, seed=0)  # type: ignore[arg-type]
     with pytest.raises(jm.JaxmarkError, match="not along normals"):
         tune(rough_sphere(300), ATTACKS, key=jax.random.key(0), scheme=KeyedScheme(direction="normals"))
     with pytest.raises(jm.JaxmarkError, match="profile is up to 64"):

@@ -221,6 +221,11 @@ def get_attack(kind: Kind) -> Attack:
     """
     if isinstance(kind, Attack):
         return kind
+    if not isinstance(kind, str):
+        raise JaxmarkError(
+            f"An attack is a name of ATTACKS or an Attack, such as Attack(function, 'unit', (0.1,)); got"
+            f" {getattr(kind, '__name__', kind)!r}."
+        )
     if kind not in ATTACKS:
         raise JaxmarkError(f"There is no attack {kind!r}; there are {', '.join(ATTACKS)}.")
     return ATTACKS[kind]

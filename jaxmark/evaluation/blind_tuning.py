@@ -4,13 +4,12 @@ from collections.abc import Sequence
 from itertools import groupby
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float64, PRNGKeyArray
 
 from jaxmark import distortion
 from jaxmark.errors import JaxmarkError
-from jaxmark.evaluation.tuning import Attacker, apply_attack
+from jaxmark.evaluation.tuning import Attacker, apply_attack, seed_numbers
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.marker import make_blind_marker
 from jaxmark.watermark.blind.prediction import Left, best_margin, compare
@@ -73,6 +72,7 @@ def tune_blind(
             f"tune_blind tunes the schemes that are read without the original ({', '.join(BLIND_SCHEMES)}), not"
             f" {scheme!r}; for the others there is tune."
         )
+    numbers = seed_numbers("tune_blind", key, seeds)
     writer = make_blind_marker(mesh, _PUBLIC_KEY, bits=bits, scheme=blind).writer
     word = codeword(bytes(bits // 8), writer.choices)
     allowances = writer.allowances(word, make_budget(budget, limits), distortion.Reference(writer.original.mesh))
@@ -90,7 +90,6 @@ def tune_blind(
         seen = looks(apply_attack(attacker, mesh, seed))
         return {width: [way for look in some for way in compare(before[width], look)] for width, some in seen.items()}
 
-    numbers = np.asarray(jax.random.randint(key, (seeds,), 0, 2**31 - 1))
     found = [[left(one, int(seed)) for seed in numbers] for one in attacks]
     size = carried(bits)
 

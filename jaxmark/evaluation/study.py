@@ -55,9 +55,13 @@ class Study:
         """Check the fields.
 
         Raises:
-            JaxmarkError: if an attack, a scheme or a metric does not exist, a payload is no positive multiple of 8
-                bits, or there is nothing to do.
+            JaxmarkError: if meshes or attacks have no names, an attack, a scheme or a metric does not exist, a payload
+                is no positive multiple of 8 bits, or there is nothing to do.
         """
+        examples = {"meshes": '{"bunny": mesh}', "attacks": '{"noise": [0.005]}'}
+        for name, example in examples.items():
+            if not isinstance(getattr(self, name), Mapping):
+                raise JaxmarkError(f"The {name} of a study have names: give them as a mapping, such as {example}.")
         parts = {"mesh": self.meshes, "attack": self.attacks, "scheme": self._schemes, "budget": self._budgets}
         parts |= {f"strength of {name!r}": self._strengths(name) for name in self.attacks if self._attack(name)}
         for name, part in {**parts, "payload": self.payloads, "seed": range(self.seeds)}.items():

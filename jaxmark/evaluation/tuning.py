@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Float64, PRNGKeyArray
+from jaxtyping import Array, Float, Float64, Int64, PRNGKeyArray
 from scipy import optimize
 
 from jaxmark.alignment.alignment import align, observation
@@ -27,6 +27,7 @@ from jaxmark.spectral.chebyshev import band_energies, filter
 from jaxmark.watermark.budget import Budget, Limits, make_budget, write
 from jaxmark.watermark.carriers.carrier import Displacement
 from jaxmark.watermark.channels import Channels, Margin, margins, measure
+from jaxmark.watermark.everyday import blind_scheme
 from jaxmark.watermark.probes import probe_signs
 from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme, TunableScheme, get_scheme
 from jaxmark.watermark.visibility import apply_mask, band_visibility
@@ -102,6 +103,9 @@ def tune(
     """
     if not attacks or seeds < 1:
         raise JaxmarkError(f"tune needs at least one attack and one seed, got {len(attacks)} and {seeds}.")
+    if blind_scheme(scheme) is not None:
+        raise JaxmarkError(f"The scheme {scheme!r} is read without the original, and has no bands; see tune_blind.")
+    numbers = seed_numbers("tune", key, seeds)
     bounds, tunable = make_budget(budget, limits), get_scheme(scheme).tunable()
     original, family = make_original(mesh), tunable.family()
     (signs,) = probe_signs("tuning", original.signal.shape, dtype=original.signal.dtype)
@@ -117,7 +121,6 @@ def tune(
     probe = shape_signs(equal)
     written = write(original, probe, bounds)
     mark = original.to_traced(written.scale * probe)
-    numbers = np.asarray(jax.random.randint(key, (seeds,), 0, 2**31 - 1))
     suspects = [[apply_attack(one, written.mesh, int(seed)) for seed in numbers] for one in attacks]
     seen = [[observation(original, align(original, suspect)) for suspect in row] for row in suspects]
 
@@ -382,6 +385,21 @@ def _profile(beta: Float64[np.ndarray, " bands"]) -> tuple[float, ...]:
 def _mean(channels: list[Channels]) -> Channels:
     """Mean channel of several trials of one attack."""
     return jax.tree.map(lambda *values: jnp.mean(jnp.stack(values), axis=0), *channels)
+
+
+def seed_numbers(caller: str, key: PRNGKeyArray, count: int) -> Int64[np.ndarray, " seeds"]:
+    """Seeds of the attacks' random choices.
+
+    Raises:
+        JaxmarkError: if `key` is no random key of JAX.
+    """
+    try:
+        found = jax.random.randint(key, (count,), 0, 2**31 - 1)
+    except TypeError:
+        raise JaxmarkError(
+            f"{caller} needs a random key of JAX for the attacks, such as jax.random.key(0); got {type(key).__name__}."
+        ) from None
+    return np.asarray(found, np.int64)
 
 
 def apply_attack(attacker: Attacker, mesh: Mesh, seed: int) -> Mesh:
