@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
+from jaxmark.app.telling import told_message
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.marking import NOISE
 from tests.samples import bumpy_sphere, rough_sphere
@@ -95,4 +96,20 @@ def test_commands_on_presence(tmp_path, monkeypatch, capfd, small: Mesh):
     assert not workshop.json("detect", "small.obj", *read, "--presence", status=1)["detected"]
     both = ("--key", "owner.key", "--presence", "--message", MESSAGE)
     assert "--presence" in workshop.refused("embed", "small.obj", "out.obj", *both)
+    twice = ("--key", "owner.key", "--text", "hello", "--message", MESSAGE)
+    assert "either --message or --text" in workshop.refused("embed", "small.obj", "out.obj", *twice)
+    assert "--presence" in workshop.refused("embed", "small.obj", "out.obj", "--key", "owner.key", "--text", "")
     assert "--presence" in workshop.refused("detect", "marked.obj", *read, "--presence", "--bits", "8")
+
+
+@pytest.mark.parametrize(
+    ("message", "told"),
+    [
+        (b"hello", '68656c6c6f ("hello")'),
+        ("Grüße".encode(), '4772c3bcc39f65 ("Grüße")'),
+        (b"\xc0\xff", "c0ff"),
+        (b"a\n", "610a"),
+    ],
+)
+def test_messages_that_are_text_are_told_as_text(message: bytes, told: str):
+    assert told_message(message) == told

@@ -77,6 +77,20 @@ class _Hexadecimal(click.ParamType):
         return message
 
 
+class _Text(click.ParamType):
+    """A message as text."""
+
+    name = "text"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> bytes:
+        """Convert text to bytes of UTF-8."""
+        if isinstance(value, bytes):
+            return value
+        if not value:
+            self.fail("an empty text is no message; for a mark that says nothing use --presence.", param, ctx)
+        return value.encode()
+
+
 class _Limit(click.ParamType):
     """A metric and its upper limit."""
 
@@ -180,6 +194,7 @@ def keygen(keyfile: Path, as_json: bool) -> None:
 @click.argument("marked", type=_MESH)
 @_KEY
 @click.option("--message", type=_Hexadecimal(), help="Hexadecimal digits; 16 of them are 64 bits.")
+@click.option("--text", type=_Text(), help="The message as text instead, in UTF-8: 8 bits for most letters.")
 @click.option("--presence", is_flag=True, help="Instead of a message: say nothing but that the mark is there.")
 @click.option("--recipient", help="Instead of a message: the recipient of this copy, for `jaxmark identify`.")
 @_BUDGET
@@ -208,6 +223,7 @@ def embed_command(
     marked: Path,
     key_file: Path,
     message: bytes | None,
+    text: bytes | None,
     presence: bool,
     recipient: str | None,
     budget: float | None,
@@ -228,6 +244,7 @@ def embed_command(
 
     For a folder, each file gets a line of output, and a refused file does not stop the others.
     """
+    message = _one_message(message, text)
     if presence and message is not None:
         raise JaxmarkError("Give either --message or --presence.")
     mark = partial(
@@ -266,6 +283,7 @@ def embed_command(
     type=_Hexadecimal(),
     help="A message that you claim is there; it can be proven even where it cannot be read.",
 )
+@click.option("--text", type=_Text(), help="The claimed message as text instead.")
 @click.option("--presence", is_flag=True, help="Claim that a presence mark is there; its record says so, too.")
 @click.option(
     "--record",
@@ -294,6 +312,7 @@ def detect_command(
     key_file: Path,
     bits: int | None,
     message: bytes | None,
+    text: bytes | None,
     presence: bool,
     record_file: Path | None,
     meshes: tuple[str, ...],
@@ -325,6 +344,7 @@ def detect_command(
     deposit = None if deposit_file is None else Deposit.load(deposit_file)
     if deposit is not None and record_file is None:
         raise JaxmarkError("A deposit dates records: give the --record that is in it, too.")
+    message = _one_message(message, text)
     if presence and (message is not None or bits):
         raise JaxmarkError("A presence mark has no message; leave out --message and --bits, or --presence.")
     payload = 0 if presence else bits
@@ -701,6 +721,13 @@ def _each(folder: Path, as_json: bool, work: Callable[[Path], Told]) -> NoReturn
         status = max(status, 0 if told.done else 1)
         _answer(as_json, {"file": file.name, **told.answer}, f"{file.name}: {told.said}")
     sys.exit(status)
+
+
+def _one_message(message: bytes | None, text: bytes | None) -> bytes | None:
+    """The message that was given in either form."""
+    if message is not None and text is not None:
+        raise JaxmarkError("Give either --message or --text.")
+    return text if message is None else message
 
 
 def _key(path: Path) -> Key:

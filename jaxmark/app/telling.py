@@ -26,6 +26,15 @@ def told_payload(bits: int) -> str:
     return f"{bits} bits" if bits else "presence"
 
 
+def told_message(message: bytes) -> str:
+    """A message in hexadecimal digits, and as text if it is one."""
+    try:
+        text = message.decode()
+    except UnicodeDecodeError:
+        text = ""
+    return f'{message.hex()} ("{text}")' if text.isprintable() and text else message.hex()
+
+
 def told_survival(survives: Survival) -> str:
     """What a mark survives, in words."""
     if math.isinf(survives.whole):
@@ -40,7 +49,7 @@ def describe(
     found: Detection | BlindDetection, detected: bool, alpha: float, dated: float | None, remarks: Sequence[str]
 ) -> str:
     """What was found, in words."""
-    read = f"message {found.message.hex()}" if found.message is not None else "no message could be read"
+    read = f"message {told_message(found.message)}" if found.message is not None else "no message could be read"
     said = f"{'detected' if detected else 'nothing detected'}: {read}; "
     if found.doubts:
         said += f"false-positive probability about {power(found.log10_p)}, an estimate: {'; '.join(found.doubts)}"
