@@ -213,6 +213,17 @@ def test_nothing_is_detected_in_any_way_of_looking(shape: Mesh, key: jm.Key):
     assert not jm.detect(shape, key=key).detected(1e-3)
 
 
+@pytest.mark.slow
+def test_values_do_not_go_beyond_the_lattice(shape: Mesh, key: jm.Key):
+    """With more budget than the largest step needs, less than the budget is used."""
+    scheme = SCHEME.fixed(WIDTH, SCHEME.steps[0])
+    marked, info = jm.embed(shape, MESSAGE, key, budget=2e-3, scheme=scheme)
+    assert info.record.beta == 1
+    assert info.rms < 1e-3
+    assert jm.compare(shape, marked, ("rms",)).rms == pytest.approx(info.rms, rel=1e-3)
+    assert jm.detect(marked, key=key, bits=32, scheme=scheme).agreement > 0.95
+
+
 def test_a_claimed_message_is_proven_or_refuted(marked, key: jm.Key):
     mesh, info = marked
     claimed = jm.detect(mesh, key=key, message=MESSAGE, scheme=SCHEME)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Float64
 from scipy import optimize
 
 from jaxmark import distortion
-from jaxmark.alignment.original import Original
+from jaxmark.alignment.original import Original, displace, shift_of
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.chebyshev import filter, transpose
@@ -229,7 +229,11 @@ class Writer:
         targets = plan.host.values - plan.alpha * plan.step * self.off(plan.host, plan.dither, word, plan.step)
         shift = self.shift(plan.host, targets, _ROUNDS)
         written = write(self.original, shift, budget, reference, first=plan.size)
-        return Written(written.mesh, written.moved, plan._replace(alpha=plan.alpha * written.scale))
+        mesh, moved, alpha = written.mesh, written.moved, plan.alpha * written.scale
+        if alpha > 1:  # beyond the lattice, values would be off again
+            mesh, alpha = displace(self.original, shift / plan.alpha), 1.0
+            moved = distortion.DisplacementSize.of(shift_of(self.original, mesh)[self.original.used])
+        return Written(mesh, moved, plan._replace(alpha=alpha))
 
     def allowances(
         self, word: Float64[np.ndarray, " code"], budget: Budget, reference: distortion.Reference
