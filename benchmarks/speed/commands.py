@@ -32,6 +32,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from common.tables import say, table
 
 BORN = time.time()
 # The functions of each stage: module, name, and stage.
@@ -124,8 +125,6 @@ def run(words: list[str], cache: Path) -> dict[str, Any]:
 
 def measure(mesh: Path, options: list[str]) -> Iterator[dict[str, Any]]:
     """Mark and read one file, twice."""
-    from common.tables import say
-
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         key, marked = place / "owner.key", place / f"marked{mesh.suffix}"
@@ -145,8 +144,6 @@ def measure(mesh: Path, options: list[str]) -> Iterator[dict[str, Any]]:
 
 def main() -> None:
     """Print the table."""
-    from common.tables import table
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("meshes", nargs="+", type=Path, metavar="MESH")
     parser.add_argument("--options", default="", help="more options of embed, in one word")
