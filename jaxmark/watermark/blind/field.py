@@ -50,7 +50,7 @@ class FieldScheme:
     """Writes values at anchors in the shape's own pose; read without the original, and after any remeshing.
 
     Widths and steps are public ladders: of the steps, the largest that keeps the limits is written, and of the widths
-    the one that is predicted to survive noise and smoothing best. Whoever reads without a record tries all of them.
+    the one that is predicted to survive noise best. Whoever reads without a record tries all of them.
     """
 
     name: ClassVar[str] = "field"

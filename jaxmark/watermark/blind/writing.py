@@ -40,7 +40,6 @@ _ROUNDS = 2  # of Gauss and Newton
 _ENOUGH = 0.9  # share of the limits that is enough to choose a width and a step by
 _SURE, _READS = 3.0, 1.0  # standard deviations by which a payload should read, and by which it is said to
 _CODE_GAP = 1.12  # half a decibel: from 180 values, 152 bits read, and 160 do not
-_SMOOTHED = 10  # steps of smoothing that widths are chosen by, besides noise
 
 
 @jax.jit
@@ -190,7 +189,8 @@ class Writer:
     ) -> Plan:
         """Choose the width that is predicted to be read best, and how strong a budget allows the mark to be.
 
-        Of the widths with which the payload surely reads, the one that noise or smoothing leaves most of is taken.
+        Of the widths with which the payload surely reads, the one that noise leaves most of is taken; readers undo
+        smoothing.
 
         Raises:
             JaxmarkError: if there is nothing to write in, or the budget allows not even the least step.
@@ -204,7 +204,7 @@ class Writer:
                 f"This mesh, or the budget for it, leaves the scheme {self.scheme.name!r} nothing to write in; use a"
                 " larger budget or the scheme 'keyed'."
             )
-        return max(fitting, key=lambda one: (sureness(one, bits), min(self._surpluses(one, bits))))
+        return max(fitting, key=lambda one: (sureness(one, bits), one.margin(self._spread(one.host), bits).surplus))
 
     def write(
         self,
@@ -257,16 +257,12 @@ class Writer:
         """The steps that may be written with: all but those to which a budget does not allow to go far enough."""
         return [step for step in self.scheme.steps if allowance.allowed / step >= _LEAST_ALPHA]
 
-    def _surpluses(self, plan: Plan, bits: int) -> list[float]:
-        """Surplus of information after each of the reference disturbances."""
-        return [plan.margin(spread, bits).surplus for spread in self._spreads(plan.host)]
-
     def survives(self, plan: Plan, bits: int) -> Survival:
         """Predict the strongest noise in which a payload reads.
 
         Half of the vertices have half of the anchors, or none if the scheme needs the whole shape.
         """
-        spread = self._spreads(plan.host)[0] / NOISE  # for each unit of noise
+        spread = self._spread(plan.host) / NOISE  # for each unit of noise
 
         def strongest(share: float) -> float:
             def spare(noise: float) -> float:
@@ -291,30 +287,23 @@ class Writer:
             plan = self.plan(word, budget, distortion.Reference(self.original.mesh), 0)
         except JaxmarkError:
             return 0
-        spread, bits = self._spreads(plan.host)[0] * noise / NOISE, 0
+        spread, bits = self._spread(plan.host) * noise / NOISE, 0
         while plan.margin(spread, bits + 8).sure >= _SURE:
             bits += 8
         return bits
 
-    def _spreads(self, host: AnchoredHost) -> tuple[float, float]:
-        """Spread of the anchors' values by noise and by smoothing of the original; see `_disturbances`."""
-        before = host.values[host.good > 0]
-        spreads = []
-        for points in self._disturbances:
-            values, _ = measure(host.shape, points)
-            after = np.asarray(values, np.float64)[host.good > 0]
-            spreads.append(float(np.sqrt(np.mean((after - before) ** 2))))
-        return spreads[0], spreads[1]
+    def _spread(self, host: AnchoredHost) -> float:
+        """Spread of the anchors' values by noise of `NOISE` in the original."""
+        values, _ = measure(host.shape, self._noisy)
+        counted = host.good > 0
+        return float(np.sqrt(np.mean((np.asarray(values, np.float64) - host.values)[counted] ** 2)))
 
     @cached_property
-    def _disturbances(self) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3"]]:
-        """The original with noise of `NOISE`, and after `_SMOOTHED` steps of smoothing."""
+    def _noisy(self) -> Float[Array, "rows 3"]:
+        """The original with noise of `NOISE`."""
         original, points = self.original, self.original.positions
         noise = np.random.default_rng(0).uniform(-1, 1, points.shape) * original.used[:, None]
-        smoothed = original.to_traced(points)
-        for _ in range(_SMOOTHED):
-            smoothed = smoothed - 0.1 * original.operator.apply(smoothed)
-        return original.to_traced(points + NOISE * radius_of(original) * noise), smoothed
+        return original.to_traced(points + NOISE * radius_of(original) * noise)
 
 
 def radius_of(original: Original) -> float:
