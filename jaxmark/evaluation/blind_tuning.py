@@ -52,9 +52,9 @@ def tune_blind(
 
     Args:
         mesh: the original.
-        attacks: see `jaxmark.tune`.
-        budget: see `jaxmark.embed`.
-        limits: see `jaxmark.embed`.
+        attacks: see `jaxmark.evaluation.tuning.tune`.
+        budget: see `jaxmark.watermark.everyday.embed`.
+        limits: see `jaxmark.watermark.everyday.embed`.
         key: a JAX random key for the attacks' random choices; not secret.
         bits: size of the payload in bits.
         scheme: a blind scheme, whose widths and steps are compared.
