@@ -5,7 +5,7 @@ BIN = $(VENV)/bin
 
 PICTURED = fandisk_6475.obj casting.off teapot_utah.obj blub_7106.obj hand_10345.obj bunny_oded_3301.obj
 
-.PHONY: help demo test lint types tests slow-tests coverage pictures docs clean
+.PHONY: help demo test lint types tests slow-tests coverage kernels pictures docs clean
 
 help:  ## list these commands
 	@awk -F ':.*  ## ' '/^[a-z-]+:.*  ## / {printf "%-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -32,6 +32,9 @@ slow-tests: $(VENV)/.dev  ## pytest: the slow ones
 coverage: $(VENV)/.dev  ## which lines the tests run; all of it in build/coverage
 	$(BIN)/python -m pytest -q -n auto --cov --cov-report=term:skip-covered --cov-report=html
 
+kernels: $(VENV)/.dev  ## compiled filters beside the rest: faster on processors, needs a C++ compiler
+	$(BIN)/python -m pip install --quiet ./kernels
+
 pictures: $(VENV)/.all  ## the pictures of the documentation, of meshes that are not in it: make pictures MESHES=folder
 	$(BIN)/python benchmarks/pictures/looks.py $(addprefix $(MESHES)/,$(PICTURED)) --levels fandisk_6475 bunny_oded_3301
 
@@ -45,4 +48,4 @@ $(VENV)/.%: pyproject.toml
 	touch $@
 
 clean:  ## remove what these commands made
-	rm -rf $(VENV) demo-output build dist docs/_build docs/reference/api
+	rm -rf $(VENV) demo-output build dist kernels/build docs/_build docs/reference/api

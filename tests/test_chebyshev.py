@@ -248,8 +248,9 @@ def test_memory_does_not_grow_with_the_degree():
 
         return jax.jit(jax.value_and_grad(loss)).lower(x).compile().memory_analysis().temp_size_in_bytes
 
-    assert scratch_of_moments(256) < 1.1 * scratch_of_moments(32)
-    assert scratch_of_own_moments(256) < 1.1 * scratch_of_own_moments(32)
+    series = 2 * 3 * x.itemsize * (256 - 32)  # of three columns, and what is multiplied with them
+    assert scratch_of_moments(256) < 1.1 * scratch_of_moments(32) + series
+    assert scratch_of_own_moments(256) < 1.1 * scratch_of_own_moments(32) + series
     assert scratch(256) < 1.1 * scratch(32)
     assert scratch(256, derived=jax.grad) < 1.1 * scratch(32, derived=jax.grad)  # forward mode over reverse mode
     assert scratch(256, recurrence.filter_scan) > 4 * scratch(32, recurrence.filter_scan)  # what the rules are for

@@ -40,10 +40,12 @@ import numpy as np
 import jaxmark as jm
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.extras import require
+from jaxmark.spectral import kernels
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import band_components, filter, moments
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.laplacian import Laplacian, sparse_matrices
+from jaxmark.spectral.recurrence import filter_scan
 from jaxmark.watermark.schemes import KeyedScheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -60,7 +62,7 @@ FOR_MEMORY = (100_000, 1_000_000, 4_000_000)
 DENSE = (500, 1000, 2000)
 DEGREES, BANDS = (16, 32, 64, 128), (32, 128)  # of the filter; of the scheme, beside the usual 64
 COPIED = 2**26  # numbers
-OURS = "jaxmark filter"
+OURS, WITHOUT_KERNELS = "jaxmark filter", "without kernels"
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")  # of Okabe and Ito
 
 
@@ -88,21 +90,29 @@ def filters(bench: Bench) -> Iterator[Row]:
         row = {"vertices": len(x), "edges": len(operator.edges), "program": OURS, "s": seconds, "times ours": 1.0}
         rate = DEGREE * moved / seconds
         yield row | {"bytes a step": moved, "GB/s": rate / 1e9, "of a copy": rate / copying()}
+        if kernels.installed():
+            scanned, theirs = bench.time(filter_scan, operator, c, x), np.asarray(filter_scan(operator, c, x))
+            yield compared(row, WITHOUT_KERNELS, scanned, theirs, ours)
         if bench.alone:
             continue
         matrix = shifted(operator)
         for name, peer in PEERS.items():
-            row = {"vertices": len(x), "edges": matrix.nnz // 2, "program": name}
             try:
                 run = peer(matrix, c, np.asarray(x))
             except jm.JaxmarkError as missing:
-                yield row | {"note": str(missing)}
+                yield {"vertices": len(x), "program": name, "note": str(missing)}
                 continue
             seconds_there = median_time(run, bench.repeat)
             theirs: Any = run()
             theirs = np.asarray(theirs.cpu() if hasattr(theirs, "cpu") else theirs)
-            row |= {"s": seconds_there, "times ours": seconds_there / seconds}
-            yield row | {"difference": float(np.abs(theirs - ours).max() / np.abs(ours).max())}
+            yield compared(row, name, seconds_there, theirs, ours)
+
+
+def compared(ours: Row, program: str, seconds: float, found: np.ndarray, result: np.ndarray) -> Row:
+    """The row of another program on the same work."""
+    difference = float(np.abs(found - result).max() / np.abs(result).max())
+    same = {key: ours[key] for key in ("vertices", "edges")} | {"program": program, "s": seconds}
+    return same | {"times ours": seconds / ours["s"], "difference": difference}
 
 
 def traffic(operator: Laplacian, x: Any) -> int:

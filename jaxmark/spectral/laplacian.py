@@ -20,6 +20,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.spectral.kernels import Rows
 from jaxmark.spectral.precision import check_precision
 
 Lowering = Literal["auto", "gather", "segments"]
@@ -57,6 +58,10 @@ class Operator(Protocol):
         self, like: Shaped[Array, " vertices *columns"]
     ) -> Callable[[Float[Array, " vertices *columns"]], Float[Array, " vertices *columns"]]:
         """The map x → Δx in the operator's own order, for signals of the shape and dtype of `like`."""
+        ...
+
+    def rows(self, like: Shaped[Array, " vertices *columns"]) -> Rows | None:
+        """The rows of Δ - I for compiled kernels, in the dtype of `like`; None if they are not all at hand."""
         ...
 
     def enter(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
@@ -146,16 +151,35 @@ class Laplacian(NamedTuple):
         """
         if not jnp.issubdtype(like.dtype, jnp.floating):
             raise JaxmarkError(f"Laplacian.apply needs a floating-point signal, got {like.dtype}.")
-        degree, inverse = (self.enter(rows) for rows in (per_row(self.degree, like), self.inverse_mass(like)))
-        own = (degree > 0).astype(like.dtype) if self.lumped_mass is None else degree * inverse
+        own, inverse = self._own(like)
         if (table := self._table) is None:
             total = self._segments(like)
         elif self.weights is None:
-            # An empty slot adds the vertex's own row, which is made up for here.
-            own, total = own + inverse * per_row(table.empty, like), _gather(table)
+            total = _gather(table)
         else:
             total = _weighted_gather(table, self.weights, like)
         return lambda x: own * x - inverse * total(x)
+
+    def rows(self, like: Shaped[Array, " vertices *columns"]) -> Rows | None:
+        """The rows of Δ - I for compiled kernels; see `Operator`."""
+        table, flat = self._table, like.reshape(len(like), -1)[:, 0]
+        if table is None:
+            return None
+        own, inverse = self._own(flat)
+        weights = rest_weights = None
+        if self.weights is not None and table.edges is not None:
+            padded = jnp.append(jnp.asarray(self.weights).astype(like.dtype), 0)
+            weights, rest_weights = padded[table.edges], padded[table.rest[:, 2]]
+        return Rows(table.vertices, weights, own - 1, inverse, table.rest, rest_weights, table.order)
+
+    def _own(self, like: Array) -> tuple[Array, Array]:
+        """What rows have of themselves in Δ, and by what their neighbours are divided, in the operator's own order."""
+        degree, inverse = (self.enter(rows) for rows in (per_row(self.degree, like), self.inverse_mass(like)))
+        own = (degree > 0).astype(like.dtype) if self.lumped_mass is None else degree * inverse
+        if self.weights is None and self._table is not None:
+            # An empty slot adds the vertex's own row, which is made up for here.
+            own += inverse * per_row(self._table.empty, like)
+        return own, inverse
 
     def linked(self, like: Shaped[Array, " vertices *columns"]) -> Bool[Array, " vertices *ones"]:
         """Which vertices have edges, to select from signals like this."""

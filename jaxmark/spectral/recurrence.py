@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
+from jaxmark.spectral.kernels import component_rows, filter_rows, project_rows, where_installed
 from jaxmark.spectral.laplacian import Operator, per_row
 from jaxmark.spectral.linear import Linear, combine, floats
 from jaxmark.spectral.precision import einsum, matmul
@@ -64,6 +65,9 @@ def filter_scan(operator: Operator, coefficients: Array, x: Array) -> Array:
 
     x = operator.enter(x)
     return operator.leave(_scan_terms(operator, x, coefficients, add, coefficients[0] * x)[0])
+
+
+_filter = where_installed(filter_rows, filter_scan)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -150,7 +154,7 @@ _change = Linear(
 
 #: f(Δ)x as a function of x: `(operator, c, x)`.
 filtered = Linear(
-    filter_scan,
+    _filter,
     _transposed_filter,
     (_change, lambda operator, c, x, change: of_coefficients(len(c))(operator, x, change)),
 )
@@ -160,7 +164,7 @@ filtered = Linear(
 def of_coefficients(terms: int) -> Linear:
     """f(Δ)x as a function of its coefficients: `(operator, x, c)`."""
     return Linear(
-        lambda operator, x, c: filter_scan(operator, c, x),
+        lambda operator, x, c: _filter(operator, c, x),
         projection(terms),
         (
             lambda operator, x, c, change: _change(operator, c, x, change),
@@ -178,7 +182,7 @@ def projection(terms: int) -> Linear:
         return projection(terms)(operator, u / mass, mass * change)
 
     return Linear(
-        partial(_projection_scan, terms),
+        where_installed(partial(project_rows, terms), partial(_projection_scan, terms)),
         lambda operator, x, m: of_coefficients(terms)(operator, x, m),
         (_changed_projection(terms), by_signal),
     )
@@ -215,6 +219,9 @@ def _components_scan(operator: Operator, c: Array, x: Array) -> Array:
     return jax.vmap(operator.leave)(_scan_terms(operator, x, c.T, add, jnp.multiply.outer(c[:, 0], x))[0])
 
 
+_components = where_installed(component_rows, _components_scan)
+
+
 @jax.jit
 def _synthesis_scan(operator: Operator, c: Array, parts: Array) -> Array:
     """Clenshaw's recurrence, on all parts at once."""
@@ -237,7 +244,7 @@ def _per_column(c: Array, x: Array) -> Array:
 
 #: All g_j(Δ)x as a function of x: `(operator, c, x)`.
 components = Linear(
-    _components_scan,
+    _components,
     lambda operator, c, y: inner_mass(operator, y[0]) * synthesis(operator, c, y / inner_mass(operator, y[0])),
     (
         lambda operator, c, x, change: jax.vmap(_change, (None, 0, None, None))(operator, _per_column(c, x), x, change),

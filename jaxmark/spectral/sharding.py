@@ -80,6 +80,9 @@ class Shard(NamedTuple):
         # The received rows are used last, so that the block's own edges are computed while rows are on their way.
         return lambda x: inside(x).at[row].add(-factor * self._received(x)[place])
 
+    def rows(self, like: Shaped[Array, " rows *columns"]) -> None:
+        """See `Operator`: some are on other devices."""
+
     def enter(self, x: Shaped[Array, " rows *columns"]) -> Shaped[Array, " rows *columns"]:
         """The same rows, as the partition has put them in a good order."""
         return x

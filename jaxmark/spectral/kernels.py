@@ -1,0 +1,101 @@
+"""Compiled kernels of the recurrence for processors, where the distribution `jaxmark-kernels` is installed.
+
+They compute several degrees on a block of rows while it is in cache (matrix-power blocking: Alappat, Hager, Schenk,
+Wellein, "Level-based blocking for sparse matrices: sparse matrix-power-vector multiplication", IEEE TPDS 34(2), 2023),
+where a scan in XLA reads all rows again for each degree. Their results agree with those of the scan to rounding, which
+is why nothing chooses between the two but what is installed, and the platform that a program is compiled for.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+Computation = Callable[..., Array]
+
+
+class Rows(NamedTuple):
+    """The rows of Δ - I as arrays: (Δ - I)x at a row is `own` x - `inverse` Σ_s `weights`_s x[`table`_s]."""
+
+    table: Int[Array | np.ndarray, "slots rows"]
+    weights: Float[Array, "slots rows"] | None  # None if all are 1
+    own: Float[Array, " rows"]
+    inverse: Float[Array, " rows"]
+    rest: Int[Array | np.ndarray, "rest 3"]  # row, column and anything, of entries without a slot, by rows
+    rest_weights: Float[Array, " rest"] | None  # None if all are 1
+    order: Int[Array | np.ndarray, " rows"] | None  # the vertex of each row; None if the orders are the same
+
+
+@cache
+def installed() -> bool:
+    """Whether there are kernels; the first call registers them with JAX."""
+    try:
+        from jaxmark_kernels import TARGETS  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return False
+    for name, target in TARGETS.items():
+        jax.ffi.register_ffi_target(f"jaxmark_{name}", target, platform="cpu")
+    return True
+
+
+def where_installed(kernel: Computation, scan: Computation) -> Computation:
+    """A function of an operator and arrays: on processors by a kernel, elsewhere, or if there is none, by a scan.
+
+    Args:
+        kernel: called with `Rows` and the arrays, of which the last is the signal.
+        scan: called with the operator and the arrays.
+    """
+
+    def compute(operator: Any, *arrays: Array) -> Array:
+        rows = operator.rows(arrays[-1]) if installed() and arrays[-1].size else None
+        if rows is None:
+            return scan(operator, *arrays)
+        # Only the branch of the platform that is compiled for becomes part of the program.
+        return jax.lax.platform_dependent(
+            operator, rows, *arrays,
+            cpu=lambda _, rows, *arrays: kernel(rows, *arrays),
+            default=lambda operator, _, *arrays: scan(operator, *arrays),
+        )  # fmt: skip
+
+    return compute
+
+
+def filter_rows(rows: Rows, c: Float[Array, " terms *series"], x: Float[Array, " rows *columns"]) -> Array:
+    """f(Δ)x of a Chebyshev series, one for each column of x if it has columns, or one for all."""
+    return component_rows(rows, c[None], x)[0]
+
+
+def component_rows(rows: Rows, c: Float[Array, "bands terms *series"], x: Float[Array, " rows *columns"]) -> Array:
+    """All f_b(Δ)x, as `filter_rows`: `[bands, *x.shape]`."""
+    columns = x.reshape(len(x), -1)
+    series = c if c.ndim == 3 else c[..., None]
+    result = jax.ShapeDtypeStruct((len(series), *columns.shape), x.dtype)
+    return _call("filter", result, rows, series, columns).reshape(len(series), *x.shape)
+
+
+def project_rows(terms: int, rows: Rows, x: Float[Array, " rows *columns"], u: Float[Array, " rows *columns"]) -> Array:
+    """Σ_v u_v (T_k(Δ - I)x)_v for so many k, column by column: `[terms, *columns]`."""
+    columns = x.reshape(len(x), -1)
+    result = jax.ShapeDtypeStruct((terms, columns.shape[1]), x.dtype)
+    return _call("project", result, rows, columns, u.reshape(columns.shape)).reshape(terms, *x.shape[1:])
+
+
+def _call(name: str, result: jax.ShapeDtypeStruct, rows: Rows, *arrays: Array) -> Array:
+    dtype = result.dtype
+    nothing, no_indices = jnp.zeros(0, dtype), jnp.zeros(0, jnp.int32)
+    given = (
+        rows.table,
+        nothing if rows.weights is None else rows.weights,
+        rows.own,
+        rows.inverse,
+        rows.rest,
+        nothing if rows.rest_weights is None else rows.rest_weights,
+        no_indices if rows.order is None else rows.order,
+        *arrays,
+    )
+    # Members of a batch run one after the other; each keeps all cores busy.
+    return jax.ffi.ffi_call(f"jaxmark_{name}_{dtype}", result, vmap_method="sequential")(*given)
