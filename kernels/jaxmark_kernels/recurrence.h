@@ -257,6 +257,8 @@ JAXMARK_CLONES void Step(const Matrix<T>& matrix, int64_t first, int64_t last, T
                          Lanes<T, W>* other, Level& level) {
   if (matrix.weights) {
     StepSlots<T, W, true, 0>(matrix, first, last, factor, now, other, level);
+  } else if (matrix.slots == 6) {  // surfaces of triangles have six or eight slots
+    StepSlots<T, W, false, 6>(matrix, first, last, factor, now, other, level);
   } else if (matrix.slots == 8) {
     StepSlots<T, W, false, 8>(matrix, first, last, factor, now, other, level);
   } else {
