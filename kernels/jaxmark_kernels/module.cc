@@ -15,13 +15,16 @@ namespace {
 
 constexpr int64_t kUsualCache = 512 * 1024;
 
-// Bytes of the cache of one core that a front of blocks may fill.
-int64_t CacheSize() {
-  int64_t size = 0;
+// Bytes of caches that a front of blocks of one thread may fill.
+Caches CacheSizes() {
+  int64_t near = 0, far = 0;
 #if defined(_SC_LEVEL2_CACHE_SIZE)
-  size = sysconf(_SC_LEVEL2_CACHE_SIZE);
+  near = sysconf(_SC_LEVEL2_CACHE_SIZE);
+  far = sysconf(_SC_LEVEL3_CACHE_SIZE);
 #endif
-  return (size > 0 ? size : kUsualCache) * 3 / 4;
+  near = (near > 0 ? near : kUsualCache) * 3 / 4;
+  // Others share the last cache.
+  return {near, std::max(near, far / 8)};
 }
 
 template <ffi::DataType kType>
@@ -62,7 +65,7 @@ template <typename T, ffi::DataType kType, int W>
 void FilterAll(const Matrix<T>& matrix, Crew& crew, const Values<kType>& c, const Values<kType>& x, T* y) {
   const int64_t columns = x.dimensions()[1], bands = c.dimensions()[0], terms = c.dimensions()[1];
   const Reach reach(matrix, crew);
-  const Plan plan(matrix, reach, crew.threads(), 2 + bands, W, CacheSize());
+  const Plan plan(matrix, reach, crew.threads(), 2 + bands, W, CacheSizes());
   Numbers<Lanes<T, W>> even(matrix.rows), odd(matrix.rows), totals(bands * matrix.rows);
   for (int64_t from = 0; from < columns; from += W) {
     FilterColumns<T, W>(matrix, reach, plan, crew, bands, terms, c.dimensions()[2] > 1, c.typed_data(), x.typed_data(),
@@ -90,7 +93,7 @@ void ProjectAll(const Matrix<T>& matrix, Crew& crew, const Values<kType>& x, con
                 T* y) {
   const int64_t columns = x.dimensions()[1];
   const Reach reach(matrix, crew);
-  const Plan plan(matrix, reach, crew.threads(), 3, W, CacheSize());
+  const Plan plan(matrix, reach, crew.threads(), 3, W, CacheSizes());
   Numbers<Lanes<T, W>> even(matrix.rows), odd(matrix.rows), weights(matrix.rows);
   for (int64_t from = 0; from < columns; from += W) {
     ProjectColumns<T, W>(matrix, reach, plan, crew, terms, x.typed_data(), u.typed_data(), columns, from, y,

@@ -20,6 +20,7 @@
 namespace jaxmark {
 
 constexpr int64_t kGranule = 64;  // rows; what a row reaches is known for so many together
+constexpr int64_t kFewDegrees = 8;  // if the nearer cache holds fewer, the farther one is used
 constexpr int kLanes = 4;         // columns that are computed together, if there are two or more
 
 #if defined(__x86_64__) && defined(__linux__) && defined(__GNUC__) && !defined(__clang__)
@@ -155,16 +156,22 @@ class Reach {
   std::vector<int64_t> above_, below_;  // of the granules before each, the highest column; of those from it, the lowest
 };
 
+// Bytes that a thread may fill in the cache of its core, and in one that cores share.
+struct Caches {
+  int64_t near, far;
+};
+
 // The rows in pieces, one for each thread, and how many degrees are computed together.
 struct Plan {
   int64_t rows, pieces, depth, tile;
 
   template <typename T>
-  Plan(const Matrix<T>& matrix, const Reach& reach, int64_t threads, int64_t vectors, int64_t lanes, int64_t cache)
+  Plan(const Matrix<T>& matrix, const Reach& reach, int64_t threads, int64_t vectors, int64_t lanes, Caches caches)
       : rows(matrix.rows), pieces(std::max<int64_t>(threads, 1)) {
     const int64_t bytes = matrix.slots * (sizeof(int32_t) + (matrix.weights ? sizeof(T) : 0)) + 2 * sizeof(T) +
                           vectors * lanes * sizeof(T);
-    const int64_t fitting = cache / (reach.lag() * bytes);
+    const int64_t width = reach.lag() * bytes;
+    const int64_t fitting = (caches.near / width < kFewDegrees ? caches.far : caches.near) / width;
     // What is left between two pieces, of the depth squared times the lag, is not shared by threads.
     depth = std::max<int64_t>(1, pieces == 1 ? fitting : std::min(fitting, rows / (8 * pieces * reach.lag())));
     tile = std::max(kGranule, reach.lag() / 2 / kGranule * kGranule);
@@ -255,7 +262,9 @@ JAXMARK_INLINE void StepSlots(const Matrix<T>& matrix, int64_t first, int64_t la
 template <typename T, int W, typename Level>
 JAXMARK_CLONES void Step(const Matrix<T>& matrix, int64_t first, int64_t last, T factor, const Lanes<T, W>* now,
                          Lanes<T, W>* other, Level& level) {
-  if (matrix.weights) {
+  if (matrix.weights && matrix.slots == 4) {  // so many have graphs of faces
+    StepSlots<T, W, true, 4>(matrix, first, last, factor, now, other, level);
+  } else if (matrix.weights) {
     StepSlots<T, W, true, 0>(matrix, first, last, factor, now, other, level);
   } else if (matrix.slots == 6) {  // surfaces of triangles have six or eight slots
     StepSlots<T, W, false, 6>(matrix, first, last, factor, now, other, level);
