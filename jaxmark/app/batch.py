@@ -169,7 +169,7 @@ class FileReader:
     guesses: bool = True  # whether to look for a mistake where nothing is detected, which takes several times as long
     meshes: Sequence[str] = ()  # names of the original's meshes to read; by default all
     also: Sequence[BlindScheme] = ()  # schemes of marks that are read besides, to unite what all prove
-    _last: tuple[tuple[Path, str | None], list[Marker]] | None = field(default=None, init=False, repr=False)
+    _last: tuple[tuple[Path, str | None], Sequence[Marker]] | None = field(default=None, init=False, repr=False)
 
     def read(
         self,
@@ -329,7 +329,7 @@ class FileReader:
         remarks = [*united.remarks, f"{alone} of {len(found.meshes) + len(found.left)} meshes prove it alone."]
         return Told(answer, describe(united, detected, self.alpha, dated, remarks), detected)
 
-    def _markers(self, mesh: Mesh, original: Path, record: Record | None, suspect: Mesh) -> list[Marker]:
+    def _markers(self, mesh: Mesh, original: Path, record: Record | None, suspect: Mesh) -> Sequence[Marker]:
         place = original, None if record is None else record.digest()
         if self._last is None or self._last[0] != place:
             bits = self.bits

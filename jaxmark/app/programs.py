@@ -9,7 +9,7 @@ _MAPS, _MOST = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 _FULL = 0.5
 _FOLDER = "jaxmark"  # in the user's own folder for what may be deleted
 _MAX_BYTES = 2**29
-_MIN_SECONDS = 0.1  # of compiling, from which on a program is kept
+_MIN_SECONDS = 0.0  # of compiling, from which on a program is kept: the many small ones take long, too
 
 
 def keep_programs() -> None:

@@ -31,7 +31,7 @@ creases that turn as a whole; silhouettes; and displacements along the surface, 
 
 import math
 from functools import cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -91,8 +91,8 @@ def make_hiding(
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     corners = vertices[faces]
     cross = cross_product(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    double = np.linalg.norm(cross, axis=1)
-    longest = np.max(np.sum((np.roll(corners, 1, axis=1) - corners) ** 2, axis=2), axis=1, initial=0)
+    double = np.sqrt(_squared(cross))
+    longest = np.max([_squared(corners[:, k] - corners[:, k - 1]) for k in range(3)], axis=0)
     area = np.where(double > _MIN_HEIGHT * longest, double / 2, 0)
     normals = cross / np.where(area > 0, double, 1)[:, None]
     pairs, against = face_pairs(faces)
@@ -106,7 +106,7 @@ def make_hiding(
     # A closed surface of triangles has three edges for two faces.
     links = pad_edges(graph_laplacian(pairs, count, weights), 1.5)
 
-    used = vertices[faces[area > 0]].reshape(-1, 3)
+    used = vertices[np.isin(np.arange(len(vertices)), faces[area > 0])]
     diagonal = float(np.linalg.norm(np.ptp(used, axis=0))) if len(used) else 1.0
     lengths = np.sqrt(4 / math.sqrt(3) * size * mean) / diagonal  # of equilateral triangles' sides
     padded = jnp.asarray(pad_rows(normals, count)), jnp.asarray(pad_rows(lengths, count))
@@ -162,10 +162,27 @@ def shading(
     """
     values = visible_turn(original, distorted, hiding)
     area = jnp.asarray(hiding.area).astype(values.dtype)
-    order = jnp.argsort(values)
-    below = jnp.cumsum(area[order])
-    place = jnp.argmax(below >= jnp.asarray(share).astype(values.dtype) * below[-1])
-    return values[order[place]]
+    return values[_percentile(jax.lax.stop_gradient(values), area, jnp.asarray(share).astype(values.dtype))]
+
+
+def _percentile(values: Array, weights: Array, share: Array) -> Array:
+    """The index of the least of the values, none negative, below or at which lies so much of the weight.
+
+    Numbers that are not negative are ordered as the integers that their bits are, which are bisected: that takes a
+    tenth of the time of sorting.
+    """
+    bits = jax.lax.bitcast_convert_type(values, jnp.dtype(f"int{8 * values.dtype.itemsize}"))
+    enough = share * jnp.sum(weights)
+
+    def halve(_: Any, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = low + (high - low) // 2
+        inside = jnp.sum(jnp.where(bits <= middle, weights, 0)) >= enough
+        return jnp.where(inside, low, middle + 1), jnp.where(inside, middle, high)
+
+    most = jnp.max(bits)
+    found, _ = jax.lax.fori_loop(0, 8 * values.dtype.itemsize, halve, (jnp.zeros_like(most), most))
+    return jnp.argmin(jnp.where(bits >= found, bits, most))
 
 
 def vertex_means(values: Float[Array, " faces"], hiding: Hiding, count: int) -> Float[Array, " vertices"]:
@@ -174,6 +191,11 @@ def vertex_means(values: Float[Array, " faces"], hiding: Hiding, count: int) -> 
     zeros, corners = jnp.zeros(count, values.dtype), hiding.faces
     total, around = zeros.at[corners].add(area), zeros.at[corners].add(area * values[:, None])
     return jnp.where(total > 0, around / jnp.where(total > 0, total, 1), 0)
+
+
+def _squared(x: Float[np.ndarray, "rows 3"]) -> Float[np.ndarray, " rows"]:
+    """Squared lengths of vectors."""
+    return np.einsum("ri,ri->r", x, x)
 
 
 def _second_largest(pairs: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
@@ -195,6 +217,8 @@ def _orient(pairs: np.ndarray, against: np.ndarray, count: int) -> np.ndarray:
 
     Each face stands twice in a graph, once for each of its sides; sides that belong together are connected.
     """
+    if not against.any():
+        return np.ones(count)
     one, other = pairs.T
     ends = np.concatenate([one, one + count]), np.concatenate([other + count * against, other + count * ~against])
     graph = sparse.coo_array((np.ones(len(ends[0])), ends), shape=(2 * count, 2 * count))
@@ -259,12 +283,12 @@ def _hidden(links: Laplacian, normals: Array, length: Array, count: int) -> tupl
 def _sensitivity(wavelength: Array) -> Array:
     """Inverse of the contrast that is just seen, of waves whose lengths are given in diagonals."""
     cycles = jnp.maximum(1 / (wavelength * _SIZE), _BEST_FREQUENCY)
-    values = _barten(cycles) / _barten(jnp.full((), _BEST_FREQUENCY, cycles.dtype))
+    values = _barten(cycles) / float(_barten(np.array(_BEST_FREQUENCY), np))
     return jnp.maximum(values, _MIN_SENSITIVITY) / _LEAST_CONTRAST
 
 
-def _barten(cycles: Array) -> Array:
-    """Barten's contrast sensitivity at so many cycles per degree."""
+def _barten(cycles: Any, xp: Any = jnp) -> Any:
+    """Barten's contrast sensitivity at so many cycles per degree, computed by JAX or by NumPy."""
     peak = 540 * (1 + 0.7 / _LUMINANCE) ** -0.2 / (1 + 12 / (_SIZE * (1 + cycles / 3) ** 2))
-    kept = jnp.exp(-0.3 * (1 + 100 / _LUMINANCE) ** 0.15 * cycles)
-    return peak * cycles * jnp.sqrt(kept**2 + 0.06 * kept)
+    kept = xp.exp(-0.3 * (1 + 100 / _LUMINANCE) ** 0.15 * cycles)
+    return peak * cycles * xp.sqrt(kept**2 + 0.06 * kept)

@@ -319,7 +319,7 @@ def cross_product(x: Float64[np.ndarray, "rows 3"], y: Float64[np.ndarray, "rows
 
 def unit(x: Float64[np.ndarray, "*rows 3"]) -> Float64[np.ndarray, "*rows 3"]:
     """Normalise vectors to length 1; zero stays zero."""
-    length = np.linalg.norm(x, axis=-1, keepdims=True)
+    length = np.sqrt(np.einsum("...i,...i->...", x, x))[..., None]
     return np.divide(x, length, out=np.zeros_like(x), where=length > 0)
 
 

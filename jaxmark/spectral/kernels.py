@@ -11,7 +11,6 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -86,7 +85,7 @@ def project_rows(terms: int, rows: Rows, x: Float[Array, " rows *columns"], u: F
 
 def _call(name: str, result: jax.ShapeDtypeStruct, rows: Rows, *arrays: Array) -> Array:
     dtype = result.dtype
-    nothing, no_indices = jnp.zeros(0, dtype), jnp.zeros(0, jnp.int32)
+    nothing, no_indices = np.zeros(0, dtype), np.zeros(0, np.int32)
     given = (
         rows.table,
         nothing if rows.weights is None else rows.weights,

@@ -26,6 +26,8 @@ _LEAST_BEND = 1e-4  # radians that the flattest faces hide in the mean of those 
 _AVERAGING_SCALE = 2  # bends are averaged over 2^2 steps of diffusion
 _SPACING_POINTS = 8  # nearest points whose mean distance says how dense a cloud is
 _LEAST_SPACING, _MOST_SPACING = 0.25, 2.0  # over the median: what denser and looser parts count as
+_ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of symmetric matrices
+_PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # of a matrix's entries among them
 _SPACING_SCALE = 5  # spacings are averaged over 2^5 steps of diffusion
 
 
@@ -59,7 +61,8 @@ def hiding_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
         bends = _bends(hiding)
     normals = face_normals(mesh)
     sides = points[np.roll(faces, -1, axis=1)] - points[faces]
-    angles = np.arccos(np.clip(-np.sum(unit(sides) * unit(np.roll(sides, 1, axis=1)), axis=2), -1, 1))
+    along = unit(sides)
+    angles = np.arccos(np.clip(-np.einsum("fci,fci->fc", along, np.roll(along, 1, axis=1)), -1, 1))
     edge = np.sqrt(4 / np.sqrt(3) * hiding.area * area(mesh))  # of an equilateral triangle
     bare, masked = hiding.bare[_BAND], hiding.threshold[_BAND]
     height = edge * np.maximum(np.minimum(masked - bare, bends), _MIN_HIDDEN * bare) / _SLOPE
@@ -111,19 +114,22 @@ def _bends(hiding: Hiding) -> Float64[np.ndarray, " faces"]:
     return np.exp(np.asarray(filter(hiding.links, average, jnp.asarray(logs)), np.float64)[: len(hiding.bend)])
 
 
-def _squares(x: Float64[np.ndarray, "rows 3"], size: Float64[np.ndarray, " rows"]) -> Float64[np.ndarray, "rows 3 3"]:
-    """Forms that are 1 for a displacement of so much along each unit vector."""
+def _squares(x: Float64[np.ndarray, "rows 3"], size: Float64[np.ndarray, " rows"]) -> Float64[np.ndarray, "rows 6"]:
+    """Forms that are 1 for a displacement of so much along each unit vector: the entries of `_ENTRIES`."""
     scaled = x / size[:, None]
-    return scaled[:, :, None] * scaled[:, None, :]
+    found = np.empty((len(x), 6))
+    for place, (i, j) in enumerate(_ENTRIES):
+        found[:, place] = scaled[:, i] * scaled[:, j]
+    return found
 
 
 def _sums(
     points: Int[np.ndarray, "rows corners"],
     weights: Float64[np.ndarray, "rows corners"],
-    forms: Float64[np.ndarray, "rows 3 3"],
+    forms: Float64[np.ndarray, "rows 6"],
     size: int,
 ) -> tuple[Float64[np.ndarray, "points 3 3"], Float64[np.ndarray, " points"]]:
     """Weighted sums of rows' forms at the points of each row, and the sums of the weights."""
     rows = np.repeat(np.arange(len(points)), points.shape[1])
     incidence = sparse.csr_array((weights.ravel(), (points.ravel(), rows)), shape=(size, len(points)))
-    return (incidence @ forms.reshape(-1, 9)).reshape(-1, 3, 3), np.asarray(incidence.sum(axis=1))
+    return (incidence @ forms)[:, _PLACES], np.asarray(incidence.sum(axis=1))

@@ -1,9 +1,9 @@
 """Marking meshes and reading them: from meshes, messages and keys to marked meshes and evidence."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -642,15 +642,33 @@ def make_markers(
     record: Record | None = None,
     scheme: str | Scheme = DEFAULT_SCHEME,
     detector: Detector | None = None,
-) -> list[Marker]:
+) -> Sequence[Marker]:
     """Prepare an original for reading marks of any version: that of the record, or without one each, the newest first.
+
+    Older versions are prepared when they are first asked for: mostly the newest is found.
 
     Args and raises: see `make_marker`.
     """
-    return [
-        make_marker(original, key, bits=bits, record=record, scheme=scheme, detector=detector, version=version)
-        for version in versions_of(record)
-    ]
+    prepare = partial(make_marker, original, key, bits=bits, record=record, scheme=scheme, detector=detector)
+    markers = _Markers([partial(prepare, version=version) for version in versions_of(record)])
+    markers[0]  # so that refusals come here
+    return markers
+
+
+class _Markers(Sequence[Marker]):
+    """Markers that are prepared at first use, and kept."""
+
+    def __init__(self, prepare: Sequence[Callable[[], Marker]]) -> None:
+        self._prepare = prepare
+        self._ready: dict[int, Marker] = {}
+
+    def __len__(self) -> int:
+        return len(self._prepare)
+
+    def __getitem__(self, index: int) -> Marker:  # pyright: ignore[reportIncompatibleMethodOverride]
+        if index not in self._ready:
+            self._ready[index] = self._prepare[index]()
+        return self._ready[index]
 
 
 def versions_of(record: Record | None) -> tuple[int, ...]:
