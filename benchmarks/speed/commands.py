@@ -114,7 +114,8 @@ def run(words: list[str], cache: Path) -> dict[str, Any]:
     result = cache / "stages.json"
     program = [sys.executable, str(Path(__file__).resolve()), "--inside", str(result), *words]
     start = time.time()
-    environment = {**os.environ, "XDG_CACHE_HOME": str(cache), "STARTED": str(start)}
+    # Modules that are compiled anew for each process would hide what takes long.
+    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "", "XDG_CACHE_HOME": str(cache), "STARTED": str(start)}
     done = subprocess.run(program, env=environment, capture_output=True, text=True)
     if done.returncode > 1 or not result.exists():
         raise SystemExit(f"jaxmark {' '.join(words)} ended with {done.returncode}: {done.stderr[-500:]}")
