@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxmark.distortion.percentiles import percentile
 from jaxmark.distortion.roots import root
 
 SHARE = 0.99  # share of the edges that change less
@@ -28,5 +29,4 @@ def stretch(
     before, after = (root(jnp.sum((x[edges[:, 0]] - x[edges[:, 1]]) ** 2, axis=1)) for x in (original, distorted))
     sound = before > 0
     change = jnp.where(sound, jnp.abs(after - before) / jnp.where(sound, before, 1), 0)
-    place = jnp.ceil(jnp.asarray(share) * len(change)).astype(jnp.int32) - 1
-    return jnp.sort(change)[jnp.clip(place, 0, len(change) - 1)]
+    return percentile(change, jnp.ones_like(change), share)
