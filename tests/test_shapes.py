@@ -22,10 +22,10 @@ def test_common_sizes_are_few_and_not_much_larger():
     counts = np.arange(1, 2**17 + 2)
     sizes = np.array([common_size(int(count)) for count in counts])
     assert (sizes >= counts).all()
-    assert len(np.unique(sizes[counts <= 2**11])) == 4
-    assert (sizes <= 1.25 * counts)[counts > 2**11].all()
+    assert len(np.unique(sizes[counts <= 2**13])) == 6
+    assert (sizes <= 1.25 * counts)[counts > 2**13].all()
     assert sizes[-1] == counts[-1]
-    octave = sizes[(counts > 2**12) & (counts <= 2**13)]
+    octave = sizes[(counts > 2**13) & (counts <= 2**14)]
     assert len(np.unique(octave)) == 4
 
 
@@ -55,9 +55,9 @@ def test_programs_serve_meshes_of_other_sizes(key: jm.Key):
     try:
         for index, mesh in enumerate((cut(whole, 7), cut(whole, 40), cut(whole, 90))):
             before = len(compiled)
-            marked, _ = jm.embed(mesh, b"s", key, budget=8e-4)
+            marked, _ = jm.embed(mesh, b"s", key)
             assert jm.detect(marked, original=mesh, key=key, bits=8).message == b"s"
-            assert len(make_original(mesh).signal) == common_size(len(mesh.vertices)) == 2560
+            assert len(make_original(mesh).signal) == common_size(len(mesh.vertices)) == 4096
             assert index == 0 or len(compiled) == before
     finally:
         jax.monitoring.unregister_event_duration_listener(hear)

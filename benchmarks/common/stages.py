@@ -18,21 +18,27 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from scipy.sparse import linalg
 
 import jaxmark as jm
 from jaxmark.alignment.alignment import align
 from jaxmark.alignment.original import make_original
 from jaxmark.spectral.chebyshev import filter
-from jaxmark.spectral.laplacian import Laplacian
+from jaxmark.spectral.laplacian import Laplacian, sparse_matrices
 from jaxmark.watermark.budget import make_budget
 from jaxmark.watermark.schemes import EigenScheme, Scheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from common.filters import DEGREE, coefficients, reordered
+from common.filters import DEGREE, coefficients, graph, reordered, shifted
 from common.marks import BUDGET, KEY, MESSAGE, write
+from common.peers import PEERS
 from common.tables import Row
 from common.timing import Call, median_time, timed
 
+BLIND = ("field", "local")
+SHORT = b"m2"  # a message, shorter than MESSAGE, that blind marks carry on small meshes, too
+EIGENVECTORS = 64
 COMPILING = ("/jax/core/compile/jaxpr_to_mlir_module_duration", "/jax/core/compile/backend_compile_duration")
 
 
@@ -62,6 +68,30 @@ def detecting(folder: Path) -> Call:
     return partial(jm.detect, jm.load_mesh(folder / "marked.ply"), original=jm.load_mesh(folder / "mesh.ply"), key=KEY)
 
 
+def marking_blindly(folder: Path, scheme: str) -> Call:
+    """Marking for reading without the original, with the usual limits; the mark is kept for `reading_blindly`."""
+    mesh, marked = jm.load_mesh(folder / "mesh.ply"), folder / f"{scheme}.ply"
+    return lambda: jm.save_mesh(jm.embed(mesh, SHORT, KEY, scheme=scheme)[0], marked)
+
+
+def reading_blindly(folder: Path, scheme: str) -> Call:
+    return partial(jm.detect, jm.load_mesh(folder / f"{scheme}.ply"), key=KEY, bits=8 * len(SHORT), scheme=scheme)
+
+
+def filtering_there(folder: Path, name: str) -> Call:
+    """The filter by another program."""
+    operator, x = graph(make_original(jm.load_mesh(folder / "mesh.ply")))
+    return PEERS[name](shifted(operator), coefficients(DEGREE), np.asarray(x))
+
+
+def decomposing(folder: Path) -> Call:
+    """The lowest eigenvectors by SciPy, shift-and-invert, as whoever has no filters would take them."""
+    operator, x = graph(make_original(jm.load_mesh(folder / "mesh.ply")))
+    stiffness, mass = sparse_matrices(operator)
+    start = np.random.default_rng(0).normal(size=len(x))
+    return partial(linalg.eigsh, stiffness.tocsc(), EIGENVECTORS, mass.tocsc(), sigma=-1e-6, v0=start)
+
+
 def aligning(folder: Path, by_surface: bool) -> Call:
     original, suspect = make_original(jm.load_mesh(folder / "mesh.ply")), jm.load_mesh(folder / "marked.ply")
     return (
@@ -74,7 +104,7 @@ def tuning(folder: Path) -> Call:
     return partial(jm.tune, jm.load_mesh(folder / "mesh.ply"), attacks, BUDGET, key=jax.random.key(0))
 
 
-STAGES: Mapping[str, Callable[[Path], Call]] = {
+WHOLE: Mapping[str, Callable[[Path], Call]] = {
     "load": lambda folder: partial(jm.load_mesh, folder / "mesh.ply"),
     "prepare": lambda folder: partial(make_original, jm.load_mesh(folder / "mesh.ply")),
     "embed": partial(embedding, budget=BUDGET),  # leaves the marked mesh for those below
@@ -86,6 +116,13 @@ STAGES: Mapping[str, Callable[[Path], Call]] = {
     "align, reordered": partial(aligning, by_surface=False),
     "align, surfaces": partial(aligning, by_surface=True),
     "tune, two attacks": tuning,
+}
+STAGES = {
+    **WHOLE,
+    **{f"mark, {scheme}": partial(marking_blindly, scheme=scheme) for scheme in BLIND},
+    **{f"read, {scheme}": partial(reading_blindly, scheme=scheme) for scheme in BLIND},
+    **{f"filter, {name}": partial(filtering_there, name=name) for name in PEERS},
+    "eigsh": decomposing,
     "filter": partial(filtering, function=filter),
     "gradients": partial(filtering, function=with_gradients),
 }

@@ -1,8 +1,10 @@
 """Seconds of calls."""
 
+import os
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import ParamSpec, TypeVar
 
 import jax
@@ -17,6 +19,14 @@ def timed(call: Callable[P, Result], *args: P.args, **kwargs: P.kwargs) -> tuple
     """What a call returns, and its seconds."""
     start = time.perf_counter()
     return call(*args, **kwargs), time.perf_counter() - start
+
+
+def for_commands(cache: Path) -> dict[str, str]:
+    """The environment of commands that keep compiled programs in a folder of their own.
+
+    Modules that are compiled anew for each process would hide what takes long.
+    """
+    return {**os.environ, "PYTHONDONTWRITEBYTECODE": "", "XDG_CACHE_HOME": str(cache)}
 
 
 def median_time(call: Call, repeat: int, *, counted: bool = False, patience: float = PATIENCE) -> float:

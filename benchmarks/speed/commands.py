@@ -33,6 +33,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.tables import say, table
+from common.timing import for_commands
 
 BORN = time.time()
 # The functions of each stage: module, name, and stage.
@@ -114,8 +115,7 @@ def run(words: list[str], cache: Path) -> dict[str, Any]:
     result = cache / "stages.json"
     program = [sys.executable, str(Path(__file__).resolve()), "--inside", str(result), *words]
     start = time.time()
-    # Modules that are compiled anew for each process would hide what takes long.
-    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "", "XDG_CACHE_HOME": str(cache), "STARTED": str(start)}
+    environment = {**for_commands(cache), "STARTED": str(start)}
     done = subprocess.run(program, env=environment, capture_output=True, text=True)
     if done.returncode > 1 or not result.exists():
         raise SystemExit(f"jaxmark {' '.join(words)} ended with {done.returncode}: {done.stderr[-500:]}")

@@ -53,7 +53,7 @@ from common.arguments import json_file, load, make_parser
 from common.filters import DEGREE, TOLERANCE, bumpy_torus, coefficients, exponent, graph, reordered, shifted
 from common.marks import BUDGET, KEY, MESSAGE
 from common.peers import PEERS, installed
-from common.stages import FILTERS, STAGES, apart, with_gradients
+from common.stages import FILTERS, WHOLE, apart, with_gradients
 from common.tables import Row, save_json, say, table
 from common.timing import Call, median_time
 
@@ -146,7 +146,7 @@ def gradients(bench: Bench) -> Iterator[Row]:
 
 
 def stages(bench: Bench) -> Iterator[Row]:
-    rows = list(apart(bench.mesh(0), [stage for stage in STAGES if stage not in FILTERS], bench.repeat))
+    rows = list(apart(bench.mesh(0), list(WHOLE), bench.repeat))
     yield from rows
     found = {row["stage"]: row for row in rows}
     for stage in ("write", "embed"):

@@ -1,4 +1,4 @@
-"""Mark and read mesh files, one at a time."""
+"""Mark and read single mesh files."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from jaxmark.app.report import save_report
 from jaxmark.app.scene import mark_scene, pick
 from jaxmark.app.telling import Told, describe, told_payload, told_survival
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import SUFFIXES, load_mesh, load_scene, load_texture, save_mesh
+from jaxmark.files import load_mesh, load_scene, load_texture, save_mesh
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.scheme import BlindScheme
@@ -27,22 +27,6 @@ from jaxmark.watermark.record import Record
 from jaxmark.watermark.scenes import SceneDetection, SceneRecord, detect_scene, load_record, pair
 from jaxmark.watermark.schemes import DEFAULT_SCHEME
 from jaxmark.watermark.tracing import make_tracer
-
-
-def mesh_files(folder: Path) -> list[Path]:
-    """List the files of a folder that have a mesh format's suffix, by name; hidden files are left out.
-
-    Raises:
-        JaxmarkError: if there is no such file.
-    """
-    found = sorted(
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")
-    )
-    if not found:
-        raise JaxmarkError(f"The folder {folder} has no mesh file ({', '.join(SUFFIXES)}).")
-    return found
 
 
 def mark_file(

@@ -8,22 +8,22 @@ line, or such an object, for each file, and the exit status is the worst of thei
 import json
 import math
 import os
-import signal
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any, NoReturn, get_args
 
 import click
 
 from jaxmark import distortion
 from jaxmark.alignment.alignment import Align
-from jaxmark.app.batch import FileReader, mark_file, mesh_files
+from jaxmark.app.batch import FileReader, mark_file
 from jaxmark.app.blind import BlindReader
-from jaxmark.app.programs import release_programs
-from jaxmark.app.telling import Told, power
+from jaxmark.app.ending import end_by_exception
+from jaxmark.app.folders import Work, each, mesh_files
+from jaxmark.app.telling import Told, power, told_error
 from jaxmark.attacks import ATTACKS, chain, get_attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.study_file import load_study
@@ -107,8 +107,6 @@ class _Limit(click.ParamType):
             self.fail(f"{value!r} is no limit: give a metric and a number, e.g. dame=0.008.", param, ctx)
 
 
-_ASK_AGAIN = 5  # seconds until a process that was asked to end is asked again
-
 _MESH = click.Path(path_type=Path)
 _KEY = click.option("--key", "key_file", type=_MESH, required=True, help="Key file, from `jaxmark keygen`.")
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
@@ -121,6 +119,13 @@ _NOISE = click.option(
 )
 _MESHES = click.option(
     "--mesh", "meshes", multiple=True, help="Of a file of several meshes, one to use, by name; may be repeated."
+)
+_WORKERS = click.option(
+    "--workers",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="For a folder: number of processes at once, each with memory of its own.",
 )
 _ALIGN = click.option(
     "--align",
@@ -217,6 +222,7 @@ def keygen(keyfile: Path, as_json: bool) -> None:
     " original. Several with commas between, such as keyed,field, mark for both.",
 )
 @click.option("--record", "record_file", type=_MESH, help=f"File for the record.  [default: MARKED{RECORD_SUFFIX}]")
+@_WORKERS
 @_JSON
 def embed_command(
     original: Path,
@@ -233,6 +239,7 @@ def embed_command(
     meshes: tuple[str, ...],
     schemes: tuple[str, ...],
     record_file: Path | None,
+    workers: int,
     as_json: bool,
 ) -> None:
     """Mark ORIGINAL and write MARKED, of the same format; or every mesh file of a folder into another folder.
@@ -267,10 +274,10 @@ def embed_command(
         return _answer(as_json, told.answer, told.said)
     if record_file is not None:
         raise JaxmarkError("Each file of a folder has a record beside it; leave out --record.")
-    key = _key(key_file)
+    work = partial(_mark_member, partial(mark, key=_key(key_file)), marked)
     mesh_files(original)  # refuses a folder without any before another is made
     marked.mkdir(parents=True, exist_ok=True)
-    _each(original, as_json, lambda file: mark(file, marked / file.name, marked / (file.name + RECORD_SUFFIX), key=key))
+    _each(original, as_json, work, workers)
 
 
 @cli.command(name="detect")
@@ -305,6 +312,7 @@ def embed_command(
 @click.option("--report", type=_MESH, help="Folder for a picture of how SUSPECT was aligned (needs the extra `plot`).")
 @click.option("--dossier", type=_MESH, help="Folder for a page that shows a detection to others (extra `plot`).")
 @_ALPHA
+@_WORKERS
 @_JSON
 def detect_command(
     suspect: Path,
@@ -323,6 +331,7 @@ def detect_command(
     report: Path | None,
     dossier: Path | None,
     alpha: float,
+    workers: int,
     as_json: bool,
 ) -> None:
     """Look for a mark in SUSPECT: a file in any pose, with the original's connectivity or not; or a folder of files.
@@ -358,13 +367,7 @@ def detect_command(
         only = blind_ones[0] if len(blind_ones) == 1 else None
         blind = BlindReader(_key(key_file), payload, message, alpha, deposit, obtained, meshes, only)
         if suspect.is_dir():
-            _each(
-                suspect,
-                as_json,
-                lambda file: blind.read(
-                    file, None if record_file is None else _member(record_file, file.name + RECORD_SUFFIX)
-                ),
-            )
+            _each(suspect, as_json, partial(_read_member_blindly, blind, record_file), workers)
         told = blind.read(suspect, record_file)
         _answer(as_json, told.answer, told.said)
         sys.exit(0 if told.done else 1)
@@ -382,17 +385,7 @@ def detect_command(
         also=blind_ones,
     )
     if suspect.is_dir():
-        _each(
-            suspect,
-            as_json,
-            lambda file: reader.read(
-                file,
-                _member(original, file.name),
-                None if record_file is None else _member(record_file, file.name + RECORD_SUFFIX),
-                None if report is None else report / file.name,
-                None if dossier is None else dossier / file.name,
-            ),
-        )
+        _each(suspect, as_json, partial(_read_member, reader, original, record_file, report, dossier), workers)
     told = reader.read(suspect, original, record_file, report, dossier)
     _answer(as_json, told.answer, told.said)
     sys.exit(0 if told.done else 1)
@@ -665,7 +658,7 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
 
 def main() -> None:
     """Run the command line; refused input ends with exit status 2 and one sentence."""
-    signal.signal(signal.SIGTERM, _end)
+    end_by_exception()
     try:
         cli(standalone_mode=False)
     except click.exceptions.Exit as end:
@@ -673,31 +666,7 @@ def main() -> None:
     except click.Abort:
         _refuse("Interrupted.")
     except Exception as error:  # status 1 would say "nothing detected"
-        _refuse(_sentence(error))
-
-
-def _end(number: int, frame: FrameType | None) -> NoReturn:
-    """End as by an exception, after which no draft is left.
-
-    Python drops an exception in callbacks of its garbage collector, as JAX has one: the alarm asks again.
-    """
-    if hasattr(signal, "alarm"):
-        signal.signal(signal.SIGALRM, _end)
-        signal.alarm(_ASK_AGAIN)
-    sys.exit(128 + signal.SIGTERM)
-
-
-def _sentence(error: Exception) -> str:
-    match error:
-        case click.ClickException():
-            said = error.format_message()
-        case JaxmarkError():
-            said = str(error)
-        case OSError():
-            said = f"{error.filename or 'A file'} cannot be used: {error.strerror or error}."
-        case _:
-            said = f"Unexpected {type(error).__name__}: {error}. Please report it, with the command and the files."
-    return " ".join(said.split())
+        _refuse(told_error(error))
 
 
 def _refuse(sentence: str) -> NoReturn:
@@ -709,18 +678,36 @@ def _say(line: str) -> None:
     click.echo(line, err=True)
 
 
-def _each(folder: Path, as_json: bool, work: Callable[[Path], Told]) -> NoReturn:
+def _each(folder: Path, as_json: bool, work: Work, workers: int) -> NoReturn:
     """Work on the mesh files of a folder, print a line for each, and exit with the worst status."""
     status = 0
-    for file in mesh_files(folder):
-        try:
-            told = work(file)
-        except Exception as error:
-            told, status = Told({"refused": _sentence(error)}, f"refused. {_sentence(error)}", False), 2
-        release_programs()
-        status = max(status, 0 if told.done else 1)
-        _answer(as_json, {"file": file.name, **told.answer}, f"{file.name}: {told.said}")
+    with closing(each(mesh_files(folder), work, workers)) as told:
+        for file, one in told:
+            status = max(status, 2 if one.refused else 0 if one.done else 1)
+            _answer(as_json, {"file": file.name, **one.answer}, f"{file.name}: {one.said}")
     sys.exit(status)
+
+
+def _mark_member(mark: Callable[..., Told], folder: Path, file: Path) -> Told:
+    """Mark a file of a folder into another."""
+    return mark(file, folder / file.name, folder / (file.name + RECORD_SUFFIX))
+
+
+def _read_member(
+    reader: FileReader, original: Path, record: Path | None, report: Path | None, dossier: Path | None, file: Path
+) -> Told:
+    """Read a file of a folder, with a folder each for originals, records, reports and dossiers, or one file for all."""
+    return reader.read(
+        file,
+        _member(original, file.name),
+        None if record is None else _member(record, file.name + RECORD_SUFFIX),
+        None if report is None else report / file.name,
+        None if dossier is None else dossier / file.name,
+    )
+
+
+def _read_member_blindly(reader: BlindReader, record: Path | None, file: Path) -> Told:
+    return reader.read(file, None if record is None else _member(record, file.name + RECORD_SUFFIX))
 
 
 def _one_message(message: bytes | None, text: bytes | None) -> bytes | None:

@@ -4,6 +4,9 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import click
+
+from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.blind.reading import BlindDetection
 from jaxmark.watermark.marking import Detection, Survival
 
@@ -14,6 +17,21 @@ class Told(NamedTuple):
     answer: dict[str, Any]  # for programs: values for JSON, except that numbers may not be finite
     said: str  # for people: one sentence
     done: bool = True  # False if nothing was detected, or the file was refused
+    refused: bool = False
+
+
+def told_error(error: Exception) -> str:
+    """What an exception says, in one line."""
+    match error:
+        case click.ClickException():
+            said = error.format_message()
+        case JaxmarkError():
+            said = str(error)
+        case OSError():
+            said = f"{error.filename or 'A file'} cannot be used: {error.strerror or error}."
+        case _:
+            said = f"Unexpected {type(error).__name__}: {error}. Please report it, with the command and the files."
+    return " ".join(said.split())
 
 
 def power(log10_p: float) -> str:

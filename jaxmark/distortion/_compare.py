@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Collection, Mapping
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,9 @@ from jaxmark.geometry.mesh import (
     weld,
     weld_mesh,
 )
+from jaxmark.spectral.shapes import SURFACE_VALENCE, common_edges, common_size, pad_rows
 
+Prepared = TypeVar("Prepared")
 Metric = str | Callable[[Mesh, Mesh], float]  # a name in `METRICS` or `RENDERED`, or a function: see `measure`
 
 
@@ -118,7 +120,10 @@ class Reference:
 
     @cached_property
     def hinges(self) -> Hinges:
-        return make_hinges(self.faces)
+        """Padded with edges of no length, so that programs compiled for one mesh serve others."""
+        found = make_hinges(self.faces)
+        count = common_edges(len(found.edges), common_size(len(self.mesh.vertices)), SURFACE_VALENCE)
+        return _ready(Hinges(*(pad_rows(np.asarray(rows), count) for rows in found)))
 
     @cached_property
     def around(self) -> PointPlanes:
@@ -126,7 +131,7 @@ class Reference:
 
     @cached_property
     def hiding(self) -> Hiding:
-        return make_hiding(np.asarray(self.mesh.vertices), self.faces)
+        return _ready(make_hiding(np.asarray(self.mesh.vertices), self.faces).padded())
 
     def measure(self, distorted: Mesh, metrics: Collection[Metric]) -> dict[Metric, float | None]:
         """Measure how far a mesh was distorted from this original; see `measure`."""
@@ -164,6 +169,13 @@ class _Pair:
         self.x, self.y = (jnp.asarray(mesh.vertices, jnp.float32) for mesh in self.meshes)
 
     @cached_property
+    def common(self) -> tuple[Array, Array]:
+        """The positions, padded to a size that many meshes share."""
+        count = common_size(len(self.x))
+        x, y = (pad_rows(np.asarray(mesh.vertices, np.float32), count) for mesh in self.meshes)
+        return jnp.asarray(x), jnp.asarray(y)
+
+    @cached_property
     def moved(self) -> DisplacementSize:
         return displacement_size(*self.given)
 
@@ -192,13 +204,13 @@ _METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
     "mrms": lambda pair: pair.surfaces.mrms,
     "hausdorff": lambda pair: pair.surfaces.hausdorff,
     "gl": lambda pair: gl(pair.x, pair.y, edges(pair.faces[0])),
-    "dame": lambda pair: dame(pair.x, pair.y, pair.reference.hinges),
+    "dame": lambda pair: dame(*pair.common, pair.reference.hinges),
     "fmpd": lambda pair: fmpd(local_roughness(pair.x, pair.faces[0]), local_roughness(pair.y, pair.faces[1])),
     "msdm": lambda pair: msdm(pair.x, pair.y, msdm_views(*pair.meshes)),
     "msdm2": lambda pair: msdm2(pair.x, pair.y, pair.views),
     "curvature": _Pair.tensor_distance,
-    "stretch": lambda pair: stretch(pair.x, pair.y, pair.reference.hinges.edges),
-    "shading": lambda pair: shading(pair.x, pair.y, pair.reference.hiding),
+    "stretch": lambda pair: stretch(*pair.common, pair.reference.hinges.edges),
+    "shading": lambda pair: shading(*pair.common, pair.reference.hiding),
     "point_to_plane": lambda pair: point_to_plane(pair.shift, pair.reference.around),
 }
 _RENDERED: Mapping[str, Callable[[_Pair], float]] = {
@@ -285,6 +297,15 @@ def shading_at_vertices(original: Mesh, distorted: Mesh) -> Float[np.ndarray, " 
     points = np.zeros(len(used), np.float32)
     points[used] = vertex_means(visible_turn(pair.x, pair.y, hiding), hiding, len(pair.x))
     return points[reference.welded.point]
+
+
+def _ready(arrays: Prepared) -> Prepared:
+    """Arrays as metrics compute with them, so that no call converts them again; numbers are float32."""
+
+    def one(leaf: np.ndarray) -> Array:
+        return jnp.asarray(leaf, jnp.float32 if np.issubdtype(leaf.dtype, np.floating) else None)
+
+    return jax.tree.map(one, arrays)
 
 
 def _plain(mesh: Mesh, welded: Weld) -> Mesh:

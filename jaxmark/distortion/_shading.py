@@ -78,6 +78,15 @@ class Hiding(NamedTuple):
     bare: Float[Array | np.ndarray, "bands faces"]  # the same if the surface had nothing that hides
     bend: Float[Array | np.ndarray, " faces"]  # second largest angle to a neighbour: 0 on planes and along their edges
 
+    def padded(self) -> "Hiding":
+        """The same with faces of no area besides, as many as `links` has, so that many meshes share its shapes."""
+        count = len(self.links.degree)
+        if len(self.area) == count:
+            return self
+        threshold, bare = (pad_rows(np.asarray(values).T, count, 1).T for values in (self.threshold, self.bare))
+        faces, area, bend = (pad_rows(np.asarray(rows), count) for rows in (self.faces, self.area, self.bend))
+        return Hiding(faces, area, pad_rows(np.asarray(self.turned), count, 1), self.links, threshold, bare, bend)
+
 
 def make_hiding(
     vertices: Float[Array | np.ndarray, "vertices 3"], faces: Int[Array | np.ndarray, "faces 3"], bands: int = BANDS
@@ -90,16 +99,11 @@ def make_hiding(
         bands: number of bands that are looked at, from the shortest waves on.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
-    corners = vertices[faces]
-    cross = cross_product(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    double = np.sqrt(_squared(cross))
-    longest = np.max([_squared(corners[:, k] - corners[:, k - 1]) for k in range(3)], axis=0)
-    area = np.where(double > _MIN_HEIGHT * longest, double / 2, 0)
-    normals = cross / np.where(area > 0, double, 1)[:, None]
     pairs, against = face_pairs(faces)
+    area, normals = _areas_and_normals(vertices, faces)
     turned = _orient(pairs, against, len(faces))
     normals *= turned[:, None]
-    angle = np.arccos(np.clip(np.sum(normals[pairs[:, 0]] * normals[pairs[:, 1]], axis=1), -1, 1))
+    angle = np.arccos(np.clip(np.einsum("pi,pi->p", normals[pairs[:, 0]], normals[pairs[:, 1]]), -1, 1))
     mean = area.sum() / max(np.count_nonzero(area), 1) or 1.0
     size = np.where(area > 0, np.maximum(area / mean, _MIN_AREA), 0)
     weights = np.exp(-((angle / _CREASE) ** 4)) * size[pairs].prod(axis=1)
@@ -172,6 +176,17 @@ def vertex_means(values: Float[Array, " faces"], hiding: Hiding, count: int) -> 
     zeros, corners = jnp.zeros(count, values.dtype), hiding.faces
     total, around = zeros.at[corners].add(area), zeros.at[corners].add(area * values[:, None])
     return jnp.where(total > 0, around / jnp.where(total > 0, total, 1), 0)
+
+
+def _areas_and_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Areas of faces and their unit normals, 0 for those that are too flat to have one."""
+    sides = [vertices[faces[:, k]] - vertices[faces[:, k - 1]] for k in range(3)]
+    longest = np.max([_squared(side) for side in sides], axis=0)
+    normals = cross_product(sides[1], sides[2])
+    double = np.sqrt(_squared(normals))
+    area = np.where(double > _MIN_HEIGHT * longest, double / 2, 0)
+    normals /= np.where(area > 0, double, 1)[:, None]
+    return area, normals
 
 
 def _squared(x: Float[np.ndarray, "rows 3"]) -> Float[np.ndarray, " rows"]:

@@ -29,4 +29,4 @@ def stretch(
     before, after = (root(jnp.sum((x[edges[:, 0]] - x[edges[:, 1]]) ** 2, axis=1)) for x in (original, distorted))
     sound = before > 0
     change = jnp.where(sound, jnp.abs(after - before) / jnp.where(sound, before, 1), 0)
-    return percentile(change, jnp.ones_like(change), share)
+    return percentile(change, sound.astype(change.dtype), share)

@@ -22,9 +22,14 @@ Pool = Callable[[], AbstractContextManager[Executor]]
 _MAX_BROKEN_POOLS = 3  # in a row, without finishing a cell
 
 
-def processes(workers: int) -> Pool:
-    """Return a maker of pools of processes, which are spawned because forks of a started JAX would hang."""
-    return lambda: ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+def processes(workers: int, begin: Callable[[], object] | None = None) -> Callable[[], ProcessPoolExecutor]:
+    """Return a maker of pools of processes, which are spawned because forks of a started JAX would hang.
+
+    Args:
+        workers: number of processes.
+        begin: what each calls before its first work, a function at the top level of a module.
+    """
+    return lambda: ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), begin)
 
 
 def run(

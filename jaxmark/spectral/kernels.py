@@ -42,7 +42,7 @@ def installed() -> bool:
 
 
 def where_installed(kernel: Computation, scan: Computation) -> Computation:
-    """A function of an operator and arrays: on processors by a kernel, elsewhere, or if there is none, by a scan.
+    """What computes a function of an operator and arrays on processors: a kernel, or if there is none, a scan.
 
     Args:
         kernel: called with `Rows` and the arrays, of which the last is the signal.
@@ -51,14 +51,7 @@ def where_installed(kernel: Computation, scan: Computation) -> Computation:
 
     def compute(operator: Any, *arrays: Array) -> Array:
         rows = operator.rows(arrays[-1]) if installed() and arrays[-1].size else None
-        if rows is None:
-            return scan(operator, *arrays)
-        # Only the branch of the platform that is compiled for becomes part of the program.
-        return jax.lax.platform_dependent(
-            operator, rows, *arrays,
-            cpu=lambda _, rows, *arrays: kernel(rows, *arrays),
-            default=lambda operator, _, *arrays: scan(operator, *arrays),
-        )  # fmt: skip
+        return scan(operator, *arrays) if rows is None else kernel(rows, *arrays)
 
     return compute
 

@@ -260,8 +260,9 @@ def make_neighbours(
     *,
     weighted: bool,
     if_it_pays: bool = False,
+    slots: int | None = None,
 ) -> Neighbours | None:
-    """Build the table of neighbours, with the number of slots that makes a product cheapest.
+    """Build the table of neighbours.
 
     Args:
         pairs: the edges.
@@ -269,20 +270,22 @@ def make_neighbours(
         order: the vertex of each row of the table; the vertices' own order unless given.
         weighted: whether the edges have weights, which the table then looks up.
         if_it_pays: whether to return None where segment-sums are cheaper.
+        slots: number of slots; by default the even number, or the next one, that makes a product cheapest.
     """
-    rank = None if order is None else np.argsort(order)
+    rank = None if order is None else np.argsort(order).astype(np.int32)
     graph = adjacency(pairs if rank is None else rank[pairs], size)
     head, edge, valence = graph.indices, graph.data, np.diff(graph.indptr)
-    tail = np.repeat(np.arange(size), valence)
-    slot = np.arange(len(tail)) - np.repeat(graph.indptr[:-1], valence)
+    tail = np.repeat(np.arange(size, dtype=np.int32), valence)
+    slot = np.arange(len(tail), dtype=np.int32) - np.repeat(graph.indptr[:-1].astype(np.int32), valence)
     left = len(tail) - np.cumsum(np.bincount(slot))  # number of neighbours without a slot, for one slot, two, …
     addition = _SCATTER_COST_CPU if jax.default_backend() == "cpu" else _SCATTER_COST_ELSEWHERE
     costs = size * np.arange(1, 1 + len(left)) + addition * left + _SCATTER_COST_PER_VERTEX * size * (left > 0)
     if if_it_pays and (len(left) == 0 or costs.min() > addition * len(tail)):
         return None
-    # The number is made even, so that more meshes share the shape of their table.
-    slots = 1 + int(np.argmin(costs)) if len(left) else 0
-    slots += slots % 2
+    if slots is None:
+        # The number is made even, so that more meshes share the shape of their table.
+        slots = 1 + int(np.argmin(costs)) if len(left) else 0
+        slots += slots % 2
     fits = slot < slots
     # An empty slot reads the vertex's own row, which is in the cache already.
     vertices = np.tile(np.arange(size, dtype=np.int32), (slots, 1))
@@ -291,9 +294,9 @@ def make_neighbours(
     if weighted:
         edges = np.full((slots, size), len(pairs), np.int32)
         edges[slot[fits], tail[fits]] = edge[fits]
-    rest = np.stack([tail, head, edge], axis=1)[~fits].astype(np.int32)
+    rest = np.stack([column[~fits] for column in (tail, head, edge)], axis=1).astype(np.int32)
     empty = slots - np.minimum(valence, slots)
-    orders = (None, None) if rank is None or order is None else (order.astype(np.int32), rank.astype(np.int32))
+    orders = (None, None) if rank is None or order is None else (order.astype(np.int32), rank)
     return Neighbours(vertices, empty.astype(np.int32), rest, edges, *orders)
 
 
@@ -304,7 +307,8 @@ def cuthill_mckee(pairs: Int[np.ndarray, "edges 2"], size: int) -> Int64[np.ndar
 
 def adjacency(pairs: Int[np.ndarray, "edges 2"], size: int) -> sparse.csr_array:
     """The adjacency matrix of the edges, with the numbers of the edges as entries."""
-    (tail, head), edge = np.concatenate([pairs, pairs[:, ::-1]]).T, np.tile(np.arange(len(pairs)), 2)
+    pairs = pairs.astype(np.int32, copy=False)
+    (tail, head), edge = np.concatenate([pairs, pairs[:, ::-1]]).T, np.tile(np.arange(len(pairs), dtype=np.int32), 2)
     return sparse.csr_array(sparse.coo_array((edge, (tail, head)), shape=(size, size)))
 
 

@@ -67,7 +67,7 @@ def filter_scan(operator: Operator, coefficients: Array, x: Array) -> Array:
     return operator.leave(_scan_terms(operator, x, coefficients, add, coefficients[0] * x)[0])
 
 
-_filter = where_installed(filter_rows, filter_scan)
+_filter_on_processors = where_installed(filter_rows, filter_scan)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -154,9 +154,10 @@ _change = Linear(
 
 #: f(Δ)x as a function of x: `(operator, c, x)`.
 filtered = Linear(
-    _filter,
+    filter_scan,
     _transposed_filter,
     (_change, lambda operator, c, x, change: of_coefficients(len(c))(operator, x, change)),
+    _filter_on_processors,
 )
 
 
@@ -164,12 +165,13 @@ filtered = Linear(
 def of_coefficients(terms: int) -> Linear:
     """f(Δ)x as a function of its coefficients: `(operator, x, c)`."""
     return Linear(
-        lambda operator, x, c: _filter(operator, c, x),
+        lambda operator, x, c: filter_scan(operator, c, x),
         projection(terms),
         (
             lambda operator, x, c, change: _change(operator, c, x, change),
             lambda operator, x, c, change: filtered(operator, c, change),
         ),
+        lambda operator, x, c: _filter_on_processors(operator, c, x),
     )
 
 
@@ -181,10 +183,12 @@ def projection(terms: int) -> Linear:
         mass = inner_mass(operator, u)
         return projection(terms)(operator, u / mass, mass * change)
 
+    scan = partial(_projection_scan, terms)
     return Linear(
-        where_installed(partial(project_rows, terms), partial(_projection_scan, terms)),
+        scan,
         lambda operator, x, m: of_coefficients(terms)(operator, x, m),
         (_changed_projection(terms), by_signal),
+        where_installed(partial(project_rows, terms), scan),
     )
 
 
@@ -219,9 +223,6 @@ def _components_scan(operator: Operator, c: Array, x: Array) -> Array:
     return jax.vmap(operator.leave)(_scan_terms(operator, x, c.T, add, jnp.multiply.outer(c[:, 0], x))[0])
 
 
-_components = where_installed(component_rows, _components_scan)
-
-
 @jax.jit
 def _synthesis_scan(operator: Operator, c: Array, parts: Array) -> Array:
     """Clenshaw's recurrence, on all parts at once."""
@@ -244,7 +245,7 @@ def _per_column(c: Array, x: Array) -> Array:
 
 #: All g_j(Δ)x as a function of x: `(operator, c, x)`.
 components = Linear(
-    _components,
+    _components_scan,
     lambda operator, c, y: inner_mass(operator, y[0]) * synthesis(operator, c, y / inner_mass(operator, y[0])),
     (
         lambda operator, c, x, change: jax.vmap(_change, (None, 0, None, None))(operator, _per_column(c, x), x, change),
@@ -252,6 +253,7 @@ components = Linear(
             operator, x, _per_column(change, x)
         ),
     ),
+    where_installed(component_rows, _components_scan),
 )
 
 #: Σ_j g_j(Δ)y_j as a function of all y_j: `(operator, c, y)`.

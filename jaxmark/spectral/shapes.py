@@ -11,20 +11,30 @@ from jaxtyping import Shaped
 
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.graphs import Weighting, from_mesh, nearest_pairs
-from jaxmark.spectral.laplacian import Laplacian, Lowering, graph_laplacian
+from jaxmark.spectral.laplacian import Laplacian, Lowering, graph_laplacian, make_neighbours
 
 _MIN_SIZE = 256
-_MAX_DOUBLED_SIZE = 2**11  # up to this, sizes double: running takes next to no time
+_MAX_DOUBLED_SIZE = 2**13  # up to this, sizes double: running takes next to no time
+SURFACE_VALENCE = 3  # edges per vertex of closed surfaces of triangles, which have few holes
 _NEIGHBOURS = 10  # nearest points that each point of a cloud is joined to, at least
+_MAX_COMMON_TABLE = 2**14  # up to this, the number of slots of a table matters less than compiling for another one
 _MAX_PADDED_SIZE = 2**17  # beyond this, running takes longer than compiling
 
 
 def common_size(count: int) -> int:
-    """Round a size up to a power of two from 2^8 on, beyond 2^11 to one of four per octave; from 2^17 on, keep it."""
+    """Round a size up to a power of two from 2^8 on, beyond 2^13 to one of four per octave; from 2^17 on, keep it."""
     step = 1 << max(count - 1, 1).bit_length() >> 3
     if count <= _MAX_DOUBLED_SIZE:
         step = max(_MIN_SIZE, 8 * step)
     return count if count > _MAX_PADDED_SIZE else -(-count // step) * step
+
+
+def common_edges(count: int, size: int, valence: float) -> int:
+    """Round a number of edges up, for a graph of a common size, to as many edges per vertex if that is enough."""
+    if size > _MAX_PADDED_SIZE:
+        return count
+    usual = math.ceil(valence * size)
+    return usual if count <= usual else common_size(count)
 
 
 def pad_rows(rows: Shaped[np.ndarray, " rows *columns"], count: int, value: float = 0) -> Shaped[np.ndarray, "..."]:
@@ -50,8 +60,7 @@ def common_laplacian(mesh: Mesh, weights: Weighting = "valence", lowering: Lower
         # Where one point is near to another, the other mostly is near to the one.
         return pad_edges(graph_laplacian(pairs, common_size(len(vertices)), lowering=lowering), 0.75 * _NEIGHBOURS)
     padded = mesh._replace(vertices=pad_rows(vertices, common_size(len(vertices))))
-    # A closed surface of triangles has about three edges per vertex.
-    return pad_edges(from_mesh(padded, weights, lowering=lowering), 3)
+    return pad_edges(from_mesh(padded, weights, lowering=lowering), SURFACE_VALENCE)
 
 
 def pad_edges(operator: Laplacian, valence: float) -> Laplacian:
@@ -64,14 +73,15 @@ def pad_edges(operator: Laplacian, valence: float) -> Laplacian:
     size, edges = len(operator.degree), np.asarray(operator.edges)
     if size > _MAX_PADDED_SIZE:
         return operator
-    count = math.ceil(valence * size)
-    if len(edges) > count:
-        count = common_size(len(edges))
+    count = common_edges(len(edges), size, valence)
     values = None if operator.weights is None else pad_rows(np.asarray(operator.weights), count)
-    operator = operator._replace(edges=pad_rows(edges, count, size), weights=values)
-    table = operator.neighbours
-    if table is None or not len(table.rest):
-        return operator
-    # In most meshes, fewer neighbours than a sixteenth of the vertices have no slot.
-    rest = max(size // 16, 1 << (len(table.rest) - 1).bit_length())
-    return operator._replace(neighbours=table._replace(rest=pad_rows(np.asarray(table.rest), rest, size)))
+    # In most meshes, fewer neighbours than a sixteenth of the vertices have no slot, if slots are chosen by their cost.
+    table, rest, step = operator.neighbours, max(size // 16, 1), 2
+    if table is not None and size < _MAX_COMMON_TABLE:
+        slots, rest, step = 4 * math.ceil((2 * valence + 1) / 4), max(size // 4, 1), 4
+        table = make_neighbours(edges, size, weighted=values is not None, slots=slots)
+    if table is not None and len(table.rest):
+        while rest < len(table.rest):
+            rest *= step
+        table = table._replace(rest=pad_rows(np.asarray(table.rest), rest, size))
+    return operator._replace(edges=pad_rows(edges, count, size), weights=values, neighbours=table)

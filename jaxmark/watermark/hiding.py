@@ -26,6 +26,7 @@ _LEAST_BEND = 1e-4  # radians that the flattest faces hide in the mean of those 
 _AVERAGING_SCALE = 2  # bends are averaged over 2^2 steps of diffusion
 _SPACING_POINTS = 8  # nearest points whose mean distance says how dense a cloud is
 _LEAST_SPACING, _MOST_SPACING = 0.25, 2.0  # over the median: what denser and looser parts count as
+_ROWS_AT_ONCE = 2**20
 _ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of symmetric matrices
 _PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # of a matrix's entries among them
 _SPACING_SCALE = 5  # spacings are averaged over 2^5 steps of diffusion
@@ -56,25 +57,17 @@ def hiding_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     if len(faces) == 0:
         return _by_spacing(original)
     mesh, size = Mesh(points, faces), len(points)
-    with jax.ensure_compile_time_eval():  # carriers may be made in traced code
-        hiding = make_hiding(points, faces, _BAND + 1)
-        bends = _bends(hiding)
+    shares, height, least = _heights(mesh)
     normals = face_normals(mesh)
-    sides = points[np.roll(faces, -1, axis=1)] - points[faces]
-    along = unit(sides)
-    angles = np.arccos(np.clip(-np.einsum("fci,fci->fc", along, np.roll(along, 1, axis=1)), -1, 1))
-    edge = np.sqrt(4 / np.sqrt(3) * hiding.area * area(mesh))  # of an equilateral triangle
-    bare, masked = hiding.bare[_BAND], hiding.threshold[_BAND]
-    height = edge * np.maximum(np.minimum(masked - bare, bends), _MIN_HIDDEN * bare) / _SLOPE
-    sound = np.flatnonzero(hiding.area)
+    sound = np.flatnonzero(shares)
+    angles = _corner_angles(points, faces)
     form, weight = _sums(faces[sound], angles[sound], _squares(normals[sound], height[sound]), size)
 
     # A border hides what the edge of a solid sheet does: as if a wall stood on it.
-    face, side = np.nonzero(open_sides(faces) & (hiding.area > 0)[:, None])
-    outward = unit(np.cross(sides[face, side], normals[face]))
-    walls = _squares(outward, (edge * _MIN_HIDDEN * bare / _SLOPE)[face])
+    face, side = np.nonzero(open_sides(faces) & (shares > 0)[:, None])
     ends = np.stack([faces[face, side], faces[face, (side + 1) % 3]], axis=1)
-    more, added = _sums(ends, np.full(ends.shape, np.pi / 2), walls, size)
+    outward = unit(np.cross(points[ends[:, 1]] - points[ends[:, 0]], normals[face]))
+    more, added = _sums(ends, np.full(ends.shape, np.pi / 2), _squares(outward, least[face]), size)
     weight += added
     form = (form + more) / np.where(weight > 0, weight, 1)[:, None, None]
 
@@ -95,6 +88,29 @@ def hiding_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     matrices = (vectors / np.sqrt(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
     matrices[~free] = 0
     return matrices / np.sqrt(np.mean(np.sum(matrices[original.used] ** 2, axis=(1, 2))) / 3)
+
+
+def _heights(
+    mesh: Mesh,
+) -> tuple[Float64[np.ndarray, " faces"], Float64[np.ndarray, " faces"], Float64[np.ndarray, " faces"]]:
+    """Each face's share of the area, how high a wave is just noticeable on it, and how high where nothing hides it."""
+    with jax.ensure_compile_time_eval():  # carriers may be made in traced code
+        hiding = make_hiding(mesh.vertices, mesh.faces, _BAND + 1)
+        bends = _bends(hiding)
+    shares = np.asarray(hiding.area)
+    bare, masked = hiding.bare[_BAND], hiding.threshold[_BAND]
+    edge = np.sqrt(4 / np.sqrt(3) * shares * area(mesh))  # of an equilateral triangle
+    least = _MIN_HIDDEN * bare
+    return shares, edge * np.maximum(np.minimum(masked - bare, bends), least) / _SLOPE, edge * least / _SLOPE
+
+
+def _corner_angles(
+    points: Float64[np.ndarray, "points 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float64[np.ndarray, "faces 3"]:
+    """The angles of faces at their corners."""
+    along = [unit(points[faces[:, (k + 1) % 3]] - points[faces[:, k]]) for k in range(3)]
+    cosines = np.stack([-np.einsum("fi,fi->f", along[k], along[k - 1]) for k in range(3)], axis=1)
+    return np.arccos(np.clip(cosines, -1, 1))
 
 
 def _by_spacing(original: Original) -> Float64[np.ndarray, "points 3 3"]:
@@ -130,6 +146,12 @@ def _sums(
     size: int,
 ) -> tuple[Float64[np.ndarray, "points 3 3"], Float64[np.ndarray, " points"]]:
     """Weighted sums of rows' forms at the points of each row, and the sums of the weights."""
-    rows = np.repeat(np.arange(len(points)), points.shape[1])
-    incidence = sparse.csr_array((weights.ravel(), (points.ravel(), rows)), shape=(size, len(points)))
-    return (incidence @ forms)[:, _PLACES], np.asarray(incidence.sum(axis=1))
+    sums, total = np.zeros((size, 6)), np.zeros(size)
+    for start in range(0, len(points), _ROWS_AT_ONCE):  # of large meshes not all at once, which would take more memory
+        some, heavy = (rows[start : start + _ROWS_AT_ONCE] for rows in (points, weights))
+        # Columns of a matrix by columns need not be sorted.
+        starts = np.arange(0, some.size + 1, some.shape[1])
+        incidence = sparse.csc_array((heavy.ravel(), some.ravel(), starts), shape=(size, len(some)))
+        sums += incidence @ forms[start : start + _ROWS_AT_ONCE]
+        total += np.bincount(some.ravel(), heavy.ravel(), size)
+    return sums[:, _PLACES], total

@@ -1,0 +1,100 @@
+"""Files of a folder, worked on by several processes."""
+
+import multiprocessing
+import os
+import signal
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+import jaxmark as jm
+from jaxmark.app.folders import each
+from jaxmark.app.telling import Told
+
+FILES = [Path(f"{name}.ply") for name in "abcdef"]
+
+
+@dataclass
+class Count:
+    """Counts what it was given, and refuses one file."""
+
+    _seen: list[str] = field(default_factory=list)
+
+    def __call__(self, file: Path) -> Told:
+        if file.stem == "c":
+            raise jm.JaxmarkError(f"{file} is not to my liking.")
+        self._seen.append(file.stem)
+        return Told({"worker": os.getpid(), "seen": len(self._seen)}, file.stem)
+
+
+def die(file: Path) -> Told:
+    """As a process does that takes too much memory."""
+    os.kill(os.getpid(), signal.SIGKILL)
+    return Told({}, "")
+
+
+def wait(file: Path) -> Told:
+    """Leave a draft while it works, as jobs do, which is removed whatever ends it."""
+    if file.stem == "f":
+        return Told({}, "")
+    draft = file.with_suffix(".draft")
+    try:
+        draft.touch()
+        time.sleep(60)
+    finally:
+        draft.unlink()
+    return Told({}, "")
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> list[Path]:
+    """Files of different sizes, the largest last."""
+    found = [tmp_path / name for name in FILES]
+    for size, file in enumerate(found):
+        file.write_bytes(bytes(size))
+    return found
+
+
+def test_several_workers_tell_of_each_file(files):
+    told = dict(each(files, Count(), workers=2))
+    assert {file.stem for file in told} == set("abcdef")
+    assert told.pop(files[2]) == Told({"refused": f"{files[2]} is not to my liking."}, told_of_c(files), False, True)
+    # Each worker keeps what it has prepared, and counts on from file to file.
+    by_worker: dict[int, list[int]] = {}
+    for one in told.values():
+        by_worker.setdefault(one.answer["worker"], []).append(one.answer["seen"])
+    assert os.getpid() not in by_worker
+    assert all(sorted(seen) == list(range(1, len(seen) + 1)) for seen in by_worker.values())
+    alone = Count()
+    assert [(file.stem, one.said) for file, one in each(files, alone)] == [
+        (file.stem, told_of_c(files) if file.stem == "c" else file.stem) for file in files
+    ]
+
+
+def told_of_c(files: list[Path]) -> str:
+    return f"refused. {files[2]} is not to my liking."
+
+
+def test_a_worker_that_is_killed_is_told_of(files):
+    with pytest.raises(jm.JaxmarkError, match=r"A worker was killed.*fewer --workers"):
+        list(each(files, die, workers=2))
+    assert_nobody_is_left()
+
+
+def test_whoever_stops_early_leaves_no_process_and_no_draft(files):
+    told = each(files, wait, workers=2)
+    assert next(told)[0] == files[-1]
+    while not list(files[0].parent.glob("*.draft")):
+        time.sleep(0.05)
+    told.close()
+    assert_nobody_is_left()
+    assert not list(files[0].parent.glob("*.draft"))
+
+
+def assert_nobody_is_left() -> None:
+    until = time.monotonic() + 20
+    while multiprocessing.active_children() and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not multiprocessing.active_children()
