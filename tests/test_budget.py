@@ -95,7 +95,7 @@ def test_without_a_word_the_mark_stays_below_what_people_notice(mesh: Mesh, key:
     ],
 )
 def test_the_largest_size_is_found_for_any_rising_metric(rising):
-    found = _largest(rising, 0.01)
+    found = _largest(rising, 0.01, 2e-4)
     assert rising(found) <= 1
     assert 0.88 * 3e-4 < found <= 3e-4
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from jaxmark import distortion
@@ -22,7 +23,7 @@ from jaxmark.watermark.budget import Visibility
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.deposit import Deposit
 from jaxmark.watermark.everyday import AnyScheme, also, name_of, prepare
-from jaxmark.watermark.marking import Marker, detect_any, make_markers
+from jaxmark.watermark.marking import Marker, Survival, detect_any, make_markers
 from jaxmark.watermark.record import Record
 from jaxmark.watermark.scenes import SceneDetection, SceneRecord, detect_scene, load_record, pair
 from jaxmark.watermark.schemes import DEFAULT_SCHEME
@@ -87,34 +88,32 @@ def mark_file(
             # The objects of an OBJ file lie in the same coordinates, and together they may carry what none can alone.
             if original.suffix.lower() != ".obj" or meshes:
                 raise
-    mesh = load_mesh(original)
-    marker, survives = None, None
+    mesh, marker = load_mesh(original), None
     if message is not None:
         marker = prepare(mesh, key, 8 * len(message), scheme)
         result, info = marker.embed(message, budget, limits=limits, visibility=visibility, noise=noise, read_back=False)
-        marker = reader = marker.with_record(info.record)
-        prepared = marker.original
-        said, reads = told_payload(info.record.bits), lambda mesh: reader.reads(mesh, message)
+        marker = marker.with_record(info.record)
+        prepared, said = marker.original, told_payload(info.record.bits)
+        tries = partial(marker.tried, message=message, predicted=info.survives)
     else:
         if scheme != DEFAULT_SCHEME:
             raise JaxmarkError(f"Fingerprints are carried by the scheme {DEFAULT_SCHEME!r}, not {scheme!r}.")
         tracer, name = make_tracer(mesh, key), str(recipient)
         result, info = tracer.fingerprint(name, budget, limits=limits, visibility=visibility)
-        prepared = tracer.marker.original
-        said, reads = f"fingerprint of {recipient}", lambda mesh: tracer.finds(mesh, name)
+        prepared, said = tracer.marker.original, f"fingerprint of {recipient}"
+        tries = partial(tracer.finds, recipient=name)
     with replacing(marked) as draft, replacing(record) as record_draft:
         save_mesh(result, draft, like=original)
         # The mark must read from the written file, whose numbers are rounded.
         written = load_mesh(draft)
-        if not reads(written):
+        survives = tries(written)
+        if not survives:
             if marker is not None and message is not None:
                 marker.check(result, message)
             raise JaxmarkError(
                 f"Rounded to the numbers of {original}, the mark no longer reads; use a larger budget, or a file with"
                 " more digits."
             )
-        if marker is not None and message is not None:
-            survives = marker.tried(written, message, info.survives)
         write_atomically(record_draft, info.record.to_json().encode())
     texture = load_texture(original)
     drift = None if texture is None else distortion.texture_drift(mesh, written, texture)
@@ -125,13 +124,13 @@ def mark_file(
         "bits": info.record.bits,
         "scheme": name_of(scheme),
         "content": info.record.content,
-        "survives": None if survives is None else survives._asdict(),
+        "survives": survives._asdict() if isinstance(survives, Survival) else None,
         "texture_drift": drift,
         "record": str(record),
         "marked": str(marked),
     }
     text = f"{said} → {marked}, RMS {change.rms:.3g} and max {change.max:.3g} of the diagonal; record → {record}"
-    if survives is not None:
+    if isinstance(survives, Survival):
         text += f"; it survives {told_survival(survives)}"
     if drift is not None:
         text += f"; a texture of 2,048 x 2,048 drifts by {drift:.2g} texels"

@@ -74,11 +74,11 @@ def mark_scene(
     fine_enough = number_check(original)
 
     def check(name: str, marker: AnyMarker, result: Mesh, info: EmbedInfo) -> EmbedInfo:
-        """Check that the file's numbers are fine enough for a mark, and what it survives."""
+        """Check that the file's numbers are fine enough for a mark."""
         release_programs()
         fine_enough(name, result)
         markers[name] = marker.with_record(info.record)
-        return info._replace(survives=markers[name].tried(result, message, info.survives))
+        return info
 
     meshes, info = embed_scene(
         scene.meshes,
@@ -91,20 +91,22 @@ def mark_scene(
         scheme=scheme,
         after=check,
     )
+    survives: dict[str, Survival] = {}
     with replacing(marked) as draft, replacing(record) as record_draft:
         remarks = save_scene(meshes, draft, like=original)
         # The marks must read from the written file, whose numbers are rounded.
         written = load_scene(draft).meshes
         for name, marker in markers.items():
-            if not marker.reads(written[name], message):
+            found = marker.tried(written[name], message, info.meshes[name].survives)
+            if found is None:
                 raise JaxmarkError(
                     f"Rounded to the numbers of {original}, the mark of the mesh {name!r} no longer reads; pick the"
                     " others by --mesh."
                 )
+            survives[name] = found
         write_atomically(record_draft, info.record.to_json().encode())
     each = {
-        name: {**_moved(markers[name], written[name]), "survives": one.survives._asdict()}
-        for name, one in info.meshes.items()
+        name: {**_moved(markers[name], written[name]), "survives": survives[name]._asdict()} for name in info.meshes
     }
     left = {**scene.left, **info.left}
     answer = {
@@ -119,7 +121,7 @@ def mark_scene(
         "record": str(record),
         "marked": str(marked),
     }
-    least = Survival(*(min(values) for values in zip(*(one.survives for one in info.meshes.values()), strict=True)))
+    least = Survival(*(min(values) for values in zip(*survives.values(), strict=True)))
     text = (
         f"{told_payload(info.record.bits)} in {len(each)} of {len(each) + len(left)} meshes → {marked}, RMS"
         f" {answer['rms']:.3g} and max {answer['max']:.3g} of their diagonals; record → {record}; the weakest survives"

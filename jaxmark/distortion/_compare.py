@@ -107,13 +107,25 @@ class Reference:
         self.given = host_mesh(original)
         self.length, self.welded = diagonal(self.given), weld(self.given.vertices)
         self.centre = np.asarray(self.given.vertices, np.float64)[used_vertices(self.given)].mean(axis=0)
-        self.mesh = self.at_unit_size(self.given, self.welded, "original")
+        self.used = used_vertices(weld_mesh(self.given, self.welded))  # mask of the distinct points
+        self.mesh = self._at_unit_size(_plain(self.given, self.welded), "original")
         self.faces = np.asarray(self.mesh.faces)
 
-    def at_unit_size(self, mesh: Mesh, points: Weld, name: str) -> Mesh:
-        """The distinct points of a mesh that faces use, moved and scaled as the original is to unit size."""
-        scaled = mesh._replace(vertices=(np.asarray(mesh.vertices, np.float64) - self.centre) / self.length)
-        scaled = _plain(scaled, points)
+    def plain(self, distorted: Mesh, same: bool) -> Mesh:
+        """The distinct points of a mesh that faces use, moved and scaled as the original is to unit size.
+
+        Args:
+            distorted: a mesh of NumPy arrays.
+            same: whether it has the original's connectivity, and so points that are distinct in the original.
+        """
+        if same:
+            points = Mesh(np.asarray(distorted.vertices)[self.welded.first[self.used]], self.faces)
+        else:
+            points = _plain(distorted, weld(distorted.vertices))
+        return self._at_unit_size(points, "distorted mesh")
+
+    def _at_unit_size(self, mesh: Mesh, name: str) -> Mesh:
+        scaled = mesh._replace(vertices=(np.asarray(mesh.vertices) - self.centre) / self.length)
         if len(scaled.faces) and not 0 < area(scaled) < np.inf:
             raise JaxmarkError(f"The {name} has an area of {area(scaled):g}; its shape cannot be compared.")
         return scaled
@@ -163,8 +175,7 @@ class _Pair:
         second = host_mesh(distorted)
         self.reference, self.given = reference, (reference.given, second)
         self.same = same_connectivity(*self.given)
-        points = reference.welded if self.same else weld(second.vertices)
-        self.meshes = reference.mesh, reference.at_unit_size(second, points, "distorted mesh")
+        self.meshes = reference.mesh, reference.plain(second, self.same)
         self.faces = [np.asarray(mesh.faces) for mesh in self.meshes]
         self.x, self.y = (jnp.asarray(mesh.vertices, jnp.float32) for mesh in self.meshes)
 
@@ -293,9 +304,8 @@ def shading_at_vertices(original: Mesh, distorted: Mesh) -> Float[np.ndarray, " 
     pair, hiding = _Pair(reference, distorted), reference.hiding
     if not pair.same:
         raise JaxmarkError("The turn of normals is known only between meshes of the same connectivity.")
-    used = used_vertices(weld_mesh(reference.given, reference.welded))
-    points = np.zeros(len(used), np.float32)
-    points[used] = vertex_means(visible_turn(pair.x, pair.y, hiding), hiding, len(pair.x))
+    points = np.zeros(len(reference.used), np.float32)
+    points[reference.used] = vertex_means(visible_turn(pair.x, pair.y, hiding), hiding, len(pair.x))
     return points[reference.welded.point]
 
 

@@ -261,15 +261,15 @@ def _by_length(series: Float[np.ndarray, "series terms"]) -> list[Float[np.ndarr
 def _hidden(links: Laplacian, normals: Array, length: Array, count: int) -> tuple[Array, Array]:
     """Just noticeable turns in each band, and what they were if nothing hid them, by the means around each face."""
     energy, dtype = jnp.sum(_bands(links, normals, count) ** 2, axis=2), normals.dtype
-    diffusions = _diffusions(count)
-    around, local, start = [], [], 0
-    for some in _by_length(diffusions):
-        rows = jnp.asarray(some, dtype)
-        around.append(filter(links, rows.T, energy[start : start + len(some)].T).T)
-        local.append(band_components(links, rows, length))
+    means, start = [], 0
+    for some in _by_length(_diffusions(count)):
+        # Each band's energy and the lengths are averaged by the same series: columns of one signal.
+        columns = jnp.concatenate([energy[start : start + len(some)], jnp.tile(length, (len(some), 1))]).T
+        means.append(filter(links, jnp.tile(jnp.asarray(some, dtype).T, (1, 2)), columns).T.reshape(2, len(some), -1))
         start += len(some)
-    contrast = math.tan(_INCIDENCE) * root(jnp.concatenate(around))
-    wavelengths = jnp.asarray(_WAVELENGTHS[:count, None], dtype) * jnp.concatenate(local)
+    around, local = jnp.concatenate(means, axis=1)
+    contrast = math.tan(_INCIDENCE) * root(around)
+    wavelengths = jnp.asarray(_WAVELENGTHS[:count, None], dtype) * local
     sensitivity = _sensitivity(jnp.maximum(wavelengths, 1e-9))
     masked = (1 + (_MASKING_SLOPE * contrast * sensitivity) ** _MASKING_BEND) ** (1 / _MASKING_BEND)
     bare = 1 / sensitivity / math.tan(_INCIDENCE)

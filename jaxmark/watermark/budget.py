@@ -36,7 +36,8 @@ CLOUD_VISIBILITY: Mapping[Visibility, Mapping[str, float]] = {
 }
 _FACET, _MOST_OF_FACETS = 0.02, 2.5  # mean edge over the diagonal beyond which a model is one of facets
 _MAX_RMS = 0.01  # displacement in diagonals, if only limits are given; a larger one is no watermark
-FIRST_RMS = 2e-4  # displacement in diagonals that is tried first
+_FIRST_OF_EDGES = 0.04  # displacement over the mean edge that is tried first: limits mostly allow about as much
+_FIRST_OF_CLOUDS = 2e-4  # the same of point clouds, in diagonals
 _MIN_LIMIT_SHARE = 0.99  # share of a limit that is as good as all of it
 _SECANT_STEPS = 10  # then bisection, which cannot fail
 
@@ -74,10 +75,19 @@ def visibility_of(mesh: Mesh) -> Mapping[Visibility, Mapping[str, float]]:
     """
     if not len(mesh.faces):
         return CLOUD_VISIBILITY
-    points, pairs = np.asarray(mesh.vertices, np.float64), edges(mesh.faces)
-    length = np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1).mean() / diagonal(mesh)
-    factor = min(max(length / _FACET, 1.0), _MOST_OF_FACETS)
+    factor = min(max(_mean_edge(mesh) / _FACET, 1.0), _MOST_OF_FACETS)
     return {name: {**limits, "dame": round(factor * limits["dame"], 4)} for name, limits in VISIBILITY.items()}
+
+
+def first_rms(mesh: Mesh) -> float:
+    """The RMS displacement in diagonals that is tried first, where limits say how far a mesh may be displaced."""
+    return _FIRST_OF_EDGES * _mean_edge(mesh) if len(mesh.faces) else _FIRST_OF_CLOUDS
+
+
+def _mean_edge(mesh: Mesh) -> float:
+    """Mean length of an edge over the diagonal."""
+    points, pairs = np.asarray(mesh.vertices, np.float64), edges(mesh.faces)
+    return float(np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1).mean()) / diagonal(mesh)
 
 
 def make_budget(
@@ -125,7 +135,7 @@ def write(
     budget: Budget,
     reference: distortion.Reference | None = None,
     *,
-    first: float = FIRST_RMS,
+    first: float | None = None,
     share: float = _MIN_LIMIT_SHARE,
 ) -> Written:
     """Displace an original as far as a budget allows: to the RMS exactly, or to limits within 1 %, never beyond.
@@ -135,7 +145,7 @@ def write(
         shift: displacement of each point, in diagonals, up to a common factor; not all zero.
         budget: the bounds to keep.
         reference: of the original's mesh, if there is one already: limits are measured against it.
-        first: RMS displacement in diagonals that is tried first, if there are limits.
+        first: RMS displacement in diagonals that is tried first, if there are limits; by default see `first_rms`.
         share: of the limits, as good as all of them: with less, fewer displacements are tried.
 
     Raises:
@@ -154,7 +164,7 @@ def write(
 
     rms = budget.rms or _MAX_RMS
     if budget.limits:
-        rms = _largest(limit_ratio, rms, first, share)
+        rms = _largest(limit_ratio, rms, first or first_rms(original.mesh), share)
         if budget.rms is None and rms == _MAX_RMS:
             raise JaxmarkError(
                 f"Moved by {_MAX_RMS:g} of its diagonal, this mesh still keeps {budget}; give a budget, too."
@@ -166,9 +176,7 @@ def write(
     return Written(marked, rms / size, reached)
 
 
-def _largest(
-    within: Callable[[float], float], most: float, first: float = FIRST_RMS, share: float = _MIN_LIMIT_SHARE
-) -> float:
+def _largest(within: Callable[[float], float], most: float, first: float, share: float = _MIN_LIMIT_SHARE) -> float:
     """Find the largest size, up to `most`, at which a rising function is at most 1; `share` of that will do.
 
     Secant steps in logarithms, because metrics are nearly powers of the size; each step stays between a size that fits

@@ -76,10 +76,6 @@ class CombinedMarker:
         """See `Marker.with_record`."""
         return replace(self, informed=self.informed.with_record(record))
 
-    def reads(self, marked: Mesh, message: bytes) -> bool:
-        """Whether each mark reads; see `Marker.reads`."""
-        return self.informed.reads(marked, message) and all(one.reads(marked, message) for one in self._blinds)
-
     def check(self, marked: Mesh, message: bytes) -> None:
         """Check that each mark reads.
 
@@ -90,9 +86,13 @@ class CombinedMarker:
         for one in self._blinds:
             one.check(marked, message)
 
-    def tried(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival:
+    def tried(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival | None:
         """Try what all marks survive, or with half of the points lost, one of them; see `Marker.tried`."""
-        tried = [one.tried(marked, message, predicted) for one in (self.informed, *self._blinds)]
+        tried: list[Survival] = []
+        for one in (self.informed, *self._blinds):
+            if (found := one.tried(marked, message, predicted)) is None:
+                return None
+            tried.append(found)
         return Survival(min(one.whole for one in tried), max(one.half for one in tried))
 
     @cached_property

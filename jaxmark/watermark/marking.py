@@ -159,11 +159,14 @@ class Marker:
         """The marker that reads a mark it has just made; a blind scheme's then knows what was chosen."""
         return self
 
-    def tried(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival:
+    def tried(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival | None:
         """Try what a mark survives: add noise, lose half of the points, and read; the prediction where it reads.
 
         Where it does not, less noise is tried; 0 if not even a tenth of what was predicted. Messages are read by plain
         correlations, which is quick: joint decoding may read in still more noise.
+
+        Returns:
+            The noise; None if the message does not even read without any.
 
         Args:
             marked: the marked mesh, in the original's order.
@@ -171,6 +174,8 @@ class Marker:
             predicted: from `EmbedInfo`.
         """
         found, rng = alignment.align(self.original, marked, "same"), np.random.default_rng(0)
+        if not self._reads_in_order(found, message):
+            return None
         points, used = self.original.positions, self.original.used
         radius = float(np.linalg.norm(points[used] - points[used].mean(axis=0), axis=1).mean())
         unit = radius * rng.uniform(-1, 1, points.shape)
@@ -205,7 +210,9 @@ class Marker:
         Plain correlations nearly always read a keyed mark that was not attacked. They are tried first, because
         weighting the bands and joint decoding are most of the work of `detect`.
         """
-        aligned = alignment.align(self.original, marked, "same")
+        return self._reads_in_order(alignment.align(self.original, marked, "same"), message)
+
+    def _reads_in_order(self, aligned: Alignment, message: bytes) -> bool:
         observed = self.observe(aligned)
         # `Reader.glance` stands for the scheme's own detector, not for any other.
         quick = self.glance(observed) if self.detector is self.scheme.detector else None

@@ -122,8 +122,10 @@ class BlindMarker:
         found = self.detect(marked)
         return found.message == message if message else found.detected()
 
-    def tried(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival:
+    def tried(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival | None:
         """Try what a mark survives: add noise, lose half of the points, and read; see `Marker.tried`."""
+        if not self.reads(marked, message):
+            return None
         points, rng = np.asarray(marked.vertices, np.float64), np.random.default_rng(0)
         size = radius_of(self.original) * self.original.diagonal
         unit = size * rng.uniform(-1, 1, self.original.positions.shape)[self.original.weld.point]

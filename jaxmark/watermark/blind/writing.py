@@ -26,7 +26,7 @@ from jaxmark.watermark.blind.dither import Dither, make_dither
 from jaxmark.watermark.blind.prediction import Margin, margin, mean_cosine
 from jaxmark.watermark.blind.reading import TAG_BITS, codeword
 from jaxmark.watermark.blind.scheme import AnchoredHost, BlindScheme, Measured, measure
-from jaxmark.watermark.budget import FIRST_RMS, Budget, write
+from jaxmark.watermark.budget import Budget, write
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.hiding import hiding_directions
 from jaxmark.watermark.marking import DEFAULT_BITS, NOISE, Survival
@@ -248,7 +248,7 @@ class Writer:
             shift = self.shift(host, host.values - host.step * self.off(host, dither, word, host.step), 1)
             size = float(distortion.rms(shift[self.original.used]))
             if math.isfinite(size) and size > 0:
-                first = found[-1].size if found else FIRST_RMS
+                first = found[-1].size if found else None
                 scale = write(self.original, shift, budget, reference, first=first, share=_ENOUGH).scale
                 found.append(Allowance(width, host.step * scale, size * scale, host, dither))
         return found
