@@ -142,7 +142,7 @@ def check_tuning() -> None:
     """What only tuning imports is there: of two equal bands, each has half of the budget."""
     import jax.numpy as jnp
 
-    from jaxmark.evaluation.tuning import allocate
+    from jaxmark.evaluation.allocation import allocate
     from jaxmark.watermark.channels import Channels
 
     alike = Channels(jnp.ones((1, 2)), jnp.ones((1, 2)), jnp.ones((1, 2)))

@@ -11,7 +11,7 @@ import pytest
 import jaxmark as jm
 from jaxmark import spectral
 from jaxmark.alignment.original import make_original
-from jaxmark.evaluation.tuning import allocate
+from jaxmark.evaluation.allocation import allocate
 from jaxmark.spectral.chebyshev import band_energies, over_bands
 from jaxmark.watermark.channels import Channels
 from jaxmark.watermark.coding.keys import Choices

@@ -13,7 +13,7 @@ import jaxmark as jm
 from jaxmark.alignment.observation import observe
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.distortion import msdm, msdm_views
-from jaxmark.evaluation import tuning
+from jaxmark.evaluation import allocation
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import band_energies, gram
 from jaxmark.spectral.laplacian import Laplacian
@@ -202,7 +202,7 @@ def test_products_of_tuning(original, key: jm.Key):
     for solver in ("projected-gradient", "accelerated-gradient"):
 
         def best(measured, cost, solver=solver):
-            return jnp.sum(tuning.allocate(measured, cost, solver=solver, steps=5))
+            return jnp.sum(allocation.allocate(measured, cost, solver=solver, steps=5))
 
         check_products(jax.value_and_grad(best, argnums=(0, 1)), measured, jnp.ones(len(family)))
 

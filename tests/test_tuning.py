@@ -12,7 +12,8 @@ from scipy import optimize
 import jaxmark as jm
 from jaxmark.alignment.observation import observe
 from jaxmark.alignment.original import make_original
-from jaxmark.evaluation.tuning import allocate, tune, upper_bound
+from jaxmark.evaluation.allocation import allocate, upper_bound
+from jaxmark.evaluation.tuning import tune
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.watermark.carriers.reception import make_host, make_receiver
@@ -153,7 +154,7 @@ def test_differentiable_with_respect_to_budget_and_strength(x64):
 def test_jaxopt_is_imported_late_and_without_its_warning():
     code = (
         "import warnings; warnings.simplefilter('error'); import sys, jaxmark, jax.numpy as jnp;"
-        "from jaxmark.evaluation.tuning import Channels, allocate; assert 'jaxopt' not in sys.modules;"
+        "from jaxmark.evaluation.allocation import Channels, allocate; assert 'jaxopt' not in sys.modules;"
         "one = jnp.ones((1, 3)); print(allocate(Channels(one, one, one), jnp.ones(3), 1.0))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

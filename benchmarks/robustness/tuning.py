@@ -1,11 +1,12 @@
-"""What tuning the bands is worth: python benchmarks/robustness/tuning.py [MESH...] --train MESH... [--limit ...].
+"""What tuning the bands is worth: python benchmarks/robustness/tuning.py [MESH...] [--train MESH...] [--limit ...].
 
 For each mesh and limit, marks of equal distortion: flat over the whole spectrum, low-pass by hand, the library's
-default, the mean profile of the training meshes (never those reported on), and tuned on the mesh itself. Each is
-attacked with seeds that tuning has not seen. The margin is the evidence for a claimed message in nats, S²/2‖a‖², and
-the bound is what no profile of these bands exceeds on the measured channels. --strengths adds the largest strength of
-each kind of attack from which a message of --bits bits still reads. Without meshes to report on, only the mean profile
-is printed: so the library's default is derived (`schemes.DERIVED`).
+default, the mean profile of the training meshes (never those reported on), tuned on the mesh itself, and --around
+profiles whose strengths differ from the tuned ones by chance. Each is attacked with seeds, and written with keys, that
+tuning has not seen. The margin is the evidence for a claimed message in nats, S²/2‖a‖², and the bound is what no
+profile of these bands exceeds on the measured channels. --strengths adds the largest strength of each kind of attack
+from which a message of --bits bits still reads. Without meshes to report on, only the mean profile is printed: so the
+library's default is derived (`schemes.DERIVED`).
 """
 
 import argparse
@@ -31,25 +32,35 @@ from common.strengths import largest
 from common.tables import Row, head, line, save_json, say
 from common.timing import timed
 
-ATTACKS = [
-    *(("noise", 0.005), ("noise", 0.001)),
-    *(("smoothing", 10), ("smoothing", 50)),
-    *(("quantisation", 8), ("quantisation", 9)),
-]
+ATTACKS = ["noise=0.005", "noise=0.001", "smoothing=10", "smoothing=50", "quantisation=8", "quantisation=9"]
+TRIED_CHANNELS = "tried of the channels' best"
 LOW_PASS = (8, 12, 16, 20, 24, 32)
 LIMITS = ["rms=0.0008", "gl=0.0002", "dame=0.008", "msdm2=0.12"]
 UNSEEN = 1000  # first seed of the attacks reported
+SPREAD = 0.3  # standard deviation of the logarithms of strengths around tuned ones
 
 
-def tuned_on(mesh: Mesh, limits: Mapping[str, float], bits: int) -> Tuned:
+def strength(word: str) -> tuple[str, float]:
+    """An attack and its strength, KIND=STRENGTH."""
+    kind, value = word.split("=")
+    return kind, float(value)
+
+
+def tuned_on(mesh: Mesh, limits: Mapping[str, float], options: argparse.Namespace) -> Tuned:
     key = jax.random.key(0)
-    return tune(mesh, ATTACKS, limits=limits, key=key, margin="evidence", bits=bits)
+    return tune(mesh, options.attacks, limits=limits, key=key, margin="evidence", bits=options.bits)
 
 
-def profiles(mesh: Mesh, mean: KeyedScheme, own: Tuned) -> dict[str, Scheme]:
-    by_hand = {f"low-pass {bands}": KeyedScheme(profile=(1.0,) * bands) for bands in LOW_PASS}
-    flat = {"flat": KeyedScheme(profile=(1.0,) * KeyedScheme.bands)}
-    return {**flat, **by_hand, "default": KeyedScheme(), "mean of the training meshes": mean, "tuned": own.scheme}
+def profiles(mesh: Mesh, mean: KeyedScheme | None, own: Tuned, around: int, bits: int) -> dict[str, Scheme]:
+    found: dict[str, Scheme] = {"flat": KeyedScheme(profile=(1.0,) * KeyedScheme.bands)}
+    found |= {f"low-pass {bands}": KeyedScheme(profile=(1.0,) * bands) for bands in LOW_PASS}
+    if mean is not None:
+        found["mean of the training meshes"] = mean
+    strengths, random = own.beta[: 1 + np.flatnonzero(own.beta)[-1]], np.random.default_rng(0)
+    for number in range(around):
+        changed = strengths * np.exp(SPREAD * random.normal(size=len(strengths)))
+        found[f"around {number}"] = KeyedScheme(profile=tuple(map(float, changed / changed.max())))
+    return {**found, "default": KeyedScheme(), "tuned": own.scheme}
 
 
 def average(found: list[Tuned]) -> KeyedScheme:
@@ -60,21 +71,25 @@ def average(found: list[Tuned]) -> KeyedScheme:
     return KeyedScheme(profile=tuple(float(f"{value:.2f}") for value in kept))
 
 
-def evidence(mesh: Mesh, scheme: Scheme, limits: Mapping[str, float], bits: int, seeds: int) -> list[float]:
-    """Nats for a claimed message after each attack, the mean over seeds."""
-    marker = jm.make_marker(mesh, KEY, bits=bits, scheme=scheme)
-    word = marker.codeword(bytes(bits // 8))
-    marked, _ = marker.write(word, make_budget(limits=limits))
-    claimed = jnp.asarray(word, marker.original.signal.dtype)
-    found = []
-    for kind, strength in ATTACKS:
-        nats = []
-        for seed in range(seeds):
-            suspect = jm.attack(marked, kind, strength, seed=UNSEEN + seed)
-            score, norm = marker.reader.claim(marker.receive(suspect), claimed)
-            nats.append(float(score) ** 2 / (2 * float(norm) ** 2))
-        found.append(float(np.mean(nats)))
-    return found
+def evidence(
+    mesh: Mesh, scheme: Scheme, limits: Mapping[str, float], options: argparse.Namespace
+) -> tuple[list[float], float]:
+    """Nats for a claimed message after each attack, the mean over keys and seeds; and the share of messages read."""
+    found, read = np.zeros((options.keys, options.seeds, len(options.attacks))), []
+    for number in range(options.keys):
+        key = KEY if number == 0 else jm.Key(bytes([number] * 32))
+        marker = jm.make_marker(mesh, key, bits=options.bits, scheme=scheme)
+        message = bytes(options.bits // 8)
+        word = marker.codeword(message)
+        marked, _ = marker.write(word, make_budget(limits=limits))
+        claimed = jnp.asarray(word, marker.original.signal.dtype)
+        for seed in range(options.seeds):
+            for place, (kind, strength) in enumerate(options.attacks):
+                received = marker.receive(jm.attack(marked, kind, strength, seed=UNSEEN + seed))
+                score, norm = marker.reader.claim(received, claimed)
+                found[number, seed, place] = max(float(score), 0) ** 2 / (2 * float(norm) ** 2)
+                read.append(marker.decode(marker.soft_values(received)) == message)
+    return found.mean(axis=(0, 1)).tolist(), float(np.mean(read))
 
 
 def strengths(mesh: Mesh, scheme: Scheme, limits: Mapping[str, float], bits: int, seeds: int) -> list[str]:
@@ -88,14 +103,14 @@ def strengths(mesh: Mesh, scheme: Scheme, limits: Mapping[str, float], bits: int
 
 
 def reported(
-    source: Path, mesh: Mesh, limits: Mapping[str, float], mean: KeyedScheme, options: argparse.Namespace
+    source: Path, mesh: Mesh, limits: Mapping[str, float], mean: KeyedScheme | None, options: argparse.Namespace
 ) -> list[Row]:
-    own, seconds = timed(tuned_on, mesh, limits, options.bits)
+    own, seconds = timed(tuned_on, mesh, limits, options)
     rows: list[Row] = []
-    for name, scheme in profiles(mesh, mean, own).items():
+    for name, scheme in profiles(mesh, mean, own, options.around, options.bits).items():
         row: Row = {"mesh": source.name, "limit": limits, "profile": name}
         try:
-            row["nats"] = evidence(mesh, scheme, limits, options.bits, options.seeds)
+            row["nats"], row["read"] = evidence(mesh, scheme, limits, options)
             if options.strengths:
                 row["strengths"] = strengths(mesh, scheme, limits, options.bits, options.seeds)
         except jm.JaxmarkError as error:
@@ -103,6 +118,11 @@ def reported(
         rows.append(row)
         say(*row.values())
     rows[-1] |= {
+        "attacks": options.attacks,
+        "tried": own.report.tried.tolist(),
+        TRIED_CHANNELS: own.report.tried_channels.tolist(),
+        "tried of the default": own.report.tried_default.tolist(),
+        "kept": own.report.kept,
         "bound": own.report.bound,
         "model": float(own.report.margins.min()),
         "gap": own.report.gap,
@@ -117,8 +137,10 @@ def table(rows: list[Row]) -> str:
     last = rows[-1]
     limit = ", ".join(f"{name} {value:g}" for name, value in last["limit"].items())
     by_hand = [row for row in rows if row["profile"].startswith(("low-pass", "flat")) and "nats" in row]
+    default = next(min(row["nats"]) for row in rows if row["profile"] == "default" and "nats" in row)
     best = max(min(row["nats"]) for row in by_hand) if by_hand else float("nan")
-    heads = [f"{kind} {strength:g}" for kind, strength in ATTACKS] + ["worst", "over the best by hand"]
+    heads = [f"{kind} {strength:g}" for kind, strength in last["attacks"]]
+    heads += ["worst", "over the best by hand", "over the default", "read"]
     if any("strengths" in row for row in rows):
         heads += ["largest noise", "steps of 0.5", "Taubin pairs", "bits of quantisation"]
     text = [f"## {last['mesh']}, {limit}", "", head("profile", *heads)]
@@ -127,11 +149,14 @@ def table(rows: list[Row]) -> str:
             cells = [row["refused"]] + [""] * (len(heads) - 1)
         else:
             worst = min(row["nats"])
-            cells = [*(f"{nats:.0f}" for nats in row["nats"]), f"{worst:.0f}", f"{worst / best:.2f}"]
+            cells = [*(f"{nats:.1f}" for nats in row["nats"]), f"{worst:.1f}", f"{worst / best:.2f}"]
+            cells += [f"{worst / default:.2f}", f"{row['read']:.0%}"]
             cells += row.get("strengths", [])
         text.append(line(row["profile"], *cells))
     note = (
-        f"Tuned in {last['seconds']:.1f} s: {last['model']:.0f} nats on the measured channels, no profile above"
+        f"Tuned in {last['seconds']:.1f} s: by trials {min(last['tried']):.1f} nats, the default"
+        f" {min(last['tried of the default']):.1f}, the best by channels"
+        f" {min(last[TRIED_CHANNELS]):.1f}; on the channels themselves {last['model']:.0f}, no profile above"
         f" {last['bound']:.0f} (gap {last['gap']:.2%})."
     )
     return "\n".join([*text, "", note, ""])
@@ -140,7 +165,10 @@ def table(rows: list[Row]) -> str:
 def main() -> None:
     parser = make_parser(__doc__)
     add_meshes(parser, nargs="*")
-    parser.add_argument("--train", nargs="+", type=Path, required=True, help="meshes whose mean profile is tried")
+    parser.add_argument("--train", nargs="+", type=Path, default=[], help="meshes whose mean profile is tried")
+    parser.add_argument("--attacks", nargs="+", type=strength, default=list(map(strength, ATTACKS)))
+    parser.add_argument("--around", type=int, default=0, help="profiles around the tuned one")
+    parser.add_argument("--keys", type=int, default=1)
     parser.add_argument("--limit", nargs="+", default=LIMITS, metavar="NAME=VALUE")
     parser.add_argument("--bits", type=int, default=16)
     parser.add_argument("--seeds", type=int, default=1)
@@ -153,8 +181,9 @@ def main() -> None:
     for limit in options.limit:
         name, value = limit.split("=")
         limits = {name: float(value)}
-        mean = average([tuned_on(mesh, limits, options.bits) for mesh in train])
-        print(f"Mean profile of the training meshes, {limit}: {mean.profile}\n", flush=True)
+        mean = average([tuned_on(mesh, limits, options) for mesh in train]) if train else None
+        if mean is not None:
+            print(f"Mean profile of the training meshes, {limit}: {mean.profile}\n", flush=True)
         for source in options.meshes:
             mesh = jm.load_mesh(source)
             assert make_original(mesh).geometry not in known, f"{source} is a training mesh"

@@ -141,6 +141,10 @@ class TunableScheme(Scheme, Protocol):
         """Factor on each vertex's displacement, or symmetric matrix `[3, 3]`; None if it is 1 everywhere."""
         ...
 
+    def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> KeyedCarrier:
+        """See `Scheme`; its strengths are those of the profile."""
+        ...
+
     def receiver(self, original: Original, bits: int) -> Receiver:
         """Make the receiver of marks with a payload, with all bands of `family`."""
         ...

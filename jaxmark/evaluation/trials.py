@@ -1,0 +1,233 @@
+"""Marks that are written, attacked and read with signs of nobody's key: what strengths are worth to the detector.
+
+Channels (`jaxmark.watermark.channels`) say which strengths are best for a model of attacks, limits and reader, quickly
+and with a proof. Trials leave nothing out, and `Trials.ascend` differentiates them: from strengths to the mark within
+its limits, to what each attack leaves of it, to the weights that the reader gives the bands, to the claim.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import cycle
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float64, Int8
+
+from jaxmark import distortion
+from jaxmark.alignment.alignment import align, observation
+from jaxmark.alignment.observation import Observation
+from jaxmark.alignment.original import Original, displace
+from jaxmark.evaluation.allocation import import_jaxopt
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.budget import Budget, write
+from jaxmark.watermark.carriers.keyed import KeyedCarrier, KeyedReader
+from jaxmark.watermark.channels import Margin, measure
+from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key
+from jaxmark.watermark.schemes import TunableScheme
+
+Attack = Callable[[Mesh], Mesh]  # an attack of some strength, with a seed of its own
+
+_KEYS = 3  # whose marks are tried, each with the opposite mark
+_SHARPNESS = 50.0  # of the soft minimum over attacks, over the least worth
+_SHAPES = 5  # cosines over the bands that strengths are changed by: more would fit what is chance in each band
+_STEPS, _TRIES = 5, 5  # of the gradient, and of the size of each step, before marks are tried again
+_REACH = 0.7  # logarithm of the factor by which each cosine changes strengths until then
+_LEAST_GAIN = 1.05  # of the worth of the worst attack, for which an ascent goes on
+
+
+class Trial(NamedTuple):
+    """Marks of one profile of strengths, each attack applied to them, and what the detector makes of that."""
+
+    scheme: TunableScheme
+    reader: KeyedReader
+    word: Float[Array, " code"]  # of all marks
+    signs: tuple[Int8[Array, "vertices channels"], ...]  # of each mark
+    scale: float  # factor on the carrier's displacement, within the limits, in diagonals
+    used: Float64[np.ndarray, " limits"]  # share of each limit that the first mark uses up
+    seen: tuple[tuple[Observation, ...], ...]  # for each attack, copies of all marks, seed by seed
+    worth: Float64[np.ndarray, " attacks"]
+
+    @property
+    def worst(self) -> float:
+        """The worth after the worst attack."""
+        return float(self.worth.min())
+
+    @property
+    def strengths(self) -> Float64[np.ndarray, " passing"]:
+        """Strength of each band of the pass band, in diagonals."""
+        return self.scale * np.asarray(self.reader.carrier.profile, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """What strengths are worth on one original, by attacks and limits; all profiles are tried alike."""
+
+    original: Original
+    bits: int
+    bounds: Budget
+    attacks: Sequence[Sequence[Attack]]  # with one or more seeds each
+    margin: Margin
+
+    def run(self, scheme: TunableScheme) -> Trial:
+        """Write, attack and read marks of a scheme.
+
+        Each mark is tried beside its opposite: what attacks have in common with its signs by chance cancels, so that
+        few marks tell two profiles apart.
+
+        Raises:
+            JaxmarkError: if the payload does not fit, a limit cannot be kept, or a suspect cannot be aligned.
+        """
+        original = self.original
+        code = scheme.code_length(original, self.bits)
+        carrier = scheme.carrier(original, Choices(Key(bytes(KEY_BYTES)), b""), self.bits, code)
+        word = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], code), original.signal.dtype)
+        drawn = [carrier, *(carrier.redraw(jax.random.key(number)) for number in range(1, _KEYS))]
+        shifts = [original.to_host(one.displacement(word)) for one in drawn]
+        written = write(original, shifts[0], self.bounds, self._reference)
+        marks = [displace(original, sign * written.scale * shift) for shift in shifts for sign in (1, -1)]
+        signs = tuple(sign * jnp.asarray(one.chips.signs) for one in drawn for sign in (1, -1))
+        seen = tuple(
+            tuple(observation(original, align(original, one(mark))) for one in seeds for mark in marks)
+            for seeds in self.attacks
+        )
+        used, reader = self._used(written.mesh, written.moved.rms), carrier.reader()
+        trial = Trial(scheme, reader, word, signs, written.scale, used, seen, np.zeros(0))
+        return trial._replace(worth=np.array([self._worth(trial, copies) for copies in seen]))
+
+    def ascend(self, start: Trial, cost: Float64[np.ndarray, "limits bands"]) -> Trial:
+        """Change strengths as the gradient of what is left after the worst attack says, as long as trials agree.
+
+        Args:
+            start: the strengths to start from.
+            cost: share of each limit, squared, that β_j² = 1 uses up in band j.
+
+        Returns:
+            The best trial, which is the first one if no other is better.
+        """
+        best, found = start, self.run(self._improved(start, cost))
+        while found.worst > _LEAST_GAIN * best.worst:
+            best, found = found, self.run(self._improved(found, cost))
+        return best
+
+    def _improved(self, at: Trial, cost: Float64[np.ndarray, "limits bands"]) -> TunableScheme:
+        """The scheme with the strengths that are best by what was seen of others, which are not far."""
+        carrier, dtype = at.reader.carrier, at.word.dtype
+        base = jnp.asarray(carrier.profile)
+        marks = [at.scale * _with_signs(carrier, signs).displacement(at.word) for signs in at.signs]
+        most = max((one.nuisance.shape[1] for some in at.seen for one in some if one.nuisance is not None), default=0)
+        copies: dict[object, list[_Copy]] = {}
+        for number, suspects in enumerate(at.seen):
+            pairs = list(zip(suspects, cycle(zip(at.signs, marks, strict=True)), strict=False))
+            gains = [measure(at.reader.receiver, one, mark).gain[0] for one, (_, mark) in pairs]
+            gain = sum(gains[1:], gains[0]) / len(gains)
+            for one, (signs, _) in pairs:
+                copy = _Copy(_widened(one, most), gain, signs, jnp.asarray(number))
+                copies.setdefault(jax.tree.structure(copy), []).append(copy)
+        groups = tuple(jax.tree.map(lambda *leaves: jnp.stack(leaves), *some) for some in copies.values())
+        limits = _Limits(jnp.asarray(cost[:, : len(base)], dtype), jnp.asarray(at.used / at.used.max(), dtype))
+        level = 1 / max(at.worst, 1e-3)
+        strengths = np.asarray(_climb(at.reader, at.word, at.scale, groups, limits, level, len(at.seen)), np.float64)
+        return at.scheme.with_profile(tuple(float(f"{value:.4g}") for value in strengths / strengths.max()))
+
+    def _worth(self, trial: Trial, copies: Sequence[Observation]) -> float:
+        """What is left after an attack, in the unit of the margin."""
+        carrier, word = trial.reader.carrier, trial.word
+        readers = cycle([trial.reader.with_carrier(_with_signs(carrier, signs)) for signs in trial.signs])
+        pairs = [(reader, reader.receive(one)) for one, reader in zip(copies, readers, strict=False)]
+        if self.margin == "rate":
+            soft = [np.asarray(word * trial.scheme.detector(*pair, 1.0), np.float64) for pair in pairs]
+            ratio = max(np.mean(soft), 0) / (np.std(soft) or 1)
+            return float(len(word) / 2 * np.log2(1 + ratio**2))
+        claims = [reader.claim(received, word) for reader, received in pairs]
+        return float(max(np.mean([float(one.score) / (float(one.norm) or 1) for one in claims]), 0) ** 2 / 2)
+
+    def _used(self, marked: Mesh, moved: float) -> Float64[np.ndarray, " limits"]:
+        """The share of each limit that a mark uses up, the RMS budget's last."""
+        found = self._reference.measure(marked, self.bounds.limits.keys())
+        shares = [(found[metric] or 0.0) / limit for metric, limit in self.bounds.limits.items()]
+        return np.array(shares + ([moved / self.bounds.rms] if self.bounds.rms is not None else []))
+
+    @cached_property
+    def _reference(self) -> distortion.Reference:
+        return distortion.Reference(self.original.mesh)
+
+
+class _Copy(NamedTuple):
+    """An attacked copy of a mark, as it was seen."""
+
+    seen: Observation
+    gain: Float[Array, " passing"]  # share of the mark's amplitude that the attack leaves in each band
+    signs: Int8[Array, "vertices channels"]  # of the mark
+    attack: Array  # its number
+
+
+class _Limits(NamedTuple):
+    cost: Float[Array, "limits passing"]  # see `Trials.ascend`
+    used: Float[Array, " limits"]  # at the strengths that were tried, over the largest
+
+    def scale(self, strengths: Float[Array, " passing"], base: Float[Array, " passing"]) -> Float[Array, ""]:
+        """Factor that brings strengths within the limits, as a share of that of the strengths that were tried.
+
+        Limits rise as the root of the sum of what bands use up of them; the metrics themselves say where they stand.
+        """
+        share = jnp.sqrt((self.cost @ strengths**2) / (self.cost @ base**2))
+        return 1 / jnp.max(self.used * share)
+
+
+def _with_signs(carrier: KeyedCarrier, signs: Int8[Array, "vertices channels"]) -> KeyedCarrier:
+    return carrier._replace(chips=carrier.chips._replace(signs=signs))
+
+
+def _widened(seen: Observation, columns: int) -> Observation:
+    """The same with so many columns of nuisance, if it has any: the reader drops zeros, and one program serves all."""
+    if seen.nuisance is None:
+        return seen
+    return seen._replace(nuisance=jnp.pad(seen.nuisance, ((0, 0), (0, columns - seen.nuisance.shape[1]))))
+
+
+@partial(jax.jit, static_argnames="attacks")
+def _climb(
+    reader: KeyedReader,
+    word: Float[Array, " code"],
+    scale: float,
+    groups: tuple[_Copy, ...],
+    limits: _Limits,
+    level: float,
+    attacks: int,
+) -> Float[Array, " passing"]:
+    """The strengths that leave most after the worst attack, of those that differ smoothly, and not by much."""
+    jaxopt = import_jaxopt()
+    base = jnp.asarray(reader.carrier.profile)
+    places = (jnp.arange(len(base)) + 0.5) / len(base)
+    shapes = jnp.cos(jnp.pi * jnp.outer(places, jnp.arange(1.0, _SHAPES + 1))).astype(base.dtype)
+
+    def loss(change: Array) -> Array:
+        strengths = base * jnp.exp(shapes @ change)
+        factor = scale * limits.scale(strengths, base)
+        left = factor * strengths - scale * base
+
+        def ratio(copy: _Copy) -> Array:
+            """S/‖a‖, where noise and what happened to the host stay as they were."""
+            carrier = _with_signs(reader.carrier, copy.signs)
+            moved = carrier.with_bands(copy.gain * left).displacement(word)
+            changed = reader.with_carrier(carrier.with_bands(strengths))
+            received = changed.receive(copy.seen._replace(residual=copy.seen.residual + moved))
+            score, norm = changed.claim(received, word)
+            return score / norm
+
+        ratios = jnp.concatenate([jax.lax.map(ratio, some) for some in groups])
+        which = jnp.concatenate([some.attack for some in groups])
+        mean = jax.ops.segment_sum(ratios, which, attacks) / jax.ops.segment_sum(jnp.ones_like(ratios), which, attacks)
+        nats = jnp.maximum(mean, 0) ** 2 / 2
+        return jax.nn.logsumexp(-_SHARPNESS * nats * level) / _SHARPNESS
+
+    with jax.numpy_dtype_promotion("standard"):  # jaxopt mixes integers into its floats
+        solver = jaxopt.ProjectedGradient(
+            loss, jaxopt.projection.projection_box, maxiter=_STEPS, maxls=_TRIES, tol=1e-4
+        )
+        most = jnp.full(_SHAPES, _REACH, base.dtype)
+        change = solver.run(jnp.zeros(_SHAPES, base.dtype), hyperparams_proj=(-most, most)).params
+    return base * jnp.exp(shapes @ change)
