@@ -28,7 +28,7 @@ from jaxmark.watermark.channels import Margin, measure
 from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key
 from jaxmark.watermark.schemes import TunableScheme
 
-Attack = Callable[[Mesh], Mesh]  # an attack of some strength, with a seed of its own
+Attack = Callable[[Mesh, int], Mesh]  # an attack of some strength on a mesh, with a seed
 
 _KEYS = 3  # whose marks are tried, each with the opposite mark
 _SHARPNESS = 50.0  # of the soft minimum over attacks, over the least worth
@@ -68,14 +68,20 @@ class Trials:
     original: Original
     bits: int
     bounds: Budget
-    attacks: Sequence[Sequence[Attack]]  # with one or more seeds each
+    attacks: Sequence[Attack]
+    seeds: Sequence[int]
     margin: Margin
 
-    def run(self, scheme: TunableScheme) -> Trial:
+    def run(self, scheme: TunableScheme, *, practice: bool = False) -> Trial:
         """Write, attack and read marks of a scheme.
 
         Each mark is tried beside its opposite: what attacks have in common with its signs by chance cancels, so that
         few marks tell two profiles apart.
+
+        Args:
+            scheme: the scheme with its strengths.
+            practice: whether to use other signs and seeds, those that strengths may be fitted to: what is good for
+                these by chance is not for the others.
 
         Raises:
             JaxmarkError: if the payload does not fit, a limit cannot be kept, or a suspect cannot be aligned.
@@ -84,14 +90,19 @@ class Trials:
         code = scheme.code_length(original, self.bits)
         carrier = scheme.carrier(original, Choices(Key(bytes(KEY_BYTES)), b""), self.bits, code)
         word = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], code), original.signal.dtype)
-        drawn = [carrier, *(carrier.redraw(jax.random.key(number)) for number in range(1, _KEYS))]
+        first = _KEYS if practice else 0
+        drawn = [carrier.redraw(jax.random.key(first + number)) for number in range(_KEYS)]
         shifts = [original.to_host(one.displacement(word)) for one in drawn]
         written = write(original, shifts[0], self.bounds, self._reference)
         marks = [displace(original, sign * written.scale * shift) for shift in shifts for sign in (1, -1)]
         signs = tuple(sign * jnp.asarray(one.chips.signs) for one in drawn for sign in (1, -1))
         seen = tuple(
-            tuple(observation(original, align(original, one(mark))) for one in seeds for mark in marks)
-            for seeds in self.attacks
+            tuple(
+                observation(original, align(original, one(mark, seed + practice)))
+                for seed in self.seeds
+                for mark in marks
+            )
+            for one in self.attacks
         )
         used, reader = self._used(written.mesh, written.moved.rms), carrier.reader()
         trial = Trial(scheme, reader, word, signs, written.scale, used, seen, np.zeros(0))
@@ -112,8 +123,9 @@ class Trials:
             best, found = found, self.run(self._improved(found, cost))
         return best
 
-    def _improved(self, at: Trial, cost: Float64[np.ndarray, "limits bands"]) -> TunableScheme:
-        """The scheme with the strengths that are best by what was seen of others, which are not far."""
+    def _improved(self, tried: Trial, cost: Float64[np.ndarray, "limits bands"]) -> TunableScheme:
+        """The scheme with the strengths that are best by what is seen of others, which are not far."""
+        at = self.run(tried.scheme, practice=True)
         carrier, dtype = at.reader.carrier, at.word.dtype
         base = jnp.asarray(carrier.profile)
         marks = [at.scale * _with_signs(carrier, signs).displacement(at.word) for signs in at.signs]
@@ -128,8 +140,8 @@ class Trials:
                 copies.setdefault(jax.tree.structure(copy), []).append(copy)
         groups = tuple(jax.tree.map(lambda *leaves: jnp.stack(leaves), *some) for some in copies.values())
         limits = _Limits(jnp.asarray(cost[:, : len(base)], dtype), jnp.asarray(at.used / at.used.max(), dtype))
-        level = 1 / max(at.worst, 1e-3)
-        strengths = np.asarray(_climb(at.reader, at.word, at.scale, groups, limits, level, len(at.seen)), np.float64)
+        scale, level = (jnp.asarray(number, dtype) for number in (at.scale, 1 / max(at.worst, 1e-3)))
+        strengths = np.asarray(_climb(at.reader, at.word, scale, groups, limits, level, len(at.seen)), np.float64)
         return at.scheme.with_profile(tuple(float(f"{value:.4g}") for value in strengths / strengths.max()))
 
     def _worth(self, trial: Trial, copies: Sequence[Observation]) -> float:
@@ -192,17 +204,17 @@ def _widened(seen: Observation, columns: int) -> Observation:
 def _climb(
     reader: KeyedReader,
     word: Float[Array, " code"],
-    scale: float,
+    scale: Float[Array, ""],
     groups: tuple[_Copy, ...],
     limits: _Limits,
-    level: float,
+    level: Float[Array, ""],
     attacks: int,
 ) -> Float[Array, " passing"]:
     """The strengths that leave most after the worst attack, of those that differ smoothly, and not by much."""
     jaxopt = import_jaxopt()
     base = jnp.asarray(reader.carrier.profile)
-    places = (jnp.arange(len(base)) + 0.5) / len(base)
-    shapes = jnp.cos(jnp.pi * jnp.outer(places, jnp.arange(1.0, _SHAPES + 1))).astype(base.dtype)
+    places = (np.arange(len(base)) + 0.5) / len(base)
+    shapes = jnp.asarray(np.cos(np.pi * np.outer(places, np.arange(1, _SHAPES + 1))), base.dtype)
 
     def loss(change: Array) -> Array:
         strengths = base * jnp.exp(shapes @ change)

@@ -34,6 +34,7 @@ from jaxmark.watermark.visibility import apply_mask, band_visibility
 Attacker = tuple[Kind, float] | Callable[[Mesh, int], Mesh]  # an attack and a strength, or (mesh, seed) → mesh
 
 
+_LOW_PASS = (1 / 8, 3 / 16, 1 / 4, 3 / 8)  # shares of the spectrum that are tried with equal strengths
 _LEAST_GAIN = 1.1  # of what the worst attack leaves by the scheme's own strengths, for which others are returned
 
 
@@ -85,9 +86,9 @@ def tune(
     Each attack's channel is measured from a probe that spends equal shares of the budget in all bands. Limits on other
     metrics than RMS displacement count as quadratic in the strengths, with the measured visibility of each band. The
     strengths that are best so have a proof, but leave out what limits, attacks and reader really are. So marks of them,
-    and of the scheme's own strengths, are written within the real limits, attacked and read, and the better ones are
-    improved by the gradient of what the detector has after the worst attack, as long as such trials agree
-    (`jaxmark.evaluation.trials`). None that do worse than the scheme's own strengths are returned.
+    of the scheme's own strengths and of low-pass filters are written within the real limits, attacked and read. The
+    best ones are improved by the gradient of what the detector has after the worst attack, as long as trials with other
+    signs and seeds agree (`jaxmark.evaluation.trials`). If the scheme's own strengths are as good, they are returned.
 
     Args:
         mesh: the original.
@@ -148,10 +149,10 @@ def tune(
     worth = np.asarray(margins(channels, jnp.asarray(beta**2, original.signal.dtype), margin), np.float64)
     bound = upper_bound(channels, weights @ cost, cap=cap, margin=margin)
 
-    seeded = [[partial(apply_attack, one, seed=int(seed)) for seed in numbers] for one in attacks]
-    trials = Trials(original, bits, bounds, seeded, margin)
+    trials = Trials(original, bits, bounds, [partial(apply_attack, one) for one in attacks], numbers.tolist(), margin)
     default, solved = trials.run(tunable), trials.run(tunable.with_profile(_profile(beta)))
-    best = trials.ascend(max(default, solved, key=lambda one: one.worst), cost)
+    even = [trials.run(tunable.with_profile((1.0,) * round(share * len(family)))) for share in _LOW_PASS]
+    best = trials.ascend(max(default, solved, *even, key=lambda one: one.worst), cost)
     if best.worst < _LEAST_GAIN * default.worst:  # by so little, others may do worse on marks that were not tried
         best = default
     report = Report(
