@@ -20,9 +20,10 @@ from jaxmark import distortion
 from jaxmark.alignment.alignment import align, observation
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, displace
+from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.allocation import import_jaxopt
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.budget import Budget, write
+from jaxmark.watermark.budget import Budget, Written, write
 from jaxmark.watermark.carriers.keyed import KeyedCarrier, KeyedReader
 from jaxmark.watermark.channels import Margin, measure
 from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key
@@ -45,7 +46,7 @@ class Trial(NamedTuple):
     reader: KeyedReader
     word: Float[Array, " code"]  # of all marks
     signs: tuple[Int8[Array, "vertices channels"], ...]  # of each mark
-    scale: float  # factor on the carrier's displacement, within the limits, in diagonals
+    scales: tuple[float, ...]  # factor on each mark's displacement, within the limits, in diagonals
     used: Float64[np.ndarray, " limits"]  # share of each limit that the first mark uses up
     seen: tuple[tuple[Observation, ...], ...]  # for each attack, copies of all marks, seed by seed
     worth: Float64[np.ndarray, " attacks"]
@@ -58,7 +59,7 @@ class Trial(NamedTuple):
     @property
     def strengths(self) -> Float64[np.ndarray, " passing"]:
         """Strength of each band of the pass band, in diagonals."""
-        return self.scale * np.asarray(self.reader.carrier.profile, np.float64)
+        return np.mean(self.scales) * np.asarray(self.reader.carrier.profile, np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +72,14 @@ class Trials:
     attacks: Sequence[Attack]
     seeds: Sequence[int]
     margin: Margin
+
+    def fits(self, scheme: TunableScheme) -> bool:
+        """Whether the bands of a scheme have room for the payload."""
+        try:
+            scheme.code_length(self.original, self.bits)
+        except JaxmarkError:
+            return False
+        return True
 
     def run(self, scheme: TunableScheme, *, practice: bool = False) -> Trial:
         """Write, attack and read marks of a scheme.
@@ -93,8 +102,12 @@ class Trials:
         first = _KEYS if practice else 0
         drawn = [carrier.redraw(jax.random.key(first + number)) for number in range(_KEYS)]
         shifts = [original.to_host(one.displacement(word)) for one in drawn]
-        written = write(original, shifts[0], self.bounds, self._reference)
-        marks = [displace(original, sign * written.scale * shift) for shift in shifts for sign in (1, -1)]
+        written = [write(original, shift, self.bounds, self._reference) for shift in shifts]
+        marks = [
+            displace(original, sign * one.scale * shift)
+            for one, shift in zip(written, shifts, strict=True)
+            for sign in (1, -1)
+        ]
         signs = tuple(sign * jnp.asarray(one.chips.signs) for one in drawn for sign in (1, -1))
         seen = tuple(
             tuple(
@@ -104,8 +117,8 @@ class Trials:
             )
             for one in self.attacks
         )
-        used, reader = self._used(written.mesh, written.moved.rms), carrier.reader()
-        trial = Trial(scheme, reader, word, signs, written.scale, used, seen, np.zeros(0))
+        scales, used = tuple(one.scale for one in written for _ in (1, -1)), self._used(written[0])
+        trial = Trial(scheme, carrier.reader(), word, signs, scales, used, seen, np.zeros(0))
         return trial._replace(worth=np.array([self._worth(trial, copies) for copies in seen]))
 
     def ascend(self, start: Trial, cost: Float64[np.ndarray, "limits bands"]) -> Trial:
@@ -128,20 +141,24 @@ class Trials:
         at = self.run(tried.scheme, practice=True)
         carrier, dtype = at.reader.carrier, at.word.dtype
         base = jnp.asarray(carrier.profile)
-        marks = [at.scale * _with_signs(carrier, signs).displacement(at.word) for signs in at.signs]
+        scales = [jnp.asarray(scale, dtype) for scale in at.scales]
+        marks = [
+            scale * _with_signs(carrier, signs).displacement(at.word)
+            for scale, signs in zip(scales, at.signs, strict=True)
+        ]
         most = max((one.nuisance.shape[1] for some in at.seen for one in some if one.nuisance is not None), default=0)
         copies: dict[object, list[_Copy]] = {}
         for number, suspects in enumerate(at.seen):
-            pairs = list(zip(suspects, cycle(zip(at.signs, marks, strict=True)), strict=False))
-            gains = [measure(at.reader.receiver, one, mark).gain[0] for one, (_, mark) in pairs]
+            pairs = list(zip(suspects, cycle(zip(at.signs, scales, marks, strict=True)), strict=False))
+            gains = [measure(at.reader.receiver, one, mark).gain[0] for one, (*_, mark) in pairs]
             gain = sum(gains[1:], gains[0]) / len(gains)
-            for one, (signs, _) in pairs:
-                copy = _Copy(_widened(one, most), gain, signs, jnp.asarray(number))
+            for one, (signs, scale, _) in pairs:
+                copy = _Copy(_widened(one, most), gain, signs, scale, jnp.asarray(number))
                 copies.setdefault(jax.tree.structure(copy), []).append(copy)
         groups = tuple(jax.tree.map(lambda *leaves: jnp.stack(leaves), *some) for some in copies.values())
         limits = _Limits(jnp.asarray(cost[:, : len(base)], dtype), jnp.asarray(at.used / at.used.max(), dtype))
-        scale, level = (jnp.asarray(number, dtype) for number in (at.scale, 1 / max(at.worst, 1e-3)))
-        strengths = np.asarray(_climb(at.reader, at.word, scale, groups, limits, level, len(at.seen)), np.float64)
+        level = jnp.asarray(1 / max(at.worst, 1e-3), dtype)
+        strengths = np.asarray(_climb(at.reader, at.word, groups, limits, level, len(at.seen)), np.float64)
         return at.scheme.with_profile(tuple(float(f"{value:.4g}") for value in strengths / strengths.max()))
 
     def _worth(self, trial: Trial, copies: Sequence[Observation]) -> float:
@@ -156,11 +173,11 @@ class Trials:
         claims = [reader.claim(received, word) for reader, received in pairs]
         return float(max(np.mean([float(one.score) / (float(one.norm) or 1) for one in claims]), 0) ** 2 / 2)
 
-    def _used(self, marked: Mesh, moved: float) -> Float64[np.ndarray, " limits"]:
+    def _used(self, written: Written) -> Float64[np.ndarray, " limits"]:
         """The share of each limit that a mark uses up, the RMS budget's last."""
-        found = self._reference.measure(marked, self.bounds.limits.keys())
+        found = self._reference.measure(written.mesh, self.bounds.limits.keys())
         shares = [(found[metric] or 0.0) / limit for metric, limit in self.bounds.limits.items()]
-        return np.array(shares + ([moved / self.bounds.rms] if self.bounds.rms is not None else []))
+        return np.array(shares + ([written.moved.rms / self.bounds.rms] if self.bounds.rms is not None else []))
 
     @cached_property
     def _reference(self) -> distortion.Reference:
@@ -173,6 +190,7 @@ class _Copy(NamedTuple):
     seen: Observation
     gain: Float[Array, " passing"]  # share of the mark's amplitude that the attack leaves in each band
     signs: Int8[Array, "vertices channels"]  # of the mark
+    scale: Float[Array, ""]  # factor on its displacement
     attack: Array  # its number
 
 
@@ -204,7 +222,6 @@ def _widened(seen: Observation, columns: int) -> Observation:
 def _climb(
     reader: KeyedReader,
     word: Float[Array, " code"],
-    scale: Float[Array, ""],
     groups: tuple[_Copy, ...],
     limits: _Limits,
     level: Float[Array, ""],
@@ -218,13 +235,12 @@ def _climb(
 
     def loss(change: Array) -> Array:
         strengths = base * jnp.exp(shapes @ change)
-        factor = scale * limits.scale(strengths, base)
-        left = factor * strengths - scale * base
+        left = limits.scale(strengths, base) * strengths - base
 
         def ratio(copy: _Copy) -> Array:
             """S/‖a‖, where noise and what happened to the host stay as they were."""
             carrier = _with_signs(reader.carrier, copy.signs)
-            moved = carrier.with_bands(copy.gain * left).displacement(word)
+            moved = copy.scale * carrier.with_bands(copy.gain * left).displacement(word)
             changed = reader.with_carrier(carrier.with_bands(strengths))
             received = changed.receive(copy.seen._replace(residual=copy.seen.residual + moved))
             score, norm = changed.claim(received, word)

@@ -50,7 +50,7 @@ class Report(NamedTuple):
     gap: float  # (bound - worst margin) / bound
     binding: Mapping[str, float]  # weights of the limits in the channels' budget
     tried: Float64[np.ndarray, " attacks"]  # what the detector has of the tuned strengths after each attack
-    tried_channels: Float64[np.ndarray, " attacks"]  # the same of the channels' best strengths
+    tried_channels: Float64[np.ndarray, " attacks"]  # the same of the channels' best; 0 if the payload does not fit
     tried_default: Float64[np.ndarray, " attacks"]  # the same of the scheme as it was given
     kept: bool  # whether no strengths were better than those of the scheme as it was given, which is returned
 
@@ -150,9 +150,10 @@ def tune(
     bound = upper_bound(channels, weights @ cost, cap=cap, margin=margin)
 
     trials = Trials(original, bits, bounds, [partial(apply_attack, one) for one in attacks], numbers.tolist(), margin)
-    default, solved = trials.run(tunable), trials.run(tunable.with_profile(_profile(beta)))
-    even = [trials.run(tunable.with_profile((1.0,) * round(share * len(family)))) for share in _LOW_PASS]
-    best = trials.ascend(max(default, solved, *even, key=lambda one: one.worst), cost)
+    default = trials.run(tunable)
+    low_pass = [(1.0,) * round(share * len(family)) for share in _LOW_PASS]
+    others = [trials.run(one) for one in map(tunable.with_profile, (_profile(beta), *low_pass)) if trials.fits(one)]
+    best = trials.ascend(max(default, *others, key=lambda one: one.worst), cost)
     if best.worst < _LEAST_GAIN * default.worst:  # by so little, others may do worse on marks that were not tried
         best = default
     report = Report(
@@ -161,7 +162,7 @@ def tune(
         1 - float(worth.min()) / bound,
         dict(zip(_names(bounds), map(float, weights), strict=True)),
         best.worth,
-        solved.worth,
+        next((one.worth for one in others if one.scheme.profile == _profile(beta)), np.zeros(len(attacks))),
         default.worth,
         best is default,
     )

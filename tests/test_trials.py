@@ -1,0 +1,106 @@
+"""Trials against marks that are made and read by themselves, and gradients against trials."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmark as jm
+from jaxmark.alignment.original import make_original
+from jaxmark.evaluation import trials as module
+from jaxmark.evaluation.trials import Trials
+from jaxmark.evaluation.tuning import apply_attack, tune
+from jaxmark.spectral.chebyshev import band_components
+from jaxmark.watermark.budget import make_budget
+from jaxmark.watermark.schemes import KeyedScheme
+from tests.samples import rough_sphere
+
+ATTACKS = (("noise", 0.004), ("smoothing", 10))
+RMS = 4e-4
+
+
+@pytest.fixture(scope="module")
+def mesh() -> jm.Mesh:
+    return rough_sphere(1500)
+
+
+@pytest.fixture(scope="module")
+def trials(mesh) -> Trials:
+    attacks = [partial(apply_attack, one) for one in ATTACKS]
+    return Trials(make_original(mesh), 16, make_budget(RMS), attacks, [7], "evidence")
+
+
+@pytest.fixture(scope="module")
+def trial(trials):
+    return trials.run(KeyedScheme(profile=(1.0,) * 12))
+
+
+def test_what_is_tried_is_what_the_detector_has(mesh, trials, trial):
+    """Keys of our own, a marker each: as much evidence, within what chance makes of so few marks."""
+    for place, attack in enumerate(ATTACKS):
+        ratios = []
+        for number in range(6):
+            marker = jm.make_marker(mesh, jm.Key(bytes([number + 1] * 32)), bits=16, scheme=trial.scheme)
+            word = marker.codeword(b"ok")
+            marked, _ = marker.write(word, make_budget(RMS))
+            received = marker.receive(jm.attack(marked, *attack, seed=100 + number))
+            score, norm = marker.reader.claim(received, jnp.asarray(word, jnp.float32))
+            ratios.append(float(score / norm))
+        # A score over its norm has about the standard deviation 1.
+        assert np.sqrt(2 * trial.worth[place]) == pytest.approx(np.mean(ratios), abs=4 / np.sqrt(6))
+    assert trial.used == pytest.approx([1.0], rel=1e-3)
+    assert trial.strengths == pytest.approx(np.mean(trial.scales) * np.ones(12))
+
+
+def test_practice_has_other_signs_and_seeds(trials, trial):
+    practised = trials.run(trial.scheme, practice=True)
+    assert not any(np.array_equal(one, other) for one in trial.signs for other in practised.signs)
+    again = trials.run(trial.scheme)
+    np.testing.assert_array_equal(again.worth, trial.worth)
+    assert (practised.worth != trial.worth).all()
+
+
+@pytest.mark.slow
+def test_the_gradient_leads_to_more_evidence(trials, monkeypatch):
+    """From strengths that fall too fast, judged by the very marks that better ones were fitted to."""
+    poor = trials.run(KeyedScheme(profile=tuple(np.geomspace(1, 0.03, 24).tolist())))
+    run = Trials.run
+    monkeypatch.setattr(Trials, "run", lambda trials, scheme, practice=False: run(trials, scheme))
+    better = trials.run(trials._improved(poor, _rms_cost(trials)))
+    assert better.worst > 1.15 * poor.worst
+    change = np.log(better.strengths / poor.strengths)
+    assert np.ptp(change) > 0.2
+    # Neighbours change alike.
+    assert np.abs(np.diff(change)).max() < 0.5 * np.ptp(change)
+
+
+def _rms_cost(trials: Trials) -> np.ndarray:
+    """Mean square displacement by unit strength in each band, which is a trace of the filter's square, by probes."""
+    original, family = trials.original, KeyedScheme().family()
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (len(original.signal), 3)).astype(np.float32)
+    parts = band_components(original.operator, jnp.asarray(family, jnp.float32), jnp.asarray(signs))
+    return np.mean(np.sum(np.asarray(parts, np.float64) ** 2, axis=2), axis=1)[None] / RMS**2
+
+
+def test_limits_bind_as_metrics_do():
+    """Two limits, of which the other one binds once strengths move to where it is used up."""
+    limits = module._Limits(jnp.array([[1.0, 0.0], [0.0, 4.0]]), jnp.array([1.0, 0.5]))
+    base = jnp.ones(2)
+    assert limits.scale(base, base) == 1
+    assert limits.scale(jnp.array([2.0, 1.0]), base) == pytest.approx(1 / 2)
+    assert limits.scale(jnp.array([1.0, 4.0]), base) == pytest.approx(1 / 2)
+
+
+@pytest.mark.slow
+def test_tuned_strengths_are_not_worse_than_those_given(mesh):
+    poor = KeyedScheme(profile=(1.0,) * 8)
+    found = tune(mesh, ATTACKS[:1], RMS, key=jax.random.key(0), bits=16, scheme=poor)
+    report = found.report
+    assert not report.kept
+    assert report.tried.min() >= max(1.1 * report.tried_default.min(), report.tried_channels.min())
+    # Started from the best, nothing is much better, and so it is kept as it is.
+    kept = tune(mesh, ATTACKS[:1], RMS, key=jax.random.key(0), bits=16, scheme=found.scheme)
+    assert kept.report.tried.min() >= report.tried.min()
+    assert kept.report.kept == (kept.scheme == found.scheme)
