@@ -243,15 +243,15 @@ def test_several_limits_at_once(tuned):
 
 @pytest.mark.slow
 def test_any_function_is_an_attack_and_a_start_is_warm(tuned):
-    mesh = tuned[0]
+    mesh, before = tuned
 
     def shrink(mesh, seed):
         return mesh._replace(vertices=0.5 * np.asarray(mesh.vertices))
 
-    first = tune(mesh, [shrink, ("smoothing", 5)], 5e-4, key=jax.random.key(0), bits=16)
     named = (jm.attacks.ATTACKS["smoothing"], 5)
-    again = tune(mesh, [shrink, named], 5e-4, key=jax.random.key(0), bits=16, start=first.beta)
-    assert again.report.margins.min() > 0.98 * first.report.margins.min()
+    found = tune(mesh, [shrink, named], 5e-4, key=jax.random.key(0), bits=16, start=before.beta)
+    assert 0 <= found.report.gap < 0.02
+    assert found.report.tried[0] > found.report.tried[1]  # a change of size takes nothing of a mark
 
 
 def test_refusals(x64, unchecked):

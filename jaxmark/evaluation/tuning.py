@@ -34,7 +34,7 @@ from jaxmark.watermark.visibility import apply_mask, band_visibility
 Attacker = tuple[Kind, float] | Callable[[Mesh, int], Mesh]  # an attack and a strength, or (mesh, seed) → mesh
 
 
-_LOW_PASS = (1 / 8, 3 / 16, 1 / 4, 3 / 8)  # shares of the spectrum that are tried with equal strengths
+_LOW_PASS = (1 / 8, 1 / 4)  # shares of the spectrum that are tried with equal strengths
 _LEAST_GAIN = 1.1  # of what the worst attack leaves by the scheme's own strengths, for which others are returned
 
 
