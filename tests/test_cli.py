@@ -98,6 +98,7 @@ def test_the_main_job(workshop: Workshop, scheme):
         assert found["coverage"] == 1.0
         assert found["log10_p"] <= -6
         assert found["log10_p_fitted"] <= found["log10_p"] or scheme != "keyed"
+        assert found["log10_p_unfloored"] <= found["log10_p"]
     claimed = workshop.json("detect", "suspect.ply", *DETECT, "--scheme", scheme, "--message", MESSAGE)
     assert claimed["detected"] is True
     compared = workshop.json("compare", "model.ply", "marked.ply")

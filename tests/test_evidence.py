@@ -11,6 +11,7 @@ import pytest
 import jaxmark as jm
 from jaxmark.watermark.evidence import (
     MIN_LOG10_P,
+    UNFLOORED,
     any_of,
     log10_p_claimed,
     log10_p_fitted,
@@ -52,6 +53,29 @@ def test_alternatives_are_paid_for():
     assert log10_p_read(2.0, 1.0, 16) == 0.0
     assert any_of(-7.0, -3.0) == pytest.approx(-7 + math.log10(2))
     assert any_of(-0.1, 0.0) == 0.0
+
+
+def test_formulas_go_on_below_the_floor_where_that_is_asked_for():
+    below = log10_p_read(40.0, 1.0, 64, UNFLOORED)
+    assert below == pytest.approx(64 * math.log10(2) - 800 / math.log(10), rel=1e-3)
+    assert any_of(below, -3.0, floor=UNFLOORED) == pytest.approx(below + math.log10(2))
+    assert share_of(below, 0.5, UNFLOORED) == pytest.approx(below + math.log10(2))
+    assert log10_p_read(0.0, 1.0, 0, UNFLOORED) == 0.0
+
+
+def test_evidence_without_floor_orders_what_the_bound_does_not():
+    """Where nothing has reached the floor both are one number; where the bound stands still, the other does not."""
+    mesh, key = bumpy_sphere(4), jm.Key(bytes(32))
+    marked, _ = jm.embed(mesh, b"original", key, budget=2e-3)
+    marker = make_marker(mesh, key)
+    found = [marker.detect(jm.attack(marked, "noise", size, seed=0)) for size in (0.0005, 0.001, 0.002, 0.02, 0.05)]
+    bounds, further = ([getattr(one, name) for one in found] for name in ("log10_p", "log10_p_unfloored"))
+    assert bounds[0] == bounds[1] == bounds[2] < MIN_LOG10_P + 1
+    assert further == sorted(further)
+    assert further[2] < MIN_LOG10_P - 10
+    assert bounds[-1] == further[-1] > -70
+    assert all(one <= bound for one, bound in zip(further, bounds, strict=True))
+    assert marker.detect(mesh).log10_p_unfloored == 0.0
 
 
 def test_the_fitted_value_is_the_gaussian_tail():

@@ -214,7 +214,7 @@ def check_shade(picture: plot.Picture, place: int, x: np.ndarray, hits: np.ndarr
 def test_success_over_strength():
     read = np.array([[True] * 4, [True, True, False, True], [False] * 4])
     bits = np.array([11.0, 9.0, 7.0])
-    curve = Robustness(bits, read, 0.5 - 0.5 * read, MIN_LOG10_P * read, (("",) * 4,) * 3)
+    curve = Robustness(bits, read, 0.5 - 0.5 * read, MIN_LOG10_P * read, MIN_LOG10_P * read, (("",) * 4,) * 3)
     picture = pictures.success({"one": curve, "two": curve._replace(success=~read)}, "bits per coordinate")
     axes = picture.figure.axes[0]
     drawn = [container.lines for container in axes.containers]

@@ -61,6 +61,7 @@ def test_together_they_prove_more_than_the_best_alone(marked, originals, key: jm
     best = min(one.log10_p for one in found.meshes.values())
     assert best > -60
     assert found.united.log10_p < best - 5
+    assert found.united.log10_p_unfloored == found.united.log10_p
     assert found.detected()
     # By Hoeffding's bound for the sum of scores over their norms, which have variances of at most 1 each.
     ratios = [np.sqrt(-2 * np.log(10) * (one.log10_p - 0.5)) for one in found.meshes.values()]

@@ -78,6 +78,7 @@ def test_rows_are_what_marker_attack_and_detect_say(results):
                 one = marker.detect(jm.attack(before, attack, strength, seed=seed))
                 # Attacks at once round otherwise than one by one.
                 assert row.log10_p == pytest.approx(one.log10_p, abs=0.05)
+                assert row.log10_p_unfloored == pytest.approx(one.log10_p_unfloored, rel=0.01, abs=0.05)
                 assert row.read == (one.message == message)
                 assert row.detected == (one.log10_p <= -6)
                 assert row.rms == (0 if control == "unmarked" else info.rms)
@@ -193,7 +194,7 @@ def test_no_worker_and_no_file(tmp_path):
 
 
 def made_up(count: int, **fields) -> list[Row]:
-    row = Row("m", "keyed", 64, "0.001", "noise", 0.1, "u", 0, "marked", True, False, 0.0, -20.0, True, "", 1.0, 1e-3)
+    row = Row("m", "keyed", 64, "0.001", "noise", 0.1, "u", 0, "marked", True, False, 0.0, -20.0, -20.0, True, "", 1.0, 1e-3)
     return [row._replace(seed=seed, **fields) for seed in range(count)]
 
 
@@ -204,6 +205,7 @@ def test_rates_pool_what_is_not_named():
     assert (both["mesh"], both["read"], both["trials"]) == ("m", 3, 4)
     assert (both["read_low"], both["read_high"]) == tuple(map(float, clopper_pearson(3, 4)))
     assert (both["bit_errors"], both["log10_p"], both["log10_p_largest"]) == (0.125, -20, -2)
+    assert both["log10_p_unfloored_least"] == -20
     assert (other["mesh"], other["trials"]) == ("n", 2)
     (all_of_them,) = table.rates([])
     assert (all_of_them["read"], all_of_them["detected"], all_of_them["trials"]) == (5, 5, 6)
@@ -230,7 +232,7 @@ def test_frame(results):
     assert frame.groupby("control").read.sum().to_dict() == {"marked": 4, "unmarked": 0, "wrong-key": 0}
 
 
-@pytest.mark.parametrize("of", ["read", "log10_p"])
+@pytest.mark.parametrize("of", ["read", "log10_p", "log10_p_unfloored"])
 def test_pictures(results, tmp_path, of):
     pytest.importorskip("matplotlib")
     rows = (*results.rows, *(row._replace(scheme="host", bits=32) for row in results.rows))

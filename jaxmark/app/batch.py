@@ -202,6 +202,7 @@ class FileReader:
             "log10_p": found.log10_p,
             "log10_p_undated": found.log10_p_undated,
             "log10_p_fitted": found.log10_p_fitted,
+            "log10_p_unfloored": found.log10_p_unfloored,
             "proof": not found.doubts,
             "doubts": list(found.doubts),
             "remarks": list(remarks),
@@ -282,6 +283,7 @@ class FileReader:
             "log10_p": united.log10_p,
             "log10_p_undated": united.log10_p_undated,
             "log10_p_fitted": united.log10_p_fitted,
+            "log10_p_unfloored": united.log10_p_unfloored,
             "proof": not united.doubts,
             "doubts": list(united.doubts),
             "remarks": list(united.remarks),
@@ -293,6 +295,7 @@ class FileReader:
                 name: {
                     "detected": one.detected(self.alpha),
                     "log10_p": one.log10_p,
+                    "log10_p_unfloored": one.log10_p_unfloored,
                     "message": None if one.message is None else one.message.hex(),
                     "coverage": one.coverage,
                     "method": one.alignment.method,

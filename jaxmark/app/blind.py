@@ -61,6 +61,7 @@ class BlindReader:
             "log10_p": best.log10_p,
             "log10_p_undated": best.log10_p_undated,
             "log10_p_fitted": best.log10_p_fitted,
+            "log10_p_unfloored": best.log10_p_unfloored,
             "proof": not best.doubts,
             "doubts": list(best.doubts),
             "remarks": remarks,

@@ -26,6 +26,7 @@ from jaxmark.app.folders import Work, each, mesh_files
 from jaxmark.app.telling import Told, power, told_error
 from jaxmark.attacks import ATTACKS, chain, get_attack
 from jaxmark.errors import JaxmarkError
+from jaxmark.evaluation.pictures.studies import Measure
 from jaxmark.evaluation.study_file import load_study
 from jaxmark.extras import require
 from jaxmark.files import load_mesh, load_scene, save_mesh, save_scene
@@ -638,7 +639,8 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
       smoothing = [10, 50]
 
     Only meshes, with paths relative to the folder of FILE, and attacks are required. The command writes results.jsonl,
-    from which it resumes when run again, results.csv, rates.md and, with the extra `plot`, read.png and log10_p.png.
+    from which it resumes when run again, results.csv, rates.md and, with the extra `plot`, read.png, log10_p.png
+    and log10_p_unfloored.png, where the evidence goes on below the floor at -77.
     """  # noqa: D301
     study = load_study(file)
     output.mkdir(parents=True, exist_ok=True)
@@ -651,8 +653,8 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
     except JaxmarkError as error:
         _say(f"No pictures: {error}")
     else:
-        results.plot().save(output / "read.png")
-        results.plot("log10_p").save(output / "log10_p.png")
+        for of in get_args(Measure):
+            results.plot(of).save(output / f"{of}.png")
     _answer(as_json, {"output": str(output), "readings": len(results.rows), "rates": results.rates()}, table.rstrip())
 
 

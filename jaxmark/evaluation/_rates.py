@@ -29,6 +29,7 @@ class Row(NamedTuple):
     wrong: bool  # another message was read, whose tag fits
     bit_errors: float  # share of the message's bits that are wrong in the best guess; 1/2 if there is no guess
     log10_p: float  # log10 of a bound on the false-positive probability, with the message unknown
+    log10_p_unfloored: float  # the same without its floor at -77, see `Detection`
     detected: bool  # log10_p is at most `LOG10_LEVEL`
     refusal: str  # a sentence that says why nothing could be read; empty otherwise
     seconds: float  # duration of the reading, with the alignment unless the row before includes it
@@ -46,7 +47,7 @@ def rates(rows: Iterable[Row], by: Sequence[str] = (*POINT, "control"), level: f
     Returns:
         For each group its fields of `by`; the number of `trials`; the counts `read` and `detected`, with the bounds
         `read_low`, `read_high`, `detected_low` and `detected_high` on their rates; the mean of `bit_errors`; the median
-        `log10_p`, with `log10_p_least` and `log10_p_largest`.
+        `log10_p`, with `log10_p_least` and `log10_p_largest`; and the same of `log10_p_unfloored`.
 
     Raises:
         JaxmarkError: if there is no such field, or the level is out of range.
@@ -63,8 +64,9 @@ def rates(rows: Iterable[Row], by: Sequence[str] = (*POINT, "control"), level: f
             rate[name] = sum(getattr(row, name) for row in group)
             interval = clopper_pearson(rate[name], len(group), level)
             rate[f"{name}_low"], rate[f"{name}_high"] = float(interval.low), float(interval.high)
-        p = [row.log10_p for row in group]
         rate["bit_errors"] = float(np.mean([row.bit_errors for row in group]))
-        rate |= {"log10_p": float(np.median(p)), "log10_p_least": min(p), "log10_p_largest": max(p)}
+        for name in ("log10_p", "log10_p_unfloored"):
+            p = [getattr(row, name) for row in group]
+            rate |= {name: float(np.median(p)), f"{name}_least": min(p), f"{name}_largest": max(p)}
         found.append(rate)
     return found

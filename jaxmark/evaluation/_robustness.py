@@ -25,6 +25,7 @@ class Reading(NamedTuple):
     wrong: bool  # another message was read, whose tag fits
     bit_errors: float  # share of the message's bits that are wrong in the best guess; 1/2 if there is no guess
     log10_p: float  # log10 of a bound on the false-positive probability, with the message unknown
+    log10_p_unfloored: float  # the same without its floor at -77, see `Detection`
 
 
 class Robustness(NamedTuple):
@@ -33,7 +34,8 @@ class Robustness(NamedTuple):
     strengths: Float64[np.ndarray, " epsilons"]
     success: Bool[np.ndarray, "epsilons samples"]  # whether the exact message was read
     bit_errors: Float64[np.ndarray, "epsilons samples"]  # see `Reading`
-    log10_p: Float64[np.ndarray, "epsilons samples"]
+    log10_p: Float64[np.ndarray, "epsilons samples"]  # see `Reading`
+    log10_p_unfloored: Float64[np.ndarray, "epsilons samples"]
     refusals: tuple[tuple[str, ...], ...]  # `[epsilons][samples]`; a sentence, empty where there is an answer
 
 
@@ -66,7 +68,7 @@ class Breaking(NamedTuple):
         return math.nan if attacked is None or not marked else attacked / marked
 
 
-NOTHING = Reading(False, False, 0.5, 0.0)  # the reading of a refused suspect
+NOTHING = Reading(False, False, 0.5, 0.0, 0.0)  # the reading of a refused suspect
 
 
 def read(marker: Marker | BlindMarker, suspect: Mesh | Alignment, message: bytes) -> Reading:
@@ -78,7 +80,8 @@ def read(marker: Marker | BlindMarker, suspect: Mesh | Alignment, message: bytes
     found = marker.detect(suspect)  # pyright: ignore[reportArgumentType] (what the marker's own `align` gave)
     said = found.message or guess(found.scores, marker.bits, marker.tag_bits)
     wrong = 0.5 if said is None else float(np.mean(_bits(said) != _bits(message)))
-    return Reading(found.message == message, found.message not in (None, message), wrong, found.log10_p)
+    other = found.message not in (None, message)
+    return Reading(found.message == message, other, wrong, found.log10_p, found.log10_p_unfloored)
 
 
 def robustness(
@@ -119,7 +122,8 @@ def robustness(
         return np.array([[getattr(reading, name) for reading, _ in row] for row in rows])
 
     refusals = tuple(tuple(sentence for _, sentence in row) for row in rows)
-    return Robustness(np.array(strengths, float), column("read"), column("bit_errors"), column("log10_p"), refusals)
+    columns = (column(name) for name in ("read", "bit_errors", "log10_p", "log10_p_unfloored"))
+    return Robustness(np.array(strengths, float), *columns, refusals)
 
 
 def minimum_distortion(

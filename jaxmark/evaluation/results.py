@@ -5,11 +5,11 @@ import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from jaxmark.evaluation import _rates as rates
 from jaxmark.evaluation._rates import POINT, Control, Row
-from jaxmark.evaluation.pictures.studies import curves
+from jaxmark.evaluation.pictures.studies import Measure, curves
 from jaxmark.extras import require
 from jaxmark.files.atomic import write_atomically
 from jaxmark.plot import Picture
@@ -40,7 +40,7 @@ class Results:
         cells: dict[tuple[Any, ...], dict[Control, dict[str, Any]]] = {}
         for rate in self.rates():
             cells.setdefault(tuple(rate[name] for name in POINT), {})[rate["control"]] = rate
-        heads = [*POINT, "read", "95 %", "wrong bits", "log10 p, median", *_LABELS.values()]
+        heads = [*POINT, "read", "95 %", "wrong bits", "log10 p, median", "without floor", *_LABELS.values()]
         lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
         for point, rate in cells.items():
             mark = rate["marked"]
@@ -49,7 +49,7 @@ class Results:
                 f"{mark['read']}/{mark['trials']}",
                 f"{100 * mark['read_low']:.0f} - {100 * mark['read_high']:.0f}",
             ]
-            said += [f"{100 * mark['bit_errors']:.1f} %", f"{mark['log10_p']:.1f}"]
+            said += [f"{100 * mark['bit_errors']:.1f} %", f"{mark['log10_p']:.1f}", f"{mark['log10_p_unfloored']:.1f}"]
             said += [f"{rate[name]['detected']}/{rate[name]['trials']}" for name in _LABELS]
             lines.append(f"| {' | '.join(said)} |")
         lines.append("")
@@ -79,6 +79,6 @@ class Results:
         writer.writerows(self.rows)
         write_atomically(path, text.getvalue().encode())
 
-    def plot(self, of: Literal["read", "log10_p"] = "read") -> Picture:
+    def plot(self, of: Measure = "read") -> Picture:
         """Plot a line for each scheme over the strengths of each attack; see `pictures.curves`."""
         return curves(self.rows, of)

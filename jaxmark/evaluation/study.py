@@ -17,7 +17,7 @@ from jaxmark.alignment.alignment import Alignment
 from jaxmark.attacks import Attack, attack_each, get_attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation._rates import LOG10_LEVEL, Control, Row
-from jaxmark.evaluation._robustness import NOTHING, read
+from jaxmark.evaluation._robustness import NOTHING, Reading, read
 from jaxmark.evaluation.cells import Cell, Pool, processes, run
 from jaxmark.evaluation.results import Results
 from jaxmark.files import load_mesh
@@ -142,7 +142,10 @@ class Study:
         schemes, budgets, count = self._schemes, self._budgets, self.seeds
         blocks = [(first, min(_SEEDS_PER_CELL, count - first)) for first in range(0, count, _SEEDS_PER_CELL)]
         for mesh, scheme, bits, budget, block in product(self.meshes, schemes, self.payloads, budgets, blocks):
-            fields = json.dumps([digests[mesh], schemes[scheme].name, parameters_of(schemes[scheme])])
+            # What an older file does not say of a reading is read again.
+            fields = json.dumps(
+                [digests[mesh], schemes[scheme].name, parameters_of(schemes[scheme]), Reading._fields]
+            )
             digest = hashlib.sha256(fields.encode()).hexdigest()[:16]
             for name in self.attacks:
                 for strength in self._strengths(name):

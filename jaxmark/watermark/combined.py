@@ -118,14 +118,21 @@ def unite(informed: Detection, blind: Sequence[BlindDetection]) -> Detection:
     product of n such is at most q is q Σ (-ln q)^i/i! over i < n (Fisher 1932). Of the undated ones the least counts,
     times their number.
     """
-    log10_q = informed.log10_p + sum(one.log10_p for one in blind)
-    nats = -log10_q * math.log(10)
-    total = sum(nats**power / math.factorial(power) for power in range(len(blind) + 1))
-    message = next((one.message for one in (informed, *blind) if one.message is not None), None)
+    alone = (informed, *blind)
+    message = next((one.message for one in alone if one.message is not None), None)
     told = tuple(f"The mark of {one.scheme!r} alone proves 10^{one.log10_p:.1f}." for one in blind)
     return informed._replace(
         message=message,
-        log10_p=evidence.share_of(log10_q, 1 / total),
+        log10_p=_product([one.log10_p for one in alone], evidence.MIN_LOG10_P),
         log10_p_undated=evidence.any_of(informed.log10_p_undated, *(one.log10_p_undated for one in blind)),
+        log10_p_unfloored=_product([one.log10_p_unfloored for one in alone], evidence.UNFLOORED),
         remarks=(*informed.remarks, *told),
     )
+
+
+def _product(log10_p: Sequence[float], floor: float) -> float:
+    """log10 of the probability that a product of independent probabilities is as small as it is."""
+    log10_q = sum(log10_p)
+    nats = -log10_q * math.log(10)
+    total = sum(nats**power / math.factorial(power) for power in range(len(log10_p)))
+    return evidence.share_of(log10_q, 1 / total, floor)

@@ -1,9 +1,10 @@
 """What a score proves: probabilities of false detection that hold for any suspect independent of the key.
 
 All results but that of `log10_p_fitted` are log10 of an upper bound on the probability, at most 0, and at least -77: a
-256-bit key supports no claim below 2⁻²⁵⁶. Pass scores and norms in the dtype that they were summed in: the largest
-error that `precision.sum_and_norm` can make in it is subtracted from the score, so that rounding makes no probability
-too small.
+256-bit key supports no claim below 2⁻²⁵⁶. With `floor=UNFLOORED` the same formulas go on below it: what they give there
+orders attacks and schemes, but no claim rests on it. Pass scores and norms in the dtype that they were summed in: the
+largest error that `precision.sum_and_norm` can make in it is subtracted from the score, so that rounding makes no
+probability too small.
 """
 
 import math
@@ -17,6 +18,7 @@ from scipy.special import log_ndtr  # scipy.stats takes long to import
 from jaxmark.spectral.precision import matmul
 
 MIN_LOG10_P = -77.0
+UNFLOORED = -math.inf
 _LOG10_TRIES = 64 * math.log10(2)
 
 
@@ -70,15 +72,15 @@ def undated(log10_p: float) -> float:
     return _clip(log10_p + _LOG10_TRIES)
 
 
-def share_of(log10_p: float, share: float) -> float:
+def share_of(log10_p: float, share: float, floor: float = MIN_LOG10_P) -> float:
     """log10 of the bound for a proof that has only a share of the probability, as others were possible in its place.
 
     Proofs whose shares add up to 1 have the stated probability together (a weighted Bonferroni bound).
     """
-    return _clip(log10_p - math.log10(share))
+    return _clip(log10_p - math.log10(share), floor)
 
 
-def log10_p_read(score: ArrayLike, norm: ArrayLike, bits: float) -> float:
+def log10_p_read(score: ArrayLike, norm: ArrayLike, bits: float, floor: float = MIN_LOG10_P) -> float:
     """log10 of a bound on the probability that any of 2^bits possible codewords scores so high (union bound).
 
     Args:
@@ -86,11 +88,12 @@ def log10_p_read(score: ArrayLike, norm: ArrayLike, bits: float) -> float:
         norm: ‖a‖ of the same vector a that the signs multiply.
         bits: size of the payload in bits, without the tag, which the message determines; and the logarithm to base 2
             of how many other choices were tried, if any were.
+        floor: the least result.
 
     Returns:
-        A finite number in [-77, 0].
+        A finite number in [floor, 0].
     """
-    return _clip(bits * math.log10(2) + _log10_tail(score, norm))
+    return _clip(bits * math.log10(2) + _log10_tail(score, norm), floor)
 
 
 def log10_p_tag(bits: int, candidates: int) -> float:
@@ -105,9 +108,9 @@ def log10_p_tag(bits: int, candidates: int) -> float:
     return _clip(math.log10(candidates) - bits * math.log10(2))
 
 
-def any_of(*log10_p: float) -> float:
+def any_of(*log10_p: float, floor: float = MIN_LOG10_P) -> float:
     """log10 of a bound on the probability that the best of several proofs is as good as it is (Bonferroni)."""
-    return _clip(min(log10_p) + math.log10(len(log10_p)))
+    return _clip(min(log10_p) + math.log10(len(log10_p)), floor)
 
 
 def log10_p_fitted(score: ArrayLike, norm: ArrayLike, bits: float = 0) -> float:
@@ -133,8 +136,8 @@ def _log10_tail(score: ArrayLike, norm: ArrayLike) -> float:
     return -(max(s / a - rounding * (1 + s / a), 0.0) ** 2) / 2 / math.log(10)
 
 
-def _clip(log10_p: float) -> float:
-    return min(0.0, max(MIN_LOG10_P, log10_p))
+def _clip(log10_p: float, floor: float = MIN_LOG10_P) -> float:
+    return min(0.0, max(floor, log10_p))
 
 
 def correlation_bound(

@@ -70,6 +70,7 @@ class Detection(NamedTuple):
     log10_p: float  # log10 of a bound on the false-positive probability, in [-77, 0], if all that is claimed is dated
     log10_p_undated: float  # the same if nothing is: for the best message of any of 2^64 keys, originals and records
     log10_p_fitted: float  # log10 of that probability if the score were Gaussian: an estimate, which decides nothing
+    log10_p_unfloored: float  # log10_p without the floor at -77: orders attacks and schemes, proves and decides nothing
     scores: Float64[np.ndarray, " code"]  # soft values of the code bits, scaled to root mean square 1
     coverage: float  # share of the original's points that the suspect gave evidence for
     alignment: Alignment  # how the suspect was brought back to the original
@@ -283,7 +284,7 @@ class Marker:
         size = np.sqrt(np.mean(soft**2)) or 1.0
         coverage = float(np.mean(self.original.to_host(observed.weights)[self.original.used] > 0))
         doubts = self.doubts if weights is None else (*self.doubts, "the weights were chosen by the reader")
-        found = Detection(None, 0.0, 0.0, 0.0, soft / size, coverage, aligned, self.choices.version, doubts)
+        found = Detection(None, 0.0, 0.0, 0.0, 0.0, soft / size, coverage, aligned, self.choices.version, doubts)
         # Rounding moves no coordinate by more than half of the grid's spacing, and the fit of the pose by little more;
         # a mark that can be read moves some.
         if np.abs(aligned.displacement).max() * self.original.diagonal <= 0.75 * self.original.grid:
@@ -342,18 +343,22 @@ class Marker:
         codeword = jnp.asarray(self.codeword(message), received.observed.residual.dtype)
         ways = list(zip(*claims(self.reader, received, codeword), strict=True))
         unknown = 0 if fixed is not None else self.bits
-        proofs = [evidence.log10_p_read(*way, unknown) for way in ways]
-        if decoded is not None and tagged:
-            proofs.append(evidence.log10_p_tag(TAG_BITS, decoded.rank))
+        tag = [evidence.log10_p_tag(TAG_BITS, decoded.rank)] if decoded is not None and tagged else []
+
+        def proven(floor: float) -> float:
+            proofs = [evidence.log10_p_read(*way, unknown, floor) for way in ways] + tag
+            return evidence.share_of(evidence.any_of(*proofs, floor=floor), share, floor)
+
         # The best message is not tried out but decoded, so who claims one that nothing dates pays for all of them.
         late = [evidence.log10_p_read(*way, self.bits) for way in ways]
         if self.choices.version == 1 and (free := self.scheme.free_strengths):
             late = [evidence.log10_p_fitted_strengths(*way, free) + self.bits * math.log10(2) for way in ways]
         return found._replace(
             message=None if decoded is None else decoded.message,
-            log10_p=evidence.share_of(evidence.any_of(*proofs), share),
+            log10_p=proven(evidence.MIN_LOG10_P),
             log10_p_undated=evidence.undated(evidence.share_of(evidence.any_of(*late), share)),
             log10_p_fitted=evidence.any_of(*(evidence.log10_p_fitted(*way, unknown) for way in ways)),
+            log10_p_unfloored=proven(evidence.UNFLOORED),
         )
 
     def write(
@@ -700,6 +705,7 @@ def detect_any(
         found = found._replace(
             log10_p=evidence.share_of(found.log10_p, share),
             log10_p_undated=evidence.share_of(found.log10_p_undated, share),
+            log10_p_unfloored=evidence.share_of(found.log10_p_unfloored, share, evidence.UNFLOORED),
         )
         best = found if best is None else min(best, found, key=lambda one: (one.log10_p, one.message is None))
         if best.detected():

@@ -231,6 +231,7 @@ def _unite(seen: Mapping[str, _Seen], claimed: bytes | None) -> Detection:
     united = best._replace(
         log10_p=evidence.share_of(best.log10_p, share),
         log10_p_undated=evidence.share_of(min(one.log10_p_undated for one in alone), share),
+        log10_p_unfloored=evidence.share_of(min(one.log10_p_unfloored for one in alone), share, evidence.UNFLOORED),
         doubts=tuple(dict.fromkeys(doubt for one in alone for doubt in one.doubts)),
     )
     markers = [one.marker for one in seen.values()]
@@ -248,12 +249,18 @@ def _unite(seen: Mapping[str, _Seen], claimed: bytes | None) -> Detection:
         part = CLAIM_SHARE if fixed else 1 - CLAIM_SHARE if any(told) else 1.0
         part *= _SUM_SHARE * ALIGN_SHARES[best.alignment.how]
         score, bits = _summed(seen.values(), message), markers[0].bits
-        log10_p = evidence.share_of(evidence.log10_p_read(score, 1.0, 0 if fixed else bits), part)
+        unknown = 0 if fixed else bits
+        log10_p = evidence.share_of(evidence.log10_p_read(score, 1.0, unknown), part)
+        further = evidence.log10_p_read(score, 1.0, unknown, evidence.UNFLOORED)
+        further = evidence.share_of(further, part, evidence.UNFLOORED)
         late = evidence.undated(evidence.share_of(evidence.log10_p_read(score, 1.0, bits), part))
-        united = united._replace(log10_p_undated=min(late, united.log10_p_undated))
+        united = united._replace(
+            log10_p_undated=min(late, united.log10_p_undated),
+            log10_p_unfloored=min(further, united.log10_p_unfloored),
+        )
         if log10_p < united.log10_p:
             read = message if any(one.message == message for one in alone) else None
-            fitted = evidence.log10_p_fitted(score, 1.0, 0 if fixed else bits)
+            fitted = evidence.log10_p_fitted(score, 1.0, unknown)
             united = united._replace(message=read, log10_p=log10_p, log10_p_fitted=fitted)
     return united
 

@@ -6,13 +6,17 @@ from typing import Any, Literal
 from jaxmark.evaluation._rates import LOG10_LEVEL, Row, rates
 from jaxmark.extras import require
 from jaxmark.plot.figures import COLOURS, MARKERS, Picture
+from jaxmark.watermark.evidence import MIN_LOG10_P
 
 _LINE_STYLES = ("-", "--", "-.", (0, (3, 1, 1, 1, 1, 1)))
 _CONTROL_STYLES = {"unmarked": ("unmarked, detected", ":", "x"), "wrong-key": ("another key, detected", "--", "+")}
 _MAX_COLUMNS = 3
 
 
-def curves(rows: Sequence[Row], of: Literal["read", "log10_p"] = "read") -> Picture:
+Measure = Literal["read", "log10_p", "log10_p_unfloored"]
+
+
+def curves(rows: Sequence[Row], of: Measure = "read") -> Picture:
     """Plot one panel for each attack, with weak strengths on the left.
 
     Each scheme has a line, or each scheme with a payload and a budget where these vary; meshes and seeds are pooled.
@@ -21,8 +25,9 @@ def curves(rows: Sequence[Row], of: Literal["read", "log10_p"] = "read") -> Pict
     Args:
         rows: the rows of a study.
         of: `"read"`, the share of messages that were read, and for controls the share that was detected, with 95 %
-            Clopper-Pearson intervals; or `"log10_p"`, the median with bars from the least to the largest, and the level
-            at which a mark counts as detected.
+            Clopper-Pearson intervals; or `"log10_p"`, the median with bars from the least to the largest, upwards the
+            more evidence there is, and the level at which a mark counts as detected; or `"log10_p_unfloored"`, the
+            same where the bound has its floor, too, which is a line there.
 
     Raises:
         JaxmarkError: if matplotlib is missing.
@@ -83,8 +88,20 @@ def _draw(panel: Any, rows: Sequence[Row], names: Sequence[str], of: str) -> Non
         panel.set_ylim(-0.04, 1.04)
         panel.set_ylabel("share read, 95 % interval", fontsize=8)
     else:
-        panel.axhline(LOG10_LEVEL, color="0.8", linewidth=1, zorder=0)
-        panel.set_ylabel("log10 p, median and range", fontsize=8)
+        _level(panel, LOG10_LEVEL, "detected")
+        if of == "log10_p_unfloored":
+            _level(panel, MIN_LOG10_P, "floor of what a key can prove")
+        panel.invert_yaxis()
+        floor = ", without floor" if of == "log10_p_unfloored" else ""
+        panel.set_ylabel(f"log10 p{floor}, median and range", fontsize=8)
+
+
+def _level(panel: Any, log10_p: float, label: str) -> None:
+    """A grey line at a level of evidence, which says what is reached there."""
+    panel.axhline(log10_p, color="0.7", linewidth=1, linestyle=":", zorder=0)
+    panel.annotate(
+        label, (0.01, log10_p), xycoords=("axes fraction", "data"), fontsize=7, color="0.4", va="bottom", zorder=0
+    )
 
 
 def _line(panel: Any, x: list[float], rates: list[dict[str, Any]], of: str, success: str, **style: Any) -> None:
@@ -92,8 +109,8 @@ def _line(panel: Any, x: list[float], rates: list[dict[str, Any]], of: str, succ
         y = [rate[success] / rate["trials"] for rate in rates]
         low, high = ([rate[f"{success}_{end}"] for rate in rates] for end in ("low", "high"))
     else:
-        y = [rate["log10_p"] for rate in rates]
-        low, high = ([rate[f"log10_p_{end}"] for rate in rates] for end in ("least", "largest"))
+        y = [rate[of] for rate in rates]
+        low, high = ([rate[f"{of}_{end}"] for rate in rates] for end in ("least", "largest"))
     # Rounding must not make a bar negative.
     below = [max(0.0, one - end) for one, end in zip(y, low, strict=True)]
     above = [max(0.0, end - one) for one, end in zip(y, high, strict=True)]

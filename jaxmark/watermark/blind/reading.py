@@ -60,6 +60,7 @@ class BlindDetection(NamedTuple):
     log10_p: float  # log10 of a bound on the false-positive probability, in [-77, 0], if all that is claimed is dated
     log10_p_undated: float  # the same if nothing is: for the best message of any of 2^64 keys
     log10_p_fitted: float  # log10 of that probability if the score were Gaussian: an estimate, which decides nothing
+    log10_p_unfloored: float  # log10_p without the floor at -77: orders attacks and schemes, proves and decides nothing
     scores: Float64[np.ndarray, " code"]  # soft values of the code bits, scaled to root mean square 1
     anchors: int  # number of values that were read
     agreement: float  # mean cosine of their phases, 1 if all are exactly where the mark put them
@@ -171,6 +172,7 @@ def best_of(found: Sequence[BlindDetection], tries: int) -> BlindDetection:
     return best._replace(
         log10_p=evidence.share_of(best.log10_p, 1 / tries),
         log10_p_undated=evidence.share_of(best.log10_p_undated, 1 / tries),
+        log10_p_unfloored=evidence.share_of(best.log10_p_unfloored, 1 / tries, evidence.UNFLOORED),
     )
 
 
@@ -244,9 +246,12 @@ def _weigh(
     chosen = int(np.argmax(np.maximum(score, 0) / np.maximum(norm, 1e-300)))
     paid = math.log2(tries)
     unknown = 0 if fixed is not None else bits
-    proofs = [evidence.log10_p_read(score[chosen], norm[chosen], unknown + paid)]
-    if decoded is not None and claimed is None:
-        proofs.append(evidence.log10_p_tag(TAG_BITS, before + decoded.rank))
+    tag = [evidence.log10_p_tag(TAG_BITS, before + decoded.rank)] if decoded is not None and claimed is None else []
+
+    def proven(floor: float) -> float:
+        proofs = [evidence.log10_p_read(score[chosen], norm[chosen], unknown + paid, floor), *tag]
+        return evidence.share_of(evidence.any_of(*proofs, floor=floor), share, floor)
+
     late = evidence.log10_p_read(score[chosen], norm[chosen], bits + paid)
     reading = readings[chosen]
     remarks = []
@@ -258,9 +263,10 @@ def _weigh(
         remarks.append("It is the mirror image of what was marked.")
     return _nothing(scheme, choices, len(word), reading)._replace(
         message=None if decoded is None else decoded.message,
-        log10_p=evidence.share_of(evidence.any_of(*proofs), share),
+        log10_p=proven(evidence.MIN_LOG10_P),
         log10_p_undated=evidence.undated(evidence.share_of(late, share)),
         log10_p_fitted=evidence.log10_p_fitted(score[chosen], norm[chosen], unknown + paid),
+        log10_p_unfloored=proven(evidence.UNFLOORED),
         agreement=float(score[chosen] / reading.anchors),
         remarks=tuple(remarks),
     )
@@ -271,12 +277,12 @@ def _nothing(scheme: BlindScheme, choices: Choices, length: int, reading: Readin
     if reading is None:
         pose = Pose(np.eye(3), np.zeros(3))
         zeros = np.zeros(length)
-        return BlindDetection(scheme.name, None, 0.0, 0.0, 0.0, zeros, 0, 0.0, 0.0, 0.0, pose, choices.version)
+        return BlindDetection(scheme.name, None, 0.0, 0.0, 0.0, 0.0, zeros, 0, 0.0, 0.0, 0.0, pose, choices.version)
     scores = reading.soft / (np.sqrt(np.mean(reading.soft**2)) or 1.0)
     return BlindDetection(
         scheme.name,
         None,
-        *(0.0, 0.0, 0.0),
+        *(0.0, 0.0, 0.0, 0.0),
         scores,
         reading.anchors,
         0.0,
