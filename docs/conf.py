@@ -67,10 +67,14 @@ def escape_markup(app: Sphinx, what: str, name: str, obj: Any, options: Any, lin
 
 
 def add_fields(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Document the fields of a class by the comments behind them."""
-    if what != "class" or any(line.startswith("Attributes:") for line in lines):
-        return
-    if described := _fields(obj):
+    """Document the fields of a class by the comments behind them, or with their types, where its docstring does."""
+    described = _fields(obj) if what == "class" else {}
+    if "Attributes:" in lines:
+        for place, line in enumerate(lines):
+            field, colon, text = line.strip().partition(": ")
+            if colon and field in described and line.startswith("    ") and line[4] != " ":
+                lines[place] = f"    {field}: {described[field]}; {text}"
+    elif described:
         lines += ["", "Attributes:", *(f"    {field}: {comment}" for field, comment in described.items()), ""]
 
 

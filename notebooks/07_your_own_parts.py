@@ -37,7 +37,7 @@ print(f"{len(mesh.vertices)} vertices")
 # An attack is a function of a mesh, a strength and a random key, with the unit of its strength and a usual range. This
 # one presses plane waves into the surface, as a worn 3D printer does. Written in JAX, it is given the mesh near the
 # origin and at unit size (diagonal 1), and can be differentiated. (`host=True` marks one in NumPy, which gets the mesh
-# as it is.)
+# as it is, and a NumPy generator instead of a key.)
 
 
 # %%
@@ -83,7 +83,7 @@ def stretch(original: Mesh, distorted: Mesh) -> float:
 
 
 for name, value in jm.distortion.measure(mesh, marked, ["rms", "dame", stretch]).items():
-    print(f"{jm.distortion.name_of(name):>8}: {value:.5f}")
+    print(f"{name:>8}: {value:.5f}")
 
 # %% [markdown]
 # Limits take it, too: the mark becomes as strong as no edge, in the mean, is stretched by more than 1 %. And as any

@@ -194,7 +194,9 @@ def test_no_worker_and_no_file(tmp_path):
 
 
 def made_up(count: int, **fields) -> list[Row]:
-    row = Row("m", "keyed", 64, "0.001", "noise", 0.1, "u", 0, "marked", True, False, 0.0, -20.0, -20.0, True, "", 1.0, 1e-3)
+    row = Row(
+        "m", "keyed", 64, "0.001", "noise", 0.1, "u", 0, "marked", True, False, 0.0, -20.0, -20.0, True, "", 1.0, 1e-3
+    )
     return [row._replace(seed=seed, **fields) for seed in range(count)]
 
 

@@ -269,6 +269,8 @@ def test_refusals(x64, unchecked):
     for wrong in (0, jm.new_key()):
         with pytest.raises(jm.JaxmarkError, match=r"tune needs a random key of JAX .* such as jax.random.key\(0\)"):
             tune(rough_sphere(300), ATTACKS, key=wrong)  # type: ignore[arg-type]
+    with pytest.raises(jm.JaxmarkError, match=r"pair such as \('noise', 0.005\), got 'noise'"):
+        tune(rough_sphere(300), ["noise"], key=jax.random.key(0))  # type: ignore[list-item]
     with pytest.raises(jm.JaxmarkError, match="see tune_blind"):
         tune(rough_sphere(300), ATTACKS, key=jax.random.key(0), scheme="field")
     with pytest.raises(jm.JaxmarkError, match="name of ATTACKS or an Attack"):
@@ -276,4 +278,4 @@ def test_refusals(x64, unchecked):
     with pytest.raises(jm.JaxmarkError, match="not along normals"):
         tune(rough_sphere(300), ATTACKS, key=jax.random.key(0), scheme=KeyedScheme(direction="normals"))
     with pytest.raises(jm.JaxmarkError, match="profile is up to 64"):
-        jm.make_marker(rough_sphere(300), jm.new_key(), scheme=KeyedScheme(profile=(1.0,) * 65))
+        KeyedScheme(profile=(1.0,) * 65)

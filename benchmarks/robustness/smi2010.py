@@ -19,7 +19,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -59,9 +58,8 @@ CROPS = 3  # averaged
 UNMARKED, KEYS = -1, 5  # in place of a trial; how many keys the unmarked mesh is read with
 
 
-def posed(mesh: Mesh, strength: float, key: jax.Array) -> Mesh:
+def posed(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
     """The protocol's similarity: shifts of up to 5 mean radii along each axis, any turn, scales from 0.1 to 10."""
-    random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     vertices = np.asarray(mesh.vertices)
     radius = np.linalg.norm(vertices - vertices.mean(axis=0), axis=1).mean()
     axis = random.normal(size=3)

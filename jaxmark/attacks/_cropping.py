@@ -1,12 +1,12 @@
 """Cropping: vertices or points are lost, with their faces, and the others stay exactly where they were; host side."""
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64, PRNGKeyArray
+from jaxtyping import Bool, Float64, Int64
 from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import generator
+from jaxmark.attacks.random import Randomness, generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, compact, edges, used_vertices
 
@@ -14,13 +14,13 @@ _HOLE_COUNT = 10
 
 
 @on_host
-def cropping(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+def cropping(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     """Cut off the part of the mesh beyond a plane of random direction.
 
     Args:
         mesh: any mesh, concrete.
         strength: share of the vertices that the plane cuts off, in [0, 1).
-        key: a JAX random key, which determines the direction.
+        key: a JAX random key or a NumPy generator, which determines the direction.
 
     Returns:
         The faces whose vertices are all left, and the vertices that they use.
@@ -34,14 +34,14 @@ def cropping(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
 
 
 @on_host
-def region_cropping(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+def region_cropping(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     """Cut out a region: the vertices nearest to a random one, by distance along edges.
 
     Args:
         mesh: any mesh, concrete.
         strength: share of the vertices in the region, in [0, 1). Once a connected part is used up, the region goes on
             with the vertices nearest in space.
-        key: a JAX random key, which determines the centre of the region.
+        key: a JAX random key or a NumPy generator, which determines the centre of the region.
 
     Returns:
         The faces whose vertices are all left, and the vertices that they use.
@@ -54,13 +54,14 @@ def region_cropping(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
 
 
 @on_host
-def holes(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+def holes(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     """Cut out ten regions, each as `region_cropping` does; their numbers of vertices differ by at most one.
 
     Args:
         mesh: any mesh, concrete.
         strength: share of the vertices in all regions together, in [0, 1).
-        key: a JAX random key, which draws the centre of each region from the vertices that are still there.
+        key: a JAX random key or a NumPy generator, which draws the centre of each region from the vertices that are
+            still there.
 
     Returns:
         The faces whose vertices are all left, and the vertices that they use.

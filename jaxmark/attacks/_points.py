@@ -1,11 +1,11 @@
 """What happens to point clouds: points are lost, added, thrown off, merged with another scan, or sampled anew."""
 
 import numpy as np
-from jaxtyping import Float64, PRNGKeyArray
+from jaxtyping import Float64
 from scipy.spatial import KDTree
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import generator
+from jaxmark.attacks.random import Randomness, generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, diagonal
 
@@ -14,13 +14,13 @@ _CORNERS = 6  # nearest points among which two span a triangle with a point
 
 
 @on_host
-def subsampling(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+def subsampling(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     """Lose points at random; the others stay where they are, in their order.
 
     Args:
         mesh: a point cloud, concrete.
         strength: share of the points that are lost, in [0, 1).
-        key: a JAX random key.
+        key: a JAX random key or a NumPy generator.
 
     Raises:
         JaxmarkError: if the mesh has faces, the share is out of range, or no point would be left.
@@ -32,13 +32,13 @@ def subsampling(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
 
 
 @on_host
-def outliers(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+def outliers(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     """Throw points off to random places in and around the cloud's box.
 
     Args:
         mesh: a point cloud, concrete.
         strength: share of the points that are thrown off, in [0, 1).
-        key: a JAX random key.
+        key: a JAX random key or a NumPy generator.
 
     Raises:
         JaxmarkError: if the mesh has faces, or the share is out of range.
@@ -50,13 +50,13 @@ def outliers(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
 
 
 @on_host
-def floaters(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+def floaters(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     """Add points at random places in and around the cloud's box, in random order among the others.
 
     Args:
         mesh: a point cloud, concrete.
         strength: number of points that are added, over those that are there.
-        key: a JAX random key.
+        key: a JAX random key or a NumPy generator.
 
     Raises:
         JaxmarkError: if the mesh has faces.
@@ -67,13 +67,13 @@ def floaters(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
 
 
 @on_host
-def merging(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+def merging(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     """Merge the cloud with a second scan of as many points on the same surface, in random order.
 
     Args:
         mesh: a point cloud, concrete.
         strength: half width of the uniform noise on each coordinate of the second scan, over the diagonal.
-        key: a JAX random key.
+        key: a JAX random key or a NumPy generator.
 
     Raises:
         JaxmarkError: if the mesh has faces.
@@ -85,13 +85,13 @@ def merging(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
 
 
 @on_host
-def resampling(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+def resampling(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     """Sample the surface anew: random places between points that are near each other take the place of all points.
 
     Args:
         mesh: a point cloud, concrete.
         strength: number of new points, over those that were there.
-        key: a JAX random key.
+        key: a JAX random key or a NumPy generator.
 
     Raises:
         JaxmarkError: if the mesh has faces, or no point would be left.

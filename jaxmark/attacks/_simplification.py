@@ -1,9 +1,9 @@
 """Simplification by edge collapses."""
 
 import numpy as np
-from jaxtyping import PRNGKeyArray
 
 from jaxmark.attacks.host import on_host
+from jaxmark.attacks.random import Randomness
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, compact, diagonal
@@ -14,7 +14,7 @@ _INPUT_DIAGONAL = 100
 
 
 @on_host
-def simplification(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
+def simplification(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
     """Collapse edges, those of least quadric error first, until only a share of the faces is left; on the host.
 
     The program is fast-simplification, which uses the quadrics of Garland and Heckbert, "Surface simplification using

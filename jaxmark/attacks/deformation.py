@@ -1,10 +1,10 @@
 """Deformation by dragged handles, as in a modelling tool; host side."""
 
 import numpy as np
-from jaxtyping import Float64, PRNGKeyArray
+from jaxtyping import Float64
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import generator
+from jaxmark.attacks.random import Randomness, generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, compact, component_of, diagonal, face_normals, used_vertices
@@ -14,7 +14,7 @@ _ARAP_STEPS = 50
 
 
 @on_host
-def as_rigid_as_possible(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+def as_rigid_as_possible(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     """Drag one end of the mesh sideways while the other is held; the rest follows as rigidly as possible.
 
     libigl takes 50 steps of Sorkine and Alexa, "As-rigid-as-possible surface modeling", SGP 2007 (with spokes and
@@ -27,7 +27,7 @@ def as_rigid_as_possible(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh
         mesh: any mesh, concrete.
         strength: length of the drag, in a random direction perpendicular to that axis, relative to the diagonal of the
             bounding box.
-        key: a JAX random key.
+        key: a JAX random key or a NumPy generator.
 
     Returns:
         The deformed mesh.

@@ -3,10 +3,10 @@
 import math
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64, PRNGKeyArray
+from jaxtyping import Bool, Float64, Int64
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import generator
+from jaxmark.attacks.random import Randomness, generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, edges, sides, unit
 
@@ -16,7 +16,7 @@ Codes = Int64[np.ndarray, " edges"]
 
 
 @on_host
-def edge_flips(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+def edge_flips(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     """Replace edges between two faces by the other diagonals of their quadrilaterals; on the host, in NumPy.
 
     An edge is flipped only if exactly two faces of consistent orientation share it, and if neither new face is thin
@@ -28,7 +28,7 @@ def edge_flips(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     Args:
         mesh: any mesh, concrete. Vertices are not welded: an edge between two copies of a point has no second face.
         strength: share of the edges to flip, in [0, 1]; which ones is random.
-        key: a JAX random key.
+        key: a JAX random key or a NumPy generator.
 
     Returns:
         The mesh with as many faces as before; unchanged faces keep their places.

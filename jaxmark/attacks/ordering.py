@@ -1,16 +1,16 @@
 """Reordering of vertices and faces."""
 
 import numpy as np
-from jaxtyping import Int64, PRNGKeyArray
+from jaxtyping import Int64
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import generator
+from jaxmark.attacks.random import Randomness, generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, used_vertices
 
 
 @on_host
-def reordering(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+def reordering(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     """Permute random vertices among themselves, and random faces among themselves; on the host.
 
     Each of these faces also starts at a random corner; its orientation stays.
@@ -18,7 +18,7 @@ def reordering(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     Args:
         mesh: any mesh, concrete.
         strength: share of the vertices and of the faces that change places, in [0, 1]; 1 for all of them.
-        key: a JAX random key.
+        key: a JAX random key or a NumPy generator.
 
     Returns:
         The same surface. A vertex that no face uses keeps its place.

@@ -1,10 +1,10 @@
 """Mosaics: pieces of a mesh between three perpendicular planes through the centre of its bounding box; host side."""
 
 import numpy as np
-from jaxtyping import Float64, Int64, PRNGKeyArray
+from jaxtyping import Float64, Int64
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import generator
+from jaxmark.attacks.random import Randomness, generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, used_vertices
 
@@ -12,7 +12,7 @@ _OCTANT_COUNT = 8
 
 
 @on_host
-def mosaic(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+def mosaic(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     """Shift the pieces of the mesh apart, each in a random direction.
 
     Three perpendicular planes of random orientation through the centre of the bounding box separate up to eight pieces.
@@ -21,7 +21,7 @@ def mosaic(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     Args:
         mesh: any mesh, concrete.
         strength: length of each shift, relative to the diagonal of the bounding box.
-        key: a JAX random key.
+        key: a JAX random key or a NumPy generator.
 
     Returns:
         The mesh with its faces in the same order; vertices are sorted by piece, and keep their order within a piece.
@@ -40,14 +40,14 @@ def mosaic(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
 
 
 @on_host
-def missing_pieces(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+def missing_pieces(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     """Remove pieces of the mesh, separated as by `mosaic`.
 
     Args:
         mesh: any mesh, concrete.
         strength: share of the pieces to remove, in [0, 1), rounded to whole pieces. Only pieces with a face count,
             mostly eight.
-        key: a JAX random key.
+        key: a JAX random key or a NumPy generator.
 
     Returns:
         The faces of the other pieces, and the vertices that they use, exactly where they were.

@@ -4,11 +4,12 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64, PRNGKeyArray
+from jaxtyping import Bool, Float64, Int64
 from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxmark.attacks.host import on_host
+from jaxmark.attacks.random import Randomness
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, boundary_vertices, diagonal, face_normals, used_vertices
 from jaxmark.geometry.pose import Points
@@ -80,7 +81,7 @@ Fit = Callable[[Region], Shape | None]  # None for a region that it does not app
 
 
 @on_host
-def plane_fitting(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
+def plane_fitting(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
     """Flatten nearly flat regions.
 
     Regions grow over edges at which normals turn by less than an angle. A region of at least ten vertices is flat if
@@ -109,7 +110,7 @@ def plane_fitting(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) 
 
 
 @on_host
-def primitive_fitting(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
+def primitive_fitting(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
     """Flatten nearly flat regions, and make nearly spherical or cylindrical ones exactly so.
 
     As `plane_fitting`, except that regions that are not flat may turn by up to three times the angle from face to face,

@@ -1,6 +1,7 @@
 """The list of attacks, and host functions that apply one or several of them to a mesh."""
 
 from collections.abc import Callable, Mapping, Sequence
+from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import jax
@@ -21,6 +22,7 @@ from jaxmark.attacks.flips import edge_flips
 from jaxmark.attacks.noise import diagonal_noise, gaussian_noise, uniform_noise
 from jaxmark.attacks.ordering import reordering
 from jaxmark.attacks.pieces import missing_pieces, mosaic
+from jaxmark.attacks.random import generator
 from jaxmark.attacks.refitting import plane_fitting, primitive_fitting
 from jaxmark.attacks.remeshing import iso_surface, isotropic, poisson
 from jaxmark.attacks.scene import adding_geometry
@@ -45,13 +47,22 @@ from jaxmark.geometry.mesh import (
 
 
 class Attack(NamedTuple):
-    """An attack: one of the library's, or your own."""
+    """An attack: one of the library's, or your own.
 
-    apply: Callable[[Mesh, Any, Any], Mesh]  # (mesh, strength, random key) → mesh
-    unit: str  # what its strength is, in words
-    strengths: tuple[float, ...]  # usual strengths, weak ones first
-    host: bool = False  # NumPy or another program; else traced, and given the mesh centred and at unit diagonal
-    faces: bool = False  # whether it needs faces, so that point clouds are refused
+    Attributes:
+        apply: function (mesh, strength, randomness) → mesh. On the host, randomness is a `numpy.random.Generator`, and
+            the mesh is as it is; else a JAX random key, and the mesh is centred and at unit diagonal.
+        unit: what its strength is, in words.
+        strengths: usual strengths, weak ones first.
+        host: whether it is NumPy or another program; else it is traced.
+        faces: whether it needs faces, so that point clouds are refused.
+    """
+
+    apply: Callable[[Mesh, Any, Any], Mesh]
+    unit: str
+    strengths: tuple[float, ...]
+    host: bool = False
+    faces: bool = False
 
 
 #: All attacks of the library, by their names.
@@ -180,7 +191,7 @@ def chain(mesh: Mesh, steps: Sequence[Step], *, seed: int) -> Mesh:
     """
     entries = [(get_attack(kind), strength) for kind, strength in steps]
     for place, (entry, strength) in enumerate(entries):
-        _check_strength(strength)
+        _check_numbers(strength, seed)
         key = jax.random.key(seed)
         mesh = _apply(host_mesh(mesh), entry, strength, jax.random.fold_in(key, place) if place else key)
     return mesh
@@ -202,7 +213,7 @@ def attack_each(meshes: Sequence[Mesh], kind: Kind, strength: float, *, seeds: S
         JaxmarkError: see `attack`; if one mesh is refused, all are.
     """
     entry, meshes = get_attack(kind), [host_mesh(mesh) for mesh in meshes]
-    _check_strength(strength)
+    _check_numbers(strength, *seeds)
     welded = weld(meshes[0].vertices)
     _check_kind(entry, meshes[0])
     if entry.host or not all(
@@ -231,9 +242,12 @@ def get_attack(kind: Kind) -> Attack:
     return ATTACKS[kind]
 
 
-def _check_strength(strength: float) -> None:
-    if not (np.isfinite(strength) and strength >= 0):
-        raise JaxmarkError(f"The strength of an attack must be a number, not negative, got {strength}.")
+def _check_numbers(strength: float, *seeds: int) -> None:
+    if not (isinstance(strength, Real) and np.isfinite(strength) and strength >= 0):
+        raise JaxmarkError(f"The strength of an attack must be a number, not negative, got {strength!r}.")
+    for seed in seeds:
+        if not isinstance(seed, Integral):
+            raise JaxmarkError(f"The seed of an attack is a whole number, such as 0, got {type(seed).__name__}.")
 
 
 def _apply(mesh: Mesh, entry: Attack, strength: float, key: PRNGKeyArray) -> Mesh:
@@ -242,7 +256,7 @@ def _apply(mesh: Mesh, entry: Attack, strength: float, key: PRNGKeyArray) -> Mes
     welded = weld(mesh.vertices)
     points = weld_mesh(mesh, welded)
     if entry.host:
-        found = entry.apply(points, strength, key)
+        found = entry.apply(points, strength, generator(key))
     else:
         small = _normalise(points)
         found = small.back(entry.apply(small.mesh, strength, key))

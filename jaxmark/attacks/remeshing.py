@@ -1,11 +1,11 @@
 """Remeshing: nearly the same surface with other vertices and faces; host side, by other programs."""
 
 import numpy as np
-from jaxtyping import Float64, Int64, PRNGKeyArray
+from jaxtyping import Float64, Int64
 
 from jaxmark.attacks.host import on_host
 from jaxmark.attacks.meshlab import apply_filter, apply_filter_to_points
-from jaxmark.attacks.random import generator
+from jaxmark.attacks.random import Randomness, generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, area, compact, edges
@@ -17,7 +17,7 @@ _CELLS_PER_BLOCK = 4  # along each side of a block; a coarse grid of blocks tell
 
 
 @on_host
-def isotropic(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
+def isotropic(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
     """Remesh with edges of about one length and vertices on the surface, by MeshLab.
 
     Args:
@@ -41,7 +41,7 @@ def isotropic(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> M
 
 
 @on_host
-def iso_surface(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
+def iso_surface(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
     """Extract the surface again from a grid of signed distances, by libigl and the marching cubes of scikit-image.
 
     Where holes leave open what is inside, the winding number decides.
@@ -84,7 +84,7 @@ def iso_surface(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) ->
 
 
 @on_host
-def poisson(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+def poisson(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     """Reconstruct the surface from random points with normals, 30 for each vertex, by MeshLab.
 
     This is the screened Poisson reconstruction of Kazhdan and Hoppe, ACM Transactions on Graphics 32(3), 2013, which
@@ -93,7 +93,7 @@ def poisson(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
     Args:
         mesh: any mesh, concrete.
         strength: depth of the octree, a whole number from 1 to 12.
-        key: a JAX random key, which determines the points.
+        key: a JAX random key or a NumPy generator, which determines the points.
 
     Returns:
         A mesh with other vertices and faces.

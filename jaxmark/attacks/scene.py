@@ -1,10 +1,9 @@
 """Scenes: a mesh beside other objects."""
 
 import numpy as np
-from jaxtyping import PRNGKeyArray
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import generator
+from jaxmark.attacks.random import Randomness, generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, diagonal, used_vertices
 
@@ -12,13 +11,13 @@ _GAP_DIAGONALS = 0.1  # between the bounding spheres of the mesh and of each obj
 
 
 @on_host
-def adding_geometry(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+def adding_geometry(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     """Add a ring on one side of the mesh and a box on the other, in a random direction and poses; on the host.
 
     Args:
         mesh: any mesh, concrete.
         strength: bounding-box diagonal of each object before it is rotated, relative to that of the mesh; positive.
-        key: a JAX random key.
+        key: a JAX random key or a NumPy generator.
 
     Returns:
         The mesh, unchanged and first, then the ring of 1,024 vertices and the box of 386. None of them touch.

@@ -4,9 +4,10 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, PRNGKeyArray
+from jaxtyping import Float64
 
 from jaxmark.attacks.host import on_host
+from jaxmark.attacks.random import Randomness
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
 from jaxmark.geometry.mesh import Mesh, used_vertices
@@ -17,7 +18,7 @@ _MAX_ROUND_TRIPS = 10
 
 
 @on_host
-def digits(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
+def digits(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
     """Round coordinates to a number of significant decimal digits, as text files do.
 
     Args:
@@ -38,7 +39,7 @@ def digits(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh
 
 
 @on_host
-def float_bits(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
+def float_bits(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
     """Round coordinates to IEEE 754 binary floats of a number of bits.
 
     Args:
@@ -66,7 +67,7 @@ def float_bits(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> 
 
 
 @on_host
-def soup(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
+def soup(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
     """Write the mesh to a binary STL file and read it again: single precision, and no vertices shared by faces.
 
     Args:

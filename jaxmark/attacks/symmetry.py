@@ -6,10 +6,11 @@ A mark that differs from one repetition to the next is averaged out.
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float64, Int64, PRNGKeyArray
+from jaxtyping import Float64, Int64
 
 from jaxmark.alignment.registration import refine
 from jaxmark.attacks.host import on_host
+from jaxmark.attacks.random import Randomness
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, component_of, diagonal, used_vertices
 from jaxmark.geometry.pose import IDENTITY, Points, PointSets, Pose, similarity
@@ -26,7 +27,7 @@ _PROCRUSTES_ROUNDS = 3
 
 
 @on_host
-def mirror_averaging(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
+def mirror_averaging(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
     """Average the mesh with its mirror image.
 
     The mirror plane is the best of three through the centroid and perpendicular to the principal axes, each refined by
@@ -65,7 +66,7 @@ def mirror_averaging(mesh: Mesh, strength: float, key: PRNGKeyArray | None = Non
 
 
 @on_host
-def instance_averaging(mesh: Mesh, strength: float, key: PRNGKeyArray | None = None) -> Mesh:
+def instance_averaging(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
     """Average parts of the mesh that repeat each other, such as screws, leaves or wheels.
 
     Connected parts repeat each other if their faces are the same once their vertices are numbered in the order in which

@@ -26,6 +26,7 @@ from jaxmark.geometry.mesh import (
     Weld,
     area,
     check_faces,
+    check_mesh,
     compact,
     diagonal,
     displacement,
@@ -239,10 +240,12 @@ _ANY_CONNECTIVITY = {"mrms", "hausdorff", "fmpd", "msdm2", *RENDERED}
 
 def metrics_of(original: Mesh, distorted: Mesh) -> tuple[str, ...]:
     """The names in `METRICS` that two meshes can be compared by: if one is a point cloud, those in `OF_POINTS`."""
+    check_mesh(original)
+    check_mesh(distorted)
     return METRICS if len(original.faces) and len(distorted.faces) else OF_POINTS
 
 
-def measure(original: Mesh, distorted: Mesh, metrics: Collection[Metric]) -> dict[Metric, float | None]:
+def measure(original: Mesh, distorted: Mesh, metrics: Collection[Metric]) -> dict[str, float | None]:
     """Measure how far a mesh was distorted, by metrics by name and by functions of your own.
 
     Args:
@@ -253,12 +256,17 @@ def measure(original: Mesh, distorted: Mesh, metrics: Collection[Metric]) -> dic
             given, in float64.
 
     Returns:
-        The value of each metric; None if a named one needs meshes of the same connectivity and these differ in it.
+        The value of each metric by its name, of a function by the function's; None if a named one needs meshes of the
+        same connectivity and these differ in it.
 
     Raises:
-        JaxmarkError: see `compare`; also if a function's value is not a finite number of at least 0.
+        JaxmarkError: see `compare`; also if a function's value is not a finite number of at least 0, or two metrics
+            have one name.
     """
-    return Reference(original).measure(distorted, metrics)
+    names = [name_of(metric) for metric in metrics]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise JaxmarkError(f"Two metrics are called {twice[0]!r}; define functions with names of their own.")
+    return {name_of(metric): value for metric, value in Reference(original).measure(distorted, metrics).items()}
 
 
 def name_of(metric: Metric) -> str:

@@ -106,13 +106,14 @@ def robustness(
     Raises:
         JaxmarkError: if there is no such attack, no strength, or no sample.
     """
-    strengths = get_attack(kind).strengths if epsilons is None else tuple(epsilons)
+    entry = get_attack(kind)
+    strengths = entry.strengths if epsilons is None else tuple(epsilons)
     if samples < 1 or not strengths:
         raise JaxmarkError(f"robustness needs a strength and a sample, got {len(strengths)} and {samples}.")
 
     def try_attack(strength: float, seed: int) -> tuple[Reading, str]:
         try:
-            return read(marker, attack(marked, kind, strength, seed=seed), message), ""
+            return read(marker, attack(marked, entry, strength, seed=seed), message), ""
         except JaxmarkError as error:
             return NOTHING, str(error)
 
@@ -122,8 +123,14 @@ def robustness(
         return np.array([[getattr(reading, name) for reading, _ in row] for row in rows])
 
     refusals = tuple(tuple(sentence for _, sentence in row) for row in rows)
-    columns = (column(name) for name in ("read", "bit_errors", "log10_p", "log10_p_unfloored"))
-    return Robustness(np.array(strengths, float), *columns, refusals)
+    return Robustness(
+        np.array(strengths, float),
+        column("read"),
+        column("bit_errors"),
+        column("log10_p"),
+        column("log10_p_unfloored"),
+        refusals,
+    )
 
 
 def minimum_distortion(

@@ -9,7 +9,7 @@ from jaxtyping import Float64, PRNGKeyArray
 
 from jaxmark import distortion
 from jaxmark.errors import JaxmarkError
-from jaxmark.evaluation.tuning import Attacker, apply_attack, seed_numbers
+from jaxmark.evaluation.tuning import Attacker, apply_attack, check_attackers, seed_numbers
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.marker import make_blind_marker
 from jaxmark.watermark.blind.prediction import Left, best_margin, compare
@@ -66,6 +66,7 @@ def tune_blind(
     """
     if not attacks or seeds < 1:
         raise JaxmarkError(f"tune_blind needs at least one attack and one seed, got {len(attacks)} and {seeds}.")
+    check_attackers(attacks)
     blind = blind_scheme(scheme)
     if blind is None:
         raise JaxmarkError(

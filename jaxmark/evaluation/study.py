@@ -1,5 +1,7 @@
 """Studies: what marks survive, over a declared grid of meshes, schemes, payloads, budgets, attacks and seeds."""
 
+from __future__ import annotations  # so that `help` shows names of types instead of what they stand for
+
 import hashlib
 import json
 import math
@@ -11,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from itertools import product
+from numbers import Integral, Real
 from typing import Any
 
 from jaxmark.alignment.alignment import Alignment
@@ -41,27 +44,32 @@ class Study:
 
     From each seed derive a key, a message and the random choices of the attack. Two controls are always read, too: the
     same suspects without a mark, and the marked ones with another key.
+
+    Attributes:
+        meshes: files, or meshes, by their names.
+        attacks: strengths by name in `ATTACKS`, or attacks of your own by any name, such as
+            `{"noise": [0.001, 0.005], "mine": Attack(function, "unit", (0.1,))}`.
+        schemes: names, or schemes of your own by any name.
+        payloads: sizes of the message, in bits.
+        budgets: RMS displacements over the diagonal, names of visibilities, or limits by metric; see `embed`.
+        seeds: number of seeds: 0, 1, …
     """
 
-    meshes: Mapping[str, str | os.PathLike[str] | Mesh]  # files, or meshes, by their names
-    attacks: Mapping[str, Sequence[float] | Attack]  # strengths by name in `ATTACKS`, or attacks of your own
-    #: Names, or schemes of your own by any name.
+    meshes: Mapping[str, str | os.PathLike[str] | Mesh]
+    attacks: Mapping[str, Sequence[float] | Attack]
     schemes: Sequence[str] | Mapping[str, str | Scheme | BlindScheme] = (DEFAULT_SCHEME,)
     payloads: Sequence[int] = (DEFAULT_BITS,)
-    budgets: Sequence[float | Visibility | Mapping[str, float]] = ("hidden",)  # RMS, names, or limits; see `embed`
-    seeds: int = 5  # number of seeds: 0, 1, …
+    budgets: Sequence[float | Visibility | Mapping[str, float]] = ("hidden",)
+    seeds: int = 5
 
     def __post_init__(self) -> None:
         """Check the fields.
 
         Raises:
-            JaxmarkError: if meshes or attacks have no names, an attack, a scheme or a metric does not exist, a payload
-                is no positive multiple of 8 bits, or there is nothing to do.
+            JaxmarkError: if a field has another form than described, an attack, a scheme or a metric does not exist, a
+                payload is no positive multiple of 8 bits, or there is nothing to do.
         """
-        examples = {"meshes": '{"bunny": mesh}', "attacks": '{"noise": [0.005]}'}
-        for name, example in examples.items():
-            if not isinstance(getattr(self, name), Mapping):
-                raise JaxmarkError(f"The {name} of a study have names: give them as a mapping, such as {example}.")
+        self._check_forms()
         parts = {"mesh": self.meshes, "attack": self.attacks, "scheme": self._schemes, "budget": self._budgets}
         parts |= {f"strength of {name!r}": self._strengths(name) for name in self.attacks if self._attack(name)}
         for name, part in {**parts, "payload": self.payloads, "seed": range(self.seeds)}.items():
@@ -69,11 +77,35 @@ class Study:
                 raise JaxmarkError(f"A study needs at least one {name}.")
         for name in self.attacks:
             for strength in self._strengths(name):
-                if not (math.isfinite(strength) and strength >= 0):
-                    raise JaxmarkError(f"The strengths of {name!r} are finite and not negative, got {strength}.")
+                if not (isinstance(strength, Real) and math.isfinite(strength) and strength >= 0):
+                    raise JaxmarkError(f"The strengths of {name!r} are finite and not negative, got {strength!r}.")
         for bits in self.payloads:
-            if bits < 8 or bits % 8:
-                raise JaxmarkError(f"A payload is a positive multiple of 8 bits, got {bits}.")
+            if not isinstance(bits, Integral) or bits < 8 or bits % 8:
+                raise JaxmarkError(f"A payload is a positive multiple of 8 bits, got {bits!r}.")
+
+    def _check_forms(self) -> None:
+        """Check that what has names has them, and what may be several is given as several."""
+        examples = {"meshes": '{"bunny": mesh}', "attacks": '{"noise": [0.005]}'}
+        for name, example in examples.items():
+            if not isinstance(getattr(self, name), Mapping):
+                raise JaxmarkError(f"The {name} of a study have names: give them as a mapping, such as {example}.")
+        for name, mesh in self.meshes.items():
+            if not isinstance(mesh, Mesh | str | os.PathLike):
+                raise JaxmarkError(f"The mesh {name!r} of a study is a Mesh or a file, got {type(mesh).__name__}.")
+        for name, given in self.attacks.items():
+            if callable(given):
+                get_attack(given)  # pyright: ignore[reportArgumentType] (refuses a function)
+            if isinstance(given, str) or not isinstance(given, Sequence):  # an `Attack` is a tuple
+                raise JaxmarkError(
+                    f"The strengths of the attack {name!r} are a list, such as [0.001, 0.005], got {given!r}."
+                )
+        examples = {"schemes": '["keyed", "host"]', "payloads": "[32, 64]", "budgets": '[0.0008, "hidden"]'}
+        for name, example in examples.items():
+            given = getattr(self, name)
+            if isinstance(given, str) or not isinstance(given, Sequence | Mapping):
+                raise JaxmarkError(f"The {name} of a study are a list, such as {example}, got {given!r}.")
+        if not isinstance(self.seeds, Integral):
+            raise JaxmarkError(f"seeds is a number of seeds, such as 5, got {self.seeds!r}.")
 
     def run(
         self,
@@ -143,9 +175,7 @@ class Study:
         blocks = [(first, min(_SEEDS_PER_CELL, count - first)) for first in range(0, count, _SEEDS_PER_CELL)]
         for mesh, scheme, bits, budget, block in product(self.meshes, schemes, self.payloads, budgets, blocks):
             # What an older file does not say of a reading is read again.
-            fields = json.dumps(
-                [digests[mesh], schemes[scheme].name, parameters_of(schemes[scheme]), Reading._fields]
-            )
+            fields = json.dumps([digests[mesh], schemes[scheme].name, parameters_of(schemes[scheme]), Reading._fields])
             digest = hashlib.sha256(fields.encode()).hexdigest()[:16]
             for name in self.attacks:
                 for strength in self._strengths(name):

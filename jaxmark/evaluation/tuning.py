@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Float64, Int64, PRNGKeyArray
 
 from jaxmark.alignment.alignment import align, observation
 from jaxmark.alignment.original import Original, make_original
-from jaxmark.attacks import Kind, attack
+from jaxmark.attacks import Kind, attack, get_attack
 from jaxmark.distortion import name_of
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.allocation import Solver, balance, upper_bound
@@ -115,6 +115,7 @@ def tune(
     """
     if not attacks or seeds < 1:
         raise JaxmarkError(f"tune needs at least one attack and one seed, got {len(attacks)} and {seeds}.")
+    check_attackers(attacks)
     if blind_scheme(scheme) is not None:
         raise JaxmarkError(f"The scheme {scheme!r} is read without the original, and has no bands; see tune_blind.")
     numbers = seed_numbers("tune", key, seeds)
@@ -217,6 +218,20 @@ def seed_numbers(caller: str, key: PRNGKeyArray, count: int) -> Int64[np.ndarray
             f"{caller} needs a random key of JAX for the attacks, such as jax.random.key(0); got {type(key).__name__}."
         ) from None
     return np.asarray(found, np.int64)
+
+
+def check_attackers(attacks: Sequence[Attacker]) -> None:
+    """Check that attacks to tune for are functions of mesh and seed, or pairs of an attack and a strength.
+
+    Raises:
+        JaxmarkError: if one is neither, or there is no such attack.
+    """
+    for attacker in attacks:
+        if callable(attacker):
+            continue
+        if not isinstance(attacker, tuple) or len(attacker) != 2:
+            raise JaxmarkError(f"An attack to tune for is a pair such as ('noise', 0.005), got {attacker!r}.")
+        get_attack(attacker[0])
 
 
 def apply_attack(attacker: Attacker, mesh: Mesh, seed: int) -> Mesh:

@@ -84,8 +84,19 @@ def make_mesh(vertices: ArrayLike, faces: ArrayLike) -> Mesh:
 
 def host_mesh(mesh: Mesh) -> Mesh:
     """Convert a mesh of any arrays to validated NumPy arrays; raises as `make_mesh` does, and for traced arrays."""
+    check_mesh(mesh)
     check_concrete("This", mesh.vertices, mesh.faces)
     return make_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def check_mesh(mesh: Mesh) -> None:
+    """Refuse what is no mesh, such as the name of a file.
+
+    Raises:
+        JaxmarkError: if it has no vertices and faces.
+    """
+    if not (hasattr(mesh, "vertices") and hasattr(mesh, "faces")):
+        raise JaxmarkError(f"A mesh is needed, got {type(mesh).__name__}; jaxmark.load_mesh reads one from a file.")
 
 
 def check_faces(name: str, mesh: Mesh) -> None:

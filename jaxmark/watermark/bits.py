@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxmark.alignment.observation import observe
+from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.carriers import Carrier
 from jaxmark.watermark.carriers.carrier import Strength
 from jaxmark.watermark.detectors import Detector, claims, decorrelate
@@ -30,7 +31,11 @@ def embed_bits(
 
     Returns:
         Marked coordinates `[N, 3]`.
+
+    Raises:
+        JaxmarkError: if bits or β have another shape.
     """
+    _check_bits(bits, carrier)
     return x + carrier.displacement(bits, beta)
 
 
@@ -57,7 +62,11 @@ def detect_bits(
 
     Returns:
         Soft values, `[k]`.
+
+    Raises:
+        JaxmarkError: if an argument has another shape.
     """
+    _check_suspect(suspect, x, weights, normals)
     reader = carrier.reader()
     return detector(reader, reader.receive(observe(suspect - x, weights, normals)), beta)
 
@@ -90,9 +99,29 @@ def log_evidence(
         negative where nothing is proven.
 
     Raises:
-        JaxmarkError: if the suspect is neither float32 nor float64.
+        JaxmarkError: if the suspect is neither float32 nor float64, or an argument has another shape.
     """
+    _check_suspect(suspect, x, weights, normals)
+    _check_bits(codeword, carrier)
     reader = carrier.reader()
     scores, norms = claims(reader, reader.receive(observe(suspect - x, weights, normals)), codeword)
     ratios = jnp.maximum(scores / norms, 0)
     return jnp.max(ratios) ** 2 / 2 - math.log(len(ratios))
+
+
+def _check_bits(bits: Float[Array, " bits"], carrier: Carrier) -> None:
+    if jnp.shape(bits) != (carrier.code_bits,):
+        raise JaxmarkError(f"This carrier has {carrier.code_bits} code bits; got the shape {jnp.shape(bits)}.")
+
+
+def _check_suspect(suspect: Array, x: Array, weights: Array | None, normals: Array | None) -> None:
+    for name, given, shape in (
+        ("the suspect", suspect, jnp.shape(x)),
+        ("weights", weights, jnp.shape(x)[:1]),
+        ("normals", normals, jnp.shape(x)),
+    ):
+        if given is not None and jnp.shape(given) != shape:
+            raise JaxmarkError(
+                f"The original has {len(x)} rows in its order, and so must {name}; got the shape {jnp.shape(given)}."
+                " jaxmark.detect brings any mesh back to its original."
+            )

@@ -4,6 +4,8 @@ Informed schemes are read beside the original (`jaxmark.watermark.marking`), bli
 (`jaxmark.watermark.blind`).
 """
 
+from __future__ import annotations  # so that `help` shows names of types instead of what they stand for
+
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -14,7 +16,7 @@ from numpy.typing import ArrayLike
 from jaxmark.alignment.alignment import Align
 from jaxmark.alignment.original import make_original
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh, check_mesh
 from jaxmark.watermark.blind import reading
 from jaxmark.watermark.blind.field import FieldScheme
 from jaxmark.watermark.blind.local import LocalScheme
@@ -259,24 +261,16 @@ def detect(
 ) -> Detection | BlindDetection:
     """Read a mark from a suspect, and compute what the reading proves.
 
-    Without `original`, marks of the blind schemes are read, and a `BlindDetection` is returned. Its bound holds for
-    any suspect independent of the key: see `jaxmark.watermark.blind.reading`. The rest is about reading beside it.
+    Without `original`, marks of the blind schemes are read; see `jaxmark.watermark.blind.reading`. Beside it, the
+    suspect is first aligned with it (`jaxmark.alignment.alignment.align`). Without `message`, what is read counts only
+    if its keyed tag fits. With it, a mark is proven whose message can no longer be read; if another message is read,
+    the claim is refuted, not the mark: log10_p is that of the message that was read, and a remark says so. All that was
+    tried, or left to choose, is paid for (`Marker.detect`).
 
-    The suspect is first aligned with the original (`jaxmark.alignment.alignment.align`); points that are far off are
-    masked. Without `message`, the message that is read counts only if its keyed tag fits. Two kinds of proof are then
-    tried, and each is paid for: the tag, and the union bound over all messages, or over the one that the record commits
-    to. With `message`, log10_p is Hoeffding's bound for that message (see `evidence.log10_p_claimed`), which can prove
-    a mark whose message can no longer be read. If another message is read, the claim is refuted, not the mark: log10_p
-    is that of the message that was read, and a remark says so. The score is taken for each way of weighting the suspect
-    (see `detectors.claims`), and each is paid for, too; so are ways of aligning other than `"auto"`, and, without a
-    record, both versions of the keyed choices.
-
-    All bounds hold for any suspect independent of the key, provided that key, original, message and record were fixed
-    before the suspect existed (if nothing shows that, log10_p_undated counts); that weights depend on suspect and
-    original only; and that the score is the plain correlation of the codeword: joint decoding may choose the codeword,
-    but does not enter the score. A mesh marked under the same key is not independent of it: once its message can no
-    longer be read, a claim of a message that has many bits in common with it may pass. Where the program cannot vouch
-    for a condition, `doubts` says why, and the figures are estimates.
+    **The bounds hold for any suspect independent of the key**, provided that key, original, message and record were
+    fixed before it existed; if nothing shows that, log10_p_undated counts. A mesh marked under the same key is not
+    independent of it: once its message can no longer be read, a claim of one that has many bits in common with it may
+    pass. Where the program cannot vouch for a condition, `doubts` says why, and the figures are estimates.
 
     Args:
         suspect: any mesh: moved, reordered, cropped, remeshed.
@@ -345,6 +339,7 @@ def read_blind(
     Raises:
         JaxmarkError: see `detect`.
     """
+    check_mesh(suspect)
     tried = [scheme] if scheme is not None else list(BLIND_SCHEMES.values())
     if record is not None:
         record.check("message" if record.bits else "presence", key)

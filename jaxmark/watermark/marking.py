@@ -64,19 +64,33 @@ class EmbedInfo(NamedTuple):
 
 
 class Detection(NamedTuple):
-    """The result of reading a suspect."""
+    """The result of reading a suspect.
 
-    message: bytes | None  # the message that was read; None unless its keyed tag fits
-    log10_p: float  # log10 of a bound on the false-positive probability, in [-77, 0], if all that is claimed is dated
-    log10_p_undated: float  # the same if nothing is: for the best message of any of 2^64 keys, originals and records
-    log10_p_fitted: float  # log10 of that probability if the score were Gaussian: an estimate, which decides nothing
-    log10_p_unfloored: float  # log10_p without the floor at -77: orders attacks and schemes, proves and decides nothing
-    scores: Float64[np.ndarray, " code"]  # soft values of the code bits, scaled to root mean square 1
-    coverage: float  # share of the original's points that the suspect gave evidence for
-    alignment: Alignment  # how the suspect was brought back to the original
-    version: int  # version of the keyed choices that were read with
-    doubts: tuple[str, ...] = ()  # why the probabilities are estimates, not proofs; empty if they are proofs
-    remarks: tuple[str, ...] = ()  # what else the suspect looks like
+    Attributes:
+        message: the message that was read; None unless its keyed tag fits.
+        log10_p: log10 of a bound on the false-positive probability, in [-77, 0], if all that is claimed is dated.
+        log10_p_undated: the same if nothing is: for the best message of any of 2^64 keys, originals and records.
+        log10_p_fitted: log10 of that probability if the score were Gaussian: an estimate, which decides nothing.
+        log10_p_unfloored: log10_p without the floor at -77: orders attacks and schemes, proves and decides nothing.
+        scores: soft values of the code bits, scaled to root mean square 1.
+        coverage: share of the original's points that the suspect gave evidence for.
+        alignment: how the suspect was brought back to the original.
+        version: version of the keyed choices that were read with.
+        doubts: why the probabilities are estimates, not proofs; empty if they are proofs.
+        remarks: what else the suspect looks like.
+    """
+
+    message: bytes | None
+    log10_p: float
+    log10_p_undated: float
+    log10_p_fitted: float
+    log10_p_unfloored: float
+    scores: Float64[np.ndarray, " code"]
+    coverage: float
+    alignment: Alignment
+    version: int
+    doubts: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def premises(self) -> str:
@@ -253,6 +267,13 @@ class Marker:
         align: Align = "auto",
     ) -> Detection:
         """Read a suspect, with a claimed message or without; see `detect`.
+
+        Points that are far off are masked. Without a claim, two kinds of proof are tried, and each is paid for: the
+        tag, and the union bound over all messages, or over the one that the record commits to. With one, log10_p is
+        Hoeffding's bound (see `evidence.log10_p_claimed`). The score is the plain correlation of the codeword: joint
+        decoding may choose the codeword, but does not enter the score. It is taken for each way of weighting the
+        suspect (see `detectors.claims`), and each is paid for, too; so are ways of aligning other than `"auto"`, and,
+        without a record, both versions of the keyed choices. Weights depend on suspect and original only.
 
         A suspect that is read with several keys needs to be aligned only once: pass the result of
         `jaxmark.alignment.alignment.align` in its place.
@@ -457,13 +478,16 @@ class Marker:
         least = room.least_budget(self.bits, conditions)
         if least <= reached:
             return
-        most = room.bits(conditions)
-        mend = "Use a shorter message"
+        most = room.bits(conditions) if self.bits else 0
+        present = room.least_budget(0, conditions) <= reached
+        mend = ["a shorter message"] if most else ["a presence mark"] if present else []
         if math.isfinite(least):
-            mend += f", or a budget of at least {_rounded_up(least):g}{self._seen_at(_rounded_up(least), conditions)}"
+            mend.append(f"a budget of at least {_rounded_up(least):g}{self._seen_at(_rounded_up(least), conditions)}")
+        carried = f"carries at most {most} bits" if most else "carries no message" if self.bits else "carries nothing"
+        wanted = f", not {self.bits}" if most else ""
         raise JaxmarkError(
-            f"This mesh ({int(self.original.used.sum())} points) carries at most {most} bits at"
-            f" {conditions.budget}, with noise of {conditions.noise:g} and half of it lost, not {self.bits}. {mend}."
+            f"This mesh ({int(self.original.used.sum())} points) {carried} at {conditions.budget}, with noise of"
+            f" {conditions.noise:g} and half of it lost{wanted}. Use {', or '.join(mend or ['less noise'])}."
         )
 
     def _seen_at(self, budget: float, conditions: Conditions) -> str:
@@ -473,7 +497,7 @@ class Marker:
         word = np.random.default_rng(0).choice([-1.0, 1.0], self.code_bits)
         marked, _ = self.write(word, make_budget(min(budget, 0.5)))
         seen = distortion.measure(self.original.mesh, marked, limits.keys())
-        told = ", ".join(f"{distortion.name_of(metric)} would be {seen[metric] or 0:.2g}" for metric in limits)
+        told = ", ".join(f"{name} would be {value or 0:.2g}" for name, value in seen.items())
         return f" (at which {told})"
 
     def check_claim(self, message: bytes) -> None:

@@ -185,6 +185,23 @@ class KeyedScheme(Scheme):
     passband: Literal["tapered", "narrow"] = "tapered"  # how bands and nuisance are chosen
     hiding: bool = True  # whether points move where and as it is hidden; see `jaxmark.watermark.hiding`
 
+    def __post_init__(self) -> None:
+        """Check the fields.
+
+        Raises:
+            JaxmarkError: if the profile is longer than the bands or no profile, or there is no such direction or pass
+                band.
+        """
+        if self.profile and not (
+            len(self.profile) <= self.bands and min(self.profile) >= 0 < max(self.profile) < math.inf
+        ):
+            raise JaxmarkError(
+                f"A profile is up to {self.bands} numbers, none negative and not all 0; got {len(self.profile)}."
+            )
+        for name, known in (("direction", ("coordinates", "normals")), ("passband", ("tapered", "narrow"))):
+            if getattr(self, name) not in known:
+                raise JaxmarkError(f"{name} must be {known[0]!r} or {known[1]!r}, got {getattr(self, name)!r}.")
+
     @property
     def detector(self) -> Detector:
         """See `Scheme`."""
@@ -279,30 +296,20 @@ class KeyedScheme(Scheme):
     @property
     def _channels(self) -> int:
         """Number of chips per vertex."""
-        match self.direction:
-            case "coordinates":
-                return 3
-            case "normals":
-                return 1
-        raise JaxmarkError(f"direction must be 'coordinates' or 'normals', got {self.direction!r}.")
+        return 3 if self.direction == "coordinates" else 1
 
     def _strengths(self, original: Original, bits: int) -> Float64[np.ndarray, " passing"]:
         """Relative strengths as in `strengths`, but also in bands that are mostly nuisance."""
         if self.profile:
-            if len(self.profile) > self.bands or not min(self.profile) >= 0 < max(self.profile) < math.inf:
-                raise JaxmarkError(f"A profile is up to {self.bands} numbers, none negative and not all 0.")
             return np.array(self.profile)
         information = bits + TAG_BITS
         usual = round(self.bands * 0.31)
-        match self.passband:
-            case "tapered":
-                passing = self._count_bands(original, 12 * information, usual)
-                places = (np.arange(passing) + 0.5) / passing
-                return np.interp(places, (np.arange(len(DERIVED)) + 0.5) / len(DERIVED), DERIVED)
-            case "narrow":
-                wanted = min(1024 + 12 * information, self._dimensions(original, usual))
-                return np.ones(self._count_bands(original, max(wanted, 6 * information), 0))
-        raise JaxmarkError(f"passband must be 'tapered' or 'narrow', got {self.passband!r}.")
+        if self.passband == "narrow":
+            wanted = min(1024 + 12 * information, self._dimensions(original, usual))
+            return np.ones(self._count_bands(original, max(wanted, 6 * information), 0))
+        passing = self._count_bands(original, 12 * information, usual)
+        places = (np.arange(passing) + 0.5) / passing
+        return np.interp(places, (np.arange(len(DERIVED)) + 0.5) / len(DERIVED), DERIVED)
 
     def _count_bands(self, original: Original, dimensions: float, least: int) -> int:
         """Number of lowest bands that reach `dimensions`; at least six, because narrower pass bands leak too much."""

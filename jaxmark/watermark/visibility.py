@@ -65,9 +65,10 @@ def band_visibility(
 
 def _per_rms(original: Original, shift: Float64[np.ndarray, "points 3"], metrics: Sequence[Metric]) -> list[float]:
     """Metrics per unit of RMS displacement, at a displacement so small that they are proportional to it."""
+    reference = distortion.Reference(original.mesh)
 
     def measure_at(names: Sequence[Metric], size: float) -> dict[Metric, float]:
-        found = distortion.measure(original.mesh, displace(original, size * shift), names)
+        found = reference.measure(displace(original, size * shift), names)
         return {name: (value or 0.0) / size for name, value in found.items()}
 
     values = measure_at(metrics, _FIRST_RMS)

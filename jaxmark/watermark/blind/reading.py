@@ -53,23 +53,41 @@ class Reading(NamedTuple):
 
 
 class BlindDetection(NamedTuple):
-    """The result of reading a suspect without the original."""
+    """The result of reading a suspect without the original.
 
-    scheme: str  # name of the scheme that it was read with
-    message: bytes | None  # the message that was read; None unless its keyed tag fits
-    log10_p: float  # log10 of a bound on the false-positive probability, in [-77, 0], if all that is claimed is dated
-    log10_p_undated: float  # the same if nothing is: for the best message of any of 2^64 keys
-    log10_p_fitted: float  # log10 of that probability if the score were Gaussian: an estimate, which decides nothing
-    log10_p_unfloored: float  # log10_p without the floor at -77: orders attacks and schemes, proves and decides nothing
-    scores: Float64[np.ndarray, " code"]  # soft values of the code bits, scaled to root mean square 1
-    anchors: int  # number of values that were read
-    agreement: float  # mean cosine of their phases, 1 if all are exactly where the mark put them
-    width: float  # of the averages, in the scheme's unit
-    step: float  # of the lattice of values, in the scheme's unit
-    pose: Pose  # from the suspect's file to where it was read
-    version: int  # version of the keyed choices that were read with
-    doubts: tuple[str, ...] = ()  # why the probabilities are estimates, not proofs; empty if they are proofs
-    remarks: tuple[str, ...] = ()  # what else the suspect looks like
+    Attributes:
+        scheme: name of the scheme that it was read with.
+        message: the message that was read; None unless its keyed tag fits.
+        log10_p: log10 of a bound on the false-positive probability, in [-77, 0], if all that is claimed is dated.
+        log10_p_undated: the same if nothing is: for the best message of any of 2^64 keys.
+        log10_p_fitted: log10 of that probability if the score were Gaussian: an estimate, which decides nothing.
+        log10_p_unfloored: log10_p without the floor at -77: orders attacks and schemes, proves and decides nothing.
+        scores: soft values of the code bits, scaled to root mean square 1.
+        anchors: number of values that were read.
+        agreement: mean cosine of their phases, 1 if all are exactly where the mark put them.
+        width: of the averages, in the scheme's unit.
+        step: of the lattice of values, in the scheme's unit.
+        pose: from the suspect's file to where it was read.
+        version: version of the keyed choices that were read with.
+        doubts: why the probabilities are estimates, not proofs; empty if they are proofs.
+        remarks: what else the suspect looks like.
+    """
+
+    scheme: str
+    message: bytes | None
+    log10_p: float
+    log10_p_undated: float
+    log10_p_fitted: float
+    log10_p_unfloored: float
+    scores: Float64[np.ndarray, " code"]
+    anchors: int
+    agreement: float
+    width: float
+    step: float
+    pose: Pose
+    version: int
+    doubts: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def premises(self) -> str:

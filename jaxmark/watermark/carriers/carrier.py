@@ -11,11 +11,25 @@ import numpy as np
 from jaxtyping import Array, Float, Float64, PRNGKeyArray
 
 from jaxmark.alignment.observation import Observation
+from jaxmark.errors import JaxmarkError
 
 Displacement = Float[Array, "vertices 3"]
 Strength = (
     float | Float[Array | np.ndarray, ""] | Float[Array | np.ndarray, " bands"] | Float[Array | np.ndarray, "bands 3"]
 )
+
+
+def check_strength(beta: Array, bands: int) -> Array:
+    """Check the shape of a strength: one number, one per band, or one per band and coordinate.
+
+    Raises:
+        JaxmarkError: if it has another shape.
+    """
+    if beta.shape not in ((), (bands,), (bands, 3)):
+        raise JaxmarkError(
+            f"beta is one number, {bands} numbers (one per band), or {bands} × 3; got the shape {beta.shape}."
+        )
+    return beta
 
 
 class Claim(NamedTuple):

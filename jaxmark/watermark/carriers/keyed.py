@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64, PRNGKeyArray
 
 from jaxmark.alignment.observation import Observation, observe
+from jaxmark.errors import JaxmarkError
 from jaxmark.spectral.chebyshev import band_energies, filter, transpose
 from jaxmark.spectral.laplacian import per_row
 from jaxmark.spectral.precision import matmul, sum_and_norm
-from jaxmark.watermark.carriers.carrier import Claim, Displacement, Room, Strength
+from jaxmark.watermark.carriers.carrier import Claim, Displacement, Room, Strength, check_strength
 from jaxmark.watermark.carriers.reception import (
     Host,
     Receiver,
@@ -121,6 +122,10 @@ class KeyedCarrier(NamedTuple):
             bands: Chebyshev coefficients, one band a row; by default the carrier's own.
         """
         host = self.host if bands is None else self.host._replace(coefficients=bands)
+        if strengths.shape != (len(host.coefficients),):
+            raise JaxmarkError(
+                f"with_bands needs {len(host.coefficients)} strengths, one per band; got the shape {strengths.shape}."
+            )
         return self._replace(profile=strengths, host=host)
 
     def reader(self) -> "KeyedReader":
@@ -131,7 +136,7 @@ class KeyedCarrier(NamedTuple):
         self, beta: Strength, weight: Float[Array, " bands"] | None = None
     ) -> Float[Array, " terms *channels"]:
         """Chebyshev coefficients of Σ_j weight_j β_j f_j, including the profile."""
-        strength = jnp.asarray(beta).astype(self._signs.dtype)
+        strength = check_strength(jnp.asarray(beta), len(self.host.coefficients)).astype(self._signs.dtype)
         if strength.ndim == 0:
             strength = jnp.broadcast_to(strength, len(self.host.coefficients))
         for factor in (weight, self.profile):

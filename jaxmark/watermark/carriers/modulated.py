@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from jaxmark.alignment.observation import Observation
 from jaxmark.spectral.precision import einsum, sum_and_norm
-from jaxmark.watermark.carriers.carrier import Claim, Displacement, Strength
+from jaxmark.watermark.carriers.carrier import Claim, Displacement, Strength, check_strength
 
 
 @runtime_checkable
@@ -123,7 +123,7 @@ class ModulatedCarrier(NamedTuple):
 
     def _per_band(self, beta: Strength) -> Array:
         """β in a shape that broadcasts against `[bands, 3]`."""
-        strength = self._as_real(beta)
+        strength = check_strength(self._as_real(beta), self.sequences.shape[1])
         return strength[:, None] if strength.ndim == 1 else strength
 
     def _as_real(self, values: ArrayLike) -> Array:

@@ -35,9 +35,10 @@ def code_length(bits: int, places: int, spread: int) -> int:
     information = bits + TAG_BITS
     length = 1 << (max(1, min(places, spread * information)).bit_length() - 1)
     if information > length:
+        most = max(0, length - TAG_BITS) // 8 * 8
+        room = f"and the payload is at most {most} bits" if most else "too few for any message"
         raise JaxmarkError(
-            f"{bits} bits and a tag of {TAG_BITS} do not fit: this mesh and scheme have {places} places, and the"
-            f" payload is at most {max(0, length - TAG_BITS) // 8 * 8} bits."
+            f"{bits} bits and a tag of {TAG_BITS} do not fit: this mesh and scheme have {places} places, {room}."
         )
     return length
 
