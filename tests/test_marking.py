@@ -293,7 +293,7 @@ def test_refusals(sphere: Mesh, key: jm.Key):
     nan = sphere._replace(vertices=np.where(sphere.vertices > 1, np.nan, sphere.vertices))
     for mesh, message, options, sentence in [
         (tiny, MESSAGE, {}, "places, too few for any message"),
-        (bumpy_sphere(2), MESSAGE, {"noise": 0.005}, r"\(162 points\) carries no message .* Use a budget of at least"),
+        (bumpy_sphere(2), MESSAGE, {"noise": 0.005}, r"\(162 points\) carries no message .* Use a presence mark"),
         (bumpy_sphere(1), MESSAGE, {"scheme": "eigen"}, r"\(42 points\) cannot carry a message of 64 bits"),
         (nan, MESSAGE, {}, "not a finite number"),
         (sphere, MESSAGE, {"budget": 0}, "budget"),
@@ -321,6 +321,7 @@ def test_refusals(sphere: Mesh, key: jm.Key):
             jm.detect(suspect, original=sphere, key=key, align=align)
     with pytest.raises(jm.JaxmarkError, match="multiple of 8"):
         jm.detect(sphere, original=sphere, key=key, bits=7)
+    jm.embed(bumpy_sphere(2), b"", key, noise=0.005)  # the presence mark that is advised
 
 
 def test_schemes_are_data():
