@@ -348,13 +348,22 @@ def test_an_interrupted_write_leaves_no_output(workshop: Workshop, monkeypatch):
 @pytest.mark.slow
 def test_demo_leaves_tables_and_pictures(workshop: Workshop, monkeypatch):
     # A key that a scheme cannot use is said to be refused; here is one that all schemes take.
-    monkeypatch.setattr("jaxmark.app.demo.new_key", lambda: jm.Key(bytes(32)))
+    keys = (jm.Key(bytes([first, *bytes(31)])) for first in range(99))
+    monkeypatch.setattr("jaxmark.app.demo.new_key", lambda: next(keys))
     monkeypatch.setattr("jaxmark.app.demo.os.urandom", lambda size: bytes(range(size)))
     told = workshop.json("demo", "model.ply", "--output", "shown")
     assert {row["scheme"] for row in told["rows"]} == {"keyed", "host", "eigen"}
     unattacked = [row for row in told["rows"] if row["attack"] == "none"]
     assert all(row["message_read"] for row in unattacked)
     assert any(not row["message_read"] for row in told["rows"])  # losses are printed as losses
+    controls = [row for row in told["rows"] if row["control"] != "marked"]
+    assert [row["control"] for row in controls] == 3 * ["unmarked", "wrong-key"]
+    assert not any(row["message_read"] or row["detected"] for row in controls)
+    assert told["verdict"][0].startswith("The scheme 'keyed' read the message from ")
+    assert told["verdict"][-1] == "In 6 controls, without a mark or with a wrong key, nothing was found, as it must be."
+    meshes = {name: loaded(f"shown/marked-{name}.ply").vertices for name in ("keyed", "host", "eigen")}
+    moved = [np.linalg.norm(mesh - loaded("model.ply").vertices) for mesh in meshes.values()]
+    assert moved == pytest.approx([moved[0]] * 3, rel=0.01)  # all at one displacement
     names = {path.name for path in Path("shown").iterdir()}
     assert {"table.md", "mark.png", "attacked.png", "marked-keyed.ply", "marked-keyed.ply.jaxmark.json"} <= names
     for picture in ("mark.png", "attacked.png"):

@@ -24,6 +24,8 @@ def kept(home: Path, **more: str) -> str:
 def test_programs_are_kept_in_a_private_folder(tmp_path: Path):
     assert kept(tmp_path) == str(tmp_path / "jaxmark")
     assert stat.S_IMODE((tmp_path / "jaxmark").stat().st_mode) == 0o700
+    assert kept(tmp_path / "none", JAX_ENABLE_COMPILATION_CACHE="false") == "None"
+    assert not (tmp_path / "none").exists()
     assert kept(tmp_path, JAX_COMPILATION_CACHE_DIR=str(tmp_path / "own")) == str(tmp_path / "own")
 
 

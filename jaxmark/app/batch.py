@@ -11,6 +11,7 @@ from jaxmark.alignment.original import shift_of
 from jaxmark.app.dossier import Case, file_hash, save_dossier
 from jaxmark.app.mistakes import guess_mistakes, is_original
 from jaxmark.app.programs import release_programs
+from jaxmark.app.progress import Doing, quietly
 from jaxmark.app.report import save_report
 from jaxmark.app.scene import mark_scene, pick
 from jaxmark.app.telling import Told, describe, told_payload, told_survival
@@ -44,6 +45,7 @@ def mark_file(
     noise: float | None,
     scheme: AnyScheme = DEFAULT_SCHEME,
     meshes: Sequence[str] = (),
+    doing: Doing = quietly,
 ) -> Told:
     """Mark a mesh file, and write the marked file and its record, both or neither.
 
@@ -60,12 +62,14 @@ def mark_file(
         noise: see `embed`.
         scheme: see `embed`.
         meshes: names of the meshes to mark, of several in the file; by default all that can carry the message.
+        doing: is told what begins.
 
     Raises:
         JaxmarkError: see `embed`; also if the mark does not read from the written file, whose numbers are rounded.
     """
     if (message is None) == (recipient is None):
         raise JaxmarkError("Give --message, --presence or --recipient, one of them.")
+    doing(f"reading {original}")
     scene = pick(load_scene(original), meshes, original)
     if len(scene.meshes) + len(scene.left) > 1:
         if message is None:
@@ -83,14 +87,17 @@ def mark_file(
                 visibility=visibility,
                 noise=noise,
                 scheme=scheme,
+                doing=doing,
             )
         except JaxmarkError:
             # The objects of an OBJ file lie in the same coordinates, and together they may carry what none can alone.
             if original.suffix.lower() != ".obj" or meshes:
                 raise
     mesh, marker = load_mesh(original), None
+    doing(f"preparing {original}")
     if message is not None:
         marker = prepare(mesh, key, 8 * len(message), scheme)
+        doing(f"embedding {original}")
         result, info = marker.embed(message, budget, limits=limits, visibility=visibility, noise=noise, read_back=False)
         marker = marker.with_record(info.record)
         prepared, said = marker.original, told_payload(info.record.bits)
@@ -99,10 +106,12 @@ def mark_file(
         if scheme != DEFAULT_SCHEME:
             raise JaxmarkError(f"Fingerprints are carried by the scheme {DEFAULT_SCHEME!r}, not {scheme!r}.")
         tracer, name = make_tracer(mesh, key), str(recipient)
+        doing(f"embedding {original}")
         result, info = tracer.fingerprint(name, budget, limits=limits, visibility=visibility)
         prepared, said = tracer.marker.original, f"fingerprint of {recipient}"
         tries = partial(tracer.finds, recipient=name)
     with replacing(marked) as draft, replacing(record) as record_draft:
+        doing(f"writing {marked}, and trying what the mark survives")
         save_mesh(result, draft, like=original)
         # The mark must read from the written file, whose numbers are rounded.
         written = load_mesh(draft)
@@ -115,6 +124,7 @@ def mark_file(
                 " more digits."
             )
         write_atomically(record_draft, info.record.to_json().encode())
+    doing("measuring what was moved")
     texture = load_texture(original)
     drift = None if texture is None else distortion.texture_drift(mesh, written, texture)
     change = distortion.DisplacementSize.of(shift_of(prepared, written)[prepared.used])
@@ -152,6 +162,7 @@ class FileReader:
     guesses: bool = True  # whether to look for a mistake where nothing is detected, which takes several times as long
     meshes: Sequence[str] = ()  # names of the original's meshes to read; by default all
     also: Sequence[BlindScheme] = ()  # schemes of marks that are read besides, to unite what all prove
+    doing: Doing = quietly  # is told what begins
     _last: tuple[tuple[Path, str | None], Sequence[Marker]] | None = field(default=None, init=False, repr=False)
 
     def read(
@@ -177,6 +188,7 @@ class FileReader:
         known = None if record is None else load_record(record)
         if known is not None and self.scheme not in (None, scheme_of(known)):
             raise JaxmarkError(f"--scheme {self.scheme} contradicts the record, which says {scheme_of(known)}.")
+        self.doing(f"reading {suspect} and {original}")
         case = self._case(suspect, original, known)
         if isinstance(case, SceneDetection):
             if report is not None or dossier is not None:
@@ -185,17 +197,21 @@ class FileReader:
                 raise JaxmarkError("Several schemes are read in files of one mesh; pick it by --mesh.")
             return self._tell_scene(case, known, suspect)
         mesh, original_mesh, known = case
+        self.doing(f"preparing {original}")
         markers = self._markers(original_mesh, original, known, mesh)
+        self.doing(f"aligning {suspect}, and looking for a mark in it")
         found = detect_any(markers, mesh, self.message, align=self.how)
         if self.also:
             found = also(found, self.also, mesh, self.key, markers[0].bits, self.message)
         marker = next(marker for marker in markers if marker.choices.version == found.version)
         aligned = found.alignment
         if report is not None:
+            self.doing("drawing the report")
             save_report(report, marker.original, mesh, aligned)
         detected = found.detected(self.alpha)
         remarks = found.remarks
         if self.guesses and record is None and found.message is None and not detected and not remarks:
+            self.doing("nothing detected, looking for a mistake")
             remarks = guess_mistakes(mesh, marker, self.how)
         answer = {
             "detected": detected,
@@ -226,6 +242,7 @@ class FileReader:
                 dated = self.deposit.log10_p(found.log10_p, marker.record, claimed=self.message is not None)
                 answer["log10_p_deposited"] = dated
         if dossier is not None:
+            self.doing("making the dossier")
             save_dossier(
                 dossier,
                 Case(
@@ -263,6 +280,7 @@ class FileReader:
             other = pair(originals, suspects).get(name)
             found = load_mesh(suspect) if other is None else suspects[other]
             return found, mesh, None if record is None else record.meshes[name]
+        self.doing(f"looking for marks in {len(originals)} meshes of {suspect}")
         return detect_scene(
             suspects,
             originals=originals,

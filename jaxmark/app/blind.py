@@ -7,6 +7,7 @@ from pathlib import Path
 
 from jaxmark.app.dossier import file_hash
 from jaxmark.app.programs import release_programs
+from jaxmark.app.progress import Doing, quietly
 from jaxmark.app.scene import pick
 from jaxmark.app.telling import Told, describe
 from jaxmark.errors import JaxmarkError
@@ -33,6 +34,7 @@ class BlindReader:
     obtained: str = ""  # when and where the suspects were got
     meshes: Sequence[str] = ()  # names of the suspect's meshes to read; by default all
     scheme: BlindScheme | None = None  # for marks without a record; by default any
+    doing: Doing = quietly  # is told what begins
 
     def read(self, suspect: Path, record: Path | None = None) -> Told:
         """Read one file: as one mesh, or each of its meshes, whose number is paid for.
@@ -45,9 +47,11 @@ class BlindReader:
         for one in records:
             if one is not None and blind_scheme(one.scheme) is None:
                 raise JaxmarkError(f"The record says that the scheme is {one.scheme!r}, which needs --original.")
+        self.doing(f"reading {suspect}")
         scene = pick(load_scene(suspect), self.meshes, suspect)
         several = len(scene.meshes) > 1
         tried = list(scene.meshes.values()) if several else [load_mesh(suspect)]
+        self.doing(f"looking for a mark in {suspect}, without an original")
         found = list(try_each(partial(self._read, mesh, one) for mesh in tried for one in records))
         best = best_of(found, len(tried) * len(records))
         detected = best.detected(self.alpha)

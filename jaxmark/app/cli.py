@@ -9,8 +9,10 @@ import json
 import math
 import os
 import sys
+import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, get_args
@@ -23,9 +25,11 @@ from jaxmark.app.batch import FileReader, mark_file
 from jaxmark.app.blind import BlindReader
 from jaxmark.app.ending import end_by_exception
 from jaxmark.app.folders import Work, each, mesh_files
+from jaxmark.app.progress import Progress
 from jaxmark.app.telling import Told, power, told_error
 from jaxmark.attacks import ATTACKS, chain, get_attack
 from jaxmark.errors import JaxmarkError
+from jaxmark.evaluation.cells import left_over
 from jaxmark.evaluation.pictures.studies import Measure
 from jaxmark.evaluation.study_file import load_study
 from jaxmark.extras import require
@@ -111,6 +115,13 @@ class _Limit(click.ParamType):
 _MESH = click.Path(path_type=Path)
 _KEY = click.option("--key", "key_file", type=_MESH, required=True, help="Key file, from `jaxmark keygen`.")
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
+_QUIET = click.option(
+    "--quiet",
+    is_flag=True,
+    expose_value=False,
+    callback=lambda context, _, quiet: _begin_progress(context, quiet),
+    help="Say nothing of what is being done; nothing is said anyway where standard error is no terminal.",
+)
 _NOISE = click.option(
     "--noise",
     type=float,
@@ -164,7 +175,8 @@ _VISIBILITY = click.option(
 
 @click.group(
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog="Exit status: 0 done or detected, 1 nothing detected, 2 refused.",
+    epilog="Exit status: 0 done or detected, 1 nothing detected, 2 refused. Compiled programs are kept in"
+    " ~/.cache/jaxmark for the next command; JAX_ENABLE_COMPILATION_CACHE=false keeps none.",
 )
 @click.version_option(package_name="jaxmark", prog_name="jaxmark")
 def cli() -> None:
@@ -224,6 +236,7 @@ def keygen(keyfile: Path, as_json: bool) -> None:
 )
 @click.option("--record", "record_file", type=_MESH, help=f"File for the record.  [default: MARKED{RECORD_SUFFIX}]")
 @_WORKERS
+@_QUIET
 @_JSON
 def embed_command(
     original: Path,
@@ -271,7 +284,7 @@ def embed_command(
         record_file = record_file or marked.with_name(marked.name + RECORD_SUFFIX)
         _check_outputs(original, marked)
         _check_distinct(original=original, marked=marked, key=key_file, record=record_file)
-        told = mark(original, marked, record_file, key=_key(key_file))
+        told = mark(original, marked, record_file, key=_key(key_file), doing=_progress().doing)
         return _answer(as_json, told.answer, told.said)
     if record_file is not None:
         raise JaxmarkError("Each file of a folder has a record beside it; leave out --record.")
@@ -314,6 +327,7 @@ def embed_command(
 @click.option("--dossier", type=_MESH, help="Folder for a page that shows a detection to others (extra `plot`).")
 @_ALPHA
 @_WORKERS
+@_QUIET
 @_JSON
 def detect_command(
     suspect: Path,
@@ -369,7 +383,7 @@ def detect_command(
         blind = BlindReader(_key(key_file), payload, message, alpha, deposit, obtained, meshes, only)
         if suspect.is_dir():
             _each(suspect, as_json, partial(_read_member_blindly, blind, record_file), workers)
-        told = blind.read(suspect, record_file)
+        told = replace(blind, doing=_progress().doing).read(suspect, record_file)
         _answer(as_json, told.answer, told.said)
         sys.exit(0 if told.done else 1)
     reader = FileReader(
@@ -387,7 +401,7 @@ def detect_command(
     )
     if suspect.is_dir():
         _each(suspect, as_json, partial(_read_member, reader, original, record_file, report, dossier), workers)
-    told = reader.read(suspect, original, record_file, report, dossier)
+    told = replace(reader, doing=_progress().doing).read(suspect, original, record_file, report, dossier)
     _answer(as_json, told.answer, told.said)
     sys.exit(0 if told.done else 1)
 
@@ -405,6 +419,7 @@ def detect_command(
 )
 @_ALIGN
 @_ALPHA
+@_QUIET
 @_JSON
 def identify_command(
     suspect: Path,
@@ -432,7 +447,9 @@ def identify_command(
         raise JaxmarkError(f"{recipients} names nobody; give one identifier a line.")
     record = None if record_file is None else Record.load(record_file)
     key = _key(key_file)
+    _progress().doing(f"reading {suspect} and {original}")
     meshes = load_mesh(suspect), load_mesh(original)
+    _progress().doing(f"looking for the copies of {len(names)} recipients in {suspect}")
     found = identify(meshes[0], names, original=meshes[1], key=key, record=record, top=top, align=how)
     accused = [one for one in found if one.log10_p <= math.log10(alpha)]
     answer = {
@@ -486,6 +503,7 @@ _KINDS = "\n".join(["\b", "KIND, and what STRENGTH is:", *(f"{name}: {entry.unit
     show_default=True,
     help="Seed of the attack's random choices.",
 )
+@_QUIET
 @_JSON
 def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int, as_json: bool) -> None:
     """Apply one attack or several to a mesh, to see what a mark survives.
@@ -496,6 +514,7 @@ def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int
     steps = _steps(words)
     _check_outputs(source, target)
     _check_distinct(IN=source, OUT=target)
+    _progress().doing(f"attacking {source}: {' '.join(words)}")
     scene = load_scene(source)
     if (
         len(scene.meshes) + len(scene.left) > 1 and source.suffix.lower() != ".obj"
@@ -551,6 +570,7 @@ def _steps(words: tuple[str, ...]) -> list[tuple[str, float]]:
 @click.argument("original", type=_MESH)
 @click.argument("distorted", type=_MESH)
 @click.option("--pictures", is_flag=True, help="Compare pictures of the meshes, too; takes many seconds.")
+@_QUIET
 @_JSON
 def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> None:
     """Measure how DISTORTED differs from ORIGINAL, by all metrics.
@@ -562,6 +582,7 @@ def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> N
     """
     first, second = load_mesh(original), load_mesh(distorted)
     metrics = distortion.metrics_of(first, second) + distortion.RENDERED * pictures
+    _progress().doing(f"comparing {original} and {distorted} by {', '.join(metrics)}")
     compared = distortion.compare(first, second, metrics)._asdict()
     found = {name: compared[name] for name in metrics}
     lines = [
@@ -583,6 +604,7 @@ def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> N
 @click.option(
     "--scheme", type=click.Choice(NAMES), default=DEFAULT_SCHEME, show_default=True, help="Scheme that carries them."
 )
+@_QUIET
 @_JSON
 def capacity_command(
     mesh: Path,
@@ -597,6 +619,7 @@ def capacity_command(
     """Say how many bits can be hidden in MESH so that they survive noise and the loss of vertices."""
     loaded = load_mesh(mesh)
     bounds = make_budget(budget, dict(limits) or None, visibility, named=visibility_of(loaded))
+    _progress().doing(f"measuring the room in {mesh}")
     bits = capacity(loaded, bounds.rms, limits=bounds.limits, noise=noise, coverage=coverage, scheme=scheme)
     answer = {"bits": bits, "budget": bounds.rms, "limits": bounds.limits, "noise": noise, "coverage": coverage}
     said = f"{bits} bits at {bounds}, noise {noise:g}, coverage {coverage:g}"
@@ -606,23 +629,25 @@ def capacity_command(
 @cli.command()
 @click.argument("mesh", type=_MESH, required=False)
 @click.option("--output", type=_MESH, default=Path("demo-output"), show_default=True, help="Folder for the results.")
+@_QUIET
 @_JSON
 def demo(mesh: Path | None, output: Path, as_json: bool) -> None:
     """Mark MESH, attack it, read it again, and write tables and pictures. Without MESH, a sample is used.
 
     Needs the extra `plot`, and `attacks` for the sample.
     """
-    from jaxmark.app.demo import run_demo
+    from jaxmark.app.demo import run_demo, verdict
 
-    rows = run_demo(mesh, output, lambda line: click.echo(line, err=as_json))
+    rows = run_demo(mesh, output, partial(_say, err=as_json), _progress().doing)
     if as_json:
-        _answer(True, {"output": str(output), "rows": [row._asdict() for row in rows]}, "")
+        _answer(True, {"output": str(output), "rows": [row._asdict() for row in rows], "verdict": verdict(rows)}, "")
 
 
 @cli.command(name="study")
 @click.argument("file", type=_MESH)
 @click.option("--output", type=_MESH, default=Path("study-output"), show_default=True, help="Folder for the results.")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Number of processes.")
+@_QUIET
 @_JSON
 def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None:
     """Run the study that a TOML FILE declares: what marks survive, with intervals and controls.
@@ -644,7 +669,8 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
     """  # noqa: D301
     study = load_study(file)
     output.mkdir(parents=True, exist_ok=True)
-    results = study.run(output / "results.jsonl", workers, _say)
+    _progress().doing(f"study {file}")
+    results = study.run(output / "results.jsonl", workers, _progress().doing)
     results.save_csv(output / "results.csv")
     table = results.markdown()
     write_atomically(output / "rates.md", table.encode())
@@ -653,6 +679,7 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
     except JaxmarkError as error:
         _say(f"No pictures: {error}")
     else:
+        _progress().doing("drawing pictures")
         for of in get_args(Measure):
             results.plot(of).save(output / f"{of}.png")
     _answer(as_json, {"output": str(output), "readings": len(results.rows), "rates": results.rates()}, table.rstrip())
@@ -671,22 +698,38 @@ def main() -> None:
         _refuse(told_error(error))
 
 
+def _begin_progress(context: click.Context, quiet: bool) -> None:
+    """Let a command tell people at a terminal what it is doing, until it ends."""
+    context.obj = Progress(None if quiet or not sys.stderr.isatty() else sys.stderr)
+    context.call_on_close(context.obj.clear)
+
+
+def _progress() -> Progress:
+    """The progress of the command that is running; one that says nothing for a command that takes no time."""
+    context = click.get_current_context(silent=True)
+    return (context and context.obj) or Progress(None)
+
+
 def _refuse(sentence: str) -> NoReturn:
     click.echo(f"jaxmark: {sentence}", err=True)
     sys.exit(2)
 
 
-def _say(line: str) -> None:
-    click.echo(line, err=True)
+def _say(line: str, err: bool = True) -> None:
+    _progress().clear()
+    click.echo(line, err=err)
 
 
 def _each(folder: Path, as_json: bool, work: Work, workers: int) -> NoReturn:
     """Work on the mesh files of a folder, print a line for each, and exit with the worst status."""
-    status = 0
-    with closing(each(mesh_files(folder), work, workers)) as told:
-        for file, one in told:
+    files, status, start = mesh_files(folder), 0, time.monotonic()
+    _progress().doing(f"0/{len(files)} files of {folder}")
+    with closing(each(files, work, workers)) as told:
+        for done, (file, one) in enumerate(told, 1):
             status = max(status, 2 if one.refused else 0 if one.done else 1)
             _answer(as_json, {"file": file.name, **one.answer}, f"{file.name}: {one.said}")
+            pace = (time.monotonic() - start) / done
+            _progress().doing(f"{done}/{len(files)} files of {folder}, {left_over((len(files) - done) * pace)}")
     sys.exit(status)
 
 
@@ -733,6 +776,7 @@ def _member(path: Path, name: str) -> Path:
 
 
 def _answer(as_json: bool, answer: Mapping[str, Any], text: str) -> None:
+    _progress().clear()
     try:
         click.echo(json.dumps(_finite(answer), allow_nan=False) if as_json else text)
         sys.stdout.flush()

@@ -16,9 +16,9 @@ def keep_programs() -> None:
     """Keep compiled programs for the next command on meshes of like size; compiling them takes most of its seconds.
 
     They lie in a folder of the user's own, since nobody else must be able to put programs there. Another folder is
-    named by JAX_COMPILATION_CACHE_DIR.
+    named by JAX_COMPILATION_CACHE_DIR; JAX_ENABLE_COMPILATION_CACHE=false keeps none.
     """
-    if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+    if os.environ.get("JAX_COMPILATION_CACHE_DIR") or not jax.config.jax_enable_compilation_cache:
         return
     try:
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / _FOLDER

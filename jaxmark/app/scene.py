@@ -6,6 +6,7 @@ from pathlib import Path
 from jaxmark import distortion
 from jaxmark.alignment.original import shift_of
 from jaxmark.app.programs import release_programs
+from jaxmark.app.progress import Doing
 from jaxmark.app.telling import Told, told_payload, told_survival
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import Scene, load_scene, number_check, save_scene
@@ -51,6 +52,7 @@ def mark_scene(
     visibility: Visibility | None,
     noise: float | None,
     scheme: AnyScheme,
+    doing: Doing,
 ) -> Told:
     """Mark the meshes of a file that can carry a message, and write the marked file and its record, both or neither.
 
@@ -66,6 +68,7 @@ def mark_scene(
         visibility: see `embed`.
         noise: see `embed`.
         scheme: see `embed`.
+        doing: is told what begins.
 
     Raises:
         JaxmarkError: if no mesh can carry the message; see `embed_scene`.
@@ -76,10 +79,12 @@ def mark_scene(
     def check(name: str, marker: AnyMarker, result: Mesh, info: EmbedInfo) -> EmbedInfo:
         """Check that the file's numbers are fine enough for a mark."""
         release_programs()
+        doing(f"{len(markers) + 1} of {len(scene.meshes)} meshes: checking {name!r}")
         fine_enough(name, result)
         markers[name] = marker.with_record(info.record)
         return info
 
+    doing(f"embedding {len(scene.meshes)} meshes of {original}")
     meshes, info = embed_scene(
         scene.meshes,
         message,
@@ -93,6 +98,7 @@ def mark_scene(
     )
     survives: dict[str, Survival] = {}
     with replacing(marked) as draft, replacing(record) as record_draft:
+        doing(f"writing {marked}, and reading it back")
         remarks = save_scene(meshes, draft, like=original)
         # The marks must read from the written file, whose numbers are rounded.
         written = load_scene(draft).meshes

@@ -38,6 +38,7 @@ def run(
     pool: Pool,
     output: str | os.PathLike[str],
     say: Callable[[str], None] = lambda line: None,
+    name: Callable[[Cell], str] = lambda cell: "",
 ) -> list[dict[str, Any]]:
     """Work on the cells that are not finished, with a new pool whenever one breaks.
 
@@ -48,6 +49,7 @@ def run(
         pool: function that makes an executor; called again when one breaks, as a pool does when a process is killed.
         output: file of JSON lines, `{"cell": [...], ...}`, each written to disk at once. It may hold other cells, too.
         say: function that is called with a line about the progress after each cell.
+        name: what to call a cell in such a line.
 
     Returns:
         The rows of the cells in their order, including those of earlier runs.
@@ -68,7 +70,8 @@ def run(
                         _append(target, {"cell": futures[future], **future.result()})
                         broken, missing = 0, missing - 1
                         pace = (time.monotonic() - start) / (count - missing)
-                        say(f"{len(cells) - missing}/{len(cells)}, about {missing * pace / 60:.0f} min left")
+                        done = f"{len(cells) - missing}/{len(cells)} {name(futures[future])}".rstrip()
+                        say(f"{done}, {left_over(missing * pace)}")
                 except BaseException:  # an interruption, too: cells that have not begun do not begin
                     executor.shutdown(wait=False, cancel_futures=True)
                     raise
@@ -79,6 +82,14 @@ def run(
             say(f"{error} A new pool goes on.")
     rows = {_cell(row): row for row in load_finished(target)}
     return [rows[cell] for cell in cells]
+
+
+def left_over(seconds: float) -> str:
+    """How long work still takes, in words: seconds, minutes or hours."""
+    for unit, size in (("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"about {seconds / size:.0f} {unit} left"
+    return f"about {seconds:.0f} s left"
 
 
 def load_finished(output: str | os.PathLike[str]) -> list[dict[str, Any]]:

@@ -136,7 +136,7 @@ class Study:
                 self._check_picklable()
             workers = processes(workers) if workers > 1 else partial(ThreadPoolExecutor, 1)
         try:
-            done = run(cells, partial(work, self), workers, output, say)
+            done = run(cells, partial(work, self), workers, output, say, self._name)
         finally:
             _marker.cache_clear()
             _mark.cache_clear()
@@ -180,6 +180,17 @@ class Study:
             for name in self.attacks:
                 for strength in self._strengths(name):
                     yield mesh, scheme, bits, budget, name, float(strength), *block, digest
+
+    def _name(self, cell: Cell) -> str:
+        """A cell by what varies in this study, such as `noise 0.02, budget 0.0004`."""
+        mesh, scheme, bits, budget, attack, strength, *_ = cell
+        varied = {
+            f"{mesh}": self.meshes,
+            f"{scheme}": self.schemes,
+            f"{bits} bits": self.payloads,
+            f"budget {budget}": self.budgets,
+        }
+        return ", ".join([f"{attack} {strength:g}", *(name for name, all_ in varied.items() if len(all_) > 1)])
 
     def _rows(self, cell: Mapping[str, Any]) -> Iterator[Row]:
         mesh, scheme, bits, budget, attack, strength, *_ = cell["cell"]
