@@ -1,15 +1,35 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
 # %% [markdown]
 # # Mark a mesh and read it again
 #
 # A key, a message, a budget: the marked mesh looks the same, and the owner, who keeps the original, reads the message
 # from an attacked copy.
 
+# %% tags=["remove-cell"]
+import importlib.util
+import subprocess
+import sys
+
+if importlib.util.find_spec("jaxmark") is None:  # in the folder of notebooks of a clone
+    subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", "..[plot]"], check=True)
+
 # %%
 import jaxmark as jm
 from jaxmark import plot
-from jaxmark.app.demo import sample_mesh
+from jaxmark.geometry import asteroid
 
-mesh = jm.load_mesh(sample_mesh())
+mesh = asteroid(20_000)  # or a file of your own: jm.load_mesh("model.obj")
 key = jm.new_key()
 marker = jm.make_marker(mesh, key, bits=64)
 marked, info = marker.embed(b"jaxmark!", budget=8e-4)
@@ -22,10 +42,10 @@ print(f"{len(mesh.vertices)} vertices moved by RMS {info.rms:.4%} of the diagona
 # %%
 original = marker.original
 shown = plot.displacement(original, marked)
-plot.draw([plot.View("marked", marked), plot.exaggerate(original, marked), shown])
+plot.draw([plot.View("marked", marked), plot.exaggerate(original, marked), shown]).save("01_1.png")
 
 # %%
-plot.show(shown.mesh, shown.values, shown.unit)
+plot.show(shown.mesh, shown.values, shown.unit).save("01_viewer.html")
 
 # %% [markdown]
 # The marker has prepared the original, and reads as many suspects as you like. The unmarked mesh, and the right suspect
@@ -53,4 +73,5 @@ assert marker.detect(mesh).message is None
 # The attacked copies look worse than the marked one, and the message is still there.
 
 # %%
-plot.draw([plot.View(name, suspect) for name, suspect in suspects.items() if name not in ("marked", "unmarked")])
+shown = {name: suspect for name, suspect in suspects.items() if name != "unmarked"}
+plot.draw([plot.View(name, suspect) for name, suspect in shown.items()]).save("01_2.png")

@@ -1,10 +1,30 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
 # %% [markdown]
 # # The paper, section by section
 #
 # Sohn, Choi, Kim, Kwon, Park, Shin, *A Digital Watermarking Scheme for Polygonal Meshes using Modified Spectral
 # Decomposition*: marks in the spectrum of a mesh, by polynomials of the Laplacian instead of its eigenvectors. This
-# notebook walks through it on a bunny about as large as theirs (1,494 vertices); `docs/paper.md` has all errata with
+# notebook walks through it on a mesh about as large as theirs (1,494 vertices); `docs/paper.md` has all errata with
 # their tests, and `benchmarks/theory/paper.py` all figures at full size.
+
+# %% tags=["remove-cell"]
+import importlib.util
+import subprocess
+import sys
+
+if importlib.util.find_spec("jaxmark") is None:  # in the folder of notebooks of a clone
+    subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", "..[plot]"], check=True)
 
 # %%
 import time
@@ -16,8 +36,8 @@ import numpy as np
 import jaxmark as jm
 from jaxmark import plot
 from jaxmark.alignment import make_original
-from jaxmark.app.demo import sample_mesh
 from jaxmark.evaluation import pictures
+from jaxmark.geometry import asteroid
 from jaxmark.spectral import (
     band_components,
     centre,
@@ -34,7 +54,7 @@ from jaxmark.watermark.carriers import host_bands
 from jaxmark.watermark.detectors import correlate
 from jaxmark.watermark.evidence import correlation_bound
 
-mesh = jm.attack(jm.load_mesh(sample_mesh()), "simplification", 0.9465, seed=0)
+mesh = asteroid(1500)
 original = make_original(mesh)
 print(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
 
@@ -69,7 +89,7 @@ def lowest(count: int) -> plot.View:
     return plot.View(f"{count} of {len(pairs.values)}", mesh._replace(vertices=vectors @ (vectors.T @ (mass @ x))))
 
 
-plot.draw([lowest(5), lowest(20), lowest(100), lowest(len(pairs.values))])
+plot.draw([lowest(5), lowest(20), lowest(100), lowest(len(pairs.values))]).save("02_1.png")
 
 # %% [markdown]
 # Ohbuchi's scheme changes their coefficients. But eigenvectors cost O(N³), and Lanczos iterations get only the lowest.
@@ -95,7 +115,7 @@ k = np.arange(16)
 for name, family in families.items():
     at_zero, at_node = family[8] @ np.cos(np.pi * k), family[8] @ np.cos(k * np.arccos(node - 1))
     print(f"{name:<23} band 9 of 16 at λ = 0, over its value at the node: {abs(at_zero / at_node):.3f}")
-plot.responses(families, mark=[node])
+plot.responses(families, mark=[node]).save("02_2.png")
 
 # %% [markdown]
 # ## Methods 1 and 2
@@ -161,7 +181,7 @@ for coherence in (0.0, 0.001, 0.7):
 #
 # $x^w = x + \sum_j \alpha\beta p_j x_j$: a bit α = ±1, a strength β, keyed signs $p_j$.
 # Several bits share the components by orthogonal sequences of signs. The reader has the original, and correlates what
-# was changed with the same components. We mark the bunny by three schemes, equally strongly: as printed; in a form that
+# was changed with the same components. We mark the mesh by three schemes, equally strongly: as printed; in a form that
 # works (damped, at unit norm, and all bits solved for at once); and by eigenvectors.
 
 # %%
@@ -179,14 +199,14 @@ for name, (scheme, detector) in schemes.items():
     read = markers[name].detect(marks[name]).message == MESSAGE
     print(f"{name:<13} RMS {info.rms:.3%}, largest {info.max:.3%}; reads unattacked: {read}")
     assert read or name == "as printed"
-plot.draw([plot.displacement(original, marked, name) for name, marked in marks.items()])
+plot.draw([plot.displacement(original, marked, name) for name, marked in marks.items()]).save("02_3.png")
 
 # %% [markdown]
 # The pictures tell why. As printed, the mark is a scaled copy of the lowest frequencies, for all bands have the same in
 # them. The working form spreads over the spectrum:
 
 # %%
-plot.spectra(original, {name: (mesh, marked) for name, marked in marks.items()})
+plot.spectra(original, {name: (mesh, marked) for name, marked in marks.items()}).save("02_4.png")
 
 # %% [markdown]
 # ## Figure 14: robustness
@@ -202,7 +222,7 @@ curves = {
 for name, curve in curves.items():
     print(f"{name:<13} read {curve.success.mean(axis=1).round(2)}, bits wrong {curve.bit_errors.mean(axis=1).round(2)}")
 assert curves["working form"].success[0].all()
-pictures.success(curves, jm.attacks.ATTACKS["diagonal-noise"].unit)
+pictures.success(curves, jm.attacks.ATTACKS["diagonal-noise"].unit).save("02_5.png")
 
 # %% [markdown]
 # ## Figures 15 and 16: the Gibbs oscillation
@@ -212,7 +232,7 @@ pictures.success(curves, jm.attacks.ATTACKS["diagonal-noise"].unit)
 
 # %%
 fine = {name: scaling(64, **form).reshape(16, 4, 64).sum(axis=1) for name, form in FORMS.items()}
-plot.responses({name: family[7:9] for name, family in (fine | {"hats": hat(nodes(16), 63)}).items()})
+plot.responses({name: family[7:9] for name, family in (fine | {"hats": hat(nodes(16), 63)}).items()}).save("02_6.png")
 
 # %% [markdown]
 # ## What became of it

@@ -1,3 +1,15 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
 # %% [markdown]
 # # Choosing bands, degree and payload
 #
@@ -5,18 +17,26 @@
 # degree, what they cost; the mesh, its budget and the noise to survive, how many bits they carry. This notebook
 # measures each on one mesh. `docs/bands.md` has all families on five meshes.
 
+# %% tags=["remove-cell"]
+import importlib.util
+import subprocess
+import sys
+
+if importlib.util.find_spec("jaxmark") is None:  # in the folder of notebooks of a clone
+    subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", "..[plot]"], check=True)
+
 # %%
 import numpy as np
 
 import jaxmark as jm
 from jaxmark import plot
 from jaxmark.alignment import make_original
-from jaxmark.app.demo import sample_mesh
 from jaxmark.evaluation import pictures
+from jaxmark.geometry import asteroid
 from jaxmark.spectral import centre, from_mesh, quadrature
 from jaxmark.spectral.bands import bernstein, hat, nodes, report, scaling
 
-mesh = jm.attack(jm.load_mesh(sample_mesh()), "simplification", 0.9, seed=0)
+mesh = asteroid(2800)
 original = make_original(mesh)
 print(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
 
@@ -49,11 +69,11 @@ def families(degree: int) -> dict[str, np.ndarray]:
 shown = families(DEGREE)
 for name, family in shown.items():
     print(f"{name:<18} sum to 1 up to {np.abs(family.sum(axis=0) - np.eye(1, DEGREE + 1)[0]).max():.0e}")
-plot.responses(shown)
+plot.responses(shown).save("03_1.png")
 
 # %% [markdown]
 # The undamped ones ripple: the Gibbs oscillation of any cut-off series. That looks harmless, until one sees where a
-# mesh has its energy. Below is what each of 64 bands holds of the bunny, of a mark by the keyed scheme, and of three
+# mesh has its energy. Below is what each of 64 bands holds of the mesh, of a mark by the keyed scheme, and of three
 # attacks. The host has ten thousand times more next to λ = 0 than elsewhere, so that a ripple of 1 % there is as much
 # as all that a band should hold.
 
@@ -66,7 +86,7 @@ attacked = {
     "8 bits": jm.attack(marked, "quantisation", 8, seed=0),
 }
 moves = {"mark": (mesh, marked)} | {name: (marked, suspect) for name, suspect in attacked.items()}
-plot.spectra(original, moves)
+plot.spectra(original, moves).save("03_2.png")
 
 # %% [markdown]
 # The mark is written at low frequencies, but the very lowest, which belong to the host's shape. Noise and rounding are
@@ -106,7 +126,7 @@ print("degree   " + "  ".join(f"{name:>18}" for name in shown))
 for degree in (15, 31, 63, 127):
     row = {name: np.median(measured(name, family).leakage) for name, family in families(degree).items()}
     print(f"{degree:>6}   " + "  ".join(f"{row[name]:18.4f}" for name in shown))
-plot.responses({f"degree {degree}": families(degree)["damped (Jackson)"] for degree in (15, 31, 63)})
+plot.responses({f"degree {degree}": families(degree)["damped (Jackson)"] for degree in (15, 31, 63)}).save("03_3.png")
 
 # %% [markdown]
 # The keyed scheme has 64 damped bands of degree 63. Neighbours overlap, which does no harm: it writes in the lowest 20
@@ -119,7 +139,7 @@ plot.responses({f"degree {degree}": families(degree)["damped (Jackson)"] for deg
 # what attacks leave.
 
 # %%
-plot.band_visibility(original, ["rms", "gl", "dame"])
+plot.band_visibility(original, ["rms", "gl", "dame"]).save("03_4.png")
 
 # %% [markdown]
 # ## Payload
@@ -154,7 +174,7 @@ for size in (2, 16):
     mesh_with, _ = one.embed(message, 4e-4, noise=0, read_back=False)
     curves[f"{8 * size} bits"] = jm.robustness(one, mesh_with, message, "noise", [0.004, 0.012], samples=2)
     print(f"{8 * size} bits:", curves[f"{8 * size} bits"].success.mean(axis=1))
-pictures.success(curves, jm.attacks.ATTACKS["noise"].unit)
+pictures.success(curves, jm.attacks.ATTACKS["noise"].unit).save("03_5.png")
 
 # %% [markdown]
 # ## In short

@@ -1,8 +1,28 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
 # %% [markdown]
 # # Parts of your own: an attack, a metric, a carrier
 #
 # Attacks, metrics and schemes are plain Python objects, and one of yours goes wherever a name of the library's does.
 # Here we write one of each, and put them through marking, reading, robustness and limits.
+
+# %% tags=["remove-cell"]
+import importlib.util
+import subprocess
+import sys
+
+if importlib.util.find_spec("jaxmark") is None:  # in the folder of notebooks of a clone
+    subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", "..[plot]"], check=True)
 
 # %%
 from dataclasses import dataclass
@@ -15,9 +35,8 @@ import numpy as np
 import jaxmark as jm
 from jaxmark import plot
 from jaxmark.alignment import make_original
-from jaxmark.app.demo import sample_mesh
 from jaxmark.evaluation import pictures
-from jaxmark.geometry import Mesh
+from jaxmark.geometry import Mesh, asteroid
 from jaxmark.geometry.mesh import vertex_normals
 from jaxmark.spectral.precision import einsum, matmul
 from jaxmark.watermark.carriers import ModulatedCarrier
@@ -27,7 +46,7 @@ from jaxmark.watermark.coding.sequences import orthogonal_sequences
 from jaxmark.watermark.detectors import Detector, decorrelate
 from jaxmark.watermark.schemes import Scheme
 
-mesh = jm.attack(jm.load_mesh(sample_mesh()), "simplification", 0.9, seed=0)
+mesh = asteroid(2800)
 key = jm.Key(bytes(range(32)))  # the same each time; real ones are `jm.new_key()`
 print(f"{len(mesh.vertices)} vertices")
 
@@ -51,7 +70,9 @@ def chatter(mesh: Mesh, strength: float, key: jax.Array) -> Mesh:
 chattering = jm.attacks.Attack(chatter, "amplitude over the diagonal", (0.0005, 0.001, 0.002, 0.006))
 original = make_original(mesh)
 chattered = jm.attack(mesh, chattering, 0.005, seed=0)
-plot.draw([plot.View("original", mesh), plot.View("chattered", chattered), plot.displacement(original, chattered)])
+plot.draw(
+    [plot.View("original", mesh), plot.View("chattered", chattered), plot.displacement(original, chattered)]
+).save("07_1.png")
 
 # %% [markdown]
 # It goes where names go: into `attack`, into chains with others, into `robustness`.
@@ -94,7 +115,7 @@ for name, value in jm.distortion.measure(mesh, marked, ["rms", "dame", stretch])
 gentle, _ = marker.embed(b"ok", limits={stretch: 0.01}, noise=0)
 print(f"stretch {stretch(mesh, gentle):.4f}, RMS {jm.compare(mesh, gentle, ['rms']).rms:.3%} of the diagonal")
 assert 0.0098 < stretch(mesh, gentle) <= 0.01
-plot.band_visibility(original, ["rms", "dame", stretch])
+plot.band_visibility(original, ["rms", "dame", stretch]).save("07_2.png")
 
 # %% [markdown]
 # ## A carrier, and the scheme that makes it
@@ -176,7 +197,9 @@ scheme = WaveScheme()
 waves = jm.make_marker(mesh, key, bits=16, scheme=scheme)
 waved, record = waves.embed(b"ok", limits={stretch: 0.01})
 print(f"RMS {record.rms:.3%} of the diagonal; read: {waves.detect(waved).message}, {record.record.parameters}")
-plot.draw([plot.exaggerate(original, gentle), plot.exaggerate(original, waved), plot.displacement(original, waved)])
+plot.draw(
+    [plot.exaggerate(original, gentle), plot.exaggerate(original, waved), plot.displacement(original, waved)]
+).save("07_3.png")
 
 # %% [markdown]
 # Everything else is the library's: alignment, tags, evidence, records. A wrong key reads nothing, and the reader asks
@@ -205,4 +228,4 @@ curves = {
 }
 for name, curve in curves.items():
     print(name, curve.success.mean(axis=1), curve.log10_p.max(axis=1).round(1))
-pictures.success(curves, chattering.unit)
+pictures.success(curves, chattering.unit).save("07_4.png")

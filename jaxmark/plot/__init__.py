@@ -7,6 +7,7 @@
 from jaxmark.plot._spectra import band_visibility as band_visibility
 from jaxmark.plot._spectra import responses as responses
 from jaxmark.plot._spectra import spectra as spectra
+from jaxmark.plot._spectra import strengths as strengths
 from jaxmark.plot.figures import Picture as Picture
 from jaxmark.plot.interactive import Viewer as Viewer
 from jaxmark.plot.interactive import show as show

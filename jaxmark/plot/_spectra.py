@@ -42,6 +42,22 @@ def responses(families: Mapping[str, Float[np.ndarray, "bands terms"]], mark: Se
     return Picture(figure)
 
 
+def strengths(betas: Mapping[str, Float[np.ndarray, " bands"]]) -> Picture:
+    """Plot the strengths of bands over λ, such as those that `jaxmark.evaluation.tuning.tune` finds.
+
+    Args:
+        betas: β of each band in diagonals, such as `Tuned.beta`, by the name of the line.
+
+    Raises:
+        JaxmarkError: if matplotlib is missing.
+    """
+    figure, (axes,) = panels(1, 6.5, 4.2)
+    for (name, beta), style in zip(betas.items(), styles(64), strict=False):
+        axes.plot(nodes(len(beta)), beta, label=name, **style)
+    finish(axes, xlabel=_FREQUENCY_LABEL, ylabel="strength β of a band / diagonal", ylim=(0, None))
+    return Picture(figure)
+
+
 def spectra(original: Original, moves: Mapping[str, tuple[Mesh, Mesh]], bands: int = 64) -> Picture:
     """Plot the energy of the host, and of displacements of it, in each of several Jackson-damped scaling functions.
 

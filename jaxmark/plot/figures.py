@@ -34,13 +34,14 @@ class Picture(NamedTuple):
         FigureCanvasAgg(self.figure).print_figure(buffer, format="png", dpi=130)
         return buffer.getvalue()
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a PNG file, whole or not at all.
+    def save(self, path: str | os.PathLike[str]) -> "Picture":
+        """Write a PNG file, whole or not at all, and return the picture, which a notebook then shows, too.
 
         Raises:
             JaxmarkError: if it cannot be written.
         """
         write_atomically(path, self.png())
+        return self
 
     def _repr_png_(self) -> bytes:
         return self.png()

@@ -20,13 +20,14 @@ class Viewer(NamedTuple):
     page: str  # HTML with nothing loaded from outside
     legend: str  # HTML of the colour scale beneath the page
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write an HTML file for any browser, whole or not at all.
+    def save(self, path: str | os.PathLike[str]) -> "Viewer":
+        """Write an HTML file for any browser, whole or not at all, and return the view, which a notebook then shows.
 
         Raises:
             JaxmarkError: if it cannot be written.
         """
         write_atomically(path, self.page.replace("</body>", f"{self.legend}</body>").encode())
+        return self
 
     def _repr_html_(self) -> str:
         frame = f'<iframe srcdoc="{html.escape(self.page)}" width="100%" height="480" style="border:none"></iframe>'
