@@ -5,7 +5,10 @@ BIN = $(VENV)/bin
 
 PICTURED = fandisk_6475.obj casting.off teapot_utah.obj blub_7106.obj hand_10345.obj bunny_oded_3301.obj
 
-.PHONY: help demo test lint types tests slow-tests coverage kernels pictures docs clean
+NOTEBOOKS = $(patsubst notebooks/%.py,docs/notebooks/%.ipynb,$(wildcard notebooks/*.py))
+
+.PHONY: help demo test lint types tests slow-tests coverage kernels notebooks pictures looks docs clean
+.DELETE_ON_ERROR:
 
 help:  ## list these commands
 	@awk -F ':.*  ## ' '/^[a-z-]+:.*  ## / {printf "%-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -35,17 +38,29 @@ coverage: $(VENV)/.dev  ## which lines the tests run; all of it in build/coverag
 kernels: $(VENV)/.dev  ## compiled filters beside the rest: faster on processors, needs a C++ compiler
 	$(BIN)/python -m pip install --quiet ./kernels
 
-pictures: $(VENV)/.all  ## the pictures of the documentation, of meshes that are not in it: make pictures MESHES=folder
+notebooks: $(NOTEBOOKS)  ## notebooks with their outputs, as docs/notebooks/*.ipynb
+
+docs/notebooks/%.ipynb: notebooks/%.py | $(VENV)/.docs
+	@echo "running $<, which takes up to two minutes"
+	@mkdir -p $(@D)
+	@$(BIN)/jupytext --quiet --to ipynb --output $@ --execute --run-path $(@D) $<
+
+pictures: $(VENV)/.all $(NOTEBOOKS)  ## the pictures of README, front page and gallery, where their sources changed
+	$(BIN)/python benchmarks/pictures/front.py
+
+looks: $(VENV)/.all  ## the pictures of docs/visibility.md, of meshes that are not in the project: make looks MESHES=folder
 	$(BIN)/python benchmarks/pictures/looks.py $(addprefix $(MESHES)/,$(PICTURED)) --levels fandisk_6475 bunny_oded_3301
 
-docs: $(VENV)/.docs  ## all pages, in docs/_build/html
+docs: $(VENV)/.docs $(NOTEBOOKS)  ## all pages, with executed notebooks, in docs/_build/html
+	@echo "building the pages, which takes a minute"
 	$(BIN)/sphinx-build --quiet --fresh-env --nitpicky --fail-on-warning --keep-going docs docs/_build/html
 
 $(VENV)/.%: pyproject.toml
+	@echo "installing into $(VENV), with the extra $*, which takes half a minute"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --no-compile --editable '.[$*]'
 	touch $@
 
 clean:  ## remove what these commands made
-	rm -rf $(VENV) demo-output build dist kernels/build docs/_build docs/reference/api
+	rm -rf $(VENV) demo-output build dist kernels/build docs/_build docs/notebooks docs/reference/api

@@ -1,4 +1,8 @@
-"""How `make docs` builds these pages: API from docstrings, links checked, nothing public without a docstring."""
+"""How `make docs` builds these pages: API from docstrings, links checked, nothing public without a docstring.
+
+Nothing is loaded from outside, neither by the build nor by the pages: formulas are set by a MathJax that is shipped
+with them. The notebooks in `docs/notebooks` were run before, by `make notebooks`, and are shown as they are.
+"""
 
 import ast
 import inspect
@@ -14,19 +18,26 @@ project = "jaxmark"
 author = "The jaxmark authors"
 html_title = "jaxmark"
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
     "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",
     "sphinx_click",
+    "sphinx_copybutton",
+    "sphinx_design",
 ]
 exclude_patterns = ["_build"]
+nb_execution_mode = "off"
+nb_merge_streams = True
+nb_output_stderr = "remove"  # what XLA says of itself
 templates_path = ["_templates"]
 html_theme = "furo"
 smartquotes = False  # two hyphens are an option
 
-myst_enable_extensions = ["dollarmath"]
+myst_enable_extensions = ["dollarmath", "colon_fence"]
+copybutton_prompt_text = "$ "
 myst_heading_anchors = 3
 
 autodoc_default_options = {"members": True, "undoc-members": True, "member-order": "bysource", "no-value": True}

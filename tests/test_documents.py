@@ -1,8 +1,10 @@
 """What the documents say is run."""
 
+import contextlib
 import doctest
 import importlib
 import inspect
+import io
 import os
 import pkgutil
 import re
@@ -34,6 +36,8 @@ FRONTS = ("README.md", "docs/index.md")
 # These have tests of their own.
 APART = (*FRONTS, "docs/robustness.md", "docs/how-to/arrays.md", "docs/how-to/recipients.md", "docs/how-to/study.md")
 COMMANDS = {"README.md": 4, "docs/reference/command_line.md": 16}
+SAMPLED = re.compile(r"^ *```python\n(.*?)^ *```\n(?:\n```text\n(.*?)^```)?", re.DOTALL | re.MULTILINE)
+NUMBER = re.compile(r"-?\d+(\.\d+)?")
 FENCE = re.compile(r"^( *)```(\w+)\n(.*?)^\1```", re.DOTALL | re.MULTILINE)
 
 
@@ -54,10 +58,18 @@ def blocks(page: str, language: str) -> list[str]:
 
 
 def run(page: str) -> dict:
-    """Run the Python blocks of a page in one namespace, in which a mesh and a key are there."""
+    """Run the Python blocks of a page in one namespace, in which a mesh and a key are there.
+
+    Text that follows a block at once is a sample of what it prints, with other numbers.
+    """
     names: dict = {"mesh": bumpy_sphere(4), "key": jm.Key(bytes(32))}
-    for block in blocks(page, "python"):
-        exec(compile(block, page, "exec"), names)
+    for block, sample in SAMPLED.findall(PAGES[page]):
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            exec(compile(textwrap.dedent(block), page, "exec"), names)
+        print(printed.getvalue())
+        if sample:
+            assert NUMBER.sub("#", printed.getvalue()) == NUMBER.sub("#", sample), page
     return names
 
 
@@ -66,11 +78,10 @@ def run(page: str) -> dict:
 def test_both_halves_of_a_front_page_run(page: str, folder: Path, unchecked, capsys):
     assert len(blocks(page, "python")) >= 2
     names = run(page)
-    message = bytes.fromhex("0123456789abcdef") if page == "README.md" else b"jaxmark!"
-    assert names["found"].message == message
-    assert (message.hex() if page == "README.md" else str(message)) in capsys.readouterr().out
+    assert names["found"].message == b"jaxmark!"
+    assert str(b"jaxmark!") in capsys.readouterr().out
     # The energy is a quadratic form of the gains: its gradient at some gains, times these, is twice the energy there.
-    gains = names.get("gains", np.ones(16, np.float32))
+    gains = np.ones(16, np.float32)
     assert names["gradient"].shape == (16,)
     np.testing.assert_allclose(names["gradient"] @ gains, 2 * names["energy"](gains), rtol=1e-5)
 
@@ -167,8 +178,31 @@ def test_make_help_lists_all_targets():
 
 
 def test_notebooks_are_listed():
-    listed = re.findall(r"^\| `(\w+\.py)` \|", PAGES["docs/notebooks.md"], re.MULTILINE)
-    assert listed == sorted(path.name for path in (ROOT / "notebooks").glob("*.py"))
+    there = sorted(path.stem for path in (ROOT / "notebooks").glob("*.py"))
+    for line in (r":link: notebooks/(\w+)", r"notebooks/(\w+)", r"- \{download\}`\w+\.ipynb <notebooks/(\w+)\.ipynb>`"):
+        assert re.findall(f"^{line}$", PAGES["docs/notebooks.md"], re.MULTILINE) == there
+
+
+@pytest.mark.parametrize("notebook", sorted((ROOT / "notebooks").glob("*.py")), ids=lambda path: path.stem)
+def test_notebooks_open_as_they_are_and_save_what_they_draw(notebook: Path):
+    text = notebook.read_text()
+    assert text.startswith("# ---\n# jupyter:\n")
+    assert "#     name: python3\n" in text.partition("# %%")[0]
+    assert '"pip", "install"' in text
+    assert "sample_mesh" not in text  # which needs an extra
+    assert "asteroid(" in text
+    drawn = re.findall(
+        r"^(?:plot\.|pictures\.|results\.)?(?:draw|show|responses|spectra|strengths|band_visibility|plot|success|p_values|roc)\(",
+        text,
+        re.M,
+    )
+    assert len(re.findall(r'\)\.save\("\d\d_\w+\.(?:png|html)"\)$', text, re.M)) >= max(1, len(drawn))
+
+
+def test_samples_follow_all_that_the_tutorial_prints():
+    printing = [sample for block, sample in SAMPLED.findall(PAGES["docs/tutorial.md"]) if "print(" in block]
+    assert len(printing) >= 6
+    assert all(printing)
 
 
 def test_tests_that_pages_name_exist():
@@ -269,3 +303,8 @@ def test_payloads_that_are_stated_are_carried():
         assert re.search(rf"\b{bits} bits \(`{scheme}`\)", PAGES["docs/how_it_works.md"])
         marked, _ = jm.embed(mesh, bytes(range(bits // 8)), key, scheme=scheme)
         assert jm.detect(marked, original=mesh, key=key, scheme=scheme, bits=bits).detected()
+
+
+def test_everyday_names_have_a_page_under_these_names():
+    shown = re.findall(r"^\.\. auto\w+:: jaxmark\.(\w+)$", PAGES["docs/reference/everyday.md"], re.MULTILINE)
+    assert sorted(shown) == sorted(name.rpartition(".")[2] for name in reference("Everyday names"))
