@@ -47,7 +47,7 @@ def test_a_line_is_replaced_and_removed():
 def test_compiling_is_said(tmp_path, monkeypatch):
     terminal = Terminal()
     progress = Progress(terminal)
-    kept = jax.config.jax_compilation_cache_dir
+    kept = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     try:
         progress.doing("adding")

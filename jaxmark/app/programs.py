@@ -18,7 +18,8 @@ def keep_programs() -> None:
     They lie in a folder of the user's own, since nobody else must be able to put programs there. Another folder is
     named by JAX_COMPILATION_CACHE_DIR; JAX_ENABLE_COMPILATION_CACHE=false keeps none.
     """
-    if os.environ.get("JAX_COMPILATION_CACHE_DIR") or not jax.config.jax_enable_compilation_cache:
+    allowed = jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
+    if os.environ.get("JAX_COMPILATION_CACHE_DIR") or not allowed:
         return
     try:
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / _FOLDER
