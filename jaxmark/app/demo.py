@@ -161,7 +161,7 @@ def verdict(rows: Sequence[Outcome]) -> list[str]:
             )
             continue
         weakest = max((row.log10_p for row in mine if row.message_read), default=0.0)
-        floor = ", the floor of what a key can prove" if weakest < MIN_LOG10_P + 1 else ""
+        floor = ", about the least that a key can prove" if weakest < MIN_LOG10_P + 1 else ""
         said.append(f"The scheme {scheme!r} read the message from {read}.")
         said.append(f"Each of its readings is a false alarm with a chance of at most {power(weakest)}{floor}.")
     controls = [row for row in rows if row.control != "marked"]
