@@ -220,7 +220,7 @@ def test_refusals_are_one_sentence_and_leave_nothing(workshop: Workshop):
         (("embed", "model.ply", "out.ply", "--key", "owner.key", "--message", "xyz"), "hexadecimal"),
         (
             ("embed", "model.ply", "out.ply", *mark, "--budget", "2e-4", "--noise", "0.005"),
-            "at most .* bits .*budget of at least 0.000",
+            "carries no message at a budget of 0.0002, .*budget of at least 0.000",
         ),
         (("embed", "model.ply", "out.ply", *mark, "--noise", "-1"), "noise"),
         (("embed", "model.ply", "out.ply", "--key", "owner.key", "--message", "00" * 600), "at most"),

@@ -56,7 +56,7 @@ def test_compiling_is_said(tmp_path, monkeypatch):
         jax.jit(lambda x: jnp.cos(x) + 4321)(jnp.ones(7)).block_until_ready()
     finally:
         jax.config.update("jax_compilation_cache_dir", kept)
-    assert "adding: compiling, 1" in terminal.shown()
+    assert "adding: compiling program 1" in terminal.shown()
     assert terminal.shown()[-1] == ""
 
 

@@ -30,6 +30,7 @@ from jaxmark.adversaries.expected import (
     rescale,
 )
 from jaxmark.alignment.original import displace
+from jaxmark.attacks.random import Randomness, random_key
 from jaxmark.attacks.registry import Attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
@@ -184,10 +185,11 @@ def _attack(
     mark: float,
     metric: str,
 ) -> Attack:
-    def apply(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+    def apply(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
         surrogate, original = make_surrogate(mesh, scheme, bits, mark, metric)
         wanted = jnp.asarray(strength, surrogate.signal.dtype)
-        return displace(original, original.to_host(rescale(surrogate, way(surrogate, wanted, key), wanted)))
+        moved = rescale(surrogate, way(surrogate, wanted, random_key(key)), wanted)
+        return displace(original, original.to_host(moved))
 
     unit = "RMS over the diagonal" if metric == "rms" else f"{metric}, as small displacements make it"
     return Attack(apply, unit, _STRENGTHS, host=True)

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Float64, PRNGKeyArray
+from jaxtyping import Float64
 
-from jaxmark.attacks.random import generator
+from jaxmark.attacks.random import Randomness, generator
 from jaxmark.attacks.registry import Attack, attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, host_mesh, same_connectivity, weld, weld_mesh
@@ -32,7 +32,7 @@ def collude(others: Sequence[Mesh], rule: Rule) -> Attack:
     _check(rule)
     points = [weld_mesh(one, weld(one.vertices)) for one in map(host_mesh, others)]
 
-    def apply(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+    def apply(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
         random = generator(key)
         together = combine([mesh, *points], rule, random)
         return attack(together, "jamming", strength, seed=int(random.integers(2**31)))

@@ -10,11 +10,12 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, PRNGKeyArray
+from jaxtyping import Array, Float, Float64
 
 from jaxmark.adversaries.expected import strongest_evidence
 from jaxmark.alignment.alignment import align
 from jaxmark.alignment.observation import Observation
+from jaxmark.attacks.random import Randomness
 from jaxmark.attacks.registry import Attack
 from jaxmark.distortion import rms
 from jaxmark.errors import JaxmarkError
@@ -82,7 +83,7 @@ def _attack(marker: Marker, message: bytes, slopes: Slope, steps: int) -> Attack
     copies = weld(original.mesh.vertices)
     codeword = jnp.asarray(marker.codeword(message), original.signal.dtype)
 
-    def apply(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+    def apply(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
         if len(mesh.vertices) != len(copies.first):
             raise JaxmarkError(
                 f"The mesh has {len(mesh.vertices)} points, the original {len(copies.first)}; only marks in the"

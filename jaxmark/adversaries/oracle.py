@@ -11,10 +11,10 @@ from typing import Generic, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float64, PRNGKeyArray
+from jaxtyping import Bool, Float64
 
 from jaxmark.attacks._jamming import through_bands
-from jaxmark.attacks.random import generator
+from jaxmark.attacks.random import Randomness, generator
 from jaxmark.attacks.registry import Attack
 from jaxmark.distortion import rms
 from jaxmark.errors import JaxmarkError
@@ -176,7 +176,7 @@ def estimated_gradient(oracle: Score, *, queries: int = 300) -> Attack:
         raise JaxmarkError(f"A gradient takes at least 2 queries, got {queries}.")
     rounds = min(_GRADIENT_ROUNDS, queries // 2)
 
-    def apply(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+    def apply(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
         space, random = _space(mesh), generator(key)
         here, total = space.rescale(space.draw(1, random)[0], strength), np.zeros_like(mesh.vertices, float)
         for _ in range(rounds if strength > 0 else 0):
@@ -213,7 +213,7 @@ def random_search(oracle: Score, *, queries: int = 300) -> Attack:
     if queries < 1:
         raise JaxmarkError(f"A search takes at least 1 query, got {queries}.")
 
-    def apply(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+    def apply(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
         space, random = _space(mesh), generator(key)
         here, step = space.rescale(space.draw(1, random)[0], strength), strength / 2
         lowest = oracle(space.mesh(here))
@@ -244,7 +244,7 @@ def boundary(oracle: Decision) -> Attack:
         these do not suffice to find a displacement that is not detected.
     """
 
-    def apply(mesh: Mesh, strength: float, key: PRNGKeyArray) -> Mesh:
+    def apply(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
         space, random, asked = _space(mesh), generator(key), Counted(oracle)
 
         def left() -> int:

@@ -46,7 +46,7 @@ class Progress:
             return
         if event == _COMPILING:
             self._compiled += 1
-            self._draw(f"{self._what}: compiling, {self._compiled}")
+            self._draw(f"{self._what}: compiling program {self._compiled}")
         elif event == _FOUND:
             self._compiled -= 1
             self._draw(self._what)
