@@ -2,6 +2,7 @@
 from . import adversaries as adversaries
 from . import alignment as alignment
 from . import attacks as attacks
+from . import catalogue as catalogue
 from . import distortion as distortion
 from . import evaluation as evaluation
 from . import files as files
@@ -10,6 +11,7 @@ from . import plot as plot
 from . import spectral as spectral
 from . import watermark as watermark
 from .attacks import attack as attack
+from .catalogue import Catalogue as Catalogue
 from .distortion import compare as compare
 from .errors import JaxmarkError as JaxmarkError
 from .evaluation import Study as Study

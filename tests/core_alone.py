@@ -53,7 +53,7 @@ def check_package() -> None:
     package = importlib.resources.files("jaxmark")
     assert package.joinpath("py.typed").is_file(), "the wheel has no py.typed"
     assert not Path(str(package)).is_relative_to(Path(__file__).parents[1] / "jaxmark"), f"{package} is the checkout"
-    others = ("fast_simplification", "skimage", "igl", "flip_evaluator", "distributed", "equinox")
+    others = ("fast_simplification", "skimage", "igl", "flip_evaluator", "distributed", "equinox", "starlette")
     for extra in ("matplotlib", "pandas", "pymeshlab", *others):
         assert importlib.util.find_spec(extra) is None, f"{extra} came with the core"
 
@@ -98,6 +98,7 @@ def needing(folder: str) -> Iterator[tuple[str, str, Callable[[], object]]]:
     import jaxmark as jm
     from jaxmark import plot
     from jaxmark.app.demo import sample_mesh
+    from jaxmark.app.serving import Desk, make_app
     from jaxmark.evaluation.results import Results
     from jaxmark.geometry.surfaces import Surface
     from jaxmark.spectral import learned
@@ -115,6 +116,7 @@ def needing(folder: str) -> Iterator[tuple[str, str, Callable[[], object]]]:
     laser.write_bytes(b"LASF")
     yield "laser scans", "files", lambda: jm.load_mesh(laser)
     yield "modules of learned filters", "learned", lambda: learned.ChebConv
+    yield "the page of a catalogue", "serve", lambda: make_app(Desk(Path("shop.db"), []), 1)
     yield "the sample mesh", "attacks", sample_mesh
     for name, strength in REMESHING.items():
         yield name, "attacks", lambda name=name, strength=strength: jm.attack(mesh, name, strength, seed=0)

@@ -31,11 +31,18 @@ PAGES = {
 }
 README = PAGES["README.md"]
 LONG = ("docs/tutorial.md", "docs/submeshes.md", "docs/how-to/extend.md")  # compiled for themselves, and need libigl
-SLOW = (*LONG, "docs/blind.md", "docs/filters.md", "docs/how-to/strength.md", "docs/how-to/pictures.md")
+SLOW = (
+    *LONG,
+    "docs/blind.md",
+    "docs/how-to/catalogue.md",
+    "docs/filters.md",
+    "docs/how-to/strength.md",
+    "docs/how-to/pictures.md",
+)
 FRONTS = ("README.md", "docs/index.md")
 # These have tests of their own.
 APART = (*FRONTS, "docs/robustness.md", "docs/how-to/arrays.md", "docs/how-to/recipients.md", "docs/how-to/study.md")
-COMMANDS = {"README.md": 4, "docs/reference/command_line.md": 16}
+COMMANDS = {"README.md": 4, "docs/reference/command_line.md": 19}
 SAMPLED = re.compile(r"^ *```python\n(.*?)^ *```\n(?:\n```text\n(.*?)^```)?", re.DOTALL | re.MULTILINE)
 NUMBER = re.compile(r"-?\d+(\.\d+)?")
 FENCE = re.compile(r"^( *)```(\w+)\n(.*?)^\1```", re.DOTALL | re.MULTILINE)

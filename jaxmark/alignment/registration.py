@@ -217,7 +217,7 @@ def _coarse(target: Points, source: Others, settings: RegistrationSettings) -> l
     """Find the likeliest distinct poses of each hand by principal axes and closest points; none if all fit badly."""
     forward, backward = KDTree(target), KDTree(source)
     coarse, fine = slice(settings.coarse_points), slice(settings.fine_points)
-    starts = _axes(target, source)
+    starts = poses_by_axes(target, source)
     first = [_closest_pairs(start, target[coarse], source[coarse], forward, backward, settings)[2] for start in starts]
     ends = [
         _closest_points(start, target[coarse], source[coarse], forward, backward, settings)
@@ -239,7 +239,7 @@ def _coarse(target: Points, source: Others, settings: RegistrationSettings) -> l
     return [pose for alike in distinct.values() for pose in alike[: settings.distinct_poses]]
 
 
-def _axes(target: Points, source: Others) -> list[Pose]:
+def poses_by_axes(target: Points, source: Others) -> list[Pose]:
     """The poses that bring the source's principal axes onto the target's, in all 48 ways, of which half mirror."""
     (target_mean, wide, onto), (source_mean, size, of) = (_principal(points) for points in (target, source))
     starts = []

@@ -5,12 +5,11 @@ standard error and no output file. With --json, standard output holds exactly on
 line, or such an object, for each file, and the exit status is the worst of theirs.
 """
 
-import json
 import math
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -21,11 +20,19 @@ import click
 
 from jaxmark import distortion
 from jaxmark.alignment.alignment import Align
+from jaxmark.app.answering import answer as _answer
+from jaxmark.app.answering import begin_progress as _begin_progress
+from jaxmark.app.answering import progress as _progress
+from jaxmark.app.answering import read_key as _key
+from jaxmark.app.answering import say as _say
 from jaxmark.app.batch import FileReader, mark_file
 from jaxmark.app.blind import BlindReader
+from jaxmark.app.catalogue import catalogue_group
 from jaxmark.app.ending import end_by_exception
+from jaxmark.app.finding import identify_by_catalogue
 from jaxmark.app.folders import Work, each, mesh_files
-from jaxmark.app.progress import Progress
+from jaxmark.app.issuing import mark_for_command
+from jaxmark.app.serving import serve_command
 from jaxmark.app.telling import Told, power, told_error
 from jaxmark.attacks import ATTACKS, chain, get_attack
 from jaxmark.errors import JaxmarkError
@@ -37,7 +44,7 @@ from jaxmark.files import load_mesh, load_scene, save_mesh, save_scene
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import same_connectivity
 from jaxmark.watermark.budget import VISIBILITY, Visibility, make_budget, visibility_of
-from jaxmark.watermark.coding.keys import Key, commitment, load_key, new_key, save_key
+from jaxmark.watermark.coding.keys import commitment, new_key, save_key
 from jaxmark.watermark.deposit import Deposit, make_deposit
 from jaxmark.watermark.everyday import NAMES, blind_scheme, capacity, split
 from jaxmark.watermark.marking import COVERAGE, DEFAULT_BITS, NOISE
@@ -408,10 +415,11 @@ def detect_command(
 
 @cli.command(name="identify")
 @click.argument("suspect", type=_MESH)
-@click.option("--original", type=_MESH, required=True, help="The unmarked mesh.")
+@click.option("--original", type=_MESH, help="The unmarked mesh.")
 @_KEY
+@click.option("--recipients", type=_MESH, help="Text file with the recipients of copies, one identifier per line.")
 @click.option(
-    "--recipients", type=_MESH, required=True, help="Text file with the recipients of copies, one identifier per line."
+    "--catalogue", "catalogue_file", type=_MESH, help="Catalogue that knows originals and recipients, in place of both."
 )
 @click.option("--record", "record_file", type=_MESH, help="The record of a copy, which binds key and original.")
 @click.option(
@@ -423,9 +431,10 @@ def detect_command(
 @_JSON
 def identify_command(
     suspect: Path,
-    original: Path,
+    original: Path | None,
     key_file: Path,
-    recipients: Path,
+    recipients: Path | None,
+    catalogue_file: Path | None,
     record_file: Path | None,
     top: int,
     how: Align,
@@ -439,6 +448,12 @@ def identify_command(
     """
     if not 0 < alpha < 1:
         raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
+    if catalogue_file is not None:
+        if original is not None or recipients is not None or record_file is not None:
+            raise JaxmarkError("A catalogue knows originals, recipients and records; leave those out.")
+        identify_by_catalogue(suspect, catalogue_file, key_file, how, alpha, as_json)
+    if original is None or recipients is None:
+        raise JaxmarkError("Give --original and --recipients, or a --catalogue that knows them.")
     try:
         names = [line for line in recipients.read_text(encoding="utf-8").splitlines() if line]
     except UnicodeDecodeError:
@@ -685,6 +700,11 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
     _answer(as_json, {"output": str(output), "readings": len(results.rows), "rates": results.rates()}, table.rstrip())
 
 
+cli.add_command(catalogue_group)
+cli.add_command(mark_for_command)
+catalogue_group.add_command(serve_command)
+
+
 def main() -> None:
     """Run the command line; refused input ends with exit status 2 and one sentence."""
     end_by_exception()
@@ -698,26 +718,9 @@ def main() -> None:
         _refuse(told_error(error))
 
 
-def _begin_progress(context: click.Context, quiet: bool) -> None:
-    """Let a command tell people at a terminal what it is doing, until it ends."""
-    context.obj = Progress(None if quiet or not sys.stderr.isatty() else sys.stderr)
-    context.call_on_close(context.obj.clear)
-
-
-def _progress() -> Progress:
-    """The progress of the command that is running; one that says nothing for a command that takes no time."""
-    context = click.get_current_context(silent=True)
-    return (context and context.obj) or Progress(None)
-
-
 def _refuse(sentence: str) -> NoReturn:
     click.echo(f"jaxmark: {sentence}", err=True)
     sys.exit(2)
-
-
-def _say(line: str, err: bool = True) -> None:
-    _progress().clear()
-    click.echo(line, err=err)
 
 
 def _each(folder: Path, as_json: bool, work: Work, workers: int) -> NoReturn:
@@ -762,36 +765,9 @@ def _one_message(message: bytes | None, text: bytes | None) -> bytes | None:
     return text if message is None else message
 
 
-def _key(path: Path) -> Key:
-    """Load a key, and say so if others may read it."""
-    key = load_key(path)
-    if os.name == "posix" and path.stat().st_mode & 0o077:
-        _say(f"jaxmark: the key file {path} may be read by others; chmod 600 {path} keeps it yours.")
-    return key
-
-
 def _member(path: Path, name: str) -> Path:
     """The path itself, or the file of that name in it if it is a folder."""
     return path / name if path.is_dir() else path
-
-
-def _answer(as_json: bool, answer: Mapping[str, Any], text: str) -> None:
-    _progress().clear()
-    try:
-        click.echo(json.dumps(_finite(answer), allow_nan=False) if as_json else text)
-        sys.stdout.flush()
-    except BrokenPipeError:
-        # The reader of our output has gone. The work is done, and the exit status still tells its outcome.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _finite(value: Any) -> Any:
-    """Replace numbers that JSON does not have by None."""
-    if isinstance(value, Mapping):
-        return {name: _finite(item) for name, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _check_outputs(source: Path, target: Path) -> None:

@@ -62,7 +62,7 @@ def each(files: Sequence[Path], work: Work, workers: int = 1) -> Generator[tuple
     largest_first = sorted(files, key=lambda file: -file.stat().st_size)
     count = min(_MOST_TOGETHER, -(-len(files) // (_TURNS * workers)))
     together = [largest_first[start : start + count] for start in range(0, len(files), count)]
-    pool = processes(min(workers, len(together)), _begin)()
+    pool = processes(min(workers, len(together)), begin_worker)()
     held = pickle.dumps(work)
     try:
         for done in as_completed([pool.submit(_tell_of, held, some) for some in together]):
@@ -103,7 +103,7 @@ def _tell_of(work: bytes, files: Sequence[Path]) -> list[tuple[Path, Told]]:
         os._exit(end.code if isinstance(end.code, int) else 1)
 
 
-def _begin() -> None:
+def begin_worker() -> None:
     """Set a worker up: whoever started it decides when it ends, and so does that process's own end."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_by_exception()

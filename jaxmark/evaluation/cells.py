@@ -67,7 +67,7 @@ def run(
                 futures = {executor.submit(work, cell): cell for cell in left}
                 try:
                     for future in as_completed(futures):
-                        _append(target, {"cell": futures[future], **future.result()})
+                        append(target, {"cell": futures[future], **future.result()})
                         broken, missing = 0, missing - 1
                         pace = (time.monotonic() - start) / (count - missing)
                         done = f"{len(cells) - missing}/{len(cells)} {name(futures[future])}".rstrip()
@@ -128,8 +128,12 @@ def _cell(row: Row) -> Cell:
     return tuple(row["cell"])
 
 
-def _append(output: Path, row: Row) -> None:
-    """Append a row, and wait until it is on disk; a disk that is full leaves part of a line, which is cut off later."""
+def append(output: Path, row: Row) -> None:
+    """Append a row, and wait until it is on disk; a disk that is full leaves part of a line, which is cut off later.
+
+    Raises:
+        JaxmarkError: if it cannot be written.
+    """
     try:
         with output.open("ab") as file:
             file.write(json.dumps(row).encode() + b"\n")

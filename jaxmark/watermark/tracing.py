@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from jaxmark.alignment import alignment
-from jaxmark.alignment.alignment import Align
+from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark import evidence
@@ -62,13 +62,15 @@ class Tracer:
         return self.identify(suspect, [recipient])[0].log10_p <= _MAX_LOG10_P
 
     def identify(
-        self, suspect: Mesh, recipients: Iterable[str], top: int = 10, align: Align = "auto"
+        self, suspect: Mesh | Alignment, recipients: Iterable[str], top: int = 10, align: Align = "auto"
     ) -> list[Accusation]:
-        """Rank recipients by their scores in a suspect; see `identify`."""
-        aligned = alignment.align(self.marker.original, suspect, align)
+        """Rank recipients by their scores in a suspect, or in its alignment; see `identify`."""
+        aligned = suspect
+        if not isinstance(aligned, Alignment):
+            aligned = alignment.align(self.marker.original, aligned, align)
         soft = self.marker.soft_values(self.marker.receive(aligned))
         ranked = rank(soft, recipients, self.marker.choices, top=top)
-        return [one._replace(doubts=self.marker.doubts) for one in pay(ranked, ALIGN_SHARES[align])]
+        return [one._replace(doubts=self.marker.doubts) for one in pay(ranked, ALIGN_SHARES[aligned.how])]
 
 
 def pay(ranking: Iterable[Accusation], share: float) -> list[Accusation]:

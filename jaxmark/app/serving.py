@@ -1,0 +1,246 @@
+"""A page to look at a catalogue, and to find by dropping a file; for this machine only. Needs the extra `serve`.
+
+Nothing is written unless it is asked for, no answer has a key, and no name that comes from outside becomes a path. Two
+files are worked on at most, one after the other; a third is turned away.
+"""
+
+import asyncio
+import secrets
+import tempfile
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import click
+
+from jaxmark.app.answering import answer, read_key
+from jaxmark.app.batch import FileReader
+from jaxmark.app.catalogue import CATALOGUE
+from jaxmark.app.finding import keep
+from jaxmark.app.programs import release_programs
+from jaxmark.app.telling import told_error
+from jaxmark.catalogue import Catalogue, Finder, Match
+from jaxmark.errors import JaxmarkError
+from jaxmark.extras import require
+from jaxmark.files import SUFFIXES
+from jaxmark.files.atomic import write_atomically
+from jaxmark.watermark.coding.keys import Key
+
+_PATH = click.Path(path_type=Path)
+_HOST = "127.0.0.1"
+_MOST_JOBS = 2  # that wait or are worked on
+_UPLOAD_SECONDS = 120.0
+_MOST_DOSSIERS = 16  # that are kept in memory
+_MOST_LISTED = 200  # originals that are shown at a time
+_UPLOADED = tuple(suffix for suffix in SUFFIXES if suffix != ".gltf")  # which refers to other files
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline'; script-src 'self';"
+    " connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+#: What the page sends with a file; pages of other places cannot without being asked, and are not answered.
+_OURS = "x-jaxmark"
+
+
+@click.command(name="serve")
+@CATALOGUE
+@click.option("--key", "key_files", type=_PATH, multiple=True, required=True, help="Key file; may be repeated.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8737, show_default=True, help="0 for any that is free.")
+@click.option(
+    "--most-megabytes", type=click.IntRange(1, 4096), default=64, show_default=True, help="Largest file that is taken."
+)
+@click.option("--keep", "keeps", is_flag=True, help="Keep verdicts in the catalogue, which is only read otherwise.")
+def serve_command(
+    catalogue_file: Path, key_files: tuple[Path, ...], port: int, most_megabytes: int, keeps: bool
+) -> None:
+    """Show the catalogue as a page on this machine, where a file that is dropped is sought; until interrupted."""
+    uvicorn = require("uvicorn", "serve")
+    require("starlette", "serve")
+    Catalogue(catalogue_file, read_only=True).close()
+    desk = Desk(catalogue_file.resolve(), [read_key(file) for file in key_files], keeps=keeps)
+    app = make_app(desk, most_megabytes * 2**20)
+    settings = uvicorn.Config(app, host=_HOST, port=port, log_level="warning", server_header=False, access_log=False)
+    server = uvicorn.Server(settings)
+    with settings.bind_socket() as socket:
+        answer(False, {}, f"http://{_HOST}:{socket.getsockname()[1]}/ shows {catalogue_file}; Ctrl+C ends it")
+        server.run(sockets=[socket])
+
+
+@dataclass
+class Desk:
+    """Finds the originals of files, one at a time, and keeps the dossiers of the last."""
+
+    catalogue: Path
+    keys: Sequence[Key]
+    keeps: bool = False  # whether verdicts are kept in the catalogue
+    dossiers: OrderedDict[str, bytes] = field(default_factory=OrderedDict)
+    _finder: Finder | None = None
+
+    def find(self, data: bytes, suffix: str) -> dict[str, Any]:
+        """Find the originals of an uploaded file.
+
+        Raises:
+            JaxmarkError: see `Finder`.
+        """
+        if self._finder is None:
+            self._finder = Finder(Catalogue(self.catalogue, read_only=not self.keeps), self.keys)
+        with tempfile.TemporaryDirectory() as folder:
+            suspect = Path(folder) / f"suspect{suffix}"
+            suspect.write_bytes(data)
+            verdict = self._finder.find(suspect)
+            if self.keeps:
+                keep(self._finder.catalogue, Path("uploaded"), verdict)
+            found = verdict.as_json()
+            for match in verdict.named[:1]:
+                found["dossier"] = self._dossier(suspect, match, Path(folder))
+        release_programs()
+        numbers = {entry.path: entry.id for entry in self._finder.catalogue.originals()}
+        for one in (found, *found["matches"]):
+            if one["original"] is not None:
+                one["id"], one["original"] = numbers.get(one["original"]), Path(one["original"]).name
+        return found
+
+    def _dossier(self, suspect: Path, match: Match, folder: Path) -> str | None:
+        """Make the dossier of a message that was read in a file of one mesh; None if there is none."""
+        if not match.message or match.mesh or match.piece or self._finder is None:
+            return None
+        key = next(key for name, key in self._finder.keys.items() if name == match.key)
+        query, record = "SELECT json FROM records WHERE digest = ?", None
+        for row in self._finder.catalogue.database.rows(query, match.record):
+            record = folder / "record.json"
+            write_atomically(record, row["json"].encode())
+        bits = None if record is not None else 4 * len(match.message)
+        reader = FileReader(key, bits, None, None, "auto", 1e-6, guesses=False)
+        with suppress(JaxmarkError):  # without the extra `plot` there is a verdict, but no dossier
+            reader.read(suspect, Path(match.original), record, dossier=folder / "dossier")
+            token = secrets.token_urlsafe(16)
+            self.dossiers[token] = (folder / "dossier" / "dossier.html").read_bytes()
+            while len(self.dossiers) > _MOST_DOSSIERS:
+                self.dossiers.popitem(last=False)
+            return token
+        return None
+
+
+def make_app(desk: Desk, most_bytes: int) -> Any:
+    """The ASGI application (Starlette).
+
+    Args:
+        desk: what finds.
+        most_bytes: the largest file that is taken.
+
+    Raises:
+        JaxmarkError: if the extra `serve` is missing.
+    """
+    require("starlette", "serve")
+    from starlette.applications import Starlette
+    from starlette.concurrency import run_in_threadpool
+    from starlette.middleware import Middleware
+    from starlette.middleware.trustedhost import TrustedHostMiddleware
+    from starlette.requests import ClientDisconnect, Request
+    from starlette.responses import JSONResponse, Response
+    from starlette.routing import Route
+
+    turn, waiting = asyncio.Lock(), 0
+
+    def reply(content: bytes, kind: str, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
+        return Response(content, status, {**_HEADERS, **(headers or {})}, kind)
+
+    def told(values: Any, status: int = 200) -> Response:
+        return JSONResponse(values, status, _HEADERS)
+
+    def refuse(sentence: str, status: int) -> Response:
+        return told({"refused": sentence}, status)
+
+    def read(work: Callable[[Catalogue], Response]) -> Response:
+        try:
+            with Catalogue(desk.catalogue, read_only=True) as catalogue:
+                return work(catalogue)
+        except JaxmarkError as error:
+            return refuse(str(error), 404)
+
+    async def page(request: Request) -> Response:
+        return reply(_asset("catalogue.html"), "text/html; charset=utf-8")
+
+    async def script(request: Request) -> Response:
+        return reply(_asset("catalogue.js"), "text/javascript; charset=utf-8")
+
+    async def originals(request: Request) -> Response:
+        start = request.query_params.get("start", "0")
+        first = int(start) if start.isdecimal() and len(start) < 10 else 0
+        return await run_in_threadpool(read, lambda catalogue: told(_listed(catalogue, first)))
+
+    async def thumbnail(request: Request) -> Response:
+        number = request.path_params["number"]
+        if number >= 2**63:
+            return refuse("There is no such original.", 404)
+        return await run_in_threadpool(read, lambda catalogue: reply(catalogue.thumbnail(number), "image/png"))
+
+    async def dossier(request: Request) -> Response:
+        found = desk.dossiers.get(request.path_params["token"])
+        return refuse("There is no such dossier.", 404) if found is None else reply(found, "text/html; charset=utf-8")
+
+    async def find(request: Request) -> Response:
+        nonlocal waiting
+        if _OURS not in request.headers or request.headers.get("sec-fetch-site", "same-origin") != "same-origin":
+            return refuse("Files are taken from this page only.", 403)
+        suffix = Path(request.query_params.get("name", "")).suffix.lower()
+        if suffix not in _UPLOADED:
+            return refuse(f"Drop a mesh file: {', '.join(_UPLOADED)}.", 415)
+        if waiting >= _MOST_JOBS:
+            return refuse("Two files are being worked on; come back when one is done.", 503)
+        waiting += 1
+        try:
+            async with asyncio.timeout(_UPLOAD_SECONDS):
+                data = bytearray()
+                async for chunk in request.stream():
+                    data += chunk
+                    if len(data) > most_bytes:
+                        return refuse(f"The file is larger than {most_bytes // 2**20} megabytes.", 413)
+            async with turn:
+                return told(await run_in_threadpool(desk.find, bytes(data), suffix))
+        except TimeoutError:
+            return refuse("The file did not come in time.", 408)
+        except ClientDisconnect:
+            return refuse("Nobody is there any more.", 400)
+        except Exception as error:
+            return refuse(told_error(error), 422 if isinstance(error, JaxmarkError) else 500)
+        finally:
+            waiting -= 1
+
+    return Starlette(
+        routes=[
+            Route("/", page),
+            Route("/catalogue.js", script),
+            Route("/originals", originals),
+            Route("/thumbnails/{number:int}", thumbnail),
+            Route("/dossiers/{token:str}", dossier),
+            Route("/find", find, methods=["POST"]),
+        ],
+        # Another place's name for this machine does not open the page to it.
+        middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])],
+    )
+
+
+def _listed(catalogue: Catalogue, start: int) -> dict[str, Any]:
+    """Some originals, as the page shows them."""
+    every = catalogue.originals()
+    shown = every[start : start + _MOST_LISTED]
+    rows = [
+        {
+            "id": entry.id,
+            "name": Path(entry.path).name,
+            **{name: getattr(entry, name) for name in ("vertices", "records", "recipients", "added")},
+        }
+        for entry in shown
+    ]
+    return {"count": len(every), "start": start, "originals": rows}
+
+
+def _asset(name: str) -> bytes:
+    return resources.files("jaxmark.app").joinpath(name).read_bytes()

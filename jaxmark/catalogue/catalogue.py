@@ -1,0 +1,375 @@
+"""The catalogue: originals and what is known of them, in one file."""
+
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from jaxmark.catalogue import descriptors
+from jaxmark.catalogue.database import Database
+from jaxmark.catalogue.originals import Prepared, file_hash, meshes_of, prepare_file
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.record import Record
+from jaxmark.watermark.scenes import SceneRecord
+
+if TYPE_CHECKING:
+    from jaxmark.catalogue.finding import Verdict
+
+_PACKAGES = ("jaxmark", "jax", "numpy", "scipy")
+
+
+class Entry(NamedTuple):
+    """An original in the catalogue."""
+
+    id: int
+    path: str  # where its file was when it was added
+    content: str  # SHA-256 of the file, hexadecimal
+    bytes: int
+    copied: bool  # whether the catalogue holds the file itself
+    meshes: int
+    vertices: int
+    records: int
+    recipients: int
+    added: str  # time in UTC, ISO 8601
+
+
+class Added(NamedTuple):
+    """What became of a file that was added."""
+
+    id: int
+    path: str
+    status: str  # "added", "known", or "moved" if it was known, but not where it was
+    meshes: int
+    left: Mapping[str, str]  # meshes that cannot be used, and why
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A record in the catalogue, and the mesh of an original that it belongs to."""
+
+    record: Record
+    shape: int
+    status: str  # "added" or "known"
+
+
+class Catalogue:
+    """Originals, records, recipients and verdicts, in one SQLite file; it holds no key, only commitments to keys.
+
+    Use it as a context manager, or close it. Several processes may use the same file, each by a connection of its own;
+    one connection serves one thread at a time.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, read_only: bool = False) -> None:
+        """Open a catalogue; a new one is made unless it is only read.
+
+        Raises:
+            JaxmarkError: if the file cannot be opened, is no catalogue, or was made by a later jaxmark.
+        """
+        self.database = Database(path, read_only=read_only)
+
+    def __enter__(self) -> "Catalogue":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self.database.close()
+
+    @property
+    def path(self) -> Path:
+        """The catalogue's file."""
+        return self.database.path
+
+    def add(self, path: str | os.PathLike[str], *, copy: bool = False) -> Added:
+        """Add an original; one that is known changes nothing, unless its file is no longer where it was.
+
+        Args:
+            path: a mesh file; what is too small to carry a mark is added, too.
+            copy: whether to keep the file itself in the catalogue.
+
+        Raises:
+            JaxmarkError: if the file cannot be read, holds no mesh with an extent, or is a copy that was made for a
+                recipient.
+        """
+        content = file_hash(path)
+        if copies := self.database.rows("SELECT recipient FROM copies WHERE file = ?", content):
+            raise JaxmarkError(f"{path} is no original, but the copy for {copies[0]['recipient']}.")
+        known = self._known(content, path)
+        return known if known is not None else self._insert(prepare_file(path, copy=copy))
+
+    def _known(self, content: str, path: str | os.PathLike[str]) -> Added | None:
+        """A known file, whose descriptors are those of this jaxmark."""
+        query = (
+            "SELECT o.id, o.path, count(*) AS meshes, min(s.described) AS described FROM originals o"
+            " JOIN shapes s ON s.original = o.id WHERE content = ? GROUP BY o.id"
+        )
+        found = self.database.rows(query, content)
+        if not found:
+            return None
+        (row,) = found
+        if row["described"] != descriptors.VERSION:
+            self._describe_again(row["id"], prepare_file(path))
+        status, here = "known", os.path.realpath(path)
+        if row["path"] != here and not Path(row["path"]).is_file():
+            with self.database.writing():
+                self.database.run("UPDATE originals SET path = ? WHERE id = ?", here, row["id"])
+            status = "moved"
+        return Added(row["id"], here if status == "moved" else row["path"], status, row["meshes"], {})
+
+    def _describe_again(self, original: int, prepared: Prepared) -> None:
+        with self.database.writing():
+            for shape in prepared.shapes:
+                statement = (
+                    "UPDATE shapes SET described = ?, whole = ?, parts = ?, points = ? WHERE original = ? AND name = ?"
+                )
+                self.database.run(
+                    statement, descriptors.VERSION, shape.whole, shape.parts, shape.points, original, shape.name
+                )
+
+    def _insert(self, prepared: Prepared) -> Added:
+        with self.database.writing():
+            # Another process may have added the same file meanwhile.
+            statement = (
+                "INSERT INTO originals (content, path, bytes, copy, thumbnail, added) VALUES (?, ?, ?, ?, ?, ?)"
+                " ON CONFLICT DO NOTHING"
+            )
+            values = prepared.content, prepared.path, prepared.size, prepared.copy, prepared.thumbnail, _now()
+            fresh = self.database.run(statement, *values).rowcount == 1
+            (row,) = self.database.rows("SELECT id FROM originals WHERE content = ?", prepared.content)
+            for shape in prepared.shapes if fresh else ():
+                self.database.run(
+                    "INSERT INTO shapes (original, name, geometry, exact, vertices, faces, described, whole, parts,"
+                    " points)"
+                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                    row["id"],
+                    shape.name,
+                    shape.geometry,
+                    shape.exact,
+                    shape.vertices,
+                    shape.faces,
+                    descriptors.VERSION,
+                    shape.whole,
+                    shape.parts,
+                    shape.points,
+                )
+        status = "added" if fresh else "known"
+        return Added(row["id"], prepared.path, status, len(prepared.shapes), prepared.left)
+
+    def add_record(self, record: Record | SceneRecord) -> list[Kept]:
+        """Add the record of a mark, or those of a file of several meshes, to the originals that they belong to.
+
+        Raises:
+            JaxmarkError: if the original of a record is not in the catalogue, or a mark is read without its original.
+        """
+        records = [record] if isinstance(record, Record) else list(record.meshes.values())
+        with self.database.writing():
+            return [self._keep(one, self._shape_of(one)) for one in records]
+
+    def add_copy(self, record: Record, recipient: str, file: str) -> Kept:
+        """Add the copy that a recipient is given.
+
+        Args:
+            record: of the fingerprint.
+            recipient: identifier.
+            file: SHA-256 of the copy's file, hexadecimal.
+
+        Raises:
+            JaxmarkError: see `add_record`; also if the record is of no fingerprint, or the identifier is empty.
+        """
+        if record.content != "fingerprint":
+            raise JaxmarkError(f"The record is of a {record.content}, not of a recipient's copy.")
+        if not recipient:
+            raise JaxmarkError("A recipient's identifier is empty: give every recipient one.")
+        with self.database.writing():
+            kept = self._keep(record, self._shape_of(record))
+            self.database.run(
+                "INSERT INTO copies (shape, key, recipient, record, file, added) VALUES (?, ?, ?, ?, ?, ?)"
+                " ON CONFLICT (shape, key, recipient) DO UPDATE SET record = excluded.record, file = excluded.file",
+                kept.shape,
+                record.key,
+                recipient,
+                record.digest(),
+                file,
+                _now(),
+            )
+        return kept
+
+    def _shape_of(self, record: Record) -> int:
+        """The mesh that a record was made for."""
+        if not record.original:
+            raise JaxmarkError(
+                f"Marks of the scheme {record.scheme!r} belong to no original; `jaxmark detect` reads them without."
+            )
+        column = "exact" if record.version == 1 else "geometry"
+        found = self.database.rows(f"SELECT id FROM shapes WHERE {column} = ? ORDER BY id", record.original)
+        if not found:
+            raise JaxmarkError("The record's original is not in the catalogue; add its file as it was marked.")
+        return found[0]["id"]
+
+    def _keep(self, record: Record, shape: int) -> Kept:
+        self.database.run("INSERT INTO keys VALUES (?, ?) ON CONFLICT DO NOTHING", record.key, _now())
+        statement = "INSERT INTO records VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING"
+        values = record.digest(), shape, record.key, record.content, record.to_json(), _now()
+        fresh = self.database.run(statement, *values).rowcount == 1
+        return Kept(record, shape, "added" if fresh else "known")
+
+    def originals(self) -> list[Entry]:
+        """All originals, in the order in which they were added."""
+        query = (
+            "SELECT o.id, o.path, o.content, o.bytes, o.copy IS NOT NULL AS copied, count(*) AS meshes,"
+            " sum(s.vertices) AS vertices,"
+            " sum((SELECT count(*) FROM records r WHERE r.shape = s.id)) AS records,"
+            " sum((SELECT count(*) FROM copies c WHERE c.shape = s.id)) AS recipients, o.added"
+            " FROM originals o JOIN shapes s ON s.original = o.id GROUP BY o.id ORDER BY o.id"
+        )
+        return [Entry(*row)._replace(copied=bool(row["copied"])) for row in self.database.rows(query)]
+
+    def find_original(self, name: str) -> Entry:
+        """The original of this number, path, or beginning of its hash (eight digits at least).
+
+        Raises:
+            JaxmarkError: if there is none, or several.
+        """
+        here = os.path.realpath(name)
+        found = [
+            entry
+            for entry in self.originals()
+            if str(entry.id) == name
+            or entry.path in (name, here)
+            or (len(name) >= 8 and entry.content.startswith(name.lower()))
+        ]
+        if not found:
+            raise JaxmarkError(f"The catalogue has no original {name}; `jaxmark catalogue list` shows all of them.")
+        if len(found) > 1:
+            numbers = ", ".join(str(entry.id) for entry in found)
+            raise JaxmarkError(f"{name} is several originals, {numbers}; name one by its number.")
+        return found[0]
+
+    def show(self, name: str) -> dict[str, Any]:
+        """All that is known of an original, as values for JSON; see `find_original`."""
+        entry = self.find_original(name)
+        shapes = "SELECT id, name, geometry, vertices, faces FROM shapes WHERE original = ? ORDER BY id"
+        records = "SELECT digest, key, content, added FROM records WHERE shape = ? ORDER BY added, digest"
+        copies = "SELECT recipient, key, record, file, added FROM copies WHERE shape = ? ORDER BY id"
+        return entry._asdict() | {
+            "shapes": [
+                {
+                    **{name: row[name] for name in ("name", "geometry", "vertices", "faces")},
+                    "records": [dict(one) for one in self.database.rows(records, row["id"])],
+                    "copies": [dict(one) for one in self.database.rows(copies, row["id"])],
+                }
+                for row in self.database.rows(shapes, entry.id)
+            ]
+        }
+
+    def thumbnail(self, original: int) -> bytes:
+        """The small picture of an original, PNG.
+
+        Raises:
+            JaxmarkError: if there is no original of this number.
+        """
+        found = self.database.rows("SELECT thumbnail FROM originals WHERE id = ?", original)
+        if not found:
+            raise JaxmarkError(f"The catalogue has no original {original}.")
+        return found[0]["thumbnail"]
+
+    def remove(self, name: str, *, records: bool = False) -> Entry:
+        """Remove an original.
+
+        Args:
+            name: see `find_original`.
+            records: whether its records and recipients may go with it.
+
+        Raises:
+            JaxmarkError: if there is none, or it has records and they may not go.
+        """
+        with self.database.writing():
+            entry = self.find_original(name)
+            if (entry.records or entry.recipients) and not records:
+                raise JaxmarkError(
+                    f"{entry.path} has {entry.records} records and {entry.recipients} recipients, without which no copy"
+                    " is traced; export them first, and give --with-records if they are to go, too."
+                )
+            self.database.run("DELETE FROM originals WHERE id = ?", entry.id)
+        return entry
+
+    def check(self) -> Iterator[tuple[Entry, str | None]]:
+        """For each original, what is wrong with its file: missing or changed; None if it is there as it was added."""
+        for entry in self.originals():
+            if not Path(entry.path).is_file():
+                yield entry, "its file is missing" + (", the catalogue holds a copy" if entry.copied else "")
+            elif Path(entry.path).stat().st_size != entry.bytes or file_hash(entry.path) != entry.content:
+                yield entry, "its file has changed" + (", the catalogue holds a copy" if entry.copied else "")
+            else:
+                yield entry, None
+
+    def load(self, shape: int) -> Mesh:
+        """Read the mesh of an original again, from its file if that is unchanged, else from the copy that was kept.
+
+        Raises:
+            JaxmarkError: if there is neither.
+        """
+        query = (
+            "SELECT s.name, o.path, o.content, o.bytes, o.copy FROM shapes s JOIN originals o ON o.id = s.original"
+            " WHERE s.id = ?"
+        )
+        (row,) = self.database.rows(query, shape)
+        path = Path(row["path"])
+        if path.is_file() and path.stat().st_size == row["bytes"] and file_hash(path) == row["content"]:
+            return meshes_of(path).meshes[row["name"]]
+        if row["copy"] is None:
+            raise JaxmarkError(
+                f"The original {path} is missing or has changed; bring it back, or add it from where it is."
+            )
+        return self._from_copy(row["copy"], path.suffix, row["name"])
+
+    @staticmethod
+    def _from_copy(data: bytes, suffix: str, name: str) -> Mesh:
+        import tempfile
+
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / f"original{suffix}"
+            file.write_bytes(data)
+            return meshes_of(file).meshes[name]
+
+    def find(self, suspect: str | os.PathLike[str] | Mesh, keys: Sequence[bytes], **options: Any) -> "Verdict":
+        """Find the originals that a suspect was made of; for many suspects make a `Finder`, which takes these options.
+
+        Raises:
+            JaxmarkError: see `Finder`.
+        """
+        from jaxmark.catalogue.finding import Finder  # which needs this module
+
+        return Finder(self, keys, **options).find(suspect)
+
+    def record_verdict(self, suspect: str, path: str, result: Mapping[str, Any]) -> None:
+        """Keep a verdict.
+
+        Args:
+            suspect: SHA-256 of the suspect's file, hexadecimal.
+            path: the suspect's file.
+            result: what was found, values for JSON.
+        """
+        versions = json.dumps({name: version(name) for name in _PACKAGES})
+        with self.database.writing():
+            statement = "INSERT INTO verdicts (suspect, path, given, versions, result) VALUES (?, ?, ?, ?, ?)"
+            self.database.run(statement, suspect, path, _now(), versions, json.dumps(result))
+
+    def verdicts(self) -> Iterator[dict[str, Any]]:
+        """All verdicts that were given, the oldest first."""
+        for row in self.database.each("SELECT suspect, path, given, versions, result FROM verdicts ORDER BY id"):
+            yield dict(row) | {name: json.loads(row[name]) for name in ("versions", "result")}
+
+
+def _now() -> str:
+    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
