@@ -14,10 +14,19 @@ from jaxmark.app.progress import Progress
 from jaxmark.watermark.coding.keys import Key, load_key
 
 
-def begin_progress(context: click.Context, quiet: bool) -> None:
+def _begin_progress(context: click.Context, quiet: bool) -> None:
     """Let a command tell people at a terminal what it is doing, until it ends."""
     context.obj = Progress(None if quiet or not sys.stderr.isatty() else sys.stderr)
     context.call_on_close(context.obj.clear)
+
+
+QUIET = click.option(
+    "--quiet",
+    is_flag=True,
+    expose_value=False,
+    callback=lambda context, _, quiet: _begin_progress(context, quiet),
+    help="Say nothing of what is being done; nothing is said anyway where standard error is no terminal.",
+)
 
 
 def progress() -> Progress:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from jaxmark.app.answering import answer, say
+from jaxmark.app.answering import QUIET, answer, progress, say
 from jaxmark.app.folders import mesh_files
 from jaxmark.app.telling import told_error
 from jaxmark.catalogue import Catalogue, export_catalogue, import_catalogue
@@ -36,6 +36,7 @@ def catalogue_group() -> None:
     help=f"Add the records that lie in the folders of FILES, too (names end in {RECORD_SUFFIX}).",
 )
 @click.option("--copy", is_flag=True, help="Keep the files themselves in the catalogue.")
+@QUIET
 @JSON
 def add_command(files: tuple[Path, ...], catalogue_file: Path, records: bool, copy: bool, as_json: bool) -> None:
     """Add originals: mesh FILES, or all of a folder; and records, by their files.
@@ -51,6 +52,7 @@ def add_command(files: tuple[Path, ...], catalogue_file: Path, records: bool, co
         given += [file for folder in folders for file in sorted(folder.glob("*" + RECORD_SUFFIX))]
     with Catalogue(catalogue_file) as catalogue:
         for file in _each_file(meshes):
+            progress().doing(f"adding {file}")
             try:
                 added = catalogue.add(file, copy=copy)
             except (JaxmarkError, OSError) as error:

@@ -20,8 +20,8 @@ import click
 
 from jaxmark import distortion
 from jaxmark.alignment.alignment import Align
+from jaxmark.app.answering import QUIET as _QUIET
 from jaxmark.app.answering import answer as _answer
-from jaxmark.app.answering import begin_progress as _begin_progress
 from jaxmark.app.answering import progress as _progress
 from jaxmark.app.answering import read_key as _key
 from jaxmark.app.answering import say as _say
@@ -122,13 +122,6 @@ class _Limit(click.ParamType):
 _MESH = click.Path(path_type=Path)
 _KEY = click.option("--key", "key_file", type=_MESH, required=True, help="Key file, from `jaxmark keygen`.")
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
-_QUIET = click.option(
-    "--quiet",
-    is_flag=True,
-    expose_value=False,
-    callback=lambda context, _, quiet: _begin_progress(context, quiet),
-    help="Say nothing of what is being done; nothing is said anyway where standard error is no terminal.",
-)
 _NOISE = click.option(
     "--noise",
     type=float,

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import click
 
 from jaxmark.alignment.alignment import Align
-from jaxmark.app.answering import answer, read_key, say
+from jaxmark.app.answering import QUIET, answer, progress, read_key, say
 from jaxmark.app.catalogue import CATALOGUE, JSON, catalogue_group
 from jaxmark.app.folders import begin_worker
 from jaxmark.app.programs import release_programs
@@ -42,6 +42,7 @@ _PATH = click.Path(path_type=Path)
 @click.option("--output", type=_PATH, help="For many suspects: file that grows by a line of JSON for each.")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="For many suspects: processes.")
 @click.option("--dask", "scheduler", help="For many suspects: address of a Dask scheduler (extra `benchmarks`).")
+@QUIET
 @JSON
 def find_command(
     suspect: Path | None,
@@ -73,6 +74,7 @@ def find_command(
         files = tuple(file.resolve() for file in key_files)
         plan = Plan(catalogue_file.resolve(), files, tuple(options.items()), release_programs)
         _find_many(plan, suspects, output, _workers(workers, scheduler), as_json)
+    progress().doing(f"looking for {suspect} among the originals")
     with opened(catalogue_file) as catalogue:
         verdict = Finder(catalogue, keys, alpha=alpha, bits=bits, depth=depth).find(suspect)
         keep(catalogue, suspect, verdict)
@@ -89,11 +91,13 @@ def _find_many(
     if output.resolve() in (plan.catalogue, *plan.keys):
         raise JaxmarkError(f"{output} is the catalogue or a key; give another --output.")
     counted = {0: 0, 1: 0, 2: 0}
+    progress().doing("looking for the first of many suspects")
     with closing(find_each(plan, suspects, output, workers, say)) as rows:
         for row in rows:
             status = 2 if "refused" in row else 0 if row["named"] else 1
             counted[status] += 1
             answer(as_json, row, f"{row['suspect']}: {_line(row)}")
+            progress().doing(f"{sum(counted.values())} suspects done")
     say(f"{counted[0]} named, {counted[1]} nobody's, {counted[2]} refused → {output}")
     sys.exit(max((status for status, count in counted.items() if count), default=0))
 
@@ -137,6 +141,7 @@ def identify_by_catalogue(
     Raises:
         JaxmarkError: see `Finder`.
     """
+    progress().doing(f"looking for the copies of recipients in {suspect}")
     with opened(catalogue_file) as catalogue:
         finder = Finder(catalogue, [read_key(key_file)], alpha=alpha, how=how, only_recipients=True)
         verdict = finder.find(suspect)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from jaxmark.app.answering import answer, read_key
+from jaxmark.app.answering import QUIET, answer, progress, read_key
 from jaxmark.app.batch import mark_file
 from jaxmark.app.catalogue import CATALOGUE, JSON
 from jaxmark.app.telling import Told
@@ -31,6 +31,7 @@ _PLAIN = re.compile(r"\w[\w.@+-]*")  # recipients whose names may be in file nam
 @click.option("--output", type=_PATH, help="File for the copy.  [default: ORIGINAL's name, - and RECIPIENT, here]")
 @click.option("--budget", type=float, help="RMS displacement of the vertices over the diagonal of the bounding box.")
 @click.option("--visibility", type=click.Choice(list(VISIBILITY)), help="How well people may see the mark.")
+@QUIET
 @JSON
 def mark_for_command(
     recipient: str,
@@ -53,6 +54,7 @@ def mark_for_command(
     if os.path.realpath(output) in map(os.path.realpath, (original, key_file, catalogue_file)):
         raise JaxmarkError(f"{output} is the original, the key or the catalogue; give another name by --output.")
     key = read_key(key_file)
+    progress().doing(f"marking {original} for {recipient}")
     with Catalogue(catalogue_file) as catalogue:
         told = issue(catalogue, recipient, original, output, key, {"budget": budget, "visibility": visibility})
     answer(as_json, {"recipient": recipient, **told.answer}, told.said)
