@@ -263,13 +263,14 @@ class Finder:
 
     def _best(self, match: Match, shape: int, suspect: Mesh, tried: int) -> tuple[Match, Pose | None, Mesh]:
         """The reading of a piece beside an original that proves most, the pose, and the original."""
-        original, best, pose = suspect, match, None
+        original, best, pose, least = suspect, match, None, None
         try:
             original = self.catalogue.load(shape)
-            for one, where in self._read(match, shape, original, suspect, tried):
-                if pose is None or one.log10_p < best.log10_p:
-                    best, pose = one, where
-                if best.named:
+            for one, where, of_record in self._read(match, shape, original, suspect, tried):
+                # The record that commits to what was read is the one that the suspect was made with.
+                if least is None or (not of_record, one.log10_p) < least:
+                    best, pose, least = one, where, (not of_record, one.log10_p)
+                if one.named and of_record:
                     break
         except JaxmarkError as error:
             if pose is None:
@@ -278,12 +279,12 @@ class Finder:
 
     def _read(
         self, match: Match, shape: int, original: Mesh, suspect: Mesh, tried: int
-    ) -> Iterator[tuple[Match, Pose]]:
-        """Read a piece beside an original with each key and record."""
+    ) -> Iterator[tuple[Match, Pose, bool]]:
+        """Read a piece beside an original with each key and record: the match, the pose, and whether they agree."""
         for name, key in self.keys.items():
             held = self._held(shape, name)
             for record, recipients in held.traced:
-                yield self._trace(match, key, record, recipients, original, suspect, tried * len(held.traced))
+                yield *self._trace(match, key, record, recipients, original, suspect, tried * len(held.traced)), True
             if self.only_recipients:
                 continue
             for record in held.records or [None]:
@@ -291,6 +292,9 @@ class Finder:
                 markers = make_markers(original, key, bits=bits, record=record)
                 found = detect_any(markers, suspect, align=self.how)
                 log10_p = evidence.share_of(found.log10_p, 1 / tried)
+                agrees = True
+                if record is not None and record.told and found.message is not None:
+                    agrees = record.commits_to(found.message, markers[0].choices)
                 yield (
                     replace(
                         match,
@@ -306,6 +310,7 @@ class Finder:
                         remarks=found.remarks,
                     ),
                     found.alignment.pose,
+                    agrees,
                 )
 
     def _held(self, shape: int, key: str) -> _Held:

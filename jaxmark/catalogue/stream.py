@@ -209,7 +209,8 @@ def _run(
                         more = _fill(executor, running, plan, suspects, alone, ahead)
                         if not running:
                             break
-                        for future in wait(running, return_when=FIRST_COMPLETED).done:
+                        done = wait(running, return_when=FIRST_COMPLETED).done
+                        for future in [one for one in running if one in done]:
                             path = running[future]
                             row, refused = _outcome(future)
                             del running[future]
