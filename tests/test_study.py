@@ -244,6 +244,46 @@ def test_pictures(results, tmp_path, of):
         results.plot(of).save(tmp_path / "no" / "curves.png")
 
 
+@pytest.mark.parametrize("strengths", [(0.005,), (0.001, 0.005), (11.0, 8.0), (0.0, 1.0)])
+@pytest.mark.parametrize("of", ["read", "log10_p", "log10_p_unfloored"])
+def test_series_that_agree_stand_side_by_side(of, strengths):
+    pytest.importorskip("matplotlib")
+    rows = [
+        row
+        for strength in strengths
+        for scheme in ("keyed", "host")
+        for row in (
+            *made_up(2, scheme=scheme, strength=strength, log10_p=-77.0, log10_p_unfloored=-90.0),
+            *made_up(2, scheme=scheme, strength=strength, control="unmarked", detected=False, log10_p=0.0),
+            *made_up(2, scheme=scheme, strength=strength, control="wrong-key", detected=False, log10_p=0.0),
+        )
+    ]
+    picture = Results(tuple(rows)).plot(of)
+    picture.figure.draw_without_rendering()  # lays it out
+    (axes,) = picture.figure.axes
+    series = {container.get_label(): container.lines[0] for container in axes.containers}
+    suffix = ", detected" if of == "read" else ""
+    assert list(series) == ["keyed", "host", f"unmarked{suffix}", f"another key{suffix}"]
+    middle = axes.transData.transform([(strength, 0.0) for strength in strengths])[:, 0]
+    places = []
+    for line in series.values():
+        np.testing.assert_array_equal(line.get_xdata(), strengths)
+        on_page = line.get_transform().transform(line.get_xydata())
+        assert all(axes.bbox.contains(*point) for point in on_page)  # nothing is cut off
+        places.append(on_page[:, 0] - middle)
+    assert (np.diff(places, axis=0) > 5).all()  # pixels
+    np.testing.assert_allclose(np.sum(places, axis=0), 0, atol=1e-6)
+    bottom, top = axes.get_ylim()
+    written = [text.get_text() for text in axes.texts]
+    if of == "read":
+        assert bottom < top
+        assert not written
+        assert axes.get_ylabel() == "share read of 2, 95 % interval"
+    else:
+        assert bottom > top  # more evidence is higher
+        assert written == ["detected from here up", "floor of what a key can prove"][: 1 + (of != "log10_p")]
+
+
 TOML = 'seeds = 1\npayloads = [16]\nbudgets = [0.002]\n[meshes]\nball = "small.ply"\n[attacks]\nnoise = [0.002]\n'
 
 

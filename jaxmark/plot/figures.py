@@ -18,6 +18,8 @@ MARKERS = "os^Dvx"
 BOUND = {"color": "black", "linestyle": "--"}  # the line of a bound that is proven, not counted
 FIELD = "cividis"  # the colour map of values on meshes
 _MARKERS_PER_LINE = 12
+_ASIDE = 0.1  # inches between series that are drawn beside each other, at most
+_ASIDE_IN_ALL = 1.5  # inches that they take of the width
 
 
 class Picture(NamedTuple):
@@ -78,6 +80,23 @@ def styles(points: int) -> Iterator[dict[str, Any]]:
 def band(axes: Any, x: Float[np.ndarray, " points"], interval: Interval, colour: str) -> None:
     """Shade a confidence interval about a line."""
     axes.fill_between(x, interval.low, interval.high, color=colour, alpha=0.2, linewidth=0)
+
+
+def move_aside(drawn: Any, place: int, count: int, points: int) -> None:
+    """Move one of several series aside on the page, whatever the scale of its axes, so that all are visible.
+
+    Args:
+        drawn: the series, matplotlib's `ErrorbarContainer`; limits of the axes are taken from where it was drawn.
+        place: place of the series among all, from 0.
+        count: number of series.
+        points: number of values of x, which share the width of the axes.
+    """
+    from matplotlib.transforms import ScaledTranslation
+
+    step = min(_ASIDE, _ASIDE_IN_ALL / (count * points))
+    for artist in drawn.get_children():
+        inches = artist.get_figure().dpi_scale_trans
+        artist.set_transform(artist.axes.transData + ScaledTranslation(step * (place - (count - 1) / 2), 0, inches))
 
 
 def finish(axes: Any, **labels: Any) -> None:

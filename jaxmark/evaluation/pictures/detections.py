@@ -8,7 +8,7 @@ from jaxtyping import Float, Float64
 from jaxmark.confidence import Interval, clopper_pearson
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation._robustness import Robustness
-from jaxmark.plot.figures import BOUND, Picture, band, finish, panels, styles
+from jaxmark.plot.figures import BOUND, Picture, band, finish, move_aside, panels, styles
 
 _CURVE_POINTS = 241  # values of log10 α
 _MIN_LOG_RATIO = 10.0  # largest over least strength, from which the axis is logarithmic
@@ -82,11 +82,12 @@ def success(curves: Mapping[str, Robustness], unit: str, *, confidence: float = 
     """
     figure, (axes,) = panels(1, 6.5, 4.2)
     strengths = np.concatenate([curve.strengths for curve in curves.values()])
-    for (name, curve), style in zip(curves.items(), styles(1), strict=False):
+    for place, ((name, curve), style) in enumerate(zip(curves.items(), styles(1), strict=False)):
         read, samples = curve.success.sum(axis=1), curve.success.shape[1]
         rate, interval = read / samples, clopper_pearson(read, samples, confidence)
         bars = np.maximum([rate - interval.low, interval.high - rate], 0)
-        axes.errorbar(curve.strengths, rate, bars, label=name, capsize=3, **style)
+        drawn = axes.errorbar(curve.strengths, rate, bars, label=name, capsize=3, **style)
+        move_aside(drawn, place, len(curves), len(np.unique(strengths)))
     wide = strengths.min() > 0 and strengths.max() >= _MIN_LOG_RATIO * strengths.min()
     finish(axes, xlabel=f"strength: {unit}", ylabel="share of messages read", xscale="log" if wide else "linear")
     first = next(iter(curves.values())).strengths

@@ -3,13 +3,17 @@
 from collections.abc import Sequence
 from typing import Any, Literal
 
-from jaxmark.evaluation._rates import LOG10_LEVEL, Row, rates
+from jaxmark.evaluation._rates import LOG10_LEVEL, Control, Row, rates
 from jaxmark.extras import require
-from jaxmark.plot.figures import COLOURS, MARKERS, Picture
+from jaxmark.plot.figures import COLOURS, MARKERS, Picture, move_aside
 from jaxmark.watermark.evidence import MIN_LOG10_P
 
 _LINE_STYLES = ("-", "--", "-.", (0, (3, 1, 1, 1, 1, 1)))
-_CONTROL_STYLES = {"unmarked": ("unmarked, detected", ":", "x"), "wrong-key": ("another key, detected", "--", "+")}
+_CONTROLS: dict[Control, str] = {"unmarked": "unmarked", "wrong-key": "another key"}
+_CONTROL_STYLES = {
+    "unmarked": {"color": "0.45", "linestyle": ":", "marker": "x"},
+    "wrong-key": {"color": "0.45", "linestyle": "--", "marker": "+"},
+}
 _MAX_COLUMNS = 3
 
 
@@ -20,7 +24,7 @@ def curves(rows: Sequence[Row], of: Measure = "read") -> Picture:
     """Plot one panel for each attack, with weak strengths on the left.
 
     Each scheme has a line, or each scheme with a payload and a budget where these vary; meshes and seeds are pooled.
-    Controls are grey, and pooled over all schemes.
+    Controls are grey, and pooled over all schemes. Lines stand beside each other, so that those that agree are visible.
 
     Args:
         rows: the rows of a study.
@@ -58,26 +62,16 @@ def _names(rows: Sequence[Row]) -> tuple[str, ...]:
 def _draw(panel: Any, rows: Sequence[Row], names: Sequence[str], of: str) -> None:
     first = rows[0]
     strengths = list(dict.fromkeys(row.strength for row in rows))
-    wide = len(strengths) > 1 and min(strengths) > 0
-    for name, (label, line, marker) in _CONTROL_STYLES.items():
-        found = [rate for rate in rates(rows, ["control", "strength"]) if rate["control"] == name]
-        style = {"color": "0.6", "linestyle": line, "marker": marker, "zorder": 1}
-        _line(panel, [rate["strength"] for rate in found], found, of, "detected", label=label, **style)
-    groups: dict[str, list[dict[str, Any]]] = {}
-    for rate in rates(rows, [*names, "control", "strength"]):
-        if rate["control"] == "marked":
-            groups.setdefault(", ".join(_format(name, rate[name]) for name in names), []).append(rate)
-    for place, (label, found) in enumerate(groups.items()):
-        # Moved aside a little, so that lines that agree are all visible.
-        aside = (max(strengths) / min(strengths)) ** (0.015 * place) if wide else 1.0
-        style = {
-            "color": _pick(COLOURS, place),
-            "marker": _pick(MARKERS, place),
-            "linestyle": _pick(_LINE_STYLES, place),
-        }
-        _line(panel, [aside * rate["strength"] for rate in found], found, of, "read", label=label, zorder=2, **style)
-    if wide:
+    series = _series(rows, names)
+    for place, (label, control, found) in enumerate(series):
+        success, style = ("detected", _CONTROL_STYLES[control]) if control else ("read", _style(place))
+        label = f"{label}, detected" if control and of == "read" else label
+        x = [rate["strength"] for rate in found]
+        drawn = _line(panel, x, found, of, success, label=label, **style)
+        move_aside(drawn, place, len(series), len(strengths))
+    if len(strengths) > 1 and min(strengths) > 0:
         panel.set_xscale("log")
+    panel.margins(x=0.12, y=0.08)  # room for the markers beside the outermost strengths
     panel.set_xticks(strengths, [f"{strength:g}" for strength in strengths], fontsize=8)
     panel.minorticks_off()
     if strengths[0] > strengths[-1]:
@@ -86,25 +80,48 @@ def _draw(panel: Any, rows: Sequence[Row], names: Sequence[str], of: str) -> Non
     panel.set_xlabel("\n".join(_wrap(first.unit)), fontsize=8)
     if of == "read":
         panel.set_ylim(-0.04, 1.04)
-        panel.set_ylabel("share read, 95 % interval", fontsize=8)
+        panel.set_ylabel(f"share read of {_trials(series)}, 95 % interval", fontsize=8)
     else:
-        _level(panel, LOG10_LEVEL, "detected")
+        _level(panel, LOG10_LEVEL, "detected from here up")
         if of == "log10_p_unfloored":
             _level(panel, MIN_LOG10_P, "floor of what a key can prove")
         panel.invert_yaxis()
         floor = ", without floor" if of == "log10_p_unfloored" else ""
-        panel.set_ylabel(f"log10 p{floor}, median and range", fontsize=8)
+        panel.set_ylabel(f"log10 p{floor}, median and range of {_trials(series)}", fontsize=8)
+
+
+def _series(rows: Sequence[Row], names: Sequence[str]) -> list[tuple[str, Control | None, list[dict[str, Any]]]]:
+    """The name of each line, which control it is if any, and its rates over strength; controls are last."""
+    marked: dict[str, list[dict[str, Any]]] = {}
+    for rate in rates(rows, [*names, "control", "strength"]):
+        if rate["control"] == "marked":
+            marked.setdefault(", ".join(_format(name, rate[name]) for name in names), []).append(rate)
+    found: list[tuple[str, Control | None, list[dict[str, Any]]]] = [(one, None, marked[one]) for one in marked]
+    pooled = rates(rows, ["control", "strength"])
+    for control, label in _CONTROLS.items():
+        found.append((label, control, [rate for rate in pooled if rate["control"] == control]))
+    return found
+
+
+def _style(place: int) -> dict[str, Any]:
+    return {"color": _pick(COLOURS, place), "marker": _pick(MARKERS, place), "linestyle": _pick(_LINE_STYLES, place)}
+
+
+def _trials(series: Sequence[tuple[str, Control | None, list[dict[str, Any]]]]) -> str:
+    """From how many readings a point of a line is, controls apart."""
+    counts = sorted({rate["trials"] for _, control, found in series if control is None for rate in found})
+    return f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}" if counts else "none"
 
 
 def _level(panel: Any, log10_p: float, label: str) -> None:
     """A grey line at a level of evidence, which says what is reached there."""
-    panel.axhline(log10_p, color="0.7", linewidth=1, linestyle=":", zorder=0)
+    panel.axhline(log10_p, color="0.5", linewidth=1, linestyle=":", zorder=0)
     panel.annotate(
-        label, (0.01, log10_p), xycoords=("axes fraction", "data"), fontsize=7, color="0.4", va="bottom", zorder=0
+        label, (0.01, log10_p), xycoords=("axes fraction", "data"), fontsize=7, color="0.3", va="bottom", zorder=0
     )
 
 
-def _line(panel: Any, x: list[float], rates: list[dict[str, Any]], of: str, success: str, **style: Any) -> None:
+def _line(panel: Any, x: list[float], rates: list[dict[str, Any]], of: str, success: str, **style: Any) -> Any:
     if of == "read":
         y = [rate[success] / rate["trials"] for rate in rates]
         low, high = ([rate[f"{success}_{end}"] for rate in rates] for end in ("low", "high"))
@@ -114,7 +131,7 @@ def _line(panel: Any, x: list[float], rates: list[dict[str, Any]], of: str, succ
     # Rounding must not make a bar negative.
     below = [max(0.0, one - end) for one, end in zip(y, low, strict=True)]
     above = [max(0.0, end - one) for one, end in zip(y, high, strict=True)]
-    panel.errorbar(x, y, yerr=[below, above], capsize=3, linewidth=1.4, elinewidth=1, markersize=5, **style)
+    return panel.errorbar(x, y, yerr=[below, above], capsize=3, linewidth=1.4, elinewidth=1, markersize=5, **style)
 
 
 def _format(name: str, value: Any) -> str:
