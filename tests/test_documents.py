@@ -34,10 +34,8 @@ LONG = ("docs/tutorial.md", "docs/submeshes.md", "docs/how-to/extend.md")  # com
 SLOW = (
     *LONG,
     "docs/blind.md",
-    "docs/how-to/catalogue.md",
     "docs/filters.md",
-    "docs/how-to/strength.md",
-    "docs/how-to/pictures.md",
+    *(f"docs/how-to/{name}.md" for name in ("catalogue", "files", "strength", "pictures")),
 )
 FRONTS = ("README.md", "docs/index.md")
 # These have tests of their own.
