@@ -37,7 +37,7 @@ print(f"{len(mesh.vertices)} vertices moved by RMS {info.rms:.4%} of the diagona
 
 # %% [markdown]
 # What was done to the mesh: nothing to be seen, but ten times as much shows where it is. The viewer turns it with the
-# mouse.
+# mouse, and switches between them.
 
 # %%
 original = marker.original
@@ -45,7 +45,8 @@ shown = plot.displacement(original, marked)
 plot.draw([plot.View("marked", marked), plot.exaggerate(original, marked), shown]).save("01_1.png")
 
 # %%
-plot.show(shown.mesh, shown.values, shown.unit).save("01_viewer.html")
+views = [plot.View("original", mesh), plot.View("marked", marked), plot.exaggerate(original, marked), shown]
+plot.show(*views).save("01_viewer.html")
 
 # %% [markdown]
 # The marker has prepared the original, and reads as many suspects as you like. The unmarked mesh, and the right suspect

@@ -257,36 +257,49 @@ def test_files_are_png_and_the_same_each_time(pair, tmp_path):
         made()[0].save(tmp_path / "none" / "picture.png")
 
 
-def test_the_viewer_holds_mesh_and_colours_and_needs_no_network(pair, tmp_path):
-    mesh = pair[0].mesh
+def test_the_viewer_holds_meshes_and_colours_and_needs_no_network(pair, tmp_path):
+    original, moved = pair
+    mesh, far = original.mesh, plot.exaggerate(original, moved)
     values = np.linspace(0, 2, len(mesh.vertices))
-    viewer = plot.show(mesh, values, "% <of> diagonal")
+    viewer = plot.show(plot.View("<original>", mesh), far, plot.View("seen", mesh, values, "% <of> diagonal"))
     viewer.save(tmp_path / "mesh.html")
     page = (tmp_path / "mesh.html").read_text()
     assert not re.search(r"<script[^>]*\ssrc|<link|@import|<img", page)
     (data,) = re.findall(r'base64_data="([^"]+)"', page)
     with (tmp_path / "mesh.glb").open("wb") as file:
         file.write(base64.b64decode(data))
-    (found,) = trimesh.load_scene(tmp_path / "mesh.glb", process=False).geometry.values()
-    assert np.linalg.norm(found.extents) == pytest.approx(1, rel=1e-5)
-    back = found.vertices * pair[0].diagonal
-    np.testing.assert_allclose(back - back[0], mesh.vertices - mesh.vertices[0], atol=1e-5)
-    np.testing.assert_array_equal(found.faces, mesh.faces)
+    found = trimesh.load_scene(tmp_path / "mesh.glb", process=False).geometry
+    assert list(found) == ["view0", "view1", "view2"]
+    assert np.linalg.norm(found["view0"].extents) == pytest.approx(1, rel=1e-5)
+    centre = np.mean(mesh.vertices, axis=0)
+    for one, shown in zip(found.values(), (mesh, far.mesh, mesh), strict=True):
+        np.testing.assert_allclose(one.vertices * original.diagonal + centre, shown.vertices, atol=1e-5)
+        np.testing.assert_array_equal(one.faces, mesh.faces)
     expected = np.array([matplotlib.colormaps["cividis"](value / 2, bytes=True) for value in values])
-    np.testing.assert_allclose(found.visual.vertex_colors.astype(int), expected.astype(int), atol=1)
-    assert "2 % &lt;of&gt; diagonal" in page
-    shown = viewer._repr_html_()
-    (frame,) = re.findall(r'srcdoc="([^"]*)"', shown)
+    np.testing.assert_allclose(found["view2"].visual.vertex_colors.astype(int), expected.astype(int), atol=1)
+    assert (found["view0"].visual.vertex_colors[:, :3] > 190).all()  # bright
+    assert "2 % &lt;of&gt; diagonal" in " ".join(re.sub("<[^>]*>", " ", page).split())
+    chosen = re.findall(r'<input type="radio" name="view" value="(\d)"( checked)?> ([^<]*)<', page)
+    assert chosen == [("0", " checked", "&lt;original&gt;"), ("1", "", "10 × the displacement"), ("2", "", "seen")]
+    assert "drag to turn" in page
+    (frame,) = re.findall(r'srcdoc="([^"]*)"', viewer._repr_html_())
     assert html.unescape(frame) == viewer.page
-    assert viewer.legend in shown
+
+
+def test_a_viewer_of_one_mesh_has_nothing_to_choose(pair):
+    mesh = pair[0].mesh
     assert plot.show(mesh) == plot.show(mesh)
-    assert not plot.show(mesh).legend
+    assert "<input" not in plot.show(mesh).page
+    assert "linear-gradient" not in plot.show(mesh).page
+    assert "<strong>mine</strong>" in plot.show(plot.View("mine", mesh)).page
+    with pytest.raises(jm.JaxmarkError, match="at least one mesh"):
+        plot.show()
 
 
 def test_refusals(pair, unchecked, monkeypatch):
     original, _ = pair
     with pytest.raises(jm.JaxmarkError, match="finite values, one for each vertex"):
-        plot.show(original.mesh, np.zeros(3))
+        plot.show(plot.View("", original.mesh, np.zeros(3)))
     with pytest.raises(jm.JaxmarkError, match="one log10 p or more"):
         pictures.roc({"nothing": np.zeros(0)})
     with pytest.raises(jm.JaxmarkError, match="lowest is a negative number"):

@@ -2,23 +2,26 @@
 
 import html
 import os
-from typing import NamedTuple
+from importlib import resources
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float64
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.files.atomic import write_atomically
 from jaxmark.geometry.mesh import Mesh, diagonal, host_mesh
 from jaxmark.plot.figures import FIELD
+from jaxmark.plot.meshes import View
+
+_PLAIN = (205, 205, 200, 255)  # the colour of a mesh without values
 
 
 class Viewer(NamedTuple):
-    """An interactive view of a mesh, which a notebook shows if it is the last expression of a cell."""
+    """An interactive view of meshes, which a notebook shows if it is the last expression of a cell."""
 
     page: str  # HTML with nothing loaded from outside
-    legend: str  # HTML of the colour scale beneath the page
 
     def save(self, path: str | os.PathLike[str]) -> "Viewer":
         """Write an HTML file for any browser, whole or not at all, and return the view, which a notebook then shows.
@@ -26,52 +29,80 @@ class Viewer(NamedTuple):
         Raises:
             JaxmarkError: if it cannot be written.
         """
-        write_atomically(path, self.page.replace("</body>", f"{self.legend}</body>").encode())
+        write_atomically(path, self.page.encode())
         return self
 
     def _repr_html_(self) -> str:
-        frame = f'<iframe srcdoc="{html.escape(self.page)}" width="100%" height="480" style="border:none"></iframe>'
-        return f"<div>{frame}{self.legend}</div>"
+        return f'<iframe srcdoc="{html.escape(self.page)}" width="100%" height="480" style="border:none"></iframe>'
 
 
-def show(mesh: Mesh, values: Float[np.ndarray, " vertices"] | None = None, unit: str = "") -> Viewer:
-    """Make an interactive view of a mesh, which notebooks and browsers show without network.
+def show(*views: View | Mesh) -> Viewer:
+    """Make an interactive view of meshes, which notebooks and browsers show without network.
+
+    One mesh is seen at a time; all are seen from where the mouse has turned the first. So a mark is looked for by
+    `show(View("original", original.mesh), View("marked", marked), exaggerate(original, marked))`.
 
     Args:
-        mesh: any mesh.
-        values: one number for each vertex, shown as colours from 0 to the largest; without them the mesh is plain.
-        unit: unit of the values, for the legend.
+        views: meshes, with titles by which they are chosen, and perhaps values, shown as colours from 0 to the largest;
+            or meshes alone. They keep their places beside the first one.
 
     Raises:
-        JaxmarkError: if matplotlib is missing, there is not one finite value for each vertex, or the mesh has no extent
-            (see `jaxmark.geometry.mesh.diagonal`).
+        JaxmarkError: if matplotlib or Jinja2 is missing, there is no view, there is not one finite value for each
+            vertex, or the first mesh has no extent (see `jaxmark.geometry.mesh.diagonal`).
     """
     require("matplotlib", "plot")
+    jinja2 = require("jinja2", "plot")
     import trimesh  # takes long to import
     from trimesh.scene import Camera, Scene
     from trimesh.viewer.notebook import scene_to_html
 
-    mesh = host_mesh(mesh)
-    colours, legend = None, ""
-    if values is not None:
-        from matplotlib import colormaps
-
-        if values.shape != (len(mesh.vertices),) or not np.isfinite(values).all():
-            raise JaxmarkError(f"A viewer needs {len(mesh.vertices)} finite values, one for each vertex.")
-        most = max(float(values.max()), 1e-300)
-        colours = colormaps[FIELD](np.clip(np.asarray(values, np.float64) / most, 0, 1), bytes=True)
-        legend = _legend([colormaps[FIELD](step) for step in np.linspace(0, 1, 9)], most, unit)
+    if not views:
+        raise JaxmarkError("A viewer needs at least one mesh.")
+    named = [view if isinstance(view, View) else View("", view) for view in views]
+    meshes = [host_mesh(view.mesh) for view in named]
     # A mesh of unit size lies between the near and the far plane of the viewer's camera.
-    points = (mesh.vertices - np.mean(mesh.vertices, axis=0)) / diagonal(mesh)
-    solid = trimesh.Trimesh(points, mesh.faces, vertex_colors=colours, process=False)
+    centre, size = np.mean(meshes[0].vertices, axis=0), diagonal(meshes[0])
     # Without names of our own, trimesh would choose random ones.
-    scene = Scene({"mesh": solid}, camera=Camera("camera", fov=(60, 45)))
+    scene = Scene(camera=Camera("camera", fov=(60, 45)))
+    for place, (view, mesh) in enumerate(zip(named, meshes, strict=True)):
+        points = (mesh.vertices - centre) / size
+        solid = trimesh.Trimesh(points, mesh.faces, vertex_colors=_colours(view, len(points)), process=False)
+        scene.add_geometry(solid, node_name=f"view{place}", geom_name=f"view{place}")
     scene.set_camera()
-    return Viewer(scene_to_html(scene), legend)
+    template = resources.files("jaxmark.plot").joinpath("viewer.html").read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    title = " / ".join(view.title for view in named if view.title) or "jaxmark"
+    controls = environment.from_string(template).render(title=title, views=[_legend(view) for view in named])
+    before, end, after = scene_to_html(scene).rpartition("</body>")
+    return Viewer(before + controls + end + after)
 
 
-def _legend(colours: list[tuple[float, ...]], most: float, unit: str) -> str:
-    steps = ", ".join(f"rgb({', '.join(str(round(255 * part)) for part in colour[:3])})" for colour in colours)
-    bar = f'<div style="height:12px;background:linear-gradient(to right, {steps})"></div>'
-    ends = f'<span>0</span><span style="float:right">{most:.3g} {html.escape(unit)}</span>'
-    return f'<div style="width:320px;font:12px sans-serif">{bar}{ends}</div>'
+def _shares(view: View, vertices: int) -> Float64[np.ndarray, " vertices"]:
+    """The values as shares of the largest."""
+    values = np.asarray(view.values, np.float64)
+    if values.shape != (vertices,) or not np.isfinite(values).all():
+        raise JaxmarkError(f"A viewer needs {vertices} finite values, one for each vertex.")
+    return np.clip(values / _most(view), 0, 1)
+
+
+def _most(view: View) -> float:
+    return max(float(np.max(view.values)), 1e-300) if view.values is not None else 0.0
+
+
+def _colours(view: View, vertices: int) -> np.ndarray:
+    if view.values is None:
+        return np.tile(np.array(_PLAIN, np.uint8), (vertices, 1))
+    from matplotlib import colormaps
+
+    return colormaps[FIELD](_shares(view, vertices), bytes=True)
+
+
+def _legend(view: View) -> dict[str, Any]:
+    """What the page says of a view: its title, and the scale of its colours if it has values."""
+    if view.values is None:
+        return {"title": view.title, "most": "", "unit": "", "colours": []}
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    colours = [to_hex(colormaps[FIELD](step)) for step in np.linspace(0, 1, 9)]
+    return {"title": view.title, "most": f"{_most(view):.3g}", "unit": view.unit, "colours": colours}
