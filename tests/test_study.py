@@ -1,9 +1,12 @@
 """Studies: against readings one by one, interrupted, refused, and declared in files; intervals as published."""
 
+import base64
 import csv
 import hashlib
+import html
 import json
 import pickle
+import re
 from pathlib import Path
 
 import numpy as np
@@ -282,6 +285,26 @@ def test_series_that_agree_stand_side_by_side(of, strengths):
     else:
         assert bottom > top  # more evidence is higher
         assert written == ["detected from here up", "floor of what a key can prove"][: 1 + (of != "log10_p")]
+
+
+def test_a_page_of_a_study_has_all_of_it_and_loads_nothing(tmp_path):
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("jinja2")
+    refused = made_up(1, mesh="<b>", read=False, detected=False, log10_p=0.0, refusal="It has no faces.")
+    rows = (*made_up(2), *refused)
+    rows = tuple(row._replace(control=control) for row in rows for control in ("marked", "unmarked", "wrong-key"))
+    results = Results(rows)
+    results.save_page(tmp_path / "study.html", "A & B")
+    page = (tmp_path / "study.html").read_text()
+    assert page.count("A &amp; B") == 2
+    assert not re.search(r"<script|<link|@import|https?:", page)
+    shown = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
+    assert [base64.b64decode(png) for png in shown] == [results.plot(of).png() for of in ("read", "log10_p_unfloored")]
+    lines = [re.findall("<t[dh]>([^<]*)</t[dh]>", line) for line in re.findall("<tr>.*</tr>", page)]
+    written = [line.strip("| ").split(" | ") for line in results.markdown().splitlines() if line.startswith("| ")]
+    assert [[html.unescape(cell) for cell in line] for line in lines] == written
+    assert "<li>&lt;b&gt;, keyed, noise 0.1, marked, 1 ×: It has no faces.</li>" in page
+    assert "unmarked, detected: 2/3, 95 % interval up to 99 %" in page
 
 
 TOML = 'seeds = 1\npayloads = [16]\nbudgets = [0.002]\n[meshes]\nball = "small.ply"\n[attacks]\nnoise = [0.002]\n'

@@ -1,10 +1,12 @@
 """Results of a study: rows, rates with their intervals, tables, files and pictures of them."""
 
+import base64
 import csv
 import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import resources
 from typing import Any
 
 from jaxmark.evaluation import _rates as rates
@@ -15,6 +17,7 @@ from jaxmark.files.atomic import write_atomically
 from jaxmark.plot import Picture
 
 _LABELS: dict[Control, str] = {"unmarked": "unmarked, detected", "wrong-key": "another key, detected"}
+_SHOWN: dict[Measure, str] = {"read": "What was read", "log10_p_unfloored": "Evidence"}
 
 
 @dataclass(frozen=True)
@@ -37,11 +40,18 @@ class Results:
 
     def markdown(self) -> str:
         """The rates as a Markdown table with their controls, the totals of the controls, and every refusal."""
+        heads, lines = self._table()
+        text = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|", *(f"| {' | '.join(line)} |" for line in lines)]
+        text += ["", *(f"{said}  " for said in self._controls()), "", *(f"- {said}" for said in self._refusals())]
+        return "\n".join(text).strip() + "\n"
+
+    def _table(self) -> tuple[list[str], list[list[str]]]:
+        """The heads of a table of all points, and its lines."""
         cells: dict[tuple[Any, ...], dict[Control, dict[str, Any]]] = {}
         for rate in self.rates():
             cells.setdefault(tuple(rate[name] for name in POINT), {})[rate["control"]] = rate
         heads = [*POINT, "read", "95 %", "wrong bits", "log10 p, median", "without floor", *_LABELS.values()]
-        lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+        lines = []
         for point, rate in cells.items():
             mark = rate["marked"]
             said = [f"{one:g}" if isinstance(one, float) else str(one) for one in point]
@@ -51,21 +61,50 @@ class Results:
             ]
             said += [f"{100 * mark['bit_errors']:.1f} %", f"{mark['log10_p']:.1f}", f"{mark['log10_p_unfloored']:.1f}"]
             said += [f"{rate[name]['detected']}/{rate[name]['trials']}" for name in _LABELS]
-            lines.append(f"| {' | '.join(said)} |")
-        lines.append("")
-        for rate in self.rates(["control"]):
-            if rate["control"] != "marked":
-                most = f"{100 * rate['detected_high']:.2g} %"
-                lines.append(
-                    f"{_LABELS[rate['control']]}: {rate['detected']}/{rate['trials']}, 95 % interval up to {most}  "
-                )
+            lines.append(said)
+        return heads, lines
+
+    def _controls(self) -> list[str]:
+        """The total of each control."""
+        return [
+            f"{_LABELS[rate['control']]}: {rate['detected']}/{rate['trials']}, "
+            f"95 % interval up to {100 * rate['detected_high']:.2g} %"
+            for rate in self.rates(["control"])
+            if rate["control"] != "marked"
+        ]
+
+    def _refusals(self) -> list[str]:
+        """Every refusal, and how often it was."""
         counts: dict[tuple[Any, ...], int] = {}
         for row in self.rows:
             if row.refusal and row.control != "wrong-key":
                 case = (row.mesh, row.scheme, f"{row.attack} {row.strength:g}", row.control, row.refusal)
                 counts[case] = counts.get(case, 0) + 1
-        lines += ["", *(f"- {', '.join(case[:-1])}, {count} ×: {case[-1]}" for case, count in counts.items())]
-        return "\n".join(lines).strip() + "\n"
+        return [f"{', '.join(case[:-1])}, {count} ×: {case[-1]}" for case, count in counts.items()]
+
+    def save_page(self, path: str | os.PathLike[str], title: str = "What a mark survives") -> None:
+        """Write one HTML page with pictures, table, controls and refusals, which loads nothing. Needs the extra `plot`.
+
+        Args:
+            path: file for the page.
+            title: its title.
+
+        Raises:
+            JaxmarkError: if matplotlib or Jinja2 is missing, or the page cannot be written.
+        """
+        jinja2 = require("jinja2", "plot")
+        template = resources.files("jaxmark.evaluation").joinpath("study.html").read_text(encoding="utf-8")
+        heads, lines = self._table()
+        page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(template)
+        text = page.render(
+            title=title,
+            pictures={name: base64.b64encode(self.plot(of).png()).decode() for of, name in _SHOWN.items()},
+            heads=heads,
+            lines=lines,
+            controls=self._controls(),
+            refusals=self._refusals(),
+        )
+        write_atomically(path, text.encode())
 
     def save_csv(self, path: str | os.PathLike[str]) -> None:
         """Write all rows as comma-separated values, the file whole or not at all.
