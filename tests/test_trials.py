@@ -48,8 +48,10 @@ def test_what_is_tried_is_what_the_detector_has(mesh, trials, trial):
             received = marker.receive(jm.attack(marked, *attack, seed=100 + number))
             score, norm = marker.reader.claim(received, jnp.asarray(word, jnp.float32))
             ratios.append(float(score / norm))
-        # A score over its norm has about the standard deviation 1.
-        assert np.sqrt(2 * trial.worth[place]) == pytest.approx(np.mean(ratios), abs=4 / np.sqrt(6))
+        # Six marks of ours beside three that were tried; after smoothing they differ by more than the score's noise.
+        spread = np.std(ratios, ddof=1) * np.sqrt(1 / 6 + 1 / 3)
+        assert np.sqrt(2 * trial.worth[place]) == pytest.approx(np.mean(ratios), abs=4 * spread)
+        assert spread < 0.3 * np.mean(ratios)
     assert trial.used == pytest.approx([1.0], rel=1e-3)
     assert trial.strengths == pytest.approx(np.mean(trial.scales) * np.ones(12))
 
