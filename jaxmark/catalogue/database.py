@@ -158,11 +158,14 @@ class Database:
         if not self.read_only:
             return self._open(str(self.path))
         # A folder that cannot be written to has no room for the log's index; then nobody writes the file either.
+        connection = self._open(f"{self.path.as_uri()}?mode=ro")
         try:
-            connection = self._open(f"{self.path.as_uri()}?mode=ro")
             connection.execute("SELECT * FROM sqlite_master").fetchone()
             return connection
-        except sqlite3.OperationalError:
+        except sqlite3.DatabaseError as error:
+            connection.close()
+            if not isinstance(error, sqlite3.OperationalError):
+                raise
             if self.path.with_name(self.path.name + "-wal").exists():
                 raise
             return self._open(f"{self.path.as_uri()}?mode=ro&immutable=1")
