@@ -7,6 +7,7 @@ import os
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import matplotlib.image
@@ -153,7 +154,7 @@ def test_two_processes_add_the_same_files_once(folder: Path):
 
 def test_what_is_no_catalogue_is_refused(folder: Path):
     Path("text.db").write_text("no database " * 100)
-    with sqlite3.connect("foreign.db") as foreign:
+    with closing(sqlite3.connect("foreign.db")) as foreign, foreign:
         foreign.execute("CREATE TABLE things (x)")
     foreign.close()
     with jm.Catalogue("late.db") as late:
@@ -175,8 +176,9 @@ def test_what_is_no_catalogue_is_refused(folder: Path):
         damaged.originals()
     with pytest.raises(jm.JaxmarkError, match="There is no catalogue"):
         jm.Catalogue("none.db", read_only=True)
-    with jm.Catalogue("good.db") as good, pytest.raises(jm.JaxmarkError, match="reading only"):
-        jm.Catalogue(good.path, read_only=True).add("tiny.ply")
+    jm.Catalogue("good.db").close()
+    with jm.Catalogue("good.db", read_only=True) as good, pytest.raises(jm.JaxmarkError, match="reading only"):
+        good.add("tiny.ply")
 
 
 def test_commands_answer_for_programs(workshop: Workshop, unchecked):
