@@ -151,9 +151,9 @@ def tune(
     bound = upper_bound(channels, weights @ cost, cap=cap, margin=margin)
 
     trials = Trials(original, bits, bounds, [partial(apply_attack, one) for one in attacks], numbers.tolist(), margin)
-    default = trials.run(tunable)
-    low_pass = [(1.0,) * round(share * len(family)) for share in _LOW_PASS]
-    others = [trials.run(one) for one in map(tunable.with_profile, (_profile(beta), *low_pass)) if trials.fits(one)]
+    default, solved = trials.run(tunable), tunable.with_profile(_profile(beta))
+    low_pass = [tunable.with_profile((1.0,) * round(share * len(family))) for share in _LOW_PASS]
+    others = [trials.run(one) for one in (solved, *low_pass) if trials.fits(one)]
     best = trials.ascend(max(default, *others, key=lambda one: one.worst), cost)
     if best.worst < _LEAST_GAIN * default.worst:  # by so little, others may do worse on marks that were not tried
         best = default
@@ -163,7 +163,7 @@ def tune(
         1 - float(worth.min()) / bound,
         dict(zip(_names(bounds), map(float, weights), strict=True)),
         best.worth,
-        next((one.worth for one in others if one.scheme.profile == _profile(beta)), np.zeros(len(attacks))),
+        next((one.worth for one in others if one.scheme is solved), np.zeros(len(attacks))),
         default.worth,
         best is default,
     )
