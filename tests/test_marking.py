@@ -1,4 +1,5 @@
 import dataclasses
+import math
 from functools import partial
 
 import jax
@@ -10,7 +11,9 @@ import jaxmark as jm
 from jaxmark import distortion
 from jaxmark.alignment.original import make_original
 from jaxmark.geometry.mesh import Mesh, make_mesh
+from jaxmark.watermark import evidence
 from jaxmark.watermark.carriers import KeyedReader
+from jaxmark.watermark.marking import Marker
 from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme, get_scheme
 from tests.samples import bumpy_sphere, exact_sheet
 
@@ -49,8 +52,10 @@ def test_round_trip_within_the_budget(sphere: Mesh, key: jm.Key, scheme, dtype):
     assert found.message == MESSAGE
     assert found.detected()
     assert found.coverage == 1.0
-    code = jm.make_marker(sphere, key, bits=64, scheme=scheme).codeword(MESSAGE)
-    assert np.mean(found.scores * code) > 0.85
+    marker = jm.make_marker(sphere, key, bits=64, scheme=scheme)
+    soft, code = marker.soft_values(marker.receive(marked)), marker.codeword(MESSAGE)
+    assert np.mean(soft * code) > 0.85 * np.sqrt(np.mean(soft**2))
+    assert np.mean(found.scores * code) > 0.7  # of what mere correlations read, where they do
     claimed = jm.detect(marked, original=sphere, key=key, scheme=scheme, message=MESSAGE)
     assert claimed.log10_p < -6
     assert jm.detect(marked, original=sphere, key=key, scheme=scheme, message=b"somebody").remarks
@@ -83,6 +88,22 @@ def test_reading_back_decodes_jointly_where_plain_correlations_fail(sphere: Mesh
     marked, _ = marker.embed(MESSAGE, 8e-4, read_back=False)
     monkeypatch.setattr(KeyedReader, "glance", lambda *_: np.zeros(marker.code_bits))
     assert marker.reads(marked, MESSAGE)
+
+
+def test_what_correlations_read_is_not_decoded_jointly_and_is_paid_for(sphere: Mesh, key: jm.Key, monkeypatch):
+    marker = jm.make_marker(sphere, key, bits=64)
+    marked, _ = marker.embed(MESSAGE, 8e-4, read_back=False)
+    flat = evidence.log10_p_tag(28, 1)
+    monkeypatch.setattr(evidence, "log10_p_read", lambda *_: 0.0)  # what the tag alone proves is left
+    with monkeypatch.context() as without:
+        without.setattr(Marker, "soft_values", None)
+        quick = marker.detect(marked)
+    monkeypatch.setattr(KeyedReader, "correlate", lambda *_: np.zeros(marker.code_bits))
+    slow = marker.detect(marked)
+    assert quick.message == slow.message == MESSAGE
+    paid = flat + math.log10(3) - math.log10(0.97)  # three proofs, and the usual way to align
+    assert quick.log10_p == pytest.approx(paid - math.log10(0.03))
+    assert slow.log10_p == pytest.approx(paid - math.log10(0.97))
 
 
 def test_golden_displacement(key: jm.Key):

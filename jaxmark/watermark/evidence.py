@@ -96,14 +96,14 @@ def log10_p_read(score: ArrayLike, norm: ArrayLike, bits: float, floor: float = 
     return _clip(bits * math.log10(2) + _log10_tail(score, norm), floor)
 
 
-def log10_p_tag(bits: int, candidates: int) -> float:
+def log10_p_tag(bits: int, candidates: float) -> float:
     """log10 of a bound on the probability that one of several messages fits its keyed tag by chance (union bound).
 
     The tag's subkey is independent of everything that chose the messages, so the probability is 2^-bits for each.
 
     Args:
         bits: size of the tag in bits.
-        candidates: number of messages tried.
+        candidates: number of messages tried, or as how many this one counts, see `Decoded.paid`.
     """
     return _clip(math.log10(candidates) - bits * math.log10(2))
 

@@ -24,7 +24,7 @@ from jaxmark.watermark import evidence
 from jaxmark.watermark.budget import Budget, Limits, Visibility, make_budget, visibility_of, write
 from jaxmark.watermark.carriers.carrier import Carrier, Reader, Received
 from jaxmark.watermark.coding.keys import SCHEME_VERSION, VERSIONS, Choices, Key, bind, commitment
-from jaxmark.watermark.coding.message import TAG_BITS, Decoded, decode, encode
+from jaxmark.watermark.coding.message import CANDIDATES, TAG_BITS, Decoded, decode, encode
 from jaxmark.watermark.detectors import Detector, claims
 from jaxmark.watermark.payload import Capacity, Conditions
 from jaxmark.watermark.record import Content, Record, commit, seal_imprint
@@ -37,6 +37,7 @@ _SAME_SHAPE = 0.01  # distance of shapes, over their size, below which an origin
 # another one; what is usual keeps nearly all of it.
 ALIGN_SHARES = {"auto": 0.97, "same": 0.01, "similarity": 0.01, "affine": 0.01}
 CLAIM_SHARE = 0.97
+_QUICK_SHARE = 0.03  # of the message that plain matched correlations read first; decoding jointly keeps nearly all
 _HAND_SHARE = 0.97  # of the hand that fits a surface better
 NOISE = 0.005  # half width over the mean distance to the centre: the strongest noise of the SMI 2010 protocol
 COVERAGE = 0.5  # share of the vertices that may be left
@@ -72,7 +73,7 @@ class Detection(NamedTuple):
         log10_p_undated: the same if nothing is: for the best message of any of 2^64 keys, originals and records.
         log10_p_fitted: log10 of that probability if the score were Gaussian: an estimate, which decides nothing.
         log10_p_unfloored: log10_p without the floor at -77: orders attacks and schemes, proves and decides nothing.
-        scores: soft values of the code bits, scaled to root mean square 1.
+        scores: soft values of the code bits that the message was decoded from, scaled to root mean square 1.
         coverage: share of the original's points that the suspect gave evidence for.
         alignment: how the suspect was brought back to the original.
         version: version of the keyed choices that were read with.
@@ -301,17 +302,33 @@ class Marker:
     def _detect(self, aligned: Alignment, message: bytes | None, weights: ArrayLike | None, share: float) -> Detection:
         """Read a suspect as it was aligned, with a share of the probability."""
         received = self.receive(aligned, weights)
-        observed, soft = received.observed, self.soft_values(received)
-        size = np.sqrt(np.mean(soft**2)) or 1.0
+        observed = received.observed
         coverage = float(np.mean(self.original.to_host(observed.weights)[self.original.used] > 0))
         doubts = self.doubts if weights is None else (*self.doubts, "the weights were chosen by the reader")
-        found = Detection(None, 0.0, 0.0, 0.0, 0.0, soft / size, coverage, aligned, self.choices.version, doubts)
+        silent = np.zeros(self.code_bits)
+        found = Detection(None, 0.0, 0.0, 0.0, 0.0, silent, coverage, aligned, self.choices.version, doubts)
         # Rounding moves no coordinate by more than half of the grid's spacing, and the fit of the pose by little more;
         # a mark that can be read moves some.
         if np.abs(aligned.displacement).max() * self.original.diagonal <= 0.75 * self.original.grid:
             remark = "The suspect is the original itself, without a mark."
-            return found._replace(scores=np.zeros(len(soft)), remarks=(remark,))
-        return self._weigh(found, received, self._decode(soft), message, share * ALIGN_SHARES[aligned.how])
+            return found._replace(remarks=(remark,))
+        soft, decoded = self._hear(received)
+        found = found._replace(scores=soft / (np.sqrt(np.mean(soft**2)) or 1.0))
+        return self._weigh(found, received, decoded, message, share * ALIGN_SHARES[aligned.how])
+
+    def _hear(self, received: Received) -> tuple[Float64[np.ndarray, " code"], Decoded | None]:
+        """The soft values of a suspect, and what they say.
+
+        Matched correlations read what was not attacked hard. Only their first message is tried; where its tag does not
+        fit, the detector decodes all bits jointly, which is most of the work of reading. Both are paid for.
+        """
+        # `Reader.correlate` stands for the scheme's own detector, not for any other.
+        quick = self.reader.correlate(received) if self.detector is self.scheme.detector else None
+        if quick is not None and ((first := self._decode(quick, 1)) is not None or not self.bits):
+            return np.asarray(quick, np.float64), first and first.paid(_QUICK_SHARE)
+        soft = self.soft_values(received)
+        decoded = self._decode(soft)
+        return soft, decoded and decoded.paid(1.0 if quick is None else 1 - _QUICK_SHARE)
 
     def _weigh(
         self, found: Detection, received: Received, decoded: Decoded | None, claimed: bytes | None, share: float
@@ -453,9 +470,9 @@ class Marker:
         """Compute one soft value per code bit."""
         return np.asarray(self.detector(self.reader, received, 1.0), np.float64)
 
-    def _decode(self, soft: ArrayLike) -> Decoded | None:
-        """Decode the message whose keyed tag fits, if there is one."""
-        return decode(np.asarray(soft, np.float64), self.bits, self.choices)
+    def _decode(self, soft: ArrayLike, candidates: int = CANDIDATES) -> Decoded | None:
+        """Decode the message whose keyed tag fits, if there is one among so many."""
+        return decode(np.asarray(soft, np.float64), self.bits, self.choices, candidates)
 
     def decode(self, soft: ArrayLike) -> bytes | None:
         """Decode the message in soft values; None if no message's keyed tag fits."""

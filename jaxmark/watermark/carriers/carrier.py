@@ -183,6 +183,15 @@ class Reader(Protocol):
         """
         ...
 
+    def correlate(self, received: Any) -> Float[Array, " bits"] | None:
+        """Correlate what was received with each bit's displacement, band by band as the suspect left them.
+
+        Returns:
+            One soft value per bit, `[k]`, in which the bits are noise to each other; None if the scheme's detector does
+            no more than that.
+        """
+        ...
+
     def room(self, moving: Float[Array, " vertices"]) -> Room | None:
         """Measure what the reader leaves of the mark in each band.
 

@@ -239,6 +239,12 @@ class KeyedReader(NamedTuple):
         residual = clean(receiver, seen, normal_factor(receiver, seen), seen.residual)
         return self.carrier.correlate(residual, self.carrier.coefficients(beta))
 
+    @jax.jit
+    def correlate(self, received: Reception) -> Float[Array, " bits"]:
+        """See `Reader`; the score of a claim is the sum of these values with the signs of its codeword."""
+        residual = matmul(received.residual, received.axes)
+        return self.carrier.correlate(residual, self._matched_coefficients(received))
+
     def room(self, moving: Float[Array, " vertices"]) -> Room:
         """See `Reader`; measured with one probe, which has random signs in place of the keyed ones."""
         whole, left = np.asarray(self._probe(moving), np.float64).clip(0)

@@ -62,6 +62,10 @@ class PlainReader(NamedTuple):
         """See `Reader`; there is no shortcut, because reading is fast anyway."""
         return None
 
+    def correlate(self, received: Observation) -> None:
+        """See `Reader`; detectors of plain carriers are fast."""
+        return None
+
     def room(self, moving: Float[Array, " vertices"]) -> None:
         """See `Reader`; there is no model of noise."""
         return None

@@ -62,12 +62,18 @@ class Decoded(NamedTuple):
     """A message whose keyed tag fits."""
 
     message: bytes
-    rank: int  # how many messages were tried, this one included; its tag fits by chance with rank · 2^-(size of tag)
+    rank: float  # as how many tried messages, this one included, it counts: chance fits its tag with rank · 2^-(its size)
     row: int = 0  # which of several readings it is from
 
+    def paid(self, share: float) -> "Decoded":
+        """The same, if only this share of the probability was left for it and others were tried with the rest."""
+        return self._replace(rank=self.rank / share)
 
-def decode(scores: Float[np.ndarray, " length"], bits: int, choices: Choices) -> Decoded | None:
-    """Decode the most plausible message whose keyed tag fits; None if there is none among the first `CANDIDATES`.
+
+def decode(
+    scores: Float[np.ndarray, " length"], bits: int, choices: Choices, candidates: int = CANDIDATES
+) -> Decoded | None:
+    """Decode the most plausible message whose keyed tag fits; None if there is none among the first `candidates`.
 
     A mark without a payload has no message.
 
@@ -77,8 +83,9 @@ def decode(scores: Float[np.ndarray, " length"], bits: int, choices: Choices) ->
         scores: soft values of the code bits, at any common scale; 0 where nothing is known.
         bits: size of the payload in bits.
         choices: the keyed choices of the mark.
+        candidates: number of messages whose tags are tried.
     """
-    return decode_any(scores[None], bits, choices, TAG_BITS, CANDIDATES)
+    return decode_any(scores[None], bits, choices, TAG_BITS, candidates)
 
 
 def decode_any(
