@@ -458,7 +458,7 @@ def test_what_needs_a_surface_is_refused(host: Mesh, key: jm.Key):
 
 @pytest.mark.slow
 def test_64_bits_in_a_large_cloud_read_from_half_of_it_in_noise(key: jm.Key):
-    host = cloud(ball(50_000))
+    host = cloud(ball(25_000))
     marker = jm.make_marker(host, key, bits=64)
     shown, info = marker.embed(MESSAGE)
     assert info.rms <= 2e-4

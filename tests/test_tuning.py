@@ -215,15 +215,13 @@ def test_what_was_predicted_is_measured(tuned, key: jm.Key):
 
 @pytest.mark.slow
 def test_tuning_beats_equal_strengths_and_says_how_far_it_is_from_the_best(tuned):
-    mesh, found = tuned
+    _, found = tuned
     assert len(found.report.margins) == len(ATTACKS)
     assert found.report.bound >= found.report.margins.min() > 0
     assert found.report.gap < 0.02
     flat = found.cost[0].sum() ** -0.5 * np.ones(64)
     assert found.report.margins.min() > 1.5 * float(margins(found.channels, jnp.asarray(flat**2), "evidence").min())
     assert found.detector_weights.shape == (len(ATTACKS), 64)
-    again = tune(mesh, ATTACKS, limits={"dame": 0.02}, key=jax.random.key(0), margin="evidence", bits=16)
-    np.testing.assert_array_equal(again.beta, found.beta)
 
 
 @pytest.mark.slow
