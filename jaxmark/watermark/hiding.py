@@ -3,10 +3,12 @@
 Points of a cloud have no faces that shade: they hide by how far they are apart.
 """
 
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float64, Int
+from jaxtyping import Bool, Float64, Int
 from scipy import sparse
 
 from jaxmark.alignment.original import Original
@@ -57,30 +59,23 @@ def hiding_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     if len(faces) == 0:
         return _by_spacing(original)
     mesh, size = Mesh(points, faces), len(points)
-    shares, height, least = _heights(mesh)
-    normals = face_normals(mesh)
+    # What faces hide takes as long as all that does not need it, and that is NumPy's: another thread computes it.
+    with ThreadPoolExecutor(1) as aside:
+        rest = aside.submit(lambda: (face_normals(mesh), _corner_angles(points, faces), open_sides(faces)))
+        edgewise = aside.submit(_along_edges, original)
+        shares, height, least = _heights(mesh)
+        (normals, angles, opened), (along, free) = rest.result(), edgewise.result()
     sound = np.flatnonzero(shares)
-    angles = _corner_angles(points, faces)
     form, weight = _sums(faces[sound], angles[sound], _squares(normals[sound], height[sound]), size)
 
     # A border hides what the edge of a solid sheet does: as if a wall stood on it.
-    face, side = np.nonzero(open_sides(faces) & (shares > 0)[:, None])
+    face, side = np.nonzero(opened & (shares > 0)[:, None])
     ends = np.stack([faces[face, side], faces[face, (side + 1) % 3]], axis=1)
     outward = unit(np.cross(points[ends[:, 1]] - points[ends[:, 0]], normals[face]))
     more, added = _sums(ends, np.full(ends.shape, np.pi / 2), _squares(outward, least[face]), size)
     weight += added
     form = (form + more) / np.where(weight > 0, weight, 1)[:, None, None]
-
-    # Along each edge, and in all directions, a displacement is bounded by lengths of edges. One long edge among short
-    # ones does not count more than twice: a mark that is mostly in a few points proves little.
-    pairs = edges(faces)
-    ends = points[pairs[:, 1]] - points[pairs[:, 0]]
-    lengths = np.linalg.norm(ends, axis=1)
-    along, count = _sums(pairs, np.ones(pairs.shape), _squares(unit(ends), _ALONG * lengths), size)
-    mean = np.bincount(pairs.ravel(), np.repeat(lengths, 2), size) / np.maximum(count, 1)
-    free = original.used & (count > 0)
-    most = _ALONG * np.minimum(mean, 2 * np.median(mean[free])) if free.any() else mean
-    form[free] += along[free] / count[free, None, None] + np.eye(3) / most[free, None, None] ** 2
+    form[free] += along
     form[~free] = np.eye(3)
 
     # A displacement is hidden where its form is at most 1.
@@ -88,6 +83,22 @@ def hiding_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     matrices = (vectors / np.sqrt(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
     matrices[~free] = 0
     return matrices / np.sqrt(np.mean(np.sum(matrices[original.used] ** 2, axis=(1, 2))) / 3)
+
+
+def _along_edges(original: Original) -> tuple[Float64[np.ndarray, "free 3 3"], Bool[np.ndarray, " points"]]:
+    """Along each edge, and in all directions, a displacement is bounded by lengths of edges: forms of points on edges.
+
+    One long edge among short ones does not count more than twice: a mark that is mostly in a few points proves little.
+    """
+    points, size = original.positions, len(original.positions)
+    pairs = edges(np.asarray(original.points.faces))
+    ends = points[pairs[:, 1]] - points[pairs[:, 0]]
+    lengths = np.linalg.norm(ends, axis=1)
+    along, count = _sums(pairs, np.ones(pairs.shape), _squares(unit(ends), _ALONG * lengths), size)
+    mean = np.bincount(pairs.ravel(), np.repeat(lengths, 2), size) / np.maximum(count, 1)
+    free = original.used & (count > 0)
+    most = _ALONG * np.minimum(mean, 2 * np.median(mean[free])) if free.any() else mean
+    return along[free] / count[free, None, None] + np.eye(3) / most[free, None, None] ** 2, free
 
 
 def _heights(

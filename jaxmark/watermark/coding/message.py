@@ -62,7 +62,7 @@ class Decoded(NamedTuple):
     """A message whose keyed tag fits."""
 
     message: bytes
-    rank: float  # as how many tried messages, this one included, it counts: chance fits its tag with rank · 2^-(its size)
+    rank: float  # how many messages were tried, this one included: chance fits its tag with rank · 2^-(size of tag)
     row: int = 0  # which of several readings it is from
 
     def paid(self, share: float) -> "Decoded":
