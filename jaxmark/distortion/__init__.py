@@ -4,6 +4,7 @@
 differentiate.
 """
 
+from jaxmark.distortion._compare import LOCAL as LOCAL
 from jaxmark.distortion._compare import METRICS as METRICS
 from jaxmark.distortion._compare import OF_POINTS as OF_POINTS
 from jaxmark.distortion._compare import RENDERED as RENDERED

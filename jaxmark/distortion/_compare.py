@@ -235,6 +235,8 @@ METRICS = tuple(_METRICS)
 RENDERED = tuple(_RENDERED)
 #: Names of the metrics that need no faces: those of point clouds.
 OF_POINTS = ("rms", "max", "point_to_plane")
+#: Names of the metrics that look at single vertices and edges, and are quickly computed.
+LOCAL = ("rms", "max", "gl", "dame", "stretch")
 _ANY_CONNECTIVITY = {"mrms", "hausdorff", "fmpd", "msdm2", *RENDERED}
 
 
