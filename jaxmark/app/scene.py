@@ -1,6 +1,7 @@
 """Mark files of several meshes."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from jaxmark import distortion
@@ -81,7 +82,8 @@ def mark_scene(
         release_programs()
         doing(f"{len(markers) + 1} of {len(scene.meshes)} meshes: checking {name!r}")
         fine_enough(name, result)
-        markers[name] = marker.with_record(info.record)
+        # What it has computed to read is let go of: that of all meshes would not fit.
+        markers[name] = replace(marker.with_record(info.record))
         return info
 
     doing(f"embedding {len(scene.meshes)} meshes of {original}")
@@ -103,7 +105,7 @@ def mark_scene(
         # The marks must read from the written file, whose numbers are rounded.
         written = load_scene(draft).meshes
         for name, marker in markers.items():
-            found = marker.tried(written[name], message, info.meshes[name].survives)
+            found = replace(marker).tried(written[name], message, info.meshes[name].survives)
             if found is None:
                 raise JaxmarkError(
                     f"Rounded to the numbers of {original}, the mark of the mesh {name!r} no longer reads; pick the"

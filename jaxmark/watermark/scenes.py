@@ -9,7 +9,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -204,7 +204,8 @@ def detect_scene(
             if mark in known:
                 raise JaxmarkError("It equals another mesh, and counts once.")
             aligned = align(marker.original, suspects[found[name]], how)
-            seen[name] = _Seen(marker, marker.detect(aligned, message))
+            # What a marker has computed to read is let go of: that of all meshes would not fit.
+            seen[name] = _Seen(replace(marker), marker.detect(aligned, message))
             known.add(mark)
         except JaxmarkError as error:
             left[name] = str(error).rstrip(".")
