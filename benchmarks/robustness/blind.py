@@ -5,7 +5,7 @@ With each of --keys keys, 64 bits are written with --scheme within --limits: the
 has a line for each attack, written as soon as it is known:
 
 read        in how many of the copies the exact message was read
-log10 p     of the false-positive probability, the worst and the best of the copies; [in brackets] without its floor at -77
+log10 p     of the false-positive probability, the worst and the best of the copies; [...] without its floor at -77
 agreement   mean cosine of the anchors' phases, the least of the copies
 seconds     of the slowest reading
 predicted   nρ² after the attack, by the unmarked mesh: n anchors are found, ρ is the mean cosine that is left of them

@@ -13,8 +13,9 @@ point_to_plane  displacement across the surface that 5 % of the points exceed, o
 embed           seconds
 
 The second table has a line for each attack, and for each cloud how many of --seeds messages read exactly, the worst
-log10 of the false-positive probability for the claimed message, [in brackets] without its floor at -77, the share of the
-points that were seen, and the seconds of the last detection. "turned" stands for any rotation, with a shift and another scale, in random order.
+log10 of the false-positive probability for the claimed message, in square brackets without its floor at -77, the share
+of the points that were seen, and the seconds of the last detection. "turned" stands for any rotation, with a shift and
+another scale, in random order.
 
 With --splats, the clouds are the centres of Gaussians besides, as large as their points are apart and with colours of
 their own. A third table has the PSNR in decibels of pictures before and after the mark from three sides, by an
