@@ -36,7 +36,7 @@ from jaxmark.geometry import asteroid
 from jaxmark.spectral.bands import scaling
 from jaxmark.watermark.visibility import band_visibility
 
-mesh = asteroid(1500)  # small, so that this takes a minute
+mesh = asteroid(1500)  # small, so that this takes a minute or two
 original = make_original(mesh)
 visible = band_visibility(original, scaling(64, damping="jackson"), ["dame", "gl"])
 for band in (0, 1, 3, 7, 15, 31):
