@@ -34,6 +34,8 @@ nb_merge_streams = True
 nb_output_stderr = "remove"  # what XLA says of itself
 templates_path = ["_templates"]
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["pages.css"]
 smartquotes = False  # two hyphens are an option
 
 myst_enable_extensions = ["dollarmath", "colon_fence"]

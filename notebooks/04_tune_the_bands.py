@@ -27,16 +27,16 @@ if importlib.util.find_spec("jaxmark") is None:  # in the folder of notebooks of
 
 # %%
 import jax
+import numpy as np
 
 import jaxmark as jm
 from jaxmark import plot
 from jaxmark.alignment import make_original
 from jaxmark.geometry import asteroid
 from jaxmark.spectral.bands import scaling
-from jaxmark.watermark import KeyedScheme
 from jaxmark.watermark.visibility import band_visibility
 
-mesh = asteroid(10_000)  # or a file of your own: jm.load_mesh("model.obj")
+mesh = asteroid(1500)  # small, so that this takes a minute or two
 original = make_original(mesh)
 visible = band_visibility(original, scaling(64, damping="jackson"), ["dame", "gl"])
 for band in (0, 1, 3, 7, 15, 31):
@@ -45,41 +45,48 @@ for band in (0, 1, 3, 7, 15, 31):
     )
 
 # %% [markdown]
-# Two attacks and one limit. The report says what each attack leaves of the best strengths found, and what no strengths
-# whatever could exceed on the channels that were measured.
+# One limit and two attacks: noise that looks like a mark, and a filter that leaves only the lowest tenth of the
+# spectrum. `tune` writes, attacks and reads marks of several strengths; `tried` is the evidence that the detector has
+# after each attack, in nats. Only the worst attack counts, so what another leaves may shrink down to it. No strengths
+# whatever could exceed `bound`, by a model of the attacks.
+#
+# The default strengths are good against many attacks, and kept where nothing does better by a tenth: try noise and
+# smoothing instead.
 
 # %%
 LIMITS = {"dame": 0.008}
-ATTACKS = [("noise", 0.005), ("smoothing", 50)]
-tuned = jm.tune(mesh, ATTACKS, limits=LIMITS, key=jax.random.key(0), margin="evidence")
-print("profile", tuned.scheme.profile)
-print("margins", tuned.report.margins.round(), "nats; bound", round(tuned.report.bound))
+ATTACKS = [("jamming", 0.002), ("low-pass", 0.9)]
+tuned = jm.tune(mesh, ATTACKS, limits=LIMITS, key=jax.random.key(0), bits=16, margin="evidence")
+report = tuned.report
+print("kept: the default is as good" if report.kept else "found: better strengths than the default's")
+for (kind, strength), left, before in zip(ATTACKS, report.tried, report.tried_default, strict=True):
+    print(f"after {kind} {strength:g}: {left:.0f} nats, by default {before:.0f}")
+print(f"worst {report.tried.min():.0f}, by default {report.tried_default.min():.0f}, bound {report.bound:.0f}")
 
 # %% [markdown]
-# The strengths over frequency. β is what is written in a band, in diagonals of the bounding box: most lies where
-# neither the eye nor the attacks look.
+# Beside a mark of the default strengths, at the same limit. The claims are of another key than those that were tried.
 
 # %%
-plot.strengths({"tuned": tuned.beta}).save("04_1.png")
-
-# %% [markdown]
-# Beside a mark that is equally strong in all bands, at the same distortion.
-
-# %%
-key, message = jm.new_key(), b"jaxmark!"
-claims = {}
-for name, scheme in (("tuned", tuned.scheme), ("flat", KeyedScheme(profile=(1.0,) * 64))):
-    marker = jm.make_marker(mesh, key, scheme=scheme)
+key, message = jm.new_key(), b"ok"
+shown, betas, worst = {}, {}, {}
+for name, scheme in (("default", "keyed"), ("tuned", tuned.scheme)):
+    marker = jm.make_marker(mesh, key, bits=16, scheme=scheme)
     marked, info = marker.embed(message, limits=LIMITS, noise=0)
     print(f"{name}: RMS {info.rms:.4%} of the diagonal, DAME {jm.compare(mesh, marked, ['dame']).dame:.4f}")
-    for kind, strength in ATTACKS:
-        found = marker.detect(jm.attack(marked, kind, strength, seed=1))
-        claims[name, kind] = found.message == message
-        print(f"  {kind} {strength:g}: read {found.message == message}, log10 p {found.log10_p:.1f}")
-    if name == "tuned":
-        shown = marked
-assert claims["tuned", "noise"]
-assert claims["tuned", "smoothing"]
+    claims = [marker.detect(jm.attack(marked, *one, seed=1), message) for one in ATTACKS]
+    for (kind, strength), found in zip(ATTACKS, claims, strict=True):
+        print(f"  after {kind} {strength:g}: log10 p of the claim {found.log10_p_unfloored:.1f}")
+    worst[name] = max(found.log10_p_unfloored for found in claims)
+    betas[name] = info.record.beta * np.asarray(marker.reader.carrier.profile)
+    shown[name] = marked
+assert worst["tuned"] < -6
+assert report.kept or worst["tuned"] < worst["default"]
+
+# %% [markdown]
+# The strengths over frequency: β is what is written in a band, in diagonals of the bounding box.
+
+# %%
+plot.strengths({name: np.pad(beta, (0, 64 - len(beta))) for name, beta in betas.items()}).save("04_1.png")
 
 # %% [markdown]
 # The mark, ten times the mark, and where it shows: displacement over what the roughness around it hides.
@@ -88,8 +95,8 @@ assert claims["tuned", "smoothing"]
 plot.draw(
     [
         plot.View("original", mesh),
-        plot.exaggerate(original, shown),
-        plot.displacement(original, shown),
-        plot.visibility(original, shown),
+        plot.exaggerate(original, shown["tuned"]),
+        plot.displacement(original, shown["tuned"]),
+        plot.visibility(original, shown["tuned"]),
     ]
 ).save("04_2.png")

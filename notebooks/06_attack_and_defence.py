@@ -13,9 +13,10 @@
 # %% [markdown]
 # # A gradient attack and a defence
 #
-# Marking, attack and reading are differentiable, so an attacker can be optimised, and so can a defence. Here the worst
-# attacker of all, one who holds original, key and message, goes against the evidence S/‖a‖ of a claim. It needs to fall
-# below 5.26 for the false-positive probability to exceed one in a million.
+# Marking, attack and reading are differentiable, so an attacker can be optimised. Here the worst attacker of all, one
+# who holds original, key and message, goes against the evidence S/‖a‖ of a claim. It needs to fall below 5.26 for the
+# false-positive probability to exceed one in a million. (Strengths of bands that hold against an attacker are found in
+# "Tune the bands under a perceptual budget".)
 
 # %% tags=["remove-cell"]
 import importlib.util
@@ -27,6 +28,7 @@ if importlib.util.find_spec("jaxmark") is None:  # in the folder of notebooks of
 
 # %%
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +42,7 @@ from jaxmark.adversaries.expected import evidence, make_surrogate, random_mark, 
 from jaxmark.geometry import asteroid
 from jaxmark.watermark.detectors import claims
 
-mesh = asteroid(6000)  # or a file of your own: jm.load_mesh("model.obj")
+mesh = asteroid(4000)  # small, so that this takes a minute
 key, message, size = jm.new_key(), b"ok", 8e-4
 marker = jm.make_marker(mesh, key, bits=16)
 marked, _ = marker.embed(message, size)
@@ -58,7 +60,7 @@ print(f"{len(mesh.vertices)} vertices, evidence needed {needed:.2f}")
 # %%
 word = jnp.asarray(marker.codeword(message), jnp.float32)
 share = 0.3
-weak = enemies.erasure_by_descent(marker, message, steps=20)
+weak = enemies.erasure_by_descent(marker, message, steps=8)
 suspect = jm.attack(marked, weak, share * size, seed=0)
 scores, norms = claims(marker.reader, marker.receive(suspect), word)
 by_bands, all_alike = np.asarray(scores / norms)
@@ -71,7 +73,7 @@ assert marker.detect(suspect, message).detected()
 
 # %%
 broken = jm.evaluation.minimum_distortion(
-    marker, marked, message, weak._replace(strengths=(share * size, 1.2 * size)), metrics=("rms",), tolerance=0.2
+    marker, marked, message, weak._replace(strengths=(0.7 * size, 1.1 * size)), metrics=("rms",), tolerance=0.2
 )
 print(f"with the key: {broken.cost('rms'):.2f} of the mark's RMS")
 
@@ -85,12 +87,19 @@ print(f"with the key: {broken.cost('rms'):.2f} of the mark's RMS")
 surrogate, original = make_surrogate(marked, "keyed", 16, size)
 strength = jnp.asarray(4 * size, jnp.float32)
 fresh = jax.random.split(jax.random.key(9), 4)
-expected = jax.jit(lambda shift: jnp.mean(jax.lax.map(lambda one: evidence(surrogate, shift, one), fresh)))
+
+
+@jax.jit
+def expected(surrogate, shift):
+    return jnp.mean(jax.lax.map(lambda one: evidence(surrogate, shift, one), fresh))
+
+
+seek = jax.jit(partial(descend, family="bands", steps=30))
 other = rescale(surrogate, random_mark(surrogate, jax.random.key(1))[1], strength)
-seek = jax.jit(lambda one: descend(surrogate, strength, one, family="bands", steps=15))
-found = seek(jax.random.key(1))
-print(f"expected evidence at {4 * size:g}: another mark {expected(other):.1f}, optimised {expected(found):.1f}")
-assert expected(found) < expected(other) < expected(jnp.zeros_like(other))
+found = seek(surrogate, strength, jax.random.key(1))
+nothing, another, best = (float(expected(surrogate, shift)) for shift in (jnp.zeros_like(other), other, found))
+print(f"expected evidence at {4 * size:g}: another mark {another:.1f}, optimised {best:.1f}")
+assert best < another < nothing
 moved = marked._replace(vertices=marked.vertices + original.diagonal * original.to_host(found)[original.weld.point])
 print(f"the owner's claim of it: log10 p {marker.detect(moved, message).log10_p:.1f}")
 
@@ -105,26 +114,3 @@ plot.draw(
         plot.displacement(original, moved, "without it"),
     ]
 ).save("06_1.png")
-
-# %% [markdown]
-# ## A defence by tuning
-#
-# `tune` allots the mark's energy to the bands so that the worst of several attacks leaves most. Against noise that
-# looks like a mark, and a low-pass filter:
-
-# %%
-tuned = jm.tune(
-    mesh, [("jamming", 4 * size), ("low-pass", 0.9)], budget=size, key=jax.random.key(0), bits=16, margin="evidence"
-)
-print("margins, nats:", np.round(tuned.report.margins, 1), "at most", round(tuned.report.bound, 1))
-worst = {}
-for name, scheme in {"default": "keyed", "tuned": tuned.scheme}.items():
-    reader = jm.make_marker(mesh, key, bits=16, scheme=scheme)
-    copy, _ = reader.embed(message, size, noise=0)
-    left = [
-        reader.detect(jm.attack(copy, kind, value, seed=0), message).log10_p_unfloored
-        for kind, value in (("jamming", 4 * size), ("low-pass", 0.9))
-    ]
-    print(f"{name:<8} log10 p after jamming {left[0]:6.1f}, after the low-pass filter {left[1]:6.1f}")
-    worst[name] = max(left)
-assert worst["tuned"] < worst["default"]

@@ -54,13 +54,13 @@ length = jnp.linalg.norm(slope)
 value, rate = jax.jvp(evidence, (bands,), (slope / length,))
 print(f"{slope.shape} coefficients, {float(value):.1f} nats")
 print(f"gradient {float(length):.1f}, by forward mode {float(rate):.1f}")
+assert jnp.allclose(rate, length, rtol=1e-2)
 lengths = (0.0, 0.01, 0.02, 0.05, 0.1)
 steps = [float(evidence(bands + t * slope / length)) for t in lengths]
 print("nats after a step along it:", *(f"{nats:.1f}" for nats in steps))
+assert max(steps) > steps[0]
 figure, (axes,) = panels(1, 6.5, 3.6)
 axes.plot(lengths, steps, marker="o", label="evidence")
 axes.plot(lengths, [steps[0] + t * float(length) for t in lengths], label="its slope at 0", **BOUND)
 finish(axes, xlabel="step along the gradient, in coefficients", ylabel="evidence, in nats", ylim=(steps[0], None))
 Picture(figure).save("12_1.png")
-assert jnp.allclose(rate, length, rtol=1e-2)
-assert max(steps) > steps[0]

@@ -348,6 +348,7 @@ def test_a_study_from_a_file(tmp_path, monkeypatch, capfd):
     assert err == ""  # progress is for terminals
     assert "| ball | keyed | 16 | 0.002 | noise | 0.002 | 1/1 |" in out
     assert Path("left/rates.md").read_text() == out
+    assert "<td>ball</td><td>keyed</td>" in Path("left/study.html").read_text()
     told = workshop.json("study", "declared/study.toml", "--output", "left")
     assert told["readings"] == 3
     assert [rate["read"] for rate in told["rates"]] == [1, 0, 0]

@@ -36,6 +36,12 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(line(*cells) for cells in lines)
 
 
+def evidence(log10_p: float, unfloored: float) -> str:
+    """log10 p, and in square brackets what it is without its floor at -77, where that is less."""
+    further = f" [{unfloored:.0f}]" if round(unfloored) < round(log10_p) else ""
+    return f"{log10_p:.0f}{further}"
+
+
 def save(folder: Path, name: str, text: str, data: Any) -> None:
     """Leave a report as Markdown, and all figures as JSON, in a folder that is made if need be."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,39 +1,31 @@
 """Draws the pictures of README, front page and gallery: python benchmarks/pictures/front.py [NAME ...].
 
-Those are drawn whose sources have changed since, or that are named. `docs/pictures/drawn.json` holds a hash of each
-picture and of what it was drawn from, which `tests/test_pictures.py` compares. The gallery's are thumbnails of what the
-notebooks save, in `docs/notebooks`, where `make pictures` runs them before.
+Those are drawn whose sources have changed since, or that are named. The gallery's are thumbnails of what the notebooks
+save, in `docs/notebooks`, where `make pictures` runs them before.
 """
 
-import hashlib
 import io
-import json
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
 import jaxmark as jm
 from jaxmark import plot, spectral
 from jaxmark.app.demo import sample_mesh
 from jaxmark.evaluation import pictures
-from jaxmark.files.atomic import write_atomically
 from jaxmark.geometry import asteroid
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import make_parser
+from common.drawn import FOLDER, MOST_BYTES, ROOT, hashes, keep, known, small
 from common.marks import KEY, MESSAGE
 from common.tables import say
 
-ROOT = Path(__file__).resolve().parents[2]
-FOLDER = ROOT / "docs" / "pictures"
-DRAWN = FOLDER / "drawn.json"
-MOST_BYTES = 150_000
-COLOURS = 128
-WIDTH, THUMBNAIL = 1250, 480  # pixels
+WIDTH, THUMBNAIL = 1250, (480, 240)  # pixels
 RMS = 4e-4  # displacement over the diagonal of all three schemes in the picture of what survives
 SAMPLES = 20
 SHOWN = ("01_1", "02_1", "03_1", "04_1", "05_1", "06_1", "07_1", "08_1", "09_2", "10_1", "11_1", "12_1", "13_1")
@@ -91,19 +83,16 @@ def narrow(picture: plot.Picture, width: float, height: float) -> bytes:
     return picture.png()
 
 
-def small(png: bytes, width: int) -> bytes:
-    """A picture at most so wide, in few colours."""
-    image = Image.open(io.BytesIO(png)).convert("RGB")
-    if image.width > width:
-        image = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
-    buffer = io.BytesIO()
-    image.quantize(COLOURS).save(buffer, format="PNG", optimize=True)
-    return buffer.getvalue()
-
-
 def thumbnail(name: str) -> Callable[[], bytes]:
-    """The thumbnail of a picture that a notebook has saved."""
-    return lambda: small((ROOT / "docs" / "notebooks" / f"{name}.png").read_bytes(), THUMBNAIL)
+    """The thumbnail of a picture that a notebook has saved; all have one shape, so that cards stand in rows."""
+
+    def draw() -> bytes:
+        image = Image.open(ROOT / "docs" / "notebooks" / f"{name}.png").convert("RGB")
+        buffer = io.BytesIO()
+        ImageOps.pad(image, THUMBNAIL, Image.Resampling.LANCZOS, color="white").save(buffer, format="PNG")
+        return small(buffer.getvalue(), THUMBNAIL[0])
+
+    return draw
 
 
 #: How each picture is drawn, by the name of its file.
@@ -113,26 +102,6 @@ PICTURES: Mapping[str, Callable[[], bytes]] = {
 }
 
 
-def sources(picture: str) -> list[Path]:
-    """The files that a picture is drawn by: of a thumbnail the notebook, else the rooms of pictures; and this one."""
-    if picture.startswith("gallery_"):
-        found = (ROOT / "notebooks").glob(f"{picture.removeprefix('gallery_')[:2]}_*.py")
-    else:
-        rooms = (ROOT / "jaxmark" / "plot", ROOT / "jaxmark" / "evaluation" / "pictures")
-        found = (path for room in rooms for path in room.glob("*.py"))
-    return sorted({*found, Path(__file__).resolve()})
-
-
-def hashes(picture: str) -> dict[str, str]:
-    """Hashes of a picture and of its sources."""
-    digest = hashlib.sha256()
-    for path in sources(picture):
-        digest.update(hashlib.sha256(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes()).digest())
-    path = FOLDER / picture
-    drawn = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
-    return {"picture": drawn, "sources": digest.hexdigest()}
-
-
 def main() -> None:
     """Draw what has changed."""
     parser = make_parser(__doc__)
@@ -140,18 +109,15 @@ def main() -> None:
     names = parser.parse_args().names
     if unknown := [name for name in names if name not in PICTURES]:
         parser.error(f"there is no picture {unknown[0]}; there are {', '.join(PICTURES)}")
-    known = json.loads(DRAWN.read_text()) if DRAWN.is_file() else {}
+    before = known()
     for name, draw in PICTURES.items():
-        if name not in names and known.get(name) == hashes(name):
+        if name not in names and before.get(name) == hashes(name):
             continue
         png = draw()
         if len(png) > MOST_BYTES:
             parser.error(f"{name} has {len(png):,} bytes, more than {MOST_BYTES:,}")
-        write_atomically(FOLDER / name, png)
+        keep(FOLDER / name, png)
         say(f"{name}: {len(png) / 1000:.0f} kB")
-        known[name] = hashes(name)
-    kept = {name: known[name] for name in sorted(PICTURES) if name in known}
-    write_atomically(DRAWN, (json.dumps(kept, indent=2) + "\n").encode())
 
 
 if __name__ == "__main__":

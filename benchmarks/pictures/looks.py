@@ -14,7 +14,6 @@ import numpy as np
 from PIL import Image
 
 import jaxmark as jm
-from jaxmark.files.atomic import write_atomically
 from jaxmark.geometry.mesh import Mesh, compact, host_mesh, weld, weld_mesh
 from jaxmark.geometry.raster import Frame
 from jaxmark.plot import Rendering, exaggerate, render
@@ -22,6 +21,7 @@ from jaxmark.watermark.budget import VISIBILITY, Budget, make_budget, visibility
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser
+from common.drawn import keep
 from common.marks import KEY, MESSAGE, write
 from common.shapes import SHAPES
 from common.tables import say
@@ -50,7 +50,7 @@ def save(gray: np.ndarray, path: Path) -> None:
     levels = np.round(np.round(gray * (GRAYS - 1)) * 255 / (GRAYS - 1)).astype(np.uint8)
     buffer = io.BytesIO()
     Image.fromarray(levels).quantize(GRAYS).save(buffer, format="PNG", optimize=True)
-    write_atomically(path, buffer.getvalue())
+    keep(path, buffer.getvalue())
 
 
 def marked(mesh: Mesh, budget: Budget) -> Mesh:

@@ -5,7 +5,7 @@ With each of --keys keys, 64 bits are written with --scheme within --limits: the
 has a line for each attack, written as soon as it is known:
 
 read        in how many of the copies the exact message was read
-log10 p     of the false-positive probability, the worst and the best of the copies
+log10 p     of the false-positive probability, the worst and the best of the copies; [...] without its floor at -77
 agreement   mean cosine of the anchors' phases, the least of the copies
 seconds     of the slowest reading
 predicted   nρ² after the attack, by the unmarked mesh: n anchors are found, ρ is the mean cosine that is left of them
@@ -40,7 +40,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser
 from common.attacks import attacked
 from common.marks import MESSAGE
-from common.tables import head, line
+from common.tables import evidence, head, line
 
 LIMITS: dict[str, dict[str, float] | None] = {
     "perceptual": {"msdm": 0.20, "mrms": 8e-4},
@@ -70,6 +70,7 @@ class Cell(NamedTuple):
 
     read: bool
     log10_p: float
+    log10_p_unfloored: float
     agreement: float
     seconds: float
 
@@ -80,8 +81,9 @@ def read(suspect: Mesh, key: bytes, scheme: BlindScheme) -> Cell:
     try:
         found = jm.detect(suspect, key=key, scheme=scheme)
     except jm.JaxmarkError:
-        return Cell(False, 0.0, 0.0, time.perf_counter() - start)
-    return Cell(found.message == MESSAGE, found.log10_p, found.agreement, time.perf_counter() - start)
+        return Cell(False, 0.0, 0.0, 0.0, time.perf_counter() - start)
+    seconds = time.perf_counter() - start
+    return Cell(found.message == MESSAGE, found.log10_p, found.log10_p_unfloored, found.agreement, seconds)
 
 
 def predict(mesh: Mesh, steps: str, one: Copy) -> float:
@@ -96,7 +98,10 @@ def predict(mesh: Mesh, steps: str, one: Copy) -> float:
 
 def row(name: str, cells: list[Cell], *more: object) -> str:
     """A line of the table: of an attack and its strength, or a control."""
-    p = [f"{worst(one.log10_p for one in cells):.0f}" for worst in (max, min)]
+    p = [
+        evidence(worst(one.log10_p for one in cells), worst(one.log10_p_unfloored for one in cells))
+        for worst in (max, min)
+    ]
     return line(
         name,
         f"{sum(cell.read for cell in cells)}/{len(cells)}",

@@ -25,6 +25,7 @@ from jaxmark.plot.figures import Picture, finish, panels, styles
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import json_file, load, make_parser
+from common.drawn import keep, small
 from common.filters import bumpy_torus, exponent
 from common.stages import apart
 from common.tables import Row, save_json, say, table
@@ -45,6 +46,7 @@ NAMES = {
 }
 MEASURES = {"s": "seconds", "GB": "GB"}
 LAST = 3  # sizes that the second exponent is of
+WIDTH = 1560  # pixels
 
 
 def resized(mesh: jm.Mesh, size: int) -> jm.Mesh:
@@ -121,7 +123,7 @@ def main() -> None:
         fitted.append(found)
     print(table(fitted))
     try:
-        picture(rows).save(options.output.with_suffix(".png"))
+        keep(options.output.with_suffix(".png"), small(picture(rows).png(), WIDTH))
     except jm.JaxmarkError as missing:
         say(missing)
 

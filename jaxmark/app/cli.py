@@ -672,8 +672,9 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
       smoothing = [10, 50]
 
     Only meshes, with paths relative to the folder of FILE, and attacks are required. The command writes results.jsonl,
-    from which it resumes when run again, results.csv, rates.md and, with the extra `plot`, read.png, log10_p.png
-    and log10_p_unfloored.png, where the evidence goes on below the floor at -77.
+    from which it resumes when run again, results.csv, rates.md and, with the extra `plot`, study.html, one page of
+    all to look at or to hand on, and its pictures: read.png, log10_p.png and log10_p_unfloored.png, where the evidence
+    goes on below the floor at -77.
     """  # noqa: D301
     study = load_study(file)
     output.mkdir(parents=True, exist_ok=True)
@@ -683,13 +684,15 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
     table = results.markdown()
     write_atomically(output / "rates.md", table.encode())
     try:
-        require("matplotlib", "plot")
+        for module in ("matplotlib", "jinja2"):
+            require(module, "plot")
     except JaxmarkError as error:
-        _say(f"No pictures: {error}")
+        _say(f"No page, no pictures: {error}")
     else:
         _progress().doing("drawing pictures")
         for of in get_args(Measure):
             results.plot(of).save(output / f"{of}.png")
+        results.save_page(output / "study.html")
     _answer(as_json, {"output": str(output), "readings": len(results.rows), "rates": results.rates()}, table.rstrip())
 
 
