@@ -11,7 +11,7 @@ import jaxmark as jm
 from jaxmark.app.finding import describe
 from jaxmark.catalogue import Finder
 from jaxmark.catalogue.descriptors import centred
-from jaxmark.catalogue.fitting import fit_part, fit_whole
+from jaxmark.catalogue.fitting import Part, fit_whole
 from jaxmark.catalogue.landmarks import KEPT, MOST, LandmarkIndex, landmarks
 from jaxmark.catalogue.pieces import split
 from jaxmark.geometry.mesh import compact
@@ -212,7 +212,9 @@ def test_a_part_fits_the_original_that_it_was_cut_from(shop: Shop):
     mesh = shop.originals[2]
     stretched = [jm.Mesh(mesh.vertices * [1, 1, factor], mesh.faces) for factor in (0.9, 1.0, 1.1, 1.2)]
     half = posed(compact(jm.Mesh(mesh.vertices, mesh.faces[mesh.vertices[mesh.faces].mean(axis=1)[:, 0] > 0])))
-    off = fit_part(half, [stretched[3]], [centred(one)[0] for one in stretched])
-    assert np.argmin(off) == 1
+    part = Part(half)
+    poses = [placed.pose for placed in part.place([stretched[3]])]
+    off = part.fit({number: centred(one)[0] for number, one in enumerate(stretched)}, dict.fromkeys(range(4), poses))
+    assert min(off, key=off.__getitem__) == 1
     whole = fit_whole(posed(mesh), [centred(one)[0] for one in stretched])
     assert np.argmin(whole) == 1

@@ -17,7 +17,7 @@ import numpy as np
 from jaxmark.alignment.alignment import Align, align
 from jaxmark.catalogue import descriptors
 from jaxmark.catalogue.catalogue import Catalogue
-from jaxmark.catalogue.fitting import fit_part, fit_whole
+from jaxmark.catalogue.fitting import Part, fit_whole
 from jaxmark.catalogue.landmarks import landmarks
 from jaxmark.catalogue.originals import file_hash, meshes_of
 from jaxmark.catalogue.pieces import Piece, is_explained, split
@@ -32,8 +32,9 @@ from jaxmark.watermark.record import Record
 from jaxmark.watermark.tracing import make_tracer, pay
 
 _ALIKE = 100  # originals that a whole is fitted to
-_LIKELY = 400  # originals that a part is fitted to
-_REFERENCES = 5  # of these, by which its pose is found
+_LIKELY = 2000  # originals of which a part may look like a piece
+_REFERENCES = 6  # of these, of different shapes, by which its pose is found
+_KIN = 200  # originals like a reference that a part is fitted to
 _DEEP_PIECES = 3  # of a suspect; of all others, the likeliest original alone is looked at
 _WHOLE = 0.95  # share of an original from which on a piece is taken for all of it
 DEPTH = 3  # originals that are aligned and read for each piece, for each way of finding them
@@ -231,16 +232,28 @@ class Finder:
         local = descriptors.local(piece)
         return [] if local is None else self.fitting(piece, self.index.by_parts(local, _LIKELY))[:count]
 
-    def fitting(self, part: Mesh, likely: list[Near]) -> list[Near]:
-        """Of the originals of which a part looks like this one, those that it fits best first."""
-        likely = likely[:_LIKELY]
-        references = []
+    def fitting(self, piece: Mesh, likely: Sequence[Near]) -> list[Near]:
+        """The originals that a part fits, that which it fits best first.
+
+        Args:
+            piece: the part.
+            likely: originals of which a part looks like this one: a few of different shapes are tried, and then those
+                that look like the ones it fits.
+        """
+        if not likely or not len(piece.faces):
+            return []
+        part = Part(piece)
+        references, known = [], []
         for near in self.index.unlike(likely, _REFERENCES):
             with suppress(JaxmarkError):  # its file is missing
                 references.append(self.catalogue.load(near.shape))
-        off = fit_part(part, references, [self._points(near.shape) for near in likely])
-        best = np.argsort(off, kind="stable")
-        return [Near(likely[place].shape, float(off[place])) for place in best if np.isfinite(off[place])]
+                known.append(near.shape)
+        poses: dict[int, list[Pose]] = {}
+        for placed in part.place(references):
+            for shape in self.index.like(known[placed.reference], _KIN):
+                poses.setdefault(shape, []).append(placed.pose)
+        off = part.fit({shape: self._points(shape) for shape in poses}, poses)
+        return [Near(shape, off[shape]) for shape in sorted(off, key=off.__getitem__)]
 
     def _points(self, shape: int) -> Points:
         """The points that are kept of an original."""

@@ -86,6 +86,11 @@ class Index:
         """
         return self._nearest(self._off_parts(part), count)
 
+    def like(self, shape: int, count: int) -> list[int]:
+        """The originals whose whole shape is most like that of one of them, itself first."""
+        (place,) = np.flatnonzero(self.shapes == shape)
+        return [near.shape for near in self.by_whole(self._whole[place].astype(np.float32), count)]
+
     def unlike(self, near: Sequence[Near], count: int) -> list[Near]:
         """Some of the originals that look like a suspect, the first of each kind of shape first."""
         place = {int(shape): number for number, shape in enumerate(self.shapes)}
