@@ -139,6 +139,16 @@ def tell(name: str, ranks: list[int], seconds: list[float]) -> None:
     print(f"| {name} | {len(ranks)} | {' | '.join(shares)} | {took} |", flush=True)
 
 
+def say(finder: Finder, shape: int, kind: str, ranks: str) -> None:
+    """The ranks of one suspect's original, on standard error."""
+    print(f"{Path(path_of(finder, shape)).stem}, {kind}: {ranks}", file=sys.stderr, flush=True)
+
+
+def path_of(finder: Finder, shape: int) -> str:
+    query = "SELECT path FROM originals o JOIN shapes s ON s.original = o.id WHERE s.id = ?"
+    return finder.catalogue.database.rows(query, shape)[0]["path"]
+
+
 def by_descriptors(finder: Finder, suspect: Mesh) -> list[Near]:
     seen = descriptors.spread(suspect)
     assert seen is not None
@@ -170,6 +180,7 @@ def rank_wholes(finder: Finder, count: int) -> None:
         ):
             ranks.setdefault(how, []).append(place(near, shape, last))
             seconds.setdefault(how, []).append(took)
+        say(finder, shape, kind, f"{ranks[kind][-1]}, {ranks[WITHOUT][-1]} without landmarks")
     for kind, found in ranks.items():
         tell(kind, found, seconds[kind])
     kinds = [kind for kind, _ in ATTACKS if kind in ranks]
@@ -186,6 +197,7 @@ def rank_halves(finder: Finder, count: int) -> None:
         near = near or finder.parts(suspect, len(finder.index.shapes))
         seconds.append(time.perf_counter() - start)
         ranks.append(place(near, shape, len(finder.index.shapes)))
+        say(finder, shape, "half", f"{ranks[-1]} of {len(near)} compared")
     tell("halves", ranks, seconds)
 
 
@@ -202,7 +214,7 @@ def rank_halves_anew(finder: Finder, count: int) -> None:
         best = finder.fitting(suspect, near)
         fitted.append(time.perf_counter() - start)
         by_fit.append(place(best, shape, len(near)))
-        print(f"half: {by_balls[-1]} by balls, {by_fit[-1]} by fit", file=sys.stderr, flush=True)
+        say(finder, shape, "half meshed anew", f"{by_balls[-1]} by balls, {by_fit[-1]} by fit")
     tell("halves meshed anew, by balls", by_balls, sought)
     tell("halves meshed anew, by fit", by_fit, fitted)
 
@@ -215,10 +227,7 @@ def answer(finder: Finder, name: str, kinds: tuple[tuple[str, float], ...], coun
         start = time.perf_counter()
         verdict = finder.find(suspect)
         seconds.append(time.perf_counter() - start)
-        (row,) = finder.catalogue.database.rows(
-            "SELECT path FROM originals o JOIN shapes s ON s.original = o.id WHERE s.id = ?", shape
-        )
-        hits = [match.original == row["path"] for match in verdict.named]
+        hits = [match.original == path_of(finder, shape) for match in verdict.named]
         right += any(hits)
         wrong += not all(hits)
         told = f"{verdict.matches[0].log10_p:.1f}" if verdict.matches else "nothing was compared"

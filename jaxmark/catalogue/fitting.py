@@ -26,7 +26,7 @@ _POSES = 3  # of each hand and reference
 _KEPT_POSES = 2  # of each reference that is kept
 _KEPT_REFERENCES = 3  # those that a part fits best
 _CLOSE = 40  # candidates that a part is fitted to as well as it can be
-_FEATURES = FeatureSettings(points=1500, radius=0.18)  # coarser than for alignment: near duplicates have details apart
+_FEATURES = FeatureSettings(points=2000, radius=0.15)  # coarser than for alignment, which is enough here, and faster
 _ROUNDS, _FIRST_ROUNDS = 10, 4
 _WHOLE_REFERENCES = 2  # originals by which poses of a whole shape are found
 _WHOLE_POSES = 3  # that are tried on all candidates

@@ -17,7 +17,7 @@ from jaxmark.geometry.pose import Points, similarity
 LANDMARK = np.dtype([("colour", "<u8"), ("place", "<f8", (3,))])
 KEPT = np.dtype([("colour", "<u8"), ("place", "<f4", (3,))])  # in catalogues
 MOST = 256  # landmarks that are kept of each original
-_RINGS = 3  # of the neighbourhoods: fewer are alike by chance, more are lost where something was cut off
+_RINGS = 2  # of the neighbourhoods: one tells few vertices apart, more are lost where something was cut off
 _LEAST = 8  # pairs by which an original is known
 _FAR = 0.15  # the most that a distance counts, in an original's mean distances to its centre
 _ROUNDS, _KEPT_SHARE = 5, 0.7  # of fits, and of the closest pairs in each
