@@ -18,7 +18,7 @@ LANDMARK = np.dtype([("colour", "<u8"), ("place", "<f8", (3,))])
 KEPT = np.dtype([("colour", "<u8"), ("place", "<f4", (3,))])  # in catalogues
 MOST = 256  # landmarks that are kept of each original
 _RINGS = 2  # of the neighbourhoods: one tells few vertices apart, more are lost where something was cut off
-_LEAST = 8  # pairs by which an original is known
+_LEAST, _LEAST_SHARE = 8, 0.2  # pairs by which an original is known; up to a tenth are left by meshing anew
 _FAR = 0.15  # the most that a distance counts, in an original's mean distances to its centre
 _ROUNDS, _KEPT_SHARE = 5, 0.7  # of fits, and of the closest pairs in each
 _CANDIDATES = 1000  # originals that a suspect is fitted to, those with the most pairs
@@ -52,6 +52,10 @@ class LandmarkIndex:
         every = np.concatenate(kept) if kept else np.empty(0, KEPT)
         order = np.argsort(every["colour"], kind="stable")
         self._colours, self._places = every["colour"][order], every["place"][order]
+        # All landmarks of an original up to its last one's colour are kept.
+        self._last = np.array(
+            [one["colour"][-1] if len(one) == MOST else np.iinfo(np.uint64).max for one in kept], np.uint64
+        )
         self._owner = np.repeat(np.arange(len(kept), dtype=np.int32), [len(one) for one in kept])[order]
 
     def off(self, seen: np.ndarray) -> dict[int, float]:
@@ -71,9 +75,9 @@ class LandmarkIndex:
         suspect, known = suspect[order], known[order]
         owners, start, pairs = np.unique(self._owner[known], return_index=True, return_counts=True)
         found: dict[int, float] = {}
-        for place in np.argsort(-pairs, kind="stable")[:_CANDIDATES]:
-            if pairs[place] < _LEAST:
-                break
+        shared = np.searchsorted(seen["colour"], self._last[owners], "right")  # if the meshing were the same
+        enough = np.flatnonzero((pairs >= _LEAST) & (pairs >= _LEAST_SHARE * shared))
+        for place in enough[np.argsort(-pairs[enough], kind="stable")[:_CANDIDATES]]:
             rows = slice(start[place], start[place] + pairs[place])
             off = _left(seen["place"][suspect[rows]].astype(float), self._places[known[rows]].astype(float))
             agree = np.count_nonzero(off < _FAR)
