@@ -17,6 +17,7 @@ from scipy.special import sph_harm_y
 
 import jaxmark as jm
 from jaxmark.catalogue import descriptors, export_catalogue, import_catalogue
+from jaxmark.catalogue.search import Index
 from tests.samples import rough_sphere
 from tests.test_cli import Workshop
 
@@ -136,6 +137,31 @@ def test_what_is_exported_is_imported_once(folder: Path, key: jm.Key):
             import_catalogue(third, "cut.jsonl")
         with jm.Catalogue("third.db") as third:
             assert not third.originals()
+
+
+def test_catalogues_of_the_first_version_are_brought_up(folder: Path):
+    """Their originals have no landmarks: they are described again when their files are added again."""
+    with jm.Catalogue("shop.db") as catalogue:
+        catalogue.add("large.ply")
+        export_catalogue(catalogue, "all.jsonl")
+        held = catalogue.database.rows("SELECT landmarks FROM shapes")[0]["landmarks"]
+        assert len(held) == 20 * 256
+        catalogue.database.run("ALTER TABLE shapes DROP COLUMN landmarks")
+        catalogue.database.run("UPDATE shapes SET described = 1")
+        catalogue.database.run("PRAGMA user_version = 1")
+    lines = [json.loads(line) for line in Path("all.jsonl").read_text().splitlines()]
+    for shape in lines[1]["original"]["shapes"]:
+        del shape["landmarks"]
+        shape["described"] = 1
+    Path("old.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with jm.Catalogue("shop.db") as catalogue, jm.Catalogue("other.db") as other:
+        assert import_catalogue(other, "old.jsonl").originals == 1
+        for one in (catalogue, other):
+            assert one.database.rows("SELECT landmarks FROM shapes")[0]["landmarks"] == b""
+            with pytest.raises(jm.JaxmarkError, match="add their files again"):
+                Index(one.database)
+            assert one.add("large.ply").status == "known"
+            assert one.database.rows("SELECT landmarks FROM shapes")[0]["landmarks"] == held
 
 
 ADDING = "import sys, jaxmark as jm\nwith jm.Catalogue('shop.db') as c:\n for f in sys.argv[1:]: print(c.add(f).status)"

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.catalogue import Finder
+from jaxmark.app.finding import describe
+from jaxmark.catalogue import Finder, Match, Verdict
 from jaxmark.catalogue.descriptors import centred
-from jaxmark.catalogue.fitting import fit_part, fit_whole
+from jaxmark.catalogue.fitting import Part, fit_whole
+from jaxmark.catalogue.landmarks import KEPT, MOST, LandmarkIndex, landmarks
 from jaxmark.catalogue.pieces import split
 from jaxmark.geometry.mesh import compact
 from jaxmark.watermark.coding.keys import commitment
@@ -83,6 +85,15 @@ def test_a_suspect_in_any_pose_is_named_with_its_message(shop: Shop):
     assert verdict.named[0].key == commitment(shop.key)
 
 
+def test_other_ways_of_aligning_are_paid_for(shop: Shop):
+    suspect = jm.attack(shop.marked[3], "noise", 0.02, seed=0)
+    auto, same = (named(shop, suspect, how=how)[1] for how in ("auto", "same"))
+    assert -70 < auto.named[0].log10_p < -10  # not at the floor, so that what is paid shows
+    assert same.named[0].log10_p == pytest.approx(auto.named[0].log10_p + math.log10(0.97 / 0.01), abs=1e-6)
+    refused = Match("3.obj", "", "", "landmarks", 1, 0.0, refused="The vertices are in another order.")
+    assert "3.obj could not be read: The vertices" in describe(Verdict("", (refused,), 1), 1e-6)
+
+
 def test_nobody_is_named_without_the_key_or_the_mark(shop: Shop):
     assert named(shop, shop.marked[1], jm.Key(bytes(32)), depth=1)[0] == []
     found, verdict = named(shop, shop.originals[1], depth=1)
@@ -146,19 +157,27 @@ def test_copies_are_issued_and_traced(workshop: Workshop):
     found = workshop.json("catalogue", "find", "leaked.ply", *shop)
     assert (found["recipient"], Path(found["original"]).name) == ("bob", "model.ply")
     assert found["tried"] == 3  # two originals, and one list of recipients
+    by_order = workshop.json("catalogue", "find", "leaked.ply", *shop, "--align", "same")
+    assert by_order["recipient"] == "bob"
+    assert by_order["log10_p"] > found["log10_p"] + 1.9  # another way than "auto" costs two decades
     assert workshop.json("identify", "leaked.ply", *shop)["accused"] == ["bob"]
     assert workshop.json("identify", "other.ply", *shop, status=1)["accused"] == []
     assert "--recipients" in workshop.refused("identify", "leaked.ply", "--key", "owner.key")
     with jm.Catalogue("shop.db", read_only=True) as catalogue:
         verdicts = list(catalogue.verdicts())
-    assert [one["result"]["recipient"] for one in verdicts] == ["bob", "bob", None]
+    assert [one["result"]["recipient"] for one in verdicts] == ["bob", "bob", "bob", None]
     assert verdicts[0]["suspect"] == found["suspect_sha256"]
     assert bytes(range(32)).hex() not in str(verdicts)
 
 
 def test_what_cannot_be_sought_is_refused(shop: Shop, workshop: Workshop):
     with jm.Catalogue(shop.file, read_only=True) as catalogue:
-        for options, said in (({"keys": []}, "key"), ({"alpha": 2.0}, "alpha"), ({"depth": 0}, "at")):
+        for options, said in (
+            ({"keys": []}, "key"),
+            ({"alpha": 2.0}, "alpha"),
+            ({"depth": 0}, "at"),
+            ({"how": "by eye"}, "by eye"),
+        ):
             with pytest.raises(jm.JaxmarkError, match=said):
                 Finder(catalogue, **({"keys": [shop.key]} | options))
     find = ("catalogue", "find", "model.ply", "--key", "owner.key", "--catalogue")
@@ -167,12 +186,32 @@ def test_what_cannot_be_sought_is_refused(shop: Shop, workshop: Workshop):
     assert "is empty" in workshop(*find, "empty.db")[2]
 
 
+def test_landmarks_tell_near_duplicates_of_one_meshing_apart():
+    """The same vertices and faces, a little stretched each; whatever becomes of pose, order, hand and most of it."""
+    mesh = rough_sphere(SIZE)
+    stretched = [jm.Mesh(mesh.vertices * [1, 1, factor], mesh.faces) for factor in (0.97, 1.0, 1.03)]
+    kept = [landmarks(one)[:MOST].astype(KEPT) for one in (*stretched, rough_sphere(SIZE, 1))]
+    index = LandmarkIndex(kept)
+    cut = compact(jm.Mesh(mesh.vertices, mesh.faces[mesh.vertices[mesh.faces].mean(axis=1)[:, 0] > 0.2]))
+    mirrored = jm.Mesh(cut.vertices * [1, -1, 1], cut.faces[:, ::-1])
+    noisy = jm.attack(posed(mirrored), "noise", 0.005, seed=0)
+    off = index.off(landmarks(noisy))
+    assert sorted(off, key=off.__getitem__)[0] == 1
+    assert set(off) == {0, 1, 2}
+    assert index.off(landmarks(rough_sphere(SIZE, 2))) == {}
+    # A scene of two models shows the landmarks of both.
+    assert set(index.off(landmarks(joined(mesh, rough_sphere(SIZE, 1))))) == {0, 1, 2, 3}
+    assert index.off(landmarks(jm.Mesh(mesh.vertices, mesh.faces[:0]))) == LandmarkIndex([]).off(landmarks(mesh)) == {}
+
+
 def test_a_part_fits_the_original_that_it_was_cut_from(shop: Shop):
     """Among near duplicates: the same shape, stretched a little."""
     mesh = shop.originals[2]
     stretched = [jm.Mesh(mesh.vertices * [1, 1, factor], mesh.faces) for factor in (0.9, 1.0, 1.1, 1.2)]
     half = posed(compact(jm.Mesh(mesh.vertices, mesh.faces[mesh.vertices[mesh.faces].mean(axis=1)[:, 0] > 0])))
-    off = fit_part(half, [stretched[3]], [centred(one)[0] for one in stretched])
-    assert np.argmin(off) == 1
+    part = Part(half)
+    poses = [placed.pose for placed in part.place([stretched[3]])]
+    off = part.fit({number: centred(one)[0] for number, one in enumerate(stretched)}, dict.fromkeys(range(4), poses))
+    assert min(off, key=off.__getitem__) == 1
     whole = fit_whole(posed(mesh), [centred(one)[0] for one in stretched])
     assert np.argmin(whole) == 1

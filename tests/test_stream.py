@@ -154,3 +154,39 @@ def test_dask_gives_the_same_answers_when_a_worker_is_killed(folder: Path, monke
         rows = run(lambda: client.get_executor(pure=False))
     assert Path("killed").exists()
     assert sorted(row["suspect_sha256"] for row in rows) == ["a.obj", "b.obj", "c.obj", "d.obj", "e.obj", "f.ply"]
+
+
+def is_read_only(plan: Plan) -> bool:
+    """In a worker: whether it opened the catalogue for reading only."""
+    return stream._finder(plan).catalogue.database.read_only
+
+
+@pytest.mark.slow
+def test_dask_workers_search_as_one_process_does(tmp_path: Path, monkeypatch):
+    """The search itself: a marked suspect and one that is nobody's get the verdicts that this process gives."""
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.chdir(tmp_path)
+    with jm.Catalogue("shop.db") as catalogue:
+        for seed in range(2):
+            jm.save_mesh(rough_sphere(500, seed), f"{seed}.obj")
+            catalogue.add(f"{seed}.obj")
+    marked, _ = jm.embed(jm.load_mesh("0.obj"), b"ab", KEY, budget=0.004)
+    jm.save_mesh(jm.attack(marked, "noise", 0.002, seed=0), "marked.obj")
+    jm.save_mesh(jm.attack(jm.load_mesh("1.obj"), "noise", 0.002, seed=0), "nobodys.obj")
+    plan, suspects = (
+        Plan(Path("shop.db").resolve(), (KEY,), (("bits", 16), ("depth", 1))),
+        ["marked.obj", "nobodys.obj"],
+    )
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        found = list(find_each(plan, suspects, "found.jsonl", lambda: client.get_executor(pure=False)))
+        assert list(client.run(is_read_only, plan).values()) == [True, True]
+    rows, alone = (
+        {Path(row["suspect"]).name: {**row, "seconds": 0} for row in some}
+        for some in (found, find_each(plan, suspects, "alone.jsonl"))
+    )
+    assert rows == alone
+    assert (Path(rows["marked.obj"]["original"]).name, rows["marked.obj"]["message"]) == ("0.obj", b"ab".hex())
+    assert not rows["nobodys.obj"]["named"]

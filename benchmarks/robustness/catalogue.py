@@ -8,8 +8,9 @@ are taken over by the next run.
     python benchmarks/robustness/catalogue.py MESH... --folder shop --count 500 --suspects 40 --halves 10 --answers 5
 
 Suspects are made of originals by ten attacks, in any pose and scale; half crops lose half of their vertices beyond a
-plane. What is ranked is not marked: a mark moves nothing that descriptors see. `--answers` are marked, attacked and
-sought to the end. `--strangers` come from files of other meshes, each deformed many times.
+plane, and `--anew` are meshed anew after that, so that no landmark is left. What is ranked is not marked: a mark moves
+nothing that landmarks and descriptors see. `--answers` are marked, attacked and sought to the end. `--strangers` come
+from files of other meshes, each deformed many times.
 """
 
 import argparse
@@ -44,8 +45,10 @@ ATTACKS = (
     ("mirror", 0),
 )
 HALF = (("cropping", 0.5),)
+HALF_ANEW = (("meshed anew", 0.5),)
 BUDGET, MESSAGE = 8e-4, b"cataloge"
 PLACES = (1, 3, 10)
+WITHOUT, ALONE = "all, without landmarks", "all, by descriptors alone"
 
 
 def parse() -> argparse.Namespace:
@@ -56,6 +59,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--most", type=int, default=3_000, help="vertices of an original, at most")
     parser.add_argument("--suspects", type=int, default=200, help="whole ones, ranked")
     parser.add_argument("--halves", type=int, default=50, help="half crops, ranked")
+    parser.add_argument("--anew", type=int, default=20, help="half crops that are meshed anew, ranked")
     parser.add_argument("--answers", type=int, default=20, help="whole ones, marked and sought to the end")
     parser.add_argument("--half-answers", type=int, default=0, help="half crops, marked and sought to the end")
     parser.add_argument("--others", type=Path, nargs="*", default=[], metavar="MESH", help="files of strangers' meshes")
@@ -92,6 +96,8 @@ def attacked(mesh: Mesh, kind: str, strength: float, seed: int) -> Mesh:
     random = np.random.default_rng(seed)
     if kind == "mirror":
         found = Mesh(np.asarray(mesh.vertices) * [-1, 1, 1], np.asarray(mesh.faces)[:, ::-1])
+    elif kind == "meshed anew":
+        found = jm.attack(compact(jm.attack(mesh, "cropping", strength, seed=seed)), "isotropic", 1.0, seed=seed)
     else:
         found = jm.attack(mesh, kind, strength, seed=seed)
     vertices = np.asarray(found.vertices) @ rotation(random).T * random.uniform(0.5, 2)
@@ -133,22 +139,48 @@ def tell(name: str, ranks: list[int], seconds: list[float]) -> None:
     print(f"| {name} | {len(ranks)} | {' | '.join(shares)} | {took} |", flush=True)
 
 
+def say(finder: Finder, shape: int, kind: str, ranks: str) -> None:
+    """The ranks of one suspect's original, on standard error."""
+    print(f"{Path(path_of(finder, shape)).stem}, {kind}: {ranks}", file=sys.stderr, flush=True)
+
+
+def path_of(finder: Finder, shape: int) -> str:
+    query = "SELECT path FROM originals o JOIN shapes s ON s.original = o.id WHERE s.id = ?"
+    return finder.catalogue.database.rows(query, shape)[0]["path"]
+
+
 def by_descriptors(finder: Finder, suspect: Mesh) -> list[Near]:
     seen = descriptors.spread(suspect)
     assert seen is not None
     return finder.index.by_whole(descriptors.whole(seen), len(finder.index.shapes))
 
 
+def place(near: list[Near], shape: int, last: int) -> int:
+    """The place of an original, from 1; the last if it is not there."""
+    order = list(dict.fromkeys(one.shape for one in near))
+    return 1 + order.index(shape) if shape in order else last
+
+
 def rank_wholes(finder: Finder, count: int) -> None:
+    """Whole suspects, in the order in which they are compared: by landmarks, then by shape."""
+    last = len(finder.index.shapes)
     ranks: dict[str, list[int]] = {}
     seconds: dict[str, list[float]] = {}
     for shape, kind, suspect in suspects(finder, ATTACKS, count, seed=1):
-        for how in (kind, "all, by descriptors alone"):
-            start = time.perf_counter()
-            near = finder.wholes(suspect, len(finder.index.shapes)) if how == kind else by_descriptors(finder, suspect)
-            seconds.setdefault(how, []).append(time.perf_counter() - start)
-            found = [one.shape for one in near]
-            ranks.setdefault(how, []).append(1 + found.index(shape) if shape in found else len(finder.index.shapes))
+        start = time.perf_counter()
+        meshed = finder.meshed_alike(suspect, last)
+        middle = time.perf_counter()
+        wholes = finder.wholes(suspect, last)
+        end = time.perf_counter()
+        described = by_descriptors(finder, suspect)
+        for how, near, took in (
+            (kind, [*meshed, *wholes], end - start),
+            (WITHOUT, wholes, end - middle),
+            (ALONE, described, time.perf_counter() - end),
+        ):
+            ranks.setdefault(how, []).append(place(near, shape, last))
+            seconds.setdefault(how, []).append(took)
+        say(finder, shape, kind, f"{ranks[kind][-1]}, {ranks[WITHOUT][-1]} without landmarks")
     for kind, found in ranks.items():
         tell(kind, found, seconds[kind])
     kinds = [kind for kind, _ in ATTACKS if kind in ranks]
@@ -157,21 +189,34 @@ def rank_wholes(finder: Finder, count: int) -> None:
 
 
 def rank_halves(finder: Finder, count: int) -> None:
-    by_balls, by_fit, sought, fitted = [], [], [], []
+    """Half crops, in the order in which they are compared; by shape where no landmark is known."""
+    ranks, seconds = [], []
     for shape, _, suspect in suspects(finder, HALF, count, seed=2):
+        start = time.perf_counter()
+        near = finder.meshed_alike(suspect, len(finder.index.shapes))
+        near = near or finder.parts(suspect, len(finder.index.shapes))
+        seconds.append(time.perf_counter() - start)
+        ranks.append(place(near, shape, len(finder.index.shapes)))
+        say(finder, shape, "half", f"{ranks[-1]} of {len(near)} compared")
+    tell("halves", ranks, seconds)
+
+
+def rank_halves_anew(finder: Finder, count: int) -> None:
+    by_balls, by_fit, sought, fitted = [], [], [], []
+    for shape, _, suspect in suspects(finder, HALF_ANEW, count, seed=6):
         start = time.perf_counter()
         local = descriptors.local(suspect)
         assert local is not None
         near = finder.index.by_parts(local, len(finder.index.shapes))
         sought.append(time.perf_counter() - start)
-        by_balls.append(1 + [one.shape for one in near].index(shape))
+        by_balls.append(place(near, shape, len(near)))
         start = time.perf_counter()
-        best = [one.shape for one in finder.fitting(suspect, near)]
+        best = finder.fitting(suspect, near)
         fitted.append(time.perf_counter() - start)
-        by_fit.append(1 + best.index(shape) if shape in best else len(near))
-        print(f"half: {by_balls[-1]} by balls, {by_fit[-1]} by fit", file=sys.stderr, flush=True)
-    tell("halves, by balls", by_balls, sought)
-    tell("halves, by fit", by_fit, fitted)
+        by_fit.append(place(best, shape, len(near)))
+        say(finder, shape, "half meshed anew", f"{by_balls[-1]} by balls, {by_fit[-1]} by fit")
+    tell("halves meshed anew, by balls", by_balls, sought)
+    tell("halves meshed anew, by fit", by_fit, fitted)
 
 
 def answer(finder: Finder, name: str, kinds: tuple[tuple[str, float], ...], count: int, seed: int, key: jm.Key) -> None:
@@ -182,10 +227,7 @@ def answer(finder: Finder, name: str, kinds: tuple[tuple[str, float], ...], coun
         start = time.perf_counter()
         verdict = finder.find(suspect)
         seconds.append(time.perf_counter() - start)
-        (row,) = finder.catalogue.database.rows(
-            "SELECT path FROM originals o JOIN shapes s ON s.original = o.id WHERE s.id = ?", shape
-        )
-        hits = [match.original == row["path"] for match in verdict.named]
+        hits = [match.original == path_of(finder, shape) for match in verdict.named]
         right += any(hits)
         wrong += not all(hits)
         told = f"{verdict.matches[0].log10_p:.1f}" if verdict.matches else "nothing was compared"
@@ -247,6 +289,7 @@ def main() -> None:
         )
         rank_wholes(finder, given.suspects)
         rank_halves(finder, given.halves)
+        rank_halves_anew(finder, given.anew)
         answer(finder, "wholes", ATTACKS, given.answers, 4, key)
         answer(finder, "halves", HALF, given.half_answers, 5, key)
         strangers(finder, given.others, given.strangers, given.through, given.most)

@@ -29,6 +29,7 @@ from jaxmark.app.batch import FileReader, mark_file
 from jaxmark.app.blind import BlindReader
 from jaxmark.app.catalogue import catalogue_group
 from jaxmark.app.ending import end_by_exception
+from jaxmark.app.finding import ALIGN as _ALIGN
 from jaxmark.app.finding import identify_by_catalogue
 from jaxmark.app.folders import Work, each, mesh_files
 from jaxmark.app.issuing import mark_for_command
@@ -138,14 +139,6 @@ _WORKERS = click.option(
     default=1,
     show_default=True,
     help="For a folder: number of processes at once, each with memory of its own.",
-)
-_ALIGN = click.option(
-    "--align",
-    "how",
-    type=click.Choice(get_args(Align)),
-    default="auto",
-    show_default=True,
-    help="same: vertex by vertex in order; similarity, affine: by surface, up to such a map; auto: first that fits.",
 )
 _ALPHA = click.option(
     "--alpha",

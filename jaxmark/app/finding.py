@@ -5,7 +5,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, get_args
 
 import click
 
@@ -21,6 +21,14 @@ from jaxmark.evaluation.cells import Pool, processes
 from jaxmark.extras import require
 
 _PATH = click.Path(path_type=Path)
+ALIGN = click.option(
+    "--align",
+    "how",
+    type=click.Choice(get_args(Align)),
+    default="auto",
+    show_default=True,
+    help="same: vertex by vertex in order; similarity, affine: by surface, up to such a map; auto: first that fits.",
+)
 
 
 @catalogue_group.command(name="find")
@@ -37,6 +45,7 @@ _PATH = click.Path(path_type=Path)
     show_default=True,
     help="Originals that are aligned and read, of those that look most like SUSPECT as a whole, and as a part.",
 )
+@ALIGN
 @click.option("--alpha", type=float, default=1e-6, show_default=True, help="Largest probability that names anybody.")
 @click.option("--list", "list_file", type=_PATH, help="Instead of SUSPECT: file with a path a line, or -.")
 @click.option("--output", type=_PATH, help="For many suspects: file that grows by a line of JSON for each.")
@@ -50,6 +59,7 @@ def find_command(
     key_files: tuple[Path, ...],
     bits: int | None,
     depth: int,
+    how: Align,
     alpha: float,
     list_file: Path | None,
     output: Path | None,
@@ -69,14 +79,14 @@ def find_command(
         raise JaxmarkError("Give SUSPECT or --list, one of them.")
     keys = [read_key(file) for file in key_files]
     if suspect is None or suspect.is_dir():
-        options = {"alpha": alpha, "bits": bits, "depth": depth}
+        options = {"alpha": alpha, "bits": bits, "depth": depth, "how": how}
         suspects = _listed(list_file) if list_file is not None else mesh_files_below(suspect or Path())
         files = tuple(file.resolve() for file in key_files)
         plan = Plan(catalogue_file.resolve(), files, tuple(options.items()), release_programs)
         _find_many(plan, suspects, output, _workers(workers, scheduler), as_json)
     progress().doing(f"looking for {suspect} among the originals")
     with opened(catalogue_file) as catalogue:
-        verdict = Finder(catalogue, keys, alpha=alpha, bits=bits, depth=depth).find(suspect)
+        verdict = Finder(catalogue, keys, alpha=alpha, bits=bits, depth=depth, how=how).find(suspect)
         keep(catalogue, suspect, verdict)
     answer(as_json, verdict.as_json(), describe(verdict, alpha))
     sys.exit(0 if verdict.named else 1)
@@ -177,6 +187,8 @@ def describe(verdict: Verdict, alpha: float) -> str:
     if seen:
         said += f"; most like {_place(seen[0])}, probability at most {power(seen[0].log10_p)}"
         said += "".join(f". {remark}" for remark in seen[0].remarks)
+    elif verdict.matches:
+        said += f"; {_place(verdict.matches[0])} could not be read: {verdict.matches[0].refused}"
     return said + _doubts(seen)
 
 
@@ -197,7 +209,7 @@ def _named(match: Match) -> str:
     else:
         what = "a mark"
     piece = f"{match.piece}: " if match.piece else ""
-    part = "" if match.by == "whole" else f", {100 * match.coverage:.0f} % of it"
+    part = "" if match.coverage >= 0.95 else f", {100 * match.coverage:.0f} % of it"
     return (
         f"{piece}{_place(match)}{part}: {what}; probability at most {power(match.log10_p)} if keys, originals and"
         f" records were fixed before the suspect existed, {power(match.log10_p_undated)} if nothing dates them"

@@ -129,11 +129,16 @@ class Catalogue:
     def _describe_again(self, original: int, prepared: Prepared) -> None:
         with self.database.writing():
             for shape in prepared.shapes:
-                statement = (
-                    "UPDATE shapes SET described = ?, whole = ?, parts = ?, points = ? WHERE original = ? AND name = ?"
-                )
                 self.database.run(
-                    statement, descriptors.VERSION, shape.whole, shape.parts, shape.points, original, shape.name
+                    "UPDATE shapes SET described = ?, whole = ?, parts = ?, points = ?, landmarks = ?"
+                    " WHERE original = ? AND name = ?",
+                    descriptors.VERSION,
+                    shape.whole,
+                    shape.parts,
+                    shape.points,
+                    shape.landmarks,
+                    original,
+                    shape.name,
                 )
 
     def _insert(self, prepared: Prepared) -> Added:
@@ -149,8 +154,8 @@ class Catalogue:
             for shape in prepared.shapes if fresh else ():
                 self.database.run(
                     "INSERT INTO shapes (original, name, geometry, exact, vertices, faces, described, whole, parts,"
-                    " points)"
-                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                    " points, landmarks)"
+                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
                     row["id"],
                     shape.name,
                     shape.geometry,
@@ -161,6 +166,7 @@ class Catalogue:
                     shape.whole,
                     shape.parts,
                     shape.points,
+                    shape.landmarks,
                 )
         status = "added" if fresh else "known"
         return Added(row["id"], prepared.path, status, len(prepared.shapes), prepared.left)

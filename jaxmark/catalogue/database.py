@@ -78,6 +78,7 @@ _MIGRATIONS = (
     );
     CREATE INDEX verdicts_by_suspect ON verdicts (suspect);
     """,
+    "ALTER TABLE shapes ADD COLUMN landmarks BLOB NOT NULL DEFAULT x''",
 )
 VERSION = len(_MIGRATIONS)
 

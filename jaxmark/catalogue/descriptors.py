@@ -20,7 +20,7 @@ from scipy.spatial import KDTree
 from jaxmark.geometry.mesh import Mesh, boundary_vertices, cross_product, unit, used_vertices
 from jaxmark.geometry.pose import Points
 
-VERSION = 1  # of the descriptors: those of other versions are not comparable
+VERSION = 2  # of all that originals are known by: those of other versions are not comparable
 _SAMPLES = 8192
 _DEGREES, _SHELLS, _APART = 12, 12, 2  # largest degree and distance of shells that are compared, of whole shapes
 _REACH = 2.2  # radius of the outermost shell over the root mean square distance to the centre

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxmark.catalogue.catalogue import Catalogue
 from jaxmark.catalogue.descriptors import CENTRES, LOCAL_SIZE, POINTS, VERSION, WHOLE_SIZE
+from jaxmark.catalogue.landmarks import is_whole
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import replacing
 from jaxmark.watermark.record import Record
@@ -31,7 +32,7 @@ _ORIGINAL: _Types = {
 _SHAPE: _Types = {
     **dict.fromkeys(("name", "geometry", "exact"), str),
     **dict.fromkeys(("vertices", "faces", "described"), int),
-    **dict.fromkeys(("whole", "parts", "points"), bytes),
+    **dict.fromkeys(("whole", "parts", "points", "landmarks"), bytes),
 }
 _KEY: _Types = dict.fromkeys(("commitment", "added"), str)
 _RECORD: _Types = dict.fromkeys(("original", "shape", "added", "json"), str)
@@ -158,13 +159,14 @@ def _checked(row: _Row, types: _Types) -> dict[str, Any]:
 def _take_original(catalogue: Catalogue, row: _Row) -> int:
     values = _checked(row, _ORIGINAL)
     bytes.fromhex(values["content"])
-    shapes = [_checked(shape, _SHAPE) for shape in row["shapes"]]
+    shapes = [_checked({"landmarks": "", **shape}, _SHAPE) for shape in row["shapes"]]  # older exports have none
     for shape in shapes:
         if shape["described"] == VERSION and not (
             len(shape["whole"]) == 2 * WHOLE_SIZE
             and len(shape["parts"]) == 2 * CENTRES * LOCAL_SIZE
             and len(shape["points"]) == 2 * 3 * POINTS
             and all(np.isfinite(np.frombuffer(shape[name], "<f2")).all() for name in ("whole", "parts", "points"))
+            and is_whole(shape["landmarks"])
         ):
             raise TypeError
     if not shapes:

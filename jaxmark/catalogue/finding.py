@@ -10,14 +10,15 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
 from jaxmark.alignment.alignment import Align, align
 from jaxmark.catalogue import descriptors
 from jaxmark.catalogue.catalogue import Catalogue
-from jaxmark.catalogue.fitting import fit_part, fit_whole
+from jaxmark.catalogue.fitting import Part, fit_whole
+from jaxmark.catalogue.landmarks import landmarks
 from jaxmark.catalogue.originals import file_hash, meshes_of
 from jaxmark.catalogue.pieces import Piece, is_explained, split
 from jaxmark.catalogue.search import Index, Near, state_of
@@ -31,11 +32,12 @@ from jaxmark.watermark.record import Record
 from jaxmark.watermark.tracing import make_tracer, pay
 
 _ALIKE = 100  # originals that a whole is fitted to
-_LIKELY = 400  # originals that a part is fitted to
-_REFERENCES = 5  # of these, by which its pose is found
+_LIKELY = 2000  # originals of which a part may look like a piece
+_REFERENCES = 6  # of these, of different shapes, by which its pose is found
+_KIN = 200  # originals like a reference that a part is fitted to
 _DEEP_PIECES = 3  # of a suspect; of all others, the likeliest original alone is looked at
 _WHOLE = 0.95  # share of an original from which on a piece is taken for all of it
-DEPTH = 3  # originals that are aligned and read for each piece, by either descriptor
+DEPTH = 3  # originals that are aligned and read for each piece, for each way of finding them
 
 
 @dataclass(frozen=True)
@@ -45,9 +47,9 @@ class Match:
     original: str  # path of its file
     mesh: str  # name of its mesh in the file; empty if it is the only one
     piece: str  # name of the suspect's piece; empty if it is the whole file
-    by: str  # how it was found: as a "whole" or as a "part"
+    by: str  # how it was found: by its "landmarks", as a "whole" or as a "part"
     rank: int  # among the originals that look like the piece, from 1
-    distance: float  # of the descriptors of wholes; what a part leaves, in the original's mean distances to its centre
+    distance: float  # of descriptors of wholes; what landmarks or parts leave, in mean distances to the centre
     named: bool = False  # whether the probability is at most alpha
     message: str | None = None  # hexadecimal
     recipient: str | None = None
@@ -118,7 +120,7 @@ class Finder:
         keys: the keys that marks may have been made with.
         alpha: largest false-positive probability at which an original is named.
         bits: payload of messages without a record; by default 64.
-        depth: how many originals are aligned and read for each piece of a suspect, by either descriptor.
+        depth: how many originals are aligned and read for each piece of a suspect, for each way of finding them.
         how: how suspects are aligned, see `detect`; other ways than "auto" are paid for.
         only_recipients: whether to look for recipients' copies only.
     """
@@ -145,6 +147,8 @@ class Finder:
             raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
         if depth < 1:
             raise JaxmarkError(f"At least one original is looked at, not {depth}.")
+        if how not in get_args(Align):
+            raise JaxmarkError(f"A suspect is aligned by {', '.join(get_args(Align))}, not {how!r}.")
         self.catalogue, self.alpha, self.bits, self.depth = catalogue, alpha, bits, depth
         self.how: Align = how
         self.keys = {commitment(key): Key(key) for key in keys}
@@ -206,6 +210,10 @@ class Finder:
                 total += row["shapes"] - told["shapes"] + told["count"]
         return max(1, total)
 
+    def meshed_alike(self, piece: Mesh, count: int) -> list[Near]:
+        """The originals that have the meshing of a piece, that which it fits best first."""
+        return self.index.by_landmarks(landmarks(piece))[:count]
+
     def wholes(self, piece: Mesh, count: int) -> list[Near]:
         """The originals whose whole shape is most like that of a piece, the most similar first.
 
@@ -224,16 +232,28 @@ class Finder:
         local = descriptors.local(piece)
         return [] if local is None else self.fitting(piece, self.index.by_parts(local, _LIKELY))[:count]
 
-    def fitting(self, part: Mesh, likely: list[Near]) -> list[Near]:
-        """Of the originals of which a part looks like this one, those that it fits best first."""
-        likely = likely[:_LIKELY]
-        references = []
+    def fitting(self, piece: Mesh, likely: Sequence[Near]) -> list[Near]:
+        """The originals that a part fits, that which it fits best first.
+
+        Args:
+            piece: the part.
+            likely: originals of which a part looks like this one: a few of different shapes are tried, and then those
+                that look like the ones it fits.
+        """
+        if not likely or not len(piece.faces):
+            return []
+        part = Part(piece)
+        references, known = [], []
         for near in self.index.unlike(likely, _REFERENCES):
             with suppress(JaxmarkError):  # its file is missing
                 references.append(self.catalogue.load(near.shape))
-        off = fit_part(part, references, [self._points(near.shape) for near in likely])
-        best = np.argsort(off, kind="stable")
-        return [Near(likely[place].shape, float(off[place])) for place in best if np.isfinite(off[place])]
+                known.append(near.shape)
+        poses: dict[int, list[Pose]] = {}
+        for placed in part.place(references):
+            for shape in self.index.like(known[placed.reference], _KIN):
+                poses.setdefault(shape, []).append(placed.pose)
+        off = part.fit({shape: self._points(shape) for shape in poses}, poses)
+        return [Near(shape, off[shape]) for shape in sorted(off, key=off.__getitem__)]
 
     def _points(self, shape: int) -> Points:
         """The points that are kept of an original."""
@@ -249,7 +269,7 @@ class Finder:
         """
         known: set[int] = set()
         is_whole = False
-        for by, look in (("whole", self.wholes), ("part", self.parts)):
+        for by, look in (("landmarks", self.meshed_alike), ("whole", self.wholes), ("part", self.parts)):
             for number, near in enumerate([] if is_whole else look(piece.mesh, depth), 1):
                 query = "SELECT o.path, s.name FROM shapes s JOIN originals o ON o.id = s.original WHERE s.id = ?"
                 found = self.catalogue.database.rows(query, near.shape)

@@ -1,29 +1,35 @@
 """Bring a part of a shape onto many originals, to tell which of those that look alike it was cut from.
 
 Local shape gives poses of the part on a few originals of different shape (`jaxmark.alignment.features`). Near
-duplicates have much the same frame, so that the poses which fit best are tried on all candidates, and improved by
-trimmed distances along normals (Chetverikov et al. 2005) to the points that the catalogue keeps. The scale may change
-by a tenth only: anything fits when it is small enough.
+duplicates have much the same frame, so that the poses which fit best are tried on those that look like these originals,
+and improved by trimmed distances along normals (Chetverikov et al. 2005) to the points that the catalogue keeps. The
+scale may change by a tenth only: anything fits when it is small enough.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import KDTree
 
-from jaxmark.alignment.features import poses_by_features
+from jaxmark.alignment.features import FeatureSettings, poses_by_features
 from jaxmark.alignment.registration import poses_by_axes
 from jaxmark.catalogue import descriptors
+from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.pose import Points, Pose
 from jaxmark.geometry.surfaces import Surface
 
 _SAMPLES = 300  # points of the part
 _POSES = 3  # of each hand and reference
-_KEPT_POSES = 3  # that are tried on all candidates
+_KEPT_POSES = 2  # of each reference that is kept
+_KEPT_REFERENCES = 3  # those that a part fits best
+_CLOSE = 40  # candidates that a part is fitted to as well as it can be
+_FEATURES = FeatureSettings(points=2000, radius=0.15)  # coarser than for alignment, which is enough here, and faster
 _ROUNDS, _FIRST_ROUNDS = 10, 4
 _WHOLE_REFERENCES = 2  # originals by which poses of a whole shape are found
+_WHOLE_POSES = 3  # that are tried on all candidates
 _KEPT_SHARE = 0.8  # of the closest pairs in each round
 _COUNTED_SHARE = 0.9  # of distances in the result
 _FAR = 0.15  # the most that a distance counts, in an original's mean distances to its centre
@@ -69,43 +75,62 @@ class Target:
         return float(height[: max(1, int(_COUNTED_SHARE * len(height)))].mean())
 
 
-def fit_part(
-    part: Mesh, references: Sequence[Mesh], candidates: Sequence[Points]
-) -> Float64[np.ndarray, " candidates"]:
-    """Find how well a part fits each of many originals: the distance that it leaves, in mean distances to the centre.
+class Placed(NamedTuple):
+    """A pose of a part on a reference."""
 
-    Args:
-        part: with an extent.
-        references: a few of the originals, by which poses are found.
-        candidates: points kept of each original, from `descriptors.few_points`.
-    """
-    seen = descriptors.spread(part, _SAMPLES)
-    if seen is None or not len(part.faces):
-        return np.full(len(candidates), np.inf)
-    found: list[tuple[float, Pose]] = []
-    for reference in references:
-        points, centre, size = descriptors.centred(reference)
-        target = Target(points)
-        unit = Mesh((np.asarray(reference.vertices) - centre) / (size * _UNIT), reference.faces)
-        for pose in poses_by_features(Surface(unit), Surface(part), _POSES):
-            found.append(target.fit(seen.points, Pose(_UNIT * pose.matrix, _UNIT * pose.shift)))
-    return _tried_on_all(seen.points, found, candidates)
+    off: float  # the distance that it leaves
+    reference: int  # its number
+    pose: Pose
 
 
-def _tried_on_all(
-    points: Points, found: list[tuple[float, Pose]], candidates: Sequence[Points]
-) -> Float64[np.ndarray, " candidates"]:
-    """The least distance that the best of some poses leave on each original."""
-    poses = [pose for _, pose in sorted(found, key=lambda end: end[0])[:_KEPT_POSES]]
-    off = np.full(len(candidates), np.inf)
-    for place, kept in enumerate(candidates):
-        target = Target(kept)
-        off[place] = min((target.fit(points, pose)[0] for pose in poses), default=np.inf)
-    return off
+class Part:
+    """A part of a shape, ready to be fitted."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        """Spread points over it.
+
+        Raises:
+            JaxmarkError: if it has no faces with an extent.
+        """
+        seen = descriptors.spread(mesh, _SAMPLES)
+        if seen is None or not len(mesh.faces):
+            raise JaxmarkError("A part without a surface fits nothing; it is compared as a whole.")
+        self.points, self._surface = seen.points, Surface(mesh)
+
+    def place(self, references: Iterable[Mesh]) -> list[Placed]:
+        """Find poses of the part on the few of some originals that it fits best, the best first."""
+        found: list[list[Placed]] = []
+        for number, reference in enumerate(references):
+            points, centre, size = descriptors.centred(reference)
+            target = Target(points)
+            unit = Surface(Mesh((np.asarray(reference.vertices) - centre) / (size * _UNIT), reference.faces))
+            poses = poses_by_features(unit, self._surface, _POSES, settings=_FEATURES)
+            starts = (Pose(_UNIT * pose.matrix, _UNIT * pose.shift) for pose in poses)
+            fits = sorted((target.fit(self.points, start) for start in starts), key=lambda end: end[0])
+            found.append([Placed(off, number, pose) for off, pose in fits[:_KEPT_POSES]])
+        found = sorted(filter(None, found), key=lambda poses: poses[0].off)[:_KEPT_REFERENCES]
+        return [placed for poses in found for placed in poses]
+
+    def fit(self, candidates: Mapping[int, Points], poses: Mapping[int, Sequence[Pose]]) -> dict[int, float]:
+        """Find the least distances that poses leave on some originals, in their mean distances to their centres.
+
+        Args:
+            candidates: the points that are kept of each original, from `descriptors.centred`, by its number.
+            poses: on originals that look like it.
+        """
+        found = {
+            number: min(
+                (Target(points).fit(self.points, pose, _FIRST_ROUNDS) for pose in poses[number]), key=lambda end: end[0]
+            )
+            for number, points in candidates.items()
+        }
+        close = sorted(found, key=lambda number: found[number][0])[:_CLOSE]
+        again = {number: Target(candidates[number]).fit(self.points, found[number][1])[0] for number in close}
+        return {number: off for number, (off, _) in found.items()} | again
 
 
 def fit_whole(shape: Mesh, candidates: Sequence[Points]) -> Float64[np.ndarray, " candidates"]:
-    """Find how well a whole shape fits each of several originals, the likeliest first; see `fit_part`.
+    """Find how well a whole shape fits each of several originals, the likeliest first; see `Part.fit`.
 
     Its principal axes are brought onto those of the first ones.
     """
@@ -117,7 +142,12 @@ def fit_whole(shape: Mesh, candidates: Sequence[Points]) -> Float64[np.ndarray, 
         target = Target(points)
         starts = poses_by_axes(points, few)
         found += [target.fit(few, pose, rounds=_FIRST_ROUNDS) for pose in starts]
-    return _tried_on_all(few, found, candidates)
+    poses = [pose for _, pose in sorted(found, key=lambda end: end[0])[:_WHOLE_POSES]]
+    off = np.full(len(candidates), np.inf)
+    for place, points in enumerate(candidates):
+        target = Target(points)
+        off[place] = min((target.fit(few, pose)[0] for pose in poses), default=np.inf)
+    return off
 
 
 def _scale(pose: Pose) -> float:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxmark.catalogue import descriptors
+from jaxmark.catalogue.landmarks import KEPT, MOST, landmarks
 from jaxmark.catalogue.thumbnails import thumbnail
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import Scene, load_mesh, load_scene
@@ -32,6 +33,7 @@ class Shape:
     whole: bytes  # descriptor of the whole shape
     parts: bytes  # descriptors of balls about points of it
     points: bytes  # points spread over it
+    landmarks: bytes  # vertices that are known by their surroundings
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,9 @@ def describe(name: str, mesh: Mesh) -> Shape | None:
     geometry, exact = geometries(mesh)
     whole, parts = descriptors.whole(seen), local.describe()
     parts = parts[np.arange(descriptors.CENTRES) % len(parts)]  # a cloud may have fewer points
+    points, centre, size = descriptors.centred(mesh)
+    known = landmarks(mesh)[:MOST]
+    known["place"] = (known["place"] - centre) / size
     return Shape(
         name,
         geometry,
@@ -131,7 +136,8 @@ def describe(name: str, mesh: Mesh) -> Shape | None:
         len(mesh.faces),
         whole.astype("<f2").tobytes(),
         parts.astype("<f2").tobytes(),
-        descriptors.centred(mesh)[0].astype("<f2").tobytes(),
+        points.astype("<f2").tobytes(),
+        known.astype(KEPT).tobytes(),
     )
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from jaxmark.catalogue import descriptors
 from jaxmark.catalogue.database import Database
+from jaxmark.catalogue.landmarks import KEPT, LandmarkIndex, is_whole
 from jaxmark.errors import JaxmarkError
 
 #: Shares of an original's area that a part may have; a ball's radius is within a twentieth for those between.
@@ -27,7 +28,7 @@ class Near(NamedTuple):
 
 
 class Index:
-    """The descriptors of all meshes in a catalogue, in memory: about 8 kilobytes each."""
+    """The descriptors of all meshes in a catalogue, in memory: about 20 kilobytes each."""
 
     def __init__(self, database: Database) -> None:
         """Read the descriptors.
@@ -39,19 +40,33 @@ class Index:
         count, sizes = self.state[0], (descriptors.WHOLE_SIZE, descriptors.CENTRES * descriptors.LOCAL_SIZE)
         self.shapes = np.empty(count, np.int64)
         self._whole, self._parts = (np.empty((count, size), "<f2") for size in sizes)
-        rows = database.each("SELECT id, described, whole, parts FROM shapes ORDER BY id LIMIT ?", count)
+        landmarks: list[np.ndarray] = []
+        rows = database.each("SELECT id, described, whole, parts, landmarks FROM shapes ORDER BY id LIMIT ?", count)
         place = -1
         for place, row in enumerate(rows):
             if row["described"] != descriptors.VERSION:
                 raise JaxmarkError("The originals were described by another jaxmark; add their files again.")
             if any(len(row[name]) != 2 * size for name, size in zip(("whole", "parts"), sizes, strict=True)):
                 raise JaxmarkError(f"The catalogue {database.path} is damaged: a descriptor is not whole.")
+            if not is_whole(row["landmarks"]):
+                raise JaxmarkError(f"The catalogue {database.path} is damaged: landmarks are not whole.")
             self.shapes[place] = row["id"]
+            landmarks.append(np.frombuffer(row["landmarks"], KEPT))
             for array, name in ((self._whole, "whole"), (self._parts, "parts")):
                 array[place] = np.frombuffer(row[name], "<f2")
         if place < 0:
             raise JaxmarkError(f"The catalogue {database.path} is empty; add originals first.")
         self.shapes, self._whole, self._parts = (a[: place + 1] for a in (self.shapes, self._whole, self._parts))
+        self._landmarks = LandmarkIndex(landmarks)
+
+    def by_landmarks(self, seen: np.ndarray) -> list[Near]:
+        """The originals with the meshing of a suspect, those on which it fits best first; none if it was meshed anew.
+
+        Args:
+            seen: from `landmarks.landmarks`.
+        """
+        off = self._landmarks.off(seen)
+        return [Near(int(self.shapes[place]), off[place]) for place in sorted(off, key=off.__getitem__)]
 
     def by_whole(self, shape: Float[np.ndarray, " numbers"], count: int) -> list[Near]:
         """The originals whose whole shape is most similar, the most similar first.
@@ -70,6 +85,11 @@ class Index:
         Each ball about a point of the part is compared with all balls of each original; the nearest one counts.
         """
         return self._nearest(self._off_parts(part), count)
+
+    def like(self, shape: int, count: int) -> list[int]:
+        """The originals whose whole shape is most like that of one of them, itself first."""
+        (place,) = np.flatnonzero(self.shapes == shape)
+        return [near.shape for near in self.by_whole(self._whole[place].astype(np.float32), count)]
 
     def unlike(self, near: Sequence[Near], count: int) -> list[Near]:
         """Some of the originals that look like a suspect, the first of each kind of shape first."""

@@ -48,6 +48,17 @@ def matching_vertices(mesh: Mesh, other: Mesh) -> Int64[np.ndarray, " vertices"]
     return _spread(found, corners, wanted, apexes, mine.valence, theirs.valence)
 
 
+def distinct_vertices(mesh: Mesh, rings: int) -> tuple[Int64[np.ndarray, " distinct"], UInt64[np.ndarray, " distinct"]]:
+    """Vertices whose neighbourhoods of so many rings no other vertex has, and their colours, in the colours' order."""
+    grown = Rings(mesh)
+    colours = np.zeros(len(mesh.vertices), np.uint64)
+    for _ in range(rings):
+        colours = grown.grow()
+    found = _unique(colours)
+    found = found[used_vertices(mesh)[found]]
+    return found, colours[found]
+
+
 class Rings:
     """Colours of a mesh's vertices, by neighbourhoods that grow ring by ring."""
 
