@@ -65,7 +65,7 @@ def _both_ways(inside: Values, power: Values) -> Values:
 
 # The mean of a uniform variable's power k is 1/(k + 1) (eq. 7), the variance of one about 0 is 1/(2k + 1) (eq. 14).
 MEAN = Statistic("cho", 1 / 2, lambda inside, power: inside**power, lambda bins, inside: bins.mean(inside))
-VARIANCE = Statistic("cho variance", 1 / 3, _both_ways, lambda bins, inside: bins.mean((2 * inside - 1) ** 2))
+VARIANCE = Statistic("cho-variance", 1 / 3, _both_ways, lambda bins, inside: bins.mean((2 * inside - 1) ** 2))
 
 
 def cho(bits: int) -> Method:
@@ -119,7 +119,9 @@ def _bins(distance: Values, count: int) -> Bins:
     return Bins(place, (distance - low[place]) / width[place], low, high)
 
 
-def _mapped(points: Points, centre: Points, statistic: Statistic, written: Bits, strength: float) -> Points:
+def _mapped(
+    points: Points, centre: Float64[np.ndarray, " 3"], statistic: Statistic, written: Bits, strength: float
+) -> Points:
     """Points whose distances to a centre have been mapped, in each bin by its power."""
     arm = points - centre
     distance = np.linalg.norm(arm, axis=1)

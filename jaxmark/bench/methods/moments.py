@@ -6,14 +6,14 @@ of order zero) is quantised by a keyed scalar Costa scheme, by a smooth deformat
 it is. All moments are integrals over triangles, cut where patches meet, and do not depend on how the surface is meshed.
 
 Chosen here, where the publication is silent or was not at hand. What is quantised is the logarithm of the volume, in
-units of the whole. The ends of the grid are at a multiple of the standard deviation along the axis, instead of at the
-last vertices, which noise moves. The two axes of the most skewness point where that is positive, the third one is
-right-handed. Points move along their normals, under a mask that falls to zero at the patch's rim and two odd ones that
-compensate the pose; of all deformations with the wanted moments that is the least, by squares over the surface, found
-by Newton's method about what the reader would see. Patches that are nearly large enough to carry a bit are made
-smaller. The strength is the quantisation step. As in the publication, the reader may know it; where it does not, it
-tries all that the writer may choose from. The score is the agreement of the moments with the quantiser's cells, whose
-places the key draws at random, in standard deviations of what another key finds.
+units of the whole. The grid divides the axis evenly between the surface's ends, and the circle about it. The two axes
+of the most skewness point where that is positive, the third one is right-handed. Points move along their normals, under
+a mask that falls to zero at the patch's rim and two odd ones that compensate the pose; of all deformations with the
+wanted moments that is the least, by squares over the surface, found by Newton's method about what the reader would see.
+Patches that are nearly large enough to carry a bit are kept smaller. The strength is the quantisation step. As in the
+publication, the reader may know it; where it does not, it tries all that the writer may choose from. The score is the
+agreement of the moments with the quantiser's cells, whose places the key draws at random, in standard deviations of
+what another key finds.
 """
 
 import math
@@ -36,7 +36,6 @@ SOURCE = "Wang, Lavoué, Denis, Baskurt, Computers & Graphics 35 (1), 2011"
 STEPS = tuple(0.128 * 2 ** (-place / 4) for place in range(25))  # of the quantiser, in logarithms of volume
 _SECTORS = 8  # around the axis; even, so that planes through the axis cut them
 _SPARE = 1.4  # patches for each bit
-_END = 1.6  # standard deviations along the axis where the first and the last slab end, which go on for ever
 _COSTA = 0.8  # share of the way to the quantiser's value
 _RIM = 0.35  # share of a patch's width, on either side, where the mask rises
 _AXIS = 0.1  # distance from the axis, in units of the volume's cube root, where the mask is a half
@@ -51,7 +50,7 @@ class Posed(NamedTuple):
     mesh: Mesh  # with normals outwards, along the axis, of volume 1
     size: float  # the length of one unit, in the units of the mesh as it was
     frame: Float64[np.ndarray, "3 3"]  # the pose's axes there, in columns
-    ends: float  # standard deviations along the axis
+    ends: tuple[float, float]  # of the surface along the axis
     slabs: int
 
     @property
@@ -128,11 +127,13 @@ def _posed(mesh: Mesh, slabs: int) -> Posed:
     sign[least] *= np.sign(np.linalg.det(axes * sign))
     size, frame = abs(found.mass) ** (1 / 3), axes * sign
     turned = Mesh(points @ frame / size, faces if found.mass > 0 else faces[:, ::-1])
-    return Posed(turned, size * length, frame, float(_END * np.sqrt(variance[2]) / size), slabs)
+    return Posed(
+        turned, size * length, frame, (float(turned.vertices[:, 0].min()), float(turned.vertices[:, 0].max())), slabs
+    )
 
 
-def _places(points: Points, ends: float, slabs: int) -> tuple[np.ndarray, np.ndarray]:
-    along = 1 + (points[:, 0] + ends) * (slabs - 2) / (2 * ends)
+def _places(points: Points, ends: tuple[float, float], slabs: int) -> tuple[np.ndarray, np.ndarray]:
+    along = (points[:, 0] - ends[0]) * slabs / (ends[1] - ends[0])
     return along, (np.arctan2(points[:, 2], points[:, 1]) / (2 * np.pi) + 0.5) * _SECTORS
 
 
@@ -146,7 +147,7 @@ def _volumes(seen: Posed) -> Cells:
     triangles = np.asarray(seen.mesh.vertices)[np.asarray(seen.mesh.faces)]
     for turn in np.pi * 2 * np.arange(_SECTORS // 2) / _SECTORS:
         triangles = _cut(triangles, np.array([0, -np.sin(turn), np.cos(turn)]), 0.0)
-    for height in np.linspace(-seen.ends, seen.ends, seen.slabs - 1):
+    for height in np.linspace(*seen.ends, seen.slabs + 1)[1:-1]:
         triangles = _cut(triangles, np.array([1.0, 0, 0]), height)
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     middle = (a + b + c) / 3
@@ -196,8 +197,8 @@ def _target(volumes: Cells, written: Bits, key: bytes, step: float) -> Cells:
     target[chosen] = value + _COSTA * (nearest - value)
     # What is not chosen stays below, so that the reader chooses the same.
     most = target[chosen].min() - step / 2
-    rest = np.isnan(target) & (volumes > math.exp(most))
-    target[rest] = most
+    rest = np.isnan(target) & (volumes > math.exp(most - step))
+    target[rest] = np.minimum(np.log(volumes[rest]), most)
     return target
 
 
@@ -206,14 +207,12 @@ def _deformation(seen: Posed, volumes: Cells, change: Cells, fixed: np.ndarray) 
     points, (along, around) = np.asarray(seen.mesh.vertices), seen.places
     area = per_point(seen.mesh, np.linalg.norm(vector_areas(seen.mesh), axis=1))
     cell = _cell(along, around, seen.slabs)
-    # The outer halves of the first and the last slab have no end.
-    along = np.clip(along, 0.5, seen.slabs - 0.5)
     along, around = along - np.floor(along), around - np.floor(around)
     radius = np.hypot(points[:, 1], points[:, 2]) ** 2
     mask = _rise(along) * _rise(around) * radius / (radius + _AXIS**2)
     modes = mask[:, None] * np.stack([np.ones(len(mask)), np.sin(2 * np.pi * along), np.sin(2 * np.pi * around)], 1)
     x, y, z = points.T
-    pose = np.stack([x, y, z, x * y, y * z, z * x, x * x - (seen.ends / _END) ** 2])
+    pose = np.stack([x, y, z, x * y, y * z, z * x])
 
     def sums(weight: np.ndarray) -> Float64[np.ndarray, " unknowns"]:
         return np.concatenate([np.bincount(cell, area * weight * mode, len(volumes)) for mode in modes.T])

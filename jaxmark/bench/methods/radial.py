@@ -118,7 +118,7 @@ def _least(seen: Radii, wanted: Float64[np.ndarray, " bits"], active: Bool[np.nd
     def sums(values: Values) -> Float64[np.ndarray, " bits"]:
         return np.where(active, np.bincount(seen.place, values, bits + 1)[:bits], 0)
 
-    def at(multipliers: Float64[np.ndarray, " bits+3"]) -> tuple[Values, Float64[np.ndarray, " bits+3"]]:
+    def at(multipliers: Float64[np.ndarray, " multipliers"]) -> tuple[Values, Float64[np.ndarray, " multipliers"]]:
         shift = np.clip(np.append(multipliers[:bits], 0)[seen.place] + ray @ multipliers[bits:], low, high)
         return shift, np.append(sums(weight * shift) - wanted, (weight * shift) @ ray)
 
