@@ -1,0 +1,1 @@
+"""Methods of the literature, one a module, as the benchmark takes them."""

@@ -1,0 +1,141 @@
+"""Cho, Prost, Jung, "An oblivious watermarking for 3-D polygonal meshes using distribution of vertex norms", 2007.
+
+IEEE Transactions on Signal Processing 55 (1), 142-155. The distances of vertices to their centre are sorted into as
+many bins of equal width as there are bits. In each, distances are brought to the unit interval by the smallest and the
+largest one there, and raised to a power of which their mean (method I) or their variance (method II) lies above or
+below that of a uniform distribution by the strength. The reader compares it with that of the uniform distribution.
+
+Chosen here, where the publication is silent. Powers are found by bisection, instead of in steps of 0.001. The centre
+is the one that the reader will find, by a few rounds, as a mark moves it. Copies of a point count once. Bits are
+scattered by a key. There is no detector: the score is the margin that three bits in four exceed, which does not depend
+on the key.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from jaxmark.bench.method import Bits, Method, Reading
+from jaxmark.bench.methods.keyed import gather, scatter
+from jaxmark.bench.methods.surface import skin
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.pose import Points
+
+SOURCE = "Cho, Prost, Jung, IEEE Transactions on Signal Processing 55 (1), 2007"
+_ROUNDS, _STILL = 30, 1e-12  # of finding the centre; its motion, over the largest distance, that ends them
+_HALVINGS = 50  # of the interval of a power
+_POWERS = (1 / 64, 64.0)  # between which one is sought
+_SURE = 0.25  # quantile of the margins
+
+Values = Float64[np.ndarray, " points"]
+PerBin = Float64[np.ndarray, " bins"]
+
+
+class Bins(NamedTuple):
+    """Distances by bins, in the unit interval of each."""
+
+    place: Int64[np.ndarray, " points"]  # the bin of each point
+    inside: Values  # 0 at the smallest distance of its bin, 1 at the largest
+    low: PerBin
+    high: PerBin
+
+    def mean(self, values: Values) -> PerBin:
+        """The mean of some values in each bin; 0 in an empty one."""
+        count = np.bincount(self.place, minlength=len(self.low))
+        return np.bincount(self.place, values, len(self.low)) / np.maximum(count, 1)
+
+
+class Statistic(NamedTuple):
+    """What carries a bit: the mean of a bin, or its variance."""
+
+    name: str
+    uniform: float  # of the uniform distribution
+    raised: Callable[[Values, Values], Values]  # values in the unit interval, by powers
+    of: Callable[[Bins, Values], PerBin]
+
+
+def _both_ways(inside: Values, power: Values) -> Values:
+    """Values about the middle of their interval, raised by their distance from it (eq. 13)."""
+    about = 2 * inside - 1
+    return (1 + np.sign(about) * np.abs(about) ** power) / 2
+
+
+# The mean of a uniform variable's power k is 1/(k + 1) (eq. 7), the variance of one about 0 is 1/(2k + 1) (eq. 14).
+MEAN = Statistic("cho", 1 / 2, lambda inside, power: inside**power, lambda bins, inside: bins.mean(inside))
+VARIANCE = Statistic("cho-variance", 1 / 3, _both_ways, lambda bins, inside: bins.mean((2 * inside - 1) ** 2))
+
+
+def cho(bits: int) -> Method:
+    """Method I, by means; strengths are shifts of a bin's mean, over its width."""
+    return _method(MEAN, bits, (1e-4, 0.3))
+
+
+def cho_variance(bits: int) -> Method:
+    """Method II, by variances; strengths are shifts of the variance of a bin that reaches from -1 to 1."""
+    return _method(VARIANCE, bits, (1e-4, 0.3))
+
+
+def _method(statistic: Statistic, bits: int, strengths: tuple[float, float]) -> Method:
+    def embed(mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
+        body = skin(mesh)
+        points = np.asarray(body.mesh.vertices)
+        written = scatter(np.asarray(message, bool), key, statistic.name)
+        centre = points.mean(axis=0)
+        for _ in range(_ROUNDS):
+            marked = _mapped(points, centre, statistic, written, strength)
+            before, centre = centre, marked.mean(axis=0)
+            if np.linalg.norm(centre - before) <= _STILL * np.abs(points - centre).max():
+                break
+        return body.moved(marked)
+
+    def read(suspect: Mesh, key: bytes, original: Mesh | None = None) -> Reading:
+        points = np.asarray(skin(suspect).mesh.vertices)
+        bins = _bins(np.linalg.norm(points - points.mean(axis=0), axis=1), bits)
+        margin = statistic.of(bins, bins.inside) - statistic.uniform
+        margin[bins.high == bins.low] = 0
+        return Reading(gather(margin > 0, key, statistic.name), float(np.quantile(np.abs(margin), _SURE)))
+
+    return Method(statistic.name, embed, read, True, bits, strengths, SOURCE)
+
+
+def _bins(distance: Values, count: int) -> Bins:
+    """Sort distances into bins (eq. 3-5).
+
+    Raises:
+        JaxmarkError: if all points are equally far from their centre.
+    """
+    least, most = distance.min(), distance.max()
+    if not most > least:
+        raise JaxmarkError("All points are equally far from their centre, so that nothing can be written there.")
+    place = np.minimum(((distance - least) / (most - least) * count).astype(np.int64), count - 1)
+    low, high = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(low, place, distance)
+    np.maximum.at(high, place, distance)
+    low, high = np.where(np.isfinite(low), low, 0), np.where(np.isfinite(high), high, 0)
+    width = np.where(high > low, high - low, 1)
+    return Bins(place, (distance - low[place]) / width[place], low, high)
+
+
+def _mapped(
+    points: Points, centre: Float64[np.ndarray, " 3"], statistic: Statistic, written: Bits, strength: float
+) -> Points:
+    """Points whose distances to a centre have been mapped, in each bin by its power."""
+    arm = points - centre
+    distance = np.linalg.norm(arm, axis=1)
+    bins = _bins(distance, len(written))
+    # A statistic falls with the power. One that is beyond its target already is left as it is.
+    now = statistic.of(bins, bins.inside)
+    up, down = statistic.uniform + strength, statistic.uniform - strength
+    target = np.where(written, np.maximum(now, up), np.minimum(now, down))
+    low, high = np.log(np.full((2, len(written)), np.array(_POWERS)[:, None]))
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        above = statistic.of(bins, statistic.raised(bins.inside, np.exp(middle)[bins.place])) > target
+        low, high = np.where(above, middle, low), np.where(above, high, middle)
+    power = np.where(target == now, 1.0, np.exp((low + high) / 2))
+    inside = statistic.raised(bins.inside, power[bins.place])
+    wanted = bins.low[bins.place] + (bins.high - bins.low)[bins.place] * inside
+    return centre + arm * (wanted / np.where(distance > 0, distance, 1))[:, None]

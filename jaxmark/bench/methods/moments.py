@@ -1,0 +1,238 @@
+"""Wang, Lavoué, Denis, Baskurt, "Robust and blind mesh watermarking based on volume moments", 2011.
+
+Computers & Graphics 35 (1), 1-19. A closed surface is brought into a pose by its volume moments and cut into patches of
+a cylinder about its longest axis. The largest patches carry a bit each: the volume between patch and axis (its moment
+of order zero) is quantised by a keyed scalar Costa scheme, by a smooth deformation of the patch that leaves the pose as
+it is. All moments are integrals over triangles, cut where patches meet, and do not depend on how the surface is meshed.
+
+Chosen here, where the publication is silent or was not at hand. What is quantised is the logarithm of the volume, in
+units of the whole. The grid divides the axis evenly between the surface's ends, and the circle about it. The two axes
+of the most skewness point where that is positive, the third one is right-handed. Points move along their normals, under
+a mask that falls to zero at the patch's rim and two odd ones that compensate the pose; of all deformations with the
+wanted moments that is the least, by squares over the surface, found by Newton's method about what the reader would see.
+Patches that are nearly large enough to carry a bit are kept smaller. The strength is the quantisation step. As in the
+publication, the reader may know it; where it does not, it tries all that the writer may choose from. The score is the
+agreement of the moments with the quantiser's cells, whose places the key draws at random, in standard deviations of
+what another key finds.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from scipy.special import ive
+
+from jaxmark.bench.method import Bits, Method, Reading
+from jaxmark.bench.methods.keyed import gather, scatter, uniform
+from jaxmark.bench.methods.surface import per_point, skin, vector_areas
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh, check_faces, cross_product, vertex_normals
+from jaxmark.geometry.moments import volume_moments
+from jaxmark.geometry.pose import Points
+
+SOURCE = "Wang, Lavoué, Denis, Baskurt, Computers & Graphics 35 (1), 2011"
+STEPS = tuple(0.128 * 2 ** (-place / 4) for place in range(25))  # of the quantiser, in logarithms of volume
+_SECTORS = 8  # around the axis; even, so that planes through the axis cut them
+_SPARE = 1.4  # patches for each bit
+_COSTA = 0.8  # share of the way to the quantiser's value
+_RIM = 0.35  # share of a patch's width, on either side, where the mask rises
+_AXIS = 0.1  # distance from the axis, in units of the volume's cube root, where the mask is a half
+_ROUNDS, _NEAR = 15, 1e-3  # of Newton's method; the share of a step that ends it
+
+Cells = Float64[np.ndarray, " cells"]
+
+
+class Posed(NamedTuple):
+    """A closed surface in the pose and at the size of its volume moments."""
+
+    mesh: Mesh  # with normals outwards, along the axis, of volume 1
+    size: float  # the length of one unit, in the units of the mesh as it was
+    frame: Float64[np.ndarray, "3 3"]  # the pose's axes there, in columns
+    ends: tuple[float, float]  # of the surface along the axis
+    slabs: int
+
+    @property
+    def places(self) -> tuple[Float64[np.ndarray, " points"], Float64[np.ndarray, " points"]]:
+        """Where points are along and around the axis, counted in cells."""
+        return _places(np.asarray(self.mesh.vertices), self.ends, self.slabs)
+
+
+def moments(bits: int, steps: Sequence[float] = STEPS) -> Method:
+    """Quantised volumes of patches; strengths are the quantisation step, rounded down to one of `steps`.
+
+    Args:
+        bits: of a message.
+        steps: what the writer may choose from and the reader tries, descending; one alone where they agree on it.
+    """
+    slabs, tried = math.ceil(_SPARE * bits / _SECTORS), np.asarray(steps, float)
+
+    def embed(mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
+        body = skin(mesh)
+        points = np.asarray(body.mesh.vertices)
+        width = float(np.append(tried[tried <= strength * (1 + 1e-9)], tried[-1])[0])
+        target: Cells | None = None
+        for _ in range(_ROUNDS):
+            seen = _posed(body.mesh._replace(vertices=points), slabs)
+            volumes = _volumes(seen)
+            if target is None:
+                target = _target(volumes, scatter(np.asarray(message, bool), key, "moments"), key, width)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                off = np.where(np.isnan(target), 0, np.log(np.maximum(volumes, 0)) - target)
+            if np.abs(off).max() <= _NEAR * width:
+                break
+            height = _deformation(seen, volumes, -off, ~np.isnan(target))
+            points = points + seen.size * height[:, None] * vertex_normals(seen.mesh) @ seen.frame.T
+        return body.moved(points)
+
+    def read(suspect: Mesh, key: bytes, original: Mesh | None = None) -> Reading:
+        volumes = _volumes(_posed(skin(suspect).mesh, slabs))
+        chosen = _largest(volumes, bits)
+        known = volumes[chosen] > 0
+        value = np.log(np.where(known, volumes[chosen], 1))
+        dither = uniform(key, "moments", "dither", len(volumes))[chosen]
+        phase = 2 * np.pi * (value / tried[:, None] - dither)
+        agreement = (np.cos(2 * phase) * known).sum(axis=1)
+        best = int(np.argmax(agreement))
+        bound = _log10_tail(float(agreement[best]), int(known.sum())) + math.log10(len(tried))
+        score = float(agreement[best] / math.sqrt(max(known.sum(), 1) / 2))
+        return Reading(gather(np.cos(phase[best]) < 0, key, "moments"), score, min(bound, 0.0))
+
+    return Method("moments", embed, read, True, bits, (float(tried[-1]), float(tried[0])), SOURCE)
+
+
+def _posed(mesh: Mesh, slabs: int) -> Posed:
+    """Bring a surface into the pose of its volume moments.
+
+    Raises:
+        JaxmarkError: if it has no faces, or encloses nothing.
+    """
+    check_faces("The method moments", mesh)
+    points, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    middle, length = points.mean(axis=0), float(np.ptp(points, axis=0).max())
+    points = (points - middle) / length
+    found = volume_moments(points[faces])
+    if not abs(found.mass) > 1e-9:
+        raise JaxmarkError("This surface encloses no volume, and moments of volume are what the method writes in.")
+    variance, axes = np.linalg.eigh(found.covariance)
+    points, axes = points - found.centre, axes[:, ::-1]
+    # The third moment of a tetrahedron at the origin is its volume over 20, times h3 of its corners.
+    corners = (points @ axes)[faces]
+    volume = (corners[:, 0] * cross_product(corners[:, 1], corners[:, 2])).sum(axis=1) / 6
+    one, two, three = (np.sum(corners**power, axis=1) for power in (1, 2, 3))
+    skewness = volume @ ((one**3 + 3 * one * two + 2 * three) / 120) / found.mass / variance[::-1] ** 1.5
+    sign = np.where(skewness < 0, -1.0, 1.0)
+    least = int(np.argmin(np.abs(skewness)))
+    sign[least] *= np.sign(np.linalg.det(axes * sign))
+    size, frame = abs(found.mass) ** (1 / 3), axes * sign
+    turned = Mesh(points @ frame / size, faces if found.mass > 0 else faces[:, ::-1])
+    return Posed(
+        turned, size * length, frame, (float(turned.vertices[:, 0].min()), float(turned.vertices[:, 0].max())), slabs
+    )
+
+
+def _places(points: Points, ends: tuple[float, float], slabs: int) -> tuple[np.ndarray, np.ndarray]:
+    along = (points[:, 0] - ends[0]) * slabs / (ends[1] - ends[0])
+    return along, (np.arctan2(points[:, 2], points[:, 1]) / (2 * np.pi) + 0.5) * _SECTORS
+
+
+def _cell(along: np.ndarray, around: np.ndarray, slabs: int) -> Int64[np.ndarray, " places"]:
+    slab = np.clip(np.floor(along), 0, slabs - 1).astype(np.int64)
+    return slab * _SECTORS + np.minimum(around.astype(np.int64), _SECTORS - 1)
+
+
+def _volumes(seen: Posed) -> Cells:
+    """The volume between each patch and the axis: the flux of (0, y, z)/2, which no cut between patches has."""
+    triangles = np.asarray(seen.mesh.vertices)[np.asarray(seen.mesh.faces)]
+    for turn in np.pi * 2 * np.arange(_SECTORS // 2) / _SECTORS:
+        triangles = _cut(triangles, np.array([0, -np.sin(turn), np.cos(turn)]), 0.0)
+    for height in np.linspace(*seen.ends, seen.slabs + 1)[1:-1]:
+        triangles = _cut(triangles, np.array([1.0, 0, 0]), height)
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    middle = (a + b + c) / 3
+    flux = (cross_product(b - a, c - a)[:, 1:] * middle[:, 1:]).sum(axis=1) / 4
+    return np.bincount(_cell(*_places(middle, seen.ends, seen.slabs), seen.slabs), flux, seen.slabs * _SECTORS)
+
+
+def _cut(
+    triangles: Float64[np.ndarray, "faces 3 3"], normal: Float64[np.ndarray, " 3"], height: float
+) -> Float64[np.ndarray, "more 3 3"]:
+    """Triangles on one side of a plane each: those that it crosses are cut into three."""
+    side = triangles @ normal - height
+    crossed = (side > 0).any(axis=1) & (side < 0).any(axis=1)
+    part, side = triangles[crossed], side[crossed]
+    positive = side > 0
+    alone = np.argmax(positive ^ (positive.sum(axis=1) == 2)[:, None], axis=1)  # the corner alone on its side
+    order = (alone[:, None] + np.arange(3)) % 3
+    part = np.take_along_axis(part, order[:, :, None], axis=1)
+    side = np.take_along_axis(side, order, axis=1)
+    share = side[:, :1] / (side[:, :1] - side[:, 1:])
+    a, b, c = part[:, 0], part[:, 1], part[:, 2]
+    on_b, on_c = a + share[:, :1] * (b - a), a + share[:, 1:] * (c - a)
+    made = [np.stack(corners, axis=1) for corners in ((a, on_b, on_c), (on_b, b, c), (on_b, c, on_c))]
+    return np.concatenate([triangles[~crossed], *made])
+
+
+def _largest(volumes: Cells, bits: int) -> Int64[np.ndarray, " bits"]:
+    """The patches that carry bits, in the order of their places."""
+    return np.sort(np.argsort(-volumes, kind="stable")[:bits])
+
+
+def _target(volumes: Cells, written: Bits, key: bytes, step: float) -> Cells:
+    """The logarithms that volumes should have; NaN where any will do.
+
+    Raises:
+        JaxmarkError: if there are fewer patches than bits.
+    """
+    chosen = _largest(volumes, len(written))
+    if not volumes[chosen].min() > 0:
+        raise JaxmarkError(
+            f"This surface has {(volumes > 0).sum()} patches about its longest axis, fewer than the"
+            f" {len(written)} bits of the message; write fewer."
+        )
+    value, target = np.log(volumes[chosen]), np.full(len(volumes), np.nan)
+    offset = uniform(key, "moments", "dither", len(volumes))[chosen] + written / 2
+    nearest = step * (np.round(value / step - offset) + offset)
+    target[chosen] = value + _COSTA * (nearest - value)
+    # What is not chosen stays below, so that the reader chooses the same.
+    most = target[chosen].min() - step / 2
+    rest = np.isnan(target) & (volumes > math.exp(most - step))
+    target[rest] = np.minimum(np.log(volumes[rest]), most)
+    return target
+
+
+def _deformation(seen: Posed, volumes: Cells, change: Cells, fixed: np.ndarray) -> Float64[np.ndarray, " points"]:
+    """The least motion along normals that changes logarithms of volumes, and not the pose."""
+    points, (along, around) = np.asarray(seen.mesh.vertices), seen.places
+    area = per_point(seen.mesh, np.linalg.norm(vector_areas(seen.mesh), axis=1))
+    cell = _cell(along, around, seen.slabs)
+    along, around = along - np.floor(along), around - np.floor(around)
+    radius = np.hypot(points[:, 1], points[:, 2]) ** 2
+    mask = _rise(along) * _rise(around) * radius / (radius + _AXIS**2)
+    modes = mask[:, None] * np.stack([np.ones(len(mask)), np.sin(2 * np.pi * along), np.sin(2 * np.pi * around)], 1)
+    x, y, z = points.T
+    pose = np.stack([x, y, z, x * y, y * z, z * x])
+
+    def sums(weight: np.ndarray) -> Float64[np.ndarray, " unknowns"]:
+        return np.concatenate([np.bincount(cell, area * weight * mode, len(volumes)) for mode in modes.T])
+
+    own = np.concatenate([np.diag(part) for part in np.split(sums(np.ones(len(x))), 3)], axis=1)[fixed]
+    relative = own / np.maximum(volumes[fixed], 1e-9)[:, None] - sums(np.ones(len(x)))  # to the whole, which is 1
+    rows = np.concatenate([relative, [sums(row) for row in pose]])
+    cost = np.concatenate([np.bincount(cell, area * mode**2, len(volumes)) for mode in modes.T])
+    inverse = np.where(cost > 0, 1 / np.maximum(cost, 1e-300), 0)
+    wanted = np.append(change[fixed], np.zeros(len(pose)))
+    amplitude = inverse * (rows.T @ np.linalg.lstsq((rows * inverse) @ rows.T, wanted, rcond=1e-12)[0])
+    return (modes * amplitude.reshape(3, -1).T[cell]).sum(axis=1)
+
+
+def _rise(place: Float64[np.ndarray, " points"]) -> Float64[np.ndarray, " points"]:
+    """The mask across a patch: from 0 at its rims smoothly to 1."""
+    return (1 - np.cos(np.pi * np.minimum(np.minimum(place, 1 - place) / _RIM, 1))) / 2
+
+
+def _log10_tail(agreement: float, count: int) -> float:
+    """Chernoff's bound on the probability that as many cosines of random angles add up to this: E exp(λ cos) is I₀."""
+    rate = np.append(0.0, np.geomspace(1e-3, 1e4, 200))
+    return float(np.min(count * (np.log(ive(0, rate)) + rate) - rate * agreement)) / math.log(10)
