@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 import jaxmark as jm
+from jaxmark.bench.shapes import SHAPES
 from jaxmark.files.atomic import write_atomically
 from jaxmark.geometry.mesh import Mesh, compact, host_mesh, weld, weld_mesh
 from jaxmark.geometry.raster import Frame
@@ -23,7 +24,6 @@ from jaxmark.watermark.budget import VISIBILITY, Budget, make_budget, visibility
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser
 from common.marks import KEY, MESSAGE, write
-from common.shapes import SHAPES
 from common.tables import say
 
 SIZE = 270  # pixels

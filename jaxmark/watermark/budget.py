@@ -164,7 +164,7 @@ def write(
 
     rms = budget.rms or _MAX_RMS
     if budget.limits:
-        rms = _largest(limit_ratio, rms, first or first_rms(original.mesh), share)
+        rms = largest_within(limit_ratio, rms, first or first_rms(original.mesh), share)
         if budget.rms is None and rms == _MAX_RMS:
             raise JaxmarkError(
                 f"Moved by {_MAX_RMS:g} of its diagonal, this mesh still keeps {budget}; give a budget, too."
@@ -176,7 +176,9 @@ def write(
     return Written(marked, rms / size, reached)
 
 
-def _largest(within: Callable[[float], float], most: float, first: float, share: float = _MIN_LIMIT_SHARE) -> float:
+def largest_within(
+    within: Callable[[float], float], most: float, first: float, share: float = _MIN_LIMIT_SHARE
+) -> float:
     """Find the largest size, up to `most`, at which a rising function is at most 1; `share` of that will do.
 
     Secant steps in logarithms, because metrics are nearly powers of the size; each step stays between a size that fits
