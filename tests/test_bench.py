@@ -7,11 +7,13 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from scipy import stats
 
 import jaxmark as jm
+from jaxmark.app.bench import ManyValues
 from jaxmark.bench import Method, Reading, calibration, compositions, leagues, paired, quality
 from jaxmark.bench.corpus import corpus, known_hashes, make_member
 from jaxmark.bench.fitting import SHARE, fit
@@ -330,7 +332,7 @@ def test_a_run_of_ones_own_methods_is_calibrated_and_goes_on_where_it_was_ended(
     methods = {"methods": [SIGNS, plain], "limits": ["perceptual"]}
     found = jm.bench.run(**small, **methods, say=said.append)
     assert len(said) == 2 + 2 * (5 + 5) + 2
-    entries = found.entries()
+    entries = jm.bench.entries(found)
     assert set(entries) == {"signs", "plain"}
     part = entries["plain"]["payloads"]["64"]
     attacks = part["leagues"]["smi2010"]["limits"]["perceptual"]["attacks"]
@@ -348,18 +350,65 @@ def test_a_run_of_ones_own_methods_is_calibrated_and_goes_on_where_it_was_ended(
     assert entries["signs"]["payloads"]["64"]["calibration"]["bound"][0]["trials"] == 106
     assert entries["signs"]["validated"] == "not validated"
     again = jm.bench.run(**small, **methods, say=lambda line: pytest.fail(line))
-    assert again.entries() == entries
+    assert jm.bench.entries(again) == entries
     assert (
         found.paired("signs", "plain@" + next(n for n in found.methods if "@" in n).split("@")[1], "smi2010").both >= 1
     )
+
+
+def test_a_run_is_held_against_a_published_one(small: dict, plain: Path, tmp_path: Path):
+    found = jm.bench.run(**{**small, "attacks": ["none"], "keys": 1}, methods=[plain], limits=["perceptual"])
+    published = tmp_path / "readings.csv"
+    jm.bench.save_readings(found, published)
+    assert jm.bench.hold_against(found, published) == (1, ())
+    head, line = published.read_text().splitlines()
+    fields = line.split(",")
+    fields[head.split(",").index("read")] = "0"
+    published.write_text(f"{head}\n{','.join(fields)}\n")
+    shared, (difference,) = jm.bench.hold_against(found, published)
+    assert shared == 1
+    assert "read 1 here, 0 there" in difference
+    published.write_text("x\n1\n")
+    with pytest.raises(jm.JaxmarkError, match="holds no readings"):
+        jm.bench.hold_against(found, published)
+
+
+def test_names_that_no_league_has_are_refused(small: dict):
+    for wrong, sentence in (
+        ({"attacks": ["frost"]}, "no attack 'frost'; there are none, file"),
+        ({"limits": ["hidden"]}, "no set of limits 'hidden'; there are perceptual, geometric"),
+        ({"leagues": ["1999"]}, "no league '1999'; there are smi2010, 2026"),
+        ({"methods": ["nothing"]}, "no method 'nothing'"),
+        ({"meshes": ["nowhere.ply"]}, "nowhere.ply"),
+    ):
+        with pytest.raises(jm.JaxmarkError, match=sentence):
+            jm.bench.run(**{**small, **wrong})
+
+
+def test_methods_are_brought_to_the_same_visibility(small: dict, plain: Path):
+    table = jm.bench.equal_visibility(
+        small["meshes"], small["output"], methods=[SIGNS, plain], payloads=[8], shares=[1, 4]
+    )
+    assert [line[0] for line in table.lines] == ["signs", table.lines[1][0]]
+    noises = [[float(cell.split()[0]) for cell in line[2:]] for line in table.lines]
+    assert all(weak <= strong for weak, strong in noises)
+    assert noises[0][1] > 0
+
+
+def test_options_of_many_values_take_them_up_to_the_next_option():
+    command = ManyValues("x", params=[click.Option(["--many"], multiple=True), click.Argument(["rest"], nargs=-1)])
+    found = command.make_context("x", ["a", "--many", "b", "c d", "--many", "e", "--", "f"]).params
+    assert found == {"rest": ("a", "f"), "many": ("b", "c d", "e")}
 
 
 def test_a_method_that_fails_ends_nothing_but_its_cells(small: dict):
     def broken(suspect: Mesh, key: bytes, original: Mesh | None) -> Reading:
         raise ZeroDivisionError("oh")
 
-    found = jm.bench.run(**small, methods=[replace(SIGNS, read=broken)], limits=["perceptual"]).entries()["signs"]
-    one = found["payloads"]["64"]["leagues"]["smi2010"]["limits"]["perceptual"]["attacks"]["none"]
+    found = jm.bench.run(**small, methods=[replace(SIGNS, read=broken)], limits=["perceptual"])
+    one = jm.bench.entries(found)["signs"]["payloads"]["64"]["leagues"]["smi2010"]["limits"]["perceptual"]["attacks"][
+        "none"
+    ]
     assert one["notes"] == ["ZeroDivisionError: oh"]
     assert one["detected"] == 0
 

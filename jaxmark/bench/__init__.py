@@ -4,6 +4,8 @@
 """
 
 from jaxmark.bench.benchmark import run as run
+from jaxmark.bench.corpus import make_corpus as make_corpus
+from jaxmark.bench.equal import equal_visibility as equal_visibility
 from jaxmark.bench.fitting import Fitted as Fitted
 from jaxmark.bench.fitting import fit as fit
 from jaxmark.bench.leagues import LEAGUES as LEAGUES
@@ -17,4 +19,9 @@ from jaxmark.bench.page import save_page as save_page
 from jaxmark.bench.paired import Paired as Paired
 from jaxmark.bench.paired import compare_paired as compare_paired
 from jaxmark.bench.plugged import load_method as load_method
+from jaxmark.bench.repeat import Repetition as Repetition
+from jaxmark.bench.repeat import hold_against as hold_against
+from jaxmark.bench.repeat import save_readings as save_readings
 from jaxmark.bench.results import BenchResults as BenchResults
+from jaxmark.bench.summary import entries as entries
+from jaxmark.bench.summary import save_entries as save_entries

@@ -2,13 +2,14 @@
 
 from __future__ import annotations  # so that `help` shows names of types instead of what they stand for
 
-import hashlib
+import importlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
 from jaxmark.bench.calibration import RATE
 from jaxmark.bench.leagues import get_league
@@ -21,7 +22,6 @@ from jaxmark.evaluation import cells
 from jaxmark.evaluation.cells import Pool, processes
 from jaxmark.extras import require
 from jaxmark.files import load_mesh
-from jaxmark.files.reading import read_file
 from jaxmark.geometry.hashing import geometry_hash
 from jaxmark.geometry.mesh import Mesh
 
@@ -77,18 +77,19 @@ def run(
         )
     folder = Path(output)
     (folder / "meshes").mkdir(parents=True, exist_ok=True)
-    named = {_name_of(given): given for given in methods}
-    bench = Bench(folder / "meshes", _files(meshes, folder / "meshes"), named, keys)
+    named = {name_of(given): given for given in methods}
+    bench = Bench(folder / "meshes", named_files(meshes, folder / "meshes"), named, keys)
     made = {name: load_method(given, payloads[0]) for name, given in named.items()}
-    chosen = {league: _chosen(league, attacks) for league in leagues}
-    missing = {
-        (league, name): get_league(league).lines[name].missing() for league in leagues for name in chosen[league]
-    }
-    skipped = {f"{league}, {name}": gone for (league, name), gone in missing.items() if gone}
-    for name, gone in skipped.items():
-        say(f"skipped: {name}: {gone}")
-    there = {league: [name for name in chosen[league] if not missing[league, name]] for league in leagues}
-    bounds = {league: [one for one in get_league(league).limits if not limits or one in limits] for league in leagues}
+    _check_names("attack", attacks, [name for league in leagues for name in get_league(league).lines])
+    _check_names("set of limits", limits, [name for league in leagues for name in get_league(league).limits])
+    plans = {league: _plan(league, attacks, limits) for league in leagues}
+    skipped = {f"{league}, {name}": why for league, plan in plans.items() for name, why in plan.skipped.items()}
+    for name, why in skipped.items():
+        say(f"skipped: {name}: {why}")
+    if workers == 1:
+        # First imported in another thread, pymeshlab destroys the heap when Python ends.
+        for name in sorted({need for plan in plans.values() for need in plan.needs}):
+            importlib.import_module(name)
     if isinstance(workers, int):
         workers = processes(workers) if workers > 1 else partial(ThreadPoolExecutor, 1)
     # Seed by seed, so that a run that is ended has some of every mesh.
@@ -96,24 +97,24 @@ def run(
         Task(name, payload, league, "", mesh, seed, name, MARK)
         for seed, payload, league, mesh, name in product(range(seeds), payloads, leagues, bench.meshes, named)
     ]
-    marks = [task._replace(limits=one) for task in whole for one in bounds[task.league]]
-    suspects = [one for task in whole for one in _suspects(task, bounds[task.league], there[task.league], list(named))]
+    marks = [task._replace(limits=one) for task in whole for one in plans[task.league].limits]
+    suspects = [one for task in whole for one in _suspects(task, plans[task.league], list(named))]
     rows = []
     for part in (marks, suspects):
         rows += cells.run(part, partial(work, bench), workers, folder / ROWS, say, _told)
     return BenchResults(made, tuple(rows), skipped, rate)
 
 
-def _suspects(task: Task, bounds: Sequence[str], attacks: Sequence[str], methods: Sequence[str]) -> Iterator[Task]:
+def _suspects(task: Task, plan: _Plan, methods: Sequence[str]) -> Iterator[Task]:
     """What one method reads of one mesh in one seed: it unmarked and marked, and in the first seed others' marks."""
-    for attack in attacks:
+    for attack in plan.attacks:
         yield task._replace(source=UNMARKED, attack=attack)
-    for limits, attack in product(bounds, attacks):
+    for limits, attack in product(plan.limits, plan.attacks):
         yield task._replace(limits=limits, attack=attack)
-    if task.seed == 0 and bounds:
+    if task.seed == 0 and plan.limits:
         for other in methods:
             if other != task.method:
-                yield task._replace(limits=bounds[0], source=other, attack="none")
+                yield task._replace(limits=plan.limits[0], source=other, attack="none")
 
 
 def _told(cell: cells.Cell) -> str:
@@ -121,7 +122,7 @@ def _told(cell: cells.Cell) -> str:
     return f"{task.method}, {task.mesh}, {task.limits or task.source}, {task.attack}"
 
 
-def _name_of(given: Given) -> str:
+def name_of(given: Given) -> str:
     """What a method is called in cells: a file's by its content, too."""
     if isinstance(given, Method):
         return given.name
@@ -129,7 +130,7 @@ def _name_of(given: Given) -> str:
     return f"{path.stem}@{digest_of(path)}" if path.suffix in (".py", ".toml") else str(given)
 
 
-def _files(meshes: Sequence[str | os.PathLike[str]] | Mapping[str, Mesh], folder: Path) -> dict[str, Path]:
+def named_files(meshes: Sequence[str | os.PathLike[str]] | Mapping[str, Mesh], folder: Path) -> dict[str, Path]:
     """The files of meshes by names that tell their content; meshes that have none get one."""
     found: dict[str, Path] = {}
     if isinstance(meshes, Mapping):
@@ -141,27 +142,34 @@ def _files(meshes: Sequence[str | os.PathLike[str]] | Mapping[str, Mesh], folder
         return found
     for given in meshes:
         path = Path(given)
-        try:
-            digest = hashlib.sha256(read_file(path)).hexdigest()
-        except OSError as error:
-            raise JaxmarkError(f"Cannot read {path}: {error.strerror}.") from None
-        load_mesh(path)  # so that one that is refused is refused here
-        found[f"{path.stem}-{digest[:8]}"] = path.resolve()
+        found[f"{path.stem}-{geometry_hash(load_mesh(path)).hex()[:8]}"] = path.resolve()
     return found
 
 
-def _chosen(league: str, attacks: Sequence[str]) -> list[str]:
-    """The lines of a league that are named, by their names or the first words of them."""
-    every = list(get_league(league).lines)
-    if not attacks:
-        return every
-    found = [name for name in every if any(name == one or name.startswith(f"{one} ") for one in attacks)]
-    if not found:
-        raise JaxmarkError(
-            f"The league {league} has none of the attacks {', '.join(attacks)}; there are {', '.join(every)}."
-        )
-    return found
+class _Plan(NamedTuple):
+    """What of a league is run."""
+
+    attacks: Sequence[str]
+    limits: Sequence[str]
+    needs: frozenset[str]  # packages
+    skipped: Mapping[str, str]  # attacks that need what is not installed, and why
 
 
-def _gone(league: str, attack: str) -> str:
-    return get_league(league).lines[attack].missing()
+def _plan(league: str, attacks: Sequence[str], limits: Sequence[str]) -> _Plan:
+    """What of a league is named; all of it where nothing is."""
+    lines, bounds = get_league(league).lines, get_league(league).limits
+    wanted = [name for name in lines if not attacks or any(_fits(name, one) for one in attacks)]
+    skipped = {name: why for name in wanted if (why := lines[name].missing())}
+    there = [name for name in wanted if name not in skipped]
+    needs = frozenset(need for name in there for need in lines[name].needs)
+    return _Plan(there, [one for one in bounds if not limits or one in limits], needs, skipped)
+
+
+def _fits(name: str, given: str) -> bool:
+    """Whether a name is the one that is given, or begins with its words."""
+    return name == given or name.startswith((f"{given} ", f"{given},"))
+
+
+def _check_names(what: str, given: Sequence[str], every: Sequence[str]) -> None:
+    if unknown := [one for one in given if not any(_fits(name, one) for name in every)]:
+        raise JaxmarkError(f"There is no {what} {unknown[0]!r}; there are {', '.join(dict.fromkeys(every))}.")

@@ -7,8 +7,9 @@ import os
 from importlib import resources
 from itertools import cycle
 
-from jaxmark.bench.quality import RANGES, Point, curve
+from jaxmark.bench.quality import RANGES, curve
 from jaxmark.bench.results import BenchResults
+from jaxmark.bench.summary import points
 from jaxmark.bench.tables import tables
 from jaxmark.extras import require
 from jaxmark.files.atomic import write_atomically
@@ -58,12 +59,8 @@ def survival(results: BenchResults, league: str) -> Picture:
     panels = figure.subplots(1, len(RANGES), squeeze=False).ravel()
     for panel, metric in zip(panels, RANGES, strict=True):
         for name, colour, style in _lines(results):
-            points = [
-                Point(one.task.mesh, one.task.seed, one.task.attack, one.costs, results.detected(one))
-                for one in results.suspects
-                if (one.task.method, one.task.league) == (name, league)
-            ]
-            if (found := curve(points, metric)) is not None:
+            some = [one for one in results.suspects if (one.task.method, one.task.league) == (name, league)]
+            if (found := curve(points(results, some), metric)) is not None:
                 panel.plot(found.cost, found.success, style, color=colour, label=results.methods[name].name)
         panel.set(xscale="log", xlabel=metric.upper(), ylim=(-0.03, 1.03))
     panels[0].set_ylabel("share detected")

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from jaxmark.bench.results import BenchResults
+from jaxmark.bench.summary import NOT_VALIDATED, entries
 
-_UNVALIDATED = "not validated"
 Entries = Mapping[str, dict[str, Any]]
 
 
@@ -32,12 +32,12 @@ class Table(NamedTuple):
 
 def tables(results: BenchResults) -> list[Table]:
     """All tables of a benchmark."""
-    entries = results.entries()
-    several = len({payload for entry in entries.values() for payload in entry["payloads"]}) > 1
-    found = [_scores(entries), _calibrations(entries, results.rate)]
-    payloads = sorted({payload for entry in entries.values() for payload in entry["payloads"]}, key=int)
+    every = entries(results)
+    several = len({payload for entry in every.values() for payload in entry["payloads"]}) > 1
+    found = [_scores(every), _calibrations(every, results.rate)]
+    payloads = sorted({payload for entry in every.values() for payload in entry["payloads"]}, key=int)
     for payload in payloads:
-        some = {name: entry["payloads"][payload] for name, entry in entries.items() if payload in entry["payloads"]}
+        some = {name: entry["payloads"][payload] for name, entry in every.items() if payload in entry["payloads"]}
         for league, limits in dict.fromkeys(
             (league, limits)
             for one in some.values()
@@ -50,8 +50,8 @@ def tables(results: BenchResults) -> list[Table]:
                 if limits in one["leagues"].get(league, {"limits": {}})["limits"]
             }
             bits = f", {payload} bits" if several else ""
-            found += [_marks(f"{league}, {limits} limits{bits}: the marks", parts, entries)]
-            found += [_attacks(f"{league}, {limits} limits{bits}: what survives", parts, entries)]
+            found += [_marks(f"{league}, {limits} limits{bits}: the marks", parts, every)]
+            found += [_attacks(f"{league}, {limits} limits{bits}: what survives", parts, every)]
     found += list(_paired(results))
     if results.skipped:
         lines = [[name, why] for name, why in results.skipped.items()]
@@ -61,7 +61,7 @@ def tables(results: BenchResults) -> list[Table]:
 
 def _label(name: str, entry: Mapping[str, Any]) -> str:
     """A method's name, with a word on what is not validated, which stands in every table."""
-    return f"{name} ({_UNVALIDATED})" if entry["validated"] == _UNVALIDATED else name
+    return f"{name} ({NOT_VALIDATED})" if entry["validated"] == NOT_VALIDATED else name
 
 
 def _number(value: float | None, digits: int = 3) -> str:

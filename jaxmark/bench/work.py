@@ -71,12 +71,12 @@ def work(bench: Bench, cell: Cell) -> dict[str, Any]:
         except Exception as error:  # a stranger's method may raise anything, which ends nothing but its cell
             return {"note": f"Not marked: {_said(error)}", "seconds": time.perf_counter() - start}
         return {**found, "seconds": time.perf_counter() - start}
-    before = original = _load(bench.meshes[task.mesh])
+    before = original = load(bench.meshes[task.mesh])
     if task.source != UNMARKED:
         file = _file(bench, task.mark)
         if not file.exists():
             return {"note": "Not marked.", "readings": []}
-        before = _load(file)
+        before = load(file)
     line = get_league(task.league).lines[task.attack]
     try:
         suspects = line.suspects(before, task.seed)
@@ -93,23 +93,27 @@ def work(bench: Bench, cell: Cell) -> dict[str, Any]:
 
 def key_of(task: Task, name: str) -> bytes:
     """The key of that name on a mesh in a seed."""
-    return _derive(task, f"key/{name}", 32)
+    return draw((task.method, task.payload, task.mesh, task.seed), f"key/{name}", 32)
 
 
 def message_of(task: Task, bits: int) -> Bits:
     """The message of a mark, of so many bits."""
-    drawn = np.frombuffer(_derive(task, "message", -(-bits // 8)), np.uint8)
-    return np.unpackbits(drawn)[:bits].astype(bool)
+    return to_bits(draw((task.method, task.payload, task.mesh, task.seed), "message", bits), bits)
 
 
-def _derive(task: Task, label: str, size: int) -> bytes:
-    name = "/".join(("jaxmark/bench", label, task.method, str(task.payload), task.mesh, str(task.seed)))
-    return hashlib.shake_256(name.encode()).digest(size)
+def draw(place: tuple[object, ...], label: str, size: int) -> bytes:
+    """Bytes for a purpose in a place of the benchmark, always the same."""
+    return hashlib.shake_256("/".join(("jaxmark/bench", label, *map(str, place))).encode()).digest(size)
+
+
+def to_bits(drawn: bytes, bits: int) -> Bits:
+    """The first bits of some bytes."""
+    return np.unpackbits(np.frombuffer(drawn, np.uint8))[:bits].astype(bool)
 
 
 def _mark(bench: Bench, task: Task) -> dict[str, Any]:
     """Make the mark of a cell, and keep the mesh."""
-    mesh, method = _load(bench.meshes[task.mesh]), bench.method(task)
+    mesh, method = load(bench.meshes[task.mesh]), bench.method(task)
     bounds = get_league(task.league).bounds(task.limits, mesh)
     found = fit(method, mesh, message_of(task, method.bits), key_of(task, _OWN), bounds)
     keep_mesh(_file(bench, task), found.mesh)
@@ -130,7 +134,7 @@ def keep_mesh(path: Path, mesh: Mesh) -> None:
 
 
 @lru_cache(maxsize=4)
-def _load(path: Path) -> Mesh:
+def load(path: Path) -> Mesh:
     """A mesh of a file of any format, or of `keep_mesh`; the same arrays for whoever asks again."""
     if path.suffix != ".npz":
         return load_mesh(path)

@@ -2,6 +2,7 @@
 
 import importlib
 from collections.abc import Mapping
+from dataclasses import replace
 
 from jaxmark.bench.method import Method
 from jaxmark.errors import JaxmarkError
@@ -28,4 +29,5 @@ def get_method(name: str, bits: int) -> Method:
     if name not in METHODS:
         raise JaxmarkError(f"There is no method {name!r}; there are {', '.join(METHODS)}, and files of your own.")
     module, _, function = METHODS[name].partition(":")
-    return getattr(importlib.import_module(f"{_HERE}.{module}"), function)(bits)
+    made = getattr(importlib.import_module(f"{_HERE}.{module}"), function)(bits)
+    return replace(made, name=name)
