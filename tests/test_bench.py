@@ -324,30 +324,30 @@ def test_toml_files_that_declare_no_method_are_refused(tmp_path: Path):
 @pytest.fixture
 def small(tmp_path: Path) -> dict:
     pytest.importorskip("igl")
-    return {"meshes": {"ball": bumpy_sphere(2)}, "output": tmp_path / "out", "attacks": ["none", "noise"], "keys": 20}
+    return {"meshes": {"ball": bumpy_sphere(2)}, "output": tmp_path / "out", "attacks": ["none", "noise 0.001"], "keys": 40}
 
 
 def test_a_run_of_ones_own_methods_is_calibrated_and_goes_on_where_it_was_ended(small: dict, plain: Path):
     said: list[str] = []
     methods = {"methods": [SIGNS, plain], "limits": ["perceptual"]}
     found = jm.bench.run(**small, **methods, say=said.append)
-    assert len(said) == 2 + 2 * (5 + 5) + 2
+    assert len(said) == 2 + 2 * (2 + 2) + 2
     entries = jm.bench.entries(found)
     assert set(entries) == {"signs", "plain"}
     part = entries["plain"]["payloads"]["64"]
     attacks = part["leagues"]["smi2010"]["limits"]["perceptual"]["attacks"]
     assert attacks["none"]["read"] == attacks["none"]["trials"] == 1
     assert attacks["noise 0.001"]["published_bit_errors"] == {"cho": 0.03, "wang": 0.01}
-    assert 0 < attacks["noise 0.005"]["costs"]["mrms"] < 0.01
+    assert 0 < attacks["noise 0.001"]["costs"]["mrms"] < 0.002
     nulls = part["calibration"]["nulls"]
     assert {kind: one["trials"] for kind, one in nulls.items()} == {
-        "unmarked": 20,
-        "unmarked, attacked": 80,
-        "another key's mark": 5,
+        "unmarked": 40,
+        "unmarked, attacked": 40,
+        "another key's mark": 2,
         "another method's mark": 1,
     }
     assert entries["signs"]["payloads"]["64"]["calibration"]["verdicts"] == []
-    assert entries["signs"]["payloads"]["64"]["calibration"]["bound"][0]["trials"] == 106
+    assert entries["signs"]["payloads"]["64"]["calibration"]["bound"][0]["trials"] == 83
     assert entries["signs"]["validated"] == "not validated"
     again = jm.bench.run(**small, **methods, say=lambda line: pytest.fail(line))
     assert jm.bench.entries(again) == entries
