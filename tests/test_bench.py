@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -157,6 +158,15 @@ def test_a_mark_is_as_strong_as_limits_allow():
     found = fit(SIGNS, mesh, np.zeros(0, bool), KEY, {"rms": 1e-3})
     assert SHARE * 1e-3 <= found.reached["rms"] <= 1e-3
     assert found.tries <= 8
+
+    def careful(mesh: Mesh, message: np.ndarray, key: bytes, strength: float) -> Mesh:
+        if strength > 8e-4:
+            raise jm.JaxmarkError("too strong")
+        return embed_signs(mesh, message, key, strength)
+
+    assert (
+        0.9 * 8e-4 <= fit(replace(SIGNS, embed=careful), mesh, np.zeros(0, bool), KEY, {"rms": 1e-3}).strength <= 8e-4
+    )
     with pytest.raises(jm.JaxmarkError, match="Even the weakest mark"):
         fit(replace(SIGNS, strengths=(5e-3, 1e-2)), mesh, np.zeros(0, bool), KEY, {"rms": 1e-3})
 
@@ -197,6 +207,17 @@ def test_correlated_noise_has_its_variance_and_its_length():
     np.testing.assert_allclose(covariance[0], [1, np.exp(-1 / 8), np.exp(-81 / 8)], atol=0.1)
 
 
+@pytest.mark.slow
+def test_every_attack_of_2026_leaves_a_mesh():
+    """An attack that is not possible on this mesh would be refused."""
+    for package in ("igl", "pymeshlab", "skimage", "fast_simplification", "DracoPy"):
+        pytest.importorskip(package)
+    mesh = bumpy_sphere(3)
+    for name, line in leagues.LINES_2026.items():
+        for suspect in line.suspects(mesh, 1) if not line.family else ():
+            assert len(jm.make_mesh(suspect.vertices, suspect.faces).faces) > 50, name
+
+
 def test_attacks_that_lack_a_package_are_named_and_left_out(monkeypatch):
     monkeypatch.setattr(leagues, "find_spec", lambda name: None)
     assert "pip install 'jaxmark[attacks]'" in leagues.LINES_2026["isotropic 1"].missing()
@@ -225,27 +246,8 @@ def test_the_corpus_is_large_and_its_small_members_are_those_that_are_known():
 
 # -- methods of one's own
 
-PYTHON = """
-import numpy as np
-from jaxmark.bench import Method, Reading
-from jaxmark.geometry import Mesh
-
-def shifts(key, count):
-    return np.random.default_rng(list(key)).choice([-1.0, 1.0], (8, count))
-
-def embed(mesh, message, key, strength):
-    signs = shifts(key, len(mesh.vertices))
-    moved = strength * (2.0 * message - 1) @ signs
-    return Mesh(np.asarray(mesh.vertices) + moved[:, None] * [0, 0, 1], mesh.faces)
-
-def read(suspect, key, original):
-    if len(suspect.vertices) != len(original.vertices):
-        raise RuntimeError("another mesh")
-    soft = shifts(key, len(original.vertices)) @ (np.asarray(suspect.vertices) - original.vertices)[:, 2]
-    return Reading(soft > 0, float(np.abs(soft).sum()))
-
-METHOD = Method("plain", embed, read, blind=False, bits=8, strengths=(1e-6, 1e-1))
-"""
+PAGE = (Path(__file__).parents[1] / "docs" / "how-to" / "benchmark.md").read_text()
+PYTHON = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)[0]  # what a stranger begins with
 
 PROGRAM = """
 import json, sys
@@ -282,9 +284,10 @@ def plain(tmp_path: Path) -> Path:
 
 
 def test_a_python_file_is_a_method(plain: Path):
-    made = load_method(plain, 64)
+    made = load_method(plain, 8)
     message, mesh = np.array([1, 0, 0, 1, 1, 1, 0, 1], bool), bumpy_sphere(2)
     assert (made.read(made.embed(mesh, message, KEY, 1e-4), KEY, mesh).message == message).all()
+    assert len(PYTHON.splitlines()) <= 60
     plain.write_text("METHOD = 3\n")
     with pytest.raises(jm.JaxmarkError, match="has no method"):
         load_method(plain, 64)
@@ -324,17 +327,22 @@ def test_toml_files_that_declare_no_method_are_refused(tmp_path: Path):
 @pytest.fixture
 def small(tmp_path: Path) -> dict:
     pytest.importorskip("igl")
-    return {"meshes": {"ball": bumpy_sphere(2)}, "output": tmp_path / "out", "attacks": ["none", "noise 0.001"], "keys": 40}
+    return {
+        "meshes": {"ball": bumpy_sphere(2)},
+        "output": tmp_path / "out",
+        "attacks": ["none", "noise 0.001"],
+        "keys": 40,
+    }
 
 
 def test_a_run_of_ones_own_methods_is_calibrated_and_goes_on_where_it_was_ended(small: dict, plain: Path):
     said: list[str] = []
-    methods = {"methods": [SIGNS, plain], "limits": ["perceptual"]}
+    methods = {"methods": [SIGNS, plain], "limits": ["perceptual"], "payloads": [8]}
     found = jm.bench.run(**small, **methods, say=said.append)
     assert len(said) == 2 + 2 * (2 + 2) + 2
     entries = jm.bench.entries(found)
     assert set(entries) == {"signs", "plain"}
-    part = entries["plain"]["payloads"]["64"]
+    part = entries["plain"]["payloads"]["8"]
     attacks = part["leagues"]["smi2010"]["limits"]["perceptual"]["attacks"]
     assert attacks["none"]["read"] == attacks["none"]["trials"] == 1
     assert attacks["noise 0.001"]["published_bit_errors"] == {"cho": 0.03, "wang": 0.01}
@@ -346,9 +354,10 @@ def test_a_run_of_ones_own_methods_is_calibrated_and_goes_on_where_it_was_ended(
         "another key's mark": 2,
         "another method's mark": 1,
     }
-    assert entries["signs"]["payloads"]["64"]["calibration"]["verdicts"] == []
-    assert entries["signs"]["payloads"]["64"]["calibration"]["bound"][0]["trials"] == 83
+    assert entries["signs"]["payloads"]["8"]["calibration"]["verdicts"] == []
+    assert entries["signs"]["payloads"]["8"]["calibration"]["bound"][0]["trials"] == 83
     assert entries["signs"]["validated"] == "not validated"
+    assert found.projected(8, 5) == pytest.approx(40 * found.seconds)
     again = jm.bench.run(**small, **methods, say=lambda line: pytest.fail(line))
     assert jm.bench.entries(again) == entries
     assert (
@@ -357,7 +366,9 @@ def test_a_run_of_ones_own_methods_is_calibrated_and_goes_on_where_it_was_ended(
 
 
 def test_a_run_is_held_against_a_published_one(small: dict, plain: Path, tmp_path: Path):
-    found = jm.bench.run(**{**small, "attacks": ["none"], "keys": 1}, methods=[plain], limits=["perceptual"])
+    found = jm.bench.run(
+        **{**small, "attacks": ["none"], "keys": 1}, methods=[plain], limits=["perceptual"], payloads=[8]
+    )
     published = tmp_path / "readings.csv"
     jm.bench.save_readings(found, published)
     assert jm.bench.hold_against(found, published) == (1, ())
@@ -420,7 +431,7 @@ def test_the_command_writes_an_entry_for_each_method_and_a_page(tmp_path: Path, 
     mesh, output = tmp_path / "ball.ply", tmp_path / "out"
     jm.save_mesh(bumpy_sphere(3), mesh)
     command = [sys.executable, "-m", "jaxmark", "bench", str(mesh), "--methods", "keyed", "harmonics", "--method"]
-    command += [str(plain), "--attacks", "none", "noise 0.001", "--limits", "perceptual", "--workers", "1"]
+    command += [str(plain), "--attacks", "none", "--limits", "perceptual", "--workers", "1", "--keys", "1"]
     done = subprocess.run([*command, "--output", str(output)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     found = json.loads((output / "results.json").read_text())

@@ -135,9 +135,14 @@ def bench_command(
         say=progress().doing,
     )
     repeated = hold_against(found, against) if against is not None else None
-    about = f"`{_command()}`, {_machine()}, jaxmark {importlib.metadata.version('jaxmark')}."
+    hours, projected = found.seconds / 3600, found.projected(8, 5) / 3600
+    about = (
+        f"`{_command()}`, jaxmark {importlib.metadata.version('jaxmark')}, {_machine()}: {hours:.2g} hours of work for one"
+        f" process. 8 meshes and 5 seeds would take {projected:.2g}."
+    )
     _write(found, output, about)
     spent = {"command": _command(), "machine": _machine(), "seconds": round(time.time() - start, 1)}
+    spent |= {"hours_of_one_process": hours, "hours_for_8_meshes_and_5_seeds": projected}
     write_atomically(output / "run.json", json.dumps(spent).encode())
     said = "\n\n".join(table.markdown() for table in tables(found)[:2])
     if repeated is not None:

@@ -38,14 +38,18 @@ def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[s
     """
     reference, weakest, strongest = Reference(mesh), *method.strengths
     best: list[Fitted] = []
-    tries = 0
+    tries, refusal = 0, ""
 
     def ratio(strength: float) -> float:
-        nonlocal tries
+        nonlocal tries, refusal
         if strength < weakest:
-            raise JaxmarkError(f"Even the weakest mark, of strength {weakest:g}, exceeds the limits.")
+            raise JaxmarkError(refusal or f"Even the weakest mark, of strength {weakest:g}, exceeds the limits.")
         tries += 1
-        marked = method.embed(mesh, message, key, strength)
+        try:
+            marked = method.embed(mesh, message, key, strength)
+        except JaxmarkError as error:  # too strong for this mesh, or else the weakest is refused, too
+            refusal = str(error)
+            return math.inf
         reached = {str(name): value for name, value in reference.measure(marked, limits.keys()).items()}
         if gone := [name for name, value in reached.items() if value is None]:
             raise JaxmarkError(f"The metric {gone[0]!r} needs the original's connectivity, which the mark changes.")

@@ -54,6 +54,15 @@ class BenchResults:
         """The rows with their cells."""
         return [(Task(*row["cell"]), row) for row in self.rows]
 
+    @property
+    def seconds(self) -> float:
+        """How long all cells took, one after the other."""
+        return sum(row.get("seconds", 0.0) for row in self.rows)
+
+    def projected(self, meshes: int, seeds: int) -> float:
+        """How many seconds as many meshes like these and seeds would take, one cell after the other."""
+        return self.seconds * meshes * seeds / len({(task.mesh, task.seed) for task, _ in self.tasks})
+
     @cached_property
     def suspects(self) -> list[Suspect]:
         """The marked suspects read with their own key; a mesh that could not be marked or attacked counts as one."""
