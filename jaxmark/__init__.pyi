@@ -2,6 +2,7 @@
 from . import adversaries as adversaries
 from . import alignment as alignment
 from . import attacks as attacks
+from . import bench as bench
 from . import catalogue as catalogue
 from . import distortion as distortion
 from . import evaluation as evaluation

@@ -14,6 +14,7 @@ import pytest
 import trimesh
 
 import jaxmark as jm
+from jaxmark.bench.shapes import SHAPES
 from tests.samples import bumpy_sphere
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -92,11 +93,9 @@ def test_help_is_shown_from_a_copy(program: Path, copy: Path, afresh, monkeypatc
     assert Path(sys.modules["common"].__file__ or "").parent == copy / "common"
 
 
-def test_shapes_are_closed_and_of_the_size_asked_for(copy: Path, afresh, monkeypatch):
-    monkeypatch.syspath_prepend(copy)
-    shapes = importlib.import_module("common.shapes").SHAPES
+def test_shapes_are_closed_and_of_the_size_asked_for():
     volumes = {"box": 0.28, "cylinder": np.pi * 0.16, "sphere": np.pi / 6, "torus": 2 * np.pi**2 * 0.4 * 0.15**2}
-    for name, make in shapes.items():
+    for name, make in SHAPES.items():
         surface = trimesh.Trimesh(*make(4_000), process=False)
         assert len(surface.vertices) == pytest.approx(4_000, rel=0.02), name
         assert surface.is_winding_consistent, name

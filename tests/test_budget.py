@@ -11,7 +11,7 @@ import jaxmark as jm
 from jaxmark.alignment.original import make_original
 from jaxmark.app import cli
 from jaxmark.geometry.mesh import Mesh, make_mesh
-from jaxmark.watermark.budget import VISIBILITY, _largest, make_budget, visibility_of, write
+from jaxmark.watermark.budget import VISIBILITY, largest_within, make_budget, visibility_of, write
 from tests.samples import rough_sphere
 
 MESSAGE = b"\xa5\x5a"
@@ -95,7 +95,7 @@ def test_without_a_word_the_mark_stays_below_what_people_notice(mesh: Mesh, key:
     ],
 )
 def test_the_largest_size_is_found_for_any_rising_metric(rising):
-    found = _largest(rising, 0.01, 2e-4)
+    found = largest_within(rising, 0.01, 2e-4)
     assert rising(found) <= 1
     assert 0.88 * 3e-4 < found <= 3e-4
 

@@ -30,7 +30,12 @@ PAGES = {
     for path in sorted(folder.glob("*.md"))
 }
 README = PAGES["README.md"]
-LONG = ("docs/tutorial.md", "docs/submeshes.md", "docs/how-to/extend.md")  # compiled for themselves, and need libigl
+LONG = (
+    "docs/tutorial.md",
+    "docs/submeshes.md",
+    "docs/how-to/extend.md",
+    "docs/how-to/benchmark.md",
+)  # compiled, and need libigl
 SLOW = (
     *LONG,
     "docs/blind.md",

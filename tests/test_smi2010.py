@@ -14,20 +14,21 @@ from scipy import sparse
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh, edges, make_mesh, vertex_normals
 from jaxmark.geometry.pose import similarity
+from jaxmark.watermark.budget import make_budget
 from tests.samples import bumpy_sphere
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 
 @pytest.fixture
-def harmonics(monkeypatch) -> ModuleType:
+def harmonics() -> ModuleType:
     pytest.importorskip("igl")
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    return importlib.import_module("common.harmonics")
+    return importlib.import_module("jaxmark.bench.methods.harmonics")
 
 
 @pytest.fixture
 def smi2010(harmonics, monkeypatch) -> ModuleType:
+    monkeypatch.syspath_prepend(BENCHMARKS)
     monkeypatch.syspath_prepend(BENCHMARKS / "robustness")
     return importlib.import_module("smi2010")
 
@@ -71,7 +72,7 @@ def test_the_carrier_of_the_tool_is_its_formula_and_its_adjoint(harmonics, x64):
 def test_the_tool_confirms_its_mark_in_noise_and_a_quarter_of_what_is_none(harmonics):
     mesh = bumpy_sphere(3)
     mark = harmonics.make_mark(mesh, [1])
-    marked = mark.embed({"rms": 1e-3})
+    marked = mark.embed(make_budget(1e-3))
     expected = jm.distortion.displacement_size(mesh, marked).max
     assert mark.correlation(jm.attack(marked, "noise", 0.002, seed=0), expected) > 0.9
     assert mark.correlation(mesh, expected) == 0  # nothing moved

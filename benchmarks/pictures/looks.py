@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 import jaxmark as jm
+from jaxmark.bench.shapes import SHAPES
 from jaxmark.geometry.mesh import Mesh, compact, host_mesh, weld, weld_mesh
 from jaxmark.geometry.raster import Frame
 from jaxmark.plot import Rendering, exaggerate, render
@@ -23,7 +24,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser
 from common.drawn import keep
 from common.marks import KEY, MESSAGE, write
-from common.shapes import SHAPES
 from common.tables import say
 
 SIZE = 270  # pixels

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxmark as jm
+from jaxmark.bench.shapes import SHAPES
 from jaxmark.distortion import shading
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, host_mesh, weld, weld_mesh
 from jaxmark.watermark.budget import Budget, make_budget
@@ -29,7 +30,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser
 from common.attacks import attacked
 from common.marks import KEY, MESSAGE, write
-from common.shapes import SHAPES
 from common.tables import Row, say, table
 from common.turns import planes, turns
 

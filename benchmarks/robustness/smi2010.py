@@ -17,34 +17,31 @@ from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
 from jaxmark.alignment.alignment import Alignment
-from jaxmark.attacks import Attack
+from jaxmark.bench.leagues import CROPS, LEAGUES, PROTOCOL
+from jaxmark.bench.methods.harmonics import THRESHOLD, HarmonicMark, make_mark
 from jaxmark.confidence import clopper_pearson
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation._robustness import NOTHING, read
 from jaxmark.evaluation.cells import Cell, processes, run
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.marker import BlindMarker
+from jaxmark.watermark.budget import make_budget
 from jaxmark.watermark.everyday import prepare_alone
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, make_parser
-from common.harmonics import THRESHOLD, HarmonicMark, make_mark
 from common.tables import Row, evidence, head, line, save, say
 from common.timing import timed
 
 BITS = 64
+LIMITS = LEAGUES["smi2010"].limits
 LEVEL = 1e-6  # false-positive probability at which jaxmark's schemes detect
-LIMITS: dict[str, dict[str, float]] = {
-    "perceptual": {"mrms": 8e-4, "msdm": 0.20},
-    "geometric": {"mrms": 2e-4, "msdm": 0.30},
-}
 SCHEMES = ("keyed", "eigen", "host", "field", "local")
 METHODS = {
     "keyed": "jaxmark's default",
@@ -54,62 +51,7 @@ METHODS = {
     "local": "read without the original, from any part",
     "harmonics": f"public tool, 20 cotangent eigenvectors, confirmed at a correlation of {THRESHOLD}",
 }
-CROPS = 3  # averaged
 UNMARKED, KEYS = -1, 5  # in place of a trial; how many keys the unmarked mesh is read with
-
-
-def posed(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """The protocol's similarity: shifts of up to 5 mean radii along each axis, any turn, scales from 0.1 to 10."""
-    vertices = np.asarray(mesh.vertices)
-    radius = np.linalg.norm(vertices - vertices.mean(axis=0), axis=1).mean()
-    axis = random.normal(size=3)
-    turn = Rotation.from_rotvec(random.uniform(0, 2 * np.pi) * axis / np.linalg.norm(axis))
-    moved = turn.apply(random.uniform(0.1, 10) * vertices) + radius * random.uniform(-5, 5, 3)
-    return Mesh(moved, mesh.faces)
-
-
-class Line(NamedTuple):
-    """One attack of the protocol, and the bit error rates published for it, under both sets of limits."""
-
-    kind: str | Attack
-    strength: float
-    cho: tuple[float, float] | None = None  # Cho, Prost, Jung 2007, on Venus, blind
-    wang: tuple[float, float] | None = None  # Wang, Lavoué, Denis, Baskurt 2011 (volume moments), on Venus, blind
-
-
-def lines(kind: str, strengths: Iterable[float], *published: str) -> dict[str, Line]:
-    """Lines of one kind; rates published for a method are lists of numbers, perceptual / geometric."""
-    columns = [[[float(x) for x in part.split()] for part in one.split("/")] for one in published]
-    return {
-        f"{kind} {strength:g}": Line(kind, strength, *((one[0][place], one[1][place]) for one in columns))
-        for place, strength in enumerate(strengths)
-    }
-
-
-# Published rates: the protocol's result page, for the model Venus.
-PROTOCOL: dict[str, Line] = {
-    "none": Line("noise", 0),
-    "file": Line("reordering", 1),
-    "similarity": Line(Attack(posed, "none", (1,), host=True), 1),
-    **lines(
-        "noise",
-        (0.0005, 0.001, 0.003, 0.005),
-        ".01 .03 .13 .28 / 0 .01 .10 .24",
-        "0 .01 .08 .16 / .02 .15 .29 .40",
-    ),
-    **lines("smoothing", (5, 10, 30, 50), ".10 .23 .38 .45 / .06 .16 .34 .42", "0 .01 .07 .14 / .06 .18 .39 .51"),
-    **lines(
-        "quantisation",
-        (11, 10, 9, 8, 7),
-        "0 .04 .14 .26 .46 / 0 .02 .06 .18 .41",
-        "0 .01 .01 .05 .17 / .01 .17 .27 .39 .53",
-    ),
-    **lines("midpoint", (1,), ".04 / .02", "0 / 0"),
-    **lines("sqrt3", (1,), ".14 / .09", "0 / .01"),
-    **lines("loop", (1,), ".16 / .09", "0 / .01"),
-    **lines("simplification", (0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.975)),
-    **lines("cropping", (0.1, 0.3, 0.5)),
-}
 
 
 @lru_cache(maxsize=8)  # what one trial reads with, and the other keys
@@ -127,7 +69,7 @@ def marked(method: str, limits: str, mesh: str, trial: int) -> tuple[Mesh, Row]:
     made, message = marker(method, mesh, trial)
     bounds = LIMITS[limits]
     if isinstance(made, HarmonicMark):
-        written, seconds = timed(made.embed, bounds)
+        written, seconds = timed(made.embed, make_budget(limits=bounds))
     else:
         (written, _), seconds = timed(made.embed, message, limits=bounds, noise=0, read_back=False)
     found = jm.compare(jm.load_mesh(mesh), written, ("rms", "max", "mrms", "msdm", "msdm2", "dame"))._asdict()

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxmark as jm
+from jaxmark.bench.shapes import SHAPES
 from jaxmark.distortion import RENDERED, make_hiding, shading
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, host_mesh, weld, weld_mesh
 from jaxmark.watermark.budget import Budget, make_budget
@@ -32,7 +33,6 @@ from jaxmark.watermark.budget import Budget, make_budget
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser
 from common.marks import KEY, MESSAGE, write
-from common.shapes import SHAPES
 from common.tables import Row, say, table
 from common.timing import timed
 from common.turns import planes, turns

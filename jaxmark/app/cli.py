@@ -26,6 +26,7 @@ from jaxmark.app.answering import progress as _progress
 from jaxmark.app.answering import read_key as _key
 from jaxmark.app.answering import say as _say
 from jaxmark.app.batch import FileReader, mark_file
+from jaxmark.app.bench import bench_command, bench_corpus_command, bench_equal_command
 from jaxmark.app.blind import BlindReader
 from jaxmark.app.catalogue import catalogue_group
 from jaxmark.app.ending import end_by_exception
@@ -689,6 +690,8 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
     _answer(as_json, {"output": str(output), "readings": len(results.rows), "rates": results.rates()}, table.rstrip())
 
 
+for command in (bench_command, bench_equal_command, bench_corpus_command):
+    cli.add_command(command)
 cli.add_command(catalogue_group)
 cli.add_command(mark_for_command)
 catalogue_group.add_command(serve_command)

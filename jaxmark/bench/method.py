@@ -37,3 +37,5 @@ class Method:
     strengths: tuple[float, float]  # the weakest and the strongest, both above 0
     source: str = ""  # the publication
     anchor: str = ""  # the published figure that this code was held against and meets; empty for 'not validated'
+    threshold: float | None = None  # of the score, from which on the method itself says that a mark is there
+    rate: float = 1e-6  # of false positives, which the method states for its threshold

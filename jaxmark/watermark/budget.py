@@ -169,7 +169,7 @@ def write(
         # What single edges tell is quickly found; mostly it is as little as all limits allow, and they are tried once.
         for metrics in dict.fromkeys((tuple(one for one in budget.limits if one in LOCAL), tuple(budget.limits))):
             if metrics:
-                rms = _largest(partial(limit_ratio, metrics), rms, first if rms == most else rms, share)
+                rms = largest_within(partial(limit_ratio, metrics), rms, first if rms == most else rms, share)
         if budget.rms is None and rms == _MAX_RMS:
             raise JaxmarkError(
                 f"Moved by {_MAX_RMS:g} of its diagonal, this mesh still keeps {budget}; give a budget, too."
@@ -181,7 +181,9 @@ def write(
     return Written(marked, rms / size, reached)
 
 
-def _largest(within: Callable[[float], float], most: float, first: float, share: float = _MIN_LIMIT_SHARE) -> float:
+def largest_within(
+    within: Callable[[float], float], most: float, first: float, share: float = _MIN_LIMIT_SHARE
+) -> float:
     """Find the largest size, up to `most`, at which a rising function is at most 1; `share` of that will do.
 
     Secant steps in logarithms, because metrics are nearly powers of the size; each step stays between a size that fits

@@ -22,7 +22,7 @@ from jaxmark.alignment.original import Original, make_original
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, vertex_normals, weld, weld_mesh
 from jaxmark.spectral.precision import einsum, matmul
-from jaxmark.watermark.budget import make_budget, write
+from jaxmark.watermark.budget import Budget, write
 from jaxmark.watermark.carriers import ModulatedCarrier
 from jaxmark.watermark.detectors import correlate
 
@@ -79,11 +79,11 @@ class HarmonicMark:
     vectors: Float64[np.ndarray, "points bands"]
     pattern: Float64[np.ndarray, " bands"]  # at length 1
 
-    def embed(self, limits: dict[str, float]) -> Mesh:
-        """As strong as limits allow; the tool itself takes a 200th of the mean edge length at most."""
+    def embed(self, budget: Budget) -> Mesh:
+        """As strong as a budget allows; the tool itself takes a 200th of the mean edge length at most."""
         made = carrier(self.vectors.astype(np.float32), self.points)
         shift = made.displacement(jnp.asarray(self.pattern, jnp.float32))
-        return write(self.original, np.asarray(shift, np.float64), make_budget(None, limits)).mesh
+        return write(self.original, np.asarray(shift, np.float64), budget).mesh
 
     def correlation(self, suspect: Mesh, expected: float) -> float:
         """Of what the suspect shows with the pattern; 0 where the reader says beforehand that it is another shape.

@@ -4,18 +4,18 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from jaxmark.geometry.mesh import Mesh, make_mesh
+from jaxmark.geometry.mesh import Mesh, make_mesh, unit
 
 
 def box(points: int) -> Mesh:
     """Of sides 1, 0.7 and 0.4."""
-    vertices, faces = _cube(points)
+    vertices, faces = cube(points)
     return make_mesh(vertices * [0.5, 0.35, 0.2], faces)
 
 
 def cylinder(points: int) -> Mesh:
     """Of radius 0.4 and height 1, closed; caps are meshed in squares that were bent to circles."""
-    vertices, faces = _cube(points)
+    vertices, faces = cube(points)
     x, y = vertices[:, 0], vertices[:, 1]
     radius = np.maximum(np.abs(x), np.abs(y))
     wide = np.abs(x) >= np.abs(y)
@@ -28,24 +28,24 @@ def cylinder(points: int) -> Mesh:
 
 def sphere(points: int) -> Mesh:
     """Of radius 0.5."""
-    vertices, faces = _cube(points)
-    return make_mesh(0.5 * _unit(np.tan(np.pi / 4 * vertices)), faces)
+    vertices, faces = cube(points)
+    return make_mesh(0.5 * unit(np.tan(np.pi / 4 * vertices)), faces)
 
 
 def rounded_box(points: int) -> Mesh:
     """The box, with edges and corners rounded to a radius of 0.08."""
-    vertices, faces = _cube(points)
+    vertices, faces = cube(points)
     radius = 0.08
     outer = np.array([0.5, 0.35, 0.2])
     inner = np.clip(vertices * outer, radius - outer, outer - radius)
-    return make_mesh(inner + radius * _unit(vertices * outer - inner), faces)
+    return make_mesh(inner + radius * unit(vertices * outer - inner), faces)
 
 
 def torus(points: int) -> Mesh:
     """Of radii 0.4 and 0.15."""
     around = round(np.sqrt(points * 0.4 / 0.15))
     across = round(points / around)
-    i, j, faces = _grid(around, across, closed=True)
+    i, j, faces = grid(around, across, closed=True)
     u, v = 2 * np.pi * i / around, 2 * np.pi * j / across
     ring = 0.4 + 0.15 * np.cos(v)
     return make_mesh(np.stack([ring * np.cos(u), ring * np.sin(u), 0.15 * np.sin(v)], axis=1), faces)
@@ -70,7 +70,7 @@ SHAPES: Mapping[str, Callable[[int], Mesh]] = {
 }
 
 
-def _grid(rows: int, columns: int, *, closed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def grid(rows: int, columns: int, *, closed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Row and column of each point, and triangles; closed, the last ones are followed by the first."""
     i, j = np.divmod(np.arange(rows * columns), columns)
     inside = np.full(len(i), True) if closed else (i < rows - 1) & (j < columns - 1)
@@ -83,14 +83,14 @@ def _grid(rows: int, columns: int, *, closed: bool) -> tuple[np.ndarray, np.ndar
 def _patch(points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Coordinates of a square patch, from 0 to 1, and triangles."""
     side = round(np.sqrt(points))
-    i, j, faces = _grid(side, side, closed=False)
+    i, j, faces = grid(side, side, closed=False)
     return i / (side - 1), j / (side - 1), faces
 
 
-def _cube(points: int) -> tuple[np.ndarray, np.ndarray]:
+def cube(points: int) -> tuple[np.ndarray, np.ndarray]:
     """The surface of a cube from -1 to 1, all sides meshed alike."""
     side = round(np.sqrt(points / 6)) + 1
-    i, j, faces = _grid(side, side, closed=False)
+    i, j, faces = grid(side, side, closed=False)
     far = np.full_like(i, side - 1)
     near = 0 * far
     sides = ((far, i, j), (near, j, i), (j, far, i), (i, near, j), (i, j, far), (j, i, near))
@@ -98,7 +98,3 @@ def _cube(points: int) -> tuple[np.ndarray, np.ndarray]:
     kept, point = np.unique(lattice, axis=0, return_inverse=True)
     triangles = np.concatenate([faces + k * side**2 for k in range(6)])
     return 2 * kept / (side - 1) - 1, point.reshape(-1)[triangles]
-
-
-def _unit(x: np.ndarray) -> np.ndarray:
-    return x / np.linalg.norm(x, axis=1, keepdims=True)

@@ -1,0 +1,156 @@
+"""How often a reader finds what is not there, counted: thresholds, false-positive rates, and bounds held against them.
+
+Nulls are scores of suspects that have no mark of the key: unmarked meshes, attacked or not, marks of other methods, and
+of other keys. Every null has a key of its own, so that given the suspects they are independent, and intervals exact.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.special import betaincinv
+
+from jaxmark.bench.method import Method
+from jaxmark.confidence import clopper_pearson
+
+RATE = 0.01  # of false positives, at which methods are compared by default
+_LEVELS = (-0.5, -1.0, -1.5, -2.0, -3.0, -4.0, -5.0, -6.0, -8.0, -10.0)  # log10, at which a bound is looked at
+_SURE = 0.999  # one-sided, over all levels, before a bound or a stated rate is called violated
+Scores = Float64[np.ndarray, " _"]
+
+
+class Threshold(NamedTuple):
+    """A score above which a suspect counts as marked, and the exact interval of how often it errs."""
+
+    value: float
+    rate: float  # the expected false-positive rate
+    low: float  # 95 % interval
+    high: float
+    reached: bool  # whether there are enough nulls for the rate that was asked for
+
+
+class Count(NamedTuple):
+    """How many of some nulls a rule accepts, with the exact 95 % interval of its rate."""
+
+    hits: int
+    trials: int
+    low: float
+    high: float
+
+
+class Level(NamedTuple):
+    """A bound at one level: how often it says that less is probable than that."""
+
+    log10_p: float
+    hits: int
+    trials: int
+    violated: bool
+
+
+def threshold(nulls: Scores, rate: float = RATE) -> Threshold:
+    """The threshold whose expected false-positive rate is at most `rate`, from nulls alone.
+
+    Of n nulls and one more, all exchangeable, the share that lies above the k-th largest null is of the distribution
+    Beta(k, n + 1 - k), whatever the scores' own is (Wilks, "Determination of sample sizes for setting tolerance
+    limits", 1941). Its mean is k/(n + 1). Ties make the rate smaller.
+    """
+    ordered, count = np.sort(nulls)[::-1], len(nulls)
+    place = max(int(np.floor(rate * (count + 1) + 1e-9)), 1)
+    low, high = betaincinv(place, count + 1 - place, [0.025, 0.975])
+    expected = place / (count + 1)
+    return Threshold(float(ordered[place - 1]), expected, float(low), float(high), expected <= rate)
+
+
+def count(accepted: Sequence[bool] | np.ndarray) -> Count:
+    """Count what was accepted; no trial says nothing."""
+    if not len(accepted):
+        return Count(0, 0, 0.0, 1.0)
+    hits = int(np.sum(accepted))
+    low, high = clopper_pearson(hits, len(accepted))
+    return Count(hits, len(accepted), float(low), float(high))
+
+
+def roc(nulls: Scores, marks: Scores) -> list[tuple[float, float]]:
+    """False- and true-positive rates at every threshold, from (0, 0) to (1, 1)."""
+    edges = np.unique(np.concatenate([nulls, marks]))[::-1]
+    points = [(float(np.mean(nulls >= edge)), float(np.mean(marks >= edge))) for edge in edges]
+    return [(0.0, 0.0), *points]
+
+
+def area_under(points: Sequence[tuple[float, float]]) -> float:
+    """Area under an ROC: the probability that a mark scores above a null, ties counted as a half."""
+    false, true = np.transpose(points)
+    return float(np.trapezoid(true, false))
+
+
+def check_bound(nulls: Scores) -> list[Level]:
+    """Hold a proven bound, log10 of probabilities of nulls, against how often it is passed."""
+    confidence = 1 - 2 * (1 - _SURE) / len(_LEVELS)
+    found = []
+    for level in _LEVELS:
+        hits = int(np.sum(nulls <= level))
+        low = float(clopper_pearson(hits, len(nulls), confidence).low)
+        found.append(Level(level, hits, len(nulls), low > 10**level))
+    return found
+
+
+class Calibration(NamedTuple):
+    """What counting says of a reader."""
+
+    threshold: Threshold
+    kinds: Mapping[str, Count]  # nulls above the threshold, by what they are
+    points: Sequence[tuple[float, float]]  # the ROC against its own marks after all attacks
+    area: float
+    own: Count | None  # nulls at the method's own threshold, where it has one
+    stated: float  # the rate that the method states for that
+    bound: Sequence[Level]  # empty where the method proves nothing
+
+    @property
+    def verdicts(self) -> list[str]:
+        """What does not hold, in sentences."""
+        said = []
+        if not self.threshold.reached:
+            said.append("Too few nulls for the rate that was asked for: the threshold is above all of them.")
+        if self.own is not None and self.own.trials:
+            sure = clopper_pearson(self.own.hits, self.own.trials, 2 * _SURE - 1)
+            if float(sure.low) > self.stated:
+                said.append(
+                    f"ITS OWN THRESHOLD IS TOO LOW: {self.own.hits} of {self.own.trials} nulls pass, where a rate of"
+                    f" {self.stated:g} is stated."
+                )
+        for level in self.bound:
+            if level.violated:
+                said.append(
+                    f"THE PROVEN BOUND IS VIOLATED: {level.hits} of {level.trials} nulls are said to be less probable"
+                    f" than 10^{level.log10_p:g}."
+                )
+        return said
+
+
+def calibrate(
+    method: Method, nulls: Mapping[str, Sequence[tuple[float, float | None]]], marks: Scores, rate: float = RATE
+) -> Calibration:
+    """Calibrate a reader by its nulls, pairs of a score and of log10 p, by their kinds.
+
+    Args:
+        method: what it declares of itself.
+        nulls: by kind; at least one.
+        marks: scores of its own marks.
+        rate: the false-positive rate of the threshold.
+    """
+    scores = {kind: np.array([score for score, _ in some], float) for kind, some in nulls.items()}
+    every = np.concatenate(list(scores.values()))
+    proven = np.array([p for some in nulls.values() for _, p in some if p is not None], float)
+    found = threshold(every, rate)
+    points = roc(every, marks) if len(marks) else [(0.0, 0.0), (1.0, 1.0)]
+    own = None if method.threshold is None else count(every >= method.threshold)
+    return Calibration(
+        found,
+        {kind: count(some > found.value) for kind, some in scores.items()},
+        points,
+        area_under(points),
+        own,
+        method.rate,
+        check_bound(proven) if len(proven) else [],
+    )

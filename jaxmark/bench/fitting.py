@@ -1,0 +1,63 @@
+"""How strong a mark may be: the strength of any method that keeps limits of distortion, found by trying."""
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from jaxmark.bench.method import Bits, Method
+from jaxmark.distortion import Reference
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.budget import largest_within
+
+SHARE = 0.95  # of the limits, as good as all of them: every try is one embedding
+
+
+class Fitted(NamedTuple):
+    """A mark as strong as limits allow."""
+
+    mesh: Mesh
+    strength: float  # in the method's own unit
+    reached: Mapping[str, float]  # the limited metrics
+    tries: int
+
+
+def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[str, float]) -> Fitted:
+    """Embed with the largest strength that keeps limits, the same search for every method.
+
+    Args:
+        method: the method; its `strengths` bound the search.
+        mesh: the original.
+        message: what is embedded.
+        key: 32 bytes.
+        limits: the largest values of metrics of `jaxmark.distortion.METRICS`.
+
+    Raises:
+        JaxmarkError: if not even the weakest mark keeps the limits, the method changes the connectivity that a metric
+            needs, or refuses the mesh.
+    """
+    reference, weakest, strongest = Reference(mesh), *method.strengths
+    best: list[Fitted] = []
+    tries, refusal = 0, ""
+
+    def ratio(strength: float) -> float:
+        nonlocal tries, refusal
+        if strength < weakest:
+            raise JaxmarkError(refusal or f"Even the weakest mark, of strength {weakest:g}, exceeds the limits.")
+        tries += 1
+        try:
+            marked = method.embed(mesh, message, key, strength)
+        except JaxmarkError as error:  # too strong for this mesh, or else the weakest is refused, too
+            refusal = str(error)
+            return math.inf
+        reached = {str(name): value for name, value in reference.measure(marked, limits.keys()).items()}
+        if gone := [name for name, value in reached.items() if value is None]:
+            raise JaxmarkError(f"The metric {gone[0]!r} needs the original's connectivity, which the mark changes.")
+        found = {name: value or 0.0 for name, value in reached.items()}
+        worst = max(found[name] / limit for name, limit in limits.items())
+        if worst <= 1:
+            best.append(Fitted(marked, strength, found, tries))
+        return worst
+
+    strength = largest_within(ratio, strongest, math.sqrt(weakest * strongest), SHARE)
+    return next(one for one in reversed(best) if one.strength == strength)._replace(tries=tries)

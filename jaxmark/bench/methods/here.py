@@ -1,0 +1,169 @@
+"""What this library has itself, as the benchmark sees it: its own schemes, two historical ones, and the public tool's.
+
+The informed schemes are read from one alignment of the suspect with the original, which all keys share. The message is
+the best guess, whether or not its tag fits. The score is the evidence, -log10 of the bound without its floor, and where
+there is none, how well the soft values agree with the codeword of the guess, from -1 to 1.
+"""
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+
+import numpy as np
+
+from jaxmark.alignment.alignment import Alignment, align
+from jaxmark.alignment.original import Original, make_original
+from jaxmark.bench.held import Held
+from jaxmark.bench.method import Bits, Method, Reading
+from jaxmark.bench.methods.harmonics import THRESHOLD, HarmonicMark, make_mark
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.blind.marker import BlindMarker
+from jaxmark.watermark.blind.reading import TAG_BITS, BlindDetection, codeword, context
+from jaxmark.watermark.blind.scheme import BlindScheme
+from jaxmark.watermark.budget import make_budget
+from jaxmark.watermark.coding.keys import Key
+from jaxmark.watermark.coding.message import guess
+from jaxmark.watermark.everyday import BLIND_SCHEMES, prepare_alone, read_blind
+from jaxmark.watermark.marking import Detection, Marker
+from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme, Scheme
+
+_RMS = (2e-6, 1e-2)  # displacements over the diagonal
+_OURS = "the scheme is defined by this code"
+_OHBUCHI = "Ohbuchi, Takahashi, Miyazawa, Mukaiyama, Watermarking 3D polygonal meshes in the mesh spectral domain, 2001"
+_SOHN = "Sohn et al., A Digital Watermarking Scheme for Polygonal Meshes using Modified Spectral Decomposition"
+
+
+def keyed(bits: int) -> Method:
+    """The default scheme: keyed signs of its own in the bands."""
+    return _informed("keyed", KeyedScheme(), bits, "jaxmark, docs/how_it_works.md", _OURS)
+
+
+def eigen(bits: int) -> Method:
+    """Ohbuchi's: the lowest eigenvectors of the graph Laplacian."""
+    return _informed("eigen", EigenScheme(), bits, _OHBUCHI)
+
+
+def host(bits: int) -> Method:
+    """Sohn's, in the form that works."""
+    return _informed("host", HostScheme(), bits, _SOHN)
+
+
+def paper(bits: int) -> Method:
+    """Sohn's as printed."""
+    printed = HostScheme(kernel="printed", damping="none", unit_norm=False)
+    return _informed("paper", printed, bits, f"{_SOHN}, as printed")
+
+
+def field(bits: int) -> Method:
+    """The blind scheme that survives any other meshing."""
+    return _blind("field", bits)
+
+
+def local(bits: int) -> Method:
+    """The blind scheme that is read from any part."""
+    return _blind("local", bits)
+
+
+def harmonics(bits: int) -> Method:
+    """The public tool's, which says only that a mark is there, whatever message is asked for.
+
+    Its reader is not told how large the mark is, and so accepts differences of any size.
+    """
+    return Method(
+        "harmonics",
+        _embed_harmonics,
+        _read_harmonics,
+        blind=False,
+        bits=0,
+        strengths=_RMS,
+        source="Forensic 3D Watermarking Suite, archtecgr",
+        threshold=THRESHOLD,
+    )
+
+
+def _informed(name: str, scheme: Scheme, bits: int, source: str, anchor: str = "") -> Method:
+    return Method(
+        name,
+        partial(_embed, scheme),
+        partial(_read, scheme, bits),
+        blind=False,
+        bits=bits,
+        strengths=_RMS,
+        source=source,
+        anchor=anchor,
+    )
+
+
+def _blind(name: str, bits: int) -> Method:
+    scheme = BLIND_SCHEMES[name]
+    return Method(
+        name,
+        partial(_embed, scheme),
+        partial(_read_blind, scheme, bits),
+        blind=True,
+        bits=bits,
+        strengths=_RMS,
+        source="jaxmark, docs/blind.md",
+        anchor=_OURS,
+    )
+
+
+@lru_cache(maxsize=4)
+def _marker(scheme: Scheme | BlindScheme, original: Held, key: bytes, bits: int) -> Marker | BlindMarker:
+    return prepare_alone(original.mesh, key, bits, scheme)
+
+
+@lru_cache(maxsize=2)
+def _original(mesh: Held) -> Original:
+    return make_original(mesh.mesh)
+
+
+@lru_cache(maxsize=2)
+def _aligned(original: Held, suspect: Held) -> Alignment:
+    """How a suspect is brought back to an original, whatever the key."""
+    return align(_original(original), suspect.mesh)
+
+
+@lru_cache(maxsize=2)
+def _harmonic_mark(original: Held, key: bytes) -> HarmonicMark:
+    return make_mark(original.mesh, list(key))
+
+
+def _embed(scheme: Scheme | BlindScheme, mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
+    marker = _marker(scheme, Held(mesh), key, len(message))
+    return marker.embed(np.packbits(message).tobytes(), strength, noise=0, read_back=False)[0]
+
+
+def _read(scheme: Scheme, bits: int, suspect: Mesh, key: bytes, original: Mesh | None) -> Reading:
+    assert original is not None
+    marker = _marker(scheme, Held(original), key, bits)
+    assert isinstance(marker, Marker)
+    found = marker.detect(_aligned(Held(original), Held(suspect)))
+    return _reading(found, bits, marker.tag_bits, marker.codeword)
+
+
+def _read_blind(scheme: BlindScheme, bits: int, suspect: Mesh, key: bytes, original: Mesh | None) -> Reading:
+    choices = context(Key(key), bits, scheme.name)
+    found = read_blind(suspect, key, bits=bits, scheme=scheme)
+    return _reading(found, bits, TAG_BITS, lambda message: codeword(message, choices))
+
+
+def _reading(
+    found: Detection | BlindDetection, bits: int, tag_bits: int, encode: Callable[[bytes], np.ndarray]
+) -> Reading:
+    said = found.message or (guess(found.scores, bits, tag_bits) if bits else None)
+    if said is None:
+        return Reading(None, 0.0 - found.log10_p_unfloored, found.log10_p)
+    word = encode(said)
+    agreement = float(found.scores @ word / np.linalg.norm(found.scores) / np.linalg.norm(word))
+    message = np.unpackbits(np.frombuffer(said, np.uint8)).astype(bool)
+    return Reading(message, agreement - found.log10_p_unfloored, found.log10_p)
+
+
+def _embed_harmonics(mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
+    return _harmonic_mark(Held(mesh), key).embed(make_budget(strength))
+
+
+def _read_harmonics(suspect: Mesh, key: bytes, original: Mesh | None) -> Reading:
+    assert original is not None
+    found = _harmonic_mark(Held(original), key).correlation(suspect, 0.0)
+    return Reading(None, float(np.nan_to_num(found)))

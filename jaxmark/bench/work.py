@@ -1,0 +1,193 @@
+"""What one cell of the benchmark computes: a mark as strong as limits allow, or a suspect and what is read of it."""
+
+import hashlib
+import io
+import math
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxmark.bench.fitting import fit
+from jaxmark.bench.leagues import get_league
+from jaxmark.bench.method import Bits, Method
+from jaxmark.bench.plugged import Given, load_method
+from jaxmark.distortion import Reference
+from jaxmark.errors import JaxmarkError
+from jaxmark.evaluation.cells import Cell
+from jaxmark.files import load_mesh
+from jaxmark.files.atomic import write_atomically
+from jaxmark.geometry.mesh import Mesh
+
+UNMARKED = "unmarked"  # in place of the method whose mark a suspect has
+MARK = "mark"  # in place of an attack: the mark itself is made
+COSTS = ("mrms", "dame", "msdm2")  # what an attack does to the shape, measured against the marked mesh
+_OWN = "own"
+
+
+class Task(NamedTuple):
+    """A cell: a method reads what an attack made of a mesh, which is marked or not."""
+
+    method: str
+    payload: int  # bits of a message that are asked for; a method may have its own number
+    league: str
+    limits: str  # empty where nothing is marked
+    mesh: str
+    seed: int
+    source: str  # whose mark the suspect has, or `UNMARKED`
+    attack: str  # of the league, or `MARK`
+
+    @property
+    def mark(self) -> "Task":
+        """The cell that makes the mark which the suspect has."""
+        return self._replace(method=self.source, attack=MARK)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What workers need to know of a benchmark."""
+
+    folder: Path  # marked meshes are kept in it
+    meshes: Mapping[str, Path]
+    methods: Mapping[str, Given]
+    keys: int  # keys that each suspect without a mark is read with
+
+    def method(self, task: Task) -> Method:
+        """The method of a cell."""
+        return load_method(self.methods[task.method], task.payload)
+
+
+def work(bench: Bench, cell: Cell) -> dict[str, Any]:
+    """Compute a cell. At the top level, where workers find it."""
+    task = Task(*cell)  # pyright: ignore[reportArgumentType] (a cell's values are those of its fields)
+    start = time.perf_counter()
+    if task.attack == MARK:
+        try:
+            found = _mark(bench, task)
+        except Exception as error:  # a stranger's method may raise anything, which ends nothing but its cell
+            return {"note": f"Not marked: {_said(error)}", "seconds": time.perf_counter() - start}
+        return {**found, "seconds": time.perf_counter() - start}
+    before = original = load(bench.meshes[task.mesh])
+    if task.source != UNMARKED:
+        file = _file(bench, task.mark)
+        if not file.exists():
+            return {"note": "Not marked.", "readings": []}
+        before = load(file)
+    line = get_league(task.league).lines[task.attack]
+    try:
+        suspects = line.suspects(before, task.seed)
+    except JaxmarkError as error:
+        return {"note": f"Not attacked: {error}", "readings": []}
+    seconds = time.perf_counter() - start
+    own = task.source == task.method
+    costs = _costs(before, suspects[0]) if own and line.in_place else {}
+    readings = [
+        one for copy, suspect in enumerate(suspects) for one in _readings(bench, task, original, suspect, own, copy)
+    ]
+    spent = time.perf_counter() - start
+    return {"attack_seconds": seconds, "seconds": spent, "costs": costs, "readings": readings}
+
+
+def key_of(task: Task, name: str) -> bytes:
+    """The key of that name on a mesh in a seed."""
+    return draw((task.method, task.payload, task.mesh, task.seed), f"key/{name}", 32)
+
+
+def message_of(task: Task, bits: int) -> Bits:
+    """The message of a mark, of so many bits."""
+    return to_bits(draw((task.method, task.payload, task.mesh, task.seed), "message", bits), bits)
+
+
+def draw(place: tuple[object, ...], label: str, size: int) -> bytes:
+    """Bytes for a purpose in a place of the benchmark, always the same."""
+    return hashlib.shake_256("/".join(("jaxmark/bench", label, *map(str, place))).encode()).digest(size)
+
+
+def to_bits(drawn: bytes, bits: int) -> Bits:
+    """The first bits of some bytes."""
+    return np.unpackbits(np.frombuffer(drawn, np.uint8))[:bits].astype(bool)
+
+
+def _mark(bench: Bench, task: Task) -> dict[str, Any]:
+    """Make the mark of a cell, and keep the mesh."""
+    mesh, method = load(bench.meshes[task.mesh]), bench.method(task)
+    bounds = get_league(task.league).bounds(task.limits, mesh)
+    found = fit(method, mesh, message_of(task, method.bits), key_of(task, _OWN), bounds)
+    keep_mesh(_file(bench, task), found.mesh)
+    moved = Reference(mesh).measure(found.mesh, ("rms", *COSTS))
+    return {"strength": found.strength, "tries": found.tries, "reached": found.reached, "moved": moved}
+
+
+def _file(bench: Bench, mark: Task) -> Path:
+    """The file of a marked mesh."""
+    return bench.folder / f"{hashlib.sha256(repr(tuple(mark)).encode()).hexdigest()[:24]}.npz"
+
+
+def keep_mesh(path: Path, mesh: Mesh) -> None:
+    """Write a mesh as arrays, exactly as it is."""
+    content = io.BytesIO()
+    np.savez_compressed(content, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces))
+    write_atomically(path, content.getvalue())
+
+
+@lru_cache(maxsize=4)
+def load(path: Path) -> Mesh:
+    """A mesh of a file of any format, or of `keep_mesh`; the same arrays for whoever asks again."""
+    if path.suffix != ".npz":
+        return load_mesh(path)
+    with np.load(path) as found:
+        return Mesh(found["vertices"], found["faces"])
+
+
+def _costs(before: Mesh, suspect: Mesh) -> dict[str, float | None]:
+    try:
+        return {str(name): value for name, value in Reference(before).measure(suspect, COSTS).items()}
+    except JaxmarkError:  # a suspect without an area
+        return {}
+
+
+def _readings(
+    bench: Bench, task: Task, original: Mesh, suspect: Mesh, own: bool, copy: int
+) -> Iterator[dict[str, Any]]:
+    """What a suspect is read as with the keys that a cell tries."""
+    # Keys that wrote nothing are used once, so that false positives are independent of each other.
+    count = bench.keys if task.source == UNMARKED else 1
+    place = "/".join((task.league, task.limits, task.source, task.attack))
+    names = [_OWN] * own + [f"{place}/{copy}/{number}" for number in range(count)]
+    method = bench.method(task)
+    message = message_of(task, method.bits)
+    for name in names:
+        start, note = time.perf_counter(), ""
+        try:
+            found = method.read(suspect, key_of(task, name), None if method.blind else original)
+            errors = _errors(found.message, message)
+            score, log10_p = float(found.score), found.log10_p
+        except Exception as error:  # see `work`
+            errors, score, log10_p, note = 0.5, -math.inf, None, _said(error)
+        yield {
+            "copy": copy,
+            "own": name == _OWN,
+            "read": bool(method.bits) and errors == 0,
+            "bit_errors": errors,
+            "score": score if math.isfinite(score) else None,
+            "log10_p": None if log10_p is None else float(log10_p),
+            "seconds": time.perf_counter() - start,
+            **({"note": note} if note else {}),
+        }
+
+
+def _errors(said: Bits | None, message: Bits) -> float:
+    """Share of wrong bits; 1/2 where nothing is said."""
+    if said is None or not len(message):
+        return 0.5
+    if np.shape(said) != message.shape:
+        raise JaxmarkError(f"A reading has {np.size(said)} bits, but the message {len(message)}.")
+    return float(np.mean(np.asarray(said, bool) != message))
+
+
+def _said(error: Exception) -> str:
+    return str(error) if isinstance(error, JaxmarkError) else f"{type(error).__name__}: {error}"
