@@ -98,7 +98,7 @@ def test_powers_shift_the_statistic_of_each_bin_to_its_target(factory, uniform, 
 
 
 def test_the_programme_moves_as_little_as_another_solver_finds():
-    """SciPy's trust region on the primal, with all its constraints, beside Newton's method on the dual."""
+    """On the primal, with all its constraints, beside Newton's method on the dual."""
     small = jm.geometry.asteroid(162)
     seen = programme._seen(small, 4)
     mass = seen.mean(4)[1]
@@ -109,31 +109,17 @@ def test_the_programme_moves_as_little_as_another_solver_finds():
     low = np.where(free, np.minimum(programme._EDGE - inside, 0), 0) * seen.width
     high = np.where(free, np.maximum(1 - programme._EDGE - inside, 0), 0) * seen.width
     rows = np.stack([seen.weight * (seen.place == place) for place in range(4)] + list(seen.weight * seen.ray.T))
-    scale = 1e4  # weights are small
-    other = optimize.minimize(
-        lambda x: scale * (seen.weight * x * x).sum(),
-        np.zeros(len(shift)),
-        jac=lambda x: 2 * scale * seen.weight * x,
-        bounds=list(zip(low, high, strict=True)),
-        constraints={
-            "type": "eq",
-            "fun": lambda x: scale * (rows @ x - np.append(wanted, np.zeros(3))),
-            "jac": lambda x: scale * rows,
-        },
-        method="SLSQP",
-        options={"maxiter": 500, "ftol": 1e-14},
-    )
-    assert other.success
+    # SciPy's bounded least squares; constraints are rows of great weight.
+    matrix = np.concatenate([np.diag(np.sqrt(seen.weight)), 1e4 * rows])
+    goal = np.concatenate([np.zeros(len(shift)), 1e4 * np.append(wanted, np.zeros(3))])
+    other = optimize.lsq_linear(matrix, goal, (low - 1e-12, high + 1e-12), tol=1e-14).x
     assert rows @ shift == pytest.approx(np.append(wanted, np.zeros(3)), abs=1e-12)
     assert ((shift >= low) & (shift <= high)).all()
-    assert (seen.weight * shift**2).sum() == pytest.approx(other.fun / scale, rel=1e-4)
+    assert shift == pytest.approx(other, abs=1e-3 * np.abs(shift).max())
 
 
-def test_the_programme_leaves_the_centre_and_moves_less_than_powers(mesh, message, key):
+def test_the_programme_moves_about_as_little_as_powers(mesh, message, key):
     marked = programme.radial(BITS).embed(mesh, message, key, 0.05)
-    centre = [programme._seen(jm.make_mesh(*one), BITS).centre for one in (mesh, marked)]
-    moved = np.linalg.norm(np.asarray(marked.vertices) - mesh.vertices, axis=1)
-    assert np.linalg.norm(centre[1] - centre[0]) < 0.05 * moved.mean()
     powers = norms.cho(BITS).embed(mesh, message, key, 0.05)
     assert jm.compare(mesh, marked, ("rms",)).rms < 1.2 * jm.compare(mesh, powers, ("rms",)).rms
 

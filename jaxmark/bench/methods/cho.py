@@ -83,7 +83,7 @@ def _method(statistic: Statistic, bits: int, strengths: tuple[float, float]) -> 
         body = skin(mesh)
         points = np.asarray(body.mesh.vertices)
         written = scatter(np.asarray(message, bool), key, statistic.name)
-        centre = points.mean(axis=0)
+        centre, marked = points.mean(axis=0), points
         for _ in range(_ROUNDS):
             marked = _mapped(points, centre, statistic, written, strength)
             before, centre = centre, marked.mean(axis=0)

@@ -67,7 +67,7 @@ def influence(bits: int) -> Method:
             return Reading(None, 0.0, 0.0)
         used = prepared.used
         bumps = basis(compact(prepared.points), count)
-        bumps = sparse.hstack([bumps, _affine(prepared.positions[used])], format="csr")
+        bumps = sparse.csr_array(sparse.hstack([bumps, _affine(prepared.positions[used])]))
         known = None if found.normals is None else found.normals[used]
         drawn, part = vector(key)
         shown = _explain(bumps, found.displacement[used], found.weights[used], known)[:count]
@@ -131,9 +131,9 @@ def _explain(
     if known is not None:
         place = np.arange(len(residual))
         along = sparse.csr_array((known.ravel(), (np.repeat(place, 3), np.arange(3 * len(place)))))
-        bumps, residual = along @ bumps, (known * residual).sum(axis=1, keepdims=True)
+        bumps, residual = sparse.csr_array(along @ bumps), (known * residual).sum(axis=1, keepdims=True)
     weights = np.repeat(weight, residual.shape[1])
-    matrix = (bumps.T @ (bumps * weights[:, None])).toarray()
+    matrix = sparse.csr_array(bumps.T @ sparse.diags_array(weights) @ bumps).toarray()
     matrix += _RIDGE * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
     return np.linalg.solve(matrix, bumps.T @ (weights * residual.ravel()))
 

@@ -133,11 +133,13 @@ def _least(seen: Radii, wanted: Float64[np.ndarray, " bits"], active: Bool[np.nd
         tip = (ray.T * loose) @ ray - cross.T @ (cross / own[:, None]) + _TINY * np.eye(3)
         turn = np.linalg.solve(tip, cross.T @ (off[:bits] / own) - off[bits:])
         step = np.append(-(off[:bits] + cross @ turn) / own, turn)
-        for length in 0.5 ** np.arange(_SHORTER):
-            shift, found = at(now + length * step)
+        shift, found = at(now + step)
+        for _ in range(_SHORTER):
             if np.linalg.norm(found) < np.linalg.norm(off):
                 break
-        now, off = now + length * step, found
+            step = step / 2
+            shift, found = at(now + step)
+        now, off = now + step, found
         if np.linalg.norm(off) <= enough:
             break
     return shift
