@@ -331,7 +331,7 @@ def small(tmp_path: Path) -> dict:
         "meshes": {"ball": bumpy_sphere(2)},
         "output": tmp_path / "out",
         "attacks": ["none", "noise 0.001"],
-        "keys": 40,
+        "keys": 60,
     }
 
 
@@ -349,13 +349,13 @@ def test_a_run_of_ones_own_methods_is_calibrated_and_goes_on_where_it_was_ended(
     assert 0 < attacks["noise 0.001"]["costs"]["mrms"] < 0.002
     nulls = part["calibration"]["nulls"]
     assert {kind: one["trials"] for kind, one in nulls.items()} == {
-        "unmarked": 40,
-        "unmarked, attacked": 40,
+        "unmarked": 60,
+        "unmarked, attacked": 60,
         "another key's mark": 2,
         "another method's mark": 1,
     }
     assert entries["signs"]["payloads"]["8"]["calibration"]["verdicts"] == []
-    assert entries["signs"]["payloads"]["8"]["calibration"]["bound"][0]["trials"] == 83
+    assert entries["signs"]["payloads"]["8"]["calibration"]["bound"][0]["trials"] == 123
     assert entries["signs"]["validated"] == "not validated"
     assert found.projected(8, 5) == pytest.approx(40 * found.seconds)
     again = jm.bench.run(**small, **methods, say=lambda line: pytest.fail(line))

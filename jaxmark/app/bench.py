@@ -137,8 +137,8 @@ def bench_command(
     repeated = hold_against(found, against) if against is not None else None
     hours, projected = found.seconds / 3600, found.projected(8, 5) / 3600
     about = (
-        f"`{_command()}`, jaxmark {importlib.metadata.version('jaxmark')}, {_machine()}: {hours:.2g} hours of work for one"
-        f" process. 8 meshes and 5 seeds would take {projected:.2g}."
+        f"`{_command()}`, jaxmark {importlib.metadata.version('jaxmark')}, {_machine()}: {hours:.2g} hours of work for"
+        f" one process. 8 meshes and 5 seeds would take {projected:.2g}."
     )
     _write(found, output, about)
     spent = {"command": _command(), "machine": _machine(), "seconds": round(time.time() - start, 1)}

@@ -10,6 +10,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.budget import largest_within
 
+_REFUSED = 2.0  # what a refused strength counts as, over the limits
 SHARE = 0.95  # of the limits, as good as all of them: every try is one embedding
 
 
@@ -49,7 +50,7 @@ def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[s
             marked = method.embed(mesh, message, key, strength)
         except JaxmarkError as error:  # too strong for this mesh, or else the weakest is refused, too
             refusal = str(error)
-            return math.inf
+            return _REFUSED
         reached = {str(name): value for name, value in reference.measure(marked, limits.keys()).items()}
         if gone := [name for name, value in reached.items() if value is None]:
             raise JaxmarkError(f"The metric {gone[0]!r} needs the original's connectivity, which the mark changes.")
