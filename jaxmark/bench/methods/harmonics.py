@@ -64,7 +64,7 @@ def harmonics(mesh: Mesh, count: int = HARMONICS) -> Float64[np.ndarray, "points
     return vectors[:, np.argsort(values)[1:]]
 
 
-def carrier(vectors: Float64[np.ndarray, "points bands"], mesh: Mesh) -> ModulatedCarrier:
+def carrier(vectors: Float[np.ndarray, "points bands"], mesh: Mesh) -> ModulatedCarrier:
     """Each "bit" is the amplitude of one eigenvector."""
     components = Harmonics(jnp.asarray(vectors), jnp.asarray(vertex_normals(mesh), vectors.dtype))
     return ModulatedCarrier(components, np.eye(vectors.shape[1], dtype=np.int8)[:, :, None])
