@@ -32,7 +32,7 @@ BITS = 32
 
 @pytest.fixture(scope="module")
 def mesh() -> Mesh:
-    return jm.geometry.asteroid(5000)
+    return jm.geometry.asteroid(3000)
 
 
 @pytest.fixture(scope="module")
@@ -116,12 +116,6 @@ def test_the_programme_moves_as_little_as_another_solver_finds():
     assert rows @ shift == pytest.approx(np.append(wanted, np.zeros(3)), abs=1e-12)
     assert ((shift >= low) & (shift <= high)).all()
     assert shift == pytest.approx(other, abs=1e-3 * np.abs(shift).max())
-
-
-def test_the_programme_moves_about_as_little_as_powers(mesh, message, key):
-    marked = programme.radial(BITS).embed(mesh, message, key, 0.05)
-    powers = norms.cho(BITS).embed(mesh, message, key, 0.05)
-    assert jm.compare(mesh, marked, ("rms",)).rms < 1.2 * jm.compare(mesh, powers, ("rms",)).rms
 
 
 def test_volumes_of_patches_are_those_of_points_thrown_into_a_box():

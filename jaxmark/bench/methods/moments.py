@@ -36,6 +36,7 @@ SOURCE = "Wang, Lavoué, Denis, Baskurt, Computers & Graphics 35 (1), 2011"
 STEPS = tuple(0.128 * 2 ** (-place / 4) for place in range(25))  # of the quantiser, in logarithms of volume
 _SECTORS = 8  # around the axis; even, so that planes through the axis cut them
 _SPARE = 1.4  # patches for each bit
+_NEARLY = 0.3  # of the smallest volume that carries a bit: patches from here on keep theirs
 _COSTA = 0.8  # share of the way to the quantiser's value
 _RIM = 0.35  # share of a patch's width, on either side, where the mask rises
 _AXIS = 0.1  # distance from the axis, in units of the volume's cube root, where the mask is a half
@@ -195,9 +196,9 @@ def _target(volumes: Cells, written: Bits, key: bytes, step: float) -> Cells:
     offset = uniform(key, "moments", "dither", len(volumes))[chosen] + written / 2
     nearest = step * (np.round(value / step - offset) + offset)
     target[chosen] = value + _COSTA * (nearest - value)
-    # What is not chosen stays below, so that the reader chooses the same.
+    # What is not chosen stays below, so that the reader chooses the same; what is small may do as it likes.
     most = target[chosen].min() - step / 2
-    rest = np.isnan(target) & (volumes > math.exp(most - step))
+    rest = np.isnan(target) & (volumes > _NEARLY * math.exp(most))
     target[rest] = np.minimum(np.log(volumes[rest]), most)
     return target
 
