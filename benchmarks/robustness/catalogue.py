@@ -65,6 +65,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--others", type=Path, nargs="*", default=[], metavar="MESH", help="files of strangers' meshes")
     parser.add_argument("--strangers", type=int, default=1_000, help="of these, deformed")
     parser.add_argument("--through", type=int, default=40, help="strangers that go through to the end, the nearest")
+    parser.add_argument("--depth", type=int, default=3, help="originals that each is compared with, each way")
     return parser.parse_args()
 
 
@@ -280,7 +281,7 @@ def main() -> None:
     fill(given.folder, models, given.count, given.most)
     key = jm.Key(bytes(range(32)))
     with jm.Catalogue(given.folder / "shop.db", read_only=True) as catalogue:
-        finder = Finder(catalogue, [key])
+        finder = Finder(catalogue, [key], depth=given.depth)
         start = time.perf_counter()
         finder.prepare()
         print(f"descriptors read in {time.perf_counter() - start:.1f} s\n")
