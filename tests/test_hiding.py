@@ -1,6 +1,7 @@
 """Directions that hide a displacement, on shapes whose directions are known, and marks that are written along them."""
 
 import dataclasses
+from threading import Thread
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +36,17 @@ def directions(mesh: Mesh) -> np.ndarray:
     """Matrices of the mesh's own vertices."""
     original = make_original(mesh)
     return hiding_directions(original)[original.weld.point]
+
+
+def test_a_program_that_ends_and_starts_no_more_threads_hides_as_well(monkeypatch: pytest.MonkeyPatch):
+    mesh = box()
+    expected = directions(mesh)
+
+    def refuse(thread: Thread) -> None:
+        raise RuntimeError("can't create new thread at interpreter shutdown")
+
+    monkeypatch.setattr(Thread, "start", refuse)
+    np.testing.assert_array_equal(directions(mesh), expected)
 
 
 def ratio(mesh: Mesh, axis: np.ndarray) -> np.ndarray:

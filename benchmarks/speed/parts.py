@@ -34,13 +34,17 @@ def main() -> None:
     parser.add_argument("output", type=Path, metavar="PARTS.glb")
     parser.add_argument("--parts", type=int, default=10)
     options = parser.parse_args()
-    if options.output.suffix != ".glb" or options.parts < 1:
-        parser.error("the output is a .glb file, of at least one part")
-    scene = trimesh.Scene()
-    for number, part in enumerate(cut(load(parser, options.mesh), options.parts)):
+    if options.output.suffix != ".glb" or not options.output.parent.is_dir():
+        parser.error(f"{options.output} cannot be written: it must end in .glb, in a folder that exists")
+    mesh, scene = load(parser, options.mesh), trimesh.Scene()
+    if not 1 <= options.parts <= len(mesh.faces):
+        parser.error(f"{options.mesh} has {len(mesh.faces)} faces, of which --parts {options.parts} cannot be made")
+    for number, part in enumerate(cut(mesh, options.parts)):
         say(f"part {number}: {len(part.vertices):,} vertices")
         scene.add_geometry(trimesh.Trimesh(*part, process=False), geom_name=f"part {number}")
-    write_atomically(options.output, scene.export(file_type="glb"))
+    written = scene.export(file_type="glb")
+    assert isinstance(written, bytes)
+    write_atomically(options.output, written)
 
 
 if __name__ == "__main__":

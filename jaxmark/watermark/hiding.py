@@ -3,7 +3,10 @@
 Points of a cloud have no faces that shade: they hide by how far they are apart.
 """
 
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import Future
+from threading import Thread
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +22,7 @@ from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.shapes import pad_rows
 
+Found = TypeVar("Found")
 _BAND = 2  # of `Hiding`: waves six edges long, of which marks mostly consist
 _SLOPE = 0.9  # largest slope of such a wave, times an edge, over its height
 _ALONG = 0.04  # displacement along the surface, in edges, that counts as much as a just noticeable one across it
@@ -60,11 +64,11 @@ def hiding_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
         return _by_spacing(original)
     mesh, size = Mesh(points, faces), len(points)
     # What faces hide takes as long as all that does not need it, and that is NumPy's: another thread computes it.
-    with ThreadPoolExecutor(1) as aside:
-        rest = aside.submit(lambda: (face_normals(mesh), _corner_angles(points, faces), open_sides(faces)))
-        edgewise = aside.submit(_along_edges, original)
-        shares, height, least = _heights(mesh)
-        (normals, angles, opened), (along, free) = rest.result(), edgewise.result()
+    rest = _beside(
+        lambda: (face_normals(mesh), _corner_angles(points, faces), open_sides(faces), _along_edges(original))
+    )
+    shares, height, least = _heights(mesh)
+    normals, angles, opened, (along, free) = rest.result()
     sound = np.flatnonzero(shares)
     form, weight = _sums(faces[sound], angles[sound], _squares(normals[sound], height[sound]), size)
 
@@ -83,6 +87,23 @@ def hiding_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     matrices = (vectors / np.sqrt(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
     matrices[~free] = 0
     return matrices / np.sqrt(np.mean(np.sum(matrices[original.used] ** 2, axis=(1, 2))) / 3)
+
+
+def _beside(compute: Callable[[], Found]) -> "Future[Found]":
+    """What another thread computes meanwhile, or this one at once, where a program that ends starts no more threads."""
+    found: Future[Found] = Future()
+
+    def run() -> None:
+        try:
+            found.set_result(compute())
+        except BaseException as error:
+            found.set_exception(error)
+
+    try:
+        Thread(target=run).start()
+    except RuntimeError:
+        run()
+    return found
 
 
 def _along_edges(original: Original) -> tuple[Float64[np.ndarray, "free 3 3"], Bool[np.ndarray, " points"]]:
