@@ -14,7 +14,7 @@ from jaxmark.bench.methods import cho as norms
 from jaxmark.bench.methods import influence as spheres
 from jaxmark.bench.methods import moments as patches
 from jaxmark.bench.methods import radial as programme
-from jaxmark.bench.methods.keyed import gather, normal, scatter
+from jaxmark.bench.methods.draws import gather, normal, scatter
 from jaxmark.geometry.mesh import Mesh
 from tests.meshes import shared_mesh
 

@@ -24,7 +24,7 @@ from scipy.sparse import csgraph
 from jaxmark.alignment.alignment import align
 from jaxmark.alignment.original import displace, make_original
 from jaxmark.bench.method import Bits, Method, Reading
-from jaxmark.bench.methods.keyed import choices, normal
+from jaxmark.bench.methods.draws import choices, normal
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, compact, edges, vertex_normals
 

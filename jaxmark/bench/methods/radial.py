@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from jaxmark.bench.method import Bits, Method, Reading
-from jaxmark.bench.methods.keyed import gather, scatter
+from jaxmark.bench.methods.draws import gather, scatter
 from jaxmark.bench.methods.surface import per_point, skin, vector_areas
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces
