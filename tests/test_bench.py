@@ -128,6 +128,8 @@ def test_the_area_under_a_step_is_where_it_stands():
         assert found.value == pytest.approx(share, abs=0.02)
         assert found.low <= found.value <= found.high
     assert quality.score([]) is None
+    alone = quality.score([one for one in points(1e-3) if (one.mesh, one.seed) == ("a", 0)])
+    assert (alone.low, alone.high) == (0, 1)
     unknown = [quality.Point("a", 0, "crop", {"mrms": None}, True)]
     assert quality.score(unknown) is None
 

@@ -76,7 +76,8 @@ def curve(points: Sequence[Point], metric: str, weights: Float64[np.ndarray, " p
 def score(points: Sequence[Point]) -> Score | None:
     """The mean of the areas under the curves over all metrics, with an interval by bootstrap; None without points.
 
-    Meshes and seeds are drawn again with replacement, all suspects of a pair together (500 times).
+    Meshes and seeds are drawn again with replacement, all suspects of a pair together (500 times). One mesh with one
+    seed says nothing of others: its interval is from 0 to 1.
     """
     found = _areas(points, None)
     if not found:
@@ -91,7 +92,8 @@ def score(points: Sequence[Point]) -> Score | None:
         areas = _areas(points, (times[0][at[0]] * times[1][at[1]]).astype(float))
         if areas:
             values.append(np.mean(list(areas.values())))
-    low, high = np.quantile(values, [0.025, 0.975])
+    alone = len(meshes) * len(seeds) == 1  # nothing is known of others
+    low, high = (0.0, 1.0) if alone else np.quantile(values, [0.025, 0.975])
     return Score(float(np.mean(list(found.values()))), float(low), float(high), found, len(points))
 
 
