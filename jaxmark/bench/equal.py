@@ -31,7 +31,7 @@ NOISE = tuple(float(f"{x:.2g}") for x in np.geomspace(1e-5, 0.05, 48))  # half w
 _OTHERS = 20  # keys above whose scores a mark without a message must stand
 
 
-class Point(NamedTuple):
+class Setting(NamedTuple):
     """A method at one payload and one visibility."""
 
     method: str
@@ -59,13 +59,13 @@ def equal_visibility(
 
     Args:
         meshes: files, or meshes by their names.
-        output: folder, in which finished points are kept.
-        methods: see `jaxmark.bench.run`.
+        output: folder, in which finished settings are kept.
+        methods: see `jaxmark.bench.benchmark.run`.
         payloads: bits of a message, for methods that have a choice.
         shares: of the limits.
         seeds: number of seeds.
-        workers: see `jaxmark.bench.run`.
-        say: function that is called with a line about the progress after each point.
+        workers: see `jaxmark.bench.benchmark.run`.
+        say: function that is called with a line about the progress after each setting.
 
     Raises:
         JaxmarkError: if there is no such method, a mesh cannot be read, or a share is not above 0.
@@ -76,28 +76,28 @@ def equal_visibility(
     (folder / "meshes").mkdir(parents=True, exist_ok=True)
     files, named = named_files(meshes, folder / "meshes"), {name_of(given): given for given in methods}
     grid = product(named, payloads, shares, files, range(seeds))
-    points: list[Cell] = [Point(*point) for point in grid]
+    settings: list[Cell] = [Setting(*setting) for setting in grid]
     if isinstance(workers, int):
         workers = processes(workers) if workers > 1 else partial(ThreadPoolExecutor, 1)
-    rows = cells.run(points, partial(_work, files, named), workers, folder / "equal.jsonl", say)
-    return _table([(Point(*row["cell"]), row) for row in rows], shares)
+    rows = cells.run(settings, partial(_work, files, named), workers, folder / "equal.jsonl", say)
+    return _table([(Setting(*row["cell"]), row) for row in rows], shares)
 
 
 def _work(files: Mapping[str, Path], named: Mapping[str, Given], cell: Cell) -> dict[str, Any]:
-    """One point: the mark, and what it survives. At the top level, where workers find it."""
-    point = Point(*cell)  # pyright: ignore[reportArgumentType] (a cell's values are those of its fields)
-    method, mesh = load_method(named[point.method], point.payload), load(files[point.mesh])
-    key, message = draw(point, "key", 32), to_bits(draw(point, "message", method.bits), method.bits)
-    limits = {name: point.share * limit for name, limit in get_league("2026").bounds("hidden", mesh).items()}
+    """One setting: the mark, and what it survives. At the top level, where workers find it."""
+    setting = Setting(*cell)  # pyright: ignore[reportArgumentType] (a cell's values are those of its fields)
+    method, mesh = load_method(named[setting.method], setting.payload), load(files[setting.mesh])
+    key, message = draw(setting, "key", 32), to_bits(draw(setting, "message", method.bits), method.bits)
+    limits = {name: setting.share * limit for name, limit in get_league("2026").bounds("hidden", mesh).items()}
     try:
         found = fit(method, mesh, message, key, limits)
     except Exception as error:  # a stranger's method may raise anything
         return {"note": f"{type(error).__name__}: {error}"}
 
     def survives(noise: float) -> bool:
-        suspect = attack(found.mesh, "noise", noise, seed=point.seed)
+        suspect = attack(found.mesh, "noise", noise, seed=setting.seed)
         try:
-            return _is_there(method, suspect, mesh, point, key, message)
+            return _is_there(method, suspect, mesh, setting, key, message)
         except Exception:
             return False
 
@@ -110,22 +110,22 @@ def _work(files: Mapping[str, Path], named: Mapping[str, Given], cell: Cell) -> 
     return {"strength": found.strength, "reached": found.reached, "moved": moved, "noise": noise}
 
 
-def _is_there(method: Method, suspect: Mesh, original: Mesh, point: Point, key: bytes, message: np.ndarray) -> bool:
+def _is_there(method: Method, suspect: Mesh, original: Mesh, setting: Setting, key: bytes, message: np.ndarray) -> bool:
     known = None if method.blind else original
     found = method.read(suspect, key, known)
     if method.bits:
         return found.message is not None and bool(np.array_equal(np.asarray(found.message, bool), message))
-    others = (draw(point, f"other/{number}", 32) for number in range(_OTHERS))
+    others = (draw(setting, f"other/{number}", 32) for number in range(_OTHERS))
     return all(found.score > method.read(suspect, other, known).score for other in others)
 
 
-def _table(rows: Sequence[tuple[Point, Mapping[str, Any]]], shares: Sequence[float]) -> Table:
+def _table(rows: Sequence[tuple[Setting, Mapping[str, Any]]], shares: Sequence[float]) -> Table:
     """The noise that half of the meshes and seeds survive, for each method, payload and share."""
     lines = []
-    for method, payload in dict.fromkeys((point.method, point.payload) for point, _ in rows):
+    for method, payload in dict.fromkeys((setting.method, setting.payload) for setting, _ in rows):
         line = [method, str(payload)]
         for share in shares:
-            some = [row for point, row in rows if point[:3] == (method, payload, share)]
+            some = [row for setting, row in rows if setting[:3] == (method, payload, share)]
             made = [row for row in some if "noise" in row]
             if not made:
                 line.append("not marked")

@@ -42,7 +42,7 @@ class Suspect:
 
 @dataclass(frozen=True)
 class BenchResults:
-    """The rows of a benchmark, as `jaxmark.bench.run` returns them."""
+    """The rows of a benchmark, as `jaxmark.bench.benchmark.run` returns them."""
 
     methods: Mapping[str, Method]  # by their names in cells
     rows: tuple[dict[str, Any], ...]

@@ -44,7 +44,7 @@ class Harmonics(NamedTuple):
 
     @property
     def gram(self) -> Float[Array, "3 bands bands"]:
-        """See `jaxmark.watermark.carriers.carrier.Components`."""
+        """See `jaxmark.watermark.carriers.modulated.Components`."""
         return einsum("vj,vc,vk->cjk", self.vectors, self.normals**2, self.vectors)
 
     def synthesise(self, amplitudes: Float[Array, "bands 3"]) -> Float[Array, "vertices 3"]:
