@@ -144,6 +144,7 @@ LINES_2026: Mapping[str, Line] = {
     },
 }
 
+#: The leagues by their names.
 LEAGUES: Mapping[str, League] = {
     "smi2010": League(
         {"perceptual": {"mrms": 8e-4, "msdm": 0.20}, "geometric": {"mrms": 2e-4, "msdm": 0.30}}, PROTOCOL
