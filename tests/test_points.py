@@ -461,7 +461,7 @@ def test_64_bits_in_a_large_cloud_read_from_half_of_it_in_noise(key: jm.Key):
     host = cloud(ball(25_000))
     marker = jm.make_marker(host, key, bits=64)
     shown, info = marker.embed(MESSAGE)
-    assert info.rms <= 2e-4
+    assert info.rms <= 2e-4 * (1 + 1e-9)
     for steps in (
         [("subsampling", 0.5), ("diagonal-noise", 1e-3)],
         [("merging", 1e-3)],
