@@ -63,6 +63,7 @@ def survival(results: BenchResults, league: str) -> Picture:
             if (found := curve(points(results, some), metric)) is not None:
                 panel.plot(found.cost, found.success, style, color=colour, label=results.methods[name].name)
         panel.set(xscale="log", xlabel=metric.upper(), ylim=(-0.03, 1.03))
+        panel.tick_params(axis="x", which="minor", labelbottom=False)
     panels[0].set_ylabel("share detected")
     _legend(figure, panels[0])
     return Picture(figure)
