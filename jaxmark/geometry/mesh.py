@@ -237,9 +237,14 @@ def open_sides(faces: Int[Array | np.ndarray, "faces 3"]) -> Bool[np.ndarray, "f
     return ((count == 1)[which.reshape(-1)] & (low != high).ravel()).reshape(faces.shape)
 
 
+def face_areas(mesh: Mesh) -> Float64[np.ndarray, " faces"]:
+    """Area of each face."""
+    return np.linalg.norm(_area_vectors(mesh), axis=1) / 2
+
+
 def area(mesh: Mesh) -> float:
     """Total surface area, in squared units of the mesh."""
-    return float(np.linalg.norm(_area_vectors(mesh), axis=1).sum() / 2)
+    return float(face_areas(mesh).sum())
 
 
 def component_of(mesh: Mesh) -> Int64[np.ndarray, " vertices"]:

@@ -26,9 +26,9 @@ from scipy.special import ive
 
 from jaxmark.bench.method import Bits, Method, Reading
 from jaxmark.bench.methods.draws import gather, scatter, uniform
-from jaxmark.bench.methods.surface import per_point, skin, vector_areas
+from jaxmark.bench.methods.surface import per_point, skin
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, check_faces, cross_product, vertex_normals
+from jaxmark.geometry.mesh import Mesh, check_faces, cross_product, face_areas, vertex_normals
 from jaxmark.geometry.moments import volume_moments
 from jaxmark.geometry.pose import Points
 
@@ -211,7 +211,7 @@ def _target(volumes: Cells, written: Bits, key: bytes, step: float) -> Cells:
 def _deformation(seen: Posed, volumes: Cells, change: Cells, fixed: np.ndarray) -> Float64[np.ndarray, " points"]:
     """The least motion along normals that changes logarithms of volumes, and not the pose."""
     points, (along, around) = np.asarray(seen.mesh.vertices), seen.places
-    area = per_point(seen.mesh, np.linalg.norm(vector_areas(seen.mesh), axis=1))
+    area = per_point(seen.mesh, face_areas(seen.mesh))
     cell = _cell(along, around, seen.slabs)
     along, around = along - np.floor(along), around - np.floor(around)
     radius = np.hypot(points[:, 1], points[:, 2]) ** 2

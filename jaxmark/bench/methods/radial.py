@@ -21,9 +21,9 @@ from jaxtyping import Bool, Float64, Int64
 
 from jaxmark.bench.method import Bits, Method, Reading
 from jaxmark.bench.methods.draws import gather, scatter
-from jaxmark.bench.methods.surface import per_point, skin, vector_areas
+from jaxmark.bench.methods.surface import per_point, skin
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, check_faces
+from jaxmark.geometry.mesh import Mesh, check_faces, face_areas
 
 SOURCE = "Rolland-Nevière, Doërr, Alliez, IEEE Transactions on Information Forensics and Security 9 (9), 2014"
 _RANGE = (0.01, 0.99)  # quantiles of the distance between which bins lie
@@ -88,7 +88,7 @@ def _seen(mesh: Mesh, bits: int) -> Radii:
     """
     check_faces("The method radial", mesh)
     points = np.asarray(mesh.vertices)
-    weight = per_point(mesh, np.linalg.norm(vector_areas(mesh), axis=1))
+    weight = per_point(mesh, face_areas(mesh))
     weight /= weight.sum()
     centre = weight @ points
     distance = np.linalg.norm(points - centre, axis=1)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from jaxmark.geometry.mesh import Mesh, Weld, cross_product, host_mesh, used_vertices, weld, weld_mesh
+from jaxmark.geometry.mesh import Mesh, Weld, compact, host_mesh, used_vertices, weld, weld_mesh
 from jaxmark.geometry.pose import Points
 
 
@@ -32,16 +32,7 @@ def skin(mesh: Mesh) -> Skin:
     """
     given = host_mesh(mesh)
     welded = weld(given.vertices)
-    points = weld_mesh(given, welded)
-    used = used_vertices(points)
-    number = np.cumsum(used) - 1
-    return Skin(Mesh(np.asarray(points.vertices)[used], number[np.asarray(points.faces)]), given, welded)
-
-
-def vector_areas(mesh: Mesh) -> Float64[np.ndarray, "faces 3"]:
-    """Normals of faces, as long as their areas."""
-    a, b, c = (np.asarray(mesh.vertices)[corner] for corner in np.asarray(mesh.faces).T)
-    return cross_product(b - a, c - a) / 2
+    return Skin(compact(weld_mesh(given, welded)), given, welded)
 
 
 def per_point(mesh: Mesh, values: Float64[np.ndarray, " faces"]) -> Float64[np.ndarray, " points"]:
