@@ -118,7 +118,7 @@ def basis(mesh: Mesh, count: int) -> Basis:
 def _affine(points: Float64[np.ndarray, "points 3"]) -> Basis:
     """The displacements that affine maps are, coordinate by coordinate."""
     each = np.column_stack([points, np.ones(len(points))])
-    return sparse.csr_array(sparse.kron(each, np.eye(3)))
+    return sparse.csr_array(sparse.kron(sparse.csr_array(each), np.eye(3)))
 
 
 def _explain(
