@@ -84,6 +84,7 @@ OUTPUT = click.option("--output", type=_PATH, required=True, help="Folder for th
 @click.option("--limits", multiple=True, help="Sets of limits of the league.  [default: all]")
 @click.option("--payloads", multiple=True, type=click.IntRange(1), help="Bits of a message.  [default: 64]")
 @SEEDS
+@click.option("--others", multiple=True, type=_PATH, help="Further meshes, read unmarked in place of each MESH.")
 @click.option(
     "--keys", type=click.IntRange(1), default=KEYS, show_default=True, help="Keys for each suspect without a mark."
 )
@@ -104,6 +105,7 @@ def bench_command(
     limits: tuple[str, ...],
     payloads: tuple[int, ...],
     seeds: int,
+    others: tuple[Path, ...],
     keys: int,
     rate: float,
     workers: int,
@@ -129,6 +131,7 @@ def bench_command(
         limits=limits,
         payloads=payloads or (64,),
         seeds=seeds,
+        others=others,
         keys=keys,
         rate=rate,
         workers=processes(workers),  # in its own process a program that an attack calls may crash

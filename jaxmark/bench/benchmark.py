@@ -39,6 +39,7 @@ def run(
     limits: Sequence[str] = (),
     payloads: Sequence[int] = (64,),
     seeds: int = 1,
+    others: Sequence[str | os.PathLike[str]] = (),
     keys: int = KEYS,
     rate: float = RATE,
     workers: int | Pool = 1,
@@ -47,8 +48,8 @@ def run(
     """Run what is not finished of a benchmark, and return the results of all. Needs the extra `align`.
 
     From each seed derive, for each method and mesh, a key, a message and the random choices of the attacks. Suspects
-    without the method's mark are always read, too: unmarked meshes after every attack, other methods' marks, and marks
-    of another key.
+    without the method's mark are always read, too: unmarked meshes after every attack, other methods' marks, marks of
+    another key, and other meshes.
 
     Args:
         meshes: files, or meshes by their names.
@@ -60,6 +61,7 @@ def run(
         limits: names of a league's sets of limits; by default all.
         payloads: bits of a message, for methods that have a choice.
         seeds: number of seeds.
+        others: files of further meshes, which every method reads unmarked, in place of each mesh.
         keys: number of keys that each unmarked suspect is read with.
         rate: of false positives, at which a mark counts as detected.
         workers: number of processes, where 1 is this one, or a function that makes an executor, see
@@ -78,7 +80,9 @@ def run(
     folder = Path(output)
     (folder / "meshes").mkdir(parents=True, exist_ok=True)
     named = {name_of(given): given for given in methods}
-    bench = Bench(folder / "meshes", named_files(meshes, folder / "meshes"), named, keys)
+    marked = named_files(meshes, folder / "meshes")
+    unrelated = named_files(others, folder / "meshes")
+    bench = Bench(folder / "meshes", {**unrelated, **marked}, named, keys)
     made = {name: load_method(given, payloads[0]) for name, given in named.items()}
     _check_names("attack", attacks, [name for league in leagues for name in get_league(league).lines])
     _check_names("set of limits", limits, [name for league in leagues for name in get_league(league).limits])
@@ -95,10 +99,15 @@ def run(
     # Seed by seed, so that a run that is ended has some of every mesh.
     whole = [
         Task(name, payload, league, "", mesh, seed, name, MARK)
-        for seed, payload, league, mesh, name in product(range(seeds), payloads, leagues, bench.meshes, named)
+        for seed, payload, league, mesh, name in product(range(seeds), payloads, leagues, marked, named)
     ]
     marks = [task._replace(limits=one) for task in whole for one in plans[task.league].limits]
     suspects = [one for task in whole for one in _suspects(task, plans[task.league], list(named))]
+    suspects += [
+        task._replace(source=other, attack="none")
+        for task, other in product(whole, unrelated)
+        if task.league == leagues[0] and task.mesh != other
+    ]
     rows = []
     for part in (marks, suspects):
         rows += cells.run(part, partial(work, bench), workers, folder / ROWS, say, _told)

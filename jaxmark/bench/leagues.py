@@ -18,6 +18,7 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.budget import visibility_of
 
 CROPS = 3  # of one mesh, whose readings are averaged
+OVERWRITTEN = "overwritten"  # by a second mark of the same method, with another key, as strong as the limits
 _EXTRAS = {"pymeshlab": "attacks", "fast_simplification": "attacks", "skimage": "attacks", "igl": "align"}
 _EXTRAS |= {"DracoPy": "files"}
 
@@ -35,7 +36,7 @@ class Line(NamedTuple):
     family: str = ""  # of an attacker with one budget, who takes the best for each mark
 
     def suspects(self, mesh: Mesh, seed: int) -> list[Mesh]:
-        """What the attack makes of a mesh.
+        """What the attack makes of a mesh, unless it is `OVERWRITTEN`, which only the method itself can do.
 
         Raises:
             JaxmarkError: if it is not possible on this mesh.
@@ -135,6 +136,7 @@ LINES_2026: Mapping[str, Line] = {
     "glTF quantised 12": Line(made.GLTF, 12),
     "grafted 0.5": Line(made.GRAFT, 0.5, copies=CROPS, in_place=False),
     "mosaic 0.1": Line("mosaic", 0.1, in_place=False),
+    OVERWRITTEN: Line(OVERWRITTEN, 1),
     **{
         f"attacker, MSDM2 {budget:g}: {kind}": Line(
             made.to_budget(kind), budget, needs=("igl",), family=f"attacker, MSDM2 {budget:g}"

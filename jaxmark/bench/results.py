@@ -21,7 +21,8 @@ from jaxmark.bench.work import MARK, UNMARKED, Task
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import write_atomically
 
-_WRONG, _OTHERS, _PLAIN, _ATTACKED = "another key's mark", "another method's mark", "unmarked", "unmarked, attacked"
+_WRONG, _OTHERS = "another key's mark", "another method's mark"
+_PLAIN, _ATTACKED, _ANOTHER = "unmarked", "unmarked, attacked", "another mesh"
 Reading = Mapping[str, Any]
 Null = tuple[float, float | None]  # a score, and log10 of the probability that is proven
 
@@ -82,7 +83,7 @@ class BenchResults:
         for task, row in self.tasks:
             for one in row.get("readings", []):
                 if not one["own"]:
-                    nulls[task.method, task.payload][_kind(task)].append((_score(one), one["log10_p"]))
+                    nulls[task.method, task.payload][self._kind(task)].append((_score(one), one["log10_p"]))
         marks: dict[tuple[str, int], list[float]] = defaultdict(list)
         for one in self.suspects:
             marks[one.task.method, one.task.payload].append(one.score)
@@ -90,6 +91,14 @@ class BenchResults:
             key: calibrate(self.methods[key[0]], kinds, np.array(marks[key], float), self.rate)
             for key, kinds in nulls.items()
         }
+
+    def _kind(self, task: Task) -> str:
+        """What kind of null a suspect is, whose readings are not with the key that marked it."""
+        if task.source == UNMARKED:
+            return _PLAIN if task.attack == "none" else _ATTACKED
+        if task.source == task.method:
+            return _WRONG
+        return _OTHERS if task.source in self.methods else _ANOTHER
 
     def succeeds(self, one: Suspect, rule: str = "detected") -> bool:
         """Whether a suspect's score is above its reader's calibrated threshold, or by `"read"` its message exact."""
@@ -134,13 +143,6 @@ class BenchResults:
             for one in row.get("readings", []):
                 writer.writerow({**task._asdict(), **one})
         write_atomically(path, text.getvalue().encode())
-
-
-def _kind(task: Task) -> str:
-    """What kind of null a suspect is, whose readings are not with the key that marked it."""
-    if task.source == UNMARKED:
-        return _PLAIN if task.attack == "none" else _ATTACKED
-    return _WRONG if task.source == task.method else _OTHERS
 
 
 def _score(reading: Reading) -> float:

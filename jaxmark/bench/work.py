@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxmark.bench.fitting import fit
-from jaxmark.bench.leagues import get_league
+from jaxmark.bench.fitting import Fitted, fit
+from jaxmark.bench.leagues import OVERWRITTEN, Line, get_league
 from jaxmark.bench.method import Bits, Method
 from jaxmark.bench.plugged import Given, load_method
 from jaxmark.distortion import Reference
@@ -26,7 +26,7 @@ from jaxmark.geometry.mesh import Mesh
 UNMARKED = "unmarked"  # in place of the method whose mark a suspect has
 MARK = "mark"  # in place of an attack: the mark itself is made
 COSTS = ("mrms", "dame", "msdm2")  # what an attack does to the shape, measured against the marked mesh
-_OWN = "own"
+_OWN, _SECOND = "own", "second"  # keys: of the mark, and of one that is written over it
 
 
 class Task(NamedTuple):
@@ -38,7 +38,7 @@ class Task(NamedTuple):
     limits: str  # empty where nothing is marked
     mesh: str
     seed: int
-    source: str  # whose mark the suspect has, or `UNMARKED`
+    source: str  # whose mark the suspect has, or `UNMARKED`, or another mesh, unmarked, in place of this one
     attack: str  # of the league, or `MARK`
 
     @property
@@ -72,14 +72,16 @@ def work(bench: Bench, cell: Cell) -> dict[str, Any]:
             return {"note": f"Not marked: {_said(error)}", "seconds": time.perf_counter() - start}
         return {**found, "seconds": time.perf_counter() - start}
     before = original = load(bench.meshes[task.mesh])
-    if task.source != UNMARKED:
+    if task.source in bench.meshes:
+        before = load(bench.meshes[task.source])
+    elif task.source != UNMARKED:
         file = _file(bench, task.mark)
         if not file.exists():
             return {"note": "Not marked.", "readings": []}
         before = load(file)
     line = get_league(task.league).lines[task.attack]
     try:
-        suspects = line.suspects(before, task.seed)
+        suspects = _suspects(bench, task, line, before)
     except JaxmarkError as error:
         return {"note": f"Not attacked: {error}", "readings": []}
     seconds = time.perf_counter() - start
@@ -97,9 +99,9 @@ def key_of(task: Task, name: str) -> bytes:
     return draw((task.method, task.payload, task.mesh, task.seed), f"key/{name}", 32)
 
 
-def message_of(task: Task, bits: int) -> Bits:
-    """The message of a mark, of so many bits."""
-    return to_bits(draw((task.method, task.payload, task.mesh, task.seed), "message", bits), bits)
+def message_of(task: Task, bits: int, name: str = _OWN) -> Bits:
+    """The message of a mark, of so many bits, that goes with the key of that name."""
+    return to_bits(draw((task.method, task.payload, task.mesh, task.seed), f"message/{name}", bits), bits)
 
 
 def draw(place: tuple[object, ...], label: str, size: int) -> bytes:
@@ -115,16 +117,36 @@ def to_bits(drawn: bytes, bits: int) -> Bits:
 def _mark(bench: Bench, task: Task) -> dict[str, Any]:
     """Make the mark of a cell, and keep the mesh."""
     mesh, method = load(bench.meshes[task.mesh]), bench.method(task)
-    bounds = get_league(task.league).bounds(task.limits, mesh)
-    found = fit(method, mesh, message_of(task, method.bits), key_of(task, _OWN), bounds)
+    found = _fit(method, task, mesh, _OWN)
     keep_mesh(_file(bench, task), found.mesh)
     moved = Reference(mesh).measure(found.mesh, ("rms", *COSTS))
     return {"strength": found.strength, "tries": found.tries, "reached": found.reached, "moved": moved}
 
 
-def _file(bench: Bench, mark: Task) -> Path:
-    """The file of a marked mesh."""
-    return bench.folder / f"{hashlib.sha256(repr(tuple(mark)).encode()).hexdigest()[:24]}.npz"
+def _fit(method: Method, task: Task, mesh: Mesh, name: str) -> Fitted:
+    """Mark a mesh with the key of a name as strongly as the limits of a cell allow, or the first of its league."""
+    league = get_league(task.league)
+    bounds = league.bounds(task.limits or next(iter(league.limits)), mesh)
+    return fit(method, mesh, message_of(task, method.bits, name), key_of(task, name), bounds)
+
+
+def _suspects(bench: Bench, task: Task, line: Line, before: Mesh) -> list[Mesh]:
+    """What the attack of a cell makes of a mesh; of an unmarked one it is made once for all methods."""
+    if task.attack == OVERWRITTEN:
+        return [_fit(bench.method(task), task, before, _SECOND).mesh]
+    if task.source != UNMARKED:
+        return line.suspects(before, task.seed)
+    shared = task._replace(method="", payload=0)
+    files = [_file(bench, shared, copy) for copy in range(line.copies)]
+    if not all(file.exists() for file in files):
+        for file, suspect in zip(files, line.suspects(before, task.seed), strict=True):
+            keep_mesh(file, suspect)
+    return [load(file) for file in files]
+
+
+def _file(bench: Bench, task: Task, copy: int = 0) -> Path:
+    """The file of a mesh that a cell makes."""
+    return bench.folder / f"{hashlib.sha256(repr((*task, copy)).encode()).hexdigest()[:24]}.npz"
 
 
 def keep_mesh(path: Path, mesh: Mesh) -> None:
@@ -134,7 +156,7 @@ def keep_mesh(path: Path, mesh: Mesh) -> None:
     write_atomically(path, content.getvalue())
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def load(path: Path) -> Mesh:
     """A mesh of a file of any format, or of `keep_mesh`; the same arrays for whoever asks again."""
     if path.suffix != ".npz":
@@ -155,7 +177,7 @@ def _readings(
 ) -> Iterator[dict[str, Any]]:
     """What a suspect is read as with the keys that a cell tries."""
     # Keys that wrote nothing are used once, so that false positives are independent of each other.
-    count = bench.keys if task.source == UNMARKED else 1
+    count = bench.keys if task.source == UNMARKED or task.source in bench.meshes else 1
     place = "/".join((task.league, task.limits, task.source, task.attack))
     names = [_OWN] * own + [f"{place}/{copy}/{number}" for number in range(count)]
     method = bench.method(task)

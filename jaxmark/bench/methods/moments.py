@@ -119,7 +119,7 @@ def _posed(mesh: Mesh, slabs: int) -> Posed:
     middle, length = points.mean(axis=0), float(np.ptp(points, axis=0).max())
     points = (points - middle) / length
     found = volume_moments(points[faces])
-    if not abs(found.mass) > 1e-9:
+    if not abs(found.mass) > 1e-9 or not np.linalg.eigvalsh(found.covariance).min() > 0:
         raise JaxmarkError("This surface encloses no volume, and moments of volume are what the method writes in.")
     variance, axes = np.linalg.eigh(found.covariance)
     points, axes = points - found.centre, axes[:, ::-1]
