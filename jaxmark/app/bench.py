@@ -119,7 +119,8 @@ def bench_command(
     its score is calibrated on suspects that have no mark. Options that may be repeated take all values up to the next
     option. The folder gets results.json, with an entry for each method, results.md, readings.csv (of marks, to
     publish), all_readings.csv (of nulls, too), and with the extra `plot` page.html. The same command goes on where it
-    was ended, and a wider one takes over what both have. With --against, the exit status is 1 where readings disagree.
+    was ended, and a wider one takes over what both have. With --against, the exit status is 1 where readings disagree
+    or none is published.
     """
     start = time.time()
     found = run(
@@ -153,7 +154,7 @@ def bench_command(
         said += "\n\n" + "\n".join([*lines, *repeated.differences])
     values = {} if repeated is None else {"repeated": repeated.shared, "differences": list(repeated.differences)}
     answer(as_json, {"output": str(output), "methods": entries(found), **values}, said)
-    if repeated is not None and repeated.differences:
+    if repeated is not None and (repeated.differences or not repeated.shared):
         click.get_current_context().exit(1)
 
 

@@ -77,12 +77,15 @@ def run(
         raise JaxmarkError(
             "A benchmark needs a mesh, a method, a seed, a key for unmarked meshes, and positive payloads."
         )
+    if not 0 < rate < 1:
+        raise JaxmarkError(f"The rate of false positives is between 0 and 1, got {rate:g}.")
     folder = Path(output)
     (folder / "meshes").mkdir(parents=True, exist_ok=True)
+    leagues, payloads = list(dict.fromkeys(leagues)), list(dict.fromkeys(payloads))
     named = {name_of(given): given for given in methods}
     marked = named_files(meshes, folder / "meshes")
     unrelated = named_files(others, folder / "meshes")
-    bench = Bench(folder / "meshes", {**unrelated, **marked}, named, keys)
+    bench = Bench(folder / "meshes", {**unrelated, **marked}, named)
     made = {name: load_method(given, payloads[0]) for name, given in named.items()}
     _check_names("attack", attacks, [name for league in leagues for name in get_league(league).lines])
     _check_names("set of limits", limits, [name for league in leagues for name in get_league(league).limits])
@@ -102,10 +105,10 @@ def run(
         for seed, payload, league, mesh, name in product(range(seeds), payloads, leagues, marked, named)
     ]
     marks = [task._replace(limits=one) for task in whole for one in plans[task.league].limits]
-    suspects = [one for task in whole for one in _suspects(task, plans[task.league], list(named))]
+    suspects = [one for task in whole for one in _suspects(task, plans[task.league], list(named), keys)]
     suspects += [
-        task._replace(source=other, attack="none")
-        for task, other in product(whole, unrelated)
+        task._replace(source=other, attack="none", number=number)
+        for task, other, number in product(whole, unrelated, range(keys))
         if task.league == leagues[0] and task.mesh != other
     ]
     rows = []
@@ -114,10 +117,12 @@ def run(
     return BenchResults(made, tuple(rows), skipped, rate)
 
 
-def _suspects(task: Task, plan: _Plan, methods: Sequence[str]) -> Iterator[Task]:
+def _suspects(task: Task, plan: _Plan, methods: Sequence[str], keys: int) -> Iterator[Task]:
     """What one method reads of one mesh in one seed: it unmarked and marked, and in the first seed others' marks."""
-    for attack in plan.attacks:
-        yield task._replace(source=UNMARKED, attack=attack)
+    for attack, number in product(plan.attacks, range(keys)):
+        yield task._replace(source=UNMARKED, attack=attack, number=number)
+    for limits in plan.limits[:1]:  # and with the key that is used to mark it
+        yield task._replace(limits=limits, source=UNMARKED, attack="none")
     for limits, attack in product(plan.limits, plan.attacks):
         yield task._replace(limits=limits, attack=attack)
     if task.seed == 0 and plan.limits:

@@ -141,7 +141,9 @@ def calibrate(
     """
     scores = {kind: np.array([score for score, _ in some], float) for kind, some in nulls.items()}
     every = np.concatenate(list(scores.values()))
-    proven = np.array([p for some in nulls.values() for _, p in some if p is not None], float)
+    stated = [p for some in nulls.values() for _, p in some]
+    # A reader that proves something says by None, or by refusing, that here it proves nothing.
+    proven = np.array([0.0 if p is None else p for p in stated] if any(p is not None for p in stated) else [], float)
     found = threshold(every, rate)
     points = roc(every, marks) if len(marks) else [(0.0, 0.0), (1.0, 1.0)]
     own = None if method.threshold is None else count(every >= method.threshold)

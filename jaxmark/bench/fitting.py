@@ -4,13 +4,17 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import numpy as np
+
 from jaxmark.bench.method import Bits, Method
 from jaxmark.distortion import Reference
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh, Weld, diagonal, weld
+from jaxmark.geometry.pose import similarity
 from jaxmark.watermark.budget import largest_within
 
 _REFUSED = 2.0  # what a refused strength counts as, over the limits
+_TORN = 1e-9  # of the diagonal: rounding
 SHARE = 0.95  # of the limits, as good as all of them: every try is one embedding
 
 
@@ -26,6 +30,9 @@ class Fitted(NamedTuple):
 def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[str, float]) -> Fitted:
     """Embed with the largest strength that keeps limits, the same search for every method.
 
+    What a mark does to the pose is undone by the similarity that fits best: a message in the pose would cost nothing
+    that a metric sees.
+
     Args:
         method: the method; its `strengths` bound the search.
         mesh: the original.
@@ -35,9 +42,9 @@ def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[s
 
     Raises:
         JaxmarkError: if not even the weakest mark keeps the limits, the method changes the connectivity that a metric
-            needs, or refuses the mesh.
+            needs, tears copies of a vertex apart, or refuses the mesh.
     """
-    reference, weakest, strongest = Reference(mesh), *method.strengths
+    reference, welded, (weakest, strongest) = Reference(mesh), weld(mesh.vertices), method.strengths
     best: list[Fitted] = []
     tries, refusal = 0, ""
 
@@ -47,7 +54,7 @@ def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[s
             raise JaxmarkError(refusal or f"Even the weakest mark, of strength {weakest:g}, exceeds the limits.")
         tries += 1
         try:
-            marked = method.embed(mesh, message, key, strength)
+            marked = _in_pose_of(mesh, method.embed(mesh, message, key, strength), welded)
         except JaxmarkError as error:  # too strong for this mesh, or else the weakest is refused, too
             refusal = str(error)
             return _REFUSED
@@ -60,5 +67,26 @@ def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[s
             best.append(Fitted(marked, strength, found, tries))
         return worst
 
-    strength = largest_within(ratio, strongest, math.sqrt(weakest * strongest), SHARE)
-    return next(one for one in reversed(best) if one.strength == strength)._replace(tries=tries)
+    try:
+        largest_within(ratio, strongest, math.sqrt(weakest * strongest), SHARE)
+    except JaxmarkError:
+        # The search stops above a strength that is not within the limits, but the weakest may be.
+        if not best and ratio(weakest) > 1:
+            raise
+    return max(best, key=lambda one: one.strength)._replace(tries=tries)
+
+
+def _in_pose_of(mesh: Mesh, marked: Mesh, welded: Weld) -> Mesh:
+    """A marked mesh brought back onto its original.
+
+    Raises:
+        JaxmarkError: if copies of a vertex are no longer at one place, which metrics of the surface do not see.
+    """
+    if len(marked.vertices) != len(mesh.vertices):
+        return marked  # metrics refuse it
+    before, after = (np.asarray(one.vertices, np.float64) for one in (mesh, marked))
+    points = after[welded.first]
+    if np.abs(points[welded.point] - after).max() > _TORN * diagonal(mesh):
+        raise JaxmarkError("The mark tears vertices apart that are copies of one point.")
+    pose = similarity(after, before)
+    return Mesh(pose(points)[welded.point], marked.faces)

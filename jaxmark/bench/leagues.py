@@ -19,6 +19,7 @@ from jaxmark.watermark.budget import visibility_of
 
 CROPS = 3  # of one mesh, whose readings are averaged
 OVERWRITTEN = "overwritten"  # by a second mark of the same method, with another key, as strong as the limits
+_FARTHEST = 0.02  # diagonals that a hidden mark moves any vertex: single ones may move far unseen by means
 _EXTRAS = {"pymeshlab": "attacks", "fast_simplification": "attacks", "skimage": "attacks", "igl": "align"}
 _EXTRAS |= {"DracoPy": "files"}
 
@@ -57,7 +58,7 @@ class League(NamedTuple):
 
     def bounds(self, limits: str, mesh: Mesh) -> Mapping[str, float]:
         """The limits of one name for a mesh."""
-        return self.limits[limits] or visibility_of(mesh)["hidden"]
+        return self.limits[limits] or {**visibility_of(mesh)["hidden"], "max": _FARTHEST}
 
 
 def posed(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:

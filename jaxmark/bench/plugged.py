@@ -65,13 +65,26 @@ def load_method(given: Given, bits: int) -> Method:
 def digest_of(path: Path) -> str:
     """The first digits of the hash of a file that declares a method, so that an edited one is measured anew.
 
+    Of a TOML file the files that its commands name count, too.
+
     Raises:
         JaxmarkError: if it cannot be read.
     """
     try:
-        return hashlib.sha256(read_file(path, _MAX_FILE_BYTES)).hexdigest()[:8]
+        content = read_file(path, _MAX_FILE_BYTES)
+        digests = [hashlib.sha256(content)]
+        for program in _files_in(content.decode(errors="replace"), path.parent) if path.suffix == ".toml" else []:
+            with program.open("rb") as file:
+                digests.append(hashlib.file_digest(file, "sha256"))
+        return hashlib.sha256(b"".join(one.digest() for one in digests)).hexdigest()[:8]
     except OSError as error:
         raise JaxmarkError(f"Cannot read {os.fspath(path)}: {error.strerror or error}.") from None
+
+
+def _files_in(text: str, folder: Path) -> list[Path]:
+    """The files of a folder that words of a text name."""
+    words = {word.strip("\"'").removeprefix("./") for word in text.split()}
+    return [file for file in sorted(folder.iterdir()) if file.name in words and file.is_file()]
 
 
 @lru_cache(maxsize=32)

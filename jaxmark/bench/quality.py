@@ -24,6 +24,7 @@ class Point(NamedTuple):
     attack: str
     costs: Mapping[str, float | None]
     success: bool
+    marked: bool = True  # False where no mark could be made, which is lost at any cost
 
 
 class Score(NamedTuple):
@@ -46,7 +47,8 @@ class Curve(NamedTuple):
 def curve(points: Sequence[Point], metric: str, weights: Float64[np.ndarray, " points"] | None = None) -> Curve | None:
     """The falling curve that fits best, every attack counting alike; None if no cost is known.
 
-    Beyond the least and the largest cost that there is, it goes on as it is there.
+    Beyond the least and the largest cost that there is, it goes on as it is there. Where some suspects have no mark, as
+    none could be made, the curve of the others is lowered to their share: a method gains nothing by refusing.
 
     Args:
         points: suspects.
@@ -70,14 +72,15 @@ def curve(points: Sequence[Point], metric: str, weights: Float64[np.ndarray, " p
     mean = np.bincount(group, share * [one.success for one, _ in known]) / weight
     fitted = isotonic_regression(mean, weights=weight, increasing=False).x
     axis = np.geomspace(low, high, _PLACES)
-    return Curve(axis, np.interp(np.log(axis), np.log(distinct), fitted))
+    marked = float(times @ [one.marked for one in points] / times.sum())
+    return Curve(axis, marked * np.interp(np.log(axis), np.log(distinct), fitted))
 
 
 def score(points: Sequence[Point]) -> Score | None:
     """The mean of the areas under the curves over all metrics, with an interval by bootstrap; None without points.
 
-    Meshes and seeds are drawn again with replacement, all suspects of a pair together (500 times). One mesh with one
-    seed says nothing of others: its interval is from 0 to 1.
+    Meshes and seeds are drawn again with replacement, all suspects of a pair together (500 times). One mesh says
+    nothing of others: its interval is from 0 to 1.
     """
     found = _areas(points, None)
     if not found:
@@ -92,7 +95,7 @@ def score(points: Sequence[Point]) -> Score | None:
         areas = _areas(points, (times[0][at[0]] * times[1][at[1]]).astype(float))
         if areas:
             values.append(np.mean(list(areas.values())))
-    alone = len(meshes) * len(seeds) == 1  # nothing is known of others
+    alone = len({one.mesh for one in points if one.marked}) == 1  # nothing is known of others
     low, high = (0.0, 1.0) if alone else np.quantile(values, [0.025, 0.975])
     return Score(float(np.mean(list(found.values()))), float(low), float(high), found, len(points))
 

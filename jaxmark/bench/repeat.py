@@ -14,7 +14,7 @@ from jaxmark.files.reading import read_file
 
 BITS = 0.1  # share of wrong bits by which two readings of a message may differ and still agree
 _FIELDS = (*Task._fields, "copy", "read", "bit_errors", "detected")
-_NAMES = (*Task._fields, "copy")
+_NAMES, _RULES = (*Task._fields, "copy"), ("read", "bit_errors", "detected")
 
 
 class Repetition(NamedTuple):
@@ -48,10 +48,13 @@ def hold_against(results: BenchResults, path: str | os.PathLike[str]) -> Repetit
     """
     try:
         rows = list(csv.DictReader(io.StringIO(read_file(path).decode())))
-        published = {tuple(row[name] for name in _NAMES): row for row in rows}
+        published = {tuple(row[name] for name in _NAMES): {rule: row[rule] for rule in _RULES} for row in rows}
+        errors = {place: float(found["bit_errors"]) for place, found in published.items()}
+        if len(published) < len(rows) or not all(0 <= one <= 1 for one in errors.values()):
+            raise ValueError("a reading stands there twice, or its wrong bits are no share")
     except OSError as error:
         raise JaxmarkError(f"Cannot read {os.fspath(path)}: {error.strerror or error}.") from None
-    except (UnicodeDecodeError, KeyError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise JaxmarkError(f"{os.fspath(path)} holds no readings of a benchmark: {error!r}.") from None
     shared, said = 0, []
     for row in _lines(results):
@@ -59,7 +62,7 @@ def hold_against(results: BenchResults, path: str | os.PathLike[str]) -> Repetit
             continue
         shared += 1
         rule = "read" if results.methods[row["method"]].bits else "detected"
-        apart = abs(float(row["bit_errors"]) - float(other["bit_errors"]))
+        apart = abs(float(row["bit_errors"]) - errors[tuple(row[name] for name in _NAMES)])
         if row[rule] != other[rule] or apart > BITS:
             place = ", ".join(row[name] for name in ("method", "payload", "league", "limits", "mesh", "seed", "attack"))
             said.append(

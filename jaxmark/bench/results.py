@@ -7,7 +7,7 @@ import io
 import math
 import os
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from jaxmark.bench.calibration import RATE, Calibration, calibrate
+from jaxmark.bench.leagues import get_league
 from jaxmark.bench.method import Method
 from jaxmark.bench.paired import Paired, compare_paired
 from jaxmark.bench.work import MARK, UNMARKED, Task
@@ -23,6 +24,7 @@ from jaxmark.files.atomic import write_atomically
 
 _WRONG, _OTHERS = "another key's mark", "another method's mark"
 _PLAIN, _ATTACKED, _ANOTHER = "unmarked", "unmarked, attacked", "another mesh"
+_UNUSED = "unmarked, with the mark's key"
 Reading = Mapping[str, Any]
 Null = tuple[float, float | None]  # a score, and log10 of the probability that is proven
 
@@ -72,9 +74,16 @@ class BenchResults:
             if task.attack == MARK or task.source != task.method:
                 continue
             mine = [one for one in row["readings"] if one["own"]]
-            nothing = {"read": False, "bit_errors": 0.5, "score": None, "log10_p": 0.0, "note": row.get("note", "")}
-            found += [Suspect(task, row.get("costs", {}), one) for one in mine or [nothing]]
+            if not mine:
+                nothing = {"read": False, "bit_errors": 0.5, "score": None, "log10_p": 0.0, "note": row.get("note", "")}
+                mine = [{**nothing, "copy": copy} for copy in range(get_league(task.league).lines[task.attack].copies)]
+            found += [Suspect(task, row.get("costs", {}), one) for one in mine]
         return found
+
+    @cached_property
+    def marks(self) -> set[Task]:
+        """The marks that could be made within their limits."""
+        return {task for task, row in self.tasks if task.attack == MARK and "strength" in row}
 
     @cached_property
     def calibrations(self) -> dict[tuple[str, int], Calibration]:
@@ -95,6 +104,8 @@ class BenchResults:
     def _kind(self, task: Task) -> str:
         """What kind of null a suspect is, whose readings are not with the key that marked it."""
         if task.source == UNMARKED:
+            if task.limits:
+                return _UNUSED
             return _PLAIN if task.attack == "none" else _ATTACKED
         if task.source == task.method:
             return _WRONG
@@ -107,21 +118,28 @@ class BenchResults:
         found = self.calibrations.get((one.task.method, one.task.payload))
         return found is not None and one.score > found.threshold.value
 
-    def paired(self, first: str, second: str, league: str, rule: str = "detected") -> Paired:
+    def paired(
+        self, first: str, second: str, league: str, rule: str = "detected", attacks: Sequence[str] = ()
+    ) -> Paired:
         """Compare two methods on all meshes, seeds, limits and attacks of a league that both have.
+
+        Interval and p take suspects for independent. After one attack, of many meshes, they are; after many attacks of
+        few meshes they say how these suspects differ, and not how others would.
 
         Args:
             first: a method's name in cells.
             second: another one.
             league: the league.
             rule: `"detected"` at the calibrated threshold, or `"read"`, the exact message.
+            attacks: after these; by default after all.
 
         Raises:
             JaxmarkError: if they share none.
         """
         won: dict[str, dict[tuple[Any, ...], bool]] = {first: {}, second: {}}
         for one in self.suspects:
-            if one.task.method in won and one.task.league == league:
+            wanted = one.task.league == league and (not attacks or one.task.attack in attacks)
+            if one.task.method in won and wanted:
                 place = (*one.task._replace(method="", source=""), one.reading.get("copy", 0))
                 won[one.task.method][place] = self.succeeds(one, rule)
         shared = sorted(won[first].keys() & won[second].keys())

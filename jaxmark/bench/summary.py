@@ -42,7 +42,15 @@ def save_entries(results: BenchResults, path: str | os.PathLike[str]) -> None:
 def points(results: BenchResults, some: Iterable[Suspect], rule: str = "detected") -> list[Point]:
     """Suspects as points of a curve, by the rule `"detected"` or `"read"`."""
     return [
-        Point(one.task.mesh, one.task.seed, one.task.attack, one.costs, results.succeeds(one, rule)) for one in some
+        Point(
+            one.task.mesh,
+            one.task.seed,
+            one.task.attack,
+            one.costs,
+            results.succeeds(one, rule),
+            one.task.mark in results.marks,
+        )
+        for one in some
     ]
 
 

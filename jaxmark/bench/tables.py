@@ -137,7 +137,7 @@ def _calibrations(entries: Entries, rate: float) -> Table:
         ],
         lines,
         f"Suspects without the key's mark, read by each reader. A mark counts as detected above the threshold whose"
-        f" expected false-positive rate is at most {rate:g}; the interval is exact.",
+        f" expected false-positive rate is at most {rate:g}; the interval is exact for nulls of one distribution.",
     )
 
 
@@ -200,5 +200,6 @@ def _paired(results: BenchResults) -> Iterator[Table]:
             "Pairs",
             ["league", "methods", "difference (95 %)", "only one of them", "McNemar's p"],
             lines,
-            "Detected, on the same meshes, seeds, limits and attacks.",
+            "Detected, on the same meshes, seeds, limits and attacks. Interval and p describe these suspects: many"
+            " attacks of one mark are not independent of each other.",
         )

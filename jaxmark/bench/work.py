@@ -3,6 +3,7 @@
 import hashlib
 import io
 import math
+import sys
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import numpy as np
 
 from jaxmark.bench.fitting import Fitted, fit
 from jaxmark.bench.leagues import OVERWRITTEN, Line, get_league
-from jaxmark.bench.method import Bits, Method
+from jaxmark.bench.method import Bits, Method, Reading
 from jaxmark.bench.plugged import Given, load_method
 from jaxmark.distortion import Reference
 from jaxmark.errors import JaxmarkError
@@ -40,6 +41,7 @@ class Task(NamedTuple):
     seed: int
     source: str  # whose mark the suspect has, or `UNMARKED`, or another mesh, unmarked, in place of this one
     attack: str  # of the league, or `MARK`
+    number: int = 0  # of the key, where several that wrote nothing are tried
 
     @property
     def mark(self) -> "Task":
@@ -54,7 +56,6 @@ class Bench:
     folder: Path  # marked meshes are kept in it
     meshes: Mapping[str, Path]
     methods: Mapping[str, Given]
-    keys: int  # keys that each suspect without a mark is read with
 
     def method(self, task: Task) -> Method:
         """The method of a cell."""
@@ -82,8 +83,8 @@ def work(bench: Bench, cell: Cell) -> dict[str, Any]:
     line = get_league(task.league).lines[task.attack]
     try:
         suspects = _suspects(bench, task, line, before)
-    except JaxmarkError as error:
-        return {"note": f"Not attacked: {error}", "readings": []}
+    except Exception as error:  # also a stranger's, whose method writes over its mark
+        return {"note": f"Not attacked: {_said(error)}", "readings": []}
     seconds = time.perf_counter() - start
     own = task.source == task.method
     costs = _costs(before, suspects[0]) if own and line.in_place else {}
@@ -136,7 +137,7 @@ def _suspects(bench: Bench, task: Task, line: Line, before: Mesh) -> list[Mesh]:
         return [_fit(bench.method(task), task, before, _SECOND).mesh]
     if task.source != UNMARKED:
         return line.suspects(before, task.seed)
-    shared = task._replace(method="", payload=0)
+    shared = task._replace(method="", payload=0, limits="", number=0)
     files = [_file(bench, shared, copy) for copy in range(line.copies)]
     if not all(file.exists() for file in files):
         for file, suspect in zip(files, line.suspects(before, task.seed), strict=True):
@@ -156,9 +157,15 @@ def keep_mesh(path: Path, mesh: Mesh) -> None:
     write_atomically(path, content.getvalue())
 
 
-@lru_cache(maxsize=8)
 def load(path: Path) -> Mesh:
     """A mesh of a file of any format, or of `keep_mesh`; the same arrays for whoever asks again."""
+    now = path.stat()
+    return _loaded(path, (now.st_mtime_ns, now.st_size, now.st_ino))
+
+
+@lru_cache(maxsize=8)
+def _loaded(path: Path, version: tuple[int, ...]) -> Mesh:
+    """A mesh of a file, as it is in this version."""
     if path.suffix != ".npz":
         return load_mesh(path)
     with np.load(path) as found:
@@ -177,9 +184,8 @@ def _readings(
 ) -> Iterator[dict[str, Any]]:
     """What a suspect is read as with the keys that a cell tries."""
     # Keys that wrote nothing are used once, so that false positives are independent of each other.
-    count = bench.keys if task.source == UNMARKED or task.source in bench.meshes else 1
-    place = "/".join((task.league, task.limits, task.source, task.attack))
-    names = [_OWN] * own + [f"{place}/{copy}/{number}" for number in range(count)]
+    fresh = "/".join((task.league, task.limits, task.source, task.attack, str(copy), str(task.number)))
+    names = [_OWN] if task.limits and task.source == UNMARKED else [_OWN, fresh] if own else [fresh]
     method = bench.method(task)
     message = message_of(task, method.bits)
     for name in names:
@@ -187,19 +193,28 @@ def _readings(
         try:
             found = method.read(suspect, key_of(task, name), None if method.blind else original)
             errors = _errors(found.message, message)
-            score, log10_p = float(found.score), found.log10_p
+            score, log10_p = _score_of(found)
         except Exception as error:  # see `work`
             errors, score, log10_p, note = 0.5, -math.inf, None, _said(error)
         yield {
             "copy": copy,
-            "own": name == _OWN,
+            "own": own and name == _OWN,
             "read": bool(method.bits) and errors == 0,
             "bit_errors": errors,
             "score": score if math.isfinite(score) else None,
-            "log10_p": None if log10_p is None else float(log10_p),
+            "log10_p": log10_p,
             "seconds": time.perf_counter() - start,
             **({"note": note} if note else {}),
         }
+
+
+def _score_of(found: Reading) -> tuple[float, float | None]:
+    """Score and log10 p of a reading, as JSON can hold them: a probability of 0 is the least that there is."""
+    score, log10_p = float(found.score), None if found.log10_p is None else float(found.log10_p)
+    if math.isnan(score) or (log10_p is not None and math.isnan(log10_p)):
+        raise JaxmarkError("The reader's score, or its log10_p, is not a number.")
+    most = sys.float_info.max
+    return min(score, most), None if log10_p is None else min(max(log10_p, -most), 0.0)
 
 
 def _errors(said: Bits | None, message: Bits) -> float:
