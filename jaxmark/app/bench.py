@@ -17,6 +17,7 @@ import click
 
 from jaxmark.app.answering import QUIET, answer, progress, say
 from jaxmark.app.catalogue import JSON
+from jaxmark.app.programs import keep_programs, release_programs
 from jaxmark.bench import page
 from jaxmark.bench.benchmark import KEYS, run
 from jaxmark.bench.calibration import RATE
@@ -135,7 +136,8 @@ def bench_command(
         others=others,
         keys=keys,
         rate=rate,
-        workers=processes(workers),  # in its own process a program that an attack calls may crash
+        workers=processes(workers, keep_programs),  # in its own process a program that an attack calls may crash
+        after=release_programs,
         say=progress().doing,
     )
     repeated = hold_against(found, against) if against is not None else None
@@ -191,7 +193,7 @@ def bench_equal_command(
         payloads=payloads or (16, 64),
         shares=shares or SHARES,
         seeds=seeds,
-        workers=processes(workers),
+        workers=processes(workers, keep_programs),
         say=progress().doing,
     )
     write_atomically(output / "equal.md", (table.markdown() + "\n").encode())

@@ -43,6 +43,7 @@ def run(
     keys: int = KEYS,
     rate: float = RATE,
     workers: int | Pool = 1,
+    after: Callable[[], object] | None = None,
     say: Callable[[str], None] = lambda line: None,
 ) -> BenchResults:
     """Run what is not finished of a benchmark, and return the results of all. Needs the extra `align`.
@@ -66,6 +67,7 @@ def run(
         rate: of false positives, at which a mark counts as detected.
         workers: number of processes, where 1 is this one, or a function that makes an executor, see
             `jaxmark.evaluation.cells`.
+        after: function that is called by the worker after each cell, such as `jax.clear_caches` in a run of many hours.
         say: function that is called with a line about the progress after each cell.
 
     Raises:
@@ -85,7 +87,7 @@ def run(
     named = {name_of(given): given for given in methods}
     marked = named_files(meshes, folder / "meshes")
     unrelated = named_files(others, folder / "meshes")
-    bench = Bench(folder / "meshes", {**unrelated, **marked}, named)
+    bench = Bench(folder / "meshes", {**unrelated, **marked}, named, after)
     made = {name: load_method(given, payloads[0]) for name, given in named.items()}
     _check_names("attack", attacks, [name for league in leagues for name in get_league(league).lines])
     _check_names("set of limits", limits, [name for league in leagues for name in get_league(league).limits])

@@ -5,7 +5,7 @@ import io
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -56,6 +56,7 @@ class Bench:
     folder: Path  # marked meshes are kept in it
     meshes: Mapping[str, Path]
     methods: Mapping[str, Given]
+    after: Callable[[], object] | None = None  # called after each cell; at the top level of a module
 
     def method(self, task: Task) -> Method:
         """The method of a cell."""
@@ -64,6 +65,14 @@ class Bench:
 
 def work(bench: Bench, cell: Cell) -> dict[str, Any]:
     """Compute a cell. At the top level, where workers find it."""
+    try:
+        return _work(bench, cell)
+    finally:
+        if bench.after is not None:
+            bench.after()
+
+
+def _work(bench: Bench, cell: Cell) -> dict[str, Any]:
     task = Task(*cell)  # pyright: ignore[reportArgumentType] (a cell's values are those of its fields)
     start = time.perf_counter()
     if task.attack == MARK:
