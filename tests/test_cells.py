@@ -3,6 +3,10 @@
 import importlib
 import json
 import os
+import signal
+import subprocess
+import sys
+import time
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -95,3 +99,21 @@ def squared(cell: Cell) -> dict[str, Any]:
 
 def inverse(cell: Cell) -> dict[str, Any]:
     return {"inverse": 1 / int(cell[1])}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="asks for signals")
+def test_workers_end_with_the_process_that_is_killed():
+    code = "import os, time\nfrom jaxmark.evaluation.cells import processes\nif __name__ == '__main__':\n"
+    code += "    pool = processes(1)()\n    print(pool.submit(os.getpid).result(), flush=True)\n    time.sleep(60)\n"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
+        worker = int(parent.stdout.readline())
+        os.kill(worker, 0)
+        parent.send_signal(signal.SIGKILL)
+    for _ in range(100):
+        try:
+            os.kill(worker, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.1)
+    pytest.fail("the worker still waits")

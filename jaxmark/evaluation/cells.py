@@ -6,6 +6,7 @@ Any `concurrent.futures` executor will do: processes here, or the workers of Das
 import json
 import multiprocessing
 import os
+import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
@@ -29,7 +30,15 @@ def processes(workers: int, begin: Callable[[], object] | None = None) -> Callab
         workers: number of processes.
         begin: what each calls before its first work, a function at the top level of a module.
     """
-    return lambda: ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), begin)
+    return lambda: ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin, (begin,))
+
+
+def _begin(begin: Callable[[], object] | None) -> None:
+    """Have this process end when the one that spawned it is killed: it would wait for work forever."""
+    if (parent := multiprocessing.parent_process()) is not None:
+        threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
+    if begin is not None:
+        begin()
 
 
 def run(
