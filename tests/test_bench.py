@@ -20,6 +20,7 @@ from jaxmark.bench.corpus import corpus, known_hashes, make_member
 from jaxmark.bench.fitting import SHARE, fit
 from jaxmark.bench.methods import METHODS, get_method
 from jaxmark.bench.plugged import digest_of, load_method
+from jaxmark.bench.tables import tables
 from jaxmark.geometry.hashing import geometry_hash
 from jaxmark.geometry.mesh import Mesh, diagonal
 from tests.samples import bumpy_sphere
@@ -358,6 +359,8 @@ def test_toml_files_that_declare_no_method_are_refused(tmp_path: Path):
         ('name = "x"', "declares no embed"),
         (DECLARED.format(python="python") + "speed = 1\n", "speed is no field"),
         (DECLARED.format(python="python").replace("[1e-6, 1e-1]", "[1e-6]"), "two numbers"),
+        (DECLARED.format(python="python").replace("{suspect}", "{suspekt}"), "has {suspekt}; here there are suspect"),
+        (DECLARED.format(python="python").replace("false", "true"), "has {original}; here there are suspect, key"),
     ):
         path.write_text(text)
         with pytest.raises(jm.JaxmarkError, match=sentence):
@@ -404,9 +407,10 @@ def test_a_run_of_ones_own_methods_is_calibrated_and_goes_on_where_it_was_ended(
     assert found.projected(8, 5) == pytest.approx(40 * found.seconds)
     again = jm.bench.run(**small, **methods, say=lambda line: pytest.fail(line))
     assert jm.bench.entries(again) == entries
-    assert (
-        found.paired("signs", "plain@" + next(n for n in found.methods if "@" in n).split("@")[1], "smi2010").both >= 1
-    )
+    assert found.paired("signs", "plain", "smi2010").both >= 1
+    assert found.paired("signs", "plain", "smi2010", attacks=["none"]) != found.paired("signs", "plain", "smi2010")
+    with pytest.raises(jm.JaxmarkError, match="no method 'plane'"):
+        found.paired("signs", "plane", "smi2010")
 
 
 def test_a_mark_is_written_over_by_a_second_one_of_the_same_method(small: dict):
@@ -449,9 +453,9 @@ def test_unmarked_suspects_are_made_once_for_all_methods(small: dict):
 
     first, second = replace(SIGNS, read=counted), replace(SIGNS, name="second", read=counted)
     jm.bench.run(**{**small, "attacks": ["noise 0.001"], "keys": 1}, methods=[first, second], limits=["perceptual"])
-    # Each reads the unmarked one, its own with two keys, and the other's, which is not attacked.
-    assert len(made) == 2 * (1 + 2 + 1)
-    assert len(set(made)) == 1 + 2 + 2
+    # Each reads the unmarked one, attacked and not, its own with two keys, and the other's, which is not attacked.
+    assert len(made) == 2 * (1 + 1 + 2 + 1)
+    assert len(set(made)) == 1 + 1 + 2 + 2
 
 
 def test_a_run_is_held_against_a_published_one(small: dict, plain: Path, tmp_path: Path):
@@ -460,20 +464,18 @@ def test_a_run_is_held_against_a_published_one(small: dict, plain: Path, tmp_pat
     )
     published = tmp_path / "readings.csv"
     jm.bench.save_readings(found, published)
-    assert jm.bench.hold_against(found, published) == (1, ())
+    assert jm.bench.hold_against(found, jm.bench.load_published(published)) == (1, ())
     head, line = published.read_text().splitlines()
     fields = line.split(",")
     fields[head.split(",").index("read")] = "0"
     published.write_text(f"{head}\n{','.join(fields)}\n")
-    shared, (difference,) = jm.bench.hold_against(found, published)
+    shared, (difference,) = jm.bench.hold_against(found, jm.bench.load_published(published))
     assert shared == 1
     assert "read 1 here, 0 there" in difference
-    published.write_text(f"{head}\n{line}\n{line}\n")
-    with pytest.raises(jm.JaxmarkError, match="stands there twice"):
-        jm.bench.hold_against(found, published)
-    published.write_text("x\n1\n")
-    with pytest.raises(jm.JaxmarkError, match="holds no readings"):
-        jm.bench.hold_against(found, published)
+    for wrong in (f"{head}\n{line}\n{line}\n", line.replace(",0", ",nan") + "\n", "x\n1\n", "", f"{head}\n", "\0\n"):
+        published.write_text(wrong)
+        with pytest.raises(jm.JaxmarkError, match=r"holds no readings of a benchmark.{,99}$"):
+            jm.bench.load_published(published)
 
 
 def test_a_reader_that_remembers_what_was_written_is_caught(small: dict):
@@ -518,6 +520,8 @@ def test_names_that_no_league_has_are_refused(small: dict):
         ({"leagues": ["1999"]}, "no league '1999'; there are smi2010, 2026"),
         ({"methods": ["nothing"]}, "no method 'nothing'"),
         ({"meshes": ["nowhere.ply"]}, "nowhere.ply"),
+        ({"rate": 2.0}, "between 0 and 1"),
+        ({"workers": 0}, "needs a worker"),
     ):
         with pytest.raises(jm.JaxmarkError, match=sentence):
             jm.bench.run(**{**small, **wrong})
@@ -537,13 +541,30 @@ def test_options_of_many_values_take_them_up_to_the_next_option():
     command = ManyValues("x", params=[click.Option(["--many"], multiple=True), click.Argument(["rest"], nargs=-1)])
     found = command.make_context("x", ["a", "--many", "b", "c d", "--many", "e", "--", "f"]).params
     assert found == {"rest": ("a", "f"), "many": ("b", "c d", "e")}
+    for wrong in (["a", "--many"], ["a", "--many", "--many", "b"]):
+        with pytest.raises(click.UsageError, match="'--many' needs a value"):
+            command.make_context("x", wrong)
+
+
+def test_methods_change_no_mesh_in_place(small: dict):
+    """Else a mark would be measured against itself."""
+
+    def careless(mesh: Mesh, message: np.ndarray, key: bytes, strength: float) -> Mesh:
+        mesh.vertices[:] += strength
+        return mesh
+
+    method = replace(SIGNS, embed=careless)
+    found = jm.bench.run(**{**small, "attacks": ["none"], "keys": 1}, methods=[method], limits=["perceptual"])
+    assert "read-only" in found.tasks[0][1]["note"]
 
 
 def test_a_method_that_fails_ends_nothing_but_its_cells(small: dict):
     def broken(suspect: Mesh, key: bytes, original: Mesh | None) -> Reading:
         raise ZeroDivisionError("oh")
 
-    found = jm.bench.run(**small, methods=[replace(SIGNS, read=broken)], limits=["perceptual"])
+    run = {**small, "attacks": ["none"], "keys": 1}
+    found = jm.bench.run(**run, methods=[replace(SIGNS, read=broken)], limits=["perceptual"])
+    assert any("ZeroDivisionError: oh" in line for table in tables(found) for line in table.lines)
     one = jm.bench.entries(found)["signs"]["payloads"]["64"]["leagues"]["smi2010"]["limits"]["perceptual"]["attacks"][
         "none"
     ]

@@ -25,7 +25,7 @@ from jaxmark.bench.corpus import make_corpus
 from jaxmark.bench.equal import SHARES, equal_visibility
 from jaxmark.bench.leagues import LEAGUES
 from jaxmark.bench.methods import METHODS
-from jaxmark.bench.repeat import hold_against, save_readings
+from jaxmark.bench.repeat import hold_against, load_published, save_readings
 from jaxmark.bench.results import BenchResults
 from jaxmark.bench.summary import entries, save_entries
 from jaxmark.bench.tables import tables
@@ -50,6 +50,8 @@ class ManyValues(click.Command):
                 break
             if arg.startswith("-") and arg != "-":
                 option = arg if arg in many else ""
+                if option and (number + 1 == len(args) or args[number + 1].startswith("--")):
+                    raise click.BadOptionUsage(option, f"Option {option!r} needs a value.", ctx)
                 found += [] if option else [arg]
             else:
                 found += [option, arg] if option else [arg]
@@ -124,6 +126,7 @@ def bench_command(
     or none is published.
     """
     start = time.time()
+    published = None if against is None else load_published(against)
     found = run(
         meshes,
         output,
@@ -140,7 +143,7 @@ def bench_command(
         after=release_programs,
         say=progress().doing,
     )
-    repeated = hold_against(found, against) if against is not None else None
+    repeated = hold_against(found, published) if published is not None else None
     hours, projected = found.seconds / 3600, found.projected(8, 5) / 3600
     about = (
         f"`{_command()}`, jaxmark {importlib.metadata.version('jaxmark')}, {_machine()}: {hours:.2g} hours of work for"
@@ -157,7 +160,7 @@ def bench_command(
     values = {} if repeated is None else {"repeated": repeated.shared, "differences": list(repeated.differences)}
     answer(as_json, {"output": str(output), "methods": entries(found), **values}, said)
     if repeated is not None and (repeated.differences or not repeated.shared):
-        click.get_current_context().exit(1)
+        sys.exit(1)
 
 
 @click.command(name="bench-equal", cls=ManyValues)
@@ -226,7 +229,7 @@ def _write(found: BenchResults, output: Path, about: str) -> None:
     if importlib.util.find_spec("pyarrow") and importlib.util.find_spec("pandas"):
         require("pandas", "study").read_csv(output / "all_readings.csv").to_parquet(output / "all_readings.parquet")
     try:
-        page.save_page(found, output / "page.html", title, about)
+        page.save_page(found, output / "page.html", title, about.replace("`", ""))
     except JaxmarkError as error:
         say(f"No page: {error}")
 

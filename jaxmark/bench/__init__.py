@@ -21,6 +21,7 @@ from jaxmark.bench.paired import compare_paired as compare_paired
 from jaxmark.bench.plugged import load_method as load_method
 from jaxmark.bench.repeat import Repetition as Repetition
 from jaxmark.bench.repeat import hold_against as hold_against
+from jaxmark.bench.repeat import load_published as load_published
 from jaxmark.bench.repeat import save_readings as save_readings
 from jaxmark.bench.results import BenchResults as BenchResults
 from jaxmark.bench.summary import entries as entries

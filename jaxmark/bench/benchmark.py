@@ -79,6 +79,8 @@ def run(
         raise JaxmarkError(
             "A benchmark needs a mesh, a method, a seed, a key for unmarked meshes, and positive payloads."
         )
+    if isinstance(workers, int) and workers < 1:
+        raise JaxmarkError(f"A benchmark needs a worker, got {workers}.")
     if not 0 < rate < 1:
         raise JaxmarkError(f"The rate of false positives is between 0 and 1, got {rate:g}.")
     folder = Path(output)
@@ -157,6 +159,8 @@ def named_files(meshes: Sequence[str | os.PathLike[str]] | Mapping[str, Mesh], f
             found[path.stem] = path
         return found
     for given in meshes:
+        if not isinstance(given, str | os.PathLike):
+            raise JaxmarkError(f"Meshes are files, or a mapping of names to meshes; got {type(given).__name__}.")
         path = Path(given)
         found[f"{path.stem}-{geometry_hash(load_mesh(path)).hex()[:8]}"] = path.resolve()
     return found

@@ -5,6 +5,7 @@ import importlib.util
 import json
 import os
 import shlex
+import string
 import subprocess
 import tempfile
 import tomllib
@@ -124,6 +125,8 @@ def _from_toml(path: Path, bits: int) -> Method:
     own = {name: value for name, value in declared.items() if name not in ("embed", "read", "suffix", "strengths")}
     if len(declared["strengths"]) != 2:
         raise JaxmarkError(f"{path}: strengths are two numbers, the weakest and the strongest.")
+    _check_places(path, declared["embed"], ("original", "marked", "message", "key", "strength"))
+    _check_places(path, declared["read"], ("suspect", "key") if declared["blind"] else ("suspect", "key", "original"))
     suffix, folder = declared.get("suffix", ".obj"), str(path.parent)
     return Method(
         embed=partial(_embed, shlex.split(declared["embed"]), folder, suffix),
@@ -131,6 +134,15 @@ def _from_toml(path: Path, bits: int) -> Method:
         strengths=(float(declared["strengths"][0]), float(declared["strengths"][1])),
         **own,
     )
+
+
+def _check_places(path: Path, command: str, known: Sequence[str]) -> None:
+    try:
+        named = {name for _, name, _, _ in string.Formatter().parse(command) if name is not None}
+    except ValueError as error:
+        raise JaxmarkError(f"{path}: {command!r}: {error}.") from None
+    if unknown := sorted(named - set(known)):
+        raise JaxmarkError(f"{path}: {command!r} has {{{unknown[0]}}}; here there are {', '.join(known)}.")
 
 
 def _embed(

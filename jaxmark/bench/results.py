@@ -127,15 +127,16 @@ class BenchResults:
         few meshes they say how these suspects differ, and not how others would.
 
         Args:
-            first: a method's name in cells.
+            first: a method's name, or its name in cells, where two have the same.
             second: another one.
             league: the league.
             rule: `"detected"` at the calibrated threshold, or `"read"`, the exact message.
             attacks: after these; by default after all.
 
         Raises:
-            JaxmarkError: if they share none.
+            JaxmarkError: if they share none, or a name is not that of one method.
         """
+        first, second = self._label(first), self._label(second)
         won: dict[str, dict[tuple[Any, ...], bool]] = {first: {}, second: {}}
         for one in self.suspects:
             wanted = one.task.league == league and (not attacks or one.task.attack in attacks)
@@ -146,6 +147,14 @@ class BenchResults:
         if not shared:
             raise JaxmarkError(f"{first!r} and {second!r} have no suspect in common in the league {league}.")
         return compare_paired([won[first][one] for one in shared], [won[second][one] for one in shared])
+
+    def _label(self, name: str) -> str:
+        """The name in cells of a method."""
+        labels = [label for label, method in self.methods.items() if name in (label, method.name)]
+        if len(labels) != 1:
+            count = "more than one" if labels else "no"
+            raise JaxmarkError(f"There is {count} method {name!r} in {', '.join(self.methods)}.")
+        return labels[0]
 
     def save_csv(self, path: str | os.PathLike[str]) -> None:
         """Write every reading as comma-separated values.

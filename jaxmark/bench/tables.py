@@ -3,6 +3,7 @@
 from __future__ import annotations  # so that `help` shows names of types instead of what they stand for
 
 import re
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -52,7 +53,7 @@ def tables(results: BenchResults) -> list[Table]:
             bits = f", {payload} bits" if several else ""
             found += [_marks(f"{league}, {limits} limits{bits}: the marks", parts, every)]
             found += [_attacks(f"{league}, {limits} limits{bits}: what survives", parts, every)]
-    found += list(_paired(results))
+    found += [*_refused(every), *_paired(results, every)]
     if results.skipped:
         lines = [[name, why] for name, why in results.skipped.items()]
         found.append(Table("Skipped", ["attack", "why"], lines))
@@ -62,6 +63,13 @@ def tables(results: BenchResults) -> list[Table]:
 def _label(name: str, entry: Mapping[str, Any]) -> str:
     """A method's name, with a word on what is not validated, which stands in every table."""
     return f"{name} ({NOT_VALIDATED})" if entry["validated"] == NOT_VALIDATED else name
+
+
+def _bits(entry: Mapping[str, Any], payload: str) -> str:
+    """Bits of a message, of which a method may have none, or a number of its own."""
+    if not entry["bits"]:
+        return "-"
+    return payload if len(entry["payloads"]) > 1 else str(entry["bits"])
 
 
 def _number(value: float | None, digits: int = 3) -> str:
@@ -77,7 +85,7 @@ def _scores(entries: Entries) -> Table:
     for name, entry in entries.items():
         for payload, part in entry["payloads"].items():
             for league, found in part["leagues"].items():
-                cells = [_label(name, entry), "blind" if entry["blind"] else "informed", payload, league]
+                cells = [_label(name, entry), "blind" if entry["blind"] else "informed", _bits(entry, payload), league]
                 for rule in ("detected", "read"):
                     one = found["scores"][rule]
                     if one is None or (rule == "read" and not entry["bits"]):
@@ -109,7 +117,7 @@ def _calibrations(entries: Entries, rate: float) -> Table:
             lines.append(
                 [
                     _label(name, entry),
-                    payload,
+                    _bits(entry, payload),
                     ", ".join(f"{kind}: {_share(one['hits'], one['trials'])}" for kind, one in found["nulls"].items()),
                     _number(found["threshold"]),
                     f"{found['rate']:.2g} ({found['rate_low']:.2g} - {found['rate_high']:.2g})",
@@ -178,9 +186,25 @@ def _attacks(title: str, parts: Mapping[str, Any], entries: Entries) -> Table:
     return Table(title, heads, lines, "How often the exact message is read; wrong bits of the best guess (BER).")
 
 
-def _paired(results: BenchResults) -> Iterator[Table]:
+def _refused(entries: Entries) -> Iterator[Table]:
+    """What methods and attacks said where nothing was read, and how often."""
+    said: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for name, entry in entries.items():
+        for part in entry["payloads"].values():
+            for league, found in part["leagues"].items():
+                for limits, under in found["limits"].items():
+                    for attack, one in under["attacks"].items():
+                        for note in one["notes"]:
+                            said[_label(name, entry), note].append(f"{league}, {limits}: {attack}")
+    if said:
+        lines = [[name, note, str(len(where)), where[0]] for (name, note), where in said.items()]
+        yield Table("Refused", ["method", "what was said", "after attacks", "the first"], lines)
+
+
+def _paired(results: BenchResults, entries: Entries) -> Iterator[Table]:
     """The first method beside each other one, on the same suspects."""
     first, *others = results.methods
+    labels = dict(zip(results.methods, (_label(name, entry) for name, entry in entries.items()), strict=True))
     leagues = dict.fromkeys(task.league for task, _ in results.tasks)
     lines = []
     for league in leagues:
@@ -189,7 +213,7 @@ def _paired(results: BenchResults) -> Iterator[Table]:
             lines.append(
                 [
                     league,
-                    f"{first} - {other}",
+                    f"{labels[first]} - {labels[other]}",
                     f"{found.difference:+.3f} ({found.low:+.3f} - {found.high:+.3f})",
                     f"{found.first} : {found.second}",
                     f"{found.p:.2g}",

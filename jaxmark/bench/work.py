@@ -78,7 +78,7 @@ def _work(bench: Bench, cell: Cell) -> dict[str, Any]:
     if task.attack == MARK:
         try:
             found = _mark(bench, task)
-        except Exception as error:  # a stranger's method may raise anything, which ends nothing but its cell
+        except (Exception, SystemExit) as error:  # a stranger's method may raise anything, which ends only its cell
             return {"note": f"Not marked: {_said(error)}", "seconds": time.perf_counter() - start}
         return {**found, "seconds": time.perf_counter() - start}
     before = original = load(bench.meshes[task.mesh])
@@ -92,7 +92,7 @@ def _work(bench: Bench, cell: Cell) -> dict[str, Any]:
     line = get_league(task.league).lines[task.attack]
     try:
         suspects = _suspects(bench, task, line, before)
-    except Exception as error:  # also a stranger's, whose method writes over its mark
+    except (Exception, SystemExit) as error:  # also a stranger's, whose method writes over its mark
         return {"note": f"Not attacked: {_said(error)}", "readings": []}
     seconds = time.perf_counter() - start
     own = task.source == task.method
@@ -176,9 +176,18 @@ def load(path: Path) -> Mesh:
 def _loaded(path: Path, version: tuple[int, ...]) -> Mesh:
     """A mesh of a file, as it is in this version."""
     if path.suffix != ".npz":
-        return load_mesh(path)
+        return _kept(load_mesh(path))
     with np.load(path) as found:
-        return Mesh(found["vertices"], found["faces"])
+        return _kept(Mesh(found["vertices"], found["faces"]))
+
+
+def _kept(mesh: Mesh) -> Mesh:
+    """A mesh whose arrays nobody changes: a method that did would change what it is compared with."""
+    parts = [np.asarray(part) for part in mesh]
+    parts = [part.copy() if part.flags.writeable else part for part in parts]
+    for part in parts:
+        part.setflags(write=False)
+    return Mesh(*parts)
 
 
 def _costs(before: Mesh, suspect: Mesh) -> dict[str, float | None]:
@@ -195,7 +204,7 @@ def _readings(
     # Keys that wrote nothing are used once, so that false positives are independent of each other.
     fresh = "/".join((task.league, task.limits, task.source, task.attack, str(copy), str(task.number)))
     names = [_OWN] if task.limits and task.source == UNMARKED else [_OWN, fresh] if own else [fresh]
-    method = bench.method(task)
+    method, suspect = bench.method(task), _kept(suspect)
     message = message_of(task, method.bits)
     for name in names:
         start, note = time.perf_counter(), ""
@@ -203,7 +212,7 @@ def _readings(
             found = method.read(suspect, key_of(task, name), None if method.blind else original)
             errors = _errors(found.message, message)
             score, log10_p = _score_of(found)
-        except Exception as error:  # see `work`
+        except (Exception, SystemExit) as error:  # see `_work`
             errors, score, log10_p, note = 0.5, -math.inf, None, _said(error)
         yield {
             "copy": copy,
@@ -235,5 +244,5 @@ def _errors(said: Bits | None, message: Bits) -> float:
     return float(np.mean(np.asarray(said, bool) != message))
 
 
-def _said(error: Exception) -> str:
+def _said(error: BaseException) -> str:
     return str(error) if isinstance(error, JaxmarkError) else f"{type(error).__name__}: {error}"

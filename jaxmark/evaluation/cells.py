@@ -87,7 +87,10 @@ def run(
         except BrokenExecutor as error:
             broken += 1
             if broken == _MAX_BROKEN_POOLS:
-                raise JaxmarkError(f"{broken} pools of workers broke without finishing a cell: {error}") from None
+                first = f", the first of which is {name(left[0])}" if name(left[0]) else ""
+                raise JaxmarkError(
+                    f"{broken} pools of workers broke without finishing a cell of {missing}{first}: {error}"
+                ) from None
             say(f"{error} A new pool goes on.")
     rows = {_cell(row): row for row in load_finished(target)}
     return [rows[cell] for cell in cells]
