@@ -221,7 +221,7 @@ def bench_corpus_command(folder: Path, most_vertices: int, as_json: bool) -> Non
 
 def _write(found: BenchResults, output: Path, about: str) -> None:
     """All files but the cells."""
-    title = "What watermarks of meshes survive"
+    title = f"What watermarks of meshes survive: {', '.join(dict.fromkeys(task.league for task, _ in found.tasks))}"
     save_entries(found, output / "results.json")
     found.save_csv(output / "all_readings.csv")
     save_readings(found, output / "readings.csv")
