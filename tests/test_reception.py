@@ -311,14 +311,14 @@ def test_what_was_meshed_anew_is_weighed_by_the_energy_around_each_point(case: C
     noise = random.normal(size=(len(case.x), 1)) * case.normals * np.where(rough, 30, 1)[:, None]
     seen = looking(case, "normals", noise, np.float64)
     weights = np.asarray(receive(make(case, np.float64), seen).seen.weights)
-    average = np.linalg.matrix_power(np.eye(len(case.x)) - laplacian_matrix(case.operator) / 2, 4)
+    average = np.linalg.matrix_power(np.eye(len(case.x)) - laplacian_matrix(case.operator) / 2, 16)
     expected = np.ones(len(case.x))
     for _ in range(3):
         rest = dense_clean(case, seen._replace(weights=jnp.asarray(expected)), noise) / expected[:, None]
         energy = average @ np.sum(rest**2, axis=1)
         expected = 1 / (energy / np.median(energy) + 0.25)
     np.testing.assert_allclose(weights, expected, rtol=1e-6)
-    assert np.median(weights[rough]) < 0.05 * np.median(weights[~rough])
+    assert np.median(weights[rough]) < 0.3 * np.median(weights[~rough])
 
 
 def test_no_residual_and_nothing_seen(case: Case, dtype):
