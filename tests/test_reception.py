@@ -304,6 +304,23 @@ def test_strange_points_count_for_less(case: Case, x64):
     np.testing.assert_allclose(received.seen.weights, expected, rtol=1e-6)
 
 
+def test_what_was_meshed_anew_is_weighed_by_the_energy_around_each_point(case: Case, x64):
+    """Three rounds of dense projections and averages; what is rough on a third of the surface counts for little."""
+    random = np.random.default_rng(6)
+    rough = case.x[:, 2] > np.quantile(case.x[:, 2], 0.7)
+    noise = random.normal(size=(len(case.x), 1)) * case.normals * np.where(rough, 30, 1)[:, None]
+    seen = looking(case, "normals", noise, np.float64)
+    weights = np.asarray(receive(make(case, np.float64), seen).seen.weights)
+    average = np.linalg.matrix_power(np.eye(len(case.x)) - laplacian_matrix(case.operator) / 2, 16)
+    expected = np.ones(len(case.x))
+    for _ in range(3):
+        rest = dense_clean(case, seen._replace(weights=jnp.asarray(expected)), noise) / expected[:, None]
+        energy = average @ np.sum(rest**2, axis=1)
+        expected = 1 / (energy / np.median(energy) + 0.25)
+    np.testing.assert_allclose(weights, expected, rtol=1e-6)
+    assert np.median(weights[rough]) < 0.3 * np.median(weights[~rough])
+
+
 def test_no_residual_and_nothing_seen(case: Case, dtype):
     host = make(case, dtype)
     zero, one = jnp.zeros(case.x.shape, dtype), jnp.ones(case.x.shape, dtype)
@@ -327,14 +344,15 @@ def test_a_host_without_extent_is_finite(case: Case, dtype):
         assert np.linalg.norm(received.residual) < 1e-4
 
 
-def test_differentiable_with_respect_to_suspect_and_original(case: Case, x64):
+@pytest.mark.parametrize("normals", [False, True])
+def test_differentiable_with_respect_to_suspect_and_original(normals: bool, case: Case, x64):
     """By finite differences along random ways, under jit."""
     random = np.random.default_rng(5)
-    x = jnp.asarray(case.x)
+    x, along = jnp.asarray(case.x), jnp.asarray(case.normals) if normals else None
 
     def loss(suspect, original):
         host = make_receiver(make_host(case.operator, original, original, FAMILY, scales=SCALES, degree=DEGREE))
-        received = receive(host, observe(suspect - original))
+        received = receive(host, observe(suspect - original, normals=along))
         return (
             jnp.sum(jnp.sin(20 * received.residual))
             + jnp.sum(received.gain)
