@@ -22,9 +22,8 @@ from jaxmark.spectral.laplacian import Laplacian, per_row
 from jaxmark.spectral.precision import check_precision, einsum, matmul
 from jaxmark.watermark.probes import probe_signs
 
-_AROUND = (
-    np.polynomial.chebyshev.Chebyshev([0.5, -0.5]) ** 16
-).coef  # steps halfway to the neighbours' mean, a hundred points
+# Sixteen steps halfway to the neighbours' mean: over about a hundred points.
+_AROUND = (np.polynomial.chebyshev.Chebyshev([0.5, -0.5]) ** 16).coef
 _LEAST_AROUND = 1e-3  # share of a point's surroundings that is seen, for a mean over it
 _LEAST_ENERGY = 0.25  # of the median, which is added: who makes single places quiet gains little weight there
 _PRECISION_ROUNDS = 3
