@@ -43,7 +43,7 @@ class Suspect:
         return _score(self.reading)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BenchResults:
     """The rows of a benchmark, as `jaxmark.bench.benchmark.run` returns them."""
 

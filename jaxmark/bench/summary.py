@@ -5,6 +5,7 @@ import math
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ NOT_VALIDATED = "not validated"
 _ROC_POINTS = 50
 
 
+@lru_cache(maxsize=1)  # tables, page and JSON are of the same entries, whose intervals take minutes on large runs
 def entries(results: BenchResults) -> dict[str, dict[str, Any]]:
     """One entry a method, under its name, that JSON can hold; where two have one name, by their names in cells."""
     names = [method.name for method in results.methods.values()]
