@@ -14,7 +14,7 @@ QUICK_ATTACKS = 'noise 0.001' 'smoothing 10' 'quantisation 9' 'simplification 0.
 
 NOTEBOOKS = $(patsubst notebooks/%.py,docs/notebooks/%.ipynb,$(wildcard notebooks/*.py))
 
-.PHONY: help demo test lint types tests slow-tests coverage kernels notebooks pictures looks benchmark benchmark-quick docs clean
+.PHONY: help demo test lint types tests slow-tests long-tests coverage kernels notebooks pictures looks benchmark benchmark-quick docs clean
 .DELETE_ON_ERROR:
 
 help:  ## list these commands
@@ -38,6 +38,9 @@ tests: $(VENV)/.dev  ## pytest: all tests but the slow ones
 
 slow-tests: $(VENV)/.dev  ## pytest: the slow ones
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m slow
+
+long-tests: $(VENV)/.dev  ## pytest: those of a minute or more, before a release
+	$(BIN)/python -m pytest -q -n auto --dist worksteal -m long
 
 coverage: $(VENV)/.dev  ## which lines the tests run; all of it in build/coverage
 	$(BIN)/python -m pytest -q -n auto --cov --cov-report=term:skip-covered --cov-report=html

@@ -112,12 +112,11 @@ def test_a_stage_is_measured_in_a_process_from_a_copy(copy: Path, afresh, monkey
     assert row["first call, s"] > 0, row
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "program",
     [
-        ["security/forging.py", "--keys", "1", "--bands", "64", "--tries", "50"],
-        ["robustness/originals.py"],
+        pytest.param(["security/forging.py", "--keys", "1", "--bands", "64", "--tries", "50"], marks=pytest.mark.long),
+        pytest.param(["robustness/originals.py"], marks=pytest.mark.slow),
     ],
     ids=["forging", "originals"],
 )

@@ -71,8 +71,9 @@ def test_sizes(marked):
     assert float(rms(plain, rescale(plain, noise, jnp.asarray(1e-3, noise.dtype)))) == pytest.approx(1e-3, rel=1e-5)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("scheme", ["keyed", "host"])
+@pytest.mark.parametrize(
+    "scheme", [pytest.param("keyed", marks=pytest.mark.long), pytest.param("host", marks=pytest.mark.slow)]
+)
 def test_who_optimises_does_more_than_who_writes_another_mark(scheme, key: jm.Key):
     marker = jm.make_marker(bumpy_sphere(3), key, bits=16, scheme=scheme)
     mesh = marker.embed(MESSAGE, MARK, noise=0)[0]

@@ -30,18 +30,12 @@ PAGES = {
     for path in sorted(folder.glob("*.md"))
 }
 README = PAGES["README.md"]
-LONG = (
-    "docs/tutorial.md",
-    "docs/submeshes.md",
-    "docs/how-to/extend.md",
-    "docs/how-to/benchmark.md",
-)  # compiled, and need libigl
-SLOW = (
-    *LONG,
-    "docs/blind.md",
-    "docs/filters.md",
-    *(f"docs/how-to/{name}.md" for name in ("catalogue", "files", "strength", "pictures")),
+WITH_LIBIGL = ("docs/tutorial.md", "docs/submeshes.md", "docs/how-to/extend.md", "docs/how-to/benchmark.md")
+MARKS = dict.fromkeys(
+    (*WITH_LIBIGL, "docs/filters.md", *(f"docs/how-to/{name}.md" for name in ("catalogue", "files", "pictures"))),
+    pytest.mark.slow,
 )
+MARKS |= dict.fromkeys(("docs/blind.md", "docs/how-to/strength.md"), pytest.mark.long)  # which tune
 FRONTS = ("README.md", "docs/index.md")
 # These have tests of their own.
 APART = (*FRONTS, "docs/robustness.md", "docs/how-to/arrays.md", "docs/how-to/recipients.md", "docs/how-to/study.md")
@@ -121,14 +115,10 @@ def test_python_block_of_the_page_on_robustness_runs(unchecked, capsys):
 
 @pytest.mark.parametrize(
     "page",
-    [
-        pytest.param(page, marks=pytest.mark.slow if page in SLOW else ())
-        for page in PAGES
-        if blocks(page, "python") and page not in APART
-    ],
+    [pytest.param(page, marks=MARKS.get(page, ())) for page in PAGES if blocks(page, "python") and page not in APART],
 )
 def test_python_blocks_of_other_pages_run(page: str, folder: Path, unchecked, capsys):
-    if page in LONG:
+    if page in WITH_LIBIGL:
         pytest.importorskip("igl")
     run(page)
 

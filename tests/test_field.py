@@ -208,7 +208,7 @@ def test_nothing_is_detected_where_nothing_is(shape: Mesh, marked, key: jm.Key, 
     assert not reading.detect(mesh, jm.Key(bytes(32)), 32, SCHEME.fixed(WIDTH, step), claimed).detected(1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_nothing_is_detected_in_any_way_of_looking(shape: Mesh, key: jm.Key):
     assert not jm.detect(shape, key=key).detected(1e-3)
 
@@ -329,7 +329,7 @@ def test_what_is_too_rough_when_smoothing_is_undone_is_left_out(shape: Mesh):
     assert not undone >= {0, 10, 30, 50}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_tuning_chooses_what_the_worst_attack_leaves_most_of(shape: Mesh):
     ways = (("noise", 0.003), lambda mesh, seed: turned(mesh))
     scheme = dataclasses.replace(SCHEME, widths=(WIDTH, 0.018))

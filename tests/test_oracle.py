@@ -143,7 +143,7 @@ def test_answers_beat_chance(marked, make):
     assert score(jm.attack(mesh, attack, 2e-3, seed=0)) < chance - 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_decisions_beat_chance(marked):
     marker, mesh = marked
     oracle = Counted(decide_by_score(score_oracle(marker, MESSAGE)))

@@ -17,7 +17,7 @@ def run(*options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, str(PAPER), *options], capture_output=True, text=True)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_all_figures(tmp_path: Path):
     mesh, output = tmp_path / "sphere.ply", tmp_path / "paper.json"
     trimesh.Trimesh(*bumpy_sphere(3), process=False).export(mesh)

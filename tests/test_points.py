@@ -456,7 +456,7 @@ def test_what_needs_a_surface_is_refused(host: Mesh, key: jm.Key):
         jm.embed(host, b"c", key, scheme=KeyedScheme(direction="normals"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_64_bits_in_a_large_cloud_read_from_half_of_it_in_noise(key: jm.Key):
     host = cloud(ball(25_000))
     marker = jm.make_marker(host, key, bits=64)

@@ -125,7 +125,7 @@ def test_published_rates_stand_beside_their_attacks(smi2010):
     assert rates["cropping 0.5"] == (None, None)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_from_start_to_end_and_again(tmp_path, smi2010):
     source, output = tmp_path / "ball.ply", tmp_path / "out"
     mesh = bumpy_sphere(3)

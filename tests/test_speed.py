@@ -14,7 +14,7 @@ def run(*options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, str(SPEED), *options], capture_output=True, text=True)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_programs_agree(tmp_path: Path):
     output = tmp_path / "speed.json"
     done = run("--sizes", "2000", "5000", "--parts", "filter", "--repeat", "1", "--output", str(output))

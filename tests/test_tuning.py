@@ -195,7 +195,7 @@ def tuned():
     return mesh, tune(mesh, ATTACKS, limits={"dame": 0.02}, key=jax.random.key(0), margin="evidence", bits=16)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_was_predicted_is_measured(tuned, key: jm.Key):
     """Marks of the tuned profile, attacked anew, have the evidence that the channels say."""
     mesh, found = tuned
@@ -213,7 +213,7 @@ def test_what_was_predicted_is_measured(tuned, key: jm.Key):
         assert marker.detect(jm.attack(marked, *one, seed=12)).message == b"ok"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_tuning_beats_equal_strengths_and_says_how_far_it_is_from_the_best(tuned):
     _, found = tuned
     assert len(found.report.margins) == len(ATTACKS)
@@ -224,7 +224,7 @@ def test_tuning_beats_equal_strengths_and_says_how_far_it_is_from_the_best(tuned
     assert found.detector_weights.shape == (len(ATTACKS), 64)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_several_limits_at_once(tuned):
     mesh = tuned[0]
     limits = {"dame": 0.02, "gl": 1e-4}
@@ -239,7 +239,7 @@ def test_several_limits_at_once(tuned):
     assert 0.98 <= max(used) <= 1 + 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_any_function_is_an_attack_and_a_start_is_warm(tuned):
     mesh, before = tuned
 

@@ -6,10 +6,13 @@ Vardy, "List Decoding of Polar Codes", ibid. 61 (2015). Information goes to the 
 with β = 2^¼): these positions are the same for every channel, and nested. Everything runs on the host, in NumPy.
 """
 
+from functools import lru_cache
+
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int8, Integer
 
 
+@lru_cache(maxsize=16)
 def frozen_inputs(length: int, information: int) -> Bool[np.ndarray, " length"]:
     """Choose which inputs of the transform are fixed to 0; the others take the information bits in order.
 
@@ -24,6 +27,7 @@ def frozen_inputs(length: int, information: int) -> Bool[np.ndarray, " length"]:
     weight = sum(((position >> j) & 1) * 2 ** (j / 4) for j in range(length.bit_length() - 1)) + np.zeros(length)
     fixed = np.ones(length, bool)
     fixed[np.argsort(weight)[length - information :]] = False
+    fixed.flags.writeable = False  # shared by all who ask
     return fixed
 
 
