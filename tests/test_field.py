@@ -262,6 +262,7 @@ def test_refusals(shape: Mesh, marked, key: jm.Key, sphere: Mesh, unchecked):
         jm.detect(shape, key=key, record=record)
 
 
+@pytest.mark.slow
 def test_capacity_is_what_embed_takes(shape: Mesh, key: jm.Key):
     bits = jm.capacity(shape, 6e-4, noise=0.001, scheme=SCHEME)
     assert bits >= 32
