@@ -18,6 +18,13 @@ def _strict_promotion() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _forget_programs() -> Iterator[None]:
+    """Let compiled programs go with the file of tests that needed them: all of them are gigabytes."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(params=["float32", "float64"])
 def dtype(request: pytest.FixtureRequest) -> Iterator[np.dtype]:
     """Both precisions; in float64 with jax's 64-bit mode on."""

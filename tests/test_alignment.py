@@ -364,6 +364,7 @@ def test_pieces_that_moved_apart_are_aligned_one_by_one(foreign, original: Origi
     assert 0.85 < left <= 1
 
 
+@pytest.mark.slow
 def test_a_remeshed_part_is_aligned(original: Original):
     vertices, faces = trimesh.remesh.subdivide(np.asarray(original.mesh.vertices), np.asarray(original.mesh.faces))
     part, _ = halves(make_mesh(vertices, faces))

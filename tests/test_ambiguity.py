@@ -69,6 +69,7 @@ def test_going_round_does_not_help(published):
     assert min(found) > -6
 
 
+@pytest.mark.slow
 def test_the_owner_has_the_forgers_original_too(original, published, forged, key: jm.Key):
     """Whose original holds the other's mark says who was first: the owner's does not hold the forger's."""
     owner = jm.make_marker(original, key, bits=16)

@@ -30,6 +30,7 @@ def lines(workshop: Workshop, *arguments: object) -> tuple[int, list[dict]]:
     return code, [json.loads(line) for line in out.splitlines()]
 
 
+@pytest.mark.slow
 def test_a_folder_is_marked_and_read(workshop: Workshop):
     code, told = lines(workshop, "embed", "models", "marked", *MARK)
     assert code == 0

@@ -381,6 +381,7 @@ def small(tmp_path: Path) -> dict:
     }
 
 
+@pytest.mark.slow
 def test_a_run_of_ones_own_methods_is_calibrated_and_goes_on_where_it_was_ended(small: dict, plain: Path):
     said: list[str] = []
     methods = {"methods": [SIGNS, plain], "limits": ["perceptual"], "payloads": [8]}
@@ -413,6 +414,7 @@ def test_a_run_of_ones_own_methods_is_calibrated_and_goes_on_where_it_was_ended(
         found.paired("signs", "plane", "smi2010")
 
 
+@pytest.mark.slow
 def test_a_mark_is_written_over_by_a_second_one_of_the_same_method(small: dict):
     """Of two marks of signs about as strong, each has half of the energy: 1/√2 of the score of one alone."""
 
@@ -428,6 +430,7 @@ def test_a_mark_is_written_over_by_a_second_one_of_the_same_method(small: dict):
     assert found.calibrations["signs", 64].kinds["unmarked, attacked"].trials == small["keys"]
 
 
+@pytest.mark.slow
 def test_other_meshes_are_read_in_place_of_each_mesh(small: dict, tmp_path: Path):
     other, readings = tmp_path / "other.ply", []
     jm.save_mesh(bumpy_sphere(3), other)

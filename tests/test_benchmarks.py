@@ -105,6 +105,7 @@ def test_shapes_are_closed_and_of_the_size_asked_for():
             assert surface.volume == pytest.approx(volumes[name], rel=0.01), name
 
 
+@pytest.mark.slow
 def test_a_stage_is_measured_in_a_process_from_a_copy(copy: Path, afresh, monkeypatch):
     monkeypatch.syspath_prepend(copy)
     stages = importlib.import_module("common.stages")

@@ -100,6 +100,7 @@ def test_adjoint_is_the_transpose(kind, operator, signal, key: jm.Key, x64):
     np.testing.assert_allclose(carrier.adjoint(residual), transposed, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["host", "eigen"])
 def test_claim_is_a_sum_over_keyed_signs(kind, operator, signal, key: jm.Key, x64):
     """S = Σ s·a: turning one keyed sign turns its term in S, and leaves ‖a‖ alone."""

@@ -167,6 +167,7 @@ def test_catalogues_of_the_first_version_are_brought_up(folder: Path):
 ADDING = "import sys, jaxmark as jm\nwith jm.Catalogue('shop.db') as c:\n for f in sys.argv[1:]: print(c.add(f).status)"
 
 
+@pytest.mark.slow
 def test_two_processes_add_the_same_files_once(folder: Path):
     command = [sys.executable, "-c", ADDING, "large.ply", "other.ply", "tiny.ply"]
     runs = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]

@@ -118,6 +118,7 @@ def test_changes_of_pose_are_derivatives(shape: Mesh, axis: int):
     assert np.linalg.norm(there - values[good]) < 0.05 * np.linalg.norm(before - values[good])
 
 
+@pytest.mark.slow
 def test_the_displacement_gives_anchors_their_values_and_keeps_the_pose(shape: Mesh):
     original = make_original(shape)
     host = HOSTS(original, CHOICES)[2 * WIDTH]
@@ -245,6 +246,7 @@ def test_presence_is_a_mark(shape: Mesh, key: jm.Key):
     assert found.message is None
 
 
+@pytest.mark.slow
 def test_refusals(shape: Mesh, marked, key: jm.Key, sphere: Mesh, unchecked):
     ball = np.asarray(sphere.vertices) / np.linalg.norm(sphere.vertices, axis=1)[:, None]
     with pytest.raises(jm.JaxmarkError, match="pose cannot be told"):

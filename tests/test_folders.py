@@ -57,6 +57,7 @@ def files(tmp_path: Path) -> list[Path]:
     return found
 
 
+@pytest.mark.slow
 def test_several_workers_tell_of_each_file(files):
     told = dict(each(files, Count(), workers=2))
     assert {file.stem for file in told} == set("abcdef")
@@ -77,12 +78,14 @@ def told_of_c(files: list[Path]) -> str:
     return f"refused. {files[2]} is not to my liking."
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_is_told_of(files):
     with pytest.raises(jm.JaxmarkError, match=r"A worker was killed.*fewer --workers"):
         list(each(files, die, workers=2))
     assert_nobody_is_left()
 
 
+@pytest.mark.slow
 def test_whoever_stops_early_leaves_no_process_and_no_draft(files):
     told = each(files, wait, workers=2)
     assert next(told)[0] == files[-1]

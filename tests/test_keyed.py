@@ -401,6 +401,7 @@ def test_no_residual_gives_zero_scores_with_finite_gradients(small: Case, key: j
         np.testing.assert_array_equal(carrier.claim(observe(suspect - x, weights), jnp.ones(BITS, x.dtype)), 0)
 
 
+@pytest.mark.slow
 def test_pure_functions_by_transformation(medium: Case, key: jm.Key, x64):
     carrier, x = make_carrier(medium, key, np.float64, bits=8), jnp.asarray(medium.x)
     messages = jnp.asarray(np.random.default_rng(8).choice([-1.0, 1.0], (3, 8)))

@@ -43,6 +43,7 @@ def part_of(mesh: Mesh, share: float) -> Mesh:
     return mesh._replace(faces=faces[(points[faces, 0] < np.quantile(points[:, 0], share)).all(axis=1)])
 
 
+@pytest.mark.slow
 def test_anchors_are_apart_and_do_not_depend_on_what_is_cut_off(shape: Mesh):
     whole, part = (local._anchors(one, CHOICES) for one in (shape, part_of(shape, 0.6)))
     here = set(whole.vertices[whole.vertices >= 0].tolist())
@@ -122,6 +123,7 @@ def test_all_blind_schemes_are_tried_and_paid_for(marked, key: jm.Key):
     assert found.log10_p == pytest.approx(alone.log10_p + math.log10(2))
 
 
+@pytest.mark.slow
 def test_nothing_is_detected_where_nothing_is(shape: Mesh, marked):
     for mesh in (shape, marked[0], jm.attack(shape, "noise", 0.01, seed=0)):
         for number in range(2):

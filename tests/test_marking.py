@@ -62,6 +62,7 @@ def test_round_trip_within_the_budget(sphere: Mesh, key: jm.Key, scheme, dtype):
     assert jm.detect(marked, original=sphere, key=jm.new_key(), scheme=scheme, message=MESSAGE).log10_p > -6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", MOSTLY_QUICK)
 def test_precisions_read_each_other(sphere: Mesh, key: jm.Key, scheme):
     marked, _ = jm.embed(sphere, MESSAGE, key, scheme=scheme)

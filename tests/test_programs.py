@@ -21,6 +21,7 @@ def kept(home: Path, **more: str) -> str:
     return subprocess.run([sys.executable, "-c", CODE], env=environment, capture_output=True, text=True).stdout.strip()
 
 
+@pytest.mark.slow
 def test_programs_are_kept_in_a_private_folder(tmp_path: Path):
     assert kept(tmp_path) == str(tmp_path / "jaxmark")
     assert stat.S_IMODE((tmp_path / "jaxmark").stat().st_mode) == 0o700
@@ -29,6 +30,7 @@ def test_programs_are_kept_in_a_private_folder(tmp_path: Path):
     assert kept(tmp_path, JAX_COMPILATION_CACHE_DIR=str(tmp_path / "own")) == str(tmp_path / "own")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="only there do permissions tell")
 def test_a_folder_that_others_may_write_is_not_used(tmp_path: Path):
     (tmp_path / "jaxmark").mkdir()

@@ -234,6 +234,7 @@ def test_the_pose_of_a_mirrored_part_is_found(prepare, mesh: Mesh):
     assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 1e-3
 
 
+@pytest.mark.slow
 def test_settings_are_frozen_and_reach_what_they_set(mesh: Mesh):
     """No pose leaves nothing at all, and a part has none if poses by local shape are not tried, or too large for it."""
     surface, suspect = Surface(mesh), placed(finer(mesh), anywhere(6))

@@ -151,6 +151,7 @@ def test_differentiable_with_respect_to_budget_and_strength(x64):
     assert abs(float(slopes[1][1])) > 1e-3
 
 
+@pytest.mark.slow
 def test_jaxopt_is_imported_late_and_without_its_warning():
     code = (
         "import warnings; warnings.simplefilter('error'); import sys, jaxmark, jax.numpy as jnp;"

@@ -168,6 +168,7 @@ def test_what_cannot_be_used_is_named_and_the_others_are_read(tmp_path: Path) ->
     assert "sparse" in left["ball"]
 
 
+@pytest.mark.slow
 def test_numbers_that_are_referred_to_too_often_are_refused(tmp_path: Path) -> None:
     document, data = scene()
     for mesh in document["meshes"]:
