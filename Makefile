@@ -33,7 +33,7 @@ lint: $(VENV)/.dev  ## ruff: style and formatting
 types: $(VENV)/.dev  ## pyright: types
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-tests: $(VENV)/.dev  ## pytest: all tests but the slow ones
+tests: $(VENV)/.dev  ## pytest: all tests but the slow and the long ones
 	$(BIN)/python -m pytest -q -n auto --dist worksteal --durations=20
 
 slow-tests: $(VENV)/.dev  ## pytest: the slow ones

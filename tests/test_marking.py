@@ -63,7 +63,7 @@ def test_round_trip_within_the_budget(sphere: Mesh, key: jm.Key, scheme, dtype):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", MOSTLY_QUICK)
+@pytest.mark.parametrize("scheme", SCHEMES)
 def test_precisions_read_each_other(sphere: Mesh, key: jm.Key, scheme):
     marked, _ = jm.embed(sphere, MESSAGE, key, scheme=scheme)
     with jax.enable_x64(True):

@@ -44,13 +44,14 @@ def test_an_attack_of_ones_own_and_a_refusal(marked):
     def flatten(mesh: Mesh, strength: float, key: jax.Array) -> Mesh:
         return Mesh(jnp.asarray(mesh.vertices) * jnp.array([1, 1, 1 - strength]), mesh.faces)
 
-    def collapse(mesh: Mesh, strength: float, key: jax.Array) -> Mesh:
-        return Mesh(np.zeros((3, 3)), np.arange(3)[None])
+    def replace(mesh: Mesh, strength: float, key: jax.Array) -> Mesh:
+        square = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], float)
+        return Mesh(square, np.array([[0, 1, 2], [1, 3, 2]]))
 
     squashed = jm.robustness(marker, mesh, MESSAGE, Attack(flatten, "share of the height", (0.4,)), samples=1)
     assert squashed.success.all()
     np.testing.assert_array_equal(squashed.strengths, [0.4])
-    lost = jm.robustness(marker, mesh, MESSAGE, Attack(collapse, "none", (1.0,), host=True), samples=1)
+    lost = jm.robustness(marker, mesh, MESSAGE, Attack(replace, "none", (1.0,), host=True), samples=1)
     assert (lost.success.item(), lost.bit_errors.item(), lost.log10_p.item()) == (False, 0.5, 0)
     assert "align" in lost.refusals[0][0]
 

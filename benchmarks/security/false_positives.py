@@ -37,7 +37,7 @@ from common.marks import BUDGET, write
 
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
 MESSAGE = b"m"
-BATCH = 250
+BATCH = 500
 ENOUGH = 10  # hits
 
 
@@ -149,7 +149,7 @@ def holds(values: np.ndarray, names: list[str], *, fires: bool, report: bool) ->
 
 def main() -> None:
     parser = make_parser(__doc__)
-    parser.add_argument("--keys", type=int, default=70_000, help="multiple of 250")
+    parser.add_argument("--keys", type=int, default=70_000, help="multiple of 500")
     parser.add_argument("--mesh", help="by default a rough sphere of 162 points")
     arguments = parser.parse_args()
     mesh = load(parser, arguments.mesh) if arguments.mesh else sample()

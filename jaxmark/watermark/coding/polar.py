@@ -21,7 +21,7 @@ def frozen_inputs(length: int, information: int) -> Bool[np.ndarray, " length"]:
         information: number of information bits, at most `length`.
 
     Returns:
-        True for each input that is fixed, `[length]`.
+        True for each input that is fixed, `[length]`; not to be written to.
     """
     position = np.arange(length)
     weight = sum(((position >> j) & 1) * 2 ** (j / 4) for j in range(length.bit_length() - 1)) + np.zeros(length)
