@@ -11,11 +11,14 @@ from scipy.spatial.transform import Rotation
 import jaxmark as jm
 from jaxmark.bench.method import Method
 from jaxmark.bench.methods import cho as norms
+from jaxmark.bench.methods import here
 from jaxmark.bench.methods import influence as spheres
 from jaxmark.bench.methods import moments as patches
 from jaxmark.bench.methods import radial as programme
 from jaxmark.bench.methods.draws import gather, normal, scatter
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.blind.field import FieldScheme
+from jaxmark.watermark.blind.reading import context
 from tests.meshes import shared_mesh
 
 FACTORIES: dict[str, tuple[Callable[[int], Method], float]] = {
@@ -173,6 +176,28 @@ def test_surfaces_are_asked_for(name, key):
     cloud = jm.make_mesh(np.random.default_rng(0).normal(size=(100, 3)), np.zeros((0, 3), np.int64))
     with pytest.raises(jm.JaxmarkError, match="needs faces"):
         factory(8).read(cloud, key, None)
+
+
+def test_what_no_key_decides_is_looked_at_once(sphere, monkeypatch):
+    asked = []
+
+    def views(scheme, suspect, choices):
+        asked.append(suspect)
+        if suspect is not sphere:
+            raise jm.JaxmarkError("nothing to look at")
+        yield from "abc"
+
+    monkeypatch.setattr(FieldScheme, "views", views)
+    scheme, mine, yours = here.SharedField(), context(bytes(32), 64, "field"), context(bytes([1] * 32), 64, "field")
+    begun = scheme.views(sphere, mine)
+    assert next(begun) == "a"
+    assert list(scheme.views(sphere, yours)) == ["a", "b", "c"]
+    assert list(begun) == ["b", "c"]
+    assert len(asked) == 1
+    other = Mesh(sphere.vertices.copy(), sphere.faces)
+    for choices in (mine, yours):  # a refusal is one for each key
+        with pytest.raises(jm.JaxmarkError, match="nothing to look at"):
+            scheme.views(other, choices)
 
 
 @pytest.mark.slow

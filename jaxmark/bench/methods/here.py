@@ -5,8 +5,11 @@ the best guess, whether or not its tag fits. The score is the evidence, -log10 o
 there is none, how well the soft values agree with the codeword of the guess, from -1 to 1.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from copy import copy
+from dataclasses import dataclass
 from functools import lru_cache, partial
+from itertools import chain, tee
 
 import numpy as np
 
@@ -16,11 +19,12 @@ from jaxmark.bench.held import Held
 from jaxmark.bench.method import Bits, Method, Reading
 from jaxmark.bench.methods.harmonics import THRESHOLD, HarmonicMark, make_mark
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.blind.field import FieldScheme
 from jaxmark.watermark.blind.marker import BlindMarker
 from jaxmark.watermark.blind.reading import TAG_BITS, BlindDetection, codeword, context
-from jaxmark.watermark.blind.scheme import BlindScheme
+from jaxmark.watermark.blind.scheme import BlindScheme, Look
 from jaxmark.watermark.budget import make_budget
-from jaxmark.watermark.coding.keys import Key
+from jaxmark.watermark.coding.keys import Choices, Key
 from jaxmark.watermark.coding.message import guess
 from jaxmark.watermark.everyday import BLIND_SCHEMES, prepare_alone, read_blind
 from jaxmark.watermark.marking import Detection, Marker
@@ -30,6 +34,22 @@ _RMS = (2e-6, 1e-2)  # displacements over the diagonal
 _OURS = "the scheme is defined by this code"
 _OHBUCHI = "Ohbuchi, Takahashi, Miyazawa, Mukaiyama, Watermarking 3D polygonal meshes in the mesh spectral domain, 2001"
 _SOHN = "Sohn et al., A Digital Watermarking Scheme for Polygonal Meshes using Modified Spectral Decomposition"
+
+
+@dataclass(frozen=True)
+class SharedField(FieldScheme):
+    """The scheme `field`, which looks at a suspect once for all keys that read it, as no key decides what it sees."""
+
+    def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:
+        """See `BlindScheme`."""
+        return copy(_views(self, Held(suspect)))
+
+
+@lru_cache(maxsize=2)
+def _views(scheme: FieldScheme, suspect: Held) -> Iterator[Look]:
+    """What a scheme sees of a suspect, whose copies start anew; a suspect that it refuses is refused each time."""
+    looks = FieldScheme.views(scheme, suspect.mesh, Choices(Key(bytes(32)), b""))
+    return tee(chain([next(looks)], looks), 1)[0]
 
 
 def keyed(bits: int) -> Method:
@@ -55,12 +75,12 @@ def paper(bits: int) -> Method:
 
 def field(bits: int) -> Method:
     """The blind scheme that survives any other meshing."""
-    return _blind("field", bits)
+    return _blind(SharedField(), bits)
 
 
 def local(bits: int) -> Method:
     """The blind scheme that is read from any part."""
-    return _blind("local", bits)
+    return _blind(BLIND_SCHEMES["local"], bits)
 
 
 def harmonics(bits: int) -> Method:
@@ -93,10 +113,9 @@ def _informed(name: str, scheme: Scheme, bits: int, source: str, anchor: str = "
     )
 
 
-def _blind(name: str, bits: int) -> Method:
-    scheme = BLIND_SCHEMES[name]
+def _blind(scheme: BlindScheme, bits: int) -> Method:
     return Method(
-        name,
+        scheme.name,
         partial(_embed, scheme),
         partial(_read_blind, scheme, bits),
         blind=True,
