@@ -23,7 +23,7 @@ from tests.samples import bumpy_sphere
 TRACED = (
     *(("noise", 0.01), ("diagonal-noise", 0.01), ("gaussian-noise", 0.01), ("smoothing", 3), ("quantisation", 8)),
     *(("taubin", 3), ("cotangent-smoothing", 0.3), ("bilateral", 1)),
-    *(("low-pass", 0.3), ("band-stop", 0.001)),
+    *(("low-pass", 0.3), ("band-stop", 0.001), ("shrinkage", 0.001)),
     *(("jamming", 0.002), ("warp", 0.005), ("bending", 2), ("twisting", 2)),
     *(("similarity", 0.3), ("affine", 0.02)),
 )

@@ -103,7 +103,7 @@ def test_python_block_on_recipients_runs(unchecked, capsys):
     assert sorted(one.recipient for one in accused if one.log10_p < -6) == ["alice", "bob"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_python_blocks_on_studies_run(folder: Path, unchecked, capsys):
     names = run("docs/how-to/study.md")
     assert [rate["read"] for rate in names["results"].rates() if rate["control"] == "marked"] == [2, 2]
@@ -134,7 +134,7 @@ def said(argv: list[str], monkeypatch, capsys) -> str:
     return found.out
 
 
-@pytest.mark.slow
+@pytest.mark.long  # which tests/first_mark.py runs, too, but for those that come after a first reading
 @pytest.mark.parametrize("page", COMMANDS)
 def test_shell_lines_run(page: str, folder: Path, unchecked, monkeypatch, capsys):
     lines = re.findall(r"^    (jaxmark .*)$", PAGES[page], re.MULTILINE)

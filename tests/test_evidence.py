@@ -85,7 +85,7 @@ def test_the_fitted_value_is_the_gaussian_tail():
     assert -1000 < log10_p_fitted(60.0, 1.0) < -700  # far below the floor of a claim, and finite
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_false_positive_rates_of_unmarked_suspects():
     """The benchmark in small: nominal against counted, with controls that must fail; it exits 1 if one does not."""
     # With fewer keys the control fails or not by chance.

@@ -139,7 +139,7 @@ def workshop(tmp_path, monkeypatch, capfd) -> Workshop:
     return Workshop(tmp_path, monkeypatch, capfd)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_copies_are_issued_and_traced(workshop: Workshop):
     """The whole job on the command line: two recipients, a leak, and what is kept."""
     jm.save_mesh(rough_sphere(SIZE, 7), "other.ply")

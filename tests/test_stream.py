@@ -161,7 +161,7 @@ def is_read_only(plan: Plan) -> bool:
     return stream._finder(plan).catalogue.database.read_only
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_dask_workers_search_as_one_process_does(tmp_path: Path, monkeypatch):
     """The search itself: a marked suspect and one that is nobody's get the verdicts that this process gives."""
     distributed = pytest.importorskip("distributed")

@@ -147,7 +147,7 @@ def test_what_is_refused_is_in_the_rows_and_ends_nothing(tmp_path):
     assert {row.rms for row in full.rows} == {0}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_cannot_be_aligned_is_in_the_rows(tmp_path):
     attacks = {"lost": Attack(scattered, "none", (1.0,), host=True)}
     found = study(attacks=attacks, seeds=1).run(tmp_path / "lost.jsonl")

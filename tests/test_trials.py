@@ -64,7 +64,7 @@ def test_practice_has_other_signs_and_seeds(trials, trial):
     assert (practised.worth != trial.worth).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_gradient_leads_to_more_evidence(trials, monkeypatch):
     """From strengths that fall too fast, judged by the very marks that better ones were fitted to."""
     poor = trials.run(KeyedScheme(profile=tuple(np.geomspace(1, 0.03, 24).tolist())))
@@ -95,7 +95,7 @@ def test_limits_bind_as_metrics_do():
     assert limits.scale(jnp.array([1.0, 4.0]), base) == pytest.approx(1 / 2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_tuned_strengths_are_not_worse_than_those_given(mesh):
     poor = KeyedScheme(profile=(1.0,) * 8)
     found = tune(mesh, ATTACKS[:1], RMS, key=jax.random.key(0), bits=16, scheme=poor)

@@ -29,7 +29,7 @@ from jaxmark.evaluation import cells
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, make_parser
-from common.costs import ALPHA, BITS, METRICS, Target, around, costs, least_distortion, make_target
+from common.costs import ALPHA, BITS, METRICS, Target, around, cell, make_target, paid
 from common.marks import BUDGET, MESSAGE
 from common.tables import head, line, say
 
@@ -88,6 +88,8 @@ ATTACKERS: dict[tuple[str, str], Callable[..., jm.attacks.Attack]] = {
     ("program", "quantisation"): named("quantisation", 10, 2),
     ("program", "Laplacian smoothing"): named("smoothing", 10, 10_000),
     ("program", "low-pass filter"): lambda target, scheme, steps: CUT,
+    ("program", "non-local means"): named("non-local-means", 0.3, 300),
+    ("program", "shrinkage of wavelets"): named("shrinkage", 3e-5, 3e-2),
     ("program", "random warp"): named("warp", 0.01, 1),
     ("program", "Wiener estimate subtracted"): sought(enemies.subtraction),
     ("program", "another mark"): sought(enemies.remarking),
@@ -113,21 +115,15 @@ LEVELS = list(dict.fromkeys(level for level, _ in ATTACKERS))
 NAMES = [*LEVELS, THEORY, *(name for _, name in ATTACKERS)]
 
 
-def work(folder: str, steps: int, cell: cells.Cell) -> cells.Row:
-    mesh, scheme, level, name = map(str, cell)
+def work(folder: str, steps: int, one: cells.Cell) -> cells.Row:
+    mesh, scheme, level, name = map(str, one)
     target = target_of(str(Path(folder, mesh)), scheme)
     if name == THEORY:
         return {"cost": {"rms": target.theory}, "strength": target.theory * BUDGET, "log10_p": math.log10(ALPHA)}
     try:
-        attack = ATTACKERS[level, name](target, scheme, steps)
-        found = least_distortion(target, attack, zlib.crc32(repr(cell).encode()) % 2**31)
+        return paid(target, ATTACKERS[level, name](target, scheme, steps), zlib.crc32(repr(one).encode()) % 2**31)
     except jm.JaxmarkError as error:
         return {"refused": str(error)}
-    if (weakest := found.weakest) is None:
-        strongest = found.curve[-1]
-        return {"not below": strongest.strength, "log10_p": strongest.log10_p}
-    cost = {metric: found.cost(metric) for metric in METRICS}
-    return {"cost": cost, "strength": weakest.strength, "log10_p": weakest.log10_p}
 
 
 def report(rows: list[dict], meshes: list[str], schemes: list[str], attackers: list[tuple[str, str]]) -> str:
@@ -139,7 +135,7 @@ def report(rows: list[dict], meshes: list[str], schemes: list[str], attackers: l
         for level in dict.fromkeys(level for level, _ in attackers):
             own = [name for one, name in attackers if one == level]
             for name in own:
-                lines.append(line(level, name, *(_cell(found[mesh, scheme, level, name]) for mesh in meshes)))
+                lines.append(line(level, name, *(cell(found[mesh, scheme, level, name]) for mesh in meshes)))
             real = [[found[mesh, scheme, level, name] for name in own if name != THEORY] for mesh in meshes]
             least = [" / ".join(f"{_least(rows, metric):.3g}" for metric in METRICS) for rows in real]
             lines.append(line(level, "**least**", *least))
@@ -148,12 +144,6 @@ def report(rows: list[dict], meshes: list[str], schemes: list[str], attackers: l
 
 def _least(rows: list[dict], metric: str) -> float:
     return min((row["cost"].get(metric, math.inf) for row in rows if "cost" in row), default=math.inf)
-
-
-def _cell(row: dict) -> str:
-    if "cost" in row:
-        return costs(row["cost"])
-    return f"refused: {row['refused']}" if "refused" in row else f"detected up to {row['not below']:g}"
 
 
 def main() -> None:

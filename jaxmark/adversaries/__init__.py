@@ -13,6 +13,10 @@ from jaxmark.adversaries.blind import descent as descent
 from jaxmark.adversaries.blind import evolution as evolution
 from jaxmark.adversaries.blind import remarking as remarking
 from jaxmark.adversaries.blind import subtraction as subtraction
+from jaxmark.adversaries.chains import Found as Found
+from jaxmark.adversaries.chains import chain_attack as chain_attack
+from jaxmark.adversaries.chains import projected_cost as projected_cost
+from jaxmark.adversaries.chains import search_chain as search_chain
 from jaxmark.adversaries.collusion import Rule as Rule
 from jaxmark.adversaries.collusion import collude as collude
 from jaxmark.adversaries.collusion import combine as combine
@@ -23,6 +27,11 @@ from jaxmark.adversaries.expected import random_mark as random_mark
 from jaxmark.adversaries.expected import rescale as rescale
 from jaxmark.adversaries.key_holder import erasure as erasure
 from jaxmark.adversaries.key_holder import erasure_by_descent as erasure_by_descent
+from jaxmark.adversaries.learned import Goal as Goal
+from jaxmark.adversaries.learned import Learned as Learned
+from jaxmark.adversaries.learned import Network as Network
+from jaxmark.adversaries.learned import learn as learn
+from jaxmark.adversaries.learned import learned_attack as learned_attack
 from jaxmark.adversaries.oracle import Counted as Counted
 from jaxmark.adversaries.oracle import boundary as boundary
 from jaxmark.adversaries.oracle import decide_by_score as decide_by_score

@@ -65,7 +65,7 @@ def subtraction(*, scheme: str | Scheme = DEFAULT_SCHEME, bits: int = 64, mark: 
         share = jnp.clip(written / jnp.maximum(whole, jnp.finfo(whole.dtype).tiny), 0, 1)
         return -band_filter(surrogate, share, surrogate.signal)
 
-    return _attack(way, scheme, bits, mark, "rms")
+    return make_attack(way, scheme, bits, mark)
 
 
 def remarking(*, scheme: str | Scheme = DEFAULT_SCHEME, bits: int = 64) -> Attack:
@@ -75,7 +75,7 @@ def remarking(*, scheme: str | Scheme = DEFAULT_SCHEME, bits: int = 64) -> Attac
         scheme: see `subtraction`.
         bits: see `subtraction`.
     """
-    return _attack(lambda surrogate, strength, key: random_mark(surrogate, key)[1], scheme, bits, MARK, "rms")
+    return make_attack(lambda surrogate, strength, key: random_mark(surrogate, key)[1], scheme, bits, MARK)
 
 
 def descent(
@@ -103,7 +103,7 @@ def descent(
         JaxmarkError: if there is no such family, or `steps` is below 1.
     """
     _check(family, steps)
-    return _attack(jax.jit(partial(descend, family=family, steps=steps)), scheme, bits, mark, metric)
+    return make_attack(jax.jit(partial(descend, family=family, steps=steps)), scheme, bits, mark, metric)
 
 
 def evolution(
@@ -134,7 +134,7 @@ def evolution(
     if family == "vertices":
         raise JaxmarkError("All vertices are too many parameters for an evolution; choose 'bands' or 'warps'.")
     _check(family, generations)
-    return _attack(jax.jit(partial(evolve, family=family, generations=generations)), scheme, bits, mark, metric)
+    return make_attack(jax.jit(partial(evolve, family=family, generations=generations)), scheme, bits, mark, metric)
 
 
 def descend(
@@ -178,13 +178,23 @@ def _check(family: Family, steps: int) -> None:
         raise JaxmarkError(f"An attack by optimisation needs at least one step, got {steps}.")
 
 
-def _attack(
+def make_attack(
     way: Callable[[Surrogate, Array, PRNGKeyArray], Displacement],
     scheme: str | Scheme,
     bits: int,
     mark: float,
-    metric: str,
+    metric: str = "rms",
 ) -> Attack:
+    """Attack by a displacement in the direction that `way` finds for a surrogate, a size and a random key.
+
+    Args:
+        way: function (surrogate, size, key) → displacement, which is scaled to the size.
+        scheme: see `subtraction`.
+        bits: see `subtraction`.
+        mark: see `subtraction`.
+        metric: see `descent`.
+    """
+
     def apply(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
         surrogate, original = make_surrogate(mesh, scheme, bits, mark, metric)
         wanted = jnp.asarray(strength, surrogate.signal.dtype)

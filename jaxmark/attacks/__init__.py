@@ -15,6 +15,8 @@ from jaxmark.attacks._quantisation import quantisation as quantisation
 from jaxmark.attacks._simplification import simplification as simplification
 from jaxmark.attacks.bilateral import bilateral_smoothing as bilateral_smoothing
 from jaxmark.attacks.deformation import as_rigid_as_possible as as_rigid_as_possible
+from jaxmark.attacks.denoising import nonlocal_means as nonlocal_means
+from jaxmark.attacks.denoising import shrinkage as shrinkage
 from jaxmark.attacks.filtering import band_stop as band_stop
 from jaxmark.attacks.filtering import low_pass as low_pass
 from jaxmark.attacks.flips import edge_flips as edge_flips

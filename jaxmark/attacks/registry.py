@@ -17,6 +17,7 @@ from jaxmark.attacks._quantisation import quantisation
 from jaxmark.attacks._simplification import simplification
 from jaxmark.attacks.bilateral import bilateral_smoothing
 from jaxmark.attacks.deformation import as_rigid_as_possible
+from jaxmark.attacks.denoising import nonlocal_means, shrinkage
 from jaxmark.attacks.filtering import band_stop, low_pass
 from jaxmark.attacks.flips import edge_flips
 from jaxmark.attacks.noise import diagonal_noise, gaussian_noise, uniform_noise
@@ -82,6 +83,15 @@ ATTACKS: Mapping[str, Attack] = {
         cotangent_smoothing, "time of diffusion by cotangents", (0.5, 1, 3, 5, 10), faces=True
     ),
     "bilateral": Attack(bilateral_smoothing, "iterations", (1, 2, 5, 10, 20), faces=True),
+    "shrinkage": Attack(
+        shrinkage,
+        "length over the diagonal that wavelets are shrunk by",
+        (0.0001, 0.0003, 0.001, 0.003, 0.01),
+        faces=True,
+    ),
+    "non-local-means": Attack(
+        nonlocal_means, "time of diffusion, whose detail is averaged", (1, 3, 10, 30, 100), host=True, faces=True
+    ),
     "low-pass": Attack(low_pass, "share of the spectrum, removed from the top", (0.3, 0.5, 0.7, 0.8, 0.9), faces=True),
     "band-stop": Attack(
         band_stop, "width in λ of the band that is removed, from 0.02 up", (0.02, 0.05, 0.1, 0.2, 0.4), faces=True

@@ -32,6 +32,7 @@ from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme, Sche
 
 _RMS = (2e-6, 1e-2)  # displacements over the diagonal
 _OURS = "the scheme is defined by this code"
+_OUR_BLIND = "jaxmark, docs/blind.md"
 _OHBUCHI = "Ohbuchi, Takahashi, Miyazawa, Mukaiyama, Watermarking 3D polygonal meshes in the mesh spectral domain, 2001"
 _SOHN = "Sohn et al., A Digital Watermarking Scheme for Polygonal Meshes using Modified Spectral Decomposition"
 
@@ -54,33 +55,33 @@ def _views(scheme: FieldScheme, suspect: Held) -> Iterator[Look]:
 
 def keyed(bits: int) -> Method:
     """The default scheme: keyed signs of its own in the bands."""
-    return _informed("keyed", KeyedScheme(), bits, "jaxmark, docs/how_it_works.md", _OURS)
+    return _method("keyed", KeyedScheme(), bits, "jaxmark, docs/how_it_works.md", _OURS)
 
 
 def eigen(bits: int) -> Method:
     """Ohbuchi's: the lowest eigenvectors of the graph Laplacian."""
-    return _informed("eigen", EigenScheme(), bits, _OHBUCHI)
+    return _method("eigen", EigenScheme(), bits, _OHBUCHI)
 
 
 def host(bits: int) -> Method:
     """Sohn's, in the form that works."""
-    return _informed("host", HostScheme(), bits, _SOHN)
+    return _method("host", HostScheme(), bits, _SOHN)
 
 
 def paper(bits: int) -> Method:
     """Sohn's as printed."""
     printed = HostScheme(kernel="printed", damping="none", unit_norm=False)
-    return _informed("paper", printed, bits, f"{_SOHN}, as printed")
+    return _method("paper", printed, bits, f"{_SOHN}, as printed")
 
 
 def field(bits: int) -> Method:
     """The blind scheme that survives any other meshing."""
-    return _blind(SharedField(), bits)
+    return _method("field", SharedField(), bits, _OUR_BLIND, _OURS, blind=True)
 
 
 def local(bits: int) -> Method:
     """The blind scheme that is read from any part."""
-    return _blind(BLIND_SCHEMES["local"], bits)
+    return _method("local", BLIND_SCHEMES["local"], bits, _OUR_BLIND, _OURS, blind=True)
 
 
 def harmonics(bits: int) -> Method:
@@ -100,29 +101,18 @@ def harmonics(bits: int) -> Method:
     )
 
 
-def _informed(name: str, scheme: Scheme, bits: int, source: str, anchor: str = "") -> Method:
+def _method(
+    name: str, scheme: Scheme | BlindScheme, bits: int, source: str, anchor: str = "", *, blind: bool = False
+) -> Method:
     return Method(
         name,
         partial(_embed, scheme),
-        partial(_read, scheme, bits),
-        blind=False,
+        partial(_read_blind if blind else _read, scheme, bits),
+        blind=blind,
         bits=bits,
         strengths=_RMS,
         source=source,
         anchor=anchor,
-    )
-
-
-def _blind(scheme: BlindScheme, bits: int) -> Method:
-    return Method(
-        scheme.name,
-        partial(_embed, scheme),
-        partial(_read_blind, scheme, bits),
-        blind=True,
-        bits=bits,
-        strengths=_RMS,
-        source="jaxmark, docs/blind.md",
-        anchor=_OURS,
     )
 
 

@@ -1,0 +1,158 @@
+"""What attackers who learned must pay: python benchmarks/security/learned.py MESH... --output FOLDER [--steps 400].
+
+They learn on meshes by formula, 20 that this library marks with random keys and 4 by which it is measured what they
+learned, and go against marks of 64 bits on the meshes that are given, at 0.08 % RMS and as strong as is hidden. What
+is printed is as of `adversarial.py`: the least distortion that brings a mark below detection at 1e-6, its message
+claimed, over the mark's own, in each metric.
+
+  estimate: a network that estimates the mark, and subtracts it
+  removal:  a network that lowers the expected evidence
+  chain:    up to four tools one after the other, found by evolution on two marked meshes for the least MSDM2
+
+Beside them denoising that learns nothing. Resumable: the same command goes on where it was ended.
+"""
+
+import json
+import sys
+import zlib
+from collections.abc import Callable
+from functools import lru_cache, partial
+from pathlib import Path
+
+import jax
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+import jaxmark as jm
+from jaxmark import adversaries as enemies
+from jaxmark.adversaries.chains import Gene, decode
+from jaxmark.adversaries.learned import init_network
+from jaxmark.bench.forms import creature
+from jaxmark.evaluation import cells
+from jaxmark.geometry import asteroid
+from jaxmark.geometry.mesh import Mesh
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from common.arguments import add_meshes, make_parser
+from common.costs import BITS, METRICS, Target, around, cell, make_target, paid
+from common.marks import BUDGET, MESSAGE
+from common.tables import head, line, say
+
+SIZE, LEARNED_FROM, HELD_OUT = 3000, 20, 4  # vertices, and meshes
+LIMITS = {"0.08 % RMS": BUDGET, "hidden": None}
+GOALS: tuple[enemies.Goal, ...] = ("estimate", "removal")
+
+
+def meshes_by_formula(first: int, count: int, size: int) -> list[Mesh]:
+    """Asteroids and creatures by turns."""
+    return [(asteroid, creature)[seed % 2](size, seed) for seed in range(first, first + count)]
+
+
+def learn(folder: Path, goal: enemies.Goal, steps: int, size: int) -> enemies.Network:
+    """The network of a folder; where it has none, one that learns first."""
+    file, unravel = folder / f"{goal}.npz", ravel_pytree(init_network(jax.random.key(0)))[1]
+    if not file.exists():
+        meshes, others = (
+            meshes_by_formula(*part, size) for part in ((100, LEARNED_FROM), (100 + LEARNED_FROM, HELD_OUT))
+        )
+        found = enemies.learn(meshes, others, key=jax.random.key(0), goal=goal, bits=BITS, steps=steps, say=say)
+        say(f"{goal}: held-out loss {found.before:.4f} of the Wiener estimate, {found.after:.4f} of the network")
+        numbers = np.asarray(ravel_pytree(found.network)[0])
+        np.savez(file, before=found.before, after=found.after, losses=found.losses, network=numbers)
+    with np.load(file) as kept:
+        return unravel(kept["network"])
+
+
+def search(folder: Path, generations: int, size: int) -> list[Gene]:
+    """The chain of a folder; where it has none, one that is searched for first."""
+    file = folder / "chain.json"
+    if not file.exists():
+        pairs = []
+        for mesh in meshes_by_formula(200, 2, size):
+            target = make_target(mesh, "keyed")
+            pairs.append((target.marker, target.marked, MESSAGE))
+        judge = enemies.projected_cost(pairs, "msdm2")
+        found = enemies.search_chain(judge, generations=generations, say=say)
+        file.write_text(json.dumps({"cost": found.cost, "chain": found.chain}))
+    return [Gene(*gene) for gene in json.loads(file.read_text())["chain"]]
+
+
+@lru_cache(maxsize=1)
+def target_of(path: str, limits: str) -> Target:
+    return make_target(jm.load_mesh(path), "keyed", LIMITS[limits])
+
+
+def network(goal: enemies.Goal, folder: Path, target: Target) -> jm.attacks.Attack:
+    attack = enemies.learned_attack(learn(folder, goal, 0, 0), goal, bits=BITS)
+    return around(attack, target.theory)
+
+
+def named(kind: str, *strengths: float) -> Callable[[Path, Target], jm.attacks.Attack]:
+    return lambda folder, target: jm.attacks.ATTACKS[kind]._replace(strengths=strengths)
+
+
+ATTACKERS: dict[str, Callable[[Path, Target], jm.attacks.Attack]] = {
+    "estimate": partial(network, "estimate"),
+    "removal": partial(network, "removal"),
+    "chain": lambda folder, target: enemies.chain_attack(search(folder, 0, 0)),
+    "non-local means": named("non-local-means", 0.3, 300),
+    "shrinkage of wavelets": named("shrinkage", 3e-5, 3e-2),
+    "another mark": lambda folder, target: around(enemies.remarking(bits=BITS), target.theory),
+}
+
+
+def work(folder: Path, output: Path, one: cells.Cell) -> cells.Row:
+    mesh, limits, name = map(str, one)
+    try:
+        target = target_of(str(folder / mesh), limits)
+        return paid(target, ATTACKERS[name](output, target), zlib.crc32(repr(one).encode()) % 2**31)
+    except jm.JaxmarkError as error:
+        return {"refused": str(error)}
+
+
+def main() -> None:
+    parser = make_parser(__doc__)
+    add_meshes(parser, help="files of one folder")
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--steps", type=int, default=400, help="of learning")
+    parser.add_argument("--generations", type=int, default=8, help="of the search for chains")
+    parser.add_argument("--size", type=int, default=SIZE, help="vertices of meshes to learn from")
+    parser.add_argument("--only", nargs="+", choices=list(ATTACKERS), default=list(ATTACKERS), help="attackers")
+    parser.add_argument("--workers", type=int, default=1)
+    arguments = parser.parse_args()
+    folders = {mesh.resolve().parent for mesh in arguments.meshes}
+    if len(folders) > 1:
+        parser.error("the meshes must be of one folder")
+    output = arguments.output.resolve()
+    output.mkdir(parents=True, exist_ok=True)
+    for goal in GOALS:
+        if goal in arguments.only:
+            learn(output, goal, arguments.steps, arguments.size)
+            with np.load(output / f"{goal}.npz") as kept:
+                print(f"{goal}: held-out loss {kept['before']:.4f} by Wiener, {kept['after']:.4f} learned")
+    if "chain" in arguments.only:
+        print(
+            "chain:",
+            ", then ".join(
+                f"{kind} {size:g}" for kind, size in decode(search(output, arguments.generations, arguments.size))
+            ),
+        )
+    meshes = [mesh.name for mesh in arguments.meshes]
+    wanted = [(mesh, limits, name) for mesh in meshes for limits in LIMITS for name in arguments.only]
+    rows = cells.run(
+        wanted,
+        partial(work, folders.pop(), output),
+        cells.processes(arguments.workers),
+        output / "cells.jsonl",
+        say,
+    )
+    found = {tuple(row["cell"]): row for row in rows}
+    for limits in LIMITS:
+        print(f"\nmarks at {limits}: distortion over the mark's, {' / '.join(METRICS)}\n")
+        print(head("mesh", *arguments.only))
+        for mesh in meshes:
+            print(line(mesh, *(cell(found[mesh, limits, name]) for name in arguments.only)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,219 @@
+"""Chains of tools, found by evolution on marks of the attacker's own: no gradient, and any program may be a step."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxmark.attacks.registry import ATTACKS, Attack, attack
+from jaxmark.distortion import Reference
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.marking import Marker
+
+#: What a step may be by default, and its weakest and strongest strength; whole numbers stay whole.
+TOOLS: Mapping[str, tuple[float, float]] = {
+    "noise": (0.0003, 0.05),
+    "jamming": (0.0001, 0.01),
+    "smoothing": (1, 300),
+    "taubin": (1, 300),
+    "bilateral": (1, 30),
+    "shrinkage": (0.00003, 0.01),
+    "non-local-means": (1, 300),
+    "quantisation": (12, 4),
+    "isotropic": (0.5, 3),
+    "simplification": (0.05, 0.95),
+    "loop": (1, 1),
+}
+_REFUSED = 1e9  # what a chain costs that a mesh refuses
+_MOST_GROWTH = 4  # of the number of vertices
+_STEP = 0.25  # of strengths in one change, over the way from the weakest to the strongest
+_FACTOR = 16.0  # by which strengths change over that way in the unit of `chain_attack`
+
+
+class Gene(NamedTuple):
+    """A step of a chain."""
+
+    kind: str
+    place: float  # between the weakest strength of its kind, 0, and the strongest, 1
+
+
+class Found(NamedTuple):
+    """A chain that was tried."""
+
+    chain: tuple[Gene, ...]
+    cost: float  # by the judge
+
+
+Judge = Callable[[Sequence[tuple[str, float]]], float]
+
+
+def search_chain(
+    judge: Judge,
+    *,
+    tools: Mapping[str, tuple[float, float]] = TOOLS,
+    steps: int = 4,
+    population: int = 12,
+    generations: int = 8,
+    seed: int = 0,
+    say: Callable[[str], None] = lambda line: None,
+) -> Found:
+    """Search for the chain of tools that costs least, by evolution: the best third lives on and has changed copies.
+
+    The first generation has every tool by itself. A changed copy has one strength moved, one step replaced, added,
+    left out or put elsewhere, or the head of one parent and the tail of another.
+
+    Args:
+        judge: function of a chain, pairs of a name in `ATTACKS` and a strength, that returns what it costs, such as
+            `projected_cost`; a chain that is refused by a `JaxmarkError` costs most.
+        tools: what a step may be, with its weakest and strongest strength.
+        steps: the longest chain.
+        population: chains of a generation after the first.
+        generations: how many generations are judged.
+        seed: of all random choices.
+        say: function that is called with a line after each generation.
+
+    Raises:
+        JaxmarkError: if there is no tool, an attack is unknown, or a number is below 1.
+    """
+    if unknown := [kind for kind in tools if kind not in ATTACKS]:
+        raise JaxmarkError(f"There is no attack {unknown[0]!r}; there are {', '.join(ATTACKS)}.")
+    if not tools or min(steps, population, generations) < 1:
+        raise JaxmarkError(
+            f"A search needs a tool, a step, a chain and a generation; got {len(tools)} tools, {steps}, {population}"
+            f" and {generations}."
+        )
+    random, kinds = np.random.default_rng(seed), list(tools)
+    known: dict[tuple[tuple[str, float], ...], Found] = {}
+    some = [(Gene(kind, float(random.random())),) for kind in kinds]
+    for generation in range(generations):
+        for one in some:
+            decoded = decode(one, tools)
+            if decoded not in known:
+                known[decoded] = Found(one, _judged(judge, decoded))
+        best = sorted(known.values(), key=lambda one: one.cost)[: max(population // 3, 1)]
+        say(f"generation {generation + 1}: {best[0].cost:.4g} by {decode(best[0].chain, tools)}")
+        some = [_changed([one.chain for one in best], kinds, steps, random) for _ in range(population)]
+    return min(known.values(), key=lambda one: one.cost)
+
+
+def decode(genes: Sequence[Gene], tools: Mapping[str, tuple[float, float]] = TOOLS) -> tuple[tuple[str, float], ...]:
+    """The steps of a chain with their strengths, which grow geometrically from the weakest to the strongest."""
+    steps = []
+    for kind, place in genes:
+        weakest, strongest = tools[kind]
+        strength = weakest * (strongest / weakest) ** min(max(place, 0.0), 1.0)
+        whole = float(weakest).is_integer() and float(strongest).is_integer() and max(tools[kind]) >= 1
+        steps.append((kind, float(round(strength)) if whole else float(f"{strength:.3g}")))
+    return tuple(steps)
+
+
+def projected_cost(
+    pairs: Sequence[tuple[Marker, Mesh, bytes]], metric: str = "msdm2", *, log10_alpha: float = -6.0, seed: int = 0
+) -> Judge:
+    """Judge chains by what it would cost to bring marks below detection: the mean over meshes.
+
+    The cost of a chain is the distortion of the marked mesh over that of the mark. Where the claim of the message is
+    still proven, it is multiplied by √(log10 p / log10 α): the evidence S/‖a‖ over what is needed, by which noise would
+    have to grow.
+
+    Args:
+        pairs: markers of the attacker's own meshes, with meshes that they marked and the messages.
+        metric: of `distortion.METRICS`; one that needs the connectivity makes remeshing cost most.
+        log10_alpha: log10 of the false-positive probability of detection.
+        seed: of the attacks.
+
+    Raises:
+        JaxmarkError: if there is no mark.
+    """
+    if not pairs:
+        raise JaxmarkError("A search for chains needs marks of the attacker's own to judge them by.")
+    references = [Reference(marked) for _, marked, _ in pairs]
+    own = [Reference(marker.original.mesh).measure(marked, [metric])[metric] for marker, marked, _ in pairs]
+
+    def judge(steps: Sequence[tuple[str, float]]) -> float:
+        costs = []
+        for (marker, marked, message), reference, mark in zip(pairs, references, own, strict=True):
+            suspect = run_chain(marked, steps, seed=seed)
+            paid = reference.measure(suspect, [metric])[metric]
+            if paid is None or not mark:
+                return _REFUSED
+            costs.append(paid / mark * math.sqrt(max(_log10_p(marker, suspect, message) / log10_alpha, 1.0)))
+        return float(np.mean(costs))
+
+    return judge
+
+
+def run_chain(mesh: Mesh, steps: Sequence[tuple[str, float]], *, seed: int) -> Mesh:
+    """Apply the steps of a chain one after the other.
+
+    Raises:
+        JaxmarkError: if a step is refused, or the mesh has more than four times as many vertices as at first.
+    """
+    most = _MOST_GROWTH * len(mesh.vertices)
+    for place, (kind, strength) in enumerate(steps):
+        mesh = attack(mesh, kind, strength, seed=seed + place)
+        if len(mesh.vertices) > most:
+            raise JaxmarkError(f"The chain makes more than {_MOST_GROWTH} times as many vertices; refine less.")
+    return mesh
+
+
+def chain_attack(genes: Sequence[Gene], tools: Mapping[str, tuple[float, float]] = TOOLS) -> Attack:
+    """A chain as an attack: all its strengths grow together by a factor of 16 on the way from weakest to strongest.
+
+    Args:
+        genes: the chain.
+        tools: of its search.
+    """
+
+    def apply(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
+        shift = math.log(max(strength, 1e-300)) / math.log(_FACTOR)
+        moved = [gene._replace(place=gene.place + shift) for gene in genes]
+        return run_chain(mesh, decode(moved, tools), seed=int(random.integers(2**31)))
+
+    return Attack(apply, "strengths over those that were found", (1 / _FACTOR, 1, _FACTOR), host=True, faces=True)
+
+
+def _log10_p(marker: Marker, suspect: Mesh, message: bytes) -> float:
+    try:
+        return marker.detect(suspect, message).log10_p_unfloored
+    except JaxmarkError:  # what cannot be aligned is not detected
+        return 0.0
+
+
+def _judged(judge: Judge, steps: Sequence[tuple[str, float]]) -> float:
+    try:
+        return judge(steps)
+    except JaxmarkError:
+        return _REFUSED
+
+
+def _changed(
+    parents: Sequence[tuple[Gene, ...]], kinds: Sequence[str], longest: int, random: np.random.Generator
+) -> tuple[Gene, ...]:
+    """A changed copy of one of the parents, or a child of two."""
+
+    def below(count: int) -> int:
+        return int(random.integers(count))
+
+    def fresh() -> Gene:
+        return Gene(kinds[below(len(kinds))], float(random.random()))
+
+    genes = list(parents[below(len(parents))])
+    place, change = below(len(genes)), random.random()
+    if change < 0.4:
+        moved = genes[place].place + _STEP * random.normal()
+        genes[place] = genes[place]._replace(place=min(max(moved, 0.0), 1.0))
+    elif change < 0.55:
+        genes[place] = fresh()
+    elif change < 0.75 and len(genes) < longest:
+        genes.insert(below(len(genes) + 1), fresh())
+    elif change < 0.85 and len(genes) > 1:
+        del genes[place]
+    elif change < 0.92:
+        genes.insert(below(len(genes)), genes.pop(place))
+    else:
+        other = parents[below(len(parents))]
+        genes = [*genes[: place + 1], *other[below(len(other)) :]][:longest]
+    return tuple(genes)

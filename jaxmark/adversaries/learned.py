@@ -1,0 +1,226 @@
+"""Networks that learn to remove marks: from meshes of the attacker's own, which this library marks with random keys.
+
+A network sees a mesh by its parts in eight bands of the graph Laplacian. Chebyshev convolutions of the parts' energies
+give each vertex a share of each part that is taken away, and a strength of noise that is put in its place, so that the
+displacement turns with the mesh. Before it has learned anything, the network subtracts the Wiener estimate of the mark.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.example_libraries import optimizers
+from jaxtyping import Array, Float, Float64, PRNGKeyArray
+
+from jaxmark.adversaries.blind import MARK, make_attack
+from jaxmark.adversaries.expected import Surrogate, evidence, make_surrogate, random_mark, rescale, rms
+from jaxmark.attacks.registry import Attack
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.spectral.bands import intervals
+from jaxmark.spectral.chebyshev import band_components
+from jaxmark.spectral.learned import cheb_conv, init_cheb_conv
+from jaxmark.watermark.carriers.carrier import Displacement
+from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme
+
+Goal = Literal["estimate", "removal"]
+Network = tuple[dict[str, Float[Array, "..."]], ...]  # parameters of convolutions, one after the other
+
+_EDGES = (0.0, 0.02, 0.05, 0.1, 0.17, 0.26, 0.36, 0.46, 2.0)  # of the bands in λ; marks are below 0.46
+_TERMS = 129
+_HIDDEN, _DEGREE = 16, 6  # columns between convolutions, and how many edges each looks
+_FLOOR = 1e-3  # of energies, in that of the mark
+_RATE = 3e-3  # of Adam
+_SIZE = 4.0  # of displacements in training for removal, in that of the mark
+_CHECKS = 4  # random keys for each mesh by which a network is judged
+
+
+class Learned(NamedTuple):
+    """A network, and what it has learned; losses are those of the goal, see `learn`."""
+
+    network: Network
+    goal: Goal
+    losses: Float64[np.ndarray, " steps"]  # on the meshes it learned from, step by step
+    before: float  # on meshes that were held out, of the Wiener estimate
+    after: float  # on the same, of the network
+
+
+def init_network(key: PRNGKeyArray) -> Network:
+    """Draw the parameters of a network whose last layer is zero, so that it gives the Wiener estimate."""
+    bands = len(_EDGES) - 1
+    sizes = ((2 * bands, _HIDDEN), (_HIDDEN, _HIDDEN), (_HIDDEN, 2 * bands))
+    keys = jax.random.split(key, len(sizes))
+    *layers, last = (init_cheb_conv(one, *size, degree=_DEGREE) for one, size in zip(keys, sizes, strict=True))
+    return (*layers, jax.tree.map(jnp.zeros_like, last))
+
+
+def estimate(network: Network, surrogate: Surrogate, signal: Displacement) -> Displacement:
+    """Estimate the mark in a signal: Σ_j share_j f_j(Δ)x, with a share of each band at each vertex.
+
+    Args:
+        network: see `init_network`.
+        surrogate: the mesh, from `expected.make_surrogate`.
+        signal: its coordinates, marked, `[rows, 3]`, in diagonals.
+    """
+    parts = _parts(surrogate, signal)
+    return surrogate.moving * jnp.sum(_decide(network, surrogate, parts)[0] * parts, axis=0)
+
+
+def removal(network: Network, surrogate: Surrogate, signal: Displacement, key: PRNGKeyArray) -> Displacement:
+    """The displacement by which a network removes a mark: less its estimate, and noise of the bands in its place.
+
+    Args:
+        network: see `init_network`.
+        surrogate: see `estimate`.
+        signal: see `estimate`.
+        key: JAX random key, of the noise.
+    """
+    parts = _parts(surrogate, signal)
+    shares, strengths = _decide(network, surrogate, parts)
+    noise = _parts(surrogate, jax.random.normal(key, signal.shape, signal.dtype))
+    return surrogate.moving * jnp.sum(surrogate.mark * strengths * noise - shares * parts, axis=0)
+
+
+def learn(
+    meshes: Sequence[Mesh],
+    held_out: Sequence[Mesh],
+    *,
+    key: PRNGKeyArray,
+    goal: Goal = "estimate",
+    scheme: str | Scheme = DEFAULT_SCHEME,
+    bits: int = 64,
+    mark: float = MARK,
+    steps: int = 400,
+    say: Callable[[str], None] = lambda line: None,
+) -> Learned:
+    """Let a network learn on meshes, each marked with another random key in every step (Adam).
+
+    Args:
+        meshes: meshes to learn from; nothing of what is attacked later.
+        held_out: meshes by which is measured what was learned.
+        key: JAX random key.
+        goal: `"estimate"`, the loss is the energy of mark less estimate, over that of the mark; `"removal"`, the
+            expected evidence S/‖a‖ after a displacement four times as large as the mark.
+        scheme: the scheme that meshes are marked with, see `make_marker`.
+        bits: size of the payload in bits.
+        mark: RMS displacement of marks, relative to the diagonal.
+        steps: number of gradient steps, each on one mesh, in turn.
+        say: function that is called with a line after every hundredth step.
+
+    Raises:
+        JaxmarkError: if there is no such goal, no mesh, or no step, or a mesh cannot be marked.
+    """
+    if goal not in get_args(Goal):
+        raise JaxmarkError(f"There is no goal {goal!r}; there are {', '.join(get_args(Goal))}.")
+    if not meshes or not held_out or steps < 1:
+        raise JaxmarkError(
+            f"Learning needs meshes, meshes that are held out, and steps; got {len(meshes)}, {len(held_out)}, {steps}."
+        )
+    surrogates = [make_surrogate(mesh, scheme, bits, mark)[0] for mesh in meshes]
+    others = [make_surrogate(mesh, scheme, bits, mark)[0] for mesh in held_out]
+    loss, begin, drawn, judged = _LOSSES[goal], *jax.random.split(key, 3)
+    init, update, get = optimizers.adam(_RATE)
+
+    @jax.jit
+    def step(count: Any, state: Any, surrogate: Surrogate, key: PRNGKeyArray) -> tuple[Any, Array]:
+        found, slope = jax.value_and_grad(loss)(get(state), surrogate, key)
+        return update(count, slope, state), found
+
+    def judge(network: Network) -> float:
+        keys = jax.random.split(judged, _CHECKS)
+        return float(np.mean([[one(network, surrogate, key) for key in keys] for surrogate in others]))
+
+    one = jax.jit(loss)
+    network = init_network(begin)
+    state, losses, before = init(network), [], judge(network)
+    for count in range(steps):
+        # The count takes the parameters' own dtype, because dtypes must not be mixed.
+        number = jnp.asarray(count, jax.tree.leaves(network)[0].dtype)
+        state, found = step(number, state, surrogates[count % len(surrogates)], jax.random.fold_in(drawn, count))
+        losses.append(float(found))
+        if (count + 1) % 100 == 0:
+            say(f"{count + 1} of {steps} steps, loss {np.mean(losses[-100:]):.4g}")
+    return Learned(get(state), goal, np.array(losses), before, judge(get(state)))
+
+
+def learned_attack(
+    network: Network,
+    goal: Goal,
+    *,
+    scheme: str | Scheme = DEFAULT_SCHEME,
+    bits: int = 64,
+    mark: float = MARK,
+) -> Attack:
+    """Attack by a network: subtract what it takes for the mark, or what it has learned to do.
+
+    Args:
+        network: from `learn`.
+        goal: what it has learned.
+        scheme: the scheme that meshes are marked with.
+        bits: size of the payload in bits.
+        mark: RMS displacement that the mark is assumed to have, relative to the diagonal.
+    """
+
+    def way(surrogate: Surrogate, strength: Array, key: PRNGKeyArray) -> Displacement:
+        if goal == "estimate":
+            return -estimate(network, surrogate, surrogate.signal)
+        return removal(network, surrogate, surrogate.signal, key)
+
+    return make_attack(way, scheme, bits, mark)
+
+
+def _parts(surrogate: Surrogate, signal: Displacement) -> Float[Array, "bands rows 3"]:
+    """The parts of a signal in the network's bands, which sum to it."""
+    return band_components(surrogate.operator, intervals(np.array(_EDGES), _TERMS), signal)
+
+
+def _decide(
+    network: Network, surrogate: Surrogate, parts: Float[Array, "bands rows 3"]
+) -> tuple[Float[Array, "bands rows 1"], Float[Array, "bands rows 1"]]:
+    """The share of each part that is taken away at each vertex, and the strength of noise in its band.
+
+    What is seen of the parts is how their energies compare with that of the mark, and what they have in common with
+    the next band: neither changes when the mesh is turned.
+    """
+    mark, bands = surrogate.mark**2, len(parts)
+    square = jnp.sum(parts**2, axis=-1)
+    common = jnp.sum(parts * jnp.roll(parts, -1, axis=0), axis=-1)
+    either = jnp.sqrt((square + _FLOOR * mark) * (jnp.roll(square, -1, axis=0) + _FLOOR * mark))
+    seen = jnp.concatenate([jnp.log(square / mark + _FLOOR) / 4, common / either]).T
+    *hidden, last = network
+    for layer in hidden:
+        seen = jnp.tanh(cheb_conv(surrogate.operator, layer, seen))
+    more, strengths = jnp.split(cheb_conv(surrogate.operator, last, seen).T[..., None], [bands])
+    energy = jnp.sum(surrogate.moving.T * square, axis=1) / surrogate.moving.sum()
+    wiener = jnp.clip(mark * _profile(surrogate) / jnp.maximum(energy, jnp.finfo(energy.dtype).tiny), 1e-6, 0.5)
+    start = jnp.log(wiener / (1 - wiener))[:, None, None]
+    return jax.nn.sigmoid(start + more), jax.nn.softplus(strengths)
+
+
+def _profile(surrogate: Surrogate) -> Float[Array, " bands"]:
+    """Share of a mark's energy in each band, the same for every key."""
+    written = random_mark(surrogate, jax.random.key(0))[1]
+    square = jnp.sum(jnp.sum(_parts(surrogate, written) ** 2, axis=-1), axis=1)
+    return square / jnp.maximum(jnp.sum(written**2), jnp.finfo(square.dtype).tiny)
+
+
+def _distance(network: Network, surrogate: Surrogate, key: PRNGKeyArray) -> Float[Array, ""]:
+    """Energy of a mark less its estimate, over its own; averaged over the mark and its negative, as in `evidence`."""
+    written = random_mark(surrogate, key)[1]
+    both = [rms(surrogate, one - estimate(network, surrogate, surrogate.signal + one)) for one in (written, -written)]
+    return jnp.mean(jnp.stack(both) ** 2) / rms(surrogate, written) ** 2
+
+
+def _evidence(network: Network, surrogate: Surrogate, key: PRNGKeyArray) -> Float[Array, ""]:
+    """Expected evidence of a mark after removal by a displacement of a fixed size."""
+    noise, mark = jax.random.split(key)
+    moved = removal(network, surrogate, surrogate.signal, noise)
+    return evidence(surrogate, rescale(surrogate, moved, _SIZE * surrogate.mark), mark)
+
+
+_LOSSES: dict[Goal, Callable[[Network, Surrogate, PRNGKeyArray], Array]] = {
+    "estimate": _distance,
+    "removal": _evidence,
+}

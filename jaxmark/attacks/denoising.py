@@ -1,0 +1,95 @@
+"""Denoising that takes small detail for noise: shrinkage of wavelets, and averages over places that look alike."""
+
+from functools import lru_cache
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float64, PRNGKeyArray
+from scipy.spatial import KDTree
+
+from jaxmark.attacks.extent import diagonal, displace, surface
+from jaxmark.attacks.random import Randomness
+from jaxmark.distortion.roots import root
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh, used_vertices, vertex_normals
+from jaxmark.spectral.bands import heat, meyer
+from jaxmark.spectral.chebyshev import band_components, synthesise
+from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.shapes import common_laplacian, pad_rows
+
+_OCTAVES = 7  # of wavelets, and a low-pass below λ = 0.03, which is the shape and stays
+_COARSER = 4  # times of diffusion, each twice the one before, by which places are compared
+_ALIKE = 64  # places that are averaged
+
+
+def shrinkage(mesh: Mesh, strength: float | Float[Array, ""], key: PRNGKeyArray | None = None) -> Mesh:
+    """Shrink the coefficients of spectral wavelets towards zero, each vector of three by the same length at most.
+
+    Donoho, "De-noising by soft-thresholding", IEEE Transactions on Information Theory 41(3), 1995, with the tight
+    frame of Meyer wavelets of the graph Laplacian, `jaxmark.spectral.bands.meyer`: what is small at its place and in
+    its octave is removed, what is large keeps its direction. All vertices that faces use move, those on a boundary too.
+
+    Args:
+        mesh: any mesh, its faces concrete.
+        strength: the length that is taken from each coefficient, relative to the diagonal of the bounding box.
+        key: not used; attacks share one signature.
+
+    Returns:
+        The denoised mesh. Differentiable with respect to vertices and strength, in reverse mode.
+    """
+    vertices, operator = jnp.asarray(mesh.vertices), from_mesh(mesh)
+    used, points = used_vertices(mesh)[:, None], surface(mesh)
+    frame = _frame().astype(vertices.dtype)
+    parts = band_components(operator, frame, jnp.where(used, vertices - points.mean(axis=0), 0))
+    length = root(jnp.sum(parts**2, axis=-1, keepdims=True))
+    most = jnp.asarray(strength).astype(vertices.dtype) * diagonal(points)
+    removed = parts * jnp.where(length > most, most / jnp.where(length > most, length, 1), 1)
+    return displace(mesh, -synthesise(operator, frame, removed.at[0].set(0)))
+
+
+@lru_cache(maxsize=1)
+def _frame() -> Float64[np.ndarray, "bands terms"]:
+    return meyer(_OCTAVES + 1)
+
+
+def nonlocal_means(mesh: Mesh, strength: float, random: Randomness | None = None) -> Mesh:
+    """Give each place the detail that places like it have on average, wherever on the surface they are.
+
+    Non-local means (Buades, Coll, Morel, "A non-local algorithm for image denoising", CVPR 2005; on meshes Yoshizawa,
+    Belyaev, Seidel, "Smoothing by example", SMI 2006). Detail is the offset along the normal between a vertex and the
+    surface after diffusion of a time t. Places are alike if the differences of the diffusions t, 2t, … 16t along their
+    normals are: the 64 that are most alike are averaged, with weights exp(-d²/h²) where h is the median distance of the
+    farthest.
+
+    Args:
+        mesh: any mesh.
+        strength: the time t, in units of the graph Laplacian: exp(-tΔ) is about t steps of smoothing.
+        random: not used; attacks share one signature.
+
+    Returns:
+        The denoised mesh.
+
+    Raises:
+        JaxmarkError: if the time is above 1,000.
+    """
+    if strength > 1000:
+        raise JaxmarkError(f"The time of diffusion of non-local means is 1,000 at most, got {strength:g}.")
+    used = used_vertices(mesh)
+    vertices, normals = np.asarray(mesh.vertices, np.float64), vertex_normals(mesh)
+    operator = common_laplacian(mesh)
+    rows = jnp.asarray(pad_rows(vertices - vertices[used].mean(axis=0), len(operator.degree)), jnp.result_type(float))
+    times = strength * 2.0 ** np.arange(_COARSER + 1)
+    diffused = np.asarray(band_components(operator, heat(times), rows), np.float64)[:, : len(vertices)]
+    steps = np.diff(np.concatenate([np.asarray(rows, np.float64)[None, : len(vertices)], diffused]), axis=0)
+    offsets = -np.einsum("svc,vc->vs", steps, normals)[used]
+    detail, coarser = offsets[:, 0], offsets[:, 1:]
+    spread = np.sqrt(np.mean(coarser**2, axis=0))
+    places = coarser / np.where(spread > 0, spread, 1)
+    apart, alike = KDTree(places).query(places, min(_ALIKE, len(places)))
+    apart, alike = apart.reshape(len(places), -1), alike.reshape(len(places), -1)
+    width = np.median(apart[:, -1]) or 1.0
+    weights = np.exp(-((apart / width) ** 2))
+    mean = (weights * detail[alike]).sum(axis=1) / weights.sum(axis=1)
+    moved = vertices.copy()
+    moved[used] += (mean - detail)[:, None] * normals[used]
+    return Mesh(moved, mesh.faces)
