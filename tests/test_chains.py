@@ -26,9 +26,9 @@ def test_the_best_chain_of_a_known_landscape_is_found():
         return cost
 
     found = search_chain(judge, tools=TOOLS, population=30, generations=30, seed=3)
-    assert [gene.kind for gene in found.chain] == ["smoothing", "noise"]
+    assert [gene.kind for gene in found.genes] == ["smoothing", "noise"]
     assert found.cost < 0.1
-    assert found.cost == judge(decode(found.chain, TOOLS))
+    assert found.cost == judge(decode(found.genes, TOOLS))
     assert max(map(len, asked)) <= 4
     assert len(asked) - 1 == len(set(asked[:-1]))  # no chain is tried twice
     again = search_chain(judge, tools=TOOLS, population=30, generations=30, seed=3)
@@ -41,7 +41,7 @@ def test_refused_chains_cost_most():
             raise jm.JaxmarkError("refused")
         return 1.0
 
-    assert search_chain(judge, tools=TOOLS, generations=2).chain[0].kind == "noise"
+    assert search_chain(judge, tools=TOOLS, generations=2).genes[0].kind == "noise"
 
 
 def test_strengths_go_from_the_weakest_to_the_strongest():
@@ -76,6 +76,8 @@ def test_costs_are_distortions_over_the_mark_and_more_where_it_is_still_proven(s
 def test_refusals(sphere: Mesh):
     with pytest.raises(jm.JaxmarkError, match="There is no attack 'nothing'; there are noise"):
         search_chain(lambda steps: 1.0, tools={"nothing": (1, 2)})
+    with pytest.raises(jm.JaxmarkError, match=r"must be positive, got \(0, 1\) for 'noise'"):
+        search_chain(lambda steps: 1.0, tools={"noise": (0, 1)})
     with pytest.raises(jm.JaxmarkError, match="got 0 tools, 4, 12 and 8"):
         search_chain(lambda steps: 1.0, tools={})
     with pytest.raises(jm.JaxmarkError, match="marks of the attacker's own"):

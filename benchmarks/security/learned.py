@@ -25,7 +25,7 @@ from jax.flatten_util import ravel_pytree
 
 import jaxmark as jm
 from jaxmark import adversaries as enemies
-from jaxmark.adversaries.chains import Gene, decode
+from jaxmark.adversaries.chains import decode
 from jaxmark.adversaries.learned import init_network
 from jaxmark.bench.forms import creature
 from jaxmark.evaluation import cells
@@ -63,7 +63,7 @@ def learn(folder: Path, goal: enemies.Goal, steps: int, size: int) -> enemies.Ne
         return unravel(kept["network"])
 
 
-def search(folder: Path, generations: int, size: int) -> list[Gene]:
+def search(folder: Path, generations: int, size: int) -> list[enemies.Gene]:
     """The chain of a folder; where it has none, one that is searched for first."""
     file = folder / "chain.json"
     if not file.exists():
@@ -73,8 +73,8 @@ def search(folder: Path, generations: int, size: int) -> list[Gene]:
             pairs.append((target.marker, target.marked, MESSAGE))
         judge = enemies.projected_cost(pairs, "msdm2")
         found = enemies.search_chain(judge, generations=generations, say=say)
-        file.write_text(json.dumps({"cost": found.cost, "chain": found.chain}))
-    return [Gene(*gene) for gene in json.loads(file.read_text())["chain"]]
+        file.write_text(json.dumps({"cost": found.cost, "genes": found.genes}))
+    return [enemies.Gene(*gene) for gene in json.loads(file.read_text())["genes"]]
 
 
 @lru_cache(maxsize=1)

@@ -13,7 +13,8 @@ from jaxmark.adversaries.blind import descent as descent
 from jaxmark.adversaries.blind import evolution as evolution
 from jaxmark.adversaries.blind import remarking as remarking
 from jaxmark.adversaries.blind import subtraction as subtraction
-from jaxmark.adversaries.chains import Found as Found
+from jaxmark.adversaries.chains import Chain as Chain
+from jaxmark.adversaries.chains import Gene as Gene
 from jaxmark.adversaries.chains import chain_attack as chain_attack
 from jaxmark.adversaries.chains import projected_cost as projected_cost
 from jaxmark.adversaries.chains import search_chain as search_chain

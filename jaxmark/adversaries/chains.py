@@ -39,10 +39,10 @@ class Gene(NamedTuple):
     place: float  # between the weakest strength of its kind, 0, and the strongest, 1
 
 
-class Found(NamedTuple):
+class Chain(NamedTuple):
     """A chain that was tried."""
 
-    chain: tuple[Gene, ...]
+    genes: tuple[Gene, ...]
     cost: float  # by the judge
 
 
@@ -58,7 +58,7 @@ def search_chain(
     generations: int = 8,
     seed: int = 0,
     say: Callable[[str], None] = lambda line: None,
-) -> Found:
+) -> Chain:
     """Search for the chain of tools that costs least, by evolution: the best third lives on and has changed copies.
 
     The first generation has every tool by itself. A changed copy has one strength moved, one step replaced, added,
@@ -75,26 +75,28 @@ def search_chain(
         say: function that is called with a line after each generation.
 
     Raises:
-        JaxmarkError: if there is no tool, an attack is unknown, or a number is below 1.
+        JaxmarkError: if there is no tool, an attack is unknown, a strength is not positive, or a number is below 1.
     """
     if unknown := [kind for kind in tools if kind not in ATTACKS]:
         raise JaxmarkError(f"There is no attack {unknown[0]!r}; there are {', '.join(ATTACKS)}.")
+    if none := [kind for kind, strengths in tools.items() if not min(strengths) > 0]:
+        raise JaxmarkError(f"The strengths of a tool must be positive, got {tools[none[0]]} for {none[0]!r}.")
     if not tools or min(steps, population, generations) < 1:
         raise JaxmarkError(
             f"A search needs a tool, a step, a chain and a generation; got {len(tools)} tools, {steps}, {population}"
             f" and {generations}."
         )
     random, kinds = np.random.default_rng(seed), list(tools)
-    known: dict[tuple[tuple[str, float], ...], Found] = {}
+    known: dict[tuple[tuple[str, float], ...], Chain] = {}
     some = [(Gene(kind, float(random.random())),) for kind in kinds]
     for generation in range(generations):
         for one in some:
             decoded = decode(one, tools)
             if decoded not in known:
-                known[decoded] = Found(one, _judged(judge, decoded))
+                known[decoded] = Chain(one, _judged(judge, decoded))
         best = sorted(known.values(), key=lambda one: one.cost)[: max(population // 3, 1)]
-        say(f"generation {generation + 1}: {best[0].cost:.4g} by {decode(best[0].chain, tools)}")
-        some = [_changed([one.chain for one in best], kinds, steps, random) for _ in range(population)]
+        say(f"generation {generation + 1}: {best[0].cost:.4g} by {decode(best[0].genes, tools)}")
+        some = [_changed([one.genes for one in best], kinds, steps, random) for _ in range(population)]
     return min(known.values(), key=lambda one: one.cost)
 
 

@@ -29,6 +29,9 @@ QUIET = click.option(
 )
 
 
+JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON on standard output.")
+
+
 def progress() -> Progress:
     """The progress of the command that is running; one that says nothing for a command that takes no time."""
     context = click.get_current_context(silent=True)

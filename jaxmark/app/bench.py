@@ -15,8 +15,7 @@ from pathlib import Path
 
 import click
 
-from jaxmark.app.answering import QUIET, answer, progress, say
-from jaxmark.app.catalogue import JSON
+from jaxmark.app.answering import JSON, QUIET, answer, progress, say
 from jaxmark.app.programs import keep_programs, release_programs
 from jaxmark.bench import page
 from jaxmark.bench.benchmark import KEYS, run

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from jaxmark.app.answering import QUIET, answer, progress, say
+from jaxmark.app.answering import JSON, QUIET, answer, progress, say
 from jaxmark.app.folders import mesh_files
 from jaxmark.app.telling import told_error
 from jaxmark.catalogue import Catalogue, export_catalogue, import_catalogue
@@ -16,7 +16,6 @@ from jaxmark.watermark.scenes import load_record
 
 _PATH = click.Path(path_type=Path)
 CATALOGUE = click.option("--catalogue", "catalogue_file", type=_PATH, required=True, help="The catalogue's file.")
-JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON on standard output.")
 
 
 @click.group(name="catalogue")

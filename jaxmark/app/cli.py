@@ -20,6 +20,7 @@ import click
 
 from jaxmark import distortion
 from jaxmark.alignment.alignment import Align
+from jaxmark.app.answering import JSON as _JSON
 from jaxmark.app.answering import QUIET as _QUIET
 from jaxmark.app.answering import answer as _answer
 from jaxmark.app.answering import progress as _progress
@@ -34,6 +35,7 @@ from jaxmark.app.finding import ALIGN as _ALIGN
 from jaxmark.app.finding import identify_by_catalogue
 from jaxmark.app.folders import Work, each, mesh_files
 from jaxmark.app.issuing import mark_for_command
+from jaxmark.app.posing import unpose_command
 from jaxmark.app.serving import serve_command
 from jaxmark.app.telling import Told, power, told_error
 from jaxmark.attacks import ATTACKS, chain, get_attack
@@ -123,7 +125,6 @@ class _Limit(click.ParamType):
 
 _MESH = click.Path(path_type=Path)
 _KEY = click.option("--key", "key_file", type=_MESH, required=True, help="Key file, from `jaxmark keygen`.")
-_JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
 _NOISE = click.option(
     "--noise",
     type=float,
@@ -694,6 +695,7 @@ for command in (bench_command, bench_equal_command, bench_corpus_command):
     cli.add_command(command)
 cli.add_command(catalogue_group)
 cli.add_command(mark_for_command)
+cli.add_command(unpose_command)
 catalogue_group.add_command(serve_command)
 
 

@@ -10,8 +10,8 @@ from typing import Any, NoReturn, get_args
 import click
 
 from jaxmark.alignment.alignment import Align
-from jaxmark.app.answering import QUIET, answer, progress, read_key, say
-from jaxmark.app.catalogue import CATALOGUE, JSON, catalogue_group
+from jaxmark.app.answering import JSON, QUIET, answer, progress, read_key, say
+from jaxmark.app.catalogue import CATALOGUE, catalogue_group
 from jaxmark.app.folders import begin_worker
 from jaxmark.app.programs import release_programs
 from jaxmark.app.telling import power, told_message

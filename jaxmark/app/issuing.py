@@ -7,9 +7,9 @@ from pathlib import Path
 
 import click
 
-from jaxmark.app.answering import QUIET, answer, progress, read_key
+from jaxmark.app.answering import JSON, QUIET, answer, progress, read_key
 from jaxmark.app.batch import mark_file
-from jaxmark.app.catalogue import CATALOGUE, JSON
+from jaxmark.app.catalogue import CATALOGUE
 from jaxmark.app.telling import Told
 from jaxmark.catalogue import Catalogue
 from jaxmark.catalogue.originals import file_hash

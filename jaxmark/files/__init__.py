@@ -17,12 +17,14 @@ from jaxmark.files.atomic import write_atomically, write_together
 from jaxmark.files.reading import read_beside, read_file
 from jaxmark.files.source import Patched, Source, Texture
 from jaxmark.geometry.mesh import Mesh, host_mesh, make_mesh
+from jaxmark.geometry.skinning import Skin
 
 __all__ = [
     "SUFFIXES",
     "Scene",
     "load_mesh",
     "load_scene",
+    "load_skin",
     "load_texture",
     "number_check",
     "save_mesh",
@@ -128,6 +130,27 @@ def load_texture(path: str | os.PathLike) -> Texture:
     """
     found = _read(path).texture()
     return None if found is None or not np.isfinite(found).any() else found
+
+
+def load_skin(path: str | os.PathLike) -> Skin:
+    """Read the skin of a GLB or glTF file: which joints move each vertex.
+
+    Args:
+        path: a mesh file, see `load_mesh`.
+
+    Returns:
+        One row for each vertex that `load_mesh` returns. The weights of a vertex sum to 1; joints of several skins
+        in one file are told apart.
+
+    Raises:
+        JaxmarkError: see `load_mesh`; or if not all meshes of the file have a skin.
+    """
+    found = _read(path).skin()
+    if found is None:
+        raise JaxmarkError(
+            f"{os.fspath(path)}: the file, or one of its meshes, has no skin; only GLB and glTF have one."
+        )
+    return found
 
 
 def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | None = None) -> None:

@@ -7,6 +7,8 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
+from jaxmark.geometry.skinning import Skin
+
 
 class Edits(NamedTuple):
     """Byte spans of a file to be replaced by other bytes; the spans do not overlap."""
@@ -66,6 +68,11 @@ def no_texture() -> Texture:
     return None
 
 
+def no_skin() -> Skin | None:
+    """The skin of a file that has none."""
+    return None
+
+
 class Part(NamedTuple):
     """One mesh of a file that may hold several."""
 
@@ -93,6 +100,7 @@ class Source:
         faces: `[F, 3]` zero-based indices into the positions; polygons are split into triangles.
         normals: the normals that follow the positions, if the file has any.
         texture: reads the texture coordinates of each face's corners, NaN where there are none; None without any.
+        skin: reads which joints move each point; None without any.
         parts: the meshes in the file that can be marked; empty if there is just one in it.
         left: the others by name, and why they cannot.
     """
@@ -102,6 +110,7 @@ class Source:
     faces: Int64[np.ndarray, "faces 3"]
     normals: Normals | None = None
     texture: Callable[[], Texture] = no_texture
+    skin: Callable[[], Skin | None] = no_skin
     parts: Sequence[Part] = ()
     left: Mapping[str, str] = field(default_factory=dict)
 

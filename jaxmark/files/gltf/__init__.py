@@ -1,6 +1,7 @@
 """Parse glTF 2.0 in both of its forms, GLB and JSON, with any number of meshes."""
 
 import copy
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -16,7 +17,9 @@ from jaxmark.files.gltf.container import Container, Read, changed_range, open_co
 from jaxmark.files.gltf.document import FLOAT, Document, Elements, attribute, objects, whole
 from jaxmark.files.normals import Transported
 from jaxmark.files.source import Part, Patched, Source, splice, unique_names
+from jaxmark.geometry.skinning import Skin
 
+_MOST_JOINTS = 2**16  # of a skin: their numbers have two bytes
 _MAX_WORK = 64  # how often the bytes of a file are looked at to see who else reads them
 
 
@@ -309,6 +312,7 @@ def _source(document: Document, found: dict[str, list[_Primitive]], left: dict[s
         np.concatenate(faces),
         turned,
         lambda: np.concatenate([read() for read in textures]),
+        partial(_skin, document, list({one.position: one for group in found.values() for one in group}.values())),
         parts if len(parts) + len(left) > 1 else (),
         left,
         container=document.container,
@@ -337,6 +341,52 @@ def _texture(document: Document, primitive: _Primitive) -> Float64[np.ndarray, "
     if pairs is None or pairs.shape[1] != 2 or primitive.faces.max(initial=-1) >= len(pairs):
         return nothing
     return pairs[primitive.faces]
+
+
+def _skin(document: Document, primitives: Sequence[_Primitive]) -> Skin | None:
+    """The skin of all points, those of one accessor of positions after the other; None unless all have one."""
+    skins = {
+        node["mesh"]: node["skin"]
+        for node in document.items("nodes")
+        if isinstance(node.get("mesh"), int) and isinstance(node.get("skin"), int)
+    }
+    parts = [_part_of_skin(document, one, skins.get(one.place[0])) for one in primitives]
+    if not parts or any(part is None for part in parts):
+        return None
+    slots = max(part.joints.shape[1] for part in parts if part is not None)
+    wide = [[np.pad(rows, ((0, 0), (0, slots - rows.shape[1]))) for rows in part] for part in parts if part is not None]
+    joints, weights = (np.concatenate(column) for column in zip(*wide, strict=True))
+    return Skin(joints, weights)
+
+
+def _part_of_skin(document: Document, primitive: _Primitive, skin: int | None) -> Skin | None:
+    """The skin of a primitive's points; joints of another skin are other joints."""
+    count, joints, weights = len(primitive.points.starts), [], []
+    for number in itertools.count():
+        found = [_rows(document, primitive, f"{name}_{number}") for name in ("JOINTS", "WEIGHTS")]
+        if found[0] is None or found[1] is None:
+            break
+        if not len(found[0]) == len(found[1]) == count:
+            raise JaxmarkError("Joints and weights of a primitive are not as many as its positions.")
+        joints.append(found[0])
+        weights.append(found[1])
+    if not joints or skin is None:
+        return None
+    share = np.concatenate(weights, axis=1)
+    total = share.sum(axis=1, keepdims=True)
+    if not (np.isfinite(share) & (share >= 0)).all() or not (total > 0).all():
+        raise JaxmarkError("A vertex has weights of joints that are negative, or none.")
+    return Skin(skin * _MOST_JOINTS + np.concatenate(joints, axis=1).astype(np.int64), share / total)
+
+
+def _rows(document: Document, primitive: _Primitive, name: str) -> np.ndarray | None:
+    """The numbers of an attribute, one row a point; None if the primitive has none."""
+    if primitive.compressed is not None:
+        found = primitive.compressed.attributes.get(name)
+        number = attribute(primitive.data, name)
+        return None if found is None or number is None else found.astype(np.float64) * document.form(number)[2]
+    number = attribute(primitive.data, name)
+    return None if number is None else document.numbers(number)
 
 
 @dataclass(kw_only=True)

@@ -1,0 +1,73 @@
+"""Skins: which joints of a skeleton move each vertex, and how a posed shape is brought back by them."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh, diagonal
+
+_RIDGE = 1e-12  # of the vertices of a joint, by which what no vertex decides stays with the whole
+_FLAT = 1e-3  # least volume of a unit cube after a pose that can be undone
+
+
+class Skin(NamedTuple):
+    """Linear blend skinning: each vertex moves by a weighted mean of what some joints do.
+
+    Attributes:
+        joints: numbers of the joints that move each vertex; those of weight 0 do not matter.
+        weights: their weights, which sum to 1.
+    """
+
+    joints: Int64[np.ndarray, "vertices slots"]
+    weights: Float64[np.ndarray, "vertices slots"]
+
+
+def unpose(original: Mesh, skin: Skin, suspect: Mesh) -> Mesh:
+    """Bring a suspect in another pose of the original's skeleton back to the original's pose.
+
+    The pose is fitted: one affine map for each joint, so that the original, blended by its weights, comes closest to
+    the suspect by least squares, and each vertex of the suspect is moved by the inverse of its blended map. No key
+    is used. The maps have twelve numbers a joint, which take as many dimensions from what tells the two apart.
+
+    Args:
+        original: the mesh as its file has it, in the pose that its skin is bound in.
+        skin: of the original, as `jaxmark.files.load_skin` reads it.
+        suspect: the same vertices in the same order, posed.
+
+    Returns:
+        The suspect's shape in the original's pose, place and size, with its own faces.
+
+    Raises:
+        JaxmarkError: if the numbers of vertices differ, or the pose flattens the surface, so that it cannot be undone.
+    """
+    start, posed = (np.array(mesh.vertices, np.float64) for mesh in (original, suspect))
+    if not len(start) == len(posed) == len(skin.joints):
+        raise JaxmarkError(
+            f"A pose is undone vertex by vertex, but the original has {len(start)}, its skin {len(skin.joints)} and the"
+            f" suspect {len(posed)}."
+        )
+    slots = skin.joints.shape[1]
+    joints, place = np.unique(skin.joints, return_inverse=True)
+    place = place.reshape(-1, slots)
+    unit, centre = diagonal(original), start.mean(axis=0)
+    local = np.c_[(start - centre) / unit, np.ones(len(start))]
+    whole = np.linalg.lstsq(local, posed, rcond=None)[0]  # of all joints as one, from which each deviates
+    rows = np.repeat(np.arange(len(start)), 4 * slots)
+    columns = (4 * place[:, :, None] + np.arange(4)).ravel()
+    blended = sparse.csc_array(
+        ((skin.weights[:, :, None] * local[:, None]).ravel(), (rows, columns)), (len(start), 4 * len(joints))
+    )
+    ridge = _RIDGE * len(start) / len(joints)
+    square = sparse.csc_array(blended.T @ blended) + ridge * sparse.eye_array(4 * len(joints), format="csc")
+    deviation = splu(square).solve(blended.T @ (posed - local @ whole))
+    maps = whole + np.einsum("vs,vsij->vij", skin.weights, deviation.reshape(-1, 4, 3)[place])
+    linear = maps[:, :3]
+    volume = np.abs(np.linalg.det(linear / np.linalg.norm(whole[:3], 2)))
+    if (flat := int((volume < _FLAT).sum())) > 0:
+        raise JaxmarkError(f"The pose flattens the surface at {flat} vertices, so that it cannot be undone there.")
+    back = np.linalg.solve(linear.transpose(0, 2, 1), (posed - maps[:, 3])[..., None])[..., 0]
+    return Mesh(centre + unit * back, suspect.faces)
