@@ -6,7 +6,6 @@ line, or such an object, for each file, and the exit status is the worst of thei
 """
 
 import math
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -35,6 +34,7 @@ from jaxmark.app.finding import ALIGN as _ALIGN
 from jaxmark.app.finding import identify_by_catalogue
 from jaxmark.app.folders import Work, each, mesh_files
 from jaxmark.app.issuing import mark_for_command
+from jaxmark.app.outputs import check_distinct, check_suffix
 from jaxmark.app.posing import unpose_command
 from jaxmark.app.serving import serve_command
 from jaxmark.app.telling import Told, power, told_error
@@ -274,11 +274,11 @@ def embed_command(
         scheme=schemes[0] if len(schemes) == 1 else schemes,
         meshes=meshes,
     )
-    _check_distinct(original=original, marked=marked)
+    check_distinct(original=original, marked=marked)
     if not original.is_dir():
         record_file = record_file or marked.with_name(marked.name + RECORD_SUFFIX)
-        _check_outputs(original, marked)
-        _check_distinct(original=original, marked=marked, key=key_file, record=record_file)
+        check_suffix(original, marked)
+        check_distinct(original=original, marked=marked, key=key_file, record=record_file)
         told = mark(original, marked, record_file, key=_key(key_file), doing=_progress().doing)
         return _answer(as_json, told.answer, told.said)
     if record_file is not None:
@@ -480,7 +480,7 @@ def deposit_command(records: tuple[Path, ...], output: Path, as_json: bool) -> N
     Publish its root, sign a commit with it, print it; or send OUTPUT.tsq to a time-stamping authority (RFC 3161) and
     keep the answer. `jaxmark detect --deposit OUTPUT` then counts a dated claim in full, less log10 of their number.
     """
-    _check_distinct(output=output, **{f"record {place}": path for place, path in enumerate(records)})
+    check_distinct(output=output, **{f"record {place}": path for place, path in enumerate(records)})
     found = make_deposit(load_record(path).digest() for path in records)
     request = output.with_name(output.name + ".tsq")
     with replacing(request) as draft:
@@ -515,8 +515,8 @@ def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int
     connectivity stays.
     """
     steps = _steps(words)
-    _check_outputs(source, target)
-    _check_distinct(IN=source, OUT=target)
+    check_suffix(source, target)
+    check_distinct(IN=source, OUT=target)
     _progress().doing(f"attacking {source}: {' '.join(words)}")
     scene = load_scene(source)
     if (
@@ -762,18 +762,3 @@ def _one_message(message: bytes | None, text: bytes | None) -> bytes | None:
 def _member(path: Path, name: str) -> Path:
     """The path itself, or the file of that name in it if it is a folder."""
     return path / name if path.is_dir() else path
-
-
-def _check_outputs(source: Path, target: Path) -> None:
-    """Refuse, before any work is done, an output of another format than its source."""
-    if source.suffix.lower() != target.suffix.lower():
-        raise JaxmarkError(f"{target} must have the suffix of {source}, whose bytes it takes over.")
-
-
-def _check_distinct(**files: Path) -> None:
-    """Refuse two names for one file, which would write over an input."""
-    seen: dict[str, str] = {}
-    for name, path in files.items():
-        other = seen.setdefault(os.path.realpath(path), name)
-        if other != name:
-            raise JaxmarkError(f"{other} and {name} are the same file, {path}; give another name.")

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from jaxmark.app.answering import JSON, QUIET, answer, progress
-from jaxmark.errors import JaxmarkError
+from jaxmark.app.outputs import check_distinct, check_suffix
 from jaxmark.files import load_mesh, load_skin, save_mesh
 from jaxmark.files.atomic import replacing
 from jaxmark.geometry import unpose
@@ -25,10 +25,8 @@ def unpose_command(suspect: Path, original: Path, target: Path, as_json: bool) -
     ORIGINAL is a GLB or glTF file with a skin, as it is, unmarked; SUSPECT has its vertices in its order. OUT is the
     file SUSPECT with other positions, which `jaxmark detect` reads.
     """
-    if suspect.suffix.lower() != target.suffix.lower():
-        raise JaxmarkError(f"{target} must have the suffix of {suspect}, whose bytes it takes over.")
-    if target.resolve() in (suspect.resolve(), original.resolve()):
-        raise JaxmarkError(f"OUT is a file that is read, {target}; give another name.")
+    check_suffix(suspect, target)
+    check_distinct(SUSPECT=suspect, ORIGINAL=original, OUT=target)
     progress().doing(f"bringing {suspect} back")
     back = unpose(load_mesh(original), load_skin(original), load_mesh(suspect))
     with replacing(target) as draft:
