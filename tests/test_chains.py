@@ -66,7 +66,8 @@ def test_costs_are_distortions_over_the_mark_and_more_where_it_is_still_proven(s
     paid = jm.compare(marked, suspect, ["rms"]).rms / jm.compare(sphere, marked, ["rms"]).rms
     log10_p = marker.detect(suspect, b"m").log10_p_unfloored
     assert log10_p < -6
-    assert judge(steps) == pytest.approx(paid * math.sqrt(log10_p / -6))
+    first = marker.detect(marked, b"m").log10_p_unfloored
+    assert judge(steps) == pytest.approx(paid * math.sqrt((first / -6 - 1) / (first / log10_p - 1)))
     dear = [("noise", 0.3)]
     far = run_chain(marked, dear, seed=0)
     assert judge(dear) == pytest.approx(jm.compare(marked, far, ["rms"]).rms / jm.compare(sphere, marked, ["rms"]).rms)
@@ -82,6 +83,9 @@ def test_refusals(sphere: Mesh):
         search_chain(lambda steps: 1.0, tools={})
     with pytest.raises(jm.JaxmarkError, match="marks of the attacker's own"):
         projected_cost([])
+    marker = jm.make_marker(sphere, jm.Key(bytes(32)), bits=8)
+    with pytest.raises(jm.JaxmarkError, match="not proven before any attack"):
+        projected_cost([(marker, sphere, b"m")])
     with pytest.raises(jm.JaxmarkError, match="more than 4 times as many vertices"):
         run_chain(sphere, [("loop", 1), ("loop", 1)], seed=0)
     assert set(ATTACKS) >= {"loop", *TOOLS}

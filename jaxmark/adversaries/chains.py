@@ -117,8 +117,8 @@ def projected_cost(
     """Judge chains by what it would cost to bring marks below detection: the mean over meshes.
 
     The cost of a chain is the distortion of the marked mesh over that of the mark. Where the claim of the message is
-    still proven, it is multiplied by √(log10 p / log10 α): the evidence S/‖a‖ over what is needed, by which noise would
-    have to grow.
+    still proven, it grows as noise would have to: noise of n times the mark's size leaves E = E₀/(1 + n²/c) of the
+    evidence E₀ = -log10 p, so that n must be √((E₀/E₁ - 1)/(E₀/E - 1)) times as large to leave E₁ = -log10 α.
 
     Args:
         pairs: markers of the attacker's own meshes, with meshes that they marked and the messages.
@@ -127,21 +127,27 @@ def projected_cost(
         seed: of the attacks.
 
     Raises:
-        JaxmarkError: if there is no mark.
+        JaxmarkError: if there is no mark, or one that is not proven before any attack.
     """
     if not pairs:
         raise JaxmarkError("A search for chains needs marks of the attacker's own to judge them by.")
     references = [Reference(marked) for _, marked, _ in pairs]
+    proven = [-_log10_p(*pair) for pair in pairs]
+    if min(proven) <= -log10_alpha:
+        raise JaxmarkError("A mark that is not proven before any attack says nothing about attacks; make it stronger.")
     own = [Reference(marker.original.mesh).measure(marked, [metric])[metric] for marker, marked, _ in pairs]
 
     def judge(steps: Sequence[tuple[str, float]]) -> float:
         costs = []
-        for (marker, marked, message), reference, mark in zip(pairs, references, own, strict=True):
+        for (marker, marked, message), reference, mark, first in zip(pairs, references, own, proven, strict=True):
             suspect = run_chain(marked, steps, seed=seed)
             paid = reference.measure(suspect, [metric])[metric]
             if paid is None or not mark:
                 return _REFUSED
-            costs.append(paid / mark * math.sqrt(max(_log10_p(marker, suspect, message) / log10_alpha, 1.0)))
+            left = max(-_log10_p(marker, suspect, message), -log10_alpha)
+            if left >= first:  # it takes nothing, however often
+                return _REFUSED
+            costs.append(paid / mark * math.sqrt((first / -log10_alpha - 1) / (first / left - 1)))
         return float(np.mean(costs))
 
     return judge
