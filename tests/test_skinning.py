@@ -121,6 +121,10 @@ def test_refusals(mesh: Mesh, tmp_path: Path):
     flat = Mesh(np.asarray(mesh.vertices) * [1.0, 1, 0], mesh.faces)
     with pytest.raises(jm.JaxmarkError, match="flattens the surface at 1500 vertices"):
         unpose(mesh, skin, flat)
+    with pytest.raises(jm.JaxmarkError, match="flattens the surface at 1500 vertices"):
+        unpose(mesh, skin, Mesh(np.zeros((1500, 3)), mesh.faces))
+    with pytest.raises(jm.JaxmarkError, match="The skin has 1500 joints"):
+        unpose(mesh, Skin(np.arange(1500)[:, None], np.ones((1500, 1))), mesh)
     save_mesh(mesh, tmp_path / "plain.glb")
     with pytest.raises(jm.JaxmarkError, match="has no skin"):
         load_skin(tmp_path / "plain.glb")

@@ -11,6 +11,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, diagonal
 
 _RIDGE = 1e-12  # of the vertices of a joint, by which what no vertex decides stays with the whole
+_MOST_JOINTS = 1024  # which take seconds and 100 MB at most, however they hang together
 _FLAT = 1e-3  # least volume of a unit cube after a pose that can be undone
 
 
@@ -42,7 +43,8 @@ def unpose(original: Mesh, skin: Skin, suspect: Mesh) -> Mesh:
         The suspect's shape in the original's pose, place and size, with its own faces.
 
     Raises:
-        JaxmarkError: if the numbers of vertices differ, or the pose flattens the surface, so that it cannot be undone.
+        JaxmarkError: if the numbers of vertices differ, there are too many joints, or the pose flattens the surface, so
+            that it cannot be undone.
     """
     start, posed = (np.array(mesh.vertices, np.float64) for mesh in (original, suspect))
     if not len(start) == len(posed) == len(skin.joints):
@@ -53,6 +55,8 @@ def unpose(original: Mesh, skin: Skin, suspect: Mesh) -> Mesh:
     slots = skin.joints.shape[1]
     joints, place = np.unique(skin.joints, return_inverse=True)
     place = place.reshape(-1, slots)
+    if len(joints) > _MOST_JOINTS:
+        raise JaxmarkError(f"The skin has {len(joints)} joints; a pose of {_MOST_JOINTS} at most is undone.")
     unit, centre = diagonal(original), start.mean(axis=0)
     local = np.c_[(start - centre) / unit, np.ones(len(start))]
     whole = np.linalg.lstsq(local, posed, rcond=None)[0]  # of all joints as one, from which each deviates
@@ -66,7 +70,7 @@ def unpose(original: Mesh, skin: Skin, suspect: Mesh) -> Mesh:
     deviation = splu(square).solve(blended.T @ (posed - local @ whole))
     maps = whole + np.einsum("vs,vsij->vij", skin.weights, deviation.reshape(-1, 4, 3)[place])
     linear = maps[:, :3]
-    volume = np.abs(np.linalg.det(linear / np.linalg.norm(whole[:3], 2)))
+    volume = np.abs(np.linalg.det(linear / max(np.linalg.norm(whole[:3], 2), np.finfo(np.float64).tiny)))
     if (flat := int((volume < _FLAT).sum())) > 0:
         raise JaxmarkError(f"The pose flattens the surface at {flat} vertices, so that it cannot be undone there.")
     back = np.linalg.solve(linear.transpose(0, 2, 1), (posed - maps[:, 3])[..., None])[..., 0]

@@ -19,7 +19,7 @@ from jaxmark.files.normals import Transported
 from jaxmark.files.source import Part, Patched, Source, splice, unique_names
 from jaxmark.geometry.skinning import Skin
 
-_MOST_JOINTS = 2**16  # of a skin: their numbers have two bytes
+_JOINTS = 2**16  # of a skin at most: their numbers have two bytes
 _MAX_WORK = 64  # how often the bytes of a file are looked at to see who else reads them
 
 
@@ -372,11 +372,13 @@ def _part_of_skin(document: Document, primitive: _Primitive, skin: int | None) -
         weights.append(found[1])
     if not joints or skin is None:
         return None
-    share = np.concatenate(weights, axis=1)
+    numbers, share = np.concatenate(joints, axis=1), np.concatenate(weights, axis=1)
+    if not ((numbers >= 0) & (numbers < _JOINTS)).all() or skin >= _JOINTS:
+        raise JaxmarkError("A skin refers to joints that no file can have.")
     total = share.sum(axis=1, keepdims=True)
     if not (np.isfinite(share) & (share >= 0)).all() or not (total > 0).all():
         raise JaxmarkError("A vertex has weights of joints that are negative, or none.")
-    return Skin(skin * _MOST_JOINTS + np.concatenate(joints, axis=1).astype(np.int64), share / total)
+    return Skin(skin * _JOINTS + numbers.astype(np.int64), share / total)
 
 
 def _rows(document: Document, primitive: _Primitive, name: str) -> np.ndarray | None:
