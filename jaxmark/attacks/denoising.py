@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, Float64, PRNGKeyArray
 from scipy.spatial import KDTree
 
 from jaxmark.attacks.extent import diagonal, displace, surface
+from jaxmark.attacks.host import on_host
 from jaxmark.attacks.random import Randomness
 from jaxmark.distortion.roots import root
 from jaxmark.errors import JaxmarkError
@@ -52,6 +53,7 @@ def _frame() -> Float64[np.ndarray, "bands terms"]:
     return meyer(_OCTAVES + 1)
 
 
+@on_host
 def nonlocal_means(mesh: Mesh, strength: float, random: Randomness | None = None) -> Mesh:
     """Give each place the detail that places like it have on average, wherever on the surface they are.
 
