@@ -12,23 +12,23 @@ from scipy.spatial.transform import Rotation
 import jaxmark as jm
 from jaxmark.app import cli
 from jaxmark.files import load_mesh, load_skin, save_mesh
-from jaxmark.geometry import Skin, asteroid, diagonal, unpose
+from jaxmark.geometry import Skinning, asteroid, diagonal, unpose
 from jaxmark.geometry.mesh import Mesh
 from tests.meshes import shared_mesh
 
 POSED = ["scenes/bevy__Fox.glb", "scenes/draco__CesiumMan.glb", "scenes/engine__bitmoji.glb"]
 
 
-def skin_along(mesh: Mesh, joints: int) -> Skin:
+def skin_along(mesh: Mesh, joints: int) -> Skinning:
     """Joints in a row along x, each vertex between the two that are next to it."""
     x = np.asarray(mesh.vertices)[:, 0]
     place = (x - x.min()) / np.ptp(x) * (joints - 1)
     low = np.minimum(place.astype(np.int64), joints - 2)
     share = place - low
-    return Skin(np.c_[low, low + 1], np.c_[1 - share, share])
+    return Skinning(np.c_[low, low + 1], np.c_[1 - share, share])
 
 
-def posed(mesh: Mesh, skin: Skin, degrees: float, seed: int = 0) -> Mesh:
+def posed(mesh: Mesh, skin: Skinning, degrees: float, seed: int = 0) -> Mesh:
     """Each joint turned about the centre of its vertices by some degrees, and shifted, one joint after the other."""
     random, found = np.random.default_rng(seed), np.zeros_like(mesh.vertices, dtype=float)
     for joint in np.unique(skin.joints):
@@ -40,7 +40,7 @@ def posed(mesh: Mesh, skin: Skin, degrees: float, seed: int = 0) -> Mesh:
     return Mesh(found, mesh.faces)
 
 
-def skinned_glb(mesh: Mesh, skin: Skin) -> bytes:
+def skinned_glb(mesh: Mesh, skin: Skinning) -> bytes:
     """A GLB file with a skin, one byte for the number of a joint and float weights."""
     columns = [
         np.asarray(mesh.vertices, "<f4"),
@@ -124,7 +124,7 @@ def test_refusals(mesh: Mesh, tmp_path: Path):
     with pytest.raises(jm.JaxmarkError, match="flattens the surface at 1500 vertices"):
         unpose(mesh, skin, Mesh(np.zeros((1500, 3)), mesh.faces))
     with pytest.raises(jm.JaxmarkError, match="The skin has 1500 joints"):
-        unpose(mesh, Skin(np.arange(1500)[:, None], np.ones((1500, 1))), mesh)
+        unpose(mesh, Skinning(np.arange(1500)[:, None], np.ones((1500, 1))), mesh)
     save_mesh(mesh, tmp_path / "plain.glb")
     with pytest.raises(jm.JaxmarkError, match="has no skin"):
         load_skin(tmp_path / "plain.glb")

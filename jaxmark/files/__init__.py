@@ -17,7 +17,7 @@ from jaxmark.files.atomic import write_atomically, write_together
 from jaxmark.files.reading import read_beside, read_file
 from jaxmark.files.source import Patched, Source, Texture
 from jaxmark.geometry.mesh import Mesh, host_mesh, make_mesh
-from jaxmark.geometry.skinning import Skin
+from jaxmark.geometry.skinning import Skinning
 
 __all__ = [
     "SUFFIXES",
@@ -132,7 +132,7 @@ def load_texture(path: str | os.PathLike) -> Texture:
     return None if found is None or not np.isfinite(found).any() else found
 
 
-def load_skin(path: str | os.PathLike) -> Skin:
+def load_skin(path: str | os.PathLike) -> Skinning:
     """Read the skin of a GLB or glTF file: which joints move each vertex.
 
     Args:

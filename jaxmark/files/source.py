@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
-from jaxmark.geometry.skinning import Skin
+from jaxmark.geometry.skinning import Skinning
 
 
 class Edits(NamedTuple):
@@ -68,7 +68,7 @@ def no_texture() -> Texture:
     return None
 
 
-def no_skin() -> Skin | None:
+def no_skin() -> Skinning | None:
     """The skin of a file that has none."""
     return None
 
@@ -110,7 +110,7 @@ class Source:
     faces: Int64[np.ndarray, "faces 3"]
     normals: Normals | None = None
     texture: Callable[[], Texture] = no_texture
-    skin: Callable[[], Skin | None] = no_skin
+    skin: Callable[[], Skinning | None] = no_skin
     parts: Sequence[Part] = ()
     left: Mapping[str, str] = field(default_factory=dict)
 

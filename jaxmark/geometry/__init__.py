@@ -19,6 +19,6 @@ from jaxmark.geometry.mesh import vertex_normals as vertex_normals
 from jaxmark.geometry.mesh import weld as weld
 from jaxmark.geometry.mesh import weld_mesh as weld_mesh
 from jaxmark.geometry.pose import Pose as Pose
-from jaxmark.geometry.skinning import Skin as Skin
+from jaxmark.geometry.skinning import Skinning as Skinning
 from jaxmark.geometry.skinning import unpose as unpose
 from jaxmark.geometry.surfaces import Surface as Surface

@@ -15,7 +15,7 @@ _MOST_JOINTS = 1024  # which take seconds and 100 MB at most, however they hang 
 _FLAT = 1e-3  # least volume of a unit cube after a pose that can be undone
 
 
-class Skin(NamedTuple):
+class Skinning(NamedTuple):
     """Linear blend skinning: each vertex moves by a weighted mean of what some joints do.
 
     Attributes:
@@ -27,7 +27,7 @@ class Skin(NamedTuple):
     weights: Float64[np.ndarray, "vertices slots"]
 
 
-def unpose(original: Mesh, skin: Skin, suspect: Mesh) -> Mesh:
+def unpose(original: Mesh, skin: Skinning, suspect: Mesh) -> Mesh:
     """Bring a suspect in another pose of the original's skeleton back to the original's pose.
 
     The pose is fitted: one affine map for each joint, so that the original, blended by its weights, comes closest to

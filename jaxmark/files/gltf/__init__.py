@@ -17,7 +17,7 @@ from jaxmark.files.gltf.container import Container, Read, changed_range, open_co
 from jaxmark.files.gltf.document import FLOAT, Document, Elements, attribute, objects, whole
 from jaxmark.files.normals import Transported
 from jaxmark.files.source import Part, Patched, Source, splice, unique_names
-from jaxmark.geometry.skinning import Skin
+from jaxmark.geometry.skinning import Skinning
 
 _JOINTS = 2**16  # of a skin at most: their numbers have two bytes
 _MAX_WORK = 64  # how often the bytes of a file are looked at to see who else reads them
@@ -343,7 +343,7 @@ def _texture(document: Document, primitive: _Primitive) -> Float64[np.ndarray, "
     return pairs[primitive.faces]
 
 
-def _skin(document: Document, primitives: Sequence[_Primitive]) -> Skin | None:
+def _skin(document: Document, primitives: Sequence[_Primitive]) -> Skinning | None:
     """The skin of all points, those of one accessor of positions after the other; None unless all have one."""
     skins = {
         node["mesh"]: node["skin"]
@@ -356,10 +356,10 @@ def _skin(document: Document, primitives: Sequence[_Primitive]) -> Skin | None:
     slots = max(part.joints.shape[1] for part in parts if part is not None)
     wide = [[np.pad(rows, ((0, 0), (0, slots - rows.shape[1]))) for rows in part] for part in parts if part is not None]
     joints, weights = (np.concatenate(column) for column in zip(*wide, strict=True))
-    return Skin(joints, weights)
+    return Skinning(joints, weights)
 
 
-def _part_of_skin(document: Document, primitive: _Primitive, skin: int | None) -> Skin | None:
+def _part_of_skin(document: Document, primitive: _Primitive, skin: int | None) -> Skinning | None:
     """The skin of a primitive's points; joints of another skin are other joints."""
     count, joints, weights = len(primitive.points.starts), [], []
     for number in itertools.count():
@@ -378,7 +378,7 @@ def _part_of_skin(document: Document, primitive: _Primitive, skin: int | None) -
     total = share.sum(axis=1, keepdims=True)
     if not (np.isfinite(share) & (share >= 0)).all() or not (total > 0).all():
         raise JaxmarkError("A vertex has weights of joints that are negative, or none.")
-    return Skin(skin * _JOINTS + numbers.astype(np.int64), share / total)
+    return Skinning(skin * _JOINTS + numbers.astype(np.int64), share / total)
 
 
 def _rows(document: Document, primitive: _Primitive, name: str) -> np.ndarray | None:
