@@ -63,4 +63,5 @@ def cell(row: Row) -> str:
 
 def costs(cost: dict[str, float]) -> str:
     """Distortions by all metrics, as a cell of a table."""
-    return " / ".join(f"{cost[metric]:.3g}" if metric in cost else "-" for metric in METRICS)
+    values = [cost.get(metric, math.nan) for metric in METRICS]
+    return " / ".join("-" if math.isnan(value) else f"{value:.3g}" for value in values)
