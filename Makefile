@@ -40,7 +40,7 @@ tests: $(VENV)/.dev  ## pytest: all tests but the slow and the long ones
 slow-tests: $(VENV)/.dev  ## pytest: the slow ones
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m slow
 
-long-tests: $(VENV)/.dev  ## pytest: those of half a minute or more, before a release
+long-tests: $(VENV)/.dev  ## pytest: those of long runs, before a release
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m long
 
 coverage: $(VENV)/.dev  ## which lines the tests run; all of it in build/coverage

@@ -345,7 +345,7 @@ def test_an_interrupted_write_leaves_no_output(workshop: Workshop, monkeypatch):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_demo_leaves_tables_and_pictures(workshop: Workshop, monkeypatch):
     # A key that a scheme cannot use is said to be refused; here is one that all schemes take.
     keys = (jm.Key(bytes([first, *bytes(31)])) for first in range(99))

@@ -325,7 +325,7 @@ def test_distances_are_those_of_metro():
         assert np.linalg.norm(surface.closest(points)[0] - points, axis=1).max() == pytest.approx(most, rel=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_severities_of_noise_are_those_published():
     """RMS, MRMS, FMPD and MSDM2 of noise of 0.1 % of the mean radius on the bunny, which other programs measured."""
     mesh = jm.load_mesh(shared_mesh("models/bunny_closed_34834.stl"))

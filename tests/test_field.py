@@ -264,7 +264,7 @@ def test_refusals(shape: Mesh, marked, key: jm.Key, sphere: Mesh, unchecked):
         jm.detect(shape, key=key, record=record)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_capacity_is_what_embed_takes(shape: Mesh, key: jm.Key):
     bits = jm.capacity(shape, 6e-4, noise=0.001, scheme=SCHEME)
     assert bits >= 32
@@ -274,7 +274,7 @@ def test_capacity_is_what_embed_takes(shape: Mesh, key: jm.Key):
     assert jm.detect(jm.attack(marked, "noise", 0.001, seed=0), key=key, bits=bits, scheme=SCHEME).message == message
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_commands_without_the_original(shape: Mesh, tmp_path: Path, monkeypatch, capfd):
     workshop = Workshop(tmp_path, monkeypatch, capfd)
     jm.save_mesh(turned(shape), tmp_path / "model.ply")

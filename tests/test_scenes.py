@@ -86,7 +86,7 @@ def test_equal_meshes_count_once(marked, originals, key: jm.Key):
     assert found.united.log10_p == alone.log10_p
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_sums_over_keys_have_the_variance_that_the_bound_assumes(originals, key: jm.Key):
     suspects = {name: moved(mesh, np.eye(3), 0.01, seed) for seed, (name, mesh) in enumerate(originals.items())}
     markers = {name: jm.make_marker(mesh, key, bits=16) for name, mesh in originals.items()}

@@ -37,7 +37,7 @@ def test_on_four_devices():
     assert "skipped" not in output
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_in_two_processes():
     with socket.socket() as free:
         free.bind(("localhost", 0))

@@ -143,7 +143,7 @@ def test_a_worker_that_is_killed_costs_no_suspect(folder: Path, quick: Quick, mo
     assert sorted(row["suspect_sha256"] for row in rows) == ["a.obj", "b.obj", "c.obj", "d.obj", "e.obj", "f.ply"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_dask_gives_the_same_answers_when_a_worker_is_killed(folder: Path, monkeypatch):
     distributed = pytest.importorskip("distributed")
     monkeypatch.setattr(stream, "work", killing)

@@ -50,7 +50,7 @@ def test_colluders_are_found(tracer: jm.watermark.Tracer, copies: np.ndarray, co
     assert found <= set(NAMES[:count])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_nobody_is_accused_by_strangers(tracer: jm.watermark.Tracer, copies: np.ndarray):
     mesh = tracer.marker.original.mesh
     other = jm.watermark.make_tracer(mesh, jm.new_key())
