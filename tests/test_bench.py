@@ -248,7 +248,7 @@ def test_correlated_noise_has_its_variance_and_its_length():
     np.testing.assert_allclose(covariance[0], [1, np.exp(-1 / 8), np.exp(-81 / 8)], atol=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_attack_of_2026_leaves_a_mesh():
     """An attack that is not possible on this mesh would be refused."""
     for package in ("igl", "pymeshlab", "skimage", "fast_simplification", "DracoPy"):

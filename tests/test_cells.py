@@ -54,7 +54,7 @@ def test_what_is_finished_stays_so(tmp_path):
     assert run(cells, squared, lambda: pytest.fail("a pool"), output) == rows[::-1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_goes_wrong_is_raised_and_what_was_finished_stays(tmp_path):
     output = tmp_path / "cells.jsonl"
     with pytest.raises(ZeroDivisionError):

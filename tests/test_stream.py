@@ -135,7 +135,7 @@ def killing(plan: Plan, path: str) -> dict:
     return {"named": False, "suspect_sha256": Path(path).name}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_worker_that_is_killed_costs_no_suspect(folder: Path, quick: Quick, monkeypatch):
     monkeypatch.setattr(stream, "work", killing)
     rows = run(processes(2))

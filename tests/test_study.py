@@ -155,7 +155,7 @@ def test_what_cannot_be_aligned_is_in_the_rows(tmp_path):
     assert all("could not be aligned" in row.refusal for row in found.rows)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_processes_and_files_give_the_same(results, tmp_path):
     mesh = bumpy_sphere(3)
     jm.save_mesh(mesh, tmp_path / "ball.obj")
