@@ -64,7 +64,7 @@ def test_what_goes_wrong_is_raised_and_what_was_finished_stays(tmp_path):
         run([("d", 1)], dies, lambda: ProcessPoolExecutor(1, get_context("spawn")), output)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_killed_worker_costs_no_cell(tmp_path, monkeypatch):
     output, pools = tmp_path / "corpus.jsonl", []
     monkeypatch.setenv("GRAVE", str(tmp_path / "grave"))

@@ -328,7 +328,7 @@ def test_module_and_script_are_the_same_program(tmp_path):
     assert module.stderr.count("\n") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_closed_pipe_does_not_change_the_status(workshop: Workshop):
     workshop.embed()
     for suspect, status in (("marked.ply", 0), ("model.ply", 1)):

@@ -336,7 +336,7 @@ def test_severities_of_noise_are_those_published():
     assert found.msdm2 == pytest.approx(0.275, rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_compare_leaves_out_what_needs_the_same_connectivity(pair: tuple[Mesh, Mesh], tmp_path, monkeypatch, capsys):
     mesh, other = pair
     same, count = jm.compare(mesh, other), len(METRICS)

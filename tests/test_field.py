@@ -214,7 +214,7 @@ def test_nothing_is_detected_in_any_way_of_looking(shape: Mesh, key: jm.Key):
     assert not jm.detect(shape, key=key).detected(1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_values_do_not_go_beyond_the_lattice(shape: Mesh, key: jm.Key):
     """With more budget than the largest step needs, less than the budget is used."""
     scheme = SCHEME.fixed(WIDTH, SCHEME.steps[0])
@@ -237,7 +237,7 @@ def test_a_claimed_message_is_proven_or_refuted(marked, key: jm.Key):
         jm.detect(mesh, key=key, record=info.record, message=bytes(4))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_presence_is_a_mark(shape: Mesh, key: jm.Key):
     mesh, info = jm.embed(shape, b"", key, budget=3e-4, scheme=SCHEME)
     assert info.record.content == "presence"

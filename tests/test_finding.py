@@ -102,7 +102,7 @@ def test_nobody_is_named_without_the_key_or_the_mark(shop: Shop):
     assert Path(verdict.matches[0].original).stem == "1"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_both_models_of_a_merged_file_are_named(shop: Shop):
     merged = joined(shop.marked[3], shop.originals[0], shop.marked[1])
     pieces = split({"": merged})

@@ -101,7 +101,7 @@ def test_controls_are_always_there_and_never_read(results):
             assert rate["detected_high"] == pytest.approx(1 - 0.025 ** (1 / 6))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_study_that_is_ended_goes_on(results, output, tmp_path):
     again, said = tmp_path / "again.jsonl", []
 
