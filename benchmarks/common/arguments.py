@@ -1,6 +1,7 @@
 """What the programs' command lines have in common."""
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,14 @@ def make_parser(description: str | None) -> argparse.ArgumentParser:
 def add_meshes(parser: argparse.ArgumentParser, **options: Any) -> None:
     """Any number of mesh files, at least one by default."""
     parser.add_argument("meshes", **{"nargs": "+", "type": Path, "metavar": "MESH"} | options)
+
+
+def folder_of(parser: argparse.ArgumentParser, meshes: Sequence[Path]) -> Path:
+    """The folder of mesh files, whose names alone tell them apart; files of several folders end the program."""
+    folders = {mesh.resolve().parent for mesh in meshes}
+    if len(folders) > 1:
+        parser.error("the meshes must be of one folder")
+    return folders.pop()
 
 
 def load(parser: argparse.ArgumentParser, path: str | Path) -> jm.Mesh:

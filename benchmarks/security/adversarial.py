@@ -28,7 +28,7 @@ from jaxmark.attacks import low_pass
 from jaxmark.evaluation import cells
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from common.arguments import add_meshes, make_parser
+from common.arguments import add_meshes, folder_of, make_parser
 from common.costs import ALPHA, BITS, METRICS, Target, around, cell, make_target, paid
 from common.marks import BUDGET, MESSAGE
 from common.tables import head, line, say
@@ -115,9 +115,9 @@ LEVELS = list(dict.fromkeys(level for level, _ in ATTACKERS))
 NAMES = [*LEVELS, THEORY, *(name for _, name in ATTACKERS)]
 
 
-def work(folder: str, steps: int, one: cells.Cell) -> cells.Row:
+def work(folder: Path, steps: int, one: cells.Cell) -> cells.Row:
     mesh, scheme, level, name = map(str, one)
-    target = target_of(str(Path(folder, mesh)), scheme)
+    target = target_of(str(folder / mesh), scheme)
     if name == THEORY:
         return {"cost": {"rms": target.theory}, "strength": target.theory * BUDGET, "log10_p": math.log10(ALPHA)}
     try:
@@ -155,9 +155,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--only", nargs="+", metavar="NAME", default=LEVELS, help="levels, or attackers by name")
     arguments = parser.parse_args()
-    folders = {str(mesh.resolve().parent) for mesh in arguments.meshes}
-    if len(folders) > 1:
-        parser.error("the meshes must be of one folder")
+    folder = folder_of(parser, arguments.meshes)
     meshes = [mesh.name for mesh in arguments.meshes]
     attackers = [one for one in [("program", THEORY), *ATTACKERS] if {*one} & {*arguments.only}]
     if unknown := {*arguments.only} - {name for one in attackers for name in one}:
@@ -166,7 +164,7 @@ def main() -> None:
     arguments.output.mkdir(parents=True, exist_ok=True)
     rows = cells.run(
         wanted,
-        partial(work, folders.pop(), arguments.steps),
+        partial(work, folder, arguments.steps),
         cells.processes(arguments.workers),
         arguments.output / "cells.jsonl",
         say,

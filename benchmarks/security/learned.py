@@ -33,7 +33,7 @@ from jaxmark.geometry import asteroid
 from jaxmark.geometry.mesh import Mesh
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from common.arguments import add_meshes, make_parser
+from common.arguments import add_meshes, folder_of, make_parser
 from common.costs import BITS, METRICS, Target, around, cell, make_target, paid
 from common.marks import BUDGET, MESSAGE
 from common.tables import head, line, say
@@ -120,9 +120,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=list(ATTACKERS), default=list(ATTACKERS), help="attackers")
     parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()
-    folders = {mesh.resolve().parent for mesh in arguments.meshes}
-    if len(folders) > 1:
-        parser.error("the meshes must be of one folder")
+    folder = folder_of(parser, arguments.meshes)
     output = arguments.output.resolve()
     output.mkdir(parents=True, exist_ok=True)
     for goal in GOALS:
@@ -141,7 +139,7 @@ def main() -> None:
     wanted = [(mesh, limits, name) for mesh in meshes for limits in LIMITS for name in arguments.only]
     rows = cells.run(
         wanted,
-        partial(work, folders.pop(), output),
+        partial(work, folder, output),
         cells.processes(arguments.workers),
         output / "cells.jsonl",
         say,

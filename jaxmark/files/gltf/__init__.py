@@ -383,12 +383,11 @@ def _part_of_skin(document: Document, primitive: _Primitive, skin: int | None) -
 
 def _rows(document: Document, primitive: _Primitive, name: str) -> np.ndarray | None:
     """The numbers of an attribute, one row a point; None if the primitive has none."""
-    if primitive.compressed is not None:
-        found = primitive.compressed.attributes.get(name)
-        number = attribute(primitive.data, name)
-        return None if found is None or number is None else found.astype(np.float64) * document.form(number)[2]
     number = attribute(primitive.data, name)
-    return None if number is None else document.numbers(number)
+    if number is None or primitive.compressed is None:
+        return None if number is None else document.numbers(number)
+    found = primitive.compressed.attributes.get(name)
+    return None if found is None else found.astype(np.float64) * document.form(number)[2]
 
 
 @dataclass(kw_only=True)
