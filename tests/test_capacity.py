@@ -144,7 +144,7 @@ def test_least_budget_scales(known: Capacity):
     whole = known.least_budget(16, USUAL._replace(coverage=1.0))
     assert 1.05 * math.sqrt(2) < least / whole < 2
     assert known.least_budget(16, USUAL._replace(coverage=0.01)) == math.inf
-    scheme, original = KeyedScheme(), known._original
+    scheme, original = KeyedScheme(), known.original
     dimensions = known._rooms[scheme.layout(original, 16)].dimensions.sum()
     assert 0.99 * needed_dimensions(16) / dimensions > 0.01  # and so it must be
     assert known.least_budget(10**5, USUAL) == math.inf

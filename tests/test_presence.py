@@ -8,7 +8,7 @@ import pytest
 import jaxmark as jm
 from jaxmark.app.telling import told_message
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.marking import NOISE
+from jaxmark.watermark.payload import NOISE
 from tests.samples import bumpy_sphere, rough_sphere
 from tests.test_cli import MESSAGE, Workshop
 
@@ -60,7 +60,9 @@ def test_a_presence_mark_is_proven_where_messages_do_not_fit(small: Mesh, key: j
     assert found.message is None
     assert found.detected()
     again = jm.detect(suspect, original=small, key=key, bits=0)
-    assert again.log10_p == pytest.approx(found.log10_p, abs=0.31)  # two versions are paid for without a record
+    assert again.log10_p == pytest.approx(
+        found.log10_p, abs=0.4
+    )  # without a record, two versions and three pass bands are paid for
     # It pays for no messages, whether dated or not.
     assert found.log10_p_undated == pytest.approx(min(0.0, found.log10_p + 64 * np.log10(2)), abs=0.05)
     for other in (

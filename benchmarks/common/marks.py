@@ -9,7 +9,7 @@ import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.budget import Budget
 from jaxmark.watermark.carriers.carrier import Room
-from jaxmark.watermark.marking import NOISE
+from jaxmark.watermark.payload import NOISE
 from jaxmark.watermark.schemes import Scheme
 
 KEY, MESSAGE, BUDGET = jm.Key(bytes(range(32))), b"jaxmark!", 8e-4

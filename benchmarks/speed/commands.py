@@ -44,12 +44,13 @@ FUNCTIONS = (
     ("jaxmark.app.batch", "prepare", "prepare"),
     ("jaxmark.app.batch", "make_markers", "prepare"),
     ("jaxmark.distortion", "Reference.measure", "limits"),
+    ("jaxmark.watermark.marking", "Marker.suited", "write"),
     ("jaxmark.watermark.marking", "Marker.embed", "write"),
     ("jaxmark.watermark.marking", "Marker.reads", "back"),
     ("jaxmark.watermark.marking", "Marker.tried", "back"),
     ("jaxmark.app.batch", "save_mesh", "save"),
     ("jaxmark.alignment.alignment", "align", "align"),
-    ("jaxmark.app.batch", "detect_any", "receive"),
+    ("jaxmark.watermark.marking", "Markers.detect", "receive"),
 )
 STAGES = ("start", *dict.fromkeys(stage for *_, stage in FUNCTIONS), "other")
 

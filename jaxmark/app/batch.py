@@ -24,7 +24,7 @@ from jaxmark.watermark.budget import Visibility
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.deposit import Deposit
 from jaxmark.watermark.everyday import AnyScheme, also, name_of, prepare
-from jaxmark.watermark.marking import Marker, Survival, detect_any, make_markers
+from jaxmark.watermark.marking import Markers, Survival, make_markers
 from jaxmark.watermark.record import Record
 from jaxmark.watermark.scenes import SceneDetection, SceneRecord, detect_scene, load_record, pair
 from jaxmark.watermark.schemes import DEFAULT_SCHEME
@@ -97,6 +97,7 @@ def mark_file(
     doing(f"preparing {original}")
     if message is not None:
         marker = prepare(mesh, key, 8 * len(message), scheme)
+        marker = marker.suited(budget, limits=limits, visibility=visibility, noise=noise)
         doing(f"embedding {original}")
         result, info = marker.embed(message, budget, limits=limits, visibility=visibility, noise=noise, read_back=False)
         marker = marker.with_record(info.record)
@@ -163,7 +164,7 @@ class FileReader:
     meshes: Sequence[str] = ()  # names of the original's meshes to read; by default all
     also: Sequence[BlindScheme] = ()  # schemes of marks that are read besides, to unite what all prove
     doing: Doing = quietly  # is told what begins
-    _last: tuple[tuple[Path, str | None], Sequence[Marker]] | None = field(default=None, init=False, repr=False)
+    _last: tuple[tuple[Path, str | None], Markers] | None = field(default=None, init=False, repr=False)
 
     def read(
         self,
@@ -200,10 +201,9 @@ class FileReader:
         self.doing(f"preparing {original}")
         markers = self._markers(original_mesh, original, known, mesh)
         self.doing(f"aligning {suspect}, and looking for a mark in it")
-        found = detect_any(markers, mesh, self.message, align=self.how)
+        found, marker = markers.detect(mesh, self.message, align=self.how)
         if self.also:
-            found = also(found, self.also, mesh, self.key, markers[0].bits, self.message)
-        marker = next(marker for marker in markers if marker.choices.version == found.version)
+            found = also(found, self.also, mesh, self.key, marker.bits, self.message)
         aligned = found.alignment
         if report is not None:
             self.doing("drawing the report")
@@ -333,7 +333,7 @@ class FileReader:
         remarks = [*united.remarks, f"{alone} of {len(found.meshes) + len(found.left)} meshes prove it alone."]
         return Told(answer, describe(united, detected, self.alpha, dated, remarks), detected)
 
-    def _markers(self, mesh: Mesh, original: Path, record: Record | None, suspect: Mesh) -> Sequence[Marker]:
+    def _markers(self, mesh: Mesh, original: Path, record: Record | None, suspect: Mesh) -> Markers:
         place = original, None if record is None else record.digest()
         if self._last is None or self._last[0] != place:
             bits = self.bits

@@ -51,7 +51,8 @@ from jaxmark.watermark.budget import VISIBILITY, Visibility, make_budget, visibi
 from jaxmark.watermark.coding.keys import commitment, new_key, save_key
 from jaxmark.watermark.deposit import Deposit, make_deposit
 from jaxmark.watermark.everyday import NAMES, blind_scheme, capacity, split
-from jaxmark.watermark.marking import COVERAGE, DEFAULT_BITS, NOISE
+from jaxmark.watermark.marking import DEFAULT_BITS
+from jaxmark.watermark.payload import COVERAGE, NOISE
 from jaxmark.watermark.record import RECORD_SUFFIX, Record
 from jaxmark.watermark.scenes import load_record
 from jaxmark.watermark.schemes import DEFAULT_SCHEME

@@ -27,7 +27,7 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.pose import Points, Pose
 from jaxmark.watermark import evidence
 from jaxmark.watermark.coding.keys import Key, commitment
-from jaxmark.watermark.marking import detect_any, make_markers
+from jaxmark.watermark.marking import make_markers
 from jaxmark.watermark.record import Record
 from jaxmark.watermark.tracing import make_tracer, pay
 
@@ -310,11 +310,11 @@ class Finder:
             for record in held.records or [None]:
                 bits = self.bits if record is None else None
                 markers = make_markers(original, key, bits=bits, record=record)
-                found = detect_any(markers, suspect, align=self.how)
+                found, marker = markers.detect(suspect, align=self.how)
                 log10_p = evidence.share_of(found.log10_p, 1 / tried)
                 agrees = True
                 if record is not None and record.told and found.message is not None:
-                    agrees = record.commits_to(found.message, markers[0].choices)
+                    agrees = record.commits_to(found.message, marker.choices)
                 yield (
                     replace(
                         match,

@@ -281,7 +281,8 @@ def _read(
 @lru_cache(maxsize=_SEEDS_PER_CELL + 1)  # the keys that a cell reads with
 def _marker(point: _Point, seed: int) -> Marker | BlindMarker:
     mesh = point.mesh if isinstance(point.mesh, Mesh) else load_mesh(point.mesh)
-    return prepare_alone(mesh, Key(_derive(seed, "key", 32)), point.bits, point.scheme)
+    rms, limits = point.budget
+    return prepare_alone(mesh, Key(_derive(seed, "key", 32)), point.bits, point.scheme).suited(rms, limits=limits)
 
 
 @lru_cache(maxsize=_SEEDS_PER_CELL)

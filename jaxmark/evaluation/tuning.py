@@ -27,8 +27,10 @@ from jaxmark.watermark.budget import Budget, Limits, make_budget, write
 from jaxmark.watermark.carriers.carrier import Displacement
 from jaxmark.watermark.channels import Channels, Margin, margins, measure
 from jaxmark.watermark.everyday import blind_scheme
+from jaxmark.watermark.payload import Capacity
 from jaxmark.watermark.probes import probe_signs
 from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme, TunableScheme, get_scheme
+from jaxmark.watermark.suiting import suited
 from jaxmark.watermark.visibility import apply_mask, band_visibility
 
 Attacker = tuple[Kind, float] | Callable[[Mesh, int], Mesh]  # an attack and a strength, or (mesh, seed) → mesh
@@ -51,8 +53,8 @@ class Report(NamedTuple):
     binding: Mapping[str, float]  # weights of the limits in the channels' budget
     tried: Float64[np.ndarray, " attacks"]  # what the detector has of the tuned strengths after each attack
     tried_channels: Float64[np.ndarray, " attacks"]  # the same of the channels' best; 0 if the payload does not fit
-    tried_default: Float64[np.ndarray, " attacks"]  # the same of the scheme as it was given
-    kept: bool  # whether no strengths were better than those of the scheme as it was given, which is returned
+    tried_default: Float64[np.ndarray, " attacks"]  # the same of the scheme as `embed` takes it
+    kept: bool  # whether no strengths were better than those of the scheme as `embed` takes it, which is returned
 
 
 class Tuned(NamedTuple):
@@ -86,9 +88,10 @@ def tune(
     Each attack's channel is measured from a probe that spends equal shares of the budget in all bands. Limits on other
     metrics than RMS displacement count as quadratic in the strengths, with the measured visibility of each band. The
     strengths that are best so have a proof, but leave out what limits, attacks and reader really are. So marks of them,
-    of the scheme's own strengths and of low-pass filters are written within the real limits, attacked and read. The
-    best ones are improved by the gradient of what the detector has after the worst attack, as long as trials with other
-    signs and seeds agree (`jaxmark.evaluation.trials`). If the scheme's own strengths are as good, they are returned.
+    of the scheme's own strengths in the pass band that suits the budget, and of low-pass filters are written within the
+    real limits, attacked and read. The best ones are improved by the gradient of what the detector has after the worst
+    attack, as long as trials with other signs and seeds agree (`jaxmark.evaluation.trials`). If the scheme's own
+    strengths are as good, they are returned.
 
     Args:
         mesh: the original.
@@ -151,7 +154,8 @@ def tune(
     bound = upper_bound(channels, weights @ cost, cap=cap, margin=margin)
 
     trials = Trials(original, bits, bounds, [partial(apply_attack, one) for one in attacks], numbers.tolist(), margin)
-    default, solved = trials.run(tunable), tunable.with_profile(_profile(beta))
+    default = trials.run(suited(Capacity(original, tunable), bits, bounds).tunable())
+    solved = tunable.with_profile(_profile(beta))
     low_pass = [tunable.with_profile((1.0,) * round(share * len(family))) for share in _LOW_PASS]
     others = [trials.run(one) for one in (solved, *low_pass) if trials.fits(one)]
     best = trials.ascend(max(default, *others, key=lambda one: one.worst), cost)

@@ -72,6 +72,17 @@ class CombinedMarker:
         least = Survival(min(one.whole for one in survives), max(one.half for one in survives))
         return marked, info._replace(rms=change.rms, max=change.max, survives=least)
 
+    def suited(
+        self,
+        budget: float | None = None,
+        *,
+        limits: Limits | None = None,
+        visibility: Visibility | None = None,
+        noise: float | None = None,
+    ) -> "CombinedMarker":
+        """See `Marker.suited`."""
+        return replace(self, informed=self.informed.suited(budget, limits=limits, visibility=visibility, noise=noise))
+
     def with_record(self, record: Record) -> "CombinedMarker":
         """See `Marker.with_record`."""
         return replace(self, informed=self.informed.with_record(record))

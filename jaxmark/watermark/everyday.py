@@ -28,17 +28,14 @@ from jaxmark.watermark.coding.keys import KEY_BYTES, Key
 from jaxmark.watermark.combined import CombinedMarker, unite
 from jaxmark.watermark.detectors import Detector
 from jaxmark.watermark.marking import (
-    COVERAGE,
     DEFAULT_BITS,
-    NOISE,
     Detection,
     EmbedInfo,
     Marker,
-    detect_any,
     make_marker,
     make_markers,
 )
-from jaxmark.watermark.payload import Capacity, Conditions
+from jaxmark.watermark.payload import COVERAGE, NOISE, Capacity, Conditions
 from jaxmark.watermark.record import Record
 from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES, Scheme, get_scheme
 
@@ -171,6 +168,7 @@ def embed(
     if not isinstance(message, bytes):
         raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
     marker = prepare(mesh, key, 8 * len(message), scheme)
+    marker = marker.suited(budget, limits=limits, visibility=visibility, noise=noise)
     return marker.embed(message, budget, limits=limits, visibility=visibility, noise=noise)
 
 
@@ -310,8 +308,8 @@ def detect(
         raise JaxmarkError(f"The scheme {named!r} is read beside the original; give it, or mark with 'field'.")
     informed = informed_scheme(scheme or DEFAULT_SCHEME)
     markers = make_markers(original, key, bits=bits, record=record, scheme=informed, detector=detector)
-    found = detect_any(markers, suspect, message, weights, align)
-    return also(found, others, suspect, key, markers[0].bits, message) if others else found
+    found, marker = markers.detect(suspect, message, weights, align)
+    return also(found, others, suspect, key, marker.bits, message) if others else found
 
 
 def also(

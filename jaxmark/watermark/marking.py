@@ -1,9 +1,10 @@
 """Marking meshes and reading them: from meshes, messages and keys to marked meshes and evidence."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -26,9 +27,10 @@ from jaxmark.watermark.carriers.carrier import Carrier, Reader, Received
 from jaxmark.watermark.coding.keys import SCHEME_VERSION, VERSIONS, Choices, Key, bind, commitment
 from jaxmark.watermark.coding.message import CANDIDATES, TAG_BITS, Decoded, decode, encode
 from jaxmark.watermark.detectors import Detector, claims
-from jaxmark.watermark.payload import Capacity, Conditions
+from jaxmark.watermark.payload import COVERAGE, NOISE, Capacity, Conditions
 from jaxmark.watermark.record import Content, Record, commit, seal_imprint
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES, Scheme, get_scheme, parameters_of
+from jaxmark.watermark.schemes import DEFAULT_SCHEME, LADDER, SCHEMES, Scheme, get_scheme, parameters_of
+from jaxmark.watermark.suiting import suited
 
 DEFAULT_BITS = 64  # size of the payload
 _MIN_ORIGINAL_SHARE = 0.5  # share of an original's points from which on an edited copy is read with, as an estimate
@@ -38,9 +40,8 @@ _SAME_SHAPE = 0.01  # distance of shapes, over their size, below which an origin
 ALIGN_SHARES = {"auto": 0.97, "same": 0.01, "similarity": 0.01, "affine": 0.01}
 CLAIM_SHARE = 0.97
 _QUICK_SHARE = 0.03  # of the message that plain matched correlations read first; decoding jointly keeps nearly all
+_USUAL_SHARE = 0.9  # of the usual pass band; readers with a record know the band
 _HAND_SHARE = 0.97  # of the hand that fits a surface better
-NOISE = 0.005  # half width over the mean distance to the centre: the strongest noise of the SMI 2010 protocol
-COVERAGE = 0.5  # share of the vertices that may be left
 _MAX_TRIED_NOISE = 0.05  # beyond which no shape is left
 
 
@@ -141,6 +142,11 @@ class Marker:
         """The reader of the carrier; made when it is first needed."""
         return self.carrier.reader()
 
+    @cached_property
+    def capacity(self) -> Capacity:
+        """What the original can carry with the scheme."""
+        return Capacity(self.original, self.scheme, {self.bits: lambda: self.reader})
+
     def embed(
         self,
         message: bytes,
@@ -157,12 +163,11 @@ class Marker:
         """
         self.check_size(message)
         bounds = make_budget(budget, limits, visibility, named=visibility_of(self.original.mesh))
-        if noise is not None and not 0 <= noise < math.inf:
-            raise JaxmarkError(f"The noise to survive is a number of at least 0, got {noise}.")
+        _check_noise(noise)
         marked, info = self.write(self.codeword(message), bounds, told=message)
         # A budget without limits is met up to rounding, so its own number is used.
         reached = info.rms if bounds.limits else bounds.rms or 0.0
-        room = Capacity(self.original, self.scheme, {self.bits: self.reader})
+        room = self.capacity
         if noise is not None:
             self._check_capacity(room, reached, Conditions(bounds, noise, COVERAGE))
         noises = (room.noise(self.bits, reached, Conditions(bounds, 1.0, share)) for share in (1.0, COVERAGE))
@@ -266,6 +271,8 @@ class Marker:
         message: bytes | None = None,
         weights: ArrayLike | None = None,
         align: Align = "auto",
+        *,
+        share: float = 1.0,
     ) -> Detection:
         """Read a suspect, with a claimed message or without; see `detect`.
 
@@ -273,31 +280,42 @@ class Marker:
         tag, and the union bound over all messages, or over the one that the record commits to. With one, log10_p is
         Hoeffding's bound (see `evidence.log10_p_claimed`). The score is the plain correlation of the codeword: joint
         decoding may choose the codeword, but does not enter the score. It is taken for each way of weighting the
-        suspect (see `detectors.claims`), and each is paid for, too; so are ways of aligning other than `"auto"`, and,
-        without a record, both versions of the keyed choices. Weights depend on suspect and original only.
+        suspect (see `detectors.claims`), and each is paid for, too; so are ways of aligning other than `"auto"`.
+        Weights depend on suspect and original only.
 
         A suspect that is read with several keys needs to be aligned only once: pass the result of
-        `jaxmark.alignment.alignment.align` in its place.
+        `jaxmark.alignment.alignment.align` in its place, and in `share` the share of the probability that this reading
+        has of all that are tried.
         """
-        if not self.bits and message is None:
-            message = b""  # presence is all that can be claimed
-        if message is not None:
-            self.check_claim(message)
-        if isinstance(suspect, Alignment):
-            return self._detect(suspect, message, weights, 1.0)
-        aligned = alignment.align(self.original, suspect, align)
-        if aligned.method != "surface":
-            return self._detect(aligned, message, weights, 1.0)
-        found = self._detect(aligned, message, weights, _HAND_SHARE)
-        if found.detected():
-            return found
-        # The surface of a shape that is nearly its own mirror image does not tell whether a suspect was mirrored.
-        try:
-            aligned = alignment.align(self.original, suspect, align, hands=(not aligned.pose.mirrors,))
-        except JaxmarkError:
-            return found
-        other = self._detect(aligned, message, weights, 1 - _HAND_SHARE)
-        return min(found, other, key=lambda one: one.log10_p)
+        if not isinstance(suspect, Alignment):
+            return Markers([[(1.0, lambda: self)]]).detect(suspect, message, weights, align)[0]
+        return self._detect(suspect, self.claimed(message), weights, share)
+
+    def suited(
+        self,
+        budget: float | None = None,
+        *,
+        limits: Limits | None = None,
+        visibility: Visibility | None = None,
+        noise: float | None = None,
+    ) -> "Marker":
+        """The marker with the pass band that suits a budget, if its scheme is the default; see `suiting.suited`.
+
+        Args and raises: see `embed`; without a demand, what is to be survived is the noise of `payload.NOISE`.
+        """
+        bounds = make_budget(budget, limits, visibility, named=visibility_of(self.original.mesh))
+        _check_noise(noise)
+        return self.with_scheme(suited(self.capacity, self.bits, bounds, noise or NOISE))
+
+    def with_scheme(self, scheme: Scheme) -> "Marker":
+        """The same marker, which has no record, with another scheme of this library."""
+        if scheme == self.scheme:
+            return self
+        version = self.choices.version
+        choices = bind_mark(self.key, self.original, scheme, self.bits, self.content, version)
+        code_bits = scheme.code_length(self.original, self.bits)
+        carrier = scheme.carrier(self.original, choices, self.bits, code_bits)
+        return replace(self, choices=choices, scheme=scheme, carrier=carrier, code_bits=code_bits)
 
     def _detect(self, aligned: Alignment, message: bytes | None, weights: ArrayLike | None, share: float) -> Detection:
         """Read a suspect as it was aligned, with a share of the probability."""
@@ -419,7 +437,7 @@ class Marker:
             raise JaxmarkError(
                 f"The {len(unit)} points of this mesh leave the scheme {self.scheme.name!r} nothing to write in."
             )
-        written = write(original, unit, budget)
+        written = write(original, unit, budget, self.capacity.reference if budget.limits else None)
         return written.mesh, EmbedInfo(
             written.moved.rms, written.moved.max, written.scale, self._make_record(written.scale, told)
         )
@@ -516,6 +534,17 @@ class Marker:
         seen = distortion.measure(self.original.mesh, marked, limits.keys())
         told = ", ".join(f"{name} would be {value or 0:.2g}" for name, value in seen.items())
         return f" (at which {told})"
+
+    def claimed(self, message: bytes | None) -> bytes | None:
+        """The message that is claimed: presence, if that is all that can be.
+
+        Raises:
+            JaxmarkError: see `check_claim`.
+        """
+        if message is None:
+            return None if self.bits else b""
+        self.check_claim(message)
+        return message
 
     def check_claim(self, message: bytes) -> None:
         """Check that a message may be claimed: that it has the payload's size, and is the one in the record, if any.
@@ -674,6 +703,11 @@ def _in_order_of(original: Original, imprint: Imprint) -> Original:
     return replace(original, order=imprint.order, in_order=original.order == imprint.order)
 
 
+def _check_noise(noise: float | None) -> None:
+    if noise is not None and not 0 <= noise < math.inf:
+        raise JaxmarkError(f"The noise to survive is a number of at least 0, got {noise}.")
+
+
 def _matches_record(scheme: Scheme, record: Record) -> bool:
     """Whether a record names this scheme, which may be one of the caller's own, with these fields."""
     if scheme.name in SCHEMES:
@@ -695,33 +729,25 @@ def make_markers(
     record: Record | None = None,
     scheme: str | Scheme = DEFAULT_SCHEME,
     detector: Detector | None = None,
-) -> Sequence[Marker]:
-    """Prepare an original for reading marks of any version: that of the record, or without one each, the newest first.
+) -> "Markers":
+    """Prepare an original for reading all marks that may be meant, the likeliest first.
 
-    Older versions are prepared when they are first asked for: mostly the newest is found.
+    With a record there is one. Without, marks have any version of the keyed choices, the newest first, and marks of the
+    default scheme any pass band that `Marker.suited` chooses.
 
     Args and raises: see `make_marker`.
     """
     prepare = partial(make_marker, original, key, bits=bits, record=record, scheme=scheme, detector=detector)
-    markers = _Markers([partial(prepare, version=version) for version in versions_of(record)])
-    markers[0]  # so that refusals come here
-    return markers
-
-
-class _Markers(Sequence[Marker]):
-    """Markers that are prepared at first use, and kept."""
-
-    def __init__(self, prepare: Sequence[Callable[[], Marker]]) -> None:
-        self._prepare = prepare
-        self._ready: dict[int, Marker] = {}
-
-    def __len__(self) -> int:
-        return len(self._prepare)
-
-    def __getitem__(self, index: int) -> Marker:  # pyright: ignore[reportIncompatibleMethodOverride]
-        if index not in self._ready:
-            self._ready[index] = self._prepare[index]()
-        return self._ready[index]
+    ladders = []
+    for version in versions_of(record):
+        usual = cache(partial(prepare, version=version))
+        ladder = [(1.0, usual)]
+        if record is None and version > 1 and scheme == DEFAULT_SCHEME:
+            share = (1 - _USUAL_SHARE) / (len(LADDER) - 1)
+            others = [(share, cache(partial(_with_passband, usual, name))) for name in LADDER[1:]]
+            ladder = [(_USUAL_SHARE, usual), *others]
+        ladders.append(ladder)
+    return Markers(ladders)
 
 
 def versions_of(record: Record | None) -> tuple[int, ...]:
@@ -729,27 +755,53 @@ def versions_of(record: Record | None) -> tuple[int, ...]:
     return VERSIONS if record is None else (record.version,)
 
 
-def detect_any(
-    markers: Sequence[Marker],
-    suspect: Mesh,
-    message: bytes | None = None,
-    weights: ArrayLike | None = None,
-    align: Align = "auto",
-) -> Detection:
-    """Read a suspect with each marker until one detects its mark, and return the best; all of them are paid for.
+def _with_passband(usual: Callable[[], Marker], name: str) -> Marker:
+    marker = usual()
+    return marker.with_scheme(replace(marker.scheme, passband=name))
 
-    Args and raises: see `detect`.
-    """
-    best, share = None, 1 / len(markers)
-    for marker in markers:
-        found = marker.detect(suspect, message, weights, align)
-        found = found._replace(
-            log10_p=evidence.share_of(found.log10_p, share),
-            log10_p_undated=evidence.share_of(found.log10_p_undated, share),
-            log10_p_unfloored=evidence.share_of(found.log10_p_unfloored, share, evidence.UNFLOORED),
-        )
-        best = found if best is None else min(best, found, key=lambda one: (one.log10_p, one.message is None))
-        if best.detected():
-            break
-    assert best is not None
-    return best
+
+class Markers:
+    """Markers of one original, key and payload that read what a mark may be; prepared at first use, and kept."""
+
+    def __init__(self, ladders: Sequence[Sequence[tuple[float, Callable[[], Marker]]]]) -> None:
+        """Prepare the first marker, so that refusals come here.
+
+        Args:
+            ladders: for each version of the keyed choices the markers, which have the same original, and their shares
+                of the probability.
+        """
+        self._ladders = ladders
+        self.first = ladders[0][0][1]()
+
+    def detect(
+        self, suspect: Mesh, message: bytes | None = None, weights: ArrayLike | None = None, align: Align = "auto"
+    ) -> tuple[Detection, Marker]:
+        """Read a suspect with each marker until one detects its mark; all of them are paid for.
+
+        Args and raises: see `detect`.
+
+        Returns:
+            The best detection, and the marker that made it.
+        """
+        message, found = self.first.claimed(message), []
+        for ladder in self._ladders:
+            for aligned, part in _ways(ladder[0][1]().original, suspect, align):
+                for share, prepare in ladder:
+                    marker = prepare()
+                    one = marker.detect(aligned, message, weights, share=share * part / len(self._ladders))
+                    if one.detected():
+                        return one, marker
+                    found.append((one, marker))
+        return min(found, key=lambda one: (one[0].log10_p, one[0].message is None))
+
+
+def _ways(original: Original, suspect: Mesh, align: Align) -> Iterator[tuple[Alignment, float]]:
+    """The ways in which a suspect is aligned, the likeliest first, and their shares of the probability."""
+    aligned = alignment.align(original, suspect, align)
+    if aligned.method != "surface":
+        yield aligned, 1.0
+        return
+    yield aligned, _HAND_SHARE
+    # The surface of a shape that is nearly its own mirror image does not tell whether a suspect was mirrored.
+    with suppress(JaxmarkError):
+        yield alignment.align(original, suspect, align, hands=(not aligned.pose.mirrors,)), 1 - _HAND_SHARE

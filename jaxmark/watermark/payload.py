@@ -1,7 +1,7 @@
 """How many bits a mesh can carry, by the room for them in the pass band and by their energy in noise."""
 
 import math
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from functools import cached_property
 from typing import NamedTuple
 
@@ -26,6 +26,10 @@ _MAX_PAYLOAD_BYTES = 2**20  # if nothing else bounds the payload
 # `benchmarks/theory/limit.py --code-only` measures it.
 _CODE_GAP_DB = 1.0
 
+NOISE = 0.005  # half width over the mean distance to the centre: the strongest noise of the SMI 2010 protocol
+COVERAGE = 0.5  # share of the vertices that may be left
+
+_GLIMPSE = 0.8  # share of a limit that is as good as all of it for a glimpse
 _PROBES = 5  # marks that are tried to see how strong limits allow them to be
 _SPREADS, _MIN_SPREAD = 3, 0.007  # standard deviations of their logarithms that are subtracted, and the least of these
 
@@ -95,18 +99,25 @@ class Capacity:
     If the scheme's reader has no model of noise (see `Reader.room`), only the number of code bits limits the payload.
     """
 
-    def __init__(self, original: Original, scheme: Scheme, known: Mapping[int, Reader] | None = None) -> None:
+    def __init__(
+        self,
+        original: Original,
+        scheme: Scheme,
+        known: Mapping[int, Callable[[], Reader]] | None = None,
+        reference: distortion.Reference | None = None,
+    ) -> None:
         """Prepare for an original and a scheme.
 
         Args:
             original: the mesh to mark.
             scheme: the scheme to mark it with.
-            known: readers that exist already, by the size of their payload in bits; they are not made again.
+            known: what makes the readers that are needed besides, or has them already, by the size of their payload.
+            reference: of the original's mesh, if there is one already.
         """
-        self._original, self._scheme = original, scheme
-        self._rooms: dict[Hashable, Room | None] = {
-            scheme.layout(original, bits): self._room(reader) for bits, reader in (known or {}).items()
-        }
+        self.original, self.scheme = original, scheme
+        self._known = {scheme.layout(original, bits): make for bits, make in (known or {}).items()}
+        self._reference = reference
+        self._rooms: dict[Hashable, Room | None] = {}
         self._reached: dict[Hashable, float] = {}
 
     def least_budget(self, bits: int, conditions: Conditions) -> float:
@@ -122,15 +133,11 @@ class Capacity:
         Returns:
             The displacement; 0 if there is no noise or no model of it, infinite if there are too few dimensions.
         """
-        original, scheme = self._original, self._scheme
         try:
-            code = scheme.code_length(original, bits)
+            self.scheme.code_length(self.original, bits)
         except JaxmarkError:
             return math.inf
-        layout = scheme.layout(original, bits)
-        if layout not in self._rooms:
-            self._rooms[layout] = self._room(self._carrier(bits, code).reader())
-        left, needed = self._rooms[layout], needed_energy(bits)
+        left, needed = self._left(bits), needed_energy(bits)
         if left is None:
             return 0.0
         dimensions = conditions.coverage * left.dimensions
@@ -159,18 +166,55 @@ class Capacity:
         least = self.least_budget(bits, conditions._replace(noise=1.0))  # which grows as the noise does
         return reached / least if least > 0 else math.inf
 
+    def evidence(self, bits: int, reached: float, noise: float) -> float:
+        """Predict the evidence for a claimed message in noise, S²/2‖a‖² in nats: ½ Σ_j n_j s_j/(1 + s_j).
+
+        s_j is the ratio of the mark's energy to the noise's in each of the n_j dimensions of band j.
+
+        Args:
+            bits: size of the payload in bits.
+            reached: the RMS displacement, in diagonals.
+            noise: as in `Conditions`, positive.
+
+        Returns:
+            The evidence; 0 if the reader has no model of noise.
+        """
+        left = self._left(bits)
+        if left is None:
+            return 0.0
+        ratio = reached**2 * left.energy / ((noise * self._radius()) ** 2 / 3)
+        return float(np.sum(left.dimensions * ratio / (1 + ratio))) / 2
+
+    def needed(self, bits: int, evidence: float, noise: float) -> float:
+        """The RMS displacement, in diagonals, at which so much evidence is predicted; infinite if it never is."""
+        if self.evidence(bits, 1.0, noise) <= evidence:
+            return math.inf
+
+        def excess(logarithm: float) -> float:
+            return self.evidence(bits, math.exp(logarithm), noise) - evidence
+
+        return math.exp(optimize.root_scalar(excess, bracket=(-100.0, 0.0)).root)
+
+    def _left(self, bits: int) -> Room | None:
+        """The room for a payload."""
+        layout = self.scheme.layout(self.original, bits)
+        if layout not in self._rooms:
+            make = self._known.get(layout) or self._carrier(bits).reader
+            self._rooms[layout] = make().room(self.original.to_traced(self.original.used))
+        return self._rooms[layout]
+
     def _radius(self) -> float:
         """Mean distance of the points that faces use to their centre, in diagonals."""
-        points = self._original.positions[self._original.used]
+        points = self.original.positions[self.original.used]
         return float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean())
 
     def reach(self, bits: int, budget: Budget) -> float:
         """RMS displacement, in diagonals, that a budget surely allows a mark with a payload of `bits` bits."""
         if budget.rms is not None and not budget.limits:
             return budget.rms
-        layout = self._scheme.layout(self._original, bits)
+        layout = self.scheme.layout(self.original, bits)
         if layout not in self._reached:
-            carrier = self._carrier(bits, self._scheme.code_length(self._original, bits))
+            carrier = self._carrier(bits)
             reached = [self._write(carrier, word, budget) for word in range(_PROBES)]
             # Marks under the same limits differ: by a percent where a limit is a mean, by ten where it is a percentile.
             logs = np.log(reached)
@@ -178,21 +222,32 @@ class Capacity:
             self._reached[layout] = math.exp(logs.mean() - _SPREADS * spread)
         return self._reached[layout]
 
-    def _write(self, carrier: Carrier, word: int, budget: Budget) -> float:
+    def glimpse(self, bits: int, budget: Budget, enough: float = math.inf) -> float:
+        """RMS displacement, in diagonals, that a budget about allows a mark, found with few displacements.
+
+        Args:
+            bits: size of the payload in bits.
+            budget: the bounds to keep.
+            enough: what need not be exceeded.
+        """
+        most = min(enough, budget.rms or math.inf)
+        bounds = budget._replace(rms=most if most < 1 else None)
+        return self._write(self._carrier(bits), 0, bounds, share=_GLIMPSE) if bounds.limits else most
+
+    def _write(self, carrier: Carrier, word: int, budget: Budget, **options: float) -> float:
         """RMS displacement of a mark with one of several codewords."""
         signs = np.random.default_rng(word).choice([-1.0, 1.0], carrier.code_bits)
-        probe = carrier.displacement(jnp.asarray(signs, self._original.signal.dtype))
-        return write(self._original, self._original.to_host(probe), budget, self._reference).moved.rms
+        probe = self.original.to_host(carrier.displacement(jnp.asarray(signs, self.original.signal.dtype)))
+        return write(self.original, probe, budget, self.reference, **options).moved.rms
 
     @cached_property
-    def _reference(self) -> distortion.Reference:
-        return distortion.Reference(self._original.mesh)
+    def reference(self) -> distortion.Reference:
+        """The original's mesh, prepared for metrics to be measured."""
+        return self._reference or distortion.Reference(self.original.mesh)
 
-    def _room(self, reader: Reader) -> Room | None:
-        return reader.room(self._original.to_traced(self._original.used))
-
-    def _carrier(self, bits: int, code: int) -> Carrier:
-        return self._scheme.carrier(self._original, Choices(Key(bytes(KEY_BYTES)), b""), bits, code)
+    def _carrier(self, bits: int) -> Carrier:
+        code = self.scheme.code_length(self.original, bits)
+        return self.scheme.carrier(self.original, Choices(Key(bytes(KEY_BYTES)), b""), bits, code)
 
     def bits(self, conditions: Conditions) -> int:
         """The largest payload, a multiple of 8 bits; 0 if not even 8."""

@@ -36,12 +36,25 @@ DERIVED = (
     *(0.37, 0.32, 0.28, 0.24, 0.21, 0.18, 0.15, 0.11, 0.07, 0.03),
 )
 
-# Least number of dimensions of the mark for each dimension of the nuisance that is projected off, apart from affine
-# maps; by pass band.
-_DIMENSIONS_PER_NUISANCE = {"tapered": 12, "narrow": 6}
 
-# Largest total degree of the polynomials among the nuisance; by pass band.
-_MAX_NUISANCE_DEGREE = {"tapered": 6, "narrow": 8}
+class PassBand(NamedTuple):
+    """How the bands are chosen that a mark is written in, and the nuisance that is projected off."""
+
+    share: float  # of all bands, the lowest ones: as many are written in, or more if the payload needs them
+    spread: int  # number of dimensions that each bit of message and tag needs
+    per_nuisance: int  # least number of dimensions for each one of the nuisance, apart from affine maps
+    degree: int  # the largest total degree of the polynomials among the nuisance
+
+
+PASS_BANDS: Mapping[str, PassBand] = {
+    "tapered": PassBand(0.31, 12, 12, 6),
+    "narrow": PassBand(0.31, 6, 6, 8),
+    "low": PassBand(0.19, 6, 12, 6),
+    "lowest": PassBand(0.125, 6, 12, 6),
+}
+# Pass bands that marks have by default, the usual one first: the others are for marks so weak that the energy in each
+# dimension is worth more than the number of dimensions, see `jaxmark.watermark.suiting`.
+LADDER = ("tapered", "low", "lowest")
 
 # The most bands or eigenpairs that a record may ask for: no file decides how much memory and time is spent.
 _MAX_COMPONENTS = 512
@@ -169,12 +182,14 @@ class KeyedScheme(Scheme):
     The default pass band is tapered. It reaches to λ = 0.44 with the strengths of `DERIVED`, but leaves out the lowest
     bands, of which the nuisance takes most. It is stretched if the payload needs more: 12 dimensions for each bit of
     message and tag. A narrow pass band is flat, and as narrow as the payload allows: it has 1,024 dimensions and 12
-    more for each bit of message and tag, but ends at λ = 0.44 unless the payload needs more. With a profile, the mark
-    is written in the bands to which the profile gives strengths, whatever the payload.
+    more for each bit of message and tag, but ends at λ = 0.44 unless the payload needs more. Low pass bands are flat
+    and end at λ = 0.17 and 0.08 unless the payload needs more than 6 dimensions a bit: for marks so weak that few
+    dimensions with more energy each prove more (see `jaxmark.watermark.suiting`). With a profile, the mark is written
+    in the bands to which the profile gives strengths, whatever the payload.
 
     Dimensions are counted as on a regular triangle mesh, √3/2π · λ for each coordinate of each vertex; on point clouds,
-    by the number of neighbours. The nuisance
-    that is projected off has at most a twelfth of them, apart from affine maps; with a narrow pass band, a sixth.
+    by the number of neighbours. The nuisance that is projected off has at most a twelfth of them, apart from affine
+    maps; with a narrow pass band, a sixth.
     """
 
     name: ClassVar[str] = "keyed"
@@ -182,7 +197,7 @@ class KeyedScheme(Scheme):
     direction: Literal["coordinates", "normals"] = "coordinates"  # along which vertices are displaced
     profile: tuple[float, ...] = ()  # relative strengths of the lowest bands, from `tune`; by default by `passband`
     masking: bool = False  # whether rough regions move more; see `jaxmark.watermark.visibility.masking`
-    passband: Literal["tapered", "narrow"] = "tapered"  # how bands and nuisance are chosen
+    passband: Literal["tapered", "narrow", "low", "lowest"] = "tapered"  # how bands and nuisance are chosen
     hiding: bool = True  # whether points move where and as it is hidden; see `jaxmark.watermark.hiding`
 
     def __post_init__(self) -> None:
@@ -198,9 +213,10 @@ class KeyedScheme(Scheme):
             raise JaxmarkError(
                 f"A profile is up to {self.bands} numbers, none negative and not all 0; got {len(self.profile)}."
             )
-        for name, known in (("direction", ("coordinates", "normals")), ("passband", ("tapered", "narrow"))):
+        for name, known in (("direction", ("coordinates", "normals")), ("passband", tuple(PASS_BANDS))):
             if getattr(self, name) not in known:
-                raise JaxmarkError(f"{name} must be {known[0]!r} or {known[1]!r}, got {getattr(self, name)!r}.")
+                *others, last = map(repr, known)
+                raise JaxmarkError(f"{name} must be {', '.join(others)} or {last}, got {getattr(self, name)!r}.")
 
     @property
     def detector(self) -> Detector:
@@ -221,18 +237,15 @@ class KeyedScheme(Scheme):
         columns = self._written_dimensions(original, strengths) / self._channels
         # Affine maps are 4 columns; each diffusion scale has one column for each coordinate.
         scales = min(9, max(0, int(columns / 3 - 4) // 3))
-        degree = 1
-        while (
-            degree < _MAX_NUISANCE_DEGREE[self.passband]
-            and math.comb(degree + 4, 3) + 3 * scales <= columns / _DIMENSIONS_PER_NUISANCE[self.passband]
-        ):
+        degree, chosen = 1, PASS_BANDS[self.passband]
+        while degree < chosen.degree and math.comb(degree + 4, 3) + 3 * scales <= columns / chosen.per_nuisance:
             degree += 1
         return Layout(len(strengths), scales, degree)
 
     def strengths(self, original: Original, bits: int) -> Float64[np.ndarray, " passing"]:
         """Relative strengths of the bands of the pass band for a payload."""
         strengths = self._strengths(original, bits)
-        if self.profile or self.passband == "narrow":
+        if self.profile or self.passband != "tapered":
             return strengths
         # In a band that is mostly nuisance, a mark is visible but can hardly be read.
         layout = self.layout(original, bits)
@@ -302,12 +315,14 @@ class KeyedScheme(Scheme):
         """Relative strengths as in `strengths`, but also in bands that are mostly nuisance."""
         if self.profile:
             return np.array(self.profile)
-        information = bits + TAG_BITS
-        usual = round(self.bands * 0.31)
+        chosen = PASS_BANDS[self.passband]
+        usual, needed = round(self.bands * chosen.share), chosen.spread * (bits + TAG_BITS)
         if self.passband == "narrow":
-            wanted = min(1024 + 12 * information, self._dimensions(original, usual))
-            return np.ones(self._count_bands(original, max(wanted, 6 * information), 0))
-        passing = self._count_bands(original, 12 * information, usual)
+            wanted = min(1024 + 2 * needed, self._dimensions(original, usual))
+            return np.ones(self._count_bands(original, max(wanted, needed), 0))
+        passing = self._count_bands(original, needed, usual)
+        if self.passband != "tapered":
+            return np.ones(passing)
         places = (np.arange(passing) + 0.5) / passing
         return np.interp(places, (np.arange(len(DERIVED)) + 0.5) / len(DERIVED), DERIVED)
 

@@ -87,6 +87,17 @@ class BlindMarker:
         plan = self.writer.plan(codeword(message, self.writer.choices), bounds, reference, self.bits)
         return Planned(plan.size, self.writer.survives(plan, self.bits))
 
+    def suited(
+        self,
+        budget: float | None = None,
+        *,
+        limits: Limits | None = None,
+        visibility: Visibility | None = None,
+        noise: float | None = None,
+    ) -> "BlindMarker":
+        """This: `embed` chooses what suits a budget."""
+        return self
+
     def with_record(self, record: Record) -> "BlindMarker":
         """The marker that reads a mark it has just made, with the width and step that were chosen."""
         return replace(self, scheme=parameters_in(record, self.scheme))

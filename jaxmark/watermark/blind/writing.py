@@ -29,7 +29,8 @@ from jaxmark.watermark.blind.scheme import AnchoredHost, BlindScheme, Measured, 
 from jaxmark.watermark.budget import Budget, write
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.hiding import hiding_directions
-from jaxmark.watermark.marking import DEFAULT_BITS, NOISE, Survival
+from jaxmark.watermark.marking import DEFAULT_BITS, Survival
+from jaxmark.watermark.payload import NOISE
 from jaxmark.watermark.visibility import apply_mask
 
 _RIDGE = 3e-3  # of the mean square of a row: values that contradict each other are met halfway

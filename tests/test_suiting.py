@@ -1,0 +1,143 @@
+"""Pass bands that suit a budget: what is predicted, what is chosen, and how readers without a record find it."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmark as jm
+from jaxmark.alignment import alignment
+from jaxmark.evaluation.tuning import tune
+from jaxmark.watermark.budget import make_budget
+from jaxmark.watermark.marking import Marker, make_markers
+from jaxmark.watermark.payload import NOISE, Capacity
+from jaxmark.watermark.schemes import LADDER, PASS_BANDS, KeyedScheme
+from tests.samples import rough_sphere
+
+FAINT = {"dame": 0.001}
+SHAPE = rough_sphere(2000)
+
+
+@cache
+def marker_of(passband: str, key: bytes = bytes(32), bits: int = 16) -> Marker:
+    return jm.make_marker(SHAPE, jm.Key(key), bits=bits).with_scheme(KeyedScheme(passband=passband))
+
+
+@cache
+def faint(bits: int = 16) -> Marker:
+    return jm.make_marker(SHAPE, jm.Key(bytes(32)), bits=bits).suited(limits=FAINT)
+
+
+def evidence(passband: str, limits: dict[str, float]) -> tuple[float, float]:
+    """Evidence for the true message in noise, measured; and predicted for marks as large as those."""
+    ratios, predicted = [], []
+    for number in range(4):
+        marker = marker_of(passband, bytes([number] * 32))
+        word = marker.codeword(b"ab")
+        marked, info = marker.write(word, make_budget(limits=limits))
+        for seed in range(3):
+            received = marker.receive(jm.attack(marked, "noise", NOISE, seed=3 * number + seed))
+            score, norm = marker.reader.claim(received, jnp.asarray(word, marker.original.signal.dtype))
+            ratios.append(float(score) / float(norm))
+        predicted.append(marker.capacity.evidence(marker.bits, info.rms, NOISE))
+    return float(np.mean(ratios)) ** 2 / 2, float(np.mean(predicted))
+
+
+@pytest.mark.parametrize("passband", LADDER)
+def test_evidence_is_what_is_predicted(passband):
+    measured, predicted = evidence(passband, {"dame": 0.003})
+    assert predicted == pytest.approx(measured, rel=0.2)
+
+
+def test_faint_marks_prove_more_in_the_band_that_is_chosen():
+    assert faint().scheme == KeyedScheme(passband="low")
+    assert evidence("low", FAINT)[0] > 1.2 * evidence("tapered", FAINT)[0]
+
+
+def test_the_usual_band_stays_where_marks_are_strong():
+    usual = jm.make_marker(SHAPE, jm.Key(bytes(32)), bits=16)
+    assert usual.suited() is usual
+    assert usual.suited(limits={"dame": 0.02}) is usual
+    assert usual.suited(1e-5) is usual  # all bands cost the same
+
+
+@pytest.mark.parametrize("scheme", [KeyedScheme(hiding=False), KeyedScheme(profile=(1.0,) * 9), "host"])
+def test_other_schemes_stay_as_they_are(scheme):
+    marker = jm.make_marker(SHAPE, jm.Key(bytes(32)), bits=16, scheme=scheme)
+    assert marker.suited(limits=FAINT) is marker
+
+
+def test_the_choice_does_not_depend_on_the_key():
+    assert {
+        jm.make_marker(SHAPE, jm.Key(bytes([number] * 32)), bits=16).suited(limits=FAINT).scheme for number in range(3)
+    } == {faint().scheme}
+
+
+def test_large_payloads_have_room_in_low_bands():
+    """Six dimensions for each bit of message and tag, where there are so many."""
+    for passband in LADDER[1:]:
+        scheme, original = KeyedScheme(passband=passband), faint().original
+        assert len(scheme.strengths(original, 0)) >= round(PASS_BANDS[passband].share * 64)
+        assert scheme.dimensions(original, 256) >= 6 * (256 + 28)
+        assert set(scheme.strengths(original, 256)) == {1.0}
+
+
+def test_what_is_asked_to_be_survived_decides():
+    """Without much noise, many dimensions are worth more than energy in each."""
+    marker = jm.make_marker(SHAPE, jm.Key(bytes(32)), bits=16)
+    assert marker.suited(limits={"dame": 0.002}).scheme.passband != "tapered"
+    assert marker.suited(limits={"dame": 0.002}, noise=1e-4) is marker
+    with pytest.raises(jm.JaxmarkError, match="at least 0"):
+        marker.suited(limits=FAINT, noise=-1.0)
+
+
+def test_faint_marks_are_read_with_their_record_and_without():
+    key = jm.Key(bytes(range(32)))
+    marked, info = jm.embed(SHAPE, b"ab", key, limits=FAINT)
+    assert info.record.parameters["passband"] == "low"
+    with_record = jm.detect(marked, original=SHAPE, key=key, message=b"ab", record=info.record)
+    without = jm.detect(marked, original=SHAPE, key=key, message=b"ab")
+    assert with_record.message == without.message == b"ab"
+    # One of two versions, and one of two bands that share a tenth.
+    price = without.log10_p_unfloored - with_record.log10_p_unfloored
+    assert price == pytest.approx(math.log10(2 * 2 / 0.1), abs=0.4)
+    assert jm.detect(marked, original=SHAPE, key=jm.new_key(), bits=16).log10_p > -6
+
+
+def test_all_bands_are_tried_beside_one_alignment(monkeypatch):
+    calls, align = [], alignment.align
+    monkeypatch.setattr(alignment, "align", lambda *given, **options: (calls.append(1), align(*given, **options))[1])
+    found, marker = make_markers(SHAPE, jm.new_key(), bits=16).detect(jm.attack(SHAPE, "noise", 0.001, seed=0))
+    assert len(calls) == 2  # of both versions, whose originals differ
+    assert not found.detected()
+    assert marker.choices.version in (1, 2)
+
+
+def test_a_scheme_that_is_given_is_the_only_one_read():
+    marked = marker_of("low").embed(b"ab", 4e-4)[0]
+    assert jm.detect(marked, original=SHAPE, key=jm.Key(bytes(32)), bits=16).message == b"ab"
+    alone = make_markers(SHAPE, jm.Key(bytes(32)), bits=16, scheme=replace(KeyedScheme(), passband="low"))
+    assert alone.detect(marked)[0].message == b"ab"
+    other = make_markers(SHAPE, jm.Key(bytes(32)), bits=16, scheme=KeyedScheme())
+    assert other.detect(marked)[0].message is None
+
+
+def test_evidence_grows_with_the_mark_up_to_half_of_the_dimensions():
+    capacity = Capacity(faint().original, KeyedScheme(passband="low"))
+    sizes = [1e-5, 1e-4, 1e-3, 1.0]
+    values = [capacity.evidence(16, size, NOISE) for size in sizes]
+    assert values == sorted(values)
+    assert values[-1] == pytest.approx(capacity._left(16).dimensions.sum() / 2, rel=1e-3)
+    assert capacity.needed(16, values[1], NOISE) == pytest.approx(sizes[1], rel=1e-6)
+    assert capacity.needed(16, 2 * values[-1], NOISE) == math.inf
+
+
+@pytest.mark.slow
+def test_tuning_begins_with_the_band_that_suits():
+    tuned = tune(SHAPE, [("noise", 0.005)], limits=FAINT, key=jax.random.key(0), bits=16, margin="evidence")
+    assert tuned.report.tried_default.min() > 1.1 * evidence("tapered", FAINT)[0]
+    assert tuned.report.tried.min() >= tuned.report.tried_default.min()
