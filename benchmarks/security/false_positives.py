@@ -5,9 +5,10 @@ For many keys and hard suspects, through `Marker.observe`, `detectors.claims` an
 the rate over all must be at least a thirtieth of it, at levels where that makes 10 hits or more (down to 1e-3 with the
 default number of keys): a bound that never fires proves nothing. As a control, the same checks of a bound with the
 exponent doubled must fail. The same for a message that was read: the best of all, paid for by the union bound, and
-without it as a control. Exit status 1 if a check does not end so.
+without it as a control. Exit status 1 if a check does not end so. With --surfaces, suspects were meshed anew, so that
+only their surface is known.
 
-    python benchmarks/security/false_positives.py [--keys N] [--mesh FILE]
+    python benchmarks/security/false_positives.py [--keys N] [--surfaces] [--mesh FILE]
 """
 
 import math
@@ -47,6 +48,14 @@ def sample() -> Mesh:
     return jm.make_mesh(ball.vertices * (1 + 0.05 * np.random.default_rng(0).normal(size=(162, 1))), ball.faces)
 
 
+def smooth_sample() -> Mesh:
+    """A smooth body of 642 points, which other meshes can approximate."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    x, y, z = ball.vertices.T
+    radius = 1 + 0.2 * np.sin(3 * x + 1) * np.cos(2 * y) + 0.1 * np.sin(4 * z + y)
+    return jm.make_mesh(ball.vertices * radius[:, None] * [1.0, 1.2, 1.5], ball.faces)
+
+
 def suspects(marker: jm.watermark.Marker) -> dict[str, Observation]:
     """What `detect` sees of meshes that know nothing of the keys tried."""
     mesh, random = marker.original.mesh, np.random.default_rng(1)
@@ -80,13 +89,48 @@ def suspects(marker: jm.watermark.Marker) -> dict[str, Observation]:
         "affine": mesh._replace(vertices=vertices @ np.diag([1, 1.1, 0.9]) + 3),
         "sign of the position": mesh._replace(vertices=vertices + 1e-3 * size * np.sign(vertices)),
     }
+    return stackable({name: marker.observe(suspect) for name, suspect in meshes.items()})
+
+
+def surfaces(marker: jm.watermark.Marker) -> dict[str, Observation]:
+    """What `detect` sees of meshes that were meshed anew, of which only the surface is known."""
+    mesh, random = marker.original.mesh, np.random.default_rng(2)
+    other = jm.make_marker(mesh, jm.Key(bytes([204] * 32)), bits=marker.bits, scheme=marker.scheme)
+    marked = write(other, MESSAGE, make_budget(BUDGET))
+    near = mesh._replace(vertices=mesh.vertices * (1 + 0.01 * random.normal(size=(len(mesh.vertices), 1))))
+    fine = jm.attack(mesh, "midpoint", 2, seed=0)
+    inner = np.linalg.norm(fine.vertices - fine.vertices.mean(axis=0), axis=1)
+    bumps = 1e-3 * marker.original.diagonal * random.normal(size=fine.vertices.shape)
+    edge = (np.abs(fine.vertices[:, 2] - np.median(fine.vertices[:, 2])) < 0.05 * inner.max())[:, None]
+    meshes = {
+        "simplified": jm.attack(mesh, "simplification", 0.5, seed=0),
+        "simplified further": jm.attack(mesh, "simplification", 0.7, seed=0),
+        "subdivided": jm.attack(mesh, "loop", 1, seed=0),
+        "subdivided, noised": jm.attack(fine, "noise", 0.005, seed=4),
+        "marked under another key, subdivided": jm.attack(marked, "midpoint", 1, seed=0),
+        "marked under another key, simplified": jm.attack(marked, "simplification", 0.5, seed=0),
+        "near shape, subdivided": jm.attack(near, "midpoint", 1, seed=0),
+        "rough in one belt only": fine._replace(vertices=fine.vertices + edge * bumps),
+        "quiet in one belt only": fine._replace(vertices=fine.vertices + ~edge * bumps),
+        "isotropic": jm.attack(mesh, "isotropic", 1, seed=0),
+    }
     seen = {name: marker.observe(suspect) for name, suspect in meshes.items()}
+    assert all(one.normals is not None for one in seen.values()), "A suspect was compared point by point."
+    return stackable(seen)
+
+
+def stackable(seen: dict[str, Observation]) -> dict[str, Observation]:
+    """The same with equal shapes."""
     # As many columns for each, so that they stack; those of zeros are dropped.
-    columns = [one.nuisance for one in seen.values() if one.nuisance is not None]
-    if not columns:
+    most = max((one.nuisance.shape[1] for one in seen.values() if one.nuisance is not None), default=0)
+    if not most:
         return seen
-    none = jnp.zeros_like(columns[0])
-    return {name: one if one.nuisance is not None else one._replace(nuisance=none) for name, one in seen.items()}
+
+    def widened(one: Observation) -> Observation:
+        given = one.residual[:, :0] if one.nuisance is None else one.nuisance
+        return one._replace(nuisance=jnp.pad(given, ((0, 0), (0, most - given.shape[1]))))
+
+    return {name: widened(one) for name, one in seen.items()}
 
 
 def best_claims(
@@ -150,11 +194,13 @@ def holds(values: np.ndarray, names: list[str], *, fires: bool, report: bool) ->
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--keys", type=int, default=70_000, help="multiple of 500")
-    parser.add_argument("--mesh", help="by default a rough sphere of 162 points")
+    parser.add_argument("--surfaces", action="store_true", help="suspects that were meshed anew instead")
+    parser.add_argument("--mesh", help="by default a rough sphere of 162 points; with --surfaces a smooth body of 642")
     arguments = parser.parse_args()
-    mesh = load(parser, arguments.mesh) if arguments.mesh else sample()
+    usual = smooth_sample if arguments.surfaces else sample
+    mesh = load(parser, arguments.mesh) if arguments.mesh else usual()
     marker = jm.make_marker(mesh, jm.Key(bytes([255] * 32)), bits=8 * len(MESSAGE))
-    seen = suspects(marker)
+    seen = (surfaces if arguments.surfaces else suspects)(marker)
     names = list(seen)
     values = united(log10_p_claimed, *best_claims(marker, seen, arguments.keys, [MESSAGE]))
     print("a message claimed: nominal, counted with 95 % interval")
