@@ -18,9 +18,10 @@ which `matched` reaches. By Hoeffding's bound, exp(-S² / 2‖a‖²), a claim p
 ½ Σ log₂(1 + s_i) bits of a message and its tag, the capacity of parallel Gaussian channels.
 
 This bounds what the model describes, no more. Receivers can beat it by what it leaves out: where vertices lie along the
-surface, how faces join them, what errors have in common. They can fall short as the model assumes too much: errors do
-depend on the mark, are not Gaussian, and their means are known only to those who know the attack. A variance that was
-estimated from 16 values makes 1/σ² larger by 15/13 in the mean, and so the bound, by up to 0.6 dB.
+surface, how faces join them, what errors have in common. They can fall short as the model assumes too much: the mark
+is as strong as it was written, whereas smoothing weakens it; errors do depend on the mark, and are not Gaussian; their
+means are known only to those who know the attack. And a variance that was estimated from 16 values makes 1/σ² larger by
+15/13 in the mean, and so the bound, by up to 0.6 dB.
 """
 
 from collections.abc import Callable, Sequence
@@ -173,7 +174,7 @@ def measure(original: Original, suspect: Mesh) -> Heights:
 
 def carried(carrier: KeyedCarrier, there: Heights) -> Matrix:
     """The covariance of A w for a mark of unit strength, A T Tᵀ Aᵀ."""
-    coefficients, moving = carrier.coefficients(1.0), np.abs(np.asarray(carrier.chips.signs))
+    coefficients, moving = carrier.coefficients(1.0), jnp.abs(jnp.asarray(carrier.chips.signs))
 
     @jax.jit
     def pull(block: jax.Array) -> jax.Array:
