@@ -174,7 +174,10 @@ def measure(original: Original, suspect: Mesh) -> Heights:
 
 def carried(carrier: KeyedCarrier, there: Heights) -> Matrix:
     """The covariance of A w for a mark of unit strength, A T Tᵀ Aᵀ."""
-    coefficients, moving = carrier.coefficients(1.0), jnp.abs(jnp.asarray(carrier.chips.signs))
+    coefficients, moving = (
+        carrier.coefficients(1.0),
+        jnp.abs(jnp.asarray(carrier.chips.signs, carrier.host.signal.dtype)),
+    )
 
     @jax.jit
     def pull(block: jax.Array) -> jax.Array:
