@@ -94,7 +94,7 @@ def test_a_whole_bound_where_its_model_is_exact(bounds, key):
     mesh = bumpy_sphere(4)
     marker = make_marker(mesh, key, bits=0)
     marked, _ = marker.embed(b"", BUDGET)
-    found = bounds.make_bound(marker, marked, scattered(marked, 600, 1), lambda other: scattered(other, 600, 1), 0)
+    found = bounds.make_bound(marker, marked, scattered(marked, 600, 1), lambda other: scattered(other, 600, 1), seed=0)
     assert found.vertices == 600
     assert 0 < found.square < 600
     assert found.bits > found.square / 2 / np.log(2)  # as log(1 + s) > s / (1 + s)

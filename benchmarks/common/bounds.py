@@ -20,8 +20,9 @@ which `matched` reaches. By Hoeffding's bound, exp(-S² / 2‖a‖²), a claim p
 This bounds what the model describes, no more. Receivers can beat it by what it leaves out: where vertices lie along the
 surface, how faces join them, what errors have in common. They can fall short as the model assumes too much: the mark
 is as strong as it was written, whereas smoothing weakens it; errors do depend on the mark, and are not Gaussian; their
-means are known only to those who know the attack. And a variance that was estimated from 16 values makes 1/σ² larger by
-15/13 in the mean, and so the bound, by up to 0.6 dB.
+means are known only to those who know the attack. A variance that was estimated from 16 values makes 1/σ² larger by
+15/13 in the mean, and so the bound, by up to 0.6 dB. More other marks have vertices nearer to each of a suspect's, which
+tell its error better: the bound grows with their number, and no number is enough. With few, real claims beat it.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,8 +44,8 @@ from jaxmark.watermark.carriers.reception import Extent, nuisance_basis
 from jaxmark.watermark.marking import Marker
 
 MOST_VERTICES = 5_000  # of a suspect, for matrices of M x M are dense
-OTHERS = 8  # other marks, of random signs
-NEAREST = 16  # vertices of their suspects, about two of each, that tell a vertex's error
+OTHERS = 64  # other marks, of random signs
+NEAREST = 16  # vertices of their suspects that tell a vertex's error, those that are nearest to it
 ROUNDS = 3  # of fitting affine maps and variances in turn
 FAR = 0.005  # distance from the original, in diagonals, beyond which a vertex is no part of it
 COLUMNS = 32  # rows of A that are filtered at a time
@@ -112,7 +113,9 @@ class Channel(NamedTuple):
         return score**2 / square if score > 0 and square > 0 else 0.0
 
 
-def make_bound(marker: Marker, marked: Mesh, suspect: Mesh, attack: Callable[[Mesh], Mesh], seed: int) -> Bound | None:
+def make_bound(
+    marker: Marker, marked: Mesh, suspect: Mesh, attack: Callable[[Mesh], Mesh], *, others: int = OTHERS, seed: int
+) -> Bound | None:
     """Bound what a suspect can carry, as the module says.
 
     Args:
@@ -120,6 +123,7 @@ def make_bound(marker: Marker, marked: Mesh, suspect: Mesh, attack: Callable[[Me
         marked: the mesh with the mark that is claimed.
         suspect: what the attack made of it, where the original lies.
         attack: makes suspects of the original with other marks.
+        others: number of those marks.
         seed: of those marks.
 
     Returns:
@@ -132,18 +136,18 @@ def make_bound(marker: Marker, marked: Mesh, suspect: Mesh, attack: Callable[[Me
     mark = shift_of(original, marked)
     size = root_mean_square(mark[original.used])
     ones = jnp.ones(carrier.code_bits, original.signal.dtype)
-    keys = jax.random.split(jax.random.key(seed), OTHERS)
+    keys = jax.random.split(jax.random.key(seed), others)
     units = [original.to_host(carrier.redraw(key).displacement(ones)) for key in keys]
     sizes = [root_mean_square(shift[original.used]) for shift in units]
     shifts = [size / one * shift for one, shift in zip(sizes, units, strict=True)]
     there = measure(original, suspect)
-    others = [measure(original, attack(displace(original, shift))) for shift in shifts]
+    elsewhere = [measure(original, attack(displace(original, shift))) for shift in shifts]
     affine = original.to_host(nuisance_basis(carrier.host._replace(extent=Extent(scales=0, degree=1))))
     nuisance = there.columns(affine)
-    if min(len(one.height) for one in (there, *others)) <= 2 * max(NEAREST, nuisance.shape[1]):
+    if min(len(one.height) for one in (there, *elsewhere)) <= 2 * max(NEAREST, nuisance.shape[1]):
         return None
-    errors = [one.height - one.along(shift) for one, shift in zip(others, shifts, strict=True)]
-    mean, deviation = expected(there, others, errors, [one.columns(affine) for one in others])
+    errors = [one.height - one.along(shift) for one, shift in zip(elsewhere, shifts, strict=True)]
+    mean, deviation = expected(there, elsewhere, errors, [one.columns(affine) for one in elsewhere])
     deviation = np.maximum(deviation, original.grid / original.diagonal / np.sqrt(12))  # that of rounding
     covariance = size**2 / np.mean(np.square(sizes)) * carried(carrier, there)
     channel = make_channel(covariance, deviation, nuisance)

@@ -47,7 +47,7 @@ from jaxmark.watermark.schemes import get_scheme
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, make_parser
 from common.attacks import parse
-from common.bounds import make_bound
+from common.bounds import OTHERS, make_bound
 from common.detection import compilation_cache, detect
 from common.marks import Case, Subject, add_schemes, mark, parse_case
 from common.tables import Row, head, line, save, say
@@ -139,12 +139,14 @@ def log10_p(square: float) -> float:
     return -square / 2 / math.log(10)
 
 
-def bounded(subject: Subject, steps: str, seed: int) -> Row:
+def bounded(subject: Subject, steps: str, seed: int, others: int) -> Row:
     """What the vertices of a suspect can carry by the model; nothing where the model says nothing."""
     marker, marked = subject.marker, subject.marked
     try:
         suspect, first = narrowest(marked, steps, seed)
-        found = make_bound(marker, marked, suspect, lambda other: attacked(other, first, seed), seed)
+        found = make_bound(
+            marker, marked, suspect, lambda other: attacked(other, first, seed), others=others, seed=seed
+        )
     except Exception as error:  # of another program, on another mark
         return {"bound_note": failed(error)["note"]}
     if found is None:
@@ -165,7 +167,7 @@ def claimed(subject: Subject, suspect: Mesh) -> float | None:
         return None
 
 
-def tried(subject: Subject, source: Path, steps: str, seed: int) -> Row:
+def tried(subject: Subject, source: Path, steps: str, seed: int, others: int) -> Row:
     """One suspect, made and read."""
     rng = np.random.default_rng([zlib.crc32(steps.encode()), seed])
     marker, message = subject.marker, subject.message
@@ -182,7 +184,7 @@ def tried(subject: Subject, source: Path, steps: str, seed: int) -> Row:
     if row["pose"]:
         found = Pose(*(np.array(row["pose"][name]) for name in Pose._fields))
         row["pose_error"] = pose_error(marker.original.mesh, true, found)
-    row |= {"claim": claimed(subject, suspect)} | bounded(subject, steps, seed)
+    row |= {"claim": claimed(subject, suspect)} | bounded(subject, steps, seed, others)
     if "bound" in row:
         row["gap_dB"] = 10 * math.log10(row["bound"] / row["claim"]) if row["claim"] else math.inf
     if "message" in answer:
@@ -205,7 +207,9 @@ def measured(source: Path, scheme: str, wanted: Case, options: argparse.Namespac
             yield row | {"note": f"not marked: {error}"}
             continue
         for steps in options.attacks:
-            yield row | {"attack": steps, "declared_noise": made.noise} | tried(made, source, steps, seed)
+            yield (
+                row | {"attack": steps, "declared_noise": made.noise} | tried(made, source, steps, seed, options.others)
+            )
 
 
 def controls(sources: list[Path], scheme: str, wanted: Case, options: argparse.Namespace, trial: int) -> Iterator[Row]:
@@ -309,6 +313,7 @@ def main() -> None:
     parser.add_argument(
         "--controls", type=int, default=0, help="how many other suspects, of the first case, each with 10 keys"
     )
+    parser.add_argument("--others", type=int, default=OTHERS, help="how many other marks tell the model's errors")
     parser.add_argument("--output", type=Path, help="for foreign.md and .json, rewritten after each mesh and case")
     options = parser.parse_args()
     known = " ".join(ATTACKS.split()).split("; ")
