@@ -21,8 +21,8 @@ This bounds what the model describes, no more. Receivers can beat it by what it 
 surface, how faces join them, what errors have in common. They can fall short as the model assumes too much: the mark
 is as strong as it was written, whereas smoothing weakens it; errors do depend on the mark, and are not Gaussian; their
 means are known only to those who know the attack. A variance that was estimated from 16 values makes 1/σ² larger by
-15/13 in the mean, and so the bound, by up to 0.6 dB. More other marks have vertices nearer to each of a suspect's, which
-tell its error better: the bound grows with their number, and no number is enough. With few, real claims beat it.
+15/13 in the mean, and so the bound, by up to 0.6 dB. More other marks have vertices nearer to each of a suspect's,
+which tell its error better: the bound grows with their number, and no number is enough. With few, claims beat it.
 """
 
 from collections.abc import Callable, Sequence
