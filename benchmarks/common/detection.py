@@ -28,7 +28,6 @@ def detect(
     suffix: str,
     *,
     like: Path | None = None,
-    claim: bytes | None = None,
 ) -> tuple[subprocess.CompletedProcess[str], float]:
     """Run `jaxmark detect` on a suspect's file.
 
@@ -38,7 +37,6 @@ def detect(
         source: the original's file.
         suffix: of the suspect's file.
         like: see `jaxmark.save_mesh`.
-        claim: a message that is claimed.
 
     Returns:
         The process, and its seconds.
@@ -48,7 +46,6 @@ def detect(
         jm.save_mesh(suspect, file, like=like)
         jm.save_key(marker.key, key)
         options = f"-m jaxmark detect --bits {marker.bits} --scheme {marker.scheme.name} --json".split()
-        options += ["--message", claim.hex()] if claim else []
         command = [sys.executable, *options, file, "--original", source, "--key", key]
         ended, seconds = timed(subprocess.run, command, capture_output=True, text=True)
     ended.stderr = ended.stderr.replace(f"{folder}/", "")

@@ -4,10 +4,22 @@ Each suspect is a marked mesh after ATTACKS, turned, shifted, scaled by 0.01 to 
 read by a process, `jaxmark detect`. Printed are whether the message is exact, what its reading proves, or how many
 bits, with their tag, such a suspect could carry at most where it does not read, and how far the pose found is from the
 true one. With --controls, also how often something is detected in suspects without this mark.
+
+Beside each suspect of at most 5,000 vertices stands a bound on what they can carry, from original and suspect. It is a
+bound by a model, see `common/bounds.py`, which says what the model leaves out; nothing else makes it true. In chains it
+is that of the step that leaves the fewest vertices, as what comes after adds nothing of the mark. The columns:
+
+    claim      log10 p of a claim of the true message, without its floor, which orders attacks and proves nothing
+    bound      the least log10 p of a claim by the model
+    gap dB     how far S²/‖a‖² of the claim is below the bound; where it is negative, the claim beats the model
+    matched    log10 p by the model's own best receiver, in the true pose, with the errors of the same attack known
+    bits bound how many bits, with their tag, the vertices tell at most by the model
 """
 
 import argparse
 import json
+import math
+import statistics
 import sys
 import zlib
 from collections import Counter
@@ -35,8 +47,9 @@ from jaxmark.watermark.schemes import get_scheme
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, make_parser
 from common.attacks import parse
+from common.bounds import OTHERS, make_bound
 from common.detection import compilation_cache, detect
-from common.marks import Case, add_schemes, mark, parse_case
+from common.marks import Case, Subject, add_schemes, mark, parse_case
 from common.tables import Row, head, line, save, say
 
 LEVEL = -6  # log10 of the false-positive probability that counts in the controls
@@ -74,12 +87,21 @@ ATTACKS = """none; simplification 0.5; simplification 0.7; simplification 0.9; s
 simplification 0.975; collapse 0.9; qslim 0.9; midpoint 1; loop 1; sqrt3 1; isotropic 1; isotropic 0.5; isotropic 2;
 iso-surface 100; iso-surface 200; poisson 8; cropping 0.1; cropping 0.3; cropping 0.5; cropping 0.8;
 simplification 0.7 + noise 0.001; cropping 0.3 + quantisation 9; simplification 0.5 + smoothing 50;
+isotropic 1.5 + smoothing 50 + isotropic 1; simplification 0.96 + loop 2;
 added-geometry 1"""
 
 
 def attacked(mesh: Mesh, steps: str, seed: int) -> Mesh:
     """A mesh after attacks one by one."""
     return jm.attacks.chain(plain(mesh), [(KINDS.get(kind, kind), size) for kind, size in parse(steps)], seed=seed)
+
+
+def narrowest(mesh: Mesh, steps: str, seed: int) -> tuple[Mesh, str]:
+    """A mesh after the first steps of a chain, those up to where the fewest vertices are left; and these steps."""
+    names = steps.split(" + ")
+    firsts = [" + ".join(names[: count + 1]) for count in range(len(names))]
+    meshes = [attacked(mesh, first, seed) for first in firsts]
+    return min(zip(meshes, firsts, strict=True), key=lambda pair: len(pair[0].vertices))
 
 
 def found_again(mesh: Mesh, rng: Generator) -> tuple[Mesh, Pose]:
@@ -97,9 +119,9 @@ def pose_error(original: Mesh, true: Pose, found: Pose) -> float:
     return float(jm.distortion.rms(found(true(points)) - points)) / diagonal(original)
 
 
-def read(marker: jm.watermark.Marker, suspect: Mesh, source: Path, suffix: str, claim: bytes | None = None) -> Row:
-    """What a process of `jaxmark detect` says of a suspect's file, with a claimed message or without."""
-    run, seconds = detect(marker, suspect, source, suffix, claim=claim)
+def read(marker: jm.watermark.Marker, suspect: Mesh, source: Path, suffix: str) -> Row:
+    """What a process of `jaxmark detect` says of a suspect's file."""
+    run, seconds = detect(marker, suspect, source, suffix)
     row: Row = {"seconds": seconds}
     if run.returncode in (0, 1) and run.stdout:  # a process that cannot start ends with 1, too
         return row | json.loads(run.stdout)
@@ -112,11 +134,45 @@ def failed(error: Exception) -> Row:
     return {"note": f"attack failed: {type(error).__name__}: {' '.join(str(error).split())}"}
 
 
-def tried(marker: jm.watermark.Marker, marked: Mesh, message: bytes, source: Path, steps: str, seed: int) -> Row:
+def log10_p(square: float) -> float:
+    """log10 of Hoeffding's bound for S²/‖a‖²."""
+    return -square / 2 / math.log(10)
+
+
+def bounded(subject: Subject, steps: str, seed: int, others: int) -> Row:
+    """What the vertices of a suspect can carry by the model; nothing where the model says nothing."""
+    marker, marked = subject.marker, subject.marked
+    try:
+        suspect, first = narrowest(marked, steps, seed)
+        found = make_bound(
+            marker, marked, suspect, lambda other: attacked(other, first, seed), others=others, seed=seed
+        )
+    except Exception as error:  # of another program, on another mark
+        return {"bound_note": failed(error)["note"]}
+    if found is None:
+        return {}
+    return {
+        "bound": log10_p(found.square),
+        "matched": log10_p(found.matched),
+        "bits_bound": found.bits,
+        "bounded_step": first,
+    }
+
+
+def claimed(subject: Subject, suspect: Mesh) -> float | None:
+    """log10 p of a claim of the true message, without floor; None for a suspect that is refused."""
+    try:
+        return subject.marker.detect(suspect, subject.message).log10_p_unfloored
+    except jm.JaxmarkError:
+        return None
+
+
+def tried(subject: Subject, source: Path, steps: str, seed: int, others: int) -> Row:
     """One suspect, made and read."""
     rng = np.random.default_rng([zlib.crc32(steps.encode()), seed])
+    marker, message = subject.marker, subject.message
     try:
-        suspect, true = found_again(attacked(marked, steps, seed), rng)
+        suspect, true = found_again(attacked(subject.marked, steps, seed), rng)
     except Exception as error:
         return failed(error)
     suffix = str(rng.choice([".ply", ".obj"]))
@@ -128,14 +184,16 @@ def tried(marker: jm.watermark.Marker, marked: Mesh, message: bytes, source: Pat
     if row["pose"]:
         found = Pose(*(np.array(row["pose"][name]) for name in Pose._fields))
         row["pose_error"] = pose_error(marker.original.mesh, true, found)
+    row |= {"claim": claimed(subject, suspect)} | bounded(subject, steps, seed, others)
+    if "bound" in row:
+        row["gap_dB"] = 10 * math.log10(row["bound"] / row["claim"]) if row["claim"] else math.inf
     if "message" in answer:
         right = answer["message"] == message.hex()
         row["message"] = "yes" if right else "WRONG" if answer["message"] else "no"
         if not right:
             # What a claim proves of the true message, exp(-SNR/2), is also a bound on what such a suspect could carry:
             # the capacity of a Gaussian channel is at most SNR/2 nats, in however many dimensions.
-            claimed = read(marker, suspect, source, suffix, message).get("log10_p")
-            row["most_bits"] = None if claimed is None else float(np.floor(-claimed * np.log2(10)))
+            row["most_bits"] = None if row["claim"] is None else math.floor(-row["claim"] * math.log2(10))
     return row
 
 
@@ -149,7 +207,9 @@ def measured(source: Path, scheme: str, wanted: Case, options: argparse.Namespac
             yield row | {"note": f"not marked: {error}"}
             continue
         for steps in options.attacks:
-            yield row | {"attack": steps, "declared_noise": made.noise} | tried(*made[:3], source, steps, seed)
+            yield (
+                row | {"attack": steps, "declared_noise": made.noise} | tried(made, source, steps, seed, options.others)
+            )
 
 
 def controls(sources: list[Path], scheme: str, wanted: Case, options: argparse.Namespace, trial: int) -> Iterator[Row]:
@@ -206,7 +266,8 @@ def tables(rows: list[Row]) -> str:
         text = "" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
         return text.replace("|", "\\|")
 
-    columns = ["mesh", "attack", "seed", "vertices", "message", "log10_p", "most_bits", "coverage", "method"]
+    columns = ["mesh", "attack", "seed", "vertices", "message", "log10_p", "most_bits"]
+    columns += ["claim", "bound", "gap_dB", "matched", "bits_bound", "coverage", "method"]
     columns += ["pose_error", "residual", "seconds", "note"]
     text = []
     for case in dict.fromkeys(row["case"] for row in rows):
@@ -214,8 +275,26 @@ def tables(rows: list[Row]) -> str:
         text += [f"## {case}", "", head(*(column.replace("_", " ") for column in columns))]
         text += [line(*(cell(row.get(column)) for column in columns)) for row in mine]
         reads = Counter(row.get("message") for row in mine)
-        text += ["", f"Of {len(mine)} rows, {reads['yes']} read exactly and {reads['WRONG']} wrongly.", ""]
+        text += [
+            "",
+            f"Of {len(mine)} rows, {reads['yes']} read exactly and {reads['WRONG']} wrongly.",
+            "",
+            *outcomes(mine),
+            "",
+        ]
     return "\n".join(text)
+
+
+def outcomes(rows: list[Row]) -> Iterator[str]:
+    """For each attack, how many messages read, how many claims are proven, and how far the model's bound is."""
+    yield head("attack", "suspects", "read", f"claims of log10 p ≤ {LEVEL}", "bounds", "gap, dB: median", "worst")
+    for attack in dict.fromkeys(row["attack"] for row in rows):
+        mine = [row for row in rows if row["attack"] == attack]
+        reads = sum(row.get("message") == "yes" for row in mine)
+        proven = sum((row.get("claim") or 0) <= LEVEL for row in mine)
+        gaps = [row["gap_dB"] for row in mine if "gap_dB" in row]
+        shown = (f"{statistics.median(gaps):.1f}", f"{max(gaps):.1f}") if gaps else ("-", "-")
+        yield line(attack, len(mine), reads, proven, sum("bound" in row for row in mine), *shown)
 
 
 def main() -> None:
@@ -234,6 +313,7 @@ def main() -> None:
     parser.add_argument(
         "--controls", type=int, default=0, help="how many other suspects, of the first case, each with 10 keys"
     )
+    parser.add_argument("--others", type=int, default=OTHERS, help="how many other marks tell the model's errors")
     parser.add_argument("--output", type=Path, help="for foreign.md and .json, rewritten after each mesh and case")
     options = parser.parse_args()
     known = " ".join(ATTACKS.split()).split("; ")

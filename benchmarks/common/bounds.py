@@ -1,0 +1,244 @@
+"""What the vertices of a simplified suspect can carry at most, by a model of them.
+
+Each of a suspect's M vertices, where the original lies, is d_i = n_i · (q_i - foot_i) above the original's surface. The
+foot is the point of that surface that is closest to the vertex q_i, and n_i the original's normal there. The model is
+
+    d = A w + B c + e.
+
+A interpolates the mark's displacement w at the feet (barycentric) and takes it along the normals; B does the same to
+affine maps, which have any coefficients c, as nobody knows the pose of a suspect exactly. The errors e_i are
+independent and Gaussian; their means and variances are those of simplifications of the original with other marks. A
+keyed mark is w = T r with random signs r, so that its covariance is T Tᵀ. Divide each height by its error's standard
+deviation, project B off, and let s_i be the eigenvalues of the covariance of A w then. Each score S = r · a with an a
+that is linear in d has
+
+    (E S)² / E‖a‖² ≤ Σ s_i / (1 + s_i) ≤ M,
+
+which `matched` reaches. By Hoeffding's bound, exp(-S² / 2‖a‖²), a claim proves half of it in nats. And d tells at most
+½ Σ log₂(1 + s_i) bits of a message and its tag, the capacity of parallel Gaussian channels.
+
+This bounds what the model describes, no more. Receivers can beat it by what it leaves out: where vertices lie along the
+surface, how faces join them, what errors have in common. They can fall short as the model assumes too much: the mark
+is as strong as it was written, whereas smoothing weakens it; errors do depend on the mark, and are not Gaussian; their
+means are known only to those who know the attack. A variance that was estimated from 16 values makes 1/σ² larger by
+15/13 in the mean, and so the bound, by up to 0.6 dB. More other marks have vertices nearer to each of a suspect's,
+which tell its error better: the bound grows with their number, and no number is enough. With few, claims beat it.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float64
+from scipy import sparse
+from scipy.linalg import eigvalsh
+from scipy.spatial import KDTree
+
+from jaxmark.alignment.original import Original, displace, shift_of
+from jaxmark.geometry.mesh import Mesh, unit, used_vertices, vertex_normals
+from jaxmark.geometry.surfaces import Surface, barycentric
+from jaxmark.watermark.carriers.keyed import KeyedCarrier
+from jaxmark.watermark.carriers.reception import Extent, nuisance_basis
+from jaxmark.watermark.marking import Marker
+
+MOST_VERTICES = 5_000  # of a suspect, for matrices of M x M are dense
+OTHERS = 64  # other marks, of random signs
+NEAREST = 16  # vertices of their suspects that tell a vertex's error, those that are nearest to it
+ROUNDS = 3  # of fitting affine maps and variances in turn
+FAR = 0.005  # distance from the original, in diagonals, beyond which a vertex is no part of it
+COLUMNS = 32  # rows of A that are filtered at a time
+
+Numbers = Float64[np.ndarray, " vertices"]
+Matrix = Float64[np.ndarray, "vertices vertices"]
+Unknowns = Float64[np.ndarray, "vertices unknowns"]
+
+
+class Heights(NamedTuple):
+    """How far a suspect's vertices are above the original."""
+
+    places: Float64[np.ndarray, "vertices 3"]  # in diagonals, centred as `Original.positions`
+    height: Numbers  # d, in diagonals
+    normals: Float64[np.ndarray, "vertices 3"]  # of the original at the feet, unit length
+    share: sparse.csr_array  # barycentric coordinates of the feet, [vertices, points]
+
+    def along(self, displacement: Float64[np.ndarray, "points 3"]) -> Numbers:
+        """Heights by a displacement of the original's points: A w."""
+        return np.sum(self.normals * (self.share @ displacement), axis=1)
+
+    def columns(self, basis: Float64[np.ndarray, "points columns"]) -> Unknowns:
+        """Heights by each column of a basis, along each coordinate: B."""
+        there = self.share @ basis
+        return np.concatenate([self.normals[:, axis, None] * there for axis in range(3)], axis=1)
+
+
+class Bound(NamedTuple):
+    """The model's bound for one suspect."""
+
+    vertices: int  # M, those near the original
+    square: float  # S² / ‖a‖² of a claim, at most
+    bits: float  # of message and tag, at most
+    matched: float  # S² / ‖a‖² of the true claim by the receiver that is best by the model; 0 if its score is negative
+
+
+class Channel(NamedTuple):
+    """The model of one suspect, after each height was divided by its standard deviation, without B."""
+
+    deviation: Numbers  # of each error, in diagonals
+    nuisance: Unknowns  # orthonormal basis of what was projected off
+    covariance: Matrix  # of A w
+
+    def white(self, height: Numbers) -> Numbers:
+        """Heights in units of their deviation, without the nuisance."""
+        return self.cleaned(height / self.deviation)
+
+    def cleaned(self, white: Numbers) -> Numbers:
+        """What is left when the nuisance is projected off."""
+        return white - self.nuisance @ (self.nuisance.T @ white)
+
+    def signal_to_noise(self) -> Numbers:
+        """The eigenvalues s."""
+        return np.maximum(eigvalsh(self.covariance), 0)
+
+    def matched(self, height: Numbers, mark: Numbers) -> float:
+        """S² / ‖a‖² of a claim by the best receiver, whose a is Tᵀ Aᵀ (1 + C)⁻¹ d with the covariance C of A w.
+
+        Args:
+            height: d, without the means of its errors.
+            mark: A w of the mark that is claimed.
+        """
+        weights = np.linalg.solve(self.covariance + np.eye(len(height)), self.white(height))
+        score, square = float(self.white(mark) @ weights), float(weights @ self.covariance @ weights)
+        return score**2 / square if score > 0 and square > 0 else 0.0
+
+
+def make_bound(
+    marker: Marker, marked: Mesh, suspect: Mesh, attack: Callable[[Mesh], Mesh], *, others: int = OTHERS, seed: int
+) -> Bound | None:
+    """Bound what a suspect can carry, as the module says.
+
+    Args:
+        marker: what the mark was made by.
+        marked: the mesh with the mark that is claimed.
+        suspect: what the attack made of it, where the original lies.
+        attack: makes suspects of the original with other marks.
+        others: number of those marks.
+        seed: of those marks.
+
+    Returns:
+        The bound; None for marks that are not keyed, and for suspects of more vertices than `MOST_VERTICES`, or of so
+        few that an affine map may explain all their heights.
+    """
+    carrier, original = marker.carrier, marker.original
+    if not isinstance(carrier, KeyedCarrier) or len(suspect.vertices) > MOST_VERTICES:
+        return None
+    mark = shift_of(original, marked)
+    size = root_mean_square(mark[original.used])
+    ones = jnp.ones(carrier.code_bits, original.signal.dtype)
+    keys = jax.random.split(jax.random.key(seed), others)
+    units = [original.to_host(carrier.redraw(key).displacement(ones)) for key in keys]
+    sizes = [root_mean_square(shift[original.used]) for shift in units]
+    shifts = [size / one * shift for one, shift in zip(sizes, units, strict=True)]
+    there = measure(original, suspect)
+    elsewhere = [measure(original, attack(displace(original, shift))) for shift in shifts]
+    affine = original.to_host(nuisance_basis(carrier.host._replace(extent=Extent(scales=0, degree=1))))
+    nuisance = there.columns(affine)
+    if min(len(one.height) for one in (there, *elsewhere)) <= 2 * max(NEAREST, nuisance.shape[1]):
+        return None
+    errors = [one.height - one.along(shift) for one, shift in zip(elsewhere, shifts, strict=True)]
+    mean, deviation = expected(there, elsewhere, errors, [one.columns(affine) for one in elsewhere])
+    deviation = np.maximum(deviation, original.grid / original.diagonal / np.sqrt(12))  # that of rounding
+    covariance = size**2 / np.mean(np.square(sizes)) * carried(carrier, there)
+    channel = make_channel(covariance, deviation, nuisance)
+    s = channel.signal_to_noise()
+    matched = channel.matched(there.height - mean, there.along(mark))
+    return Bound(len(s), float(np.sum(s / (1 + s))), float(np.sum(np.log2(1 + s)) / 2), matched)
+
+
+def root_mean_square(x: Float64[np.ndarray, "points 3"]) -> float:
+    """Root of the mean square length."""
+    return float(np.sqrt(np.mean(np.sum(x**2, axis=1))))
+
+
+def measure(original: Original, suspect: Mesh) -> Heights:
+    """Measure the heights of a suspect's vertices, those that faces use and that are near the original."""
+    centre = np.asarray(original.points.vertices)[original.used].mean(axis=0)
+    places = (np.asarray(suspect.vertices)[used_vertices(suspect)] - centre) / original.diagonal
+    surface = Surface(Mesh(original.positions, original.points.faces))
+    feet, face = surface.closest(places)
+    near = np.linalg.norm(places - feet, axis=1) <= FAR
+    places, feet, corners = places[near], feet[near], np.asarray(surface.mesh.faces)[face[near]]
+    parts = barycentric(surface.mesh, face[near], feet)
+    normals = unit(np.einsum("mk,mkc->mc", parts, vertex_normals(surface.mesh)[corners]))
+    entries = parts.ravel(), (np.repeat(np.arange(len(feet)), 3), corners.ravel())
+    share = sparse.csr_array(entries, shape=(len(feet), len(original.positions)))
+    return Heights(places, np.sum(normals * (places - feet), axis=1), normals, share)
+
+
+def carried(carrier: KeyedCarrier, there: Heights) -> Matrix:
+    """The covariance of A w for a mark of unit strength, A T Tᵀ Aᵀ."""
+    coefficients, moving = (
+        carrier.coefficients(1.0),
+        jnp.abs(jnp.asarray(carrier.chips.signs, carrier.host.signal.dtype)),
+    )
+
+    @jax.jit
+    def pull(block: jax.Array) -> jax.Array:
+        """Tᵀ of displacements, `[rows, 3, columns]`, up to the signs of chips."""
+        return moving[:, :, None] * jax.vmap(lambda one: carrier.match_chips(one, coefficients), 2, 2)(block)
+
+    parts = []
+    for start in range(0, len(there.height), COLUMNS):
+        some = there.share[start : start + COLUMNS].toarray().T
+        block = np.zeros((len(moving), 3, COLUMNS), carrier.host.signal.dtype)
+        block[: len(some), :, : some.shape[1]] = some[:, None] * there.normals[start : start + COLUMNS].T
+        parts.append(np.asarray(pull(jnp.asarray(block))).reshape(-1, COLUMNS)[:, : some.shape[1]])
+    pulled = np.concatenate(parts, axis=1)
+    return np.asarray(pulled.T @ pulled, np.float64)
+
+
+def expected(
+    there: Heights, others: Sequence[Heights], errors: Sequence[Numbers], nuisance: Sequence[Unknowns]
+) -> tuple[Numbers, Numbers]:
+    """Estimate mean and standard deviation of each error from those of suspects with other marks.
+
+    The nuisance is fitted to the errors of each of these and subtracted, with weights by the variances of the round
+    before. Mean and deviation are those of the nearest vertices, of all of these suspects together; the variance is
+    larger by the mean's own, and by what the fit of the nuisance takes of squares on average.
+
+    Args:
+        there: the suspect's vertices.
+        others: those of suspects with other marks.
+        errors: heights of each of those without its mark.
+        nuisance: B of each of those.
+    """
+    tree = KDTree(np.concatenate([one.places for one in others]))
+    near = [np.asarray(tree.query(one.places, NEAREST)[1]) for one in (*others, there)]
+    *deviations, mine = (np.ones(len(some)) for some in near)
+    count, fitted = sum(map(len, errors)), sum(columns.shape[1] for columns in nuisance)
+    wider = np.sqrt((1 + 1 / NEAREST) * count / (count - fitted))
+    pool = np.concatenate(errors)
+    for _ in range(ROUNDS):
+        left = []
+        for error, columns, deviation in zip(errors, nuisance, deviations, strict=True):
+            basis, white = orthonormal(columns / deviation[:, None]), error / deviation
+            left.append(deviation * (white - basis @ (basis.T @ white)))
+        pool = np.concatenate(left)
+        least = 1e-9 * pool.std() + np.finfo(float).tiny  # where errors are the same, as if exact
+        *deviations, mine = (wider * pool[some].std(axis=1, ddof=1) + least for some in near)
+    return pool[near[-1]].mean(axis=1), mine
+
+
+def make_channel(covariance: Matrix, deviation: Numbers, nuisance: Unknowns) -> Channel:
+    """Make the model of a suspect from the covariance of A w, the deviation of each error, and B."""
+    basis = orthonormal(nuisance / deviation[:, None])
+    white = covariance / deviation[:, None] / deviation
+    white = white - basis @ (basis.T @ white)
+    return Channel(deviation, basis, white - (white @ basis) @ basis.T)
+
+
+def orthonormal(columns: Unknowns) -> Float64[np.ndarray, "vertices rank"]:
+    """An orthonormal basis of the columns' span."""
+    u, values, _ = np.linalg.svd(columns, full_matrices=False)
+    return u[:, values > 1e-9 * values.max()]
