@@ -84,7 +84,7 @@ def test_errors_are_found_where_others_have_them(bounds):
         return there, deviation, 5 * places[:, 1] + deviation * rng.normal(size=600)
 
     (there, deviation, _), *others = [suspect() for _ in range(9)]
-    found = bounds.expected(there, [one[0] for one in others], [one[2] for one in others], [nothing] * 8)
+    found = bounds.expected_errors(there, [one[0] for one in others], [one[2] for one in others], [nothing] * 8)
     assert np.corrcoef(found[0], 5 * there.places[:, 1])[0, 1] > 0.95
     assert np.median(found[1] / deviation) == pytest.approx(1, abs=0.1)
 

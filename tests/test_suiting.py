@@ -89,7 +89,7 @@ def test_large_payloads_have_room_in_low_bands():
 def test_what_is_asked_to_be_survived_decides():
     """Without much noise, many dimensions are worth more than energy in each."""
     marker = jm.make_marker(SHAPE, jm.Key(bytes(32)), bits=16)
-    assert marker.suited(limits={"dame": 0.002}).scheme.passband != "tapered"
+    assert marker.suited(limits={"dame": 0.002}).scheme != KeyedScheme()
     assert marker.suited(limits={"dame": 0.002}, noise=1e-4) is marker
     with pytest.raises(jm.JaxmarkError, match="at least 0"):
         marker.suited(limits=FAINT, noise=-1.0)

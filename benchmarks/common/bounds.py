@@ -25,52 +25,30 @@ means are known only to those who know the attack. A variance that was estimated
 which tell its error better: the bound grows with their number, and no number is enough. With few, claims beat it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
-from scipy import sparse
 from scipy.linalg import eigvalsh
-from scipy.spatial import KDTree
 
+from jaxmark.alignment.heights import Heights, Numbers, Unknowns, measure_heights
 from jaxmark.alignment.original import Original, displace, shift_of
-from jaxmark.geometry.mesh import Mesh, unit, used_vertices, vertex_normals
-from jaxmark.geometry.surfaces import Surface, barycentric
+from jaxmark.distortion import rms
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.surfaces import Surface
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
 from jaxmark.watermark.carriers.reception import Extent, nuisance_basis
+from jaxmark.watermark.coarse import NEAREST, expected_errors, orthonormal
 from jaxmark.watermark.marking import Marker
 
 MOST_VERTICES = 5_000  # of a suspect, for matrices of M x M are dense
 OTHERS = 64  # other marks, of random signs
-NEAREST = 16  # vertices of their suspects that tell a vertex's error, those that are nearest to it
-ROUNDS = 3  # of fitting affine maps and variances in turn
-FAR = 0.005  # distance from the original, in diagonals, beyond which a vertex is no part of it
 COLUMNS = 32  # rows of A that are filtered at a time
 
-Numbers = Float64[np.ndarray, " vertices"]
 Matrix = Float64[np.ndarray, "vertices vertices"]
-Unknowns = Float64[np.ndarray, "vertices unknowns"]
-
-
-class Heights(NamedTuple):
-    """How far a suspect's vertices are above the original."""
-
-    places: Float64[np.ndarray, "vertices 3"]  # in diagonals, centred as `Original.positions`
-    height: Numbers  # d, in diagonals
-    normals: Float64[np.ndarray, "vertices 3"]  # of the original at the feet, unit length
-    share: sparse.csr_array  # barycentric coordinates of the feet, [vertices, points]
-
-    def along(self, displacement: Float64[np.ndarray, "points 3"]) -> Numbers:
-        """Heights by a displacement of the original's points: A w."""
-        return np.sum(self.normals * (self.share @ displacement), axis=1)
-
-    def columns(self, basis: Float64[np.ndarray, "points columns"]) -> Unknowns:
-        """Heights by each column of a basis, along each coordinate: B."""
-        there = self.share @ basis
-        return np.concatenate([self.normals[:, axis, None] * there for axis in range(3)], axis=1)
 
 
 class Bound(NamedTuple):
@@ -134,11 +112,11 @@ def make_bound(
     if not isinstance(carrier, KeyedCarrier) or len(suspect.vertices) > MOST_VERTICES:
         return None
     mark = shift_of(original, marked)
-    size = root_mean_square(mark[original.used])
+    size = float(rms(mark[original.used]))
     ones = jnp.ones(carrier.code_bits, original.signal.dtype)
     keys = jax.random.split(jax.random.key(seed), others)
     units = [original.to_host(carrier.redraw(key).displacement(ones)) for key in keys]
-    sizes = [root_mean_square(shift[original.used]) for shift in units]
+    sizes = [float(rms(shift[original.used])) for shift in units]
     shifts = [size / one * shift for one, shift in zip(sizes, units, strict=True)]
     there = measure(original, suspect)
     elsewhere = [measure(original, attack(displace(original, shift))) for shift in shifts]
@@ -147,7 +125,7 @@ def make_bound(
     if min(len(one.height) for one in (there, *elsewhere)) <= 2 * max(NEAREST, nuisance.shape[1]):
         return None
     errors = [one.height - one.along(shift) for one, shift in zip(elsewhere, shifts, strict=True)]
-    mean, deviation = expected(there, elsewhere, errors, [one.columns(affine) for one in elsewhere])
+    mean, deviation = expected_errors(there, elsewhere, errors, [one.columns(affine) for one in elsewhere])
     deviation = np.maximum(deviation, original.grid / original.diagonal / np.sqrt(12))  # that of rounding
     covariance = size**2 / np.mean(np.square(sizes)) * carried(carrier, there)
     channel = make_channel(covariance, deviation, nuisance)
@@ -156,24 +134,11 @@ def make_bound(
     return Bound(len(s), float(np.sum(s / (1 + s))), float(np.sum(np.log2(1 + s)) / 2), matched)
 
 
-def root_mean_square(x: Float64[np.ndarray, "points 3"]) -> float:
-    """Root of the mean square length."""
-    return float(np.sqrt(np.mean(np.sum(x**2, axis=1))))
-
-
 def measure(original: Original, suspect: Mesh) -> Heights:
-    """Measure the heights of a suspect's vertices, those that faces use and that are near the original."""
+    """Measure the heights of a suspect's vertices where the original lies in its file."""
     centre = np.asarray(original.points.vertices)[original.used].mean(axis=0)
-    places = (np.asarray(suspect.vertices)[used_vertices(suspect)] - centre) / original.diagonal
-    surface = Surface(Mesh(original.positions, original.points.faces))
-    feet, face = surface.closest(places)
-    near = np.linalg.norm(places - feet, axis=1) <= FAR
-    places, feet, corners = places[near], feet[near], np.asarray(surface.mesh.faces)[face[near]]
-    parts = barycentric(surface.mesh, face[near], feet)
-    normals = unit(np.einsum("mk,mkc->mc", parts, vertex_normals(surface.mesh)[corners]))
-    entries = parts.ravel(), (np.repeat(np.arange(len(feet)), 3), corners.ravel())
-    share = sparse.csr_array(entries, shape=(len(feet), len(original.positions)))
-    return Heights(places, np.sum(normals * (places - feet), axis=1), normals, share)
+    placed = suspect._replace(vertices=(np.asarray(suspect.vertices) - centre) / original.diagonal)
+    return measure_heights(Surface(Mesh(original.positions, original.points.faces)), placed)
 
 
 def carried(carrier: KeyedCarrier, there: Heights) -> Matrix:
@@ -198,47 +163,9 @@ def carried(carrier: KeyedCarrier, there: Heights) -> Matrix:
     return np.asarray(pulled.T @ pulled, np.float64)
 
 
-def expected(
-    there: Heights, others: Sequence[Heights], errors: Sequence[Numbers], nuisance: Sequence[Unknowns]
-) -> tuple[Numbers, Numbers]:
-    """Estimate mean and standard deviation of each error from those of suspects with other marks.
-
-    The nuisance is fitted to the errors of each of these and subtracted, with weights by the variances of the round
-    before. Mean and deviation are those of the nearest vertices, of all of these suspects together; the variance is
-    larger by the mean's own, and by what the fit of the nuisance takes of squares on average.
-
-    Args:
-        there: the suspect's vertices.
-        others: those of suspects with other marks.
-        errors: heights of each of those without its mark.
-        nuisance: B of each of those.
-    """
-    tree = KDTree(np.concatenate([one.places for one in others]))
-    near = [np.asarray(tree.query(one.places, NEAREST)[1]) for one in (*others, there)]
-    *deviations, mine = (np.ones(len(some)) for some in near)
-    count, fitted = sum(map(len, errors)), sum(columns.shape[1] for columns in nuisance)
-    wider = np.sqrt((1 + 1 / NEAREST) * count / (count - fitted))
-    pool = np.concatenate(errors)
-    for _ in range(ROUNDS):
-        left = []
-        for error, columns, deviation in zip(errors, nuisance, deviations, strict=True):
-            basis, white = orthonormal(columns / deviation[:, None]), error / deviation
-            left.append(deviation * (white - basis @ (basis.T @ white)))
-        pool = np.concatenate(left)
-        least = 1e-9 * pool.std() + np.finfo(float).tiny  # where errors are the same, as if exact
-        *deviations, mine = (wider * pool[some].std(axis=1, ddof=1) + least for some in near)
-    return pool[near[-1]].mean(axis=1), mine
-
-
 def make_channel(covariance: Matrix, deviation: Numbers, nuisance: Unknowns) -> Channel:
     """Make the model of a suspect from the covariance of A w, the deviation of each error, and B."""
     basis = orthonormal(nuisance / deviation[:, None])
     white = covariance / deviation[:, None] / deviation
     white = white - basis @ (basis.T @ white)
     return Channel(deviation, basis, white - (white @ basis) @ basis.T)
-
-
-def orthonormal(columns: Unknowns) -> Float64[np.ndarray, "vertices rank"]:
-    """An orthonormal basis of the columns' span."""
-    u, values, _ = np.linalg.svd(columns, full_matrices=False)
-    return u[:, values > 1e-9 * values.max()]

@@ -15,6 +15,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int64
 
+from jaxmark.alignment.heights import Heights, measure_heights
 from jaxmark.alignment.nearest import find_heights, settle
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, residual
@@ -56,6 +57,7 @@ _MIN_COVERAGE = 0.05  # share of the original that an alignment must show
 _FULL_COVERAGE = 0.95  # share of the original from which on no further pieces are looked for
 _MIN_IN_PLACE = 0.5  # share of a cloud's points that must be in order, or near their place in the file
 _SAMPLES_PER_POINT = 2  # points sampled from a surface for each of an original cloud, which they are compared with
+_FEW_VERTICES = 0.5  # of the original's: with so many or less, a surface is right at its vertices, and chords between
 _MIN_PIECE_POINTS, _MIN_PIECE_SHARE = 100, 0.01  # a piece with a map of its own shows this much of the original
 
 
@@ -71,6 +73,7 @@ class Alignment(NamedTuple):
     residual: float  # root mean square displacement of the points with weight 1, in diagonals
     seconds: float  # duration of the alignment
     how: Align = "auto"  # how it was asked for
+    heights: Heights | None = None  # of the vertices of a surface that has few, above the original
 
 
 def observation(original: Original, found: Alignment) -> Observation:
@@ -482,7 +485,10 @@ def _by_surface(original: Original, surface: Surface, suspect: Surface, pose: Po
     normals = face_normals(posed)[face]
     nuisance = replay_smoothing(surface, posed, face, closest, normals, seen) if size <= _FAR_DISTANCE else None
     file = pose.then(_file(original))
-    return Alignment(displacement, seen.astype(float), normals, nuisance, "surface", file, size, 0.0)
+    heights = None
+    if len(posed.vertices) <= _FEW_VERTICES * original.used.sum() and size <= _FAR_DISTANCE:
+        heights = measure_heights(surface, posed, round(len(posed.faces) * area(surface.mesh) / area(posed)))
+    return Alignment(displacement, seen.astype(float), normals, nuisance, "surface", file, size, 0.0, heights=heights)
 
 
 def _closest(

@@ -1,25 +1,19 @@
 """Simplification by edge collapses."""
 
-import numpy as np
-
 from jaxmark.attacks.host import on_host
 from jaxmark.attacks.random import Randomness
 from jaxmark.errors import JaxmarkError
-from jaxmark.extras import require
-from jaxmark.geometry.mesh import Mesh, compact, diagonal
-
-# Diagonal to which meshes are scaled for fast-simplification. Its thresholds are absolute: in smaller meshes it
-# collapses many edges in arbitrary order, in much larger ones too few.
-_INPUT_DIAGONAL = 100
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.simplified import simplify
 
 
 @on_host
 def simplification(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
     """Collapse edges, those of least quadric error first, until only a share of the faces is left; on the host.
 
-    The program is fast-simplification, which uses the quadrics of Garland and Heckbert, "Surface simplification using
-    quadric error metrics", SIGGRAPH 1997. The protocol of SMI 2010 (Wang et al.) has the same strengths, but uses the
-    simplifier of CGAL, that of Lindstrom and Turk, "Fast and memory efficient polygonal simplification", 1998.
+    The program is fast-simplification (`jaxmark.geometry.simplified`). The protocol of SMI 2010 (Wang et al.) has the
+    same strengths, but uses the simplifier of CGAL, that of Lindstrom and Turk, "Fast and memory efficient polygonal
+    simplification", 1998.
 
     Args:
         mesh: any mesh, concrete.
@@ -40,12 +34,4 @@ def simplification(mesh: Mesh, strength: float, key: Randomness | None = None) -
     left = round((1 - strength) * count)
     if left == 0:
         raise JaxmarkError(f"Of {count} faces none would be left; ask for a share of at most {1 - 1 / count:g}.")
-    if left == count:
-        return mesh
-    simplify = require("fast_simplification", "attacks").simplify
-    vertices, faces = map(np.asarray, compact(mesh))
-    centre, length = vertices.mean(axis=0), diagonal(mesh) / _INPUT_DIAGONAL
-    points, faces = simplify((vertices - centre) / length, faces, target_count=left)
-    if len(faces) == 0:
-        raise JaxmarkError("fast-simplification left no face of this mesh; ask for a smaller share.")
-    return Mesh(centre + length * points, faces.astype(np.int64))
+    return simplify(mesh, left)

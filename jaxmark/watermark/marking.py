@@ -24,6 +24,9 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark import evidence
 from jaxmark.watermark.budget import Budget, Limits, Visibility, make_budget, visibility_of, write
 from jaxmark.watermark.carriers.carrier import Carrier, Reader, Received
+from jaxmark.watermark.carriers.keyed import KeyedCarrier
+from jaxmark.watermark.carriers.reception import Reception
+from jaxmark.watermark.coarse import receive_coarse
 from jaxmark.watermark.coding.keys import SCHEME_VERSION, VERSIONS, Choices, Key, bind, commitment
 from jaxmark.watermark.coding.message import CANDIDATES, TAG_BITS, Decoded, decode, encode
 from jaxmark.watermark.detectors import Detector, claims
@@ -40,6 +43,7 @@ _SAME_SHAPE = 0.01  # distance of shapes, over their size, below which an origin
 ALIGN_SHARES = {"auto": 0.97, "same": 0.01, "similarity": 0.01, "affine": 0.01}
 CLAIM_SHARE = 0.97
 _QUICK_SHARE = 0.03  # of the message that plain matched correlations read first; decoding jointly keeps nearly all
+_COARSE_SHARE = 0.05  # of surfaces of few vertices, if they are read by these
 _USUAL_SHARE = 0.9  # of the usual pass band; readers with a record know the band
 _HAND_SHARE = 0.97  # of the hand that fits a surface better
 _MAX_TRIED_NOISE = 0.05  # beyond which no shape is left
@@ -280,7 +284,8 @@ class Marker:
         tag, and the union bound over all messages, or over the one that the record commits to. With one, log10_p is
         Hoeffding's bound (see `evidence.log10_p_claimed`). The score is the plain correlation of the codeword: joint
         decoding may choose the codeword, but does not enter the score. It is taken for each way of weighting the
-        suspect (see `detectors.claims`), and each is paid for, too; so are ways of aligning other than `"auto"`.
+        suspect (see `detectors.claims`), and each is paid for, too; so are ways of aligning other than `"auto"`, and
+        reading surfaces of few vertices by these (`jaxmark.watermark.coarse`) where no message is read otherwise.
         Weights depend on suspect and original only.
 
         A suspect that is read with several keys needs to be aligned only once: pass the result of
@@ -330,9 +335,20 @@ class Marker:
         if np.abs(aligned.displacement).max() * self.original.diagonal <= 0.75 * self.original.grid:
             remark = "The suspect is the original itself, without a mark."
             return found._replace(remarks=(remark,))
-        soft, decoded = self._hear(received)
-        found = found._replace(scores=soft / (np.sqrt(np.mean(soft**2)) or 1.0))
-        return self._weigh(found, received, decoded, message, share * ALIGN_SHARES[aligned.how])
+        share *= ALIGN_SHARES[aligned.how]
+        carrier = self.carrier
+        few = aligned.heights if weights is None else None
+        if few is None or not isinstance(carrier, KeyedCarrier) or not isinstance(received, Reception):
+            return self._weigh(found, received, *self._hear(received), message, share)
+        usual = self._weigh(found, received, *self._hear(received), message, share * (1 - _COARSE_SHARE))
+        if usual.detected() and (usual.message is not None or not self.bits):
+            return usual
+        coarse = receive_coarse(carrier, self.original, few, received)
+        if coarse is None:
+            return usual
+        soft = np.asarray(self.reader.correlate(coarse), np.float64)
+        other = self._weigh(found, coarse, soft, self._decode(soft), message, share * _COARSE_SHARE)
+        return min(usual, other, key=lambda one: (one.log10_p, one.message is None))
 
     def _hear(self, received: Received) -> tuple[Float64[np.ndarray, " code"], Decoded | None]:
         """The soft values of a suspect, and what they say.
@@ -349,9 +365,16 @@ class Marker:
         return soft, decoded and decoded.paid(1.0 if quick is None else 1 - _QUICK_SHARE)
 
     def _weigh(
-        self, found: Detection, received: Received, decoded: Decoded | None, claimed: bytes | None, share: float
+        self,
+        found: Detection,
+        received: Received,
+        soft: Float64[np.ndarray, " code"],
+        decoded: Decoded | None,
+        claimed: bytes | None,
+        share: float,
     ) -> Detection:
         """Complete a detection by what was decoded and what was claimed, with a share of the probability."""
+        found = found._replace(scores=soft / (np.sqrt(np.mean(soft**2)) or 1.0))
         if decoded is None and claimed is None:
             return found
         fixed = claimed
