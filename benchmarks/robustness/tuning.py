@@ -5,8 +5,9 @@ default, the same in the usual pass band whatever the limit, the mean profile of
 reported on), tuned on the mesh itself, and --around profiles whose strengths differ from the tuned ones by chance. Each
 is attacked with seeds, and written with keys, that tuning has not seen. The margin is the evidence for a claimed
 message in nats, S²/2‖a‖², and the bound is what no profile of these bands exceeds on the measured channels. --strengths
-adds the largest strength of each kind of attack from which a message of --bits bits still reads. Without meshes to
-report on, only the mean profile is printed: so the library's default is derived (`schemes.DERIVED`).
+adds the largest strength of each kind of attack from which a message of --bits bits still reads. --untuned leaves out
+tuning, which takes minutes. Without meshes to report on, only the mean profile is printed: so the library's default is
+derived (`schemes.DERIVED`).
 """
 
 import argparse
@@ -52,18 +53,21 @@ def tuned_on(mesh: Mesh, limits: Mapping[str, float], options: argparse.Namespac
 
 
 def profiles(
-    mesh: Mesh, limits: Mapping[str, float], mean: KeyedScheme | None, own: Tuned, around: int, bits: int
+    mesh: Mesh, limits: Mapping[str, float], mean: KeyedScheme | None, own: Tuned | None, around: int, bits: int
 ) -> dict[str, Scheme]:
     found: dict[str, Scheme] = {"flat": KeyedScheme(profile=(1.0,) * KeyedScheme.bands)}
     found |= {f"low-pass {bands}": KeyedScheme(profile=(1.0,) * bands) for bands in LOW_PASS}
     if mean is not None:
         found["mean of the training meshes"] = mean
+    suited = jm.make_marker(mesh, KEY, bits=bits).suited(limits=limits).scheme
+    found |= {"usual pass band": KeyedScheme(), "default": suited}
+    if own is None:
+        return found
     strengths, random = own.beta[: 1 + np.flatnonzero(own.beta)[-1]], np.random.default_rng(0)
     for number in range(around):
         changed = strengths * np.exp(SPREAD * random.normal(size=len(strengths)))
         found[f"around {number}"] = KeyedScheme(profile=tuple(map(float, changed / changed.max())))
-    suited = jm.make_marker(mesh, KEY, bits=bits).suited(limits=limits).scheme
-    return {**found, "usual pass band": KeyedScheme(), "default": suited, "tuned": own.scheme}
+    return {**found, "tuned": own.scheme}
 
 
 def average(found: list[Tuned]) -> KeyedScheme:
@@ -108,7 +112,7 @@ def strengths(mesh: Mesh, scheme: Scheme, limits: Mapping[str, float], bits: int
 def reported(
     source: Path, mesh: Mesh, limits: Mapping[str, float], mean: KeyedScheme | None, options: argparse.Namespace
 ) -> list[Row]:
-    own, seconds = timed(tuned_on, mesh, limits, options)
+    own, seconds = (None, 0.0) if options.untuned else timed(tuned_on, mesh, limits, options)
     rows: list[Row] = []
     for name, scheme in profiles(mesh, limits, mean, own, options.around, options.bits).items():
         row: Row = {"mesh": source.name, "limit": limits, "profile": name}
@@ -120,8 +124,9 @@ def reported(
             row["refused"] = str(error)
         rows.append(row)
         say(*row.values())
+    if own is None:
+        return rows
     rows[-1] |= {
-        "attacks": options.attacks,
         "tried": own.report.tried.tolist(),
         TRIED_CHANNELS: own.report.tried_channels.tolist(),
         "tried of the default": own.report.tried_default.tolist(),
@@ -135,14 +140,14 @@ def reported(
     return rows
 
 
-def table(rows: list[Row]) -> str:
+def table(rows: list[Row], attacks: list[tuple[str, float]]) -> str:
     """One mesh and limit."""
     last = rows[-1]
     limit = ", ".join(f"{name} {value:g}" for name, value in last["limit"].items())
     by_hand = [row for row in rows if row["profile"].startswith(("low-pass", "flat")) and "nats" in row]
     default = next(min(row["nats"]) for row in rows if row["profile"] == "default" and "nats" in row)
     best = max(min(row["nats"]) for row in by_hand) if by_hand else float("nan")
-    heads = [f"{kind} {strength:g}" for kind, strength in last["attacks"]]
+    heads = [f"{kind} {strength:g}" for kind, strength in attacks]
     heads += ["worst", "over the best by hand", "over the default", "read"]
     if any("strengths" in row for row in rows):
         heads += ["largest noise", "steps of 0.5", "Taubin pairs", "bits of quantisation"]
@@ -156,6 +161,8 @@ def table(rows: list[Row]) -> str:
             cells += [f"{worst / default:.2f}", f"{row['read']:.0%}"]
             cells += row.get("strengths", [])
         text.append(line(row["profile"], *cells))
+    if "tried" not in last:
+        return "\n".join([*text, ""])
     note = (
         f"Tuned in {last['seconds']:.1f} s: by trials {min(last['tried']):.1f} nats, the default"
         f" {min(last['tried of the default']):.1f}, the best by channels"
@@ -171,6 +178,7 @@ def main() -> None:
     parser.add_argument("--train", nargs="+", type=Path, default=[], help="meshes whose mean profile is tried")
     parser.add_argument("--attacks", nargs="+", type=strength, default=list(map(strength, ATTACKS)))
     parser.add_argument("--around", type=int, default=0, help="profiles around the tuned one")
+    parser.add_argument("--untuned", action="store_true", help="leave out tuning")
     parser.add_argument("--keys", type=int, default=1)
     parser.add_argument("--limit", nargs="+", default=LIMITS, metavar="NAME=VALUE")
     parser.add_argument("--bits", type=int, default=16)
@@ -191,7 +199,7 @@ def main() -> None:
             mesh = jm.load_mesh(source)
             assert make_original(mesh).geometry not in known, f"{source} is a training mesh"
             rows = reported(source, mesh, limits, mean, options)
-            print(table(rows), flush=True)
+            print(table(rows, options.attacks), flush=True)
             everything += rows
             if options.output:
                 save_json(options.output, everything)

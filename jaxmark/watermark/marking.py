@@ -811,7 +811,9 @@ class Markers:
             for aligned, part in _ways(ladder[0][1]().original, suspect, align):
                 for share, prepare in ladder:
                     marker = prepare()
-                    one = marker.detect(aligned, message, weights, share=share * part / len(self._ladders))
+                    # Reading by vertices takes seconds: only what is likeliest is read so.
+                    seen = aligned._replace(heights=None) if found else aligned
+                    one = marker.detect(seen, message, weights, share=share * part / len(self._ladders))
                     if one.detected():
                         return one, marker
                     found.append((one, marker))
