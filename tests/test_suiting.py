@@ -136,7 +136,7 @@ def test_evidence_grows_with_the_mark_up_to_half_of_the_dimensions():
     assert capacity.needed(16, 2 * values[-1], NOISE) == math.inf
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_tuning_begins_with_the_band_that_suits():
     tuned = tune(SHAPE, [("noise", 0.005)], limits=FAINT, key=jax.random.key(0), bits=16, margin="evidence")
     assert tuned.report.tried_default.min() > 1.1 * evidence("tapered", FAINT)[0]
