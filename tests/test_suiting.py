@@ -47,7 +47,9 @@ def evidence(passband: str, limits: dict[str, float]) -> tuple[float, float]:
     return float(np.mean(ratios)) ** 2 / 2, float(np.mean(predicted))
 
 
-@pytest.mark.parametrize("passband", LADDER)
+@pytest.mark.parametrize(
+    "passband", ["low", *(pytest.param(one, marks=pytest.mark.long) for one in LADDER if one != "low")]
+)
 def test_evidence_is_what_is_predicted(passband):
     measured, predicted = evidence(passband, {"dame": 0.003})
     assert predicted == pytest.approx(measured, rel=0.2)
@@ -117,6 +119,7 @@ def test_all_bands_are_tried_beside_one_alignment(monkeypatch):
     assert marker.choices.version in (1, 2)
 
 
+@pytest.mark.long
 def test_a_scheme_that_is_given_is_the_only_one_read():
     marked = marker_of("low").embed(b"ab", 4e-4)[0]
     assert jm.detect(marked, original=SHAPE, key=jm.Key(bytes(32)), bits=16).message == b"ab"
