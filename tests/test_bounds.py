@@ -80,7 +80,7 @@ def test_errors_are_found_where_others_have_them(bounds):
     def suspect() -> tuple[Any, np.ndarray, np.ndarray]:
         places = rng.uniform(-1, 1, (600, 3)) * [1, 1, 0]
         deviation = 2.0 + places[:, 0]
-        there = bounds.Heights(places, 0 * deviation, places, None)
+        there = bounds.VertexHeights(places, 0 * deviation, places, None)
         return there, deviation, 5 * places[:, 1] + deviation * rng.normal(size=600)
 
     (there, deviation, _), *others = [suspect() for _ in range(9)]

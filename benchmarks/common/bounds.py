@@ -34,7 +34,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.linalg import eigvalsh
 
-from jaxmark.alignment.heights import Heights, Numbers, Unknowns, measure_heights
+from jaxmark.alignment.heights import Numbers, Unknowns, VertexHeights, measure_heights
 from jaxmark.alignment.original import Original, displace, shift_of
 from jaxmark.distortion import rms
 from jaxmark.geometry.mesh import Mesh
@@ -68,7 +68,7 @@ class Channel(NamedTuple):
     covariance: Matrix  # of A w
 
     def white(self, height: Numbers) -> Numbers:
-        """Heights in units of their deviation, without the nuisance."""
+        """VertexHeights in units of their deviation, without the nuisance."""
         return self.cleaned(height / self.deviation)
 
     def cleaned(self, white: Numbers) -> Numbers:
@@ -134,14 +134,14 @@ def make_bound(
     return Bound(len(s), float(np.sum(s / (1 + s))), float(np.sum(np.log2(1 + s)) / 2), matched)
 
 
-def measure(original: Original, suspect: Mesh) -> Heights:
+def measure(original: Original, suspect: Mesh) -> VertexHeights:
     """Measure the heights of a suspect's vertices where the original lies in its file."""
     centre = np.asarray(original.points.vertices)[original.used].mean(axis=0)
     placed = suspect._replace(vertices=(np.asarray(suspect.vertices) - centre) / original.diagonal)
     return measure_heights(Surface(Mesh(original.positions, original.points.faces)), placed)
 
 
-def carried(carrier: KeyedCarrier, there: Heights) -> Matrix:
+def carried(carrier: KeyedCarrier, there: VertexHeights) -> Matrix:
     """The covariance of A w for a mark of unit strength, A T Tᵀ Aᵀ."""
     coefficients, moving = (
         carrier.coefficients(1.0),

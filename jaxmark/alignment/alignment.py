@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int64
 
-from jaxmark.alignment.heights import Heights, measure_heights
+from jaxmark.alignment.heights import VertexHeights, measure_heights
 from jaxmark.alignment.nearest import find_heights, settle
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, residual
@@ -73,7 +73,7 @@ class Alignment(NamedTuple):
     residual: float  # root mean square displacement of the points with weight 1, in diagonals
     seconds: float  # duration of the alignment
     how: Align = "auto"  # how it was asked for
-    heights: Heights | None = None  # of the vertices of a surface that has few, above the original
+    heights: VertexHeights | None = None  # of the vertices of a surface that has few, above the original
 
 
 def observation(original: Original, found: Alignment) -> Observation:

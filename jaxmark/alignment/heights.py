@@ -18,7 +18,7 @@ Numbers = Float64[np.ndarray, " vertices"]
 Unknowns = Float64[np.ndarray, "vertices unknowns"]
 
 
-class Heights(NamedTuple):
+class VertexHeights(NamedTuple):
     """The heights of a suspect's vertices above the original's surface, along its normals at their feet.
 
     The foot of a vertex is the point of the original's surface that is closest to it.
@@ -31,7 +31,7 @@ class Heights(NamedTuple):
     faces: int = 0  # number that as fine a mesh of the whole original would have
 
     def along(self, displacement: Float64[np.ndarray, "points 3"]) -> Numbers:
-        """Heights by a displacement of the original's points."""
+        """VertexHeights by a displacement of the original's points."""
         return np.sum(self.normals * (self.share @ displacement), axis=1)
 
     def adjoint(self, height: Numbers) -> Float64[np.ndarray, "points 3"]:
@@ -39,18 +39,18 @@ class Heights(NamedTuple):
         return self.share.T @ (self.normals * height[:, None])
 
     def columns(self, basis: Float64[np.ndarray, "points columns"]) -> Unknowns:
-        """Heights by each column of a basis, along each coordinate."""
+        """VertexHeights by each column of a basis, along each coordinate."""
         there = self.share @ basis
         return np.concatenate([self.normals[:, axis, None] * there for axis in range(3)], axis=1)
 
 
-def measure_heights(original: Surface, suspect: Mesh, faces: int = 0) -> Heights:
+def measure_heights(original: Surface, suspect: Mesh, faces: int = 0) -> VertexHeights:
     """Measure the heights of a suspect's vertices, those that faces use and that are near the original.
 
     Args:
         original: the original's points and faces, in diagonals.
         suspect: the suspect, where the original is.
-        faces: see `Heights`.
+        faces: see `VertexHeights`.
 
     Raises:
         JaxmarkError: if libigl is missing.
@@ -63,4 +63,4 @@ def measure_heights(original: Surface, suspect: Mesh, faces: int = 0) -> Heights
     normals = unit(np.einsum("mk,mkc->mc", parts, vertex_normals(original.mesh)[corners]))
     entries = parts.ravel(), (np.repeat(np.arange(len(feet)), 3), corners.ravel())
     share = sparse.csr_array(entries, shape=(len(feet), len(original.mesh.vertices)))
-    return Heights(places, np.sum(normals * (places - feet), axis=1), normals, share, faces)
+    return VertexHeights(places, np.sum(normals * (places - feet), axis=1), normals, share, faces)

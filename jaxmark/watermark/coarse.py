@@ -26,7 +26,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from scipy.spatial import KDTree
 
 from jaxmark import distortion
-from jaxmark.alignment.heights import Heights, Numbers, Unknowns, measure_heights
+from jaxmark.alignment.heights import Numbers, Unknowns, VertexHeights, measure_heights
 from jaxmark.alignment.original import Original
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.simplified import simplify
@@ -44,7 +44,9 @@ _PROBES = 4  # random heights that tell how much energy a mark has
 _STEPS, _TOLERANCE = 40, 1e-2  # of conjugate gradients
 
 
-def receive_coarse(carrier: KeyedCarrier, original: Original, there: Heights, received: Reception) -> Reception | None:
+def receive_coarse(
+    carrier: KeyedCarrier, original: Original, there: VertexHeights, received: Reception
+) -> Reception | None:
     """Receive a suspect by the heights of its vertices, in place of closest points; independent of the key.
 
     Args:
@@ -128,8 +130,8 @@ def _covariance(carrier: KeyedCarrier, x: Displacement) -> Float[Array, "vertice
 
 
 def expected_errors(
-    there: Heights,
-    others: Sequence[Heights],
+    there: VertexHeights,
+    others: Sequence[VertexHeights],
     errors: Sequence[Float64[np.ndarray, " _"]],
     nuisance: Sequence[Float64[np.ndarray, "_ unknowns"]],
 ) -> tuple[Numbers, Numbers]:
