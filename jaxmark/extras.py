@@ -24,6 +24,11 @@ def require(module: str, extra: str) -> ModuleType:
         raise JaxmarkError(f"{_missing(module, extra)} ({error})") from None
 
 
+def available(module: str) -> bool:
+    """Whether an optional dependency is installed, without importing it."""
+    return importlib.util.find_spec(module) is not None
+
+
 def package_folder(module: str, extra: str) -> Path:
     """Find the folder of an optional package without importing it.
 

@@ -126,3 +126,8 @@ def test_fine_suspects_have_no_heights():
     noised = jm.attack(fine, "noise", 0.001, seed=0)
     assert align(marker_of(3).original, noised).heights is None
     assert align(marker_of(3).original, SHAPE).heights is None
+
+
+def test_without_the_simplifier_suspects_are_read_by_closest_points(monkeypatch):
+    monkeypatch.setattr("jaxmark.alignment.alignment.available", lambda module: False)
+    assert align(marker_of(3).original, suspect()).heights is None

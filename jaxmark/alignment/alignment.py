@@ -22,6 +22,7 @@ from jaxmark.alignment.original import Original, residual
 from jaxmark.alignment.registration import BOTH_HANDS, SETTINGS, refine, register_part, register_whole
 from jaxmark.alignment.replay import replay_smoothing, replay_smoothing_of_points
 from jaxmark.errors import JaxmarkError
+from jaxmark.extras import available
 from jaxmark.geometry.clouds import Cloud
 from jaxmark.geometry.connectivity import matching_vertices
 from jaxmark.geometry.mesh import (
@@ -486,7 +487,8 @@ def _by_surface(original: Original, surface: Surface, suspect: Surface, pose: Po
     nuisance = replay_smoothing(surface, posed, face, closest, normals, seen) if size <= _FAR_DISTANCE else None
     file = pose.then(_file(original))
     heights = None
-    if len(posed.vertices) <= _FEW_VERTICES * original.used.sum() and size <= _FAR_DISTANCE:
+    few = len(posed.vertices) <= _FEW_VERTICES * original.used.sum()
+    if few and size <= _FAR_DISTANCE and available("fast_simplification"):  # which tells what errors heights have
         heights = measure_heights(surface, posed, round(len(posed.faces) * area(surface.mesh) / area(posed)))
     return Alignment(displacement, seen.astype(float), normals, nuisance, "surface", file, size, 0.0, heights=heights)
 
