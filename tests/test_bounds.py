@@ -12,6 +12,7 @@ import pytest
 
 from jaxmark.geometry.mesh import Mesh, vertex_normals
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
+from jaxmark.watermark.coarse import expected_errors
 from jaxmark.watermark.marking import make_marker
 from tests.samples import bumpy_sphere
 
@@ -42,7 +43,7 @@ def test_covariance_and_eigenvalues_are_those_of_dense_matrices(bounds, key, x64
     marker = make_marker(bumpy_sphere(2), key, bits=0)
     carrier, original = marker.carrier, marker.original
     assert isinstance(carrier, KeyedCarrier)
-    there = bounds.measure(original, scattered(original.mesh, 60, 0))
+    there = bounds.measurer(original)(scattered(original.mesh, 60, 0))
     shape = carrier.chips.signs.shape
     chips = np.eye(shape[0] * shape[1])[np.abs(carrier.chips.signs).ravel() > 0].reshape(-1, *shape)
     spread = jax.vmap(lambda one: carrier.filter_chips(one, carrier.coefficients(1.0)))(jnp.asarray(chips))
@@ -84,7 +85,7 @@ def test_errors_are_found_where_others_have_them(bounds):
         return there, deviation, 5 * places[:, 1] + deviation * rng.normal(size=600)
 
     (there, deviation, _), *others = [suspect() for _ in range(9)]
-    found = bounds.expected_errors(there, [one[0] for one in others], [one[2] for one in others], [nothing] * 8)
+    found = expected_errors(there, [one[0] for one in others], [one[2] for one in others], [nothing] * 8)
     assert np.corrcoef(found[0], 5 * there.places[:, 1])[0, 1] > 0.95
     assert np.median(found[1] / deviation) == pytest.approx(1, abs=0.1)
 

@@ -40,8 +40,7 @@ from jaxmark.distortion import rms
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.surfaces import Surface
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
-from jaxmark.watermark.carriers.reception import Extent, nuisance_basis
-from jaxmark.watermark.coarse import NEAREST, expected_errors, orthonormal
+from jaxmark.watermark.coarse import model_errors, orthonormal
 from jaxmark.watermark.marking import Marker
 
 MOST_VERTICES = 5_000  # of a suspect, for matrices of M x M are dense
@@ -68,7 +67,7 @@ class Channel(NamedTuple):
     covariance: Matrix  # of A w
 
     def white(self, height: Numbers) -> Numbers:
-        """VertexHeights in units of their deviation, without the nuisance."""
+        """Heights in units of their deviation, without the nuisance."""
         return self.cleaned(height / self.deviation)
 
     def cleaned(self, white: Numbers) -> Numbers:
@@ -118,35 +117,35 @@ def make_bound(
     units = [original.to_host(carrier.redraw(key).displacement(ones)) for key in keys]
     sizes = [float(rms(shift[original.used])) for shift in units]
     shifts = [size / one * shift for one, shift in zip(sizes, units, strict=True)]
-    there = measure(original, suspect)
-    elsewhere = [measure(original, attack(displace(original, shift))) for shift in shifts]
-    affine = original.to_host(nuisance_basis(carrier.host._replace(extent=Extent(scales=0, degree=1))))
-    nuisance = there.columns(affine)
-    if min(len(one.height) for one in (there, *elsewhere)) <= 2 * max(NEAREST, nuisance.shape[1]):
+    measured = measurer(original)
+    there = measured(suspect)
+    elsewhere = [measured(attack(displace(original, shift))) for shift in shifts]
+    errors = model_errors(carrier, original, there, elsewhere, shifts)
+    if errors is None:
         return None
-    errors = [one.height - one.along(shift) for one, shift in zip(elsewhere, shifts, strict=True)]
-    mean, deviation = expected_errors(there, elsewhere, errors, [one.columns(affine) for one in elsewhere])
-    deviation = np.maximum(deviation, original.grid / original.diagonal / np.sqrt(12))  # that of rounding
     covariance = size**2 / np.mean(np.square(sizes)) * carried(carrier, there)
-    channel = make_channel(covariance, deviation, nuisance)
+    channel = make_channel(covariance, errors.deviation, errors.nuisance)
     s = channel.signal_to_noise()
-    matched = channel.matched(there.height - mean, there.along(mark))
+    matched = channel.matched(there.height - errors.mean, there.along(mark))
     return Bound(len(s), float(np.sum(s / (1 + s))), float(np.sum(np.log2(1 + s)) / 2), matched)
 
 
-def measure(original: Original, suspect: Mesh) -> VertexHeights:
-    """Measure the heights of a suspect's vertices where the original lies in its file."""
+def measurer(original: Original) -> Callable[[Mesh], VertexHeights]:
+    """What measures the heights of a mesh's vertices where the original lies in its file."""
+    surface = Surface(Mesh(original.positions, original.points.faces))
     centre = np.asarray(original.points.vertices)[original.used].mean(axis=0)
-    placed = suspect._replace(vertices=(np.asarray(suspect.vertices) - centre) / original.diagonal)
-    return measure_heights(Surface(Mesh(original.positions, original.points.faces)), placed)
+
+    def measured(mesh: Mesh) -> VertexHeights:
+        places = (np.asarray(mesh.vertices) - centre) / original.diagonal
+        return measure_heights(surface, mesh._replace(vertices=places))
+
+    return measured
 
 
 def carried(carrier: KeyedCarrier, there: VertexHeights) -> Matrix:
     """The covariance of A w for a mark of unit strength, A T Tᵀ Aᵀ."""
-    coefficients, moving = (
-        carrier.coefficients(1.0),
-        jnp.abs(jnp.asarray(carrier.chips.signs, carrier.host.signal.dtype)),
-    )
+    coefficients = carrier.coefficients(1.0)
+    moving = jnp.abs(jnp.asarray(carrier.chips.signs, carrier.host.signal.dtype))
 
     @jax.jit
     def pull(block: jax.Array) -> jax.Array:

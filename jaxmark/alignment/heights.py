@@ -31,7 +31,7 @@ class VertexHeights(NamedTuple):
     faces: int = 0  # number that as fine a mesh of the whole original would have
 
     def along(self, displacement: Float64[np.ndarray, "points 3"]) -> Numbers:
-        """VertexHeights by a displacement of the original's points."""
+        """Heights by a displacement of the original's points."""
         return np.sum(self.normals * (self.share @ displacement), axis=1)
 
     def adjoint(self, height: Numbers) -> Float64[np.ndarray, "points 3"]:
@@ -39,7 +39,7 @@ class VertexHeights(NamedTuple):
         return self.share.T @ (self.normals * height[:, None])
 
     def columns(self, basis: Float64[np.ndarray, "points columns"]) -> Unknowns:
-        """VertexHeights by each column of a basis, along each coordinate."""
+        """Heights by each column of a basis, along each coordinate."""
         there = self.share @ basis
         return np.concatenate([self.normals[:, axis, None] * there for axis in range(3)], axis=1)
 

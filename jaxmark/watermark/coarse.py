@@ -17,6 +17,7 @@ No key takes part in a, so that what a claim proves by it holds whatever was don
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +39,7 @@ from jaxmark.watermark.carriers.reception import Extent, Reception, nuisance_bas
 
 _OTHERS, _LEAST_OTHERS = 32, 8  # other marks
 _MOST_POINTS = 2**21  # of all originals with other marks together: so much time is spent at most
-NEAREST = 16  # vertices of their simplifications that tell a vertex's error, those that are nearest to it
+_NEAREST = 16  # vertices of their simplifications that tell a vertex's error, those that are nearest to it
 _ROUNDS = 3  # of fitting affine maps and variances in turn
 _PROBES = 4  # random heights that tell how much energy a mark has
 _STEPS, _TOLERANCE = 40, 1e-2  # of conjugate gradients
@@ -65,24 +66,19 @@ def receive_coarse(
     others = min(_OTHERS, _MOST_POINTS // len(original.positions))
     if others < _LEAST_OTHERS:
         return None
-    unit = distortion.rms(original.to_host(_any_mark(carrier, 0))[original.used])
-    shifts = [
-        first_rms(original.mesh) / float(unit) * original.to_host(_any_mark(carrier, number))
-        for number in range(others)
-    ]
-    surface = Surface(Mesh(original.positions, original.points.faces))
+    marks = [original.to_host(_any_mark(carrier, number)) for number in range(others)]
+    unit = float(distortion.rms(marks[0][original.used]))
+    shifts = [first_rms(original.mesh) / unit * mark for mark in marks]
+    faces = original.points.faces
+    surface = Surface(Mesh(original.positions, faces))
     elsewhere = [
-        measure_heights(surface, simplify(Mesh(original.positions + shift, original.points.faces), there.faces))
-        for shift in shifts
+        measure_heights(surface, simplify(Mesh(original.positions + shift, faces), there.faces)) for shift in shifts
     ]
-    affine = original.to_host(nuisance_basis(carrier.host._replace(extent=Extent(scales=0, degree=1))))
-    columns = there.columns(affine)
-    if min(len(one.height) for one in (there, *elsewhere)) <= 2 * max(NEAREST, columns.shape[1]):
+    errors = model_errors(carrier, original, there, elsewhere, shifts)
+    if errors is None:
         return None
-    errors = [one.height - one.along(shift) for one, shift in zip(elsewhere, shifts, strict=True)]
-    mean, deviation = expected_errors(there, elsewhere, errors, [one.columns(affine) for one in elsewhere])
-    deviation = np.maximum(deviation, original.grid / original.diagonal / np.sqrt(12))  # that of rounding
-    basis = orthonormal(columns / deviation[:, None])
+    deviation = errors.deviation
+    basis = orthonormal(errors.nuisance / deviation[:, None])
 
     def cleaned(white: Numbers) -> Numbers:
         return white - basis @ (basis.T @ white)
@@ -93,10 +89,10 @@ def receive_coarse(
 
     def carried(white: Numbers) -> Numbers:
         """A T Tᵀ Aᵀ, for a mark of RMS 1."""
-        moved = original.to_host(_covariance(carrier, pulled(white))) / float(unit) ** 2
+        moved = original.to_host(_covariance(carrier, pulled(white))) / unit**2
         return cleaned(there.along(moved) / deviation)
 
-    white = cleaned((there.height - mean) / deviation)
+    white = cleaned((there.height - errors.mean) / deviation)
     probes = np.random.default_rng(0).choice([-1.0, 1.0], (_PROBES, len(white)))
     energy = float(np.mean([one @ carried(one) for one in probes]))
     size = max(float(white @ white) - len(white), 0.0) / energy if energy > 0 else 0.0
@@ -129,6 +125,43 @@ def _covariance(carrier: KeyedCarrier, x: Displacement) -> Float[Array, "vertice
     return carrier.filter_chips(moving * carrier.match_chips(x, coefficients), coefficients)
 
 
+class Errors(NamedTuple):
+    """What is known of the heights of a suspect's vertices besides the mark."""
+
+    mean: Numbers  # of each error, in diagonals
+    deviation: Numbers  # of each error, in diagonals
+    nuisance: Unknowns  # heights by affine maps: B
+
+
+def model_errors(
+    carrier: KeyedCarrier,
+    original: Original,
+    there: VertexHeights,
+    elsewhere: Sequence[VertexHeights],
+    shifts: Sequence[Float64[np.ndarray, "points 3"]],
+) -> Errors | None:
+    """Estimate the errors of a suspect's vertices from meshes of the original with other marks.
+
+    Args:
+        carrier: of the mark.
+        original: the original.
+        there: the suspect's vertices.
+        elsewhere: those of meshes with other marks.
+        shifts: these marks, in diagonals.
+
+    Returns:
+        The errors; None if vertices are so few that an affine map may explain all their heights.
+    """
+    affine = original.to_host(nuisance_basis(carrier.host._replace(extent=Extent(scales=0, degree=1))))
+    nuisance = there.columns(affine)
+    if min(len(one.height) for one in (there, *elsewhere)) <= 2 * max(_NEAREST, nuisance.shape[1]):
+        return None
+    errors = [one.height - one.along(shift) for one, shift in zip(elsewhere, shifts, strict=True)]
+    mean, deviation = expected_errors(there, elsewhere, errors, [one.columns(affine) for one in elsewhere])
+    rounding = original.grid / original.diagonal / np.sqrt(12)
+    return Errors(mean, np.maximum(deviation, rounding), nuisance)
+
+
 def expected_errors(
     there: VertexHeights,
     others: Sequence[VertexHeights],
@@ -148,10 +181,10 @@ def expected_errors(
         nuisance: heights of each of those by each column of the nuisance.
     """
     tree = KDTree(np.concatenate([one.places for one in others]))
-    near = [np.asarray(tree.query(one.places, NEAREST)[1]) for one in (*others, there)]
+    near = [np.asarray(tree.query(one.places, _NEAREST)[1]) for one in (*others, there)]
     *deviations, mine = (np.ones(len(some)) for some in near)
     count, fitted = sum(map(len, errors)), sum(columns.shape[1] for columns in nuisance)
-    wider = np.sqrt((1 + 1 / NEAREST) * count / (count - fitted))
+    wider = np.sqrt((1 + 1 / _NEAREST) * count / (count - fitted))
     pool = np.concatenate(errors)
     for _ in range(_ROUNDS):
         left = []

@@ -316,9 +316,8 @@ class Marker:
         """The same marker, which has no record, with another scheme of this library."""
         if scheme == self.scheme:
             return self
-        version = self.choices.version
-        choices = bind_mark(self.key, self.original, scheme, self.bits, self.content, version)
         code_bits = scheme.code_length(self.original, self.bits)
+        choices = bind_mark(self.key, self.original, scheme, self.bits, self.content, self.choices.version)
         carrier = scheme.carrier(self.original, choices, self.bits, code_bits)
         return replace(self, choices=choices, scheme=scheme, carrier=carrier, code_bits=code_bits)
 
