@@ -91,6 +91,15 @@ def test_the_price_is_paid():
     assert claimed == pytest.approx(alone + price, abs=0.02)
 
 
+def test_a_share_is_paid_for_and_no_more_than_all():
+    marker = marker_of(3)
+    half = marker.detect(aligned(), MESSAGE, share=0.5).log10_p_unfloored
+    assert half == pytest.approx(marker.detect(aligned(), MESSAGE).log10_p_unfloored + np.log10(2), abs=1e-6)
+    for share in (0.0, 1.5, float("nan")):
+        with pytest.raises(jm.JaxmarkError, match="share"):
+            marker.detect(aligned(), MESSAGE, share=share)
+
+
 def test_heights_are_those_of_a_plane():
     """Of points above one, its normals and barycentric coordinates are exact."""
     grid = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0), indexing="ij"), -1).reshape(-1, 2) / 4

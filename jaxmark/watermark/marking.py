@@ -292,8 +292,10 @@ class Marker:
         `jaxmark.alignment.alignment.align` in its place, and in `share` the share of the probability that this reading
         has of all that are tried.
         """
+        if not 0 < share <= 1:
+            raise JaxmarkError(f"A reading's share of the probability is in (0, 1], got {share:g}.")
         if not isinstance(suspect, Alignment):
-            return Markers([[(1.0, lambda: self)]]).detect(suspect, message, weights, align)[0]
+            return Markers([[(share, lambda: self)]]).detect(suspect, message, weights, align)[0]
         return self._detect(suspect, self.claimed(message), weights, share)
 
     def suited(
