@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 import jaxmark as jm
 from jaxmark.alignment.original import make_original
@@ -56,20 +57,36 @@ def test_what_is_tried_is_what_the_detector_has(mesh, trials, trial):
     assert trial.strengths == pytest.approx(np.mean(trial.scales) * np.ones(12))
 
 
-def test_practice_has_other_signs_and_seeds(trials, trial):
-    practised = trials.run(trial.scheme, practice=True)
-    assert not any(np.array_equal(one, other) for one in trial.signs for other in practised.signs)
+def test_strengths_are_fitted_chosen_and_checked_by_different_signs(trials, trial):
+    fitted, checked = trials._run(trial.scheme, module._FITTED), trials.check(trial.scheme)
+    signs = [np.asarray(one).tobytes() for tried in (trial, fitted, checked) for one in tried.signs]
+    assert len(set(signs)) == len(signs) == 2 * (3 + 3 + 8)
     again = trials.run(trial.scheme)
     np.testing.assert_array_equal(again.worth, trial.worth)
-    assert (practised.worth != trial.worth).all()
+    assert (fitted.worth != trial.worth).all()
+    # The worth of each mark is that of all, but for how far they differ.
+    np.testing.assert_allclose(np.sqrt(checked.by_signs).mean(axis=0), np.sqrt(checked.worth), rtol=1e-9)
+
+
+def test_what_is_better_by_chance_does_not_surpass(trial):
+    """Eight marks with gains that a t-test of SciPy's calls chance, or not."""
+    random = np.random.default_rng(0)
+    before = 10 + random.normal(size=(8, 2))
+    other = trial._replace(by_signs=before, worth=before.mean(axis=0))
+    for gain, spread, surpasses in ((2.0, 0.3, True), (2.0, 8.0, False), (0.5, 0.1, False), (-2.0, 0.3, False)):
+        after = before + gain + spread * random.normal(size=(8, 1))
+        found = trial._replace(by_signs=after, worth=np.full(2, 10 + gain))
+        assert found.surpasses(other, 1.1) == surpasses
+        if gain == 2.0:
+            chance = stats.ttest_rel(after.min(axis=1), before.min(axis=1), alternative="greater").pvalue
+            assert (chance < 0.043) == surpasses  # of two standard errors, with seven degrees of freedom
 
 
 @pytest.mark.long
 def test_the_gradient_leads_to_more_evidence(trials, monkeypatch):
     """From strengths that fall too fast, judged by the very marks that better ones were fitted to."""
     poor = trials.run(KeyedScheme(profile=tuple(np.geomspace(1, 0.03, 24).tolist())))
-    run = Trials.run
-    monkeypatch.setattr(Trials, "run", lambda trials, scheme, practice=False: run(trials, scheme))
+    monkeypatch.setattr(module, "_FITTED", module._CHOSEN)
     better = trials.run(trials._improved(poor, _rms_cost(trials)))
     assert better.worst > 1.15 * poor.worst
     change = np.log(better.strengths / poor.strengths)

@@ -35,7 +35,7 @@ from common.timing import timed
 
 ATTACKS = ["noise=0.005", "noise=0.001", "smoothing=10", "smoothing=50", "quantisation=8", "quantisation=9"]
 TRIED_CHANNELS = "tried of the channels' best"
-LOW_PASS = (8, 12, 16, 20, 24, 32)
+LOW_PASS = (8, 16, 32)
 LIMITS = ["rms=0.0008", "gl=0.0002", "dame=0.008", "msdm2=0.12"]
 UNSEEN = 1000  # first seed of the attacks reported
 SPREAD = 0.3  # standard deviation of the logarithms of strengths around tuned ones

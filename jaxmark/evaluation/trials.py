@@ -31,12 +31,15 @@ from jaxmark.watermark.schemes import TunableScheme
 
 Attack = Callable[[Mesh, int], Mesh]  # an attack of some strength on a mesh, with a seed
 
-_KEYS = 3  # whose marks are tried, each with the opposite mark
+# Numbers of the signs of marks, each of which is tried beside its opposite. What strengths are fitted to, those that are
+# best of several are chosen by, and the choice is checked by are different ones: each is good by chance for its own.
+_FITTED, _CHOSEN, _CHECKED = range(3, 6), range(3), range(6, 14)
 _SHARPNESS = 50.0  # of the soft minimum over attacks, over the least worth
 _SHAPES = 5  # cosines over the bands that strengths are changed by: more would fit what is chance in each band
 _STEPS, _TRIES = 5, 5  # of the gradient, and of the size of each step, before marks are tried again
 _REACH = 0.7  # logarithm of the factor by which each cosine changes strengths until then
 _LEAST_GAIN = 1.05  # of the worth of the worst attack, for which an ascent goes on
+_SURE = 2.0  # standard errors of the mean gain over marks, from which on it is no chance
 
 
 class Trial(NamedTuple):
@@ -50,6 +53,7 @@ class Trial(NamedTuple):
     used: Float64[np.ndarray, " limits"]  # share of each limit that the first mark uses up
     seen: tuple[tuple[Observation, ...], ...]  # for each attack, copies of all marks, seed by seed
     worth: Float64[np.ndarray, " attacks"]
+    by_signs: Float64[np.ndarray, "marks attacks"]  # worth of each mark with its opposite
 
     @property
     def worst(self) -> float:
@@ -60,6 +64,17 @@ class Trial(NamedTuple):
     def strengths(self) -> Float64[np.ndarray, " passing"]:
         """Strength of each band of the pass band, in diagonals."""
         return np.mean(self.scales) * np.asarray(self.reader.carrier.profile, np.float64)
+
+    def surpasses(self, other: "Trial", least: float) -> bool:
+        """Whether the worst attack leaves more than of another trial of the same signs, by a factor and beyond chance.
+
+        Args:
+            other: the other trial.
+            least: the factor.
+        """
+        gains = self.by_signs.min(axis=1) - other.by_signs.min(axis=1)
+        error = float(np.std(gains, ddof=1)) / len(gains) ** 0.5
+        return self.worst >= least * other.worst and float(np.mean(gains)) > _SURE * error
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +96,23 @@ class Trials:
             return False
         return True
 
-    def run(self, scheme: TunableScheme, *, practice: bool = False) -> Trial:
+    def run(self, scheme: TunableScheme) -> Trial:
+        """Write, attack and read marks of a scheme, to choose among several.
+
+        Raises:
+            JaxmarkError: if the payload does not fit, a limit cannot be kept, or a suspect cannot be aligned.
+        """
+        return self._run(scheme, _CHOSEN)
+
+    def check(self, scheme: TunableScheme) -> Trial:
+        """Write, attack and read more marks of a scheme than `run`, by which nothing was chosen before.
+
+        Raises:
+            JaxmarkError: see `run`.
+        """
+        return self._run(scheme, _CHECKED)
+
+    def _run(self, scheme: TunableScheme, numbers: range) -> Trial:
         """Write, attack and read marks of a scheme.
 
         Each mark is tried beside its opposite: what attacks have in common with its signs by chance cancels, so that
@@ -89,18 +120,13 @@ class Trials:
 
         Args:
             scheme: the scheme with its strengths.
-            practice: whether to use other signs and seeds, those that strengths may be fitted to: what is good for
-                these by chance is not for the others.
-
-        Raises:
-            JaxmarkError: if the payload does not fit, a limit cannot be kept, or a suspect cannot be aligned.
+            numbers: of the signs, which are drawn from nobody's key; the first one is added to the attacks' seeds.
         """
         original = self.original
         code = scheme.code_length(original, self.bits)
         carrier = scheme.carrier(original, Choices(Key(bytes(KEY_BYTES)), b""), self.bits, code)
         word = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], code), original.signal.dtype)
-        first = _KEYS if practice else 0
-        drawn = [carrier.redraw(jax.random.key(first + number)) for number in range(_KEYS)]
+        drawn = [carrier.redraw(jax.random.key(number)) for number in numbers]
         shifts = [original.to_host(one.displacement(word)) for one in drawn]
         written = [write(original, shift, self.bounds, self._reference) for shift in shifts]
         marks = [
@@ -111,15 +137,18 @@ class Trials:
         signs = tuple(sign * jnp.asarray(one.chips.signs) for one in drawn for sign in (1, -1))
         seen = tuple(
             tuple(
-                observation(original, align(original, one(mark, seed + practice)))
+                observation(original, align(original, one(mark, seed + numbers.start)))
                 for seed in self.seeds
                 for mark in marks
             )
             for one in self.attacks
         )
         scales, used = tuple(one.scale for one in written for _ in (1, -1)), self._used(written[0])
-        trial = Trial(scheme, carrier.reader(), word, signs, scales, used, seen, np.zeros(0))
-        return trial._replace(worth=np.array([self._worth(trial, copies) for copies in seen]))
+        reader = carrier.reader()
+        left = [self._left(scheme, reader, word, signs, copies) for copies in seen]
+        worth = np.array([self._worth(values) for values in left])
+        by_signs = np.array([[self._worth(values[:, place]) for values in left] for place in range(len(numbers))])
+        return Trial(scheme, reader, word, signs, scales, used, seen, worth, by_signs)
 
     def ascend(self, start: Trial, cost: Float64[np.ndarray, "limits bands"]) -> Trial:
         """Change strengths as the gradient of what is left after the worst attack says, as long as trials agree.
@@ -138,7 +167,7 @@ class Trials:
 
     def _improved(self, tried: Trial, cost: Float64[np.ndarray, "limits bands"]) -> TunableScheme:
         """The scheme with the strengths that are best by what is seen of others, which are not far."""
-        at = self.run(tried.scheme, practice=True)
+        at = self._run(tried.scheme, _FITTED)
         carrier, dtype = at.reader.carrier, at.word.dtype
         base = jnp.asarray(carrier.profile)
         scales = [jnp.asarray(scale, dtype) for scale in at.scales]
@@ -161,17 +190,30 @@ class Trials:
         strengths = np.asarray(_climb(at.reader, at.word, groups, limits, level, len(at.seen)), np.float64)
         return at.scheme.with_profile(tuple(float(f"{value:.4g}") for value in strengths / strengths.max()))
 
-    def _worth(self, trial: Trial, copies: Sequence[Observation]) -> float:
-        """What is left after an attack, in the unit of the margin."""
-        carrier, word = trial.reader.carrier, trial.word
-        readers = cycle([trial.reader.with_carrier(_with_signs(carrier, signs)) for signs in trial.signs])
-        pairs = [(reader, reader.receive(one)) for one, reader in zip(copies, readers, strict=False)]
+    def _left(
+        self,
+        scheme: TunableScheme,
+        reader: KeyedReader,
+        word: Float[Array, " code"],
+        signs: Sequence[Int8[Array, "vertices channels"]],
+        copies: Sequence[Observation],
+    ) -> Float64[np.ndarray, "seeds marks two values"]:
+        """What is left of each mark and its opposite after an attack: S/‖a‖, or the soft value of each bit."""
+        readers = cycle([reader.with_carrier(_with_signs(reader.carrier, one)) for one in signs])
+        pairs = [(own, own.receive(one)) for one, own in zip(copies, readers, strict=False)]
         if self.margin == "rate":
-            soft = [np.asarray(word * trial.scheme.detector(*pair, 1.0), np.float64) for pair in pairs]
-            ratio = max(np.mean(soft), 0) / (np.std(soft) or 1)
-            return float(len(word) / 2 * np.log2(1 + ratio**2))
-        claims = [reader.claim(received, word) for reader, received in pairs]
-        return float(max(np.mean([float(one.score) / (float(one.norm) or 1) for one in claims]), 0) ** 2 / 2)
+            values = [np.asarray(word * scheme.detector(*pair, 1.0), np.float64) for pair in pairs]
+        else:
+            claims = [own.claim(received, word) for own, received in pairs]
+            values = [np.array([float(one.score) / (float(one.norm) or 1)]) for one in claims]
+        return np.reshape(values, (len(self.seeds), len(signs) // 2, 2, -1))
+
+    def _worth(self, values: Float64[np.ndarray, "*axes"]) -> float:
+        """What values are worth in the unit of the margin."""
+        mean = max(np.mean(values), 0)
+        if self.margin == "rate":
+            return float(values.shape[-1] / 2 * np.log2(1 + (mean / (np.std(values) or 1)) ** 2))
+        return float(mean**2 / 2)
 
     def _used(self, written: Written) -> Float64[np.ndarray, " limits"]:
         """The share of each limit that a mark uses up, the RMS budget's last."""

@@ -158,18 +158,21 @@ def tune(
     solved = tunable.with_profile(_profile(beta))
     low_pass = [tunable.with_profile((1.0,) * round(share * len(family))) for share in _LOW_PASS]
     others = [trials.run(one) for one in (solved, *low_pass) if trials.fits(one)]
-    best = trials.ascend(max(default, *others, key=lambda one: one.worst), cost)
-    if best.worst < _LEAST_GAIN * default.worst:  # by so little, others may do worse on marks that were not tried
-        best = default
+    chosen = trials.ascend(max(default, *others, key=lambda one: one.worst), cost)
+    # Which of several is best in few trials is so by chance in part: other marks decide.
+    checked = {one: trials.check(one) for one in {default.scheme, solved, chosen.scheme} if trials.fits(one)}
+    usual, best = checked[default.scheme], max(checked.values(), key=lambda one: one.worst)
+    if not best.surpasses(usual, _LEAST_GAIN):
+        best = usual
     report = Report(
         worth,
         bound,
         1 - float(worth.min()) / bound,
         dict(zip(_names(bounds), map(float, weights), strict=True)),
         best.worth,
-        next((one.worth for one in others if one.scheme is solved), np.zeros(len(attacks))),
-        default.worth,
-        best is default,
+        checked[solved].worth if solved in checked else np.zeros(len(attacks)),
+        usual.worth,
+        best is usual,
     )
     exact = np.zeros(len(family))
     exact[: len(best.strengths)] = best.strengths
