@@ -39,7 +39,7 @@ _SHAPES = 5  # cosines over the bands that strengths are changed by: more would 
 _STEPS, _TRIES = 5, 5  # of the gradient, and of the size of each step, before marks are tried again
 _REACH = 0.7  # logarithm of the factor by which each cosine changes strengths until then
 _LEAST_GAIN = 1.05  # of the worth of the worst attack, for which an ascent goes on
-_SURE = 2.0  # standard errors of the mean gain over marks, from which on it is no chance
+_SURE = 3.0  # standard errors of the mean gain over marks, from which on it is no chance
 
 
 class Trial(NamedTuple):

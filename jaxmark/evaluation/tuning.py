@@ -37,7 +37,7 @@ Attacker = tuple[Kind, float] | Callable[[Mesh, int], Mesh]  # an attack and a s
 
 
 _LOW_PASS = (1 / 8, 1 / 4)  # shares of the spectrum that are tried with equal strengths
-_LEAST_GAIN = 1.1  # of what the worst attack leaves by the scheme's own strengths, for which others are returned
+_LEAST_GAIN = 1.2  # of what the worst attack leaves by the scheme's own strengths, for which others are returned
 
 
 class Report(NamedTuple):
