@@ -15,6 +15,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int64
 
+from jaxmark.alignment.bending import Bent, straighten
 from jaxmark.alignment.heights import VertexHeights, measure_heights
 from jaxmark.alignment.nearest import find_heights, settle
 from jaxmark.alignment.observation import Observation
@@ -75,6 +76,7 @@ class Alignment(NamedTuple):
     seconds: float  # duration of the alignment
     how: Align = "auto"  # how it was asked for
     heights: VertexHeights | None = None  # of the vertices of a surface that has few, above the original
+    bent: Bent | None = None  # recognised points that no single map brings back
 
 
 def observation(original: Original, found: Alignment) -> Observation:
@@ -89,6 +91,13 @@ def observation(original: Original, found: Alignment) -> Observation:
         array(found.normals),
         array(found.nuisance),
     )
+
+
+def straightened(original: Original, found: Alignment, bent: Bent) -> Alignment:
+    """The same suspect, brought back by a map of its own around each point; see `bending.straighten`."""
+    displacement, weights = straighten(original.operator, np.asarray(original.positions, np.float64), bent)
+    residual = _rms(displacement[weights > 0])
+    return found._replace(displacement=displacement, weights=weights, nuisance=None, residual=residual, bent=None)
 
 
 def align(original: Original, suspect: Mesh, how: Align = "auto", *, hands: Sequence[bool] = BOTH_HANDS) -> Alignment:
@@ -305,6 +314,7 @@ def _by_points(
     # Points that do not agree may belong to pieces that moved apart; if the residual is large, so may all points.
     far = _rms(error[agreeing]) > _FAR_DISTANCE
     has_pieces = far or np.sum(sound & ~agreeing) >= _min_piece_points(x)
+    bent = Bent(pose(y), sound) if has_pieces else None
     label = np.where(sound, component_of(Mesh(y, faces)), -1) if has_pieces else np.full(len(x), -1)
     pieces = _fit_pieces(x, y, label) if far else []
     if 2 * sum(len(points) for points, _ in pieces) > known.sum():
@@ -319,7 +329,8 @@ def _by_points(
         error = np.zeros_like(error)
     pose = before.then(pose).then(_file(original))
     nuisance = replay_smoothing_of_points(original.operator, mesh, error, agreeing)
-    return Alignment(error, agreeing.astype(float), None, nuisance, method, pose, _rms(error[agreeing]), 0.0)
+    size = _rms(error[agreeing])
+    return Alignment(error, agreeing.astype(float), None, nuisance, method, pose, size, 0.0, bent=bent)
 
 
 def _fit_pieces(

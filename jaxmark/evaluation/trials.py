@@ -31,8 +31,8 @@ from jaxmark.watermark.schemes import TunableScheme
 
 Attack = Callable[[Mesh, int], Mesh]  # an attack of some strength on a mesh, with a seed
 
-# Numbers of the signs of marks, each of which is tried beside its opposite. What strengths are fitted to, those that are
-# best of several are chosen by, and the choice is checked by are different ones: each is good by chance for its own.
+# Numbers of the signs of marks, each of which is tried beside its opposite. Strengths are fitted to the first ones, the
+# best of several are chosen by others, and the choice is checked by others again: each is good by chance for its own.
 _FITTED, _CHOSEN, _CHECKED = range(3, 6), range(3), range(6, 14)
 _SHARPNESS = 50.0  # of the soft minimum over attacks, over the least worth
 _SHAPES = 5  # cosines over the bands that strengths are changed by: more would fit what is chance in each band

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 from jaxmark import distortion
 from jaxmark.alignment import alignment
 from jaxmark.alignment.alignment import Align, Alignment
+from jaxmark.alignment.bending import Bent
+from jaxmark.alignment.heights import VertexHeights
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.errors import JaxmarkError
@@ -43,7 +45,7 @@ _SAME_SHAPE = 0.01  # distance of shapes, over their size, below which an origin
 ALIGN_SHARES = {"auto": 0.97, "same": 0.01, "similarity": 0.01, "affine": 0.01}
 CLAIM_SHARE = 0.97
 _QUICK_SHARE = 0.03  # of the message that plain matched correlations read first; decoding jointly keeps nearly all
-_COARSE_SHARE = 0.05  # of surfaces of few vertices, if they are read by these
+_OTHER_SHARE = 0.05  # of suspects of few vertices, read by these, or bent, read without their bends
 _USUAL_SHARE = 0.9  # of the usual pass band; readers with a record know the band
 _HAND_SHARE = 0.97  # of the hand that fits a surface better
 _MAX_TRIED_NOISE = 0.05  # beyond which no shape is left
@@ -284,8 +286,9 @@ class Marker:
         tag, and the union bound over all messages, or over the one that the record commits to. With one, log10_p is
         Hoeffding's bound (see `evidence.log10_p_claimed`). The score is the plain correlation of the codeword: joint
         decoding may choose the codeword, but does not enter the score. It is taken for each way of weighting the
-        suspect (see `detectors.claims`), and each is paid for, too; so are ways of aligning other than `"auto"`, and
-        reading surfaces of few vertices by these (`jaxmark.watermark.coarse`) where no message is read otherwise.
+        suspect (see `detectors.claims`), and each is paid for, too; so are ways of aligning other than `"auto"`, and,
+        where no message is read otherwise, reading surfaces of few vertices by these (`jaxmark.watermark.coarse`), and
+        what was bent by a map of its own around each point (`jaxmark.alignment.bending`).
         Weights depend on suspect and original only.
 
         A suspect that is read with several keys needs to be aligned only once: pass the result of
@@ -326,8 +329,7 @@ class Marker:
     def _detect(self, aligned: Alignment, message: bytes | None, weights: ArrayLike | None, share: float) -> Detection:
         """Read a suspect as it was aligned, with a share of the probability."""
         received = self.receive(aligned, weights)
-        observed = received.observed
-        coverage = float(np.mean(self.original.to_host(observed.weights)[self.original.used] > 0))
+        coverage = self._coverage(received.observed)
         doubts = self.doubts if weights is None else (*self.doubts, "the weights were chosen by the reader")
         silent = np.zeros(self.code_bits)
         found = Detection(None, 0.0, 0.0, 0.0, 0.0, silent, coverage, aligned, self.choices.version, doubts)
@@ -337,19 +339,56 @@ class Marker:
             remark = "The suspect is the original itself, without a mark."
             return found._replace(remarks=(remark,))
         share *= ALIGN_SHARES[aligned.how]
-        carrier = self.carrier
-        few = aligned.heights if weights is None else None
-        if few is None or not isinstance(carrier, KeyedCarrier) or not isinstance(received, Reception):
+        read_otherwise = self._read_otherwise(found, received) if weights is None else None
+        if read_otherwise is None:
             return self._weigh(found, received, *self._hear(received), message, share)
-        usual = self._weigh(found, received, *self._hear(received), message, share * (1 - _COARSE_SHARE))
+        usual = self._weigh(found, received, *self._hear(received), message, share * (1 - _OTHER_SHARE))
         if usual.detected() and (usual.message is not None or not self.bits):
             return usual
-        coarse = receive_coarse(carrier, self.original, few, received)
-        if coarse is None:
-            return usual
-        soft = np.asarray(self.reader.correlate(coarse), np.float64)
-        other = self._weigh(found, coarse, soft, self._decode(soft), message, share * _COARSE_SHARE)
+        other = read_otherwise(message, share * _OTHER_SHARE)
         return min(usual, other, key=lambda one: (one.log10_p, one.message is None))
+
+    def _read_otherwise(
+        self, found: Detection, received: Received
+    ) -> Callable[[bytes | None, float], Detection] | None:
+        """What reads a suspect again that has few vertices or is bent, with a share of the probability; else None."""
+        aligned, carrier = found.alignment, self.carrier
+        if aligned.bent is not None:
+            return partial(self._read_straightened, found, aligned.bent)
+        if aligned.heights is not None and isinstance(carrier, KeyedCarrier) and isinstance(received, Reception):
+            return partial(self._read_by_vertices, found, received, carrier, aligned.heights)
+        return None
+
+    def _read_straightened(self, found: Detection, bent: Bent, message: bytes | None, share: float) -> Detection:
+        """Read a suspect without its bends."""
+        aligned = alignment.straightened(self.original, found.alignment, bent)
+        received = self.receive(aligned)
+        found = found._replace(
+            alignment=aligned,
+            coverage=self._coverage(received.observed),
+            remarks=("Each point was brought back by a map of its own surroundings, as if the suspect was bent.",),
+        )
+        return self._weigh(found, received, *self._hear(received), message, share)
+
+    def _read_by_vertices(
+        self,
+        found: Detection,
+        received: Reception,
+        carrier: KeyedCarrier,
+        heights: VertexHeights,
+        message: bytes | None,
+        share: float,
+    ) -> Detection:
+        """Read a surface by its vertices; nothing where errors of few vertices have no model."""
+        coarse = receive_coarse(carrier, self.original, heights, received)
+        if coarse is None:
+            return found
+        soft = np.asarray(self.reader.correlate(coarse), np.float64)
+        return self._weigh(found, coarse, soft, self._decode(soft), message, share)
+
+    def _coverage(self, observed: Observation) -> float:
+        """Share of the original's points that a suspect gives evidence for."""
+        return float(np.mean(self.original.to_host(observed.weights)[self.original.used] > 0))
 
     def _hear(self, received: Received) -> tuple[Float64[np.ndarray, " code"], Decoded | None]:
         """The soft values of a suspect, and what they say.
@@ -393,7 +432,7 @@ class Marker:
         if claimed:
             there = self._fitted_beside(received, claimed, decoded.message)
             remark += f" That both are there is an estimate: log10 p about {there:.1f} for the one claimed."
-        return other._replace(remarks=(remark,))
+        return other._replace(remarks=(*other.remarks, remark))
 
     def _fitted_beside(self, received: Received, claimed: bytes, read: bytes) -> float:
         """Estimate log10 p of a claimed message beside another one that was read: of what their codewords do not share.
@@ -812,8 +851,8 @@ class Markers:
             for aligned, part in _ways(ladder[0][1]().original, suspect, align):
                 for share, prepare in ladder:
                     marker = prepare()
-                    # Reading by vertices takes seconds: only what is likeliest is read so.
-                    seen = aligned._replace(heights=None) if found else aligned
+                    # Reading once more takes seconds: only what is likeliest is read so.
+                    seen = aligned._replace(heights=None, bent=None) if found else aligned
                     one = marker.detect(seen, message, weights, share=share * part / len(self._ladders))
                     if one.detected():
                         return one, marker
