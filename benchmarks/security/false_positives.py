@@ -23,6 +23,7 @@ import numpy as np
 import trimesh
 
 import jaxmark as jm
+from jaxmark.alignment.alignment import straightened
 from jaxmark.alignment.observation import Observation
 from jaxmark.confidence import clopper_pearson
 from jaxmark.geometry.mesh import Mesh
@@ -92,7 +93,12 @@ def suspects(marker: jm.watermark.Marker) -> dict[str, Observation]:
         "affine": mesh._replace(vertices=vertices @ np.diag([1, 1.1, 0.9]) + 3),
         "sign of the position": mesh._replace(vertices=vertices + 1e-3 * size * np.sign(vertices)),
     }
-    return stackable({name: marker.observe(suspect) for name, suspect in meshes.items()})
+    seen = {name: marker.observe(suspect) for name, suspect in meshes.items()}
+    for name, mesh in (("bent", mesh), ("marked under another key, bent", marked(204))):
+        aligned = marker.align(jm.attack(mesh, "twisting", 120, seed=5))
+        assert aligned.bent is not None
+        seen[f"{name}, straightened"] = marker.observe(straightened(marker.original, aligned, aligned.bent))
+    return stackable(seen)
 
 
 def surfaces(marker: jm.watermark.Marker) -> dict[str, Observation]:
