@@ -67,7 +67,7 @@ def test_maps_are_least_squares_with_the_weights_of_a_random_walk(monkeypatch):
 def test_a_turned_shape_leaves_nothing_and_what_is_unknown_counts_nothing(original):
     x = np.asarray(original.positions)
     turn = Rotation.from_euler("xyz", [40, -70, 10], degrees=True)
-    found = straighten(original.operator, x, Bent(turn.apply(x) + [1.0, 2, 3], original.used))
+    found = straighten(original.operator, x, Bent(turn.apply(x) + np.array([1.0, 2, 3]), original.used))
     np.testing.assert_allclose(found.displacement, 0, atol=1e-10)
     known = x[:, 0] < 0.1
     lost = np.where(known[:, None], turn.apply(x), 1e6)

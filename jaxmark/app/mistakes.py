@@ -3,6 +3,8 @@
 What is tried here uses the key, and is not paid for: it is a hint where to look, never evidence.
 """
 
+from collections.abc import Iterator
+from dataclasses import replace
 from itertools import product
 
 from jaxmark.alignment.alignment import Align, align
@@ -11,7 +13,7 @@ from jaxmark.geometry.imprint import restore
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.marking import Marker, make_marker
 from jaxmark.watermark.record import Record
-from jaxmark.watermark.schemes import SCHEMES, EigenScheme
+from jaxmark.watermark.schemes import LADDER, SCHEMES, EigenScheme, KeyedScheme, Scheme, get_scheme
 
 _PAYLOADS = (16, 32, 64, 128)  # sizes that people choose
 _MAX_EIGEN_POINTS = 20_000  # more points have eigenpairs that take minutes
@@ -34,20 +36,41 @@ def guess_mistakes(suspect: Mesh, marker: Marker, how: Align) -> tuple[str, ...]
         marker: the marker that found nothing.
         how: how suspects are aligned.
     """
-    original, mine = marker.original.mesh, (marker.scheme.name, marker.bits)
-    if _reads(suspect, original, marker, *mine, how):
-        return ("The files look exchanged: a mark reads in the original, if the suspect is taken for it.",)
-    for scheme, bits in product(SCHEMES, sorted({*_PAYLOADS, marker.bits})):
-        too_long = scheme == EigenScheme.name and len(original.vertices) > _MAX_EIGEN_POINTS
-        if (scheme, bits) != mine and not too_long and _reads(original, suspect, marker, scheme, bits, how):
-            return (f"A message of {bits} bits reads with the scheme {scheme!r}: give these, or the record.",)
+    mine, version = (marker.scheme.name, marker.bits), marker.choices.version
+    schemes = [one for name in SCHEMES for one in _stands_for(get_scheme(name, version=version))]
+    try:
+        exchanged = make_marker(suspect, marker.key, bits=marker.bits, scheme=marker.scheme, version=version)
+        own = [one for one in schemes if one.name == marker.scheme.name] or [marker.scheme]
+        if any(_heard(exchanged, marker.original.mesh, own, [marker.bits], how)):
+            return ("The files look exchanged: a mark reads in the original, if the suspect is taken for it.",)
+    except JaxmarkError:
+        pass  # no mesh that can be marked
+    if len(marker.original.positions) > _MAX_EIGEN_POINTS:
+        schemes = [one for one in schemes if not isinstance(one, EigenScheme)]
+    for scheme, bits in _heard(marker, suspect, schemes, sorted({*_PAYLOADS, marker.bits}), how):
+        if (scheme.name, bits) != mine:
+            return (f"A message of {bits} bits reads with the scheme {scheme.name!r}: give these, or the record.",)
     return ("Without its record, a mark reads only with the original's numbers as they were marked, in their order.",)
 
 
-def _reads(original: Mesh, suspect: Mesh, marker: Marker, scheme: str, bits: int, how: Align) -> bool:
-    """Whether anything reads at a glance with another original, scheme or payload."""
+def _stands_for(scheme: Scheme) -> list[Scheme]:
+    """The schemes that a name may have meant when a mark was made."""
+    if scheme != KeyedScheme():
+        return [scheme]
+    return [replace(KeyedScheme(), passband=name) for name in LADDER]
+
+
+def _heard(
+    marker: Marker, suspect: Mesh, schemes: list[Scheme], payloads: list[int], how: Align
+) -> Iterator[tuple[Scheme, int]]:
+    """Schemes and payloads with which anything reads at a glance; a suspect is aligned only once."""
     try:
-        other = make_marker(original, marker.key, bits=bits, scheme=scheme, version=marker.choices.version)
-        return other.glance(other.observe(align(other.original, suspect, how))) is not None
+        seen = marker.observe(align(marker.original, suspect, how))
     except JaxmarkError:
-        return False
+        return
+    for scheme, bits in product(schemes, payloads):
+        try:
+            if marker.with_scheme(scheme, bits).glance(seen) is not None:
+                yield scheme, bits
+        except JaxmarkError:
+            continue  # this payload does not fit

@@ -282,7 +282,8 @@ def _read(
 def _marker(point: _Point, seed: int) -> Marker | BlindMarker:
     mesh = point.mesh if isinstance(point.mesh, Mesh) else load_mesh(point.mesh)
     rms, limits = point.budget
-    return prepare_alone(mesh, Key(_derive(seed, "key", 32)), point.bits, point.scheme).suited(rms, limits=limits)
+    marker = prepare_alone(mesh, Key(_derive(seed, "key", 32)), point.bits, point.scheme)
+    return marker.suited(rms, limits=limits) if isinstance(point.scheme, str) else marker
 
 
 @lru_cache(maxsize=_SEEDS_PER_CELL)

@@ -4,14 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy import linalg, sparse
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, diagonal
 
 _RIDGE = 1e-12  # of the vertices of a joint, by which what no vertex decides stays with the whole
-_MOST_JOINTS = 1024  # which take seconds and 100 MB at most, however they hang together
+_MOST_JOINTS = 1024  # whose equations take seconds and some 300 MB, however they hang together
+_MOST_SLOTS = 16  # joints that move one vertex
 _FLAT = 1e-3  # least volume of a unit cube after a pose that can be undone
 
 
@@ -57,6 +57,10 @@ def unpose(original: Mesh, skin: Skinning, suspect: Mesh) -> Mesh:
     place = place.reshape(-1, slots)
     if len(joints) > _MOST_JOINTS:
         raise JaxmarkError(f"The skin has {len(joints)} joints; a pose of {_MOST_JOINTS} at most is undone.")
+    if slots > _MOST_SLOTS:
+        raise JaxmarkError(f"The skin has {slots} joints for each vertex; {_MOST_SLOTS} at most are blended.")
+    if not np.isfinite(posed).all():
+        raise JaxmarkError(f"The suspect has {int((~np.isfinite(posed)).any(axis=1).sum())} vertices without a place.")
     unit, centre = diagonal(original), start.mean(axis=0)
     local = np.c_[(start - centre) / unit, np.ones(len(start))]
     whole = np.linalg.lstsq(local, posed, rcond=None)[0]  # of all joints as one, from which each deviates
@@ -66,8 +70,8 @@ def unpose(original: Mesh, skin: Skinning, suspect: Mesh) -> Mesh:
         ((skin.weights[:, :, None] * local[:, None]).ravel(), (rows, columns)), (len(start), 4 * len(joints))
     )
     ridge = _RIDGE * len(start) / len(joints)
-    square = sparse.csc_array(blended.T @ blended) + ridge * sparse.eye_array(4 * len(joints), format="csc")
-    deviation = splu(square).solve(blended.T @ (posed - local @ whole))
+    square = (blended.T @ blended).toarray() + ridge * np.eye(4 * len(joints))
+    deviation = linalg.solve(square, blended.T @ (posed - local @ whole), assume_a="gen", overwrite_a=True)
     maps = whole + np.einsum("vs,vsij->vij", skin.weights, deviation.reshape(-1, 4, 3)[place])
     linear = maps[:, :3]
     volume = np.abs(np.linalg.det(linear / max(np.linalg.norm(whole[:3], 2), np.finfo(np.float64).tiny)))

@@ -40,6 +40,7 @@ from jaxmark.watermark.carriers.reception import Extent, Reception, nuisance_bas
 _OTHERS, _LEAST_OTHERS = 32, 8  # other marks
 _MOST_POINTS = 2**21  # of all originals with other marks together: so much time is spent at most
 _NEAREST = 16  # vertices of their simplifications that tell a vertex's error, those that are nearest to it
+_FEWEST = 2 * _NEAREST  # vertices of a suspect, up to which its heights tell nothing
 _ROUNDS = 3  # of fitting affine maps and variances in turn
 _PROBES = 4  # random heights that tell how much energy a mark has
 _STEPS, _TOLERANCE = 40, 1e-2  # of conjugate gradients
@@ -64,7 +65,7 @@ def receive_coarse(
         JaxmarkError: if fast-simplification is missing.
     """
     others = min(_OTHERS, _MOST_POINTS // len(original.positions))
-    if others < _LEAST_OTHERS:
+    if others < _LEAST_OTHERS or len(there.height) <= _FEWEST:
         return None
     marks = [original.to_host(_any_mark(carrier, number)) for number in range(others)]
     unit = float(distortion.rms(marks[0][original.used]))
@@ -154,7 +155,7 @@ def model_errors(
     """
     affine = original.to_host(nuisance_basis(carrier.host._replace(extent=Extent(scales=0, degree=1))))
     nuisance = there.columns(affine)
-    if min(len(one.height) for one in (there, *elsewhere)) <= 2 * max(_NEAREST, nuisance.shape[1]):
+    if min(len(one.height) for one in (there, *elsewhere)) <= max(_FEWEST, 2 * nuisance.shape[1]):
         return None
     errors = [one.height - one.along(shift) for one, shift in zip(elsewhere, shifts, strict=True)]
     mean, deviation = expected_errors(there, elsewhere, errors, [one.columns(affine) for one in elsewhere])

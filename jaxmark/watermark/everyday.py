@@ -153,9 +153,10 @@ def embed(
         noise: a demand: the noise that the message must survive when half of the vertices are lost, see `capacity`; 0
             requires only that there are enough dimensions. By default nothing is demanded but that the message reads.
             It has no effect for schemes whose readers have no model of noise, such as `host` and `eigen`.
-        scheme: a name or a scheme, see `make_marker`; or `"field"` or `"local"`, whose marks are read without the
-            original, after any remeshing or from any part; or several names, as `("keyed", "field")`, for marks within
-            one set of bounds, of which the first is informed and has the record.
+        scheme: a name or a scheme, see `make_marker`; the default, by its name, takes the pass band that suits what
+            may be seen (see `Marker.suited`), a scheme the one it has. Or `"field"` or `"local"`, whose marks are read
+            without the original, after any remeshing or from any part; or several names, as `("keyed", "field")`, for
+            marks within one set of bounds, of which the first is informed and has the record.
 
     Returns:
         The marked mesh (float64 vertices, same faces) and how it was marked.
@@ -168,7 +169,8 @@ def embed(
     if not isinstance(message, bytes):
         raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
     marker = prepare(mesh, key, 8 * len(message), scheme)
-    marker = marker.suited(budget, limits=limits, visibility=visibility, noise=noise)
+    if isinstance(scheme, str | tuple):  # names stand for any pass band, objects for the one they have
+        marker = marker.suited(budget, limits=limits, visibility=visibility, noise=noise)
     return marker.embed(message, budget, limits=limits, visibility=visibility, noise=noise)
 
 

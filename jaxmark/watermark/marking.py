@@ -317,14 +317,28 @@ class Marker:
         _check_noise(noise)
         return self.with_scheme(suited(self.capacity, self.bits, bounds, noise or NOISE))
 
-    def with_scheme(self, scheme: Scheme) -> "Marker":
-        """The same marker, which has no record, with another scheme of this library."""
-        if scheme == self.scheme:
+    def with_scheme(self, scheme: Scheme, bits: int | None = None) -> "Marker":
+        """The same marker, which has no record, with another scheme of this library, or payload of so many bits.
+
+        Raises:
+            JaxmarkError: if the payload does not fit.
+        """
+        bits = self.bits if bits is None else bits
+        if (scheme, bits) == (self.scheme, self.bits):
             return self
-        code_bits = scheme.code_length(self.original, self.bits)
-        choices = bind_mark(self.key, self.original, scheme, self.bits, self.content, self.choices.version)
-        carrier = scheme.carrier(self.original, choices, self.bits, code_bits)
-        return replace(self, choices=choices, scheme=scheme, carrier=carrier, code_bits=code_bits)
+        code_bits, content = _code_bits(scheme, self.original, bits), _content(bits)
+        choices = bind_mark(self.key, self.original, scheme, bits, content, self.choices.version)
+        carrier = scheme.carrier(self.original, choices, bits, code_bits)
+        return replace(
+            self,
+            choices=choices,
+            bits=bits,
+            scheme=scheme,
+            carrier=carrier,
+            code_bits=code_bits,
+            detector=scheme.detector if self.detector == self.scheme.detector else self.detector,
+            content=content,
+        )
 
     def _detect(self, aligned: Alignment, message: bytes | None, weights: ArrayLike | None, share: float) -> Detection:
         """Read a suspect as it was aligned, with a share of the probability."""
@@ -346,17 +360,22 @@ class Marker:
         if usual.detected() and (usual.message is not None or not self.bits):
             return usual
         other = read_otherwise(message, share * _OTHER_SHARE)
+        if not other.detected():
+            other = other._replace(remarks=usual.remarks)
         return min(usual, other, key=lambda one: (one.log10_p, one.message is None))
 
     def _read_otherwise(
         self, found: Detection, received: Received
     ) -> Callable[[bytes | None, float], Detection] | None:
         """What reads a suspect again that has few vertices or is bent, with a share of the probability; else None."""
-        aligned, carrier = found.alignment, self.carrier
+        aligned = found.alignment
         if aligned.bent is not None:
             return partial(self._read_straightened, found, aligned.bent)
-        if aligned.heights is not None and isinstance(carrier, KeyedCarrier) and isinstance(received, Reception):
-            return partial(self._read_by_vertices, found, received, carrier, aligned.heights)
+        # The proof for strengths that version 1 does not bind holds for weights that do not depend on them.
+        if aligned.heights is None or self.choices.version == 1:
+            return None
+        if isinstance(self.carrier, KeyedCarrier) and isinstance(received, Reception):
+            return partial(self._read_by_vertices, found, received, self.carrier, aligned.heights)
         return None
 
     def _read_straightened(self, found: Detection, bent: Bent, message: bytes | None, share: float) -> Detection:
@@ -383,6 +402,7 @@ class Marker:
         coarse = receive_coarse(carrier, self.original, heights, received)
         if coarse is None:
             return found
+        found = found._replace(remarks=("The suspect was read by its own vertices, which are few.",))
         soft = np.asarray(self.reader.correlate(coarse), np.float64)
         return self._weigh(found, coarse, soft, self._decode(soft), message, share)
 
@@ -680,8 +700,7 @@ def make_marker(
     ready, doubts = recall(original, key, record, used)
     scheme = get_scheme(scheme, version=used)
     payload = DEFAULT_BITS if bits is None else bits
-    code_bits = scheme.code_length(ready, payload) if payload else 1
-    content: Content = "message" if payload else "presence"
+    code_bits, content = _code_bits(scheme, ready, payload), _content(payload)
     choices = bind_mark(key, ready, scheme, payload, content, used, record=record)
     carrier = scheme.carrier(ready, choices, payload, code_bits)
     if not isinstance(scheme, tuple(SCHEMES.values())):
@@ -691,6 +710,19 @@ def make_marker(
     return Marker(
         ready, choices, payload, scheme, carrier, code_bits, detector or scheme.detector, content, record, doubts
     )
+
+
+def _code_bits(scheme: Scheme, original: Original, bits: int) -> int:
+    """Number of code bits of a payload; a presence mark has one.
+
+    Raises:
+        JaxmarkError: if the payload does not fit.
+    """
+    return scheme.code_length(original, bits) if bits else 1
+
+
+def _content(bits: int) -> Content:
+    return "message" if bits else "presence"
 
 
 def bind_mark(

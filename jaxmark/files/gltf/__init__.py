@@ -1,7 +1,6 @@
 """Parse glTF 2.0 in both of its forms, GLB and JSON, with any number of meshes."""
 
 import copy
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -20,6 +19,7 @@ from jaxmark.files.source import Part, Patched, Source, splice, unique_names
 from jaxmark.geometry.skinning import Skinning
 
 _JOINTS = 2**16  # of a skin at most: their numbers have two bytes
+_SETS = 4  # of joints that move a vertex, four in each
 _MAX_WORK = 64  # how often the bytes of a file are looked at to see who else reads them
 
 
@@ -346,9 +346,9 @@ def _texture(document: Document, primitive: _Primitive) -> Float64[np.ndarray, "
 def _skin(document: Document, primitives: Sequence[_Primitive]) -> Skinning | None:
     """The skin of all points, those of one accessor of positions after the other; None unless all have one."""
     skins = {
-        node["mesh"]: node["skin"]
+        node["mesh"]: whole(node, "skin", "a node")
         for node in document.items("nodes")
-        if isinstance(node.get("mesh"), int) and isinstance(node.get("skin"), int)
+        if isinstance(node.get("mesh"), int) and "skin" in node
     }
     parts = [_part_of_skin(document, one, skins.get(one.place[0])) for one in primitives]
     if not parts or any(part is None for part in parts):
@@ -362,10 +362,14 @@ def _skin(document: Document, primitives: Sequence[_Primitive]) -> Skinning | No
 def _part_of_skin(document: Document, primitive: _Primitive, skin: int | None) -> Skinning | None:
     """The skin of a primitive's points; joints of another skin are other joints."""
     count, joints, weights = len(primitive.points.starts), [], []
-    for number in itertools.count():
+    for number in range(_SETS + 1):
         found = [_rows(document, primitive, f"{name}_{number}") for name in ("JOINTS", "WEIGHTS")]
         if found[0] is None or found[1] is None:
             break
+        if number == _SETS:
+            raise JaxmarkError(f"A skin has more than {_SETS} sets of joints and weights.")
+        if found[0].shape[1] != 4 or found[1].shape[1] != 4:
+            raise JaxmarkError("Joints and weights of a skin come in sets of four.")
         if not len(found[0]) == len(found[1]) == count:
             raise JaxmarkError("Joints and weights of a primitive are not as many as its positions.")
         joints.append(found[0])
