@@ -34,6 +34,13 @@ def load(parser: argparse.ArgumentParser, path: str | Path) -> jm.Mesh:
         parser.error(str(refusal))
 
 
+def positive(text: str) -> int:
+    """The type of an argument that is a number of something, at least one."""
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number of at least 1")
+    return int(text)
+
+
 def json_file(text: str) -> Path:
     """The type of an argument that names a JSON file to write, refused before hours of work rather than after."""
     path = Path(text)

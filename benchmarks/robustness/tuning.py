@@ -21,6 +21,7 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark.alignment.original import make_original
+from jaxmark.app.programs import release_programs
 from jaxmark.evaluation.tuning import Tuned, tune
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.budget import make_budget
@@ -196,6 +197,7 @@ def main() -> None:
         if mean is not None:
             print(f"Mean profile of the training meshes, {limit}: {mean.profile}\n", flush=True)
         for source in options.meshes:
+            release_programs()  # of the mesh before, which has another size
             mesh = jm.load_mesh(source)
             assert make_original(mesh).geometry not in known, f"{source} is a training mesh"
             rows = reported(source, mesh, limits, mean, options)

@@ -9,9 +9,11 @@ claimed, over the mark's own, in each metric.
   removal:  a network that lowers the expected evidence
   chain:    up to four tools one after the other, found by evolution on two marked meshes for the least MSDM2
 
-Beside them denoising that learns nothing. Resumable: the same command goes on where it was ended.
+Beside them denoising that learns nothing. Resumable: the same command goes on where it was ended; the folder keeps
+networks and chain, and is refused with other settings of these.
 """
 
+import argparse
 import json
 import sys
 import zlib
@@ -33,7 +35,7 @@ from jaxmark.geometry import asteroid
 from jaxmark.geometry.mesh import Mesh
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from common.arguments import add_meshes, folder_of, make_parser
+from common.arguments import add_meshes, folder_of, load, make_parser, positive
 from common.costs import BITS, METRICS, Target, around, cell, make_target, paid
 from common.marks import BUDGET, MESSAGE
 from common.tables import head, line, say
@@ -110,19 +112,31 @@ def work(folder: Path, output: Path, one: cells.Cell) -> cells.Row:
         return {"refused": str(error)}
 
 
+def keep_settings(parser: argparse.ArgumentParser, output: Path, settings: dict[str, int]) -> None:
+    """Leave the settings in the folder; those of another run end the program."""
+    file = output / "settings.json"
+    if not file.exists():
+        file.write_text(json.dumps(settings))
+    elif (before := json.loads(file.read_text())) != settings:
+        parser.error(f"{output} has results with {before}; choose another folder, or the same settings")
+
+
 def main() -> None:
     parser = make_parser(__doc__)
     add_meshes(parser, help="files of one folder")
     parser.add_argument("--output", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=400, help="of learning")
-    parser.add_argument("--generations", type=int, default=8, help="of the search for chains")
-    parser.add_argument("--size", type=int, default=SIZE, help="vertices of meshes to learn from")
+    parser.add_argument("--steps", type=positive, default=400, help="of learning (%(default)s)")
+    parser.add_argument("--generations", type=positive, default=8, help="of the search for chains (%(default)s)")
+    parser.add_argument("--size", type=positive, default=SIZE, help="vertices of meshes to learn from (%(default)s)")
     parser.add_argument("--only", nargs="+", choices=list(ATTACKERS), default=list(ATTACKERS), help="attackers")
     parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()
     folder = folder_of(parser, arguments.meshes)
     output = arguments.output.resolve()
     output.mkdir(parents=True, exist_ok=True)
+    keep_settings(parser, output, {name: getattr(arguments, name) for name in ("steps", "generations", "size")})
+    for mesh in arguments.meshes:
+        load(parser, mesh)
     for goal in GOALS:
         if goal in arguments.only:
             learn(output, goal, arguments.steps, arguments.size)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmark.attacks.registry import ATTACKS, Attack, attack
-from jaxmark.distortion import Reference
+from jaxmark.distortion import METRICS, Reference
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.marking import Marker
@@ -75,7 +75,8 @@ def search_chain(
         say: function that is called with a line after each generation.
 
     Raises:
-        JaxmarkError: if there is no tool, an attack is unknown, a strength is not positive, or a number is below 1.
+        JaxmarkError: if there is no tool, an attack is unknown, a strength is not positive, or a number is below 1; or
+            if the judge says of a chain that it costs no number.
     """
     if unknown := [kind for kind in tools if kind not in ATTACKS]:
         raise JaxmarkError(f"There is no attack {unknown[0]!r}; there are {', '.join(ATTACKS)}.")
@@ -127,8 +128,10 @@ def projected_cost(
         seed: of the attacks.
 
     Raises:
-        JaxmarkError: if there is no mark, or one that is not proven before any attack.
+        JaxmarkError: if there is no such metric, no mark, or one that is not proven before any attack.
     """
+    if metric not in METRICS:
+        raise JaxmarkError(f"There is no metric {metric!r}; there are {', '.join(METRICS)}.")
     if not pairs:
         raise JaxmarkError("A search for chains needs marks of the attacker's own to judge them by.")
     references = [Reference(marked) for _, marked, _ in pairs]
@@ -192,9 +195,12 @@ def _log10_p(marker: Marker, suspect: Mesh, message: bytes) -> float:
 
 def _judged(judge: Judge, steps: Sequence[tuple[str, float]]) -> float:
     try:
-        return judge(steps)
+        cost = judge(steps)
     except JaxmarkError:
         return _REFUSED
+    if math.isnan(cost):
+        raise JaxmarkError(f"The judge says that the chain {tuple(steps)} costs no number.")
+    return cost
 
 
 def _changed(

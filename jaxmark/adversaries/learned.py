@@ -109,11 +109,16 @@ def learn(
         steps: number of gradient steps, each on one mesh, in turn.
         say: function that is called with a line after every hundredth step.
 
+    Returns:
+        The network, its losses on the way, and what it reaches on meshes that were held out; `learned_attack` attacks
+        by it.
+
     Raises:
-        JaxmarkError: if there is no such goal, no mesh, or no step, or a mesh cannot be marked.
+        JaxmarkError: if there is no such goal, no mesh, no mark or no step, or a mesh cannot be marked.
     """
-    if goal not in get_args(Goal):
-        raise JaxmarkError(f"There is no goal {goal!r}; there are {', '.join(get_args(Goal))}.")
+    _check_goal(goal)
+    if not mark > 0:
+        raise JaxmarkError(f"The RMS displacement of a mark is positive, got {mark:g}.")
     if not meshes or not held_out or steps < 1:
         raise JaxmarkError(
             f"Learning needs meshes, meshes that are held out, and steps; got {len(meshes)}, {len(held_out)}, {steps}."
@@ -156,12 +161,18 @@ def learned_attack(
     """Attack by a network: subtract what it takes for the mark, or what it has learned to do.
 
     Args:
-        network: from `learn`.
-        goal: what it has learned.
+        network: `Learned.network`, from `learn`.
+        goal: what it has learned, `Learned.goal`.
         scheme: the scheme that meshes are marked with.
         bits: size of the payload in bits.
         mark: RMS displacement that the mark is assumed to have, relative to the diagonal.
+
+    Raises:
+        JaxmarkError: if there is no such goal, or the network is none.
     """
+    _check_goal(goal)
+    if isinstance(network, Learned):
+        raise JaxmarkError("An attack is made of the network that has learned: pass its `network`, and its `goal`.")
 
     def way(surrogate: Surrogate, strength: Array, key: PRNGKeyArray) -> Displacement:
         if goal == "estimate":
@@ -169,6 +180,11 @@ def learned_attack(
         return removal(network, surrogate, surrogate.signal, key)
 
     return make_attack(way, scheme, bits, mark)
+
+
+def _check_goal(goal: Goal) -> None:
+    if goal not in get_args(Goal):
+        raise JaxmarkError(f"There is no goal {goal!r}; there are {', '.join(get_args(Goal))}.")
 
 
 def _parts(surrogate: Surrogate, signal: Displacement) -> Float[Array, "bands rows 3"]:

@@ -16,7 +16,7 @@ from jaxmark.app.report import save_report
 from jaxmark.app.scene import mark_scene, pick
 from jaxmark.app.telling import Told, describe, told_payload, told_survival
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import load_mesh, load_scene, load_texture, save_mesh
+from jaxmark.files import load_mesh, load_scene, load_skin, load_texture, save_mesh
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.scheme import BlindScheme
@@ -27,7 +27,7 @@ from jaxmark.watermark.everyday import AnyScheme, also, name_of, prepare
 from jaxmark.watermark.marking import Markers, Survival, make_markers
 from jaxmark.watermark.record import Record
 from jaxmark.watermark.scenes import SceneDetection, SceneRecord, detect_scene, load_record, pair
-from jaxmark.watermark.schemes import DEFAULT_SCHEME
+from jaxmark.watermark.schemes import DEFAULT_SCHEME, LADDER
 from jaxmark.watermark.tracing import make_tracer
 
 
@@ -134,6 +134,7 @@ def mark_file(
         "max": change.max,
         "bits": info.record.bits,
         "scheme": name_of(scheme),
+        "parameters": dict(info.record.parameters),
         "content": info.record.content,
         "survives": survives._asdict() if isinstance(survives, Survival) else None,
         "texture_drift": drift,
@@ -143,6 +144,8 @@ def mark_file(
     text = f"{said} → {marked}, RMS {change.rms:.3g} and max {change.max:.3g} of the diagonal; record → {record}"
     if isinstance(survives, Survival):
         text += f"; it survives {told_survival(survives)}"
+    if (band := info.record.parameters.get("passband")) in LADDER[1:]:
+        text += f"; so faint a mark is written in the pass band {band!r}, which the record says"
     if drift is not None:
         text += f"; a texture of 2,048 x 2,048 drifts by {drift:.2g} texels"
     return Told(answer, text)
@@ -213,6 +216,8 @@ class FileReader:
         if self.guesses and record is None and found.message is None and not detected and not remarks:
             self.doing("nothing detected, looking for a mistake")
             remarks = guess_mistakes(mesh, marker, self.how)
+        if not detected and found.alignment.bent is not None and _has_skin(original):
+            remarks += ("If it is in another pose of the original's skeleton, `jaxmark unpose` undoes that.",)
         answer = {
             "detected": detected,
             "log10_p": found.log10_p,
@@ -348,6 +353,15 @@ class FileReader:
                 raise
             self._last = place, markers
         return self._last[1]
+
+
+def _has_skin(path: Path) -> bool:
+    """Whether a file has a skin by which a pose can be undone."""
+    try:
+        load_skin(path)
+    except JaxmarkError:
+        return False
+    return True
 
 
 def scheme_of(record: Record | SceneRecord) -> str:

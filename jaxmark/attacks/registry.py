@@ -110,7 +110,7 @@ ATTACKS: Mapping[str, Attack] = {
     "sqrt3": Attack(sqrt3, "steps", (1, 2, 3), faces=True),
     "loop": Attack(loop, "steps", (1, 2, 3), faces=True),
     "simplification": Attack(
-        simplification, "share of the edges", (0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.975), host=True, faces=True
+        simplification, "share of the edges that goes", (0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.975), host=True, faces=True
     ),
     "isotropic": Attack(isotropic, "edge length over the mean one", (0.5, 0.7, 1, 1.4, 2), host=True, faces=True),
     "iso-surface": Attack(iso_surface, "cells along the longest side", (200, 150, 100, 70, 50), host=True, faces=True),

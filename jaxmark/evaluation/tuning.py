@@ -7,7 +7,7 @@ detector itself.
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -119,6 +119,8 @@ def tune(
     if not attacks or seeds < 1:
         raise JaxmarkError(f"tune needs at least one attack and one seed, got {len(attacks)} and {seeds}.")
     check_attackers(attacks)
+    if margin not in get_args(Margin):
+        raise JaxmarkError(f"The margin to tune for is one of {', '.join(get_args(Margin))}, got {margin!r}.")
     if blind_scheme(scheme) is not None:
         raise JaxmarkError(f"The scheme {scheme!r} is read without the original, and has no bands; see tune_blind.")
     numbers = seed_numbers("tune", key, seeds)

@@ -318,6 +318,6 @@ def _check_spacing(source: Source, positions: np.ndarray, places: Int64[np.ndarr
         raise JaxmarkError(
             f"The mesh differs from the file by {rms:.3g} (root mean square over the vertices, in file units),"
             f" but the file's numbers are {spacing:.3g} apart, more than a tenth of that;"
-            f" {source.coordinates.advice(rms / _MIN_SPACINGS)}."
+            f" {source.coordinates.advice(rms / _MIN_SPACINGS)}, or change it more."
         )
     return True
