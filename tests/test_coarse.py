@@ -69,6 +69,18 @@ def test_vertices_tell_what_closest_points_do_not():
     assert marker.detect(aligned(), weights=np.ones(len(SHAPE.vertices))).message is None
 
 
+def test_marks_of_version_1_are_not_read_by_vertices(monkeypatch):
+    """Their record does not bind the strengths, on which these weights depend, but not those of closest points."""
+    calls = []
+    monkeypatch.setattr("jaxmark.watermark.marking.receive_coarse", lambda *_: calls.append(1))
+    for version in (1, 2):
+        marker = jm.make_marker(SHAPE, jm.Key(bytes([9] * 32)), bits=0, version=version)
+        seen = align(marker.original, suspect())
+        assert seen.heights is not None
+        assert not marker.detect(seen).detected()
+        assert len(calls) == version - 1
+
+
 def test_no_key_takes_part():
     assert np.array_equal(coarse(3).residual, coarse(5).residual)
 

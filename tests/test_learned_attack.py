@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import jaxmark as jm
 from jaxmark import adversaries
 from jaxmark.adversaries.expected import make_surrogate, random_mark, rms
-from jaxmark.adversaries.learned import Goal, estimate, init_network, learn, learned_attack, removal
+from jaxmark.adversaries.learned import Goal, Learned, estimate, init_network, learn, learned_attack, removal
 from jaxmark.geometry import asteroid
 from jaxmark.geometry.mesh import Mesh
 
@@ -83,5 +83,11 @@ def test_what_is_learned_holds_on_other_meshes_and_is_an_attack(goal: Goal, mark
 def test_refusals(mesh, unchecked):
     with pytest.raises(jm.JaxmarkError, match="There is no goal 'x'; there are estimate, removal"):
         adversaries.learn([mesh], [mesh], key=jax.random.key(0), goal="x")  # type: ignore[arg-type]
+    with pytest.raises(jm.JaxmarkError, match="There is no goal 'x'"):
+        learned_attack(init_network(jax.random.key(0)), "x")  # type: ignore[arg-type]
+    with pytest.raises(jm.JaxmarkError, match="pass its `network`, and its `goal`"):
+        learned_attack(Learned((), "estimate", np.zeros(0), 0.0, 0.0), "estimate")  # type: ignore[arg-type]
+    with pytest.raises(jm.JaxmarkError, match="of a mark is positive, got -1"):
+        adversaries.learn([mesh], [mesh], key=jax.random.key(0), mark=-1.0)
     with pytest.raises(jm.JaxmarkError, match="got 1, 0, 400"):
         adversaries.learn([mesh], [], key=jax.random.key(0))

@@ -125,6 +125,11 @@ def test_refusals(mesh: Mesh, tmp_path: Path):
         unpose(mesh, skin, Mesh(np.zeros((1500, 3)), mesh.faces))
     with pytest.raises(jm.JaxmarkError, match="The skin has 1500 joints"):
         unpose(mesh, Skinning(np.arange(1500)[:, None], np.ones((1500, 1))), mesh)
+    with pytest.raises(jm.JaxmarkError, match="20 joints for each vertex; 16 at most"):
+        unpose(mesh, Skinning(np.zeros((1500, 20), int), np.full((1500, 20), 1 / 20)), mesh)
+    lost = np.where(np.arange(1500)[:, None] < 2, np.nan, mesh.vertices)
+    with pytest.raises(jm.JaxmarkError, match="2 vertices without a place"):
+        unpose(mesh, skin, Mesh(lost, mesh.faces))
     save_mesh(mesh, tmp_path / "plain.glb")
     with pytest.raises(jm.JaxmarkError, match="has no skin"):
         load_skin(tmp_path / "plain.glb")
@@ -134,6 +139,27 @@ def test_refusals(mesh: Mesh, tmp_path: Path):
     (tmp_path / "loose.glb").write_bytes(data)
     with pytest.raises(jm.JaxmarkError, match="weights of joints that are negative, or none"):
         load_skin(tmp_path / "loose.glb")
+    data = skinned_glb(mesh, skin)
+    sets = b"".join(b',"JOINTS_%d":1,"WEIGHTS_%d":2' % (number, number) for number in range(1, 5))
+    for old, new, sentence in (
+        (b'"skin": 0', b'"skin": -9', "skin of a node is -9, not an index"),
+        (b'"VEC4"', b'"MAT4"', "does not lie inside|come in sets of four"),
+        (b', "WEIGHTS_0": 2', b', "WEIGHTS_0": 2' + sets, "more than 4 sets of joints and weights"),
+    ):
+        (tmp_path / "wrong.glb").write_bytes(with_text(data, old, new))
+        with pytest.raises(jm.JaxmarkError, match=sentence):
+            load_skin(tmp_path / "wrong.glb")
+
+
+def with_text(data: bytes, old: bytes, new: bytes) -> bytes:
+    """A GLB file with other words in its JSON."""
+    (length,) = struct.unpack("<I", data[12:16])
+    text, body = data[20 : 20 + length], data[20 + length :]
+    assert old in text
+    text = text.replace(old, new)
+    text = text.ljust(-(-len(text) // 4) * 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + body
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
 def save(mesh: Mesh, path: Path) -> Path:

@@ -11,6 +11,7 @@ import pytest
 
 import jaxmark as jm
 from jaxmark.alignment import alignment
+from jaxmark.app import mistakes
 from jaxmark.evaluation.tuning import tune
 from jaxmark.watermark.budget import make_budget
 from jaxmark.watermark.marking import Marker, make_markers
@@ -117,6 +118,29 @@ def test_all_bands_are_tried_beside_one_alignment(monkeypatch):
     assert len(calls) == 2  # of both versions, whose originals differ
     assert not found.detected()
     assert marker.choices.version in (1, 2)
+
+
+def test_a_scheme_given_as_an_object_keeps_its_band_and_is_read_with_it():
+    key = jm.Key(bytes(range(32)))
+    marked, info = jm.embed(SHAPE, b"ab", key, limits=FAINT, scheme=KeyedScheme())
+    assert info.record.parameters["passband"] == "tapered"
+    assert jm.detect(marked, original=SHAPE, key=key, bits=16, scheme=KeyedScheme()).message == b"ab"
+    assert jm.detect(marked, original=SHAPE, key=key, bits=16).message == b"ab"
+
+
+def test_a_forgotten_payload_size_is_told_whatever_the_band(monkeypatch):
+    """And the suspect is aligned twice, however much is tried: as it is, and for the files exchanged."""
+    calls = []
+    align = mistakes.align
+    monkeypatch.setattr(mistakes, "align", lambda *given: (calls.append(1), align(*given))[1])
+    marked = faint().embed(b"ab", limits=FAINT)[0]
+    usual = jm.make_marker(SHAPE, jm.Key(bytes(32)))
+    (hint,) = mistakes.guess_mistakes(marked, usual, "auto")
+    assert hint.startswith("A message of 16 bits reads with the scheme 'keyed'")
+    exchanged = jm.make_marker(marked, jm.Key(bytes(32)), bits=16)
+    (hint,) = mistakes.guess_mistakes(SHAPE, exchanged, "auto")
+    assert hint.startswith("The files look exchanged")
+    assert len(calls) == 3
 
 
 @pytest.mark.long

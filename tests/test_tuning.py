@@ -270,6 +270,8 @@ def test_refusals(x64, unchecked):
             tune(rough_sphere(300), ATTACKS, key=wrong)  # type: ignore[arg-type]
     with pytest.raises(jm.JaxmarkError, match=r"pair such as \('noise', 0.005\), got 'noise'"):
         tune(rough_sphere(300), ["noise"], key=jax.random.key(0))  # type: ignore[list-item]
+    with pytest.raises(jm.JaxmarkError, match="one of rate, evidence, snr, got 'x'"):
+        tune(rough_sphere(300), ATTACKS, key=jax.random.key(0), margin="x")  # type: ignore[arg-type]
     with pytest.raises(jm.JaxmarkError, match="see tune_blind"):
         tune(rough_sphere(300), ATTACKS, key=jax.random.key(0), scheme="field")
     with pytest.raises(jm.JaxmarkError, match="name of ATTACKS or an Attack"):

@@ -94,8 +94,8 @@ def suspects(marker: jm.watermark.Marker) -> dict[str, Observation]:
         "sign of the position": mesh._replace(vertices=vertices + 1e-3 * size * np.sign(vertices)),
     }
     seen = {name: marker.observe(suspect) for name, suspect in meshes.items()}
-    for name, mesh in (("bent", mesh), ("marked under another key, bent", marked(204))):
-        aligned = marker.align(jm.attack(mesh, "twisting", 120, seed=5))
+    for name, straight in (("bent", mesh), ("marked under another key, bent", marked(204))):
+        aligned = marker.align(jm.attack(straight, "twisting", 120, seed=5))
         assert aligned.bent is not None
         seen[f"{name}, straightened"] = marker.observe(straightened(marker.original, aligned, aligned.bent))
     return stackable(seen)
