@@ -1,4 +1,4 @@
-"""What each defence buys: python benchmarks/security/defences.py MESH [--steps 20] [--rounds 2] [--queries 300].
+"""What each defence buys: python benchmarks/security/defences.py MESH [--attackers NAME...] [--queries 300].
 
 As `adversarial.py`: a mark of 64 bits at 0.08 % RMS, brought below detection at 1e-6 with its message claimed; what
 that costs over the mark's own distortion. First defences of the mark, against who knows the program and, where
@@ -8,12 +8,18 @@ strengths are tuned, these; then of the detector's answers, against who may ask 
          they do is added to all that the next are tuned to (min-max by fictitious play)
   jittered: the strength of each band times a factor that the key draws, log-normal, spread 0.5; the attacker takes its
          median for it
+
+The attackers of marks are `bands` and `vertices`, by gradient, unless others are named: `shrinkage` of wavelets, and
+`remarking`, another mark of the same strengths. What a defence of the mark costs elsewhere stands beside it: the mark's
+own DAME and MSDM2, and log10 p of a claim after noise of 0.5 % and 50 steps of smoothing, without its floor.
 """
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -21,6 +27,7 @@ import numpy as np
 import jaxmark as jm
 from jaxmark import adversaries as enemies
 from jaxmark.alignment.original import make_original
+from jaxmark.evaluation._robustness import Breaking
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.schemes import KeyedScheme, Scheme
@@ -35,18 +42,48 @@ JITTER = 0.5
 STEP, SPREAD = 5.0, 5.0  # of scores, in units of their noise in meshes without a mark
 
 
+class Attacker(NamedTuple):
+    """Who goes against a mark whose strengths are known."""
+
+    attack: Callable[[Scheme, int], jm.attacks.Attack]  # by the strengths, and the number of steps
+    strength: float | None  # that marks are tuned to; None is the least one that succeeded
+
+
 def descent(family: enemies.Family, known: Scheme, steps: int) -> jm.attacks.Attack:
     return enemies.descent(family, scheme=known, bits=BITS, steps=steps)
 
 
-def tuned(mesh: Mesh, steps: int, rounds: int) -> Iterator[tuple[str, Scheme, Scheme]]:
+ATTACKERS = {
+    "bands": Attacker(partial(descent, "bands"), 4 * BUDGET),
+    "vertices": Attacker(partial(descent, "vertices"), 4 * BUDGET),
+    "shrinkage": Attacker(lambda known, steps: jm.attacks.ATTACKS["shrinkage"], None),
+    "remarking": Attacker(lambda known, steps: enemies.remarking(scheme=known, bits=BITS), None),
+}
+OWN_RANGE = {"shrinkage": (3e-5, 3e-2)}  # of strengths; those of others are displacements, about noise by theory
+ELSEWHERE = (("noise", 0.005), ("smoothing", 50))
+
+
+def go_against(target: Target, name: str, known: Scheme, steps: int) -> Breaking:
+    attack = ATTACKERS[name].attack(known, steps)
+    ranged = attack._replace(strengths=OWN_RANGE[name]) if name in OWN_RANGE else around(attack, target.theory)
+    return least_distortion(target, ranged, seed=1)
+
+
+def tuned(mesh: Mesh, names: Sequence[str], steps: int, rounds: int) -> Iterator[tuple[str, Scheme, Scheme]]:
     scheme: Scheme = KeyedScheme()
     attacks = []
     for count in range(1, rounds + 1):
-        attacks += [(descent(family, scheme, steps), 4 * BUDGET) for family in ("bands", "vertices")]
+        for name in names:
+            strength = ATTACKERS[name].strength
+            if strength is None:
+                weakest = go_against(make_target(mesh, scheme), name, scheme, steps).weakest
+                if weakest is None:
+                    continue
+                strength = weakest.strength
+            attacks.append((ATTACKERS[name].attack(scheme, steps), strength))
         found = jm.tune(mesh, attacks, BUDGET, key=jax.random.key(0), bits=BITS, margin="evidence")
         scheme = found.scheme
-        yield f"tuned, round {count}", scheme, scheme
+        yield f"tuned, round {count}" + (" (the default)" if found.report.kept else ""), scheme, scheme
 
 
 def jittered(mesh: Mesh) -> tuple[str, KeyedScheme, KeyedScheme]:
@@ -59,18 +96,26 @@ def jittered(mesh: Mesh) -> tuple[str, KeyedScheme, KeyedScheme]:
     return "jittered strengths", replace(known, profile=tuple(map(float, strengths * jitter))), known
 
 
-def broken(target: Target, attack: jm.attacks.Attack) -> str:
-    found = least_distortion(target, attack, seed=1)
+def broken(found: Breaking) -> str:
     return costs({metric: found.cost(metric) for metric in METRICS}) if found.weakest else "detected"
 
 
-def marks(mesh: Mesh, steps: int, rounds: int) -> None:
-    print(head("defence of the mark", "noise by theory, rms", "bands, by gradient", "vertices, by gradient"))
-    schemes = [("none", KeyedScheme(), KeyedScheme()), *tuned(mesh, steps, rounds), jittered(mesh)]
+def elsewhere(target: Target) -> Iterator[str]:
+    seen = jm.compare(target.marker.original.mesh, target.marked, ["dame", "msdm2"])
+    yield from (f"{value:.3g}" for value in (seen.dame, seen.msdm2))
+    for kind, strength in ELSEWHERE:
+        found = target.marker.detect(jm.attack(target.marked, kind, strength, seed=1), MESSAGE)
+        yield f"{found.log10_p_unfloored:.1f}"
+
+
+def marks(mesh: Mesh, names: Sequence[str], steps: int, rounds: int) -> None:
+    after = [f"{kind} {strength:g}" for kind, strength in ELSEWHERE]
+    print(head("defence of the mark", "noise by theory, rms", *names, "own DAME", "own MSDM2", *after))
+    schemes = [("none", KeyedScheme(), KeyedScheme()), *tuned(mesh, names, steps, rounds), jittered(mesh)]
     for name, scheme, known in schemes:
         target = make_target(mesh, scheme)
-        ways = [around(descent(family, known, steps), target.theory) for family in ("bands", "vertices")]
-        print(line(name, f"{target.theory:.3g}", *(broken(target, way) for way in ways)), flush=True)
+        cells = [broken(go_against(target, attacker, known, steps)) for attacker in names]
+        print(line(name, f"{target.theory:.3g}", *cells, *elsewhere(target)), flush=True)
 
 
 def answers(mesh: Mesh, queries: int) -> None:
@@ -85,7 +130,10 @@ def answers(mesh: Mesh, queries: int) -> None:
     print(head("answers of the detector", "gradients of scores", "random search by scores"))
     for name, oracle in oracles.items():
         ways = [search(oracle, queries=queries) for search in (enemies.estimated_gradient, enemies.random_search)]
-        print(line(name, *(broken(target, around(way, target.theory)) for way in ways)), flush=True)
+        print(
+            line(name, *(broken(least_distortion(target, around(way, target.theory), seed=1)) for way in ways)),
+            flush=True,
+        )
     print()
     print(head("decisions of the detector", "boundary by decisions"))
     decisions = {
@@ -96,20 +144,22 @@ def answers(mesh: Mesh, queries: int) -> None:
     }
     for name, decision in decisions.items():
         attack = enemies.boundary(decision)._replace(strengths=(queries, queries))
-        print(line(name, broken(target, attack)), flush=True)
+        print(line(name, broken(least_distortion(target, attack, seed=1))), flush=True)
 
 
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("mesh")
+    parser.add_argument("--attackers", nargs="+", choices=list(ATTACKERS), default=["bands", "vertices"])
     parser.add_argument("--steps", type=int, default=20, help="of optimisers")
     parser.add_argument("--rounds", type=int, default=2, help="of tuning")
-    parser.add_argument("--queries", type=int, default=300)
+    parser.add_argument("--queries", type=int, default=300, help="of attackers who ask; 0 leaves them out")
     arguments = parser.parse_args()
     mesh = load(parser, arguments.mesh)
     print(f"Distortion over the mark's, {' / '.join(METRICS)}:\n")
-    marks(mesh, arguments.steps, arguments.rounds)
-    answers(mesh, arguments.queries)
+    marks(mesh, arguments.attackers, arguments.steps, arguments.rounds)
+    if arguments.queries:
+        answers(mesh, arguments.queries)
 
 
 if __name__ == "__main__":
