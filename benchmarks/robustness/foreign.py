@@ -23,7 +23,7 @@ import statistics
 import sys
 import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -76,18 +76,31 @@ def qslim(mesh: Mesh, share: float, _: Any) -> Mesh:
     return plain(Mesh(*require("igl", "attacks").qslim(*arrays, left(mesh, share))[:2]))
 
 
-# Simplifiers of MeshLab and libigl beside the library's.
+def filtered(name: str) -> Callable[[Mesh, float, Any], Mesh]:
+    """A filter of MeshLab, some times one after the other."""
+
+    def run(mesh: Mesh, times: float, _: Any) -> Mesh:
+        for _time in range(round(times)):
+            mesh = apply_filter(name, mesh)
+        return plain(mesh)
+
+    return run
+
+
+# Simplifiers of MeshLab and libigl, and smoothing by MeshLab, beside the library's.
 KINDS = {
     "none": Attack(lambda mesh, *_: mesh, "none", (0,), host=True),
     "collapse": Attack(collapse, "share of the edges", (0.9,), host=True),
     "qslim": Attack(qslim, "share of the edges", (0.9,), host=True),
+    "hc": Attack(filtered("apply_coord_hc_laplacian_smoothing"), "times", (1, 10), host=True),
+    "two-step": Attack(filtered("apply_coord_two_steps_smoothing"), "times", (1, 10), host=True),
 }
 # Those, and attacks of `jaxmark attack`, with their strengths.
 ATTACKS = """none; simplification 0.5; simplification 0.7; simplification 0.9; simplification 0.95;
 simplification 0.975; collapse 0.9; qslim 0.9; midpoint 1; loop 1; sqrt3 1; isotropic 1; isotropic 0.5; isotropic 2;
 iso-surface 100; iso-surface 200; poisson 8; cropping 0.1; cropping 0.3; cropping 0.5; cropping 0.8;
 simplification 0.7 + noise 0.001; cropping 0.3 + quantisation 9; simplification 0.5 + smoothing 50;
-isotropic 1.5 + smoothing 50 + isotropic 1; simplification 0.96 + loop 2;
+isotropic 1.5 + smoothing 50 + isotropic 1; simplification 0.96 + loop 2; hc 5; two-step 5;
 added-geometry 1"""
 
 
