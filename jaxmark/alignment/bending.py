@@ -16,6 +16,7 @@ from jaxmark.spectral.laplacian import Laplacian
 
 _STEPS = 20  # halfway to the neighbours' mean: surroundings of about a hundred points
 _RIDGE = 1e-3  # of the variance around a point, by which a rotation is preferred where planes do not tell
+_LEAST_VARIANCE = 1e-12  # in squared diagonals, of which rounding makes no singular matrix
 _FLAT = 1e-3  # volume of a unit cube after a map that can be undone
 _LEAST_ENERGY = 0.25  # of the median, which is added: no place gains much weight by being quiet
 
@@ -57,7 +58,7 @@ def straighten(operator: Laplacian, positions: Points, bent: Bent) -> Straighten
     signs = np.ones((len(x), 3, 1))
     signs[:, 2, 0] = np.sign(np.linalg.det(u @ vt))
     rotation = u @ (signs * vt)
-    ridge = (_RIDGE * np.trace(variance, axis1=1, axis2=2) + np.finfo(np.float64).tiny)[:, None, None]
+    ridge = (_RIDGE * np.trace(variance, axis1=1, axis2=2) + _LEAST_VARIANCE)[:, None, None]
     linear = np.linalg.solve(
         variance + ridge * np.eye(3), change + ridge * rotation
     )  # y - image = (x - centre) @ linear
