@@ -46,8 +46,11 @@ Align = Literal["auto", "same", "similarity", "affine"]
 Method = Literal["same", "connectivity", "points", "surface"]
 
 # A point is masked if it is off by more than the distance (in diagonals), and by more than the multiple of the 40 %
-# quantile of all points' distances. A suspect whose residual exceeds the distance is not aligned.
+# quantile of all points' distances. A suspect whose residual exceeds the distance is aligned only if nothing fits better.
 _FAR_DISTANCE, _FAR_MULTIPLE = 0.005, 10.0
+# Little more than the shape may be left of a surface. Where no pose leaves less, it is read up to this residual if so
+# much of the original is seen.
+_ROUGH_DISTANCE, _ROUGH_COVERAGE = 0.01, 0.5
 _MAX_TRIMMING_ROUNDS = 30  # rounds of fitting a map to the better half of the points
 _MAX_AGREEING_ROUNDS = 10  # rounds of fitting a map to the points that agree with it
 _MAX_FIT_POINTS = 50_000  # random points by which a map is found before all points refine it
@@ -115,8 +118,8 @@ def align(original: Original, suspect: Mesh, how: Align = "auto", *, hands: Sequ
 
     Raises:
         JaxmarkError: if the suspect does not share the original's connectivity under `"same"`, cannot be aligned (the
-            residual is over 0.5 % of the diagonal, or less than 5 % of the original is seen), or libigl is missing,
-            which surfaces need.
+            residual is over 1 % of the diagonal, or over 0.5 % where less than half of the original is seen, or less
+            than 5 % is seen), or libigl is missing, which surfaces need.
     """
     if how not in get_args(Align):
         raise JaxmarkError(f"A suspect is aligned by {', '.join(get_args(Align))}, not {how!r}.")
@@ -438,15 +441,20 @@ def _by_surfaces(
     whole = Surface(suspect)
     parts = [Surface(part) for part in components(suspect)[:_MAX_COMPONENTS] if area(part) > 0]
     parts = parts if len(parts) > 1 else []
-    failed = [(np.inf, 0.0)]
+    failed: list[tuple[Alignment, Surface, Pose]] = []
     for part, register in ((whole, register_whole), (whole, register_part), *((p, register_whole) for p in parts)):
         if (pose := register(surface, part, hands)) is None:
             continue
         found = _by_surface(original, surface, part, pose, by_affine)
         if (coverage := _coverage(original, found)) >= _MIN_COVERAGE and found.residual <= _FAR_DISTANCE:
             return _with_pieces(original, surface, parts, found, pose) if coverage < _FULL_COVERAGE else found
-        failed.append((found.residual, coverage))
-    size, coverage = min(failed)
+        failed.append((found, part, pose))
+    size, coverage = np.inf, 0.0
+    if failed:
+        found, part, pose = min(failed, key=lambda one: one[0].residual)
+        size, coverage = found.residual, _coverage(original, found)
+        if coverage >= _ROUGH_COVERAGE and size <= _ROUGH_DISTANCE:
+            return _by_surface(original, surface, part, pose, by_affine, _ROUGH_DISTANCE)
     raise JaxmarkError(
         "The suspect could not be aligned: "
         + (
@@ -483,8 +491,18 @@ def _with_pieces(original: Original, surface: Surface, parts: list[Surface], fou
     return found
 
 
-def _by_surface(original: Original, surface: Surface, suspect: Surface, pose: Pose, by_affine: bool) -> Alignment:
-    """Align a suspect's surface in a pose; of each point, only the displacement along the surface's normal is known."""
+def _by_surface(
+    original: Original,
+    surface: Surface,
+    suspect: Surface,
+    pose: Pose,
+    by_affine: bool,
+    most: float = _FAR_DISTANCE,
+) -> Alignment:
+    """Align a suspect's surface in a pose; of each point, only the displacement along the surface's normal is known.
+
+    What happened to the host is only looked for if the residual is `most` or less.
+    """
     x = np.asarray(surface.mesh.vertices)
     closest, face, seen = _closest(original, x, suspect, pose)
     if by_affine and seen.any():
@@ -495,11 +513,11 @@ def _by_surface(original: Original, surface: Surface, suspect: Surface, pose: Po
     posed = suspect.mesh._replace(vertices=pose(np.asarray(suspect.mesh.vertices)))
     # Closest points lie along the suspect's normals, which on coarse suspects differ from the original's.
     normals = face_normals(posed)[face]
-    nuisance = replay_smoothing(surface, posed, face, closest, normals, seen) if size <= _FAR_DISTANCE else None
+    nuisance = replay_smoothing(surface, posed, face, closest, normals, seen) if size <= most else None
     file = pose.then(_file(original))
     heights = None
     few = len(posed.vertices) <= _FEW_VERTICES * original.used.sum()
-    if few and size <= _FAR_DISTANCE and available("fast_simplification"):  # which tells what errors heights have
+    if few and size <= most and available("fast_simplification"):  # which tells what errors heights have
         heights = measure_heights(surface, posed, round(len(posed.faces) * area(surface.mesh) / area(posed)))
     return Alignment(displacement, seen.astype(float), normals, nuisance, "surface", file, size, 0.0, heights=heights)
 
