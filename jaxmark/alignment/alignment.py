@@ -46,7 +46,7 @@ Align = Literal["auto", "same", "similarity", "affine"]
 Method = Literal["same", "connectivity", "points", "surface"]
 
 # A point is masked if it is off by more than the distance (in diagonals), and by more than the multiple of the 40 %
-# quantile of all points' distances. A suspect whose residual exceeds the distance is aligned only if nothing fits better.
+# quantile of all points' distances. A suspect whose residual exceeds the distance is aligned if nothing fits better.
 _FAR_DISTANCE, _FAR_MULTIPLE = 0.005, 10.0
 # Little more than the shape may be left of a surface. Where no pose leaves less, it is read up to this residual if so
 # much of the original is seen.
