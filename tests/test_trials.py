@@ -80,6 +80,8 @@ def test_what_is_better_by_chance_does_not_surpass(trial):
         if gain == 3.0:
             chance = stats.ttest_rel(after.min(axis=1), before.min(axis=1), alternative="greater").pvalue
             assert (chance < 0.01) == surpasses  # of three standard errors, with seven degrees of freedom
+    nothing, hardly = (trial._replace(by_signs=np.full((8, 2), some), worth=np.full(2, some)) for some in (0.1, 0.5))
+    assert not hardly.surpasses(nothing, 1.2)
 
 
 @pytest.mark.long

@@ -40,6 +40,7 @@ _STEPS, _TRIES = 5, 5  # of the gradient, and of the size of each step, before m
 _REACH = 0.7  # logarithm of the factor by which each cosine changes strengths until then
 _LEAST_GAIN = 1.05  # of the worth of the worst attack, for which an ascent goes on
 _SURE = 3.0  # standard errors of the mean gain over marks, from which on it is no chance
+_LEAST_WORTH = 1.0  # nats or bits, of which a smaller gain is none: next to nothing is no better than nothing
 
 
 class Trial(NamedTuple):
@@ -74,7 +75,7 @@ class Trial(NamedTuple):
         """
         gains = self.by_signs.min(axis=1) - other.by_signs.min(axis=1)
         error = float(np.std(gains, ddof=1)) / len(gains) ** 0.5
-        return self.worst >= least * other.worst and float(np.mean(gains)) > _SURE * error
+        return self.worst >= least * other.worst and float(np.mean(gains)) > max(_SURE * error, _LEAST_WORTH)
 
 
 @dataclass(frozen=True, eq=False)
