@@ -50,7 +50,7 @@ for band in (0, 1, 3, 7, 15, 31):
 # after each attack, in nats. Only the worst attack counts, so what another leaves may shrink down to it. No strengths
 # whatever could exceed `bound`, by a model of the attacks.
 #
-# The default strengths are good against many attacks, and kept where nothing does better by a tenth: try noise and
+# The default strengths are good against many attacks, and kept where nothing does better by a fifth: try noise and
 # smoothing instead.
 
 # %%

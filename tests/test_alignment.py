@@ -13,7 +13,7 @@ from jaxmark.alignment.alignment import align
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.geometry.mesh import Mesh, make_mesh, vertex_normals
 from jaxmark.geometry.pose import Pose
-from tests.samples import bumpy_sphere, exact_sheet
+from tests.samples import bumpy_sphere, exact_sheet, rough_sphere
 
 
 @pytest.fixture(scope="module")
@@ -426,6 +426,21 @@ def rippled_ball() -> Mesh:
     vertices = np.asarray(hull.vertices)
     waves = np.cos(9 * vertices @ rng.normal(size=(3, 12))).sum(axis=1, keepdims=True)
     return make_mesh(vertices * (1 + 0.02 * waves), np.asarray(hull.faces))
+
+
+@pytest.mark.slow
+def test_a_surface_with_little_more_than_the_shape_is_read_as_a_whole_only():
+    """Strong smoothing moves it further than anything else is allowed to; half of it is not enough to tell the pose."""
+    mesh = rough_sphere(1500)
+    original = make_original(mesh)
+    smooth = jm.attack(jm.attack(mesh, "smoothing", 80, seed=0), "midpoint", 1, seed=0)
+    turn = Rotation.from_euler("xyz", [20, 40, 60], degrees=True)
+    found = align(original, Mesh(3 * turn.apply(smooth.vertices), smooth.faces))
+    assert 0.005 < found.residual < 0.01
+    assert found.nuisance is not None  # what smoothing did to the host
+    np.testing.assert_allclose(found.pose.matrix @ turn.as_matrix() * 3, np.eye(3), atol=0.05)
+    with pytest.raises(jm.JaxmarkError, match="could not be aligned: its surface lies"):
+        align(original, jm.attack(smooth, "cropping", 0.6, seed=0))
 
 
 @pytest.mark.slow
