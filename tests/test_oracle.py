@@ -33,10 +33,10 @@ def along(mesh: Mesh, way: np.ndarray) -> Counted:
     return Counted(lambda suspect: -float(np.sum((suspect.vertices - mesh.vertices) * way)))
 
 
-@pytest.mark.parametrize("strength", [0.006, 0.03])
-def test_oracles_say_what_the_detector_says(marked, strength):
+@pytest.mark.parametrize(("kind", "strength"), [("jamming", 0.0047), ("noise", 0.017)])
+def test_oracles_say_what_the_detector_says(marked, kind, strength):
     marker, mesh = marked
-    suspect = jm.attack(mesh, "jamming", strength, seed=0)
+    suspect = jm.attack(mesh, kind, strength, seed=0)
     found, score = marker.detect(suspect, MESSAGE), score_oracle(marker, MESSAGE)(suspect)
     # Hoeffding's bound is the score's square, over 2 ln 10; rounding is taken off it, and what else might have been
     # read or aligned is paid for.
