@@ -60,7 +60,7 @@ def score_oracle(marker: Marker, message: bytes) -> Score:
     """Make an oracle for the evidence √(-2 ln p) of a claim, with no floor on p; 0 for a suspect that is refused.
 
     The evidence is S/‖a‖ if the detector tries one way of weighting the suspect, and a little less if it takes the
-    better of two (`detectors.claims`). What the detector reads once more, of few vertices or without bends, is left out.
+    better of two (`detectors.claims`). What is read once more, of few vertices or without bends, is left out.
 
     Args:
         marker: the reader: original, key, payload and scheme.
