@@ -106,8 +106,7 @@ def test_what_no_map_brings_back_is_finite_or_counts_nothing(original):
     assert (nothing.weights == 0).all()
 
 
-def test_a_message_is_read_in_another_pose(mesh, key: jm.Key):
-    """Without a skeleton; with other keys, and without a mark, nothing is."""
+def test_a_message_is_read_in_another_pose_without_a_skeleton(mesh, key: jm.Key):
     marker = jm.make_marker(mesh, key, bits=16)
     marked, _ = marker.embed(b"ok", 8e-4)
     suspect = folded(marked, 40)
@@ -117,6 +116,12 @@ def test_a_message_is_read_in_another_pose(mesh, key: jm.Key):
     assert found.detected()
     assert found.alignment.bent is None
     assert "map of its own" in found.remarks[0]
+
+
+@pytest.mark.long
+def test_without_a_mark_or_its_key_nothing_is_read(mesh, key: jm.Key):
+    marker = jm.make_marker(mesh, key, bits=16)
+    suspect = folded(marker.embed(b"ok", 8e-4)[0], 40)
     assert not marker.detect(folded(mesh, 40)).detected(1e-3)
     other = jm.make_marker(mesh, jm.Key(bytes(32)), bits=16)
     assert not other.detect(suspect).detected(1e-3)
