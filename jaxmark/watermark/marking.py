@@ -379,11 +379,9 @@ class Marker:
         return None
 
     def _read_straightened(self, found: Detection, bent: Bent, message: bytes | None, share: float) -> Detection:
-        """Read a suspect without its bends."""
-        aligned = alignment.straightened(self.original, found.alignment, bent)
-        received = self.receive(aligned)
+        """Read a suspect without its bends; the alignment that is told stays the one that no key had a part in."""
+        received = self.receive(alignment.straightened(self.original, found.alignment, bent))
         found = found._replace(
-            alignment=aligned,
             coverage=self._coverage(received.observed),
             remarks=("Each point was brought back by a map of its own surroundings, as if the suspect was bent.",),
         )
