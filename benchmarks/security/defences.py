@@ -47,6 +47,7 @@ class Attacker(NamedTuple):
 
     attack: Callable[[Scheme, int], jm.attacks.Attack]  # by the strengths, and the number of steps
     strength: float | None  # that marks are tuned to; None is the least one that succeeded
+    reach: tuple[float, float] | None = None  # of strengths; None are displacements about noise by theory
 
 
 def descent(family: enemies.Family, known: Scheme, steps: int) -> jm.attacks.Attack:
@@ -56,16 +57,15 @@ def descent(family: enemies.Family, known: Scheme, steps: int) -> jm.attacks.Att
 ATTACKERS = {
     "bands": Attacker(partial(descent, "bands"), 4 * BUDGET),
     "vertices": Attacker(partial(descent, "vertices"), 4 * BUDGET),
-    "shrinkage": Attacker(lambda known, steps: jm.attacks.ATTACKS["shrinkage"], None),
+    "shrinkage": Attacker(lambda known, steps: jm.attacks.ATTACKS["shrinkage"], None, (3e-5, 3e-2)),
     "remarking": Attacker(lambda known, steps: enemies.remarking(scheme=known, bits=BITS), None),
 }
-OWN_RANGE = {"shrinkage": (3e-5, 3e-2)}  # of strengths; those of others are displacements, about noise by theory
 ELSEWHERE = (("noise", 0.005), ("smoothing", 50))
 
 
 def go_against(target: Target, name: str, known: Scheme, steps: int) -> Breaking:
-    attack = ATTACKERS[name].attack(known, steps)
-    ranged = attack._replace(strengths=OWN_RANGE[name]) if name in OWN_RANGE else around(attack, target.theory)
+    attack, reach = ATTACKERS[name].attack(known, steps), ATTACKERS[name].reach
+    ranged = around(attack, target.theory) if reach is None else attack._replace(strengths=reach)
     return least_distortion(target, ranged, seed=1)
 
 
@@ -130,10 +130,8 @@ def answers(mesh: Mesh, queries: int) -> None:
     print(head("answers of the detector", "gradients of scores", "random search by scores"))
     for name, oracle in oracles.items():
         ways = [search(oracle, queries=queries) for search in (enemies.estimated_gradient, enemies.random_search)]
-        print(
-            line(name, *(broken(least_distortion(target, around(way, target.theory), seed=1)) for way in ways)),
-            flush=True,
-        )
+        found = [least_distortion(target, around(way, target.theory), seed=1) for way in ways]
+        print(line(name, *map(broken, found)), flush=True)
     print()
     print(head("decisions of the detector", "boundary by decisions"))
     decisions = {

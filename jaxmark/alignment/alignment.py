@@ -441,20 +441,20 @@ def _by_surfaces(
     whole = Surface(suspect)
     parts = [Surface(part) for part in components(suspect)[:_MAX_COMPONENTS] if area(part) > 0]
     parts = parts if len(parts) > 1 else []
-    failed: list[tuple[Alignment, Surface, Pose]] = []
+    failed: list[Alignment] = []
     for part, register in ((whole, register_whole), (whole, register_part), *((p, register_whole) for p in parts)):
         if (pose := register(surface, part, hands)) is None:
             continue
         found = _by_surface(original, surface, part, pose, by_affine)
         if (coverage := _coverage(original, found)) >= _MIN_COVERAGE and found.residual <= _FAR_DISTANCE:
             return _with_pieces(original, surface, parts, found, pose) if coverage < _FULL_COVERAGE else found
-        failed.append((found, part, pose))
+        failed.append(found)
     size, coverage = np.inf, 0.0
     if failed:
-        found, part, pose = min(failed, key=lambda one: one[0].residual)
+        found = min(failed, key=lambda one: one.residual)
         size, coverage = found.residual, _coverage(original, found)
         if coverage >= _ROUGH_COVERAGE and size <= _ROUGH_DISTANCE:
-            return _by_surface(original, surface, part, pose, by_affine, _ROUGH_DISTANCE)
+            return found
     raise JaxmarkError(
         "The suspect could not be aligned: "
         + (
@@ -491,18 +491,8 @@ def _with_pieces(original: Original, surface: Surface, parts: list[Surface], fou
     return found
 
 
-def _by_surface(
-    original: Original,
-    surface: Surface,
-    suspect: Surface,
-    pose: Pose,
-    by_affine: bool,
-    most: float = _FAR_DISTANCE,
-) -> Alignment:
-    """Align a suspect's surface in a pose; of each point, only the displacement along the surface's normal is known.
-
-    What happened to the host is only looked for if the residual is `most` or less.
-    """
+def _by_surface(original: Original, surface: Surface, suspect: Surface, pose: Pose, by_affine: bool) -> Alignment:
+    """Align a suspect's surface in a pose; of each point, only the displacement along the surface's normal is known."""
     x = np.asarray(surface.mesh.vertices)
     closest, face, seen = _closest(original, x, suspect, pose)
     if by_affine and seen.any():
@@ -513,11 +503,11 @@ def _by_surface(
     posed = suspect.mesh._replace(vertices=pose(np.asarray(suspect.mesh.vertices)))
     # Closest points lie along the suspect's normals, which on coarse suspects differ from the original's.
     normals = face_normals(posed)[face]
-    nuisance = replay_smoothing(surface, posed, face, closest, normals, seen) if size <= most else None
+    nuisance = replay_smoothing(surface, posed, face, closest, normals, seen) if size <= _ROUGH_DISTANCE else None
     file = pose.then(_file(original))
     heights = None
     few = len(posed.vertices) <= _FEW_VERTICES * original.used.sum()
-    if few and size <= most and available("fast_simplification"):  # which tells what errors heights have
+    if few and size <= _ROUGH_DISTANCE and available("fast_simplification"):  # which tells what errors heights have
         heights = measure_heights(surface, posed, round(len(posed.faces) * area(surface.mesh) / area(posed)))
     return Alignment(displacement, seen.astype(float), normals, nuisance, "surface", file, size, 0.0, heights=heights)
 

@@ -59,9 +59,8 @@ def straighten(operator: Laplacian, positions: Points, bent: Bent) -> Straighten
     signs[:, 2, 0] = np.sign(np.linalg.det(u @ vt))
     rotation = u @ (signs * vt)
     ridge = (_RIDGE * np.trace(variance, axis1=1, axis2=2) + _LEAST_VARIANCE)[:, None, None]
-    linear = np.linalg.solve(
-        variance + ridge * np.eye(3), change + ridge * rotation
-    )  # y - image = (x - centre) @ linear
+    # y - image = (x - centre) @ linear, nearly
+    linear = np.linalg.solve(variance + ridge * np.eye(3), change + ridge * rotation)
     sound = known & (np.abs(np.linalg.det(linear)) > _FLAT)
     linear[~sound] = np.eye(3)
     back = centre + np.linalg.solve(linear.transpose(0, 2, 1), (y - image)[..., None])[..., 0]
