@@ -4,7 +4,6 @@ What is tried here uses the key, and is not paid for: it is a hint where to look
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import product
 
 from jaxmark.alignment.alignment import Align, align
@@ -13,7 +12,7 @@ from jaxmark.geometry.imprint import restore
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.marking import Marker, make_marker
 from jaxmark.watermark.record import Record
-from jaxmark.watermark.schemes import LADDER, SCHEMES, EigenScheme, KeyedScheme, Scheme, get_scheme
+from jaxmark.watermark.schemes import SCHEMES, EigenScheme, Scheme, get_scheme, stands_for
 
 _PAYLOADS = (16, 32, 64, 128)  # sizes that people choose
 _MAX_EIGEN_POINTS = 20_000  # more points have eigenpairs that take minutes
@@ -37,7 +36,7 @@ def guess_mistakes(suspect: Mesh, marker: Marker, how: Align) -> tuple[str, ...]
         how: how suspects are aligned.
     """
     mine, version = (marker.scheme.name, marker.bits), marker.choices.version
-    schemes = [one for name in SCHEMES for one in _stands_for(get_scheme(name, version=version))]
+    schemes = [one for name in SCHEMES for one in stands_for(get_scheme(name, version=version))]
     try:
         exchanged = make_marker(suspect, marker.key, bits=marker.bits, scheme=marker.scheme, version=version)
         own = [one for one in schemes if one.name == marker.scheme.name] or [marker.scheme]
@@ -51,13 +50,6 @@ def guess_mistakes(suspect: Mesh, marker: Marker, how: Align) -> tuple[str, ...]
         if (scheme.name, bits) != mine:
             return (f"A message of {bits} bits reads with the scheme {scheme.name!r}: give these, or the record.",)
     return ("Without its record, a mark reads only with the original's numbers as they were marked, in their order.",)
-
-
-def _stands_for(scheme: Scheme) -> list[Scheme]:
-    """The schemes that a name may have meant when a mark was made."""
-    if scheme != KeyedScheme():
-        return [scheme]
-    return [replace(KeyedScheme(), passband=name) for name in LADDER]
 
 
 def _heard(

@@ -34,7 +34,7 @@ from jaxmark.watermark.coding.message import CANDIDATES, TAG_BITS, Decoded, deco
 from jaxmark.watermark.detectors import Detector, claims
 from jaxmark.watermark.payload import COVERAGE, NOISE, Capacity, Conditions
 from jaxmark.watermark.record import Content, Record, commit, seal_imprint
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, LADDER, SCHEMES, Scheme, get_scheme, parameters_of
+from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES, Scheme, get_scheme, parameters_of, stands_for
 from jaxmark.watermark.suiting import suited
 
 DEFAULT_BITS = 64  # size of the payload
@@ -835,10 +835,11 @@ def make_markers(
     for version in versions_of(record):
         usual = cache(partial(prepare, version=version))
         ladder = [(1.0, usual)]
-        if record is None and version > 1 and scheme == DEFAULT_SCHEME:
-            share = (1 - _USUAL_SHARE) / (len(LADDER) - 1)
-            others = [(share, cache(partial(_with_passband, usual, name))) for name in LADDER[1:]]
-            ladder = [(_USUAL_SHARE, usual), *others]
+        is_named = record is None and scheme == DEFAULT_SCHEME
+        others = stands_for(get_scheme(DEFAULT_SCHEME, version=version))[1:] if is_named else ()
+        if others:
+            share = (1 - _USUAL_SHARE) / len(others)
+            ladder = [(_USUAL_SHARE, usual), *((share, cache(partial(_with_scheme, usual, other))) for other in others)]
         ladders.append(ladder)
     return Markers(ladders)
 
@@ -848,9 +849,8 @@ def versions_of(record: Record | None) -> tuple[int, ...]:
     return VERSIONS if record is None else (record.version,)
 
 
-def _with_passband(usual: Callable[[], Marker], name: str) -> Marker:
-    marker = usual()
-    return marker.with_scheme(replace(marker.scheme, passband=name))
+def _with_scheme(usual: Callable[[], Marker], scheme: Scheme) -> Marker:
+    return usual().with_scheme(scheme)
 
 
 class Markers:

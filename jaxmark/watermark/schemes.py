@@ -448,6 +448,13 @@ def get_scheme(
     return SCHEMES[scheme](**{**before, **given})
 
 
+def stands_for(scheme: Scheme) -> tuple[Scheme, ...]:
+    """The schemes that marks may have where this one is meant by its name: of the default, those of `LADDER`."""
+    if scheme != KeyedScheme():
+        return (scheme,)
+    return tuple(replace(KeyedScheme(), passband=name) for name in LADDER)
+
+
 def parameters_of(scheme: Fields) -> dict[str, Any]:
     """The fields of a scheme, as a record stores them."""
     return asdict(scheme)

@@ -7,12 +7,11 @@ all bands, the usual pass band stays. Readers without a record try all pass band
 """
 
 import math
-from dataclasses import replace
 
 from jaxmark.watermark.budget import Budget
 from jaxmark.watermark.evidence import MIN_LOG10_P
 from jaxmark.watermark.payload import COVERAGE, NOISE, Capacity, Conditions
-from jaxmark.watermark.schemes import LADDER, KeyedScheme, Scheme
+from jaxmark.watermark.schemes import KeyedScheme, Scheme, stands_for
 
 _PLENTY = -2 * MIN_LOG10_P * math.log(10)  # nats: with twice what can be proven, another pass band has no use
 _LEAST_GAIN = 1.1  # of the evidence, for which it is another one: predictions are as good as that
@@ -38,8 +37,7 @@ def suited(usual: Capacity, bits: int, budget: Budget, noise: float = NOISE) -> 
         return best
     reached = usual.glimpse(bits, budget, usual.needed(bits, _PLENTY, noise))
     most = usual.evidence(bits, reached, noise) * (1 + 1e-6)  # as numbers are rounded
-    for name in LADDER[1:]:
-        other = replace(KeyedScheme(), passband=name)
+    for other in stands_for(best)[1:]:
         # Without any noise, half of the dimensions are left.
         if most >= min(_PLENTY, other.dimensions(original, bits) / 2):
             break
