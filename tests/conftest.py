@@ -25,7 +25,7 @@ def _forget_programs() -> Iterator[None]:
     jax.clear_caches()
 
 
-@pytest.fixture(params=["float32", "float64"])
+@pytest.fixture(params=["float32", pytest.param("float64", marks=pytest.mark.double)])
 def dtype(request: pytest.FixtureRequest) -> Iterator[np.dtype]:
     """Both precisions; in float64 with jax's 64-bit mode on."""
     with jax.enable_x64(request.param == "float64"):

@@ -18,6 +18,8 @@ from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.schemes import KeyedScheme
 from tests.samples import rough_sphere
 
+pytestmark = pytest.mark.core
+
 BANDS = np.asarray(spectral.bands.scaling(8, damping="jackson"), np.float32)
 SECTIONS = np.array([[1, 0, 0, 1, 0.5, 0.0]])
 

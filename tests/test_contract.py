@@ -20,6 +20,8 @@ from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme, Scheme
 from tests.samples import bumpy_sphere
 
+pytestmark = pytest.mark.core
+
 TRACED = (
     *(("noise", 0.01), ("diagonal-noise", 0.01), ("gaussian-noise", 0.01), ("smoothing", 3), ("quantisation", 8)),
     *(("taubin", 3), ("cotangent-smoothing", 0.3), ("bilateral", 1)),

@@ -24,6 +24,8 @@ from jaxmark.watermark.detectors import correlate
 from tests.dense import laplacian_matrix
 from tests.samples import bumpy_sphere
 
+pytestmark = pytest.mark.core
+
 GRID = np.cos(np.linspace(0, np.pi, 1001))
 
 

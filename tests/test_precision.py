@@ -27,6 +27,8 @@ from jaxmark.watermark.detectors import decorrelate
 from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme
 from tests.samples import bumpy_sphere
 
+pytestmark = pytest.mark.core
+
 COUNT = 2**21
 SUM, SUM_AND_NORM = jax.jit(compensated_sum), jax.jit(sum_and_norm)
 

@@ -14,6 +14,8 @@ from jaxmark.spectral.laplacian import Laplacian
 from tests.dense import tolerance
 from tests.samples import bumpy_sphere, ordered_laplacian
 
+pytestmark = pytest.mark.core
+
 BANDS = np.random.default_rng(0).normal(size=(3, 5))
 WEIGHTS = np.random.default_rng(1).normal(size=(4, 2, 3))
 SECTIONS = np.array([[1, 0.5, 0, 1, 0.5, 0.1]])

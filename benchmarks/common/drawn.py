@@ -1,7 +1,8 @@
 """The pictures that documents show, and hashes of what they were drawn by.
 
-`docs/pictures/drawn.json` holds a hash of each picture and of what it was drawn by, which `tests/test_pictures.py`
-compares. Where the measurement that a picture shows is not in the project, the picture alone is compared.
+`docs/pictures/drawn.json` holds a hash of each picture and of what it was drawn by, which
+`tests/project/test_pictures.py` compares. Where the measurement that a picture shows is not in the project, the
+picture alone is compared.
 """
 
 import hashlib

@@ -9,6 +9,8 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import atomic
 from jaxmark.files.atomic import write_atomically
 
+pytestmark = pytest.mark.core
+
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such permissions")
 @pytest.mark.parametrize(("mode", "expected"), [(None, 0o640), (0o600, 0o600), (0o666, 0o666)])

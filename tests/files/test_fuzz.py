@@ -11,6 +11,8 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
 from tests.files import test_glb, test_obj, test_off, test_ply, test_stl, test_threemf
 
+pytestmark = pytest.mark.core
+
 SEEDS = {
     "rich.obj": test_obj.RICH,
     "rich.off": test_off.RICH,

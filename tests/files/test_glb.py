@@ -13,6 +13,8 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, load_texture
 from tests.files.helpers import loaded, noisy, patched, shifted, turned, written
 
+pytestmark = pytest.mark.core
+
 POINTS = [[0.5, 0, 0], [1, 0, 0], [0, 0, 1]]
 MORE = [[5, 0, 0], [6, 0, 0], [5, 0, 1]]
 # Position, colour and normal of each vertex beside each other (28 bytes), then indices, then plain positions.

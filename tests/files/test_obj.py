@@ -8,6 +8,8 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, load_texture, save_mesh
 from tests.files.helpers import loaded, noisy, patched, shifted, turned, written
 
+pytestmark = pytest.mark.core
+
 # A square of two triangles on a UV seam, with whatever else such files hold. No newline at the end.
 RICH = (
     b"# caf\xe9, not UTF-8\r\n"

@@ -8,6 +8,8 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh
 from tests.files.helpers import loaded, noisy, patched, shifted, turned, written
 
+pytestmark = pytest.mark.core
+
 RICH = (
     b"# made by hand\n"
     b"COFF # with colours\n"

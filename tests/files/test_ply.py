@@ -8,6 +8,8 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
 from tests.files.helpers import loaded, noisy, patched, shifted, turned, written
 
+pytestmark = pytest.mark.core
+
 ASCII = (
     b"ply\r\nformat ascii 1.0\r\ncomment by hand, caf\xe9\r\nobj_info x 1\r\n"
     b"element vertex 4\r\nproperty uchar red\r\nproperty float z\r\nproperty float y\r\nproperty float32 x\r\n"

@@ -11,6 +11,8 @@ from jaxmark.files import load_mesh, save_mesh
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from tests.files.helpers import noisy, shifted, written
 
+pytestmark = pytest.mark.core
+
 SUFFIXES = [".obj", ".off", ".ply", ".stl", ".glb", ".gltf", ".3mf"]
 # Doubled vertices, an isolated one, a degenerate face, numbers of all sizes.
 MESH = make_mesh(

@@ -11,6 +11,8 @@ from jaxmark.files import load_mesh, save_mesh
 from tests.files.helpers import noisy
 from tests.meshes import MESHES, shared_mesh, shared_meshes
 
+pytestmark = pytest.mark.core
+
 REFUSED = {
     *("empty.obj", "empty.ply", "notenoughindices.obj", "ply_empty_header.ply", "stl_empty_bin.stl"),
 }

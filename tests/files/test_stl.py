@@ -9,6 +9,8 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh
 from tests.files.helpers import loaded, noisy, patched, shifted, turned, written
 
+pytestmark = pytest.mark.core
+
 TRIANGLE = [0, 0, 0, 1, 0, 0, 0, 0, 1]  # its normal is -y; turned by a right angle about z it is +x
 
 

@@ -15,6 +15,8 @@ from jaxmark.geometry.mesh import make_mesh
 from tests.files.helpers import loaded, noisy, patched, shifted, written
 from tests.meshes import shared_mesh
 
+pytestmark = pytest.mark.core
+
 CORE = b"http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
 RELATIONS = (
     b'<?xml version="1.0"?><Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">'

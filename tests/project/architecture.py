@@ -1,0 +1,84 @@
+"""The rooms of the package and what they import of each other, read from the code; run it to draw the figure again."""
+
+import ast
+from collections.abc import Iterator, Mapping
+
+from tests import ROOT
+
+PACKAGE = ROOT / "jaxmark"
+FIGURE = ROOT / "docs" / "architecture.svg"
+WIDE, HIGH, ACROSS, DOWN = 120, 30, 150, 66  # of a box, and from one to the next
+
+
+def modules() -> set[str]:
+    """Names of all modules and folders of the package, without the underscores of private ones."""
+    return {path.stem.lstrip("_") for path in PACKAGE.rglob("*.py")} | {path.name for path in PACKAGE.rglob("*/")}
+
+
+def rooms() -> dict[str, set[str]]:
+    """For each module or folder at the top of the package, what it imports of the others."""
+    found: dict[str, set[str]] = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        if not room.startswith("_"):
+            found.setdefault(room, set()).update(set(imports(path.read_text())) - {room})
+    return {room: others & found.keys() for room, others in found.items()}
+
+
+def imports(source: str) -> Iterator[str]:
+    """Modules right below jaxmark that a source imports, anywhere in it."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            dotted = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "relative imports are not followed here"
+            dotted = [f"{node.module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        yield from (name.split(".")[1] for name in dotted if name.startswith("jaxmark."))
+
+
+def draw(found: Mapping[str, set[str]]) -> str:
+    """An SVG of the rooms, each above all that it imports; an import that others imply has no arrow."""
+    below: dict[str, set[str]] = {}  # all that a room rests on
+
+    def rest(room: str) -> set[str]:
+        if room not in below:
+            below[room] = set().union(*({other} | rest(other) for other in found[room]))
+        return below[room]
+
+    floor: dict[str, int] = {}
+    for room in sorted(found, key=lambda room: len(rest(room))):
+        floor[room] = max((floor[other] + 1 for other in rest(room)), default=0)
+    floors = [sorted(room for room in found if floor[room] == number) for number in range(max(floor.values()) + 1)]
+    widest = max(map(len, floors))
+    place = {
+        room: (ACROSS * (column + (widest - len(row) + 1) / 2), DOWN * (len(floors) - number - 0.5))
+        for number, row in enumerate(floors)
+        for column, room in enumerate(row)
+    }
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {ACROSS * widest} {DOWN * len(floors)}"'
+        ' font-family="monospace" font-size="13" text-anchor="middle">',
+        '<defs><marker id="head" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
+        '<path d="M0 0 L8 4 L0 8 z" fill="#4a6fa5"/></marker></defs>',
+        '<rect width="100%" height="100%" fill="white"/>',
+    ]
+    for room, others in sorted(found.items()):
+        x, y = place[room]
+        for other in sorted(others - set().union(*(rest(one) for one in others))):
+            to, down = place[other]
+            lines.append(
+                f'<line x1="{x:g}" y1="{y + HIGH / 2:g}" x2="{to:g}" y2="{down - HIGH / 2:g}" stroke="#4a6fa5"'
+                ' marker-end="url(#head)"/>'
+            )
+    for room, (x, y) in sorted(place.items()):
+        lines.append(
+            f'<rect x="{x - WIDE / 2:g}" y="{y - HIGH / 2:g}" width="{WIDE}" height="{HIGH}" rx="5" fill="#eef3fa"'
+            f' stroke="#4a6fa5"/><text x="{x:g}" y="{y + 4:g}">{room}</text>'
+        )
+    return "\n".join([*lines, "</svg>", ""])
+
+
+if __name__ == "__main__":
+    FIGURE.write_text(draw(rooms()))

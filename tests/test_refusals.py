@@ -1,0 +1,120 @@
+"""What people get wrong in Python is told in one sentence of the library's own, when the object is made."""
+
+import pydoc
+import textwrap
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmark as jm
+from jaxmark.attacks import Attack
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark import HostScheme, KeyedScheme, detect_bits, embed_bits, log_evidence
+from jaxmark.watermark.carriers import KeyedCarrier
+from tests.samples import bumpy_sphere
+
+pytestmark = pytest.mark.core
+
+MESH, KEY, LINES = bumpy_sphere(2), jm.Key(bytes(32)), 45
+ATTACKS = {"noise": [0.005]}
+WEAK = {"meshes": {"a": MESH}, "attacks": ATTACKS}
+
+
+def mine(mesh: Mesh, strength: float, randomness: object) -> Mesh:
+    return mesh
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda: jm.Study([MESH], ATTACKS), "The meshes of a study have names: give them as a mapping"),
+        (lambda: jm.Study({"a": MESH}, ["noise"]), r'have names: give them as a mapping, such as {"noise": \[0.005\]}'),
+        (lambda: jm.Study({"a": 3}, ATTACKS), "The mesh 'a' of a study is a Mesh or a file, got int"),
+        (lambda: jm.Study({"a": MESH}, {"mine": mine}), "An attack is a name of ATTACKS or an Attack, .* got 'mine'"),
+        (lambda: jm.Study({"a": MESH}, {"noise": 0.1}), "strengths of the attack 'noise' are a list, .* got 0.1"),
+        (lambda: jm.Study({"a": MESH}, {"noise": ["much"]}), "'noise' are finite and not negative, got 'much'"),
+        (lambda: jm.Study(**WEAK, schemes="keyed"), "The schemes of a study are a list, .* got 'keyed'"),
+        (lambda: jm.Study(**WEAK, payloads=64), r"The payloads of a study are a list, such as \[32, 64\], got 64"),
+        (lambda: jm.Study(**WEAK, payloads=["8"]), "positive multiple of 8 bits, got '8'"),
+        (lambda: jm.Study(**WEAK, budgets=8e-4), "The budgets of a study are a list, .* got 0.0008"),
+        (lambda: jm.Study(**WEAK, seeds=[0, 1]), r"seeds is a number of seeds, such as 5, got \[0, 1\]"),
+        (lambda: jm.robustness(None, MESH, b"", mine), "name of ATTACKS or an Attack, .* got 'mine'"),
+        (lambda: jm.attack(MESH, "noise", "much", seed=0), "strength of an attack must be a number, .* got 'much'"),
+        (lambda: jm.attack(MESH, "noise", 0.1, seed=None), "seed of an attack is a whole number, .* got NoneType"),
+        (lambda: jm.embed("model.ply", b"x", KEY), "A mesh is needed, got str; jaxmark.load_mesh reads one"),
+        (lambda: jm.detect("model.ply", key=KEY), "A mesh is needed, got str"),
+        (lambda: jm.detect(MESH, original="model.ply", key=KEY), "A mesh is needed, got str"),
+        (lambda: jm.compare("model.ply", MESH), "A mesh is needed, got str"),
+        (lambda: jm.embed(MESH, "hello", KEY), "A message is bytes, got str"),
+        (
+            lambda: jm.detect(MESH, original=MESH, key=KEY, message=b"abc", bits=64),
+            "has 24 bits, but the payload is 64",
+        ),
+        (lambda: KeyedScheme(profile=(1.0,) * 65), "A profile is up to 64 numbers, .* got 65"),
+        (lambda: KeyedScheme(direction="up"), "direction must be 'coordinates' or 'normals', got 'up'"),
+    ],
+)
+def test_what_is_wrong_is_told(call: Callable[[], object], sentence: str):
+    with pytest.raises(jm.JaxmarkError, match=sentence) as refusal:
+        call()
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("scheme", [KeyedScheme(), HostScheme(16)], ids=lambda scheme: scheme.name)
+def test_arrays_of_another_length_are_told(scheme: KeyedScheme | HostScheme):
+    marker = jm.make_marker(MESH, KEY, bits=0, scheme=scheme)
+    carrier, x = marker.carrier, marker.original.signal
+    bits, bands = jnp.ones(carrier.code_bits), jnp.ones(99)
+    for call, sentence in (
+        (lambda: embed_bits(x, bits, carrier, bands), r"beta is one number, \d+ numbers .* got the shape \(99,\)"),
+        (lambda: embed_bits(x, jnp.ones(99), carrier, 1.0), r"This carrier has 1 code bits; got the shape \(99,\)"),
+        (lambda: detect_bits(x[:-1], x, carrier), r"rows in its order, and so must the suspect; got the shape"),
+        (lambda: detect_bits(x, x, carrier, weights=bands), r"and so must weights; got the shape \(99,\)"),
+        (lambda: detect_bits(x, x, carrier, beta=bands), "beta is one number"),
+        (lambda: log_evidence(x, x, carrier, jnp.ones(99)), "This carrier has 1 code bits"),
+    ):
+        with pytest.raises(jm.JaxmarkError, match=sentence):
+            call()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_bands_of_another_number_are_told():
+    carrier = jm.make_marker(MESH, KEY, bits=0).carrier
+    assert isinstance(carrier, KeyedCarrier)
+    with pytest.raises(jm.JaxmarkError, match=r"with_bands needs \d+ strengths, one per band; got the shape \(99,\)"):
+        carrier.with_bands(jnp.ones(99))
+
+
+def test_attacks_on_the_host_are_given_a_generator_of_numpy():
+    def shaken(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
+        return mesh._replace(vertices=mesh.vertices + strength * random.normal(size=mesh.vertices.shape))
+
+    attack = Attack(shaken, "standard deviation", (0.1,), host=True)
+    once, again, other = (jm.attack(MESH, attack, 0.1, seed=seed).vertices for seed in (0, 0, 1))
+    np.testing.assert_array_equal(once, again)
+    assert (once != other).all()
+    assert np.std(once - MESH.vertices) == pytest.approx(0.1, rel=0.2)
+
+
+@pytest.mark.parametrize("name", ["detect", "embed", "capacity"])
+def test_help_fits_a_screen(name: str):
+    said = pydoc.plain(pydoc.render_doc(getattr(jm, name)))
+    # From Python 3.13 on, each parameter has a line of its own, which says no more than one line does.
+    head, text = said.split(") ->", 1)
+    said = f"{' '.join(head.split())}) ->{text}"
+    lines = [part for line in said.splitlines() for part in textwrap.wrap(line, 120) or [""]]
+    assert len(lines) <= LINES
+    assert "numpy._typing" not in said
+    assert "typing." not in said
+
+
+@pytest.mark.parametrize("described", [jm.Study, Attack, jm.watermark.Detection, jm.watermark.BlindDetection])
+def test_help_describes_all_fields(described: type):
+    names = described._fields if hasattr(described, "_fields") else described.__dataclass_fields__
+    _, _, attributes = (described.__doc__ or "").partition("Attributes:")
+    for name in names:
+        assert f"\n        {name}: " in attributes or f"\n    {name}: " in attributes

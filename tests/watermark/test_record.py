@@ -1,0 +1,245 @@
+"""A record binds all that reading uses: nobody can edit it, and its owner only pays for editing it."""
+
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxmark as jm
+from jaxmark.geometry.mesh import Mesh, make_mesh
+from jaxmark.watermark.coding.keys import Choices, bind
+from jaxmark.watermark.deposit import Deposit, make_deposit
+from jaxmark.watermark.record import commit
+from jaxmark.watermark.schemes import KeyedScheme
+from tests.geometry.test_imprint import COPIES
+from tests.samples import bumpy_sphere
+
+MESSAGE = b"ok"
+PROFILE = (0.0, *(1.0,) * 20, 0.5, 0.5)
+
+
+@pytest.fixture(scope="module")
+def original() -> Mesh:
+    return bumpy_sphere(3)
+
+
+@pytest.fixture(scope="module")
+def marked(original: Mesh, key: jm.Key) -> tuple[Mesh, jm.Record]:
+    scheme = KeyedScheme(profile=PROFILE)
+    mesh, info = jm.embed(original, MESSAGE, key, budget=2e-3, noise=0, scheme=scheme)
+    return jm.attack(mesh, "noise", 0.002, seed=0), info.record
+
+
+def edits(record: jm.Record) -> dict[str, jm.Record]:
+    """The record with one field changed, each in turn."""
+    other = {
+        "scheme": "host",
+        "bits": 24,
+        "beta": record.beta * (1 + 1e-15),
+        "original": "00" * 32,
+        "parameters": {**record.parameters, "profile": (*PROFILE[:-1], np.nextafter(0.5, 1))},
+        "version": 1,
+        "told": "00" * 32,
+        "imprint": {**record.imprint, "grid": 2 * record.imprint["grid"]},
+        "code": "00" * 32,
+    }
+    changed = {name: dataclasses.replace(record, **{name: value}) for name, value in other.items()}
+    for name in ("centre", "covariance", "order", "tags"):
+        value = record.imprint[name][:-4] + "AAA=" if name == "tags" else [0.0] * len(record.imprint[name])
+        value = "00" * 32 if name == "order" else value
+        changed[f"imprint/{name}"] = dataclasses.replace(record, imprint={**record.imprint, name: value})
+    changed["parameters/unknown"] = dataclasses.replace(record, parameters={**record.parameters, "more": 1})
+    return changed
+
+
+FIELDS = ["scheme", "bits", "beta", "original", "parameters", "told", "imprint", "code"]
+FIELDS += ["imprint/centre", "imprint/covariance", "imprint/order", "imprint/tags", "parameters/unknown"]
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_every_edit_of_one_field_is_refused(marked, original: Mesh, key: jm.Key, field):
+    suspect, record = marked
+    with pytest.raises(jm.JaxmarkError, match="The record was edited"):
+        jm.detect(suspect, original=original, key=key, record=edits(record)[field])
+    assert edits(record)[field].digest() != record.digest()
+
+
+def test_other_edits_are_refused_too(marked, original: Mesh, key: jm.Key, tmp_path):
+    suspect, record = marked
+    with pytest.raises(jm.JaxmarkError, match="not the mesh that the record was made for"):
+        jm.detect(suspect, original=original, key=key, record=edits(record)["version"])
+    with pytest.raises(jm.JaxmarkError, match="fingerprint; identify"):
+        jm.make_marker(original, key, record=dataclasses.replace(record, content="fingerprint"))
+    with pytest.raises(jm.JaxmarkError, match="not the one that the record commits to"):
+        jm.make_marker(original, key, record=dataclasses.replace(record, key="00" * 32))
+    path = tmp_path / "record.json"
+    for change in ({"more": 1}, {"told": None}, {"version": 3}, {"content": "poem"}):
+        path.write_text(json.dumps(json.loads(record.to_json()) | change))
+        with pytest.raises(jm.JaxmarkError, match="record"):
+            jm.Record.load(path)
+    path.write_text(record.to_json())
+    assert jm.Record.load(path).digest() == record.digest()
+    assert MESSAGE.hex() not in record.to_json()
+
+
+def test_the_owner_gets_other_choices_for_other_parameters(marked, original: Mesh, key: jm.Key):
+    """Who has the key can write any record, but the smallest change of it makes another mark."""
+    suspect, record = marked
+    edited = edits(record)["parameters"].sealed(key)
+    assert jm.detect(suspect, original=original, key=key, record=record, message=MESSAGE).detected()
+    edited = dataclasses.replace(edited, told="").sealed(key)
+    assert jm.detect(suspect, original=original, key=key, record=edited, message=MESSAGE).log10_p > -6
+
+
+def test_a_record_does_not_decide_how_much_is_computed(original: Mesh, key: jm.Key):
+    record = jm.make_marker(original, key, bits=16, version=1).embed(MESSAGE, 2e-3, noise=0)[1].record
+    for bands in (0, 513, 10**9):
+        huge = dataclasses.replace(record, parameters={**record.parameters, "bands": bands})
+        with pytest.raises(jm.JaxmarkError, match="1 to 512 bands"):
+            jm.make_marker(original, key, record=huge)
+
+
+def test_choices_are_bound_to_everything(key: jm.Key):
+    fixed = {"content": "message", "scheme": "keyed", "parameters": {"bands": 64, "profile": (0.5, 1.0)}, "bits": 64}
+    base = bind(key, b"g" * 32, fixed).signs("signs", 4096).astype(int)
+    others = [bind(key, b"h" * 32, fixed), bind(key, b"g" * 32, fixed, 3)]
+    for name, value in {"content": "fingerprint", "scheme": "host", "bits": 72, "more": 0}.items():
+        others.append(bind(key, b"g" * 32, fixed | {name: value}))
+    others.append(bind(key, b"g" * 32, fixed | {"parameters": {"bands": 64, "profile": (0.5, 1.0 + 2**-52)}}))
+    for other in others:
+        assert abs(base @ other.signs("signs", 4096)) < 6 * 64  # 6 standard deviations
+    listed = fixed | {"parameters": {"profile": [0.5, 1.0], "bands": 64}}  # as JSON has it
+    np.testing.assert_array_equal(bind(key, b"g" * 32, listed).signs("signs", 4096), base)
+    with pytest.raises(jm.JaxmarkError, match="bound to"):
+        bind(key, b"g" * 32, fixed | {"bits": float("nan")})
+
+
+@pytest.mark.parametrize("name", ["float32", "turned and reordered", "unwelded"])
+def test_an_original_that_was_saved_again_will_do(marked, original: Mesh, key: jm.Key, name):
+    suspect, record = marked
+    exact = jm.detect(suspect, original=original, key=key, record=record)
+    found = jm.detect(suspect, original=COPIES[name](original), key=key, record=record)
+    assert found.message == exact.message == MESSAGE
+    assert found.log10_p == pytest.approx(exact.log10_p, rel=0.1)
+    assert found.doubts == ()
+
+
+def test_what_is_presented_is_never_read_with(marked, original: Mesh, key: jm.Key):
+    """An original moved against the mark, within the tolerance, reads as the exact one does, bit for bit."""
+    suspect, record = marked
+    markers = [jm.make_marker(one, key, record=record) for one in (original, COPIES["six digits"](original))]
+    one, other = (marker.original for marker in markers)
+    assert one.geometry == other.geometry
+    np.testing.assert_array_equal(one.positions, other.positions)
+    np.testing.assert_array_equal(one.signal, other.signal)
+    assert markers[0].detect(suspect).log10_p == markers[1].detect(suspect).log10_p
+
+
+def test_the_order_of_an_original_is_no_choice(original: Mesh, key: jm.Key):
+    """Whoever could turn the corners of a soup when the suspect is known would choose what is compared with what."""
+    faces = np.asarray(original.faces)
+    corners = np.arange(faces.size).reshape(-1, 3)
+    soup = make_mesh(np.asarray(original.vertices)[faces].reshape(-1, 3), corners)
+    marker = jm.make_marker(soup, key, bits=16)
+    marked, info = marker.embed(MESSAGE, 2e-3, noise=0)
+    best = (corners // 3 * 3 + (np.arange(3) + np.random.default_rng(0).integers(3, size=(len(faces), 1))) % 3).ravel()
+    crafted = make_mesh(np.asarray(soup.vertices)[best], corners)
+    turned = jm.make_marker(crafted, key, record=info.record)
+    np.testing.assert_array_equal(turned.original.positions, marker.original.positions)
+    assert not turned.original.in_order
+    # In whatever order the file is, the same points are compared.
+    found = turned.detect(marked)
+    assert found.message == MESSAGE
+    assert found.alignment.method != "same"
+    with pytest.raises(jm.JaxmarkError, match="another order"):
+        turned.detect(marked, align="same")
+    # Without the record, another order has other choices.
+    assert jm.make_marker(crafted, key, bits=16).choices.context != marker.choices.context
+    assert jm.detect(marked, original=crafted, key=key, message=MESSAGE).log10_p > -6
+
+
+def test_an_edited_original_gives_an_estimate_and_others_are_refused(marked, original: Mesh, key: jm.Key):
+    suspect, record = marked
+    dented = np.where(original.vertices[:, :1] > 0.8, 1.01 * original.vertices, original.vertices)
+    found = jm.detect(suspect, original=Mesh(dented, original.faces), key=key, record=record, message=MESSAGE)
+    assert found.detected()
+    assert "the original was edited" in found.doubts[0]
+    with pytest.raises(jm.JaxmarkError, match="looks like the marked file"):
+        jm.detect(suspect, original=suspect, key=key, record=record)
+    with pytest.raises(jm.JaxmarkError, match="their shapes differ by"):
+        jm.detect(suspect, original=bumpy_sphere(3, seed=5), key=key, record=record)
+
+
+def test_the_record_commits_to_the_message(marked, original: Mesh, key: jm.Key):
+    suspect, record = marked
+    with pytest.raises(jm.JaxmarkError, match="commits to another message"):
+        jm.detect(suspect, original=original, key=key, record=record, message=b"no")
+    # A message that the record committed to counts as claimed, without paying for all others.
+    without = jm.detect(suspect, original=original, key=key, record=dataclasses.replace(record, told="").sealed(key))
+    assert jm.detect(suspect, original=original, key=key, record=record).log10_p < without.log10_p
+    choices = Choices(key, b"c" * 32)
+    assert commit(b"a", choices) != commit(b"b", choices) != commit(b"b", Choices(key, b"d" * 32))
+
+
+def test_who_dates_nothing_pays_for_all_messages(marked, original: Mesh, key: jm.Key):
+    """The best message can be decoded in one go, however many there are, and a record can be made for it."""
+    suspect, record = marked
+    noisy = jm.attack(suspect, "noise", 0.005, seed=1)
+    for claimed in (MESSAGE, None):
+        found = jm.detect(noisy, original=original, key=key, record=record, message=claimed)
+        assert -70 < found.log10_p < -30
+        assert found.log10_p_undated == pytest.approx(found.log10_p + (16 + 64) * np.log10(2), abs=0.2)
+
+
+def test_weights_detectors_and_schemes_of_ones_own_make_no_proof(marked, original: Mesh, key: jm.Key):
+    suspect, record = marked
+    weights = np.ones(len(original.vertices))
+    assert jm.detect(suspect, original=original, key=key, record=record, weights=weights).doubts
+    from jaxmark.watermark.detectors import correlate
+
+    assert jm.make_marker(original, key, record=record, detector=correlate).doubts
+
+
+def test_deposits_date_records(marked, original: Mesh, key: jm.Key, tmp_path: Path):
+    _, record = marked
+    others = [f"{number:064x}" for number in range(6)]
+    deposit = make_deposit([*others, record.digest(), others[0]])
+    assert len(deposit.digests) == 7
+    assert deposit.log10_p(-20.0, record, claimed=True) == pytest.approx(-20 + np.log10(7))
+    first = dataclasses.replace(record, version=1, told="")
+    dated = make_deposit([first.digest()])
+    assert dated.log10_p(-20.0, first, claimed=True) == pytest.approx(-20 + 16 * np.log10(2)), "it commits to none"
+    assert dated.log10_p(-20.0, first, claimed=False) == -20
+    with pytest.raises(jm.JaxmarkError, match="not in the deposit"):
+        make_deposit(others).log10_p(-20.0, record, claimed=True)
+    path = tmp_path / "deposit.json"
+    path.write_text(deposit.to_json())
+    assert Deposit.load(path) == deposit
+    roots = {make_deposit(others[:count]).root for count in range(1, 7)} | {deposit.root}
+    assert len(roots) == 7
+    for text in ("", "[]", "{}", deposit.to_json().replace(deposit.root, "00" * 32), '{"digests": ["x"]}'):
+        path.write_text(text)
+        with pytest.raises(jm.JaxmarkError, match="not a deposit"):
+            Deposit.load(path)
+    with pytest.raises(jm.JaxmarkError, match="cannot be read"):
+        Deposit.load(tmp_path / "absent")
+    for bad in ([], ["xy"], ["0" * 63]):
+        with pytest.raises(jm.JaxmarkError, match="at least one record's digest"):
+            make_deposit(bad)
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is absent")
+def test_openssl_reads_the_request_for_a_date(tmp_path: Path):
+    deposit = make_deposit(["ab" * 32])
+    (tmp_path / "request.tsq").write_bytes(deposit.timestamp_request())
+    command = ["openssl", "ts", "-query", "-in", "request.tsq", "-text"]
+    said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    shown = "".join(re.findall(r"- (.*?)   ", said)).replace(" ", "").replace("-", "")
+    assert shown == deposit.root
+    assert "Hash Algorithm: sha256" in said
+    assert "Certificate required: yes" in said

@@ -1,0 +1,201 @@
+"""Files of several meshes: each is marked alone, and what they prove together is no more than they do."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import jaxmark as jm
+from jaxmark.files import load_scene
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark import scenes
+from jaxmark.watermark.scenes import SceneDetection, SceneRecord, detect_scene, embed_scene, load_record
+from tests.app.test_cli import Workshop
+from tests.samples import bumpy_sphere
+
+MESSAGE = b"ok"
+NAMES = ("left", "right", "third")
+BUDGET = 2e-4
+
+
+def moved(mesh: Mesh, matrix: np.ndarray, noise: float = 0.0, seed: int = 0) -> Mesh:
+    vertices = np.asarray(mesh.vertices) @ matrix.T + 5
+    return mesh._replace(vertices=vertices + noise * np.random.default_rng(seed).normal(size=vertices.shape))
+
+
+TURN = np.array([[0, -2.0, 0], [2, 0, 0], [0, 0, 2]])
+
+
+@pytest.fixture(scope="module")
+def originals() -> dict[str, Mesh]:
+    return {name: bumpy_sphere(3, seed) for seed, name in enumerate(NAMES)}
+
+
+@pytest.fixture(scope="module")
+def marked(originals, key: jm.Key):
+    small = bumpy_sphere(0)  # twelve points carry nothing
+    return embed_scene({**originals, "small": small, "again": originals["left"]}, MESSAGE, key, budget=BUDGET)
+
+
+def test_what_cannot_carry_is_named(marked):
+    meshes, info = marked
+    assert list(meshes) == [*NAMES, "again"] == list(info.record.meshes)
+    assert list(info.left) == ["small"]
+    for one in info.meshes.values():
+        assert one.rms == pytest.approx(BUDGET, rel=1e-3)
+
+
+def read(marked, originals, key: jm.Key, noise: float, **options) -> SceneDetection:
+    meshes, info = marked
+    record = SceneRecord({name: info.record.meshes[name] for name in NAMES})
+    # In another order, under other names, turned and scaled.
+    suspects = {f"object {name}": moved(meshes[name], TURN, noise) for name in reversed(NAMES)}
+    return detect_scene(suspects, originals=originals, key=key, record=record, **options)
+
+
+def test_together_they_prove_more_than_the_best_alone(marked, originals, key: jm.Key):
+    found = read(marked, originals, key, 0.006, message=MESSAGE)
+    assert found.left == {}
+    best = min(one.log10_p for one in found.meshes.values())
+    assert best > -60
+    assert found.united.log10_p < best - 5
+    assert found.united.log10_p_unfloored == found.united.log10_p
+    assert found.detected()
+    # By Hoeffding's bound for the sum of scores over their norms, which have variances of at most 1 each.
+    ratios = [np.sqrt(-2 * np.log(10) * (one.log10_p - 0.5)) for one in found.meshes.values()]
+    assert found.united.log10_p >= -(np.sum(ratios) ** 2) / 3 / 2 / np.log(10) - 3
+
+
+def test_each_reads_alone(marked, originals, key: jm.Key):
+    meshes, info = marked
+    for name in NAMES:
+        found = jm.detect(meshes[name], original=originals[name], key=key, record=info.record.meshes[name])
+        assert found.message == MESSAGE
+        assert found.detected()
+
+
+def test_equal_meshes_count_once(marked, originals, key: jm.Key):
+    meshes, info = marked
+    twice = dict.fromkeys(("left", "again"), originals["left"])
+    record = SceneRecord({name: info.record.meshes[name] for name in twice})
+    found = detect_scene({name: meshes[name] for name in twice}, originals=twice, key=key, record=record)
+    alone = jm.detect(meshes["left"], original=originals["left"], key=key, record=record.meshes["left"])
+    assert list(found.meshes) == ["left"]
+    assert found.united.log10_p == alone.log10_p
+
+
+@pytest.mark.long
+def test_sums_over_keys_have_the_variance_that_the_bound_assumes(originals, key: jm.Key):
+    suspects = {name: moved(mesh, np.eye(3), 0.01, seed) for seed, (name, mesh) in enumerate(originals.items())}
+    markers = {name: jm.make_marker(mesh, key, bits=16) for name, mesh in originals.items()}
+    found = {name: markers[name].detect(suspects[name], b"ok") for name in NAMES}
+    sums = []
+    for number in range(16):
+        other = jm.Key(bytes([number]) * 32)
+        seen = [scenes._Seen(jm.make_marker(mesh, other, bits=16), found[name]) for name, mesh in originals.items()]
+        sums.append(scenes._summed(seen, b"ok"))
+    assert 0.4 < np.std(sums) < 1.6  # 16 numbers of variance 1: within 3.4 standard errors
+    assert np.abs(sums).max() < 4
+
+
+@pytest.mark.parametrize("claimed", [None, MESSAGE])
+def test_what_is_not_marked_is_not_detected(marked, originals, key: jm.Key, claimed):
+    _, info = marked
+    record = SceneRecord({name: info.record.meshes[name] for name in NAMES})
+    suspects = {name: moved(mesh, np.eye(3), 0.005) for name, mesh in originals.items()}
+    found = detect_scene(suspects, originals=originals, key=key, record=record, message=claimed)
+    assert not found.detected(0.01)
+
+
+def test_records_of_files(marked, tmp_path: Path):
+    record = marked[1].record
+    (tmp_path / "a.json").write_text(record.to_json())
+    again = load_record(tmp_path / "a.json")
+    assert again.to_json() == record.to_json()
+    assert again.digest() == record.digest()
+    data = json.loads(record.to_json())
+    for change in ({"meshes": {}}, {"version": 9}, {"meshes": {"left": {**data["meshes"]["left"], "bits": "x"}}}):
+        (tmp_path / "b.json").write_text(json.dumps({**data, **change}))
+        with pytest.raises(jm.JaxmarkError, match="record"):
+            load_record(tmp_path / "b.json")
+
+
+def test_pairs(originals):
+    turned = {name: moved(mesh, TURN) for name, mesh in originals.items()}
+    # By connectivity, whatever the names say.
+    assert scenes.pair(originals, {"right": turned["left"], "left": turned["right"]}) == {
+        **{"left": "right", "right": "left"}
+    }
+    # By shape, where it is another connectivity.
+    other = {name: bumpy_sphere(4, seed) for seed, name in enumerate(NAMES)}
+    stretched = originals["right"]._replace(vertices=np.asarray(originals["right"].vertices) * [1, 1, 5])
+    shuffled = {"x": moved(stretched, TURN)._replace(faces=stretched.faces[::-1]), "y": other["left"]}
+    assert scenes.pair({"long": stretched, "round": originals["left"]}, shuffled) == {"long": "x", "round": "y"}
+    assert scenes.pair(originals, {"only": other["left"]}) == dict.fromkeys(NAMES, "only")
+
+
+def test_meshes_of_one_connectivity_are_paired_by_shape(sphere: Mesh):
+    """As rocks made from one template are, whatever the names and the order say."""
+    rocks = {
+        name: sphere._replace(vertices=np.asarray(sphere.vertices) * [1, 1, size])
+        for name, size in zip("abc", (1, 2, 3), strict=True)
+    }
+    turned = {name: moved(mesh, TURN) for name, mesh in rocks.items()}
+    assert scenes.pair(rocks, {"c": turned["a"], "x": turned["c"], "a": turned["b"]}) == {"a": "c", "b": "a", "c": "x"}
+    # Names tell equal shapes apart.
+    equal = {name: moved(rocks["a"], TURN, 0.001 * place) for place, name in enumerate("abc")}
+    assert scenes.pair(dict.fromkeys("abc", rocks["a"]), equal) == dict(zip("abc", "abc", strict=True))
+
+
+def exported(folder: Path, meshes: dict[str, Mesh], name: str) -> Path:
+    scene = trimesh.Scene({name: trimesh.Trimesh(*mesh, process=False) for name, mesh in meshes.items()})
+    scene.export(folder / name)
+    return folder / name
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_commands_on_a_file_of_several_meshes(tmp_path, monkeypatch, capfd, originals):
+    workshop = Workshop(tmp_path, monkeypatch, capfd)
+    exported(tmp_path, {"left": originals["left"], "small": bumpy_sphere(0), "right": originals["right"]}, "a.glb")
+    message = ("--key", "owner.key", "--message", "c0ff")
+    told = workshop.json("embed", "a.glb", "b.glb", *message)
+    assert list(told["meshes"]) == ["left", "right"]
+    assert list(told["left"]) == ["small"]
+    assert all(one["survives"]["whole"] > one["survives"]["half"] > 0 for one in told["meshes"].values())
+    workshop.json("attack", "b.glb", "c.glb", "noise", "0.002")
+    read = ("--original", "a.glb", "--key", "owner.key", "--record", "b.glb.jaxmark.json")
+    found = workshop.json("detect", "c.glb", *read)
+    assert found["message"] == "c0ff"
+    assert all(one["detected"] for one in found["meshes"].values())
+    assert workshop.json("detect", "b.glb", *read, "--mesh", "right")["message"] == "c0ff"
+    assert workshop.json("detect", "a.glb", *read, status=1)["meshes"].keys() == found["meshes"].keys()
+    assert "no mesh 'wrong'" in workshop.refused("embed", "a.glb", "d.glb", *message, "--mesh", "wrong")
+    picked = workshop.json("embed", "a.glb", "e.glb", *message, "--mesh", "left")
+    assert list(picked["meshes"]) == ["left"]
+    before, after = load_scene("a.glb").meshes, load_scene("e.glb").meshes
+    np.testing.assert_array_equal(before["right"].vertices, after["right"].vertices)
+    assert "faces" in workshop.refused("attack", "b.glb", "f.glb", "midpoint", "1")
+    deposit = workshop.json("deposit", "b.glb.jaxmark.json", "--output", "d.json")
+    assert deposit["records"] == 1
+    assert workshop.json("detect", "b.glb", *read, "--deposit", "d.json")["log10_p_deposited"] < -6
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_objects_of_an_obj_file(tmp_path, monkeypatch, capfd, originals):
+    workshop = Workshop(tmp_path, monkeypatch, capfd)
+    text, base = "", 1
+    for name in ("left", "right"):
+        vertices, faces = (np.asarray(part) for part in originals[name])
+        text += f"o {name}\n" + "".join("v {!r} {!r} {!r}\n".format(*row) for row in vertices.tolist())
+        text += "".join("f {} {} {}\n".format(*row) for row in (faces + base).tolist())
+        base += len(vertices)
+    Path("a.obj").write_text(text)
+    told = workshop.json("embed", "a.obj", "b.obj", "--key", "owner.key", "--message", "c0ff")
+    assert list(told["meshes"]) == ["left", "right"]
+    # Saved by another program, which keeps no names, as one mesh in two pieces.
+    trimesh.load("b.obj", process=False, force="mesh").export("c.ply")
+    read = ("--original", "a.obj", "--key", "owner.key", "--record", "b.obj.jaxmark.json")
+    assert workshop.json("detect", "b.obj", *read)["message"] == "c0ff"
+    assert workshop.json("detect", "c.ply", *read)["message"] == "c0ff"
