@@ -51,8 +51,8 @@ from jaxmark.spectral.bands import hat, nodes, scaling
 from jaxmark.spectral.laplacian import sparse_matrices
 from jaxmark.watermark import EigenScheme, HostScheme
 from jaxmark.watermark.carriers import host_bands
-from jaxmark.watermark.detectors import correlate
-from jaxmark.watermark.evidence import correlation_bound
+from jaxmark.watermark.evidence.bounds import correlation_bound
+from jaxmark.watermark.reading.detectors import correlate
 
 mesh = asteroid(1500)
 original = make_original(mesh)

@@ -34,7 +34,7 @@ from jaxmark import plot
 from jaxmark.alignment import make_original
 from jaxmark.geometry import asteroid
 from jaxmark.spectral.bands import scaling
-from jaxmark.watermark.visibility import band_visibility
+from jaxmark.watermark.perception.visibility import band_visibility
 
 mesh = asteroid(1500)  # small, so that this takes a minute or two
 original = make_original(mesh)

@@ -40,7 +40,7 @@ from jaxmark import plot
 from jaxmark.adversaries.blind import descend
 from jaxmark.adversaries.expected import evidence, make_surrogate, random_mark, rescale
 from jaxmark.geometry import asteroid
-from jaxmark.watermark.detectors import claims
+from jaxmark.watermark.reading.detectors import claims
 
 mesh = asteroid(4000)  # small, so that this takes a minute
 key, message, size = jm.new_key(), b"ok", 8e-4

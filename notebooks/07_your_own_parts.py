@@ -43,8 +43,8 @@ from jaxmark.watermark.carriers import ModulatedCarrier
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import code_length
 from jaxmark.watermark.coding.sequences import orthogonal_sequences
-from jaxmark.watermark.detectors import Detector, decorrelate
-from jaxmark.watermark.schemes import Scheme
+from jaxmark.watermark.reading.detectors import Detector, decorrelate
+from jaxmark.watermark.schemes.scheme import Scheme
 
 mesh = asteroid(2800)
 key = jm.Key(bytes(range(32)))  # the same each time; real ones are `jm.new_key()`

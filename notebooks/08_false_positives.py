@@ -39,7 +39,7 @@ from jaxmark.evaluation import pictures
 from jaxmark.geometry import asteroid
 from jaxmark.watermark.carriers import make_chips
 from jaxmark.watermark.coding.message import encode
-from jaxmark.watermark.evidence import log10_p_claimed, log10_p_fitted
+from jaxmark.watermark.evidence.bounds import log10_p_claimed, log10_p_fitted
 
 mesh = asteroid(1400)
 MESSAGE = b"jaxmark!"

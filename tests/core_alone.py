@@ -145,7 +145,7 @@ def check_tuning() -> None:
     import jax.numpy as jnp
 
     from jaxmark.evaluation.allocation import allocate
-    from jaxmark.watermark.channels import Channels
+    from jaxmark.evaluation.channels import Channels
 
     alike = Channels(jnp.ones((1, 2)), jnp.ones((1, 2)), jnp.ones((1, 2)))
     strengths = allocate(alike, jnp.ones(2))

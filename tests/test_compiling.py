@@ -12,10 +12,10 @@ import jaxmark as jm
 from jaxmark import spectral
 from jaxmark.alignment.original import make_original
 from jaxmark.evaluation.allocation import allocate
+from jaxmark.evaluation.channels import Channels
 from jaxmark.spectral.chebyshev import band_energies, over_bands
-from jaxmark.watermark.channels import Channels
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.schemes import KeyedScheme
+from jaxmark.watermark.schemes.scheme import KeyedScheme
 from tests.samples import rough_sphere
 
 pytestmark = pytest.mark.core

@@ -15,9 +15,9 @@ from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral import bands, filter, from_mesh
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark import SCHEMES
-from jaxmark.watermark.budget import make_budget
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme, Scheme
+from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.schemes.scheme import EigenScheme, HostScheme, KeyedScheme, Scheme
 from tests.samples import bumpy_sphere
 
 pytestmark = pytest.mark.core

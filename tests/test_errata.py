@@ -20,7 +20,7 @@ from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.laplacian import centre
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark.carriers import ModulatedCarrier, eigenspaces, host_bands
-from jaxmark.watermark.detectors import correlate
+from jaxmark.watermark.reading.detectors import correlate
 from tests.dense import laplacian_matrix
 from tests.samples import bumpy_sphere
 

@@ -17,8 +17,8 @@ from jaxmark.app import cli
 from jaxmark.attacks import ATTACKS
 from jaxmark.geometry.clouds import Cloud, planes, spacings
 from jaxmark.geometry.mesh import Mesh, diagonal, make_mesh, used_vertices
-from jaxmark.watermark.budget import CLOUD_VISIBILITY, VISIBILITY, make_budget
-from jaxmark.watermark.schemes import KeyedScheme
+from jaxmark.watermark.perception.budget import CLOUD_VISIBILITY, VISIBILITY, make_budget
+from jaxmark.watermark.schemes.scheme import KeyedScheme
 from tests.samples import rough_sphere
 
 NONE = np.zeros((0, 3), int)

@@ -13,18 +13,18 @@ import jaxmark as jm
 from jaxmark.alignment.observation import observe
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.distortion import msdm, msdm_views
-from jaxmark.evaluation import allocation
+from jaxmark.evaluation import allocation, channels
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import band_energies, gram
 from jaxmark.spectral.laplacian import Laplacian
 from jaxmark.spectral.precision import compensated_sum, sum_and_norm
-from jaxmark.watermark import channels, evidence
 from jaxmark.watermark.bits import detect_bits, embed_bits
 from jaxmark.watermark.carriers import Chips, KeyedCarrier, KeyedReader
-from jaxmark.watermark.carriers.reception import Reception, make_host, make_receiver
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.detectors import decorrelate
-from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme
+from jaxmark.watermark.evidence import bounds as evidence
+from jaxmark.watermark.reading.detectors import decorrelate
+from jaxmark.watermark.reading.reception import Reception, make_host, make_receiver
+from jaxmark.watermark.schemes.scheme import EigenScheme, HostScheme, KeyedScheme
 from tests.samples import bumpy_sphere
 
 pytestmark = pytest.mark.core

@@ -40,8 +40,8 @@ from jaxmark.distortion import rms
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.surfaces import Surface
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
-from jaxmark.watermark.coarse import model_errors, orthonormal
 from jaxmark.watermark.marking import Marker
+from jaxmark.watermark.reading.coarse import model_errors, orthonormal
 
 MOST_VERTICES = 5_000  # of a suspect, for matrices of M x M are dense
 OTHERS = 64  # other marks, of random signs

@@ -9,7 +9,7 @@ from common.tables import Row
 from jaxmark import adversaries as enemies
 from jaxmark.evaluation._robustness import Breaking
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.schemes import Scheme
+from jaxmark.watermark.schemes.scheme import Scheme
 
 BITS, ALPHA = 8 * len(MESSAGE), 1e-6
 METRICS = ("rms", "dame", "msdm2")

@@ -7,10 +7,10 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.budget import Budget
-from jaxmark.watermark.carriers.carrier import Room
-from jaxmark.watermark.payload import NOISE
-from jaxmark.watermark.schemes import Scheme
+from jaxmark.watermark.interfaces import Room
+from jaxmark.watermark.perception.budget import Budget
+from jaxmark.watermark.perception.capacity import NOISE
+from jaxmark.watermark.schemes.scheme import Scheme
 
 KEY, MESSAGE, BUDGET = jm.Key(bytes(range(32))), b"jaxmark!", 8e-4
 

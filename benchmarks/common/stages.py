@@ -26,8 +26,8 @@ from jaxmark.alignment.alignment import align
 from jaxmark.alignment.original import make_original
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.laplacian import Laplacian, sparse_matrices
-from jaxmark.watermark.budget import make_budget
-from jaxmark.watermark.schemes import EigenScheme, Scheme
+from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.schemes.scheme import EigenScheme, Scheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.filters import DEGREE, coefficients, graph, reordered, shifted

@@ -18,7 +18,7 @@ from jaxmark.bench.shapes import SHAPES
 from jaxmark.geometry.mesh import Mesh, compact, host_mesh, weld, weld_mesh
 from jaxmark.geometry.raster import Frame
 from jaxmark.plot import Rendering, exaggerate, render
-from jaxmark.watermark.budget import VISIBILITY, Budget, make_budget, visibility_of
+from jaxmark.watermark.perception.budget import VISIBILITY, Budget, make_budget, visibility_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser

@@ -42,7 +42,7 @@ from jaxmark.confidence import clopper_pearson
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, used_vertices, weld, weld_mesh
 from jaxmark.geometry.pose import Pose
-from jaxmark.watermark.schemes import get_scheme
+from jaxmark.watermark.schemes.scheme import get_scheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, make_parser

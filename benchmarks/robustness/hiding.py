@@ -22,9 +22,9 @@ import jaxmark as jm
 from jaxmark.bench.shapes import SHAPES
 from jaxmark.distortion import shading
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, host_mesh, weld, weld_mesh
-from jaxmark.watermark.budget import Budget, make_budget
-from jaxmark.watermark.detectors import claims
-from jaxmark.watermark.schemes import KeyedScheme
+from jaxmark.watermark.perception.budget import Budget, make_budget
+from jaxmark.watermark.reading.detectors import claims
+from jaxmark.watermark.schemes.scheme import KeyedScheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser

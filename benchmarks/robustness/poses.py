@@ -25,7 +25,7 @@ from jaxmark.files import load_skin
 from jaxmark.geometry import Skinning, unpose
 from jaxmark.geometry.mesh import Mesh, diagonal
 from jaxmark.geometry.pose import Pose, similarity
-from jaxmark.watermark.schemes import KeyedScheme
+from jaxmark.watermark.schemes.scheme import KeyedScheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser

@@ -18,8 +18,8 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh, weld, weld_mesh
-from jaxmark.watermark.payload import least_energy
-from jaxmark.watermark.schemes import KeyedScheme, get_scheme
+from jaxmark.watermark.perception.capacity import least_energy
+from jaxmark.watermark.schemes.scheme import KeyedScheme, get_scheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, make_parser

@@ -31,8 +31,8 @@ from jaxmark.evaluation._robustness import NOTHING, read
 from jaxmark.evaluation.cells import Cell, processes, run
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.marker import BlindMarker
-from jaxmark.watermark.budget import make_budget
 from jaxmark.watermark.everyday import prepare_alone
+from jaxmark.watermark.perception.budget import make_budget
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, make_parser

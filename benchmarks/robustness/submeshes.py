@@ -23,7 +23,7 @@ import numpy as np
 import jaxmark as jm
 from jaxmark.alignment.original import Original
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.payload import NOISE
+from jaxmark.watermark.perception.capacity import NOISE
 from jaxmark.watermark.submeshes import make_part_marker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))

@@ -24,8 +24,8 @@ from jaxmark.alignment.original import make_original
 from jaxmark.app.programs import release_programs
 from jaxmark.evaluation.tuning import Tuned, tune
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.budget import make_budget
-from jaxmark.watermark.schemes import KeyedScheme, Scheme
+from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.schemes.scheme import KeyedScheme, Scheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, make_parser

@@ -28,7 +28,7 @@ import jaxmark as jm
 from jaxmark.bench.shapes import SHAPES
 from jaxmark.distortion import RENDERED, make_hiding, shading
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, host_mesh, weld, weld_mesh
-from jaxmark.watermark.budget import Budget, make_budget
+from jaxmark.watermark.perception.budget import Budget, make_budget
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser

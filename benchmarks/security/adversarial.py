@@ -9,8 +9,8 @@ claimed, over the mark's own distortion, in each metric; and the least of all at
   key:     key, original and message; subtracting the mark itself costs 1
 
 "noise by theory" is noise of the mark's own spectrum that leaves so little evidence, by
-`jaxmark.watermark.channels.margins`: what an attacker who only adds noise pays in RMS. Resumable: the same command goes
-on where it was ended.
+`jaxmark.evaluation.channels.margins`: what an attacker who only adds noise pays in RMS. Resumable: the same command
+goes on where it was ended.
 """
 
 import math

@@ -43,7 +43,6 @@ import jaxmark as jm
 from jaxmark import distortion
 from jaxmark.alignment.original import Original, displace, make_original
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, weld, weld_mesh
-from jaxmark.watermark import evidence
 from jaxmark.watermark.blind import reading
 from jaxmark.watermark.blind.anchors import place, see
 from jaxmark.watermark.blind.dither import make_dither
@@ -52,6 +51,7 @@ from jaxmark.watermark.blind.marker import make_blind_marker
 from jaxmark.watermark.blind.scheme import AnchoredHost
 from jaxmark.watermark.blind.writing import Writer
 from jaxmark.watermark.everyday import BLIND_SCHEMES
+from jaxmark.watermark.evidence import bounds as evidence
 from jaxmark.watermark.marking import EmbedInfo
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))

@@ -30,7 +30,7 @@ from jaxmark.alignment.original import make_original
 from jaxmark.evaluation._robustness import Breaking
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.schemes import KeyedScheme, Scheme
+from jaxmark.watermark.schemes.scheme import KeyedScheme, Scheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import load, make_parser

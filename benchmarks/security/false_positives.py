@@ -27,14 +27,14 @@ from jaxmark.alignment.alignment import straightened
 from jaxmark.alignment.observation import Observation
 from jaxmark.confidence import clopper_pearson
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.budget import make_budget
 from jaxmark.watermark.carriers import make_chips
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
-from jaxmark.watermark.carriers.reception import Reception
-from jaxmark.watermark.coarse import receive_coarse
 from jaxmark.watermark.coding.message import encode
-from jaxmark.watermark.detectors import claims
-from jaxmark.watermark.evidence import any_of, log10_p_claimed, log10_p_read
+from jaxmark.watermark.evidence.bounds import any_of, log10_p_claimed, log10_p_read
+from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.reading.coarse import receive_coarse
+from jaxmark.watermark.reading.detectors import claims
+from jaxmark.watermark.reading.reception import Reception
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import load, make_parser

@@ -33,15 +33,15 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.chebyshev import band_components
 from jaxmark.spectral.laplacian import per_row
 from jaxmark.spectral.precision import matmul
-from jaxmark.watermark import evidence
-from jaxmark.watermark.budget import make_budget
 from jaxmark.watermark.carriers import make_chips
 from jaxmark.watermark.coding import polar
 from jaxmark.watermark.coding.keys import bind
 from jaxmark.watermark.coding.message import TAG_BITS, encode
+from jaxmark.watermark.evidence import bounds as evidence
 from jaxmark.watermark.marking import ALIGN_SHARES, Marker
+from jaxmark.watermark.perception.budget import make_budget
 from jaxmark.watermark.record import Record, commit
-from jaxmark.watermark.schemes import KeyedScheme, parameters_of
+from jaxmark.watermark.schemes.scheme import KeyedScheme, parameters_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import load, make_parser

@@ -30,10 +30,10 @@ from scipy import stats
 import jaxmark as jm
 from jaxmark.alignment.original import displace, shift_of
 from jaxmark.confidence import clopper_pearson
-from jaxmark.watermark.budget import make_budget
 from jaxmark.watermark.coding import message, polar
 from jaxmark.watermark.marking import Marker, make_marker
-from jaxmark.watermark.payload import least_energy
+from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.perception.capacity import least_energy
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import load, make_parser

@@ -18,8 +18,8 @@ import jaxmark as jm
 from jaxmark.app.demo import sample_mesh
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import band_components, filter, gram, moments
-from jaxmark.watermark.detectors import joint
-from jaxmark.watermark.evidence import log10_p_claimed
+from jaxmark.watermark.evidence.bounds import log10_p_claimed
+from jaxmark.watermark.reading.detectors import joint
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import load, make_parser

@@ -10,12 +10,12 @@ from jaxmark.alignment.alignment import align, observation
 from jaxmark.alignment.original import make_original
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, host_mesh, same_connectivity
-from jaxmark.watermark import evidence
 from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key
 from jaxmark.watermark.coding.message import encode
-from jaxmark.watermark.detectors import claims
+from jaxmark.watermark.evidence import bounds as evidence
 from jaxmark.watermark.marking import bind_mark, make_marker
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme, get_scheme
+from jaxmark.watermark.reading.detectors import claims
+from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, Scheme, get_scheme
 
 
 class Search(NamedTuple):

@@ -30,13 +30,13 @@ from jaxmark.adversaries.expected import (
     rescale,
 )
 from jaxmark.alignment.original import displace
-from jaxmark.attacks.random import Randomness, random_key
 from jaxmark.attacks.registry import Attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.seeds import Randomness, random_key
 from jaxmark.spectral.precision import matmul
-from jaxmark.watermark.carriers.carrier import Displacement
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme
+from jaxmark.watermark.interfaces import Displacement
+from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, Scheme
 
 Parameters = Any  # a pytree of arrays
 Family = Literal["vertices", "bands", "warps"]

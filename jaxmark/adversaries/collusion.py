@@ -6,10 +6,10 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float64
 
-from jaxmark.attacks.random import Randomness, generator
 from jaxmark.attacks.registry import Attack, attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, host_mesh, same_connectivity, weld, weld_mesh
+from jaxmark.seeds import Randomness, generator
 
 Rule = Literal["mean", "median", "minimum", "maximum", "mixing", "circumcentre"]
 

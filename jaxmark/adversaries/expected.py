@@ -18,12 +18,12 @@ from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import band_energies, filter
 from jaxmark.spectral.laplacian import Laplacian
 from jaxmark.spectral.precision import matmul
-from jaxmark.watermark.carriers.carrier import Displacement, Reader, Received
 from jaxmark.watermark.coding.keys import new_key
-from jaxmark.watermark.detectors import claims
+from jaxmark.watermark.interfaces import Displacement, Reader, Received
 from jaxmark.watermark.marking import make_marker
-from jaxmark.watermark.schemes import Scheme
-from jaxmark.watermark.visibility import band_visibility
+from jaxmark.watermark.perception.visibility import band_visibility
+from jaxmark.watermark.reading.detectors import claims
+from jaxmark.watermark.schemes.scheme import Scheme
 
 _ATTACKER_BANDS = 64  # bands by which the attacker shapes displacements, over the whole spectrum
 _LOGSUMEXP_SHARPNESS = 4.0  # of the smooth maximum over ways of weighting a suspect

@@ -15,12 +15,12 @@ from jaxtyping import Array, Float, Float64
 from jaxmark.adversaries.expected import strongest_evidence
 from jaxmark.alignment.alignment import align
 from jaxmark.alignment.observation import Observation
-from jaxmark.attacks.random import Randomness
 from jaxmark.attacks.registry import Attack
 from jaxmark.distortion import rms
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, weld
-from jaxmark.watermark.carriers.carrier import Reader
+from jaxmark.seeds import Randomness
+from jaxmark.watermark.interfaces import Reader
 from jaxmark.watermark.marking import Marker
 
 _UNIT = "RMS over the diagonal"

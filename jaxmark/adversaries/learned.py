@@ -22,8 +22,8 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.bands import intervals
 from jaxmark.spectral.chebyshev import band_components
 from jaxmark.spectral.learned import cheb_conv, init_cheb_conv
-from jaxmark.watermark.carriers.carrier import Displacement
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme
+from jaxmark.watermark.interfaces import Displacement
+from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, Scheme
 
 Goal = Literal["estimate", "removal"]
 Network = tuple[dict[str, Float[Array, "..."]], ...]  # parameters of convolutions, one after the other

@@ -13,18 +13,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from jaxmark.attacks._jamming import through_bands
-from jaxmark.attacks.random import Randomness, generator
+from jaxmark.adversaries._jamming import through_bands
 from jaxmark.attacks.registry import Attack
 from jaxmark.distortion import rms
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.hashing import geometry_hash
 from jaxmark.geometry.mesh import Mesh, diagonal, host_mesh, used_vertices
+from jaxmark.seeds import Randomness, generator
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.laplacian import Laplacian
 from jaxmark.watermark.coding.keys import Choices, Key
-from jaxmark.watermark.detectors import claims
 from jaxmark.watermark.marking import Marker
+from jaxmark.watermark.reading.detectors import claims
 
 _UNIT = "RMS over the diagonal"
 _STRENGTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)

@@ -15,9 +15,9 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int64
 
-from jaxmark.alignment.bending import Bent, straighten
 from jaxmark.alignment.heights import VertexHeights, measure_heights
 from jaxmark.alignment.nearest import find_heights, settle
+from jaxmark.alignment.nonrigid import Bent, straighten
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, residual
 from jaxmark.alignment.registration import BOTH_HANDS, SETTINGS, refine, register_part, register_whole

@@ -20,15 +20,15 @@ from jaxmark.files import load_mesh, load_scene, load_skin, load_texture, save_m
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.scheme import BlindScheme
-from jaxmark.watermark.budget import Visibility
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.deposit import Deposit
 from jaxmark.watermark.everyday import AnyScheme, also, name_of, prepare
 from jaxmark.watermark.marking import Markers, Survival, make_markers
+from jaxmark.watermark.perception.budget import Visibility
 from jaxmark.watermark.record import Record
 from jaxmark.watermark.scenes import SceneDetection, SceneRecord, detect_scene, load_record, pair
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, LADDER
-from jaxmark.watermark.tracing import make_tracer
+from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, LADDER
+from jaxmark.watermark.tracing.tracer import make_tracer
 
 
 def mark_file(

@@ -47,16 +47,16 @@ from jaxmark.extras import require
 from jaxmark.files import load_mesh, load_scene, save_mesh, save_scene
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import same_connectivity
-from jaxmark.watermark.budget import VISIBILITY, Visibility, make_budget, visibility_of
 from jaxmark.watermark.coding.keys import commitment, new_key, save_key
 from jaxmark.watermark.deposit import Deposit, make_deposit
 from jaxmark.watermark.everyday import NAMES, blind_scheme, capacity, split
 from jaxmark.watermark.marking import DEFAULT_BITS
-from jaxmark.watermark.payload import COVERAGE, NOISE
+from jaxmark.watermark.perception.budget import VISIBILITY, Visibility, make_budget, visibility_of
+from jaxmark.watermark.perception.capacity import COVERAGE, NOISE
 from jaxmark.watermark.record import RECORD_SUFFIX, Record
 from jaxmark.watermark.scenes import load_record
-from jaxmark.watermark.schemes import DEFAULT_SCHEME
-from jaxmark.watermark.tracing import identify
+from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME
+from jaxmark.watermark.tracing.tracer import identify
 
 
 class _Schemes(click.ParamType):

@@ -19,12 +19,12 @@ from jaxmark.files import load_mesh, save_mesh
 from jaxmark.files.atomic import write_atomically
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.plot import View, displacement, exaggerate, save_views, visibility
-from jaxmark.watermark.budget import make_budget
 from jaxmark.watermark.coding.keys import new_key
-from jaxmark.watermark.evidence import MIN_LOG10_P
+from jaxmark.watermark.evidence.bounds import MIN_LOG10_P
 from jaxmark.watermark.marking import Marker, make_marker
+from jaxmark.watermark.perception.budget import make_budget
 from jaxmark.watermark.record import RECORD_SUFFIX
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES
+from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, SCHEMES
 
 _ATTACKS = (
     ("noise", 0.001),

@@ -15,8 +15,8 @@ from jaxmark.catalogue import Catalogue
 from jaxmark.catalogue.originals import file_hash
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import replacing
-from jaxmark.watermark.budget import VISIBILITY, Visibility
 from jaxmark.watermark.coding.keys import Key
+from jaxmark.watermark.perception.budget import VISIBILITY, Visibility
 from jaxmark.watermark.record import RECORD_SUFFIX, Record
 
 _PATH = click.Path(path_type=Path)

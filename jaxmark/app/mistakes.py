@@ -12,7 +12,7 @@ from jaxmark.geometry.imprint import restore
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.marking import Marker, make_marker
 from jaxmark.watermark.record import Record
-from jaxmark.watermark.schemes import SCHEMES, EigenScheme, Scheme, get_scheme, stands_for
+from jaxmark.watermark.schemes.scheme import SCHEMES, EigenScheme, Scheme, get_scheme, stands_for
 
 _PAYLOADS = (16, 32, 64, 128)  # sizes that people choose
 _MAX_EIGEN_POINTS = 20_000  # more points have eigenpairs that take minutes

@@ -13,10 +13,10 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import Scene, load_scene, number_check, save_scene
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.budget import Visibility
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.everyday import AnyMarker, AnyScheme, name_of
 from jaxmark.watermark.marking import EmbedInfo, Survival
+from jaxmark.watermark.perception.budget import Visibility
 from jaxmark.watermark.scenes import embed_scene
 
 _MOST_TOLD = 5  # meshes that are named in a sentence

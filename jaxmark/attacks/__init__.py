@@ -5,20 +5,20 @@ because graphs are prepared on the host. Vertices that no face uses are not part
 count.
 """
 
+from jaxmark.adversaries._jamming import jamming as jamming
+from jaxmark.adversaries.filtering import band_stop as band_stop
+from jaxmark.adversaries.filtering import low_pass as low_pass
 from jaxmark.attacks._affine import affine as affine
 from jaxmark.attacks._affine import similarity as similarity
 from jaxmark.attacks._cropping import cropping as cropping
 from jaxmark.attacks._cropping import holes as holes
 from jaxmark.attacks._cropping import region_cropping as region_cropping
-from jaxmark.attacks._jamming import jamming as jamming
 from jaxmark.attacks._quantisation import quantisation as quantisation
 from jaxmark.attacks._simplification import simplification as simplification
 from jaxmark.attacks.bilateral import bilateral_smoothing as bilateral_smoothing
 from jaxmark.attacks.deformation import as_rigid_as_possible as as_rigid_as_possible
 from jaxmark.attacks.denoising import nonlocal_means as nonlocal_means
 from jaxmark.attacks.denoising import shrinkage as shrinkage
-from jaxmark.attacks.filtering import band_stop as band_stop
-from jaxmark.attacks.filtering import low_pass as low_pass
 from jaxmark.attacks.flips import edge_flips as edge_flips
 from jaxmark.attacks.noise import diagonal_noise as diagonal_noise
 from jaxmark.attacks.noise import gaussian_noise as gaussian_noise

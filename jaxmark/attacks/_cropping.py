@@ -6,9 +6,9 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import Randomness, generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, compact, edges, used_vertices
+from jaxmark.seeds import Randomness, generator
 
 _HOLE_COUNT = 10
 

@@ -5,9 +5,9 @@ from jaxtyping import Float64
 from scipy.spatial import KDTree
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import Randomness, generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, diagonal
+from jaxmark.seeds import Randomness, generator
 
 _AROUND = 0.25  # width of what lies around a cloud's box on each side, over its diagonal
 _CORNERS = 6  # nearest points among which two span a triangle with a point

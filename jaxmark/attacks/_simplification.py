@@ -1,10 +1,10 @@
 """Simplification by edge collapses."""
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import Randomness
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.simplified import simplify
+from jaxmark.seeds import Randomness
 
 
 @on_host

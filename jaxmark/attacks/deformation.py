@@ -4,10 +4,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import Randomness, generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, compact, component_of, diagonal, face_normals, used_vertices
+from jaxmark.seeds import Randomness, generator
 
 _HANDLE_SHARE = 0.05  # of the vertices, at either end
 _ARAP_STEPS = 50

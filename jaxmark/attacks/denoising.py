@@ -9,10 +9,10 @@ from scipy.spatial import KDTree
 
 from jaxmark.attacks.extent import diagonal, displace, surface
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import Randomness
 from jaxmark.distortion.roots import root
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, used_vertices, vertex_normals
+from jaxmark.seeds import Randomness
 from jaxmark.spectral.bands import heat, meyer
 from jaxmark.spectral.chebyshev import band_components, synthesise
 from jaxmark.spectral.graphs import from_mesh

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import Randomness, generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, edges, sides, unit
+from jaxmark.seeds import Randomness, generator
 
 _MIN_HEIGHT_RATIO = 0.01  # height of a new face over its longest side
 Faces = Int64[np.ndarray, "faces 3"]

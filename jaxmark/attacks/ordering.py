@@ -4,9 +4,9 @@ import numpy as np
 from jaxtyping import Int64
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import Randomness, generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, used_vertices
+from jaxmark.seeds import Randomness, generator
 
 
 @on_host

@@ -9,10 +9,10 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import Randomness
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, boundary_vertices, diagonal, face_normals, used_vertices
 from jaxmark.geometry.pose import Points
+from jaxmark.seeds import Randomness
 
 _MAX_DEGREES = 30.0
 _MIN_REGION_VERTICES = 10  # fewer fit most shapes

@@ -9,21 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float64, Key, PRNGKeyArray
 
+from jaxmark.adversaries._jamming import jamming
+from jaxmark.adversaries.filtering import band_stop, low_pass
 from jaxmark.attacks._affine import affine, similarity
 from jaxmark.attacks._cropping import cropping, holes, region_cropping
-from jaxmark.attacks._jamming import jamming
 from jaxmark.attacks._points import floaters, merging, outliers, resampling, subsampling
 from jaxmark.attacks._quantisation import quantisation
 from jaxmark.attacks._simplification import simplification
 from jaxmark.attacks.bilateral import bilateral_smoothing
 from jaxmark.attacks.deformation import as_rigid_as_possible
 from jaxmark.attacks.denoising import nonlocal_means, shrinkage
-from jaxmark.attacks.filtering import band_stop, low_pass
 from jaxmark.attacks.flips import edge_flips
 from jaxmark.attacks.noise import diagonal_noise, gaussian_noise, uniform_noise
 from jaxmark.attacks.ordering import reordering
 from jaxmark.attacks.pieces import missing_pieces, mosaic
-from jaxmark.attacks.random import generator
 from jaxmark.attacks.refitting import plane_fitting, primitive_fitting
 from jaxmark.attacks.remeshing import iso_surface, isotropic, poisson
 from jaxmark.attacks.scene import adding_geometry
@@ -45,6 +44,7 @@ from jaxmark.geometry.mesh import (
     weld,
     weld_mesh,
 )
+from jaxmark.seeds import generator
 
 
 class Attack(NamedTuple):

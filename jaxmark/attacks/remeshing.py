@@ -5,10 +5,10 @@ from jaxtyping import Float64, Int64
 
 from jaxmark.attacks.host import on_host
 from jaxmark.attacks.meshlab import apply_filter, apply_filter_to_points
-from jaxmark.attacks.random import Randomness, generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, area, compact, edges
+from jaxmark.seeds import Randomness, generator
 
 _CELL_RANGE = 4, 512  # along the longest side
 _DEPTH_RANGE = 1, 12  # of the octree

@@ -3,9 +3,9 @@
 import numpy as np
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import Randomness, generator
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, diagonal, used_vertices
+from jaxmark.seeds import Randomness, generator
 
 _GAP_DIAGONALS = 0.1  # between the bounding spheres of the mesh and of each object, in diagonals of the mesh
 

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import Randomness
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
 from jaxmark.geometry.mesh import Mesh, used_vertices
+from jaxmark.seeds import Randomness
 
 _MAX_DIGITS = 17  # enough to tell any two float64 apart
 _FLOAT_TYPES = {64: np.float64, 32: np.float32, 16: np.float16}  # by their bits

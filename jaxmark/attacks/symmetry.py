@@ -10,11 +10,11 @@ from jaxtyping import Float64, Int64
 
 from jaxmark.alignment.registration import refine
 from jaxmark.attacks.host import on_host
-from jaxmark.attacks.random import Randomness
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, component_of, diagonal, used_vertices
 from jaxmark.geometry.pose import IDENTITY, Points, PointSets, Pose, similarity
 from jaxmark.geometry.surfaces import Surface, sample
+from jaxmark.seeds import Randomness
 
 _SAMPLE_POINTS = 4000
 _FIRST_SAMPLE_POINTS = 1000  # used to choose between mirror planes

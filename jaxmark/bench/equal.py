@@ -54,8 +54,8 @@ def equal_visibility(
 ) -> Table:
     """Bring all methods to the same visibility by bisection, and find by another the strongest noise each survives.
 
-    Visibility is a share of the limits of what is hidden, see `jaxmark.watermark.budget.visibility_of`. A message
-    survives if it is read exactly; a mark without one if its score is above those of twenty other keys.
+    Visibility is a share of the limits of what is hidden, see `visibility_of`. A message survives if
+    it is read exactly; a mark without one if its score is above those of twenty other keys.
 
     Args:
         meshes: files, or meshes by their names.

@@ -11,7 +11,7 @@ from jaxmark.distortion import Reference
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, Weld, diagonal, weld
 from jaxmark.geometry.pose import similarity
-from jaxmark.watermark.budget import largest_within
+from jaxmark.watermark.perception.budget import largest_within
 
 _REFUSED = 2.0  # what a refused strength counts as, over the limits
 _TORN = 1e-9  # of the diagonal: rounding

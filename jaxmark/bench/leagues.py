@@ -15,7 +15,7 @@ from jaxmark.attacks import Attack, attack
 from jaxmark.bench import compositions as made
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.budget import visibility_of
+from jaxmark.watermark.perception.budget import visibility_of
 
 CROPS = 3  # of one mesh, whose readings are averaged
 OVERWRITTEN = "overwritten"  # by a second mark of the same method, with another key, as strong as the limits

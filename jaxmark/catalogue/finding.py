@@ -25,11 +25,11 @@ from jaxmark.catalogue.search import Index, Near, state_of
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.pose import Points, Pose
-from jaxmark.watermark import evidence
 from jaxmark.watermark.coding.keys import Key, commitment
+from jaxmark.watermark.evidence import bounds as evidence
 from jaxmark.watermark.marking import make_markers
 from jaxmark.watermark.record import Record
-from jaxmark.watermark.tracing import make_tracer, pay
+from jaxmark.watermark.tracing.tracer import make_tracer, pay
 
 _ALIKE = 100  # originals that a whole is fitted to
 _LIKELY = 2000  # originals of which a part may look like a piece

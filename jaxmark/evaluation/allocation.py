@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Float64
 from scipy import optimize
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.watermark.channels import Channels, Margin, margins
+from jaxmark.evaluation.channels import Channels, Margin, margins
 
 Solver = Literal["projected-gradient", "accelerated-gradient"]
 
@@ -48,7 +48,7 @@ def allocate(
         channels: channels of the attacks to survive.
         cost: cost of each band at β = 1, positive; if it is the mean square displacement, the budget is an RMS.
         budget: root of the total cost.
-        margin: see `jaxmark.watermark.channels.margins`.
+        margin: see `jaxmark.evaluation.channels.margins`.
         cap: the largest share of the budget that one band gets, at least 1/bands.
         sharpness: sharpness of the soft minimum.
         steps: largest number of iterations.

@@ -16,8 +16,8 @@ from jaxmark.watermark.blind.prediction import Left, best_margin, compare
 from jaxmark.watermark.blind.reading import codeword
 from jaxmark.watermark.blind.scheme import BlindScheme, Look
 from jaxmark.watermark.blind.writing import Plan, carried, sureness
-from jaxmark.watermark.budget import Limits, make_budget
 from jaxmark.watermark.everyday import BLIND_SCHEMES, blind_scheme
+from jaxmark.watermark.perception.budget import Limits, make_budget
 
 _PUBLIC_KEY = bytes(32)  # predictions hardly depend on the key
 

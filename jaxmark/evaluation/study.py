@@ -29,11 +29,11 @@ from jaxmark.geometry.hashing import geometry_hash
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.marker import BlindMarker
 from jaxmark.watermark.blind.scheme import BlindScheme
-from jaxmark.watermark.budget import Budget, Visibility, make_budget
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.everyday import prepare_alone, scheme_named
 from jaxmark.watermark.marking import DEFAULT_BITS, Marker
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme, parameters_of
+from jaxmark.watermark.perception.budget import Budget, Visibility, make_budget
+from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, Scheme, parameters_of
 
 _SEEDS_PER_CELL = 5  # attacked by one call
 

@@ -1,6 +1,6 @@
 """Marks that are written, attacked and read with signs of nobody's key: what strengths are worth to the detector.
 
-Channels (`jaxmark.watermark.channels`) say which strengths are best for a model of attacks, limits and reader, quickly
+Channels (`jaxmark.evaluation.channels`) say which strengths are best for a model of attacks, limits and reader, quickly
 and with a proof. Trials leave nothing out, and `Trials.ascend` differentiates them: from strengths to the mark within
 its limits, to what each attack leaves of it, to the weights that the reader gives the bands, to the claim.
 """
@@ -22,12 +22,12 @@ from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, displace
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.allocation import import_jaxopt
+from jaxmark.evaluation.channels import Margin, measure
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.budget import Budget, Written, write
 from jaxmark.watermark.carriers.keyed import KeyedCarrier, KeyedReader
-from jaxmark.watermark.channels import Margin, measure
 from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key
-from jaxmark.watermark.schemes import TunableScheme
+from jaxmark.watermark.perception.budget import Budget, Written, write
+from jaxmark.watermark.schemes.scheme import TunableScheme
 
 Attack = Callable[[Mesh, int], Mesh]  # an attack of some strength on a mesh, with a seed
 

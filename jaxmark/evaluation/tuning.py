@@ -20,18 +20,18 @@ from jaxmark.attacks import Kind, attack, get_attack
 from jaxmark.distortion import name_of
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.allocation import Solver, balance, upper_bound
+from jaxmark.evaluation.channels import Channels, Margin, margins, measure
 from jaxmark.evaluation.trials import Trials
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.chebyshev import band_energies, filter
-from jaxmark.watermark.budget import Budget, Limits, make_budget, write
-from jaxmark.watermark.carriers.carrier import Displacement
-from jaxmark.watermark.channels import Channels, Margin, margins, measure
 from jaxmark.watermark.everyday import blind_scheme
-from jaxmark.watermark.payload import Capacity
+from jaxmark.watermark.interfaces import Displacement
+from jaxmark.watermark.perception.budget import Budget, Limits, make_budget, write
+from jaxmark.watermark.perception.capacity import Capacity
+from jaxmark.watermark.perception.visibility import apply_mask, band_visibility
 from jaxmark.watermark.probes import probe_signs
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme, TunableScheme, get_scheme
-from jaxmark.watermark.suiting import suited
-from jaxmark.watermark.visibility import apply_mask, band_visibility
+from jaxmark.watermark.schemes.passband import suited
+from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, Scheme, TunableScheme, get_scheme
 
 Attacker = tuple[Kind, float] | Callable[[Mesh, int], Mesh]  # an attack and a strength, or (mesh, seed) → mesh
 
@@ -104,7 +104,7 @@ def tune(
         scheme: the scheme whose bands are tuned; its profile is replaced.
         seeds: number of times that each attack is tried; what is measured is averaged.
         margin: what the worst attack should leave: `"evidence"`, for a claimed message, or `"rate"`, for a message that
-            is to be read; see `jaxmark.watermark.channels.margins`. Trials have S²/2‖a‖² in nats of the claim, or the
+            is to be read; see `jaxmark.evaluation.channels.margins`. Trials have S²/2‖a‖² in nats of the claim, or the
             bits that the soft values of joint decoding transmit.
         cap: the largest share of the budget that one band gets, so that losing a band does not lose the mark.
         solver: see `jaxmark.evaluation.allocation.allocate`.

@@ -9,11 +9,11 @@ from numpy.polynomial import chebyshev
 
 from jaxmark.alignment.original import Original, shift_of
 from jaxmark.distortion import Metric, name_of
+from jaxmark.evaluation.channels import band_energies
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.plot.figures import FIELD, Picture, finish, panels, styles
 from jaxmark.spectral.bands import nodes, scaling
-from jaxmark.watermark import visibility
-from jaxmark.watermark.channels import band_energies
+from jaxmark.watermark.perception import visibility
 
 _FREQUENCY_LABEL = "frequency λ, from 0, smooth, to 2"
 
@@ -98,7 +98,7 @@ def mean_squares(
 def band_visibility(original: Original, metrics: Sequence[Metric], bands: int = 64) -> Picture:
     """Plot how far metrics rise per unit of displacement in each band.
 
-    The values are those of `jaxmark.watermark.visibility.band_visibility`.
+    The values are those of `jaxmark.watermark.perception.visibility.band_visibility`.
 
     Args:
         original: the original.

@@ -11,7 +11,7 @@ from jaxmark.alignment.original import Original, shift_of
 from jaxmark.distortion import shading_at_vertices
 from jaxmark.geometry.mesh import Mesh, host_mesh
 from jaxmark.plot.figures import FIELD, Picture, panels
-from jaxmark.watermark.visibility import masking
+from jaxmark.watermark.perception.visibility import masking
 
 
 class View(NamedTuple):
@@ -42,7 +42,7 @@ def visibility(
 ) -> View:
     """Make a heat map of displacement over what roughness hides.
 
-    The same displacement shows more where the mesh is smooth; see `jaxmark.watermark.visibility.masking`.
+    The same displacement shows more where the mesh is smooth; see `jaxmark.watermark.perception.visibility.masking`.
 
     Args:
         original: the original, not moved.

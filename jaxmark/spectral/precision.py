@@ -64,8 +64,8 @@ def sum_and_norm(terms: Float[Array, "..."]) -> tuple[Float[Array, ""], Float[Ar
     """Σ terms and ‖terms‖, both by compensated sums: a score and its probability are computed from these.
 
     Terms may be so small that their squares underflow. For up to ten million float32 terms the quotient t of the two is
-    off by at most 4 eps (1 + |t|), with eps = 1.2e-7; for float64 terms likewise. `jaxmark.watermark.evidence` allows
-    for this error.
+    off by at most 4 eps (1 + |t|), with eps = 1.2e-7; for float64 terms likewise.
+    `jaxmark.watermark.evidence.bounds` allows for this error.
     """
     peak = jax.lax.stop_gradient(jnp.max(jnp.abs(terms), initial=0))
     # Select before the root: its slope at zero is infinite.

@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from jaxmark.alignment.observation import observe
 from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.carriers import Carrier
-from jaxmark.watermark.carriers.carrier import Strength
-from jaxmark.watermark.detectors import Detector, claims, decorrelate
+from jaxmark.watermark.interfaces import Strength
+from jaxmark.watermark.reading.detectors import Detector, claims, decorrelate
 
 
 def embed_bits(
@@ -55,7 +55,7 @@ def detect_bits(
         suspect: coordinates `[N, 3]` in the original's vertex order.
         x: the original's coordinates `[N, 3]`.
         carrier: the carrier that the bits were embedded with.
-        detector: see `jaxmark.watermark.detectors`.
+        detector: see `jaxmark.watermark.reading.detectors`.
         beta: the strengths' profile over the bands, as embedded; a common factor only rescales the result.
         weights: relative inverse variance of each vertex `[N]`, 0 where nothing is known; by default all are equal.
         normals: unit vectors `[N, 3]`, if only the displacement along them is known; by default all of it is.

@@ -8,12 +8,12 @@ from functools import cached_property
 from jaxmark import distortion
 from jaxmark.alignment.original import Original
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark import evidence
 from jaxmark.watermark.blind.marker import BlindMarker, make_blind_marker
 from jaxmark.watermark.blind.reading import BlindDetection
 from jaxmark.watermark.blind.scheme import BlindScheme
-from jaxmark.watermark.budget import Limits, Visibility, make_budget, visibility_of
+from jaxmark.watermark.evidence import bounds as evidence
 from jaxmark.watermark.marking import Detection, EmbedInfo, Marker, Survival
+from jaxmark.watermark.perception.budget import Limits, Visibility, make_budget, visibility_of
 from jaxmark.watermark.record import Record
 
 _LEAST_SHARE, _MOST_SHARE = 0.3, 0.9  # of what is allowed, for a mark that is not the last

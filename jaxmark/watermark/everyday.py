@@ -23,10 +23,8 @@ from jaxmark.watermark.blind.local import LocalScheme
 from jaxmark.watermark.blind.marker import BlindMarker, make_blind_marker, parameters_in
 from jaxmark.watermark.blind.reading import BlindDetection
 from jaxmark.watermark.blind.scheme import BlindScheme
-from jaxmark.watermark.budget import Limits, Visibility, make_budget, visibility_of
 from jaxmark.watermark.coding.keys import KEY_BYTES, Key
 from jaxmark.watermark.combined import CombinedMarker, unite
-from jaxmark.watermark.detectors import Detector
 from jaxmark.watermark.marking import (
     DEFAULT_BITS,
     Detection,
@@ -35,9 +33,11 @@ from jaxmark.watermark.marking import (
     make_marker,
     make_markers,
 )
-from jaxmark.watermark.payload import COVERAGE, NOISE, Capacity, Conditions
+from jaxmark.watermark.perception.budget import Limits, Visibility, make_budget, visibility_of
+from jaxmark.watermark.perception.capacity import COVERAGE, NOISE, Capacity, Conditions
+from jaxmark.watermark.reading.detectors import Detector
 from jaxmark.watermark.record import Record
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES, Scheme, get_scheme
+from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, SCHEMES, Scheme, get_scheme
 
 #: The schemes that are read without the original, the soonest read first.
 BLIND_SCHEMES: Mapping[str, BlindScheme] = {LocalScheme.name: LocalScheme(), FieldScheme.name: FieldScheme()}
@@ -149,7 +149,8 @@ def embed(
         limits: the largest values that metrics of `distortion.METRICS` may reach, by name, in the units of
             `distortion.Comparison`; or that metrics of your own may, by function (see `distortion.measure`).
         visibility: how well people may see the mark: `"hidden"`, the default if budget and limits are not given;
-            `"careful look"`, seen beside the original; `"visible"`. See `jaxmark.watermark.budget.VISIBILITY`.
+            `"careful look"`, seen beside the original; `"visible"`. See
+            `jaxmark.watermark.perception.budget.VISIBILITY`.
         noise: a demand: the noise that the message must survive when half of the vertices are lost, see `capacity`; 0
             requires only that there are enough dimensions. By default nothing is demanded but that the message reads.
             It has no effect for schemes whose readers have no model of noise, such as `host` and `eigen`.

@@ -15,27 +15,27 @@ from numpy.typing import ArrayLike
 from jaxmark import distortion
 from jaxmark.alignment import alignment
 from jaxmark.alignment.alignment import Align, Alignment
-from jaxmark.alignment.bending import Bent
 from jaxmark.alignment.heights import VertexHeights
+from jaxmark.alignment.nonrigid import Bent
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.canonical import Canonical
 from jaxmark.geometry.imprint import Imprint, make_imprint, restore
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark import evidence
-from jaxmark.watermark.budget import Budget, Limits, Visibility, make_budget, visibility_of, write
-from jaxmark.watermark.carriers.carrier import Carrier, Reader, Received
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
-from jaxmark.watermark.carriers.reception import Reception
-from jaxmark.watermark.coarse import receive_coarse
 from jaxmark.watermark.coding.keys import SCHEME_VERSION, VERSIONS, Choices, Key, bind, commitment
 from jaxmark.watermark.coding.message import CANDIDATES, TAG_BITS, Decoded, decode, encode
-from jaxmark.watermark.detectors import Detector, claims
-from jaxmark.watermark.payload import COVERAGE, NOISE, Capacity, Conditions
+from jaxmark.watermark.evidence import bounds as evidence
+from jaxmark.watermark.interfaces import Carrier, Reader, Received
+from jaxmark.watermark.perception.budget import Budget, Limits, Visibility, make_budget, visibility_of, write
+from jaxmark.watermark.perception.capacity import COVERAGE, NOISE, Capacity, Conditions
+from jaxmark.watermark.reading.coarse import receive_coarse
+from jaxmark.watermark.reading.detectors import Detector, claims
+from jaxmark.watermark.reading.reception import Reception
 from jaxmark.watermark.record import Content, Record, commit, seal_imprint
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, SCHEMES, Scheme, get_scheme, parameters_of, stands_for
-from jaxmark.watermark.suiting import suited
+from jaxmark.watermark.schemes.passband import suited
+from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, SCHEMES, Scheme, get_scheme, parameters_of, stands_for
 
 DEFAULT_BITS = 64  # size of the payload
 _MIN_ORIGINAL_SHARE = 0.5  # share of an original's points from which on an edited copy is read with, as an estimate
@@ -287,8 +287,8 @@ class Marker:
         Hoeffding's bound (see `evidence.log10_p_claimed`). The score is the plain correlation of the codeword: joint
         decoding may choose the codeword, but does not enter the score. It is taken for each way of weighting the
         suspect (see `detectors.claims`), and each is paid for, too; so are ways of aligning other than `"auto"`, and,
-        where no message is read otherwise, reading surfaces of few vertices by these (`jaxmark.watermark.coarse`), and
-        what was bent by a map of its own around each point (`jaxmark.alignment.bending`).
+        where no message is read otherwise, reading surfaces of few vertices by these
+        (`jaxmark.watermark.reading.coarse`), and what was bent by a map of its own around each point (`jaxmark.alignment.nonrigid`).
         Weights depend on suspect and original only.
 
         A suspect that is read with several keys needs to be aligned only once: pass the result of
@@ -671,8 +671,8 @@ def make_marker(
         record: the record of an earlier mark, which fixes scheme and payload size; original and key must be those that
             it was made with.
         scheme: a name (`"keyed"`, `"host"`, `"eigen"`), which a record overrides; or a scheme of
-            `jaxmark.watermark.schemes` or your own.
-        detector: a detector of `jaxmark.watermark.detectors`; by default the scheme's own.
+            `jaxmark.watermark.schemes.scheme` or your own.
+        detector: a detector of `jaxmark.watermark.reading.detectors`; by default the scheme's own.
         version: version of the keyed choices: the record's, else 2; 1 is for marks of that version without a record.
 
     Returns:

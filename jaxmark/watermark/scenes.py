@@ -20,14 +20,14 @@ from scipy.spatial.distance import cdist
 from jaxmark.alignment.alignment import Align, align
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark import evidence
-from jaxmark.watermark.budget import Limits, Visibility
 from jaxmark.watermark.coding.keys import canonical_json
-from jaxmark.watermark.detectors import claims
 from jaxmark.watermark.everyday import AnyMarker, AnyScheme, prepare
+from jaxmark.watermark.evidence import bounds as evidence
 from jaxmark.watermark.marking import ALIGN_SHARES, CLAIM_SHARE, Detection, EmbedInfo, Marker, make_marker
+from jaxmark.watermark.perception.budget import Limits, Visibility
+from jaxmark.watermark.reading.detectors import claims
 from jaxmark.watermark.record import Record, read_json
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme
+from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, Scheme
 
 _Numbers = Float64[np.ndarray, " numbers"]
 

@@ -19,7 +19,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces, edges, host_mesh, used_vertices, weld, weld_mesh
 from jaxmark.spectral.laplacian import adjacency
 from jaxmark.watermark.marking import Detection, EmbedInfo, Marker, make_marker
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, Scheme
+from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, Scheme
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from jaxmark.adversaries.ambiguity import forge_original, search_key, transplant
 from jaxmark.alignment.original import make_original
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.marking import Marker, bind_mark
-from jaxmark.watermark.schemes import KeyedScheme
+from jaxmark.watermark.schemes.scheme import KeyedScheme
 from tests.samples import bumpy_sphere
 
 MESSAGE, FORGED = b"ok", b"my"

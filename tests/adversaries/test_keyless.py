@@ -12,8 +12,8 @@ from jaxmark.adversaries import blind
 from jaxmark.adversaries.expected import evidence, make_surrogate, random_mark, rescale, rms, size
 from jaxmark.distortion import compare
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.budget import make_budget
-from jaxmark.watermark.detectors import claims
+from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.reading.detectors import claims
 from tests.samples import bumpy_sphere
 
 MESSAGE, MARK = b"ok", 2e-3

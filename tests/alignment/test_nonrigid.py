@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
 from jaxmark.alignment.alignment import align, straightened
-from jaxmark.alignment.bending import _STEPS, Bent, straighten
+from jaxmark.alignment.nonrigid import _STEPS, Bent, straighten
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.geometry import asteroid
 from jaxmark.geometry.mesh import Mesh, edges
@@ -47,7 +47,7 @@ def folded(mesh: Mesh, degrees: float, joints: int = 2) -> Mesh:
 
 def test_maps_are_least_squares_with_the_weights_of_a_random_walk(monkeypatch):
     """Each point's map by a dense power of the walk, and NumPy's lstsq."""
-    monkeypatch.setattr("jaxmark.alignment.bending._RIDGE", 0.0)
+    monkeypatch.setattr("jaxmark.alignment.nonrigid._RIDGE", 0.0)
     random, original = np.random.default_rng(0), make_original(bumpy_sphere(2))
     x = np.asarray(original.positions)
     y = x + 0.1 * np.sin(3 * x[:, [1, 2, 0]]) + 1e-3 * random.normal(size=x.shape)

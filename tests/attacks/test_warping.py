@@ -10,7 +10,7 @@ import jaxmark as jm
 from jaxmark.attacks import bending, jamming, twisting, warp
 from jaxmark.geometry.mesh import Mesh, diagonal, make_mesh
 from jaxmark.spectral.graphs import from_mesh
-from jaxmark.watermark.schemes import DERIVED
+from jaxmark.watermark.schemes.scheme import DERIVED
 from tests.dense import laplacian_matrix
 from tests.samples import exact_sheet, rough_sphere
 from tests.test_precision import check_products

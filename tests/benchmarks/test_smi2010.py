@@ -13,7 +13,7 @@ from scipy import sparse
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh, edges, make_mesh, vertex_normals
 from jaxmark.geometry.pose import similarity
-from jaxmark.watermark.budget import make_budget
+from jaxmark.watermark.perception.budget import make_budget
 from tests import ROOT
 from tests.samples import bumpy_sphere
 

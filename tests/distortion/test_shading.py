@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 import jaxmark as jm
 from jaxmark.distortion import Hiding, make_hiding, shading, vertex_means, visible_turn
 from jaxmark.geometry.mesh import Mesh, make_mesh
-from jaxmark.watermark.budget import make_budget
-from jaxmark.watermark.schemes import KeyedScheme
+from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.schemes.scheme import KeyedScheme
 from tests.samples import rough_sphere
 
 pytestmark = pytest.mark.core

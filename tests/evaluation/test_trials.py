@@ -14,8 +14,8 @@ from jaxmark.evaluation import trials as module
 from jaxmark.evaluation.trials import Trials
 from jaxmark.evaluation.tuning import apply_attack, tune
 from jaxmark.spectral.chebyshev import band_components
-from jaxmark.watermark.budget import make_budget
-from jaxmark.watermark.schemes import KeyedScheme
+from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.schemes.scheme import KeyedScheme
 from tests.samples import rough_sphere
 
 ATTACKS = (("noise", 0.004), ("smoothing", 10))

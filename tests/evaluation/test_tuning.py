@@ -13,12 +13,12 @@ import jaxmark as jm
 from jaxmark.alignment.observation import observe
 from jaxmark.alignment.original import make_original
 from jaxmark.evaluation.allocation import allocate, upper_bound
+from jaxmark.evaluation.channels import Channels, margins, measure, rate
 from jaxmark.evaluation.tuning import tune
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import filter
-from jaxmark.watermark.carriers.reception import make_host, make_receiver
-from jaxmark.watermark.channels import Channels, margins, measure, rate
-from jaxmark.watermark.schemes import KeyedScheme
+from jaxmark.watermark.reading.reception import make_host, make_receiver
+from jaxmark.watermark.schemes.scheme import KeyedScheme
 from tests.samples import rough_sphere
 
 

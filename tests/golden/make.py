@@ -11,7 +11,7 @@ import trimesh
 import jaxmark as jm
 from jaxmark.watermark.coding.keys import SCHEME_VERSION
 from jaxmark.watermark.record import RECORD_SUFFIX
-from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme, Scheme
+from jaxmark.watermark.schemes.scheme import EigenScheme, HostScheme, KeyedScheme, Scheme
 from tests.samples import rough_sphere
 
 FOLDER = Path(__file__).parent / str(SCHEME_VERSION)

@@ -17,8 +17,8 @@ from jaxmark.evaluation import Robustness, pictures
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.spectrum import eigenpairs
-from jaxmark.watermark.evidence import MIN_LOG10_P, log10_p_claimed
-from jaxmark.watermark.visibility import masking
+from jaxmark.watermark.evidence.bounds import MIN_LOG10_P, log10_p_claimed
+from jaxmark.watermark.perception.visibility import masking
 from tests.samples import bumpy_sphere
 
 matplotlib = pytest.importorskip("matplotlib")

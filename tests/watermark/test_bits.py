@@ -14,8 +14,8 @@ from jaxmark.watermark.bits import detect_bits, embed_bits, log_evidence
 from jaxmark.watermark.carriers import ModulatedCarrier, host_bands
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.sequences import orthogonal_sequences
-from jaxmark.watermark.detectors import correlate, decorrelate
-from jaxmark.watermark.evidence import correlation_bound
+from jaxmark.watermark.evidence.bounds import correlation_bound
+from jaxmark.watermark.reading.detectors import correlate, decorrelate
 from tests.samples import bumpy_sphere
 
 pytestmark = pytest.mark.core

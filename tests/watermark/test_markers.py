@@ -11,10 +11,10 @@ import jaxmark as jm
 from jaxmark import distortion
 from jaxmark.alignment.original import make_original
 from jaxmark.geometry.mesh import Mesh, make_mesh
-from jaxmark.watermark import evidence
 from jaxmark.watermark.carriers import KeyedReader
+from jaxmark.watermark.evidence import bounds as evidence
 from jaxmark.watermark.marking import Marker
-from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme, get_scheme
+from jaxmark.watermark.schemes.scheme import EigenScheme, HostScheme, KeyedScheme, get_scheme
 from tests.samples import bumpy_sphere, exact_sheet
 
 MESSAGE = bytes.fromhex("0123456789abcdef")

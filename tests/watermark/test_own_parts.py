@@ -19,8 +19,8 @@ from jaxmark.spectral.precision import matmul, sum_and_norm
 from jaxmark.watermark.carriers import Carrier, Claim, PlainReader, Reader
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import code_length
-from jaxmark.watermark.detectors import Detector, claims, correlate
-from jaxmark.watermark.schemes import Scheme
+from jaxmark.watermark.reading.detectors import Detector, claims, correlate
+from jaxmark.watermark.schemes.scheme import Scheme
 from tests.samples import bumpy_sphere
 
 pytestmark = pytest.mark.core

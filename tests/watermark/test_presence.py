@@ -8,7 +8,7 @@ import pytest
 import jaxmark as jm
 from jaxmark.app.telling import told_message
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.payload import NOISE
+from jaxmark.watermark.perception.capacity import NOISE
 from tests.app.test_cli import MESSAGE, Workshop
 from tests.samples import bumpy_sphere, rough_sphere
 

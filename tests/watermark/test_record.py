@@ -15,7 +15,7 @@ from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.watermark.coding.keys import Choices, bind
 from jaxmark.watermark.deposit import Deposit, make_deposit
 from jaxmark.watermark.record import commit
-from jaxmark.watermark.schemes import KeyedScheme
+from jaxmark.watermark.schemes.scheme import KeyedScheme
 from tests.geometry.test_imprint import COPIES
 from tests.samples import bumpy_sphere
 
@@ -200,7 +200,7 @@ def test_weights_detectors_and_schemes_of_ones_own_make_no_proof(marked, origina
     suspect, record = marked
     weights = np.ones(len(original.vertices))
     assert jm.detect(suspect, original=original, key=key, record=record, weights=weights).doubts
-    from jaxmark.watermark.detectors import correlate
+    from jaxmark.watermark.reading.detectors import correlate
 
     assert jm.make_marker(original, key, record=record, detector=correlate).doubts
 

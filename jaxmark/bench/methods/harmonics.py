@@ -22,9 +22,9 @@ from jaxmark.alignment.original import Original, make_original
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, vertex_normals, weld, weld_mesh
 from jaxmark.spectral.precision import einsum, matmul
-from jaxmark.watermark.budget import Budget, write
 from jaxmark.watermark.carriers import ModulatedCarrier
-from jaxmark.watermark.detectors import correlate
+from jaxmark.watermark.perception.budget import Budget, write
+from jaxmark.watermark.reading.detectors import correlate
 
 HARMONICS = 20
 THRESHOLD = 0.15  # of the correlation

@@ -23,12 +23,12 @@ from jaxmark.watermark.blind.field import FieldScheme
 from jaxmark.watermark.blind.marker import BlindMarker
 from jaxmark.watermark.blind.reading import TAG_BITS, BlindDetection, codeword, context
 from jaxmark.watermark.blind.scheme import BlindScheme, Look
-from jaxmark.watermark.budget import make_budget
 from jaxmark.watermark.coding.keys import Choices, Key
 from jaxmark.watermark.coding.message import guess
 from jaxmark.watermark.everyday import BLIND_SCHEMES, prepare_alone, read_blind
 from jaxmark.watermark.marking import Detection, Marker
-from jaxmark.watermark.schemes import EigenScheme, HostScheme, KeyedScheme, Scheme
+from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.schemes.scheme import EigenScheme, HostScheme, KeyedScheme, Scheme
 
 _RMS = (2e-6, 1e-2)  # displacements over the diagonal
 _OURS = "the scheme is defined by this code"

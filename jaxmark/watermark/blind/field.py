@@ -56,7 +56,7 @@ class FieldScheme:
     name: ClassVar[str] = "field"
     widths: tuple[float, ...] = (0.018, 0.0125, 0.025)  # of the narrow Gaussian, about in diagonals
     steps: tuple[float, ...] = tuple(1e-4 * 2 ** (rung / 2) for rung in range(11))  # of the lattice, in the same unit
-    hiding: bool = False  # whether points move where and as it is hidden; see `jaxmark.watermark.hiding`
+    hiding: bool = False  # whether points move where and as it is hidden; see `jaxmark.watermark.perception.masking`
 
     @property
     def in_parts(self) -> bool:

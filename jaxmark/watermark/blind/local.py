@@ -50,7 +50,7 @@ class LocalScheme:
     name: ClassVar[str] = "local"
     widths: tuple[float, ...] = (32.0,)  # power k of the narrow average (I - Δ/2)^k
     steps: tuple[float, ...] = tuple(0.0625 * 2 ** (rung / 2) for rung in range(11))  # of the lattice, over local sizes
-    hiding: bool = False  # whether points move where and as it is hidden; see `jaxmark.watermark.hiding`
+    hiding: bool = False  # whether points move where and as it is hidden; see `jaxmark.watermark.perception.masking`
 
     @property
     def in_parts(self) -> bool:

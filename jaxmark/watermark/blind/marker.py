@@ -12,9 +12,9 @@ from jaxmark.geometry.mesh import Mesh, check_faces
 from jaxmark.watermark.blind.reading import TAG_BITS, BlindDetection, code_length, codeword, context, detect
 from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.blind.writing import Writer, radius_of
-from jaxmark.watermark.budget import Budget, Limits, Visibility, make_budget, visibility_of
 from jaxmark.watermark.coding.keys import Key, commitment
 from jaxmark.watermark.marking import DEFAULT_BITS, EmbedInfo, Survival
+from jaxmark.watermark.perception.budget import Budget, Limits, Visibility, make_budget, visibility_of
 from jaxmark.watermark.record import Record, commit
 
 _TRIED = (1.0, 0.7, 0.5, 0.3)  # shares of a predicted noise that are tried

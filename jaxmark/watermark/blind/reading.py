@@ -23,12 +23,12 @@ from jaxtyping import Float64
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.pose import Pose
-from jaxmark.watermark import evidence
 from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.scheme import BlindScheme, Look
 from jaxmark.watermark.blind.search import moved, search
 from jaxmark.watermark.coding.keys import Choices, Key, bind
 from jaxmark.watermark.coding.message import decode_any, encode
+from jaxmark.watermark.evidence import bounds as evidence
 from jaxmark.watermark.marking import CLAIM_SHARE
 from jaxmark.watermark.record import Record
 

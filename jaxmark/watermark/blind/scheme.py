@@ -81,7 +81,7 @@ class BlindScheme(Protocol):
 
     @property
     def hiding(self) -> bool:
-        """Whether points move where and as it is hidden; see `jaxmark.watermark.hiding`."""
+        """Whether points move where and as it is hidden; see `jaxmark.watermark.perception.masking`."""
         ...
 
     @property

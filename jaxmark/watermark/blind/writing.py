@@ -26,12 +26,12 @@ from jaxmark.watermark.blind.dither import Dither, make_dither
 from jaxmark.watermark.blind.prediction import Margin, margin, mean_cosine
 from jaxmark.watermark.blind.reading import TAG_BITS, codeword
 from jaxmark.watermark.blind.scheme import AnchoredHost, BlindScheme, Measured, measure
-from jaxmark.watermark.budget import Budget, write
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.hiding import hiding_directions
 from jaxmark.watermark.marking import DEFAULT_BITS, Survival
-from jaxmark.watermark.payload import NOISE
-from jaxmark.watermark.visibility import apply_mask
+from jaxmark.watermark.perception.budget import Budget, write
+from jaxmark.watermark.perception.capacity import NOISE
+from jaxmark.watermark.perception.masking import hiding_directions
+from jaxmark.watermark.perception.visibility import apply_mask
 
 _RIDGE = 3e-3  # of the mean square of a row: values that contradict each other are met halfway
 _HELD_RIDGE = 1e-4  # of the rows of what is held, which are scaled to the others' size

@@ -4,9 +4,6 @@
 `ModulatedCarrier` writes them on components of the host such as `host_bands` and `eigenspaces`.
 """
 
-from jaxmark.watermark.carriers.carrier import Carrier as Carrier
-from jaxmark.watermark.carriers.carrier import Claim as Claim
-from jaxmark.watermark.carriers.carrier import Reader as Reader
 from jaxmark.watermark.carriers.eigen import Eigenspaces as Eigenspaces
 from jaxmark.watermark.carriers.eigen import eigenspaces as eigenspaces
 from jaxmark.watermark.carriers.host import HostBands as HostBands
@@ -18,3 +15,6 @@ from jaxmark.watermark.carriers.keyed import make_chips as make_chips
 from jaxmark.watermark.carriers.modulated import Components as Components
 from jaxmark.watermark.carriers.modulated import ModulatedCarrier as ModulatedCarrier
 from jaxmark.watermark.carriers.modulated import PlainReader as PlainReader
+from jaxmark.watermark.interfaces import Carrier as Carrier
+from jaxmark.watermark.interfaces import Claim as Claim
+from jaxmark.watermark.interfaces import Reader as Reader

@@ -18,8 +18,11 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.spectral.chebyshev import band_energies, filter, transpose
 from jaxmark.spectral.laplacian import per_row
 from jaxmark.spectral.precision import matmul, sum_and_norm
-from jaxmark.watermark.carriers.carrier import Claim, Displacement, Room, Strength, check_strength
-from jaxmark.watermark.carriers.reception import (
+from jaxmark.watermark.coding.keys import Choices
+from jaxmark.watermark.interfaces import Claim, Displacement, Room, Strength, check_strength
+from jaxmark.watermark.perception.visibility import apply_mask
+from jaxmark.watermark.probes import probe_signs
+from jaxmark.watermark.reading.reception import (
     Host,
     Receiver,
     Reception,
@@ -29,9 +32,6 @@ from jaxmark.watermark.carriers.reception import (
     receive,
     weigh_evenly,
 )
-from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.probes import probe_signs
-from jaxmark.watermark.visibility import apply_mask
 
 
 class Chips(NamedTuple):
@@ -202,7 +202,7 @@ class KeyedReader(NamedTuple):
         return Receiver(host.operator, host.signal, host.coefficients, self.nuisance)
 
     def receive(self, seen: Observation) -> Reception:
-        """See `Reader`, and `jaxmark.watermark.carriers.reception.receive`."""
+        """See `Reader`, and `jaxmark.watermark.reading.reception.receive`."""
         return receive(self.receiver, seen)
 
     def ways(self, received: Reception) -> Sequence[Reception]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from jaxmark.alignment.observation import Observation
 from jaxmark.spectral.precision import einsum, sum_and_norm
-from jaxmark.watermark.carriers.carrier import Claim, Displacement, Strength, check_strength
+from jaxmark.watermark.interfaces import Claim, Displacement, Strength, check_strength
 
 
 @runtime_checkable

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from jaxmark.confidence import clopper_pearson
 from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.reading import context
-from jaxmark.watermark.evidence import log10_p_claimed
+from jaxmark.watermark.evidence.bounds import log10_p_claimed
 
 PAIRS, ANCHORS = 30_000, 80
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-4)

@@ -14,12 +14,12 @@ from jaxmark.geometry.mesh import vertex_normals
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.laplacian import Laplacian, centre
-from jaxmark.watermark import detectors
 from jaxmark.watermark.bits import detect_bits, embed_bits
 from jaxmark.watermark.carriers import Carrier, KeyedCarrier, KeyedReader, ModulatedCarrier, host_bands, make_chips
-from jaxmark.watermark.carriers.reception import Reception, make_host, make_receiver, receive
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.detectors import joint
+from jaxmark.watermark.reading import detectors
+from jaxmark.watermark.reading.detectors import joint
+from jaxmark.watermark.reading.reception import Reception, make_host, make_receiver, receive
 from tests.dense import chebyshev_matrices
 from tests.samples import bumpy_sphere
 

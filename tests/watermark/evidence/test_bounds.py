@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.watermark.evidence import (
+from jaxmark.watermark.evidence.bounds import (
     MIN_LOG10_P,
     UNFLOORED,
     any_of,

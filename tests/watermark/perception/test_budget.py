@@ -11,7 +11,7 @@ import jaxmark as jm
 from jaxmark.alignment.original import make_original
 from jaxmark.app import cli
 from jaxmark.geometry.mesh import Mesh, make_mesh
-from jaxmark.watermark.budget import VISIBILITY, largest_within, make_budget, visibility_of, write
+from jaxmark.watermark.perception.budget import VISIBILITY, largest_within, make_budget, visibility_of, write
 from tests.samples import rough_sphere
 
 MESSAGE = b"\xa5\x5a"

@@ -12,11 +12,18 @@ import jaxmark as jm
 from jaxmark.alignment.original import make_original
 from jaxmark.geometry.mesh import Mesh, make_mesh, vertex_normals
 from jaxmark.spectral.bands import scaling
-from jaxmark.watermark.budget import make_budget
-from jaxmark.watermark.carriers.reception import make_receiver
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.payload import Capacity, Conditions, least_energy, needed_dimensions, needed_energy, worth
-from jaxmark.watermark.schemes import KeyedScheme
+from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.perception.capacity import (
+    Capacity,
+    Conditions,
+    least_energy,
+    needed_dimensions,
+    needed_energy,
+    worth,
+)
+from jaxmark.watermark.reading.reception import make_receiver
+from jaxmark.watermark.schemes.scheme import KeyedScheme
 from tests.dense import chebyshev_matrices
 from tests.samples import bumpy_sphere, rough_sphere
 

@@ -14,12 +14,12 @@ import jaxmark as jm
 from jaxmark.alignment.original import make_original
 from jaxmark.distortion import stretch, texture_drift
 from jaxmark.geometry.mesh import Mesh, edges, face_normals, make_mesh
-from jaxmark.watermark.budget import VISIBILITY, make_budget
 from jaxmark.watermark.carriers import KeyedCarrier
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.hiding import hiding_directions
-from jaxmark.watermark.schemes import KeyedScheme, get_scheme, parameters_of
-from jaxmark.watermark.visibility import band_visibility
+from jaxmark.watermark.perception.budget import VISIBILITY, make_budget
+from jaxmark.watermark.perception.masking import hiding_directions
+from jaxmark.watermark.perception.visibility import band_visibility
+from jaxmark.watermark.schemes.scheme import KeyedScheme, get_scheme, parameters_of
 from tests.distortion.test_shading import sheet
 from tests.samples import rough_sphere
 

@@ -11,8 +11,8 @@ from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.watermark.carriers import KeyedCarrier
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.schemes import KeyedScheme, get_scheme, parameters_of
-from jaxmark.watermark.visibility import band_visibility, masking
+from jaxmark.watermark.perception.visibility import band_visibility, masking
+from jaxmark.watermark.schemes.scheme import KeyedScheme, get_scheme, parameters_of
 from tests.samples import rough_sphere
 
 pytestmark = pytest.mark.core

@@ -13,9 +13,9 @@ from jaxmark.geometry.mesh import Mesh, face_normals
 from jaxmark.geometry.simplified import simplify
 from jaxmark.geometry.surfaces import Surface
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
-from jaxmark.watermark.carriers.reception import Reception
-from jaxmark.watermark.coarse import receive_coarse
 from jaxmark.watermark.marking import Marker
+from jaxmark.watermark.reading.coarse import receive_coarse
+from jaxmark.watermark.reading.reception import Reception
 from tests.samples import bumpy_sphere
 
 pytest.importorskip("igl")

@@ -14,8 +14,8 @@ from jaxmark.spectral.bands import diffusion, scaling
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.laplacian import Laplacian, centre
-from jaxmark.watermark.carriers import reception
-from jaxmark.watermark.carriers.reception import Receiver, clean, extend, make_host, make_receiver, receive
+from jaxmark.watermark.reading import reception
+from jaxmark.watermark.reading.reception import Receiver, clean, extend, make_host, make_receiver, receive
 from tests.dense import laplacian_matrix
 from tests.samples import bumpy_sphere
 

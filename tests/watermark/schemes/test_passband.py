@@ -13,10 +13,10 @@ import jaxmark as jm
 from jaxmark.alignment import alignment
 from jaxmark.app import mistakes
 from jaxmark.evaluation.tuning import tune
-from jaxmark.watermark.budget import make_budget
 from jaxmark.watermark.marking import Marker, make_markers
-from jaxmark.watermark.payload import NOISE, Capacity
-from jaxmark.watermark.schemes import LADDER, PASS_BANDS, KeyedScheme
+from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.perception.capacity import NOISE, Capacity
+from jaxmark.watermark.schemes.scheme import LADDER, PASS_BANDS, KeyedScheme
 from tests.samples import rough_sphere
 
 FAINT = {"dame": 0.001}

@@ -10,8 +10,17 @@ from scipy import special, stats
 
 import jaxmark as jm
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.evidence import MIN_LOG10_P
-from jaxmark.watermark.tardos import _THRESHOLDS, MIN_BIAS_LEVEL, Accusation, biases, codewords, log10_p, rank, scores
+from jaxmark.watermark.evidence.bounds import MIN_LOG10_P
+from jaxmark.watermark.tracing.tardos import (
+    _THRESHOLDS,
+    MIN_BIAS_LEVEL,
+    Accusation,
+    biases,
+    codewords,
+    log10_p,
+    rank,
+    scores,
+)
 
 pytestmark = pytest.mark.core
 

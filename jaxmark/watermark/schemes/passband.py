@@ -8,10 +8,10 @@ all bands, the usual pass band stays. Readers without a record try all pass band
 
 import math
 
-from jaxmark.watermark.budget import Budget
-from jaxmark.watermark.evidence import MIN_LOG10_P
-from jaxmark.watermark.payload import COVERAGE, NOISE, Capacity, Conditions
-from jaxmark.watermark.schemes import KeyedScheme, Scheme, stands_for
+from jaxmark.watermark.evidence.bounds import MIN_LOG10_P
+from jaxmark.watermark.perception.budget import Budget
+from jaxmark.watermark.perception.capacity import COVERAGE, NOISE, Capacity, Conditions
+from jaxmark.watermark.schemes.scheme import KeyedScheme, Scheme, stands_for
 
 _PLENTY = -2 * MIN_LOG10_P * math.log(10)  # nats: with twice what can be proven, another pass band has no use
 _LEAST_GAIN = 1.1  # of the evidence, for which it is another one: predictions are as good as that

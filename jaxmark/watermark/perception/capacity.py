@@ -14,11 +14,11 @@ from scipy.special import log_ndtr, ndtri  # scipy.stats takes long to import
 from jaxmark import distortion
 from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
-from jaxmark.watermark.budget import Budget, write
-from jaxmark.watermark.carriers.carrier import Carrier, Reader, Room
 from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key
 from jaxmark.watermark.coding.message import TAG_BITS
-from jaxmark.watermark.schemes import Scheme
+from jaxmark.watermark.interfaces import Carrier, Reader, Room
+from jaxmark.watermark.perception.budget import Budget, write
+from jaxmark.watermark.schemes.scheme import Scheme
 
 _MAX_PAYLOAD_BYTES = 2**20  # if nothing else bounds the payload
 

@@ -15,7 +15,7 @@ from jaxtyping import Float, Float64, Int8
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.evidence import MIN_LOG10_P
+from jaxmark.watermark.evidence.bounds import MIN_LOG10_P
 
 Slots = Float[np.ndarray, " slots"]
 

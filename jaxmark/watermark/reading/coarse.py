@@ -32,10 +32,10 @@ from jaxmark.alignment.original import Original
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.simplified import simplify
 from jaxmark.geometry.surfaces import Surface
-from jaxmark.watermark.budget import first_rms
-from jaxmark.watermark.carriers.carrier import Displacement
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
-from jaxmark.watermark.carriers.reception import Extent, Reception, nuisance_basis
+from jaxmark.watermark.interfaces import Displacement
+from jaxmark.watermark.perception.budget import first_rms
+from jaxmark.watermark.reading.reception import Extent, Reception, nuisance_basis
 
 _OTHERS, _LEAST_OTHERS = 32, 8  # other marks
 _MOST_POINTS = 2**21  # of all originals with other marks together: so much time is spent at most

@@ -1,8 +1,8 @@
 """Tracing copies: each recipient's copy carries a fingerprint, which tells whose copies a suspect was made of.
 
 The carrier is the same as for messages, with keyed choices of its own; its code bits are the slots of a code that
-resists collusion (`jaxmark.watermark.tardos`). Accusations rest on the randomness of the recipients' codewords, never
-on that of the chips: another recipient's copy under the same key is not independent of the chips.
+resists collusion (`jaxmark.watermark.tracing.tardos`). Accusations rest on the randomness of the recipients' codewords,
+never on that of the chips: another recipient's copy under the same key is not independent of the chips.
 """
 
 from collections.abc import Iterable
@@ -12,13 +12,13 @@ from jaxmark.alignment import alignment
 from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark import evidence
-from jaxmark.watermark.budget import Limits, Visibility, make_budget, visibility_of
 from jaxmark.watermark.coding.keys import KEY_BYTES, SCHEME_VERSION, Key
+from jaxmark.watermark.evidence import bounds as evidence
 from jaxmark.watermark.marking import ALIGN_SHARES, EmbedInfo, Marker, bind_mark, recall, versions_of
+from jaxmark.watermark.perception.budget import Limits, Visibility, make_budget, visibility_of
 from jaxmark.watermark.record import Record
-from jaxmark.watermark.schemes import DEFAULT_SCHEME, get_scheme
-from jaxmark.watermark.tardos import Accusation, biases, codewords, rank
+from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, get_scheme
+from jaxmark.watermark.tracing.tardos import Accusation, biases, codewords, rank
 
 # Fingerprints use the pass band for a message of this size: wide enough for 2,048 slots on a mesh of 10,000 vertices.
 _PASSBAND_MESSAGE_BITS = 232
@@ -162,7 +162,7 @@ def identify(
     Returns:
         The recipients with the highest scores, the highest first. log10_p bounds the probability that any of the
         recipients tried who had no part in the suspect scores so high, whatever the others did; it rests on the
-        codewords alone (see `jaxmark.watermark.tardos`).
+        codewords alone (see `jaxmark.watermark.tracing.tardos`).
 
     Raises:
         JaxmarkError: see `make_tracer`; also if the suspect cannot be aligned, or an identifier is empty.

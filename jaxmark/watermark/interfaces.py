@@ -35,7 +35,7 @@ def check_strength(beta: Array, bands: int) -> Array:
 class Claim(NamedTuple):
     """The evidence for a claimed codeword: a score S = Σ s·a over the keyed signs s, and the norm ‖a‖.
 
-    The vector a must be independent of the signs: the bounds in `jaxmark.watermark.evidence` need that.
+    The vector a must be independent of the signs: the bounds in `jaxmark.watermark.evidence.bounds` need that.
     """
 
     score: Float[Array, ""]  # S
@@ -148,8 +148,8 @@ class Reader(Protocol):
     def ways(self, received: Any) -> Sequence[Any]:
         """Return one version of `received` for each way of weighting the suspect.
 
-        Each version gives a claim of its own; `jaxmark.watermark.evidence.any_of` takes the best, and every one is paid
-        for.
+        Each version gives a claim of its own; `jaxmark.watermark.evidence.bounds.any_of` takes the best, and every
+        one is paid for.
         """
         ...
 

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float
 from jaxmark.alignment.observation import Observation
 from jaxmark.spectral.chebyshev import band_energies
 from jaxmark.spectral.precision import matmul
-from jaxmark.watermark.carriers.carrier import Displacement
-from jaxmark.watermark.carriers.reception import Receiver, clean, receive
+from jaxmark.watermark.interfaces import Displacement
 from jaxmark.watermark.probes import probe_signs
+from jaxmark.watermark.reading.reception import Receiver, clean, receive
 
 Margin = Literal["rate", "evidence", "snr"]
 

@@ -19,13 +19,13 @@ from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark.carriers import Carrier, KeyedCarrier, ModulatedCarrier, eigenspaces, host_bands, make_chips
 from jaxmark.watermark.carriers.modulated import Components
-from jaxmark.watermark.carriers.reception import Host, Receiver, make_host, make_receiver
 from jaxmark.watermark.coding.keys import SCHEME_VERSION, Choices
 from jaxmark.watermark.coding.message import TAG_BITS, code_length
 from jaxmark.watermark.coding.sequences import orthogonal_sequences
-from jaxmark.watermark.detectors import Detector, decorrelate, joint
-from jaxmark.watermark.hiding import hiding_directions
-from jaxmark.watermark.visibility import masking
+from jaxmark.watermark.perception.masking import hiding_directions
+from jaxmark.watermark.perception.visibility import masking
+from jaxmark.watermark.reading.detectors import Detector, decorrelate, joint
+from jaxmark.watermark.reading.reception import Host, Receiver, make_host, make_receiver
 
 # Relative strengths of the lowest 20 of 64 bands: the mean over meshes that were tuned to noise, smoothing and
 # quantisation at the default budget. `benchmarks/robustness/tuning.py --limit dame=0.008 --train blub_7106.obj
@@ -53,7 +53,7 @@ PASS_BANDS: Mapping[str, PassBand] = {
     "lowest": PassBand(0.125, 6, 12, 6),
 }
 # Pass bands that marks have by default, the usual one first: the others are for marks so weak that the energy in each
-# dimension is worth more than the number of dimensions, see `jaxmark.watermark.suiting`.
+# dimension is worth more than the number of dimensions, see `jaxmark.watermark.schemes.passband`.
 LADDER = ("tapered", "low", "lowest")
 
 # The most bands or eigenpairs that a record may ask for: no file decides how much memory and time is spent.
@@ -184,8 +184,8 @@ class KeyedScheme(Scheme):
     message and tag. A narrow pass band is flat, and as narrow as the payload allows: it has 1,024 dimensions and 12
     more for each bit of message and tag, but ends at λ = 0.44 unless the payload needs more. Low pass bands are flat
     and end at λ = 0.17 and 0.08 unless the payload needs more than 6 dimensions a bit: for marks so weak that few
-    dimensions with more energy each prove more (see `jaxmark.watermark.suiting`). With a profile, the mark is written
-    in the bands to which the profile gives strengths, whatever the payload.
+    dimensions with more energy each prove more (see `jaxmark.watermark.schemes.passband`). With a profile, the mark is
+    written in the bands to which the profile gives strengths, whatever the payload.
 
     Dimensions are counted as on a regular triangle mesh, √3/2π · λ for each coordinate of each vertex; on point clouds,
     by the number of neighbours. The nuisance that is projected off has at most a twelfth of them, apart from affine
@@ -196,9 +196,9 @@ class KeyedScheme(Scheme):
     bands: int = 64  # number of Jackson-damped scaling functions over the whole spectrum; the lowest pass
     direction: Literal["coordinates", "normals"] = "coordinates"  # along which vertices are displaced
     profile: tuple[float, ...] = ()  # relative strengths of the lowest bands, from `tune`; by default by `passband`
-    masking: bool = False  # whether rough regions move more; see `jaxmark.watermark.visibility.masking`
+    masking: bool = False  # whether rough regions move more; see `jaxmark.watermark.perception.visibility.masking`
     passband: Literal["tapered", "narrow", "low", "lowest"] = "tapered"  # how bands and nuisance are chosen
-    hiding: bool = True  # whether points move where and as it is hidden; see `jaxmark.watermark.hiding`
+    hiding: bool = True  # whether points move where and as it is hidden; see `jaxmark.watermark.perception.masking`
 
     def __post_init__(self) -> None:
         """Check the fields.

@@ -16,10 +16,10 @@ from jaxtyping import Array, Float
 from jaxmark.errors import JaxmarkError
 from jaxmark.spectral.chebyshev import filter, transpose
 from jaxmark.spectral.precision import matmul
-from jaxmark.watermark.carriers.carrier import Reader, Received, Strength
 from jaxmark.watermark.carriers.keyed import KeyedReader
-from jaxmark.watermark.carriers.reception import Reception, clean, whitening
+from jaxmark.watermark.interfaces import Reader, Received, Strength
 from jaxmark.watermark.probes import probe_signs
+from jaxmark.watermark.reading.reception import Reception, clean, whitening
 
 #: A function of a reader, what it received from a suspect, and the strengths' profile as embedded; returns one soft
 #: value per bit.
@@ -68,7 +68,7 @@ def claims(
 def joint(reader: Reader, received: Any, beta: Strength = 1.0) -> Float[Array, " bits"]:
     """Estimate all bits jointly with least mean square error, by conjugate gradients; no matrix bits x bits is formed.
 
-    The nuisance is projected off and each band is weighted by its power (`jaxmark.watermark.carriers.reception`). The
+    The nuisance is projected off and each band is weighted by its power (`jaxmark.watermark.reading.reception`). The
     mark is then modelled as the carrier's displacement with each band at the gain that the host has in it. The balance
     between noise and the interference of the bits is estimated from the energy before and after matched filtering.
 

@@ -1,0 +1,1 @@
+"""Copies for recipients: fingerprints that resist collusion, and whom a suspect accuses."""
