@@ -4,6 +4,7 @@ A whole number and the JAX key that it makes stand for the same random choices, 
 """
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray
 
@@ -15,8 +16,9 @@ def random_key(seed: Randomness) -> PRNGKeyArray:
     """Make a JAX random key from a seed; a key is returned as it is, and a NumPy generator draws one."""
     if isinstance(seed, np.random.Generator):
         return jax.random.key(int(seed.integers(2**31)))
-    is_key = jax.dtypes.issubdtype(getattr(seed, "dtype", None), jax.dtypes.prng_key) or np.ndim(seed)  # (raw keys)
-    return seed if is_key else jax.random.key(seed)  # pyright: ignore[reportReturnType, reportArgumentType]
+    if isinstance(seed, int | np.integer) or (jnp.issubdtype(seed.dtype, jnp.integer) and not seed.ndim):
+        return jax.random.key(seed)
+    return seed
 
 
 def generator(seed: Randomness) -> np.random.Generator:

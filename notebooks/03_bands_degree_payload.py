@@ -139,7 +139,7 @@ plot.responses({f"degree {degree}": families(degree)["damped (Jackson)"] for deg
 # what attacks leave.
 
 # %%
-plot.band_visibility(original, ["rms", "gl", "dame"]).save("03_4.png")
+pictures.band_visibility(original, ["rms", "gl", "dame"]).save("03_4.png")
 
 # %% [markdown]
 # ## Payload

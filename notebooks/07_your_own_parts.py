@@ -115,7 +115,7 @@ for name, value in jm.distortion.measure(mesh, marked, ["rms", "dame", stretch])
 gentle, _ = marker.embed(b"ok", limits={stretch: 0.01}, noise=0)
 print(f"stretch {stretch(mesh, gentle):.4f}, RMS {jm.compare(mesh, gentle, ['rms']).rms:.3%} of the diagonal")
 assert 0.0098 < stretch(mesh, gentle) <= 0.01
-plot.band_visibility(original, ["rms", "dame", stretch]).save("07_2.png")
+pictures.band_visibility(original, ["rms", "dame", stretch]).save("07_2.png")
 
 # %% [markdown]
 # ## A carrier, and the scheme that makes it

@@ -17,6 +17,7 @@ from jaxmark.app import cli
 from jaxmark.attacks import ATTACKS
 from jaxmark.geometry.clouds import Cloud, planes, spacings
 from jaxmark.geometry.mesh import Mesh, diagonal, make_mesh, used_vertices
+from jaxmark.plot.meshes import roughness_masking
 from jaxmark.watermark.perception.budget import CLOUD_VISIBILITY, VISIBILITY, make_budget
 from jaxmark.watermark.schemes.scheme import KeyedScheme
 from tests.samples import rough_sphere
@@ -451,7 +452,7 @@ def test_what_needs_a_surface_is_refused(host: Mesh, key: jm.Key):
     with pytest.raises(jm.JaxmarkError, match="Shading needs faces"):
         jm.distortion.shading_at_vertices(host, host)
     with pytest.raises(jm.JaxmarkError, match="roughness needs faces"):
-        jm.embed(host, b"c", key, scheme=KeyedScheme(masking=True))
+        roughness_masking(make_original(host))
     with pytest.raises(jm.JaxmarkError, match="along normals needs faces"):
         jm.embed(host, b"c", key, scheme=KeyedScheme(direction="normals"))
 

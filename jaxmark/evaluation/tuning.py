@@ -28,7 +28,8 @@ from jaxmark.watermark.everyday import blind_scheme
 from jaxmark.watermark.interfaces import Displacement
 from jaxmark.watermark.perception.budget import Budget, Limits, make_budget, write
 from jaxmark.watermark.perception.capacity import Capacity
-from jaxmark.watermark.perception.visibility import apply_mask, band_visibility
+from jaxmark.watermark.perception.masking import apply_mask
+from jaxmark.watermark.perception.visibility import band_visibility
 from jaxmark.watermark.probes import probe_signs
 from jaxmark.watermark.schemes.passband import suited
 from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, Scheme, TunableScheme, get_scheme

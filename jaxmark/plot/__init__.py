@@ -4,7 +4,6 @@
 `show` returns an interactive view of a mesh.
 """
 
-from jaxmark.plot._spectra import band_visibility as band_visibility
 from jaxmark.plot._spectra import responses as responses
 from jaxmark.plot._spectra import spectra as spectra
 from jaxmark.plot._spectra import strengths as strengths
@@ -21,4 +20,3 @@ from jaxmark.plot.meshes import visibility as visibility
 from jaxmark.plot.reflections import Rendering as Rendering
 from jaxmark.plot.reflections import draw_renderings as draw_renderings
 from jaxmark.plot.reflections import render as render
-from jaxmark.plot.reflections import save_renderings as save_renderings

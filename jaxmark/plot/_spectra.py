@@ -1,4 +1,4 @@
-"""Plots over frequency: responses of bands, energy of host, mark and attacks in each band, and visibility."""
+"""Plots over frequency: responses of bands, their strengths, and energy of host, mark and attacks in each band."""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,14 +8,12 @@ from jaxtyping import Float, Float64
 from numpy.polynomial import chebyshev
 
 from jaxmark.alignment.original import Original, shift_of
-from jaxmark.distortion import Metric, name_of
-from jaxmark.evaluation.channels import band_energies
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.plot.figures import FIELD, Picture, finish, panels, styles
 from jaxmark.spectral.bands import nodes, scaling
-from jaxmark.watermark.perception import visibility
+from jaxmark.spectral.chebyshev import band_energies
 
-_FREQUENCY_LABEL = "frequency λ, from 0, smooth, to 2"
+FREQUENCY = "frequency λ, from 0, smooth, to 2"
 
 
 def responses(families: Mapping[str, Float[np.ndarray, "bands terms"]], mark: Sequence[float] = ()) -> Picture:
@@ -38,7 +36,7 @@ def responses(families: Mapping[str, Float[np.ndarray, "bands terms"]], mark: Se
             panel.plot(grid, response, color=colormaps[FIELD](place / max(1, len(family) - 1)), linewidth=1)
         for place in mark:
             panel.axvline(place, color="grey", linewidth=0.5)
-        finish(panel, title=name, xlabel=_FREQUENCY_LABEL, ylabel="response f(λ)")
+        finish(panel, title=name, xlabel=FREQUENCY, ylabel="response f(λ)")
     return Picture(figure)
 
 
@@ -54,7 +52,7 @@ def strengths(betas: Mapping[str, Float[np.ndarray, " bands"]]) -> Picture:
     figure, (axes,) = panels(1, 6.5, 4.2)
     for (name, beta), style in zip(betas.items(), styles(64), strict=False):
         axes.plot(nodes(len(beta)), beta, label=name, **style)
-    finish(axes, xlabel=_FREQUENCY_LABEL, ylabel="strength β of a band / diagonal", ylim=(0, None))
+    finish(axes, xlabel=FREQUENCY, ylabel="strength β of a band / diagonal", ylim=(0, None))
     return Picture(figure)
 
 
@@ -78,7 +76,7 @@ def spectra(original: Original, moves: Mapping[str, tuple[Mesh, Mesh]], bands: i
     figure, (axes,) = panels(1, 6.5, 4.2)
     for (name, signal), style in zip(signals.items(), styles(bands), strict=False):
         axes.plot(nodes(bands), mean_squares(original, signal, bands), label=name, **style)
-    finish(axes, xlabel=_FREQUENCY_LABEL, ylabel="mean square in the band / diagonal²", yscale="log")
+    finish(axes, xlabel=FREQUENCY, ylabel="mean square in the band / diagonal²", yscale="log")
     return Picture(figure)
 
 
@@ -93,24 +91,3 @@ def mean_squares(
     energies = np.asarray(band_energies(original.operator, family, x, x), np.float64)
     floor = 10 * float(np.finfo(original.signal.dtype).eps) * energies.sum() / bands
     return np.where(energies > floor, energies, np.nan) / original.used.sum()
-
-
-def band_visibility(original: Original, metrics: Sequence[Metric], bands: int = 64) -> Picture:
-    """Plot how far metrics rise per unit of displacement in each band.
-
-    The values are those of `jaxmark.watermark.perception.visibility.band_visibility`.
-
-    Args:
-        original: the original.
-        metrics: names in `distortion.METRICS`, or functions of your own.
-        bands: number of Jackson-damped scaling functions.
-
-    Raises:
-        JaxmarkError: if matplotlib is missing, or a metric is refused (see `distortion.measure`).
-    """
-    found = visibility.band_visibility(original, scaling(bands, damping="jackson"), metrics)
-    figure, (axes,) = panels(1, 6.5, 4.2)
-    for name, row, style in zip(metrics, found, styles(bands), strict=False):
-        axes.plot(nodes(bands), row, label=name_of(name), **style)
-    finish(axes, xlabel=_FREQUENCY_LABEL, ylabel="metric / (RMS displacement / diagonal)", yscale="log")
-    return Picture(figure)

@@ -1,6 +1,5 @@
 """Pictures of meshes pixel by pixel: flat and smooth shading, and the reflection of stripes, which shows every dent."""
 
-import os
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
@@ -69,15 +68,6 @@ def draw_renderings(renderings: Sequence[Rendering], size: int = 600) -> Picture
         panel.set_title(rendering.title, fontsize=10)
         panel.set_axis_off()
     return Picture(figure)
-
-
-def save_renderings(renderings: Sequence[Rendering], path: str | os.PathLike[str], size: int = 600) -> None:
-    """Write the picture of `draw_renderings` to a PNG file, whole or not at all.
-
-    Raises:
-        JaxmarkError: see `draw_renderings`; also if the file cannot be written.
-    """
-    draw_renderings(renderings, size).save(path)
 
 
 def _camera(side: str | tuple[float, float]) -> Float64[np.ndarray, "3 3"]:

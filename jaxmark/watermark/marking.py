@@ -288,7 +288,8 @@ class Marker:
         decoding may choose the codeword, but does not enter the score. It is taken for each way of weighting the
         suspect (see `detectors.claims`), and each is paid for, too; so are ways of aligning other than `"auto"`, and,
         where no message is read otherwise, reading surfaces of few vertices by these
-        (`jaxmark.watermark.reading.coarse`), and what was bent by a map of its own around each point (`jaxmark.alignment.nonrigid`).
+        (`jaxmark.watermark.reading.coarse`), and what was bent by a map of its own around each point
+        (`jaxmark.alignment.nonrigid`).
         Weights depend on suspect and original only.
 
         A suspect that is read with several keys needs to be aligned only once: pass the result of

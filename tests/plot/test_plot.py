@@ -15,10 +15,10 @@ from jaxmark import plot
 from jaxmark.alignment.original import Original, displace, make_original
 from jaxmark.evaluation import Robustness, pictures
 from jaxmark.geometry.mesh import Mesh, make_mesh
+from jaxmark.plot.meshes import roughness_masking
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark.evidence.bounds import MIN_LOG10_P, log10_p_claimed
-from jaxmark.watermark.perception.visibility import masking
 from tests.samples import bumpy_sphere
 
 matplotlib = pytest.importorskip("matplotlib")
@@ -53,7 +53,7 @@ def test_heat_maps_of_displacement_and_visibility(pair):
     np.testing.assert_allclose(view.values, expected, rtol=1e-9)
     assert view.unit == "% of diagonal"
     seen = plot.visibility(original, moved)
-    hidden = np.asarray(masking(original), float)[original.weld.point]
+    hidden = np.asarray(roughness_masking(original), float)[original.weld.point]
     np.testing.assert_allclose(seen.values * hidden, expected, rtol=1e-6)
     far = plot.exaggerate(original, moved, 3)
     np.testing.assert_allclose(far.mesh.vertices - vertices, 3 * (moved.vertices - vertices), rtol=1e-9)
@@ -97,7 +97,7 @@ def test_stripes_move_by_twice_the_turn_of_a_mirror(tmp_path):
     assert found[3.75] < 0.3 < 0.9 < found[0.0] == pytest.approx(found[7.5], abs=0.05)
     front, tilted = (plot.render(plot.Rendering("", plane, "flat", side), 24) for side in ("front", (0.0, 0.0)))
     np.testing.assert_allclose(front, tilted)
-    plot.save_renderings([plot.Rendering("a plane", plane, "zebra")], tmp_path / "zebra.png", 32)
+    plot.draw_renderings([plot.Rendering("a plane", plane, "zebra")], 32).save(tmp_path / "zebra.png")
     assert (tmp_path / "zebra.png").read_bytes().startswith(PNG)
     with pytest.raises(jm.JaxmarkError, match="no side 'inside'"):
         plot.render(plot.Rendering("", plane, side="inside"))
@@ -159,7 +159,7 @@ def test_responses_are_the_chebyshev_series():
 
 
 def test_band_visibility_of_the_displacement_itself_is_one(pair):
-    picture = plot.band_visibility(pair[0], ["rms", "gl"], 8)
+    picture = pictures.band_visibility(pair[0], ["rms", "gl"], 8)
     drawn = lines(picture)
     np.testing.assert_allclose(drawn["rms"][1], 1, rtol=1e-3)
     assert (np.diff(drawn["gl"][1])[:5] > 0).all()  # it grows with frequency, where the sphere has any

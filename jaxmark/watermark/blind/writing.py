@@ -30,8 +30,7 @@ from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.marking import DEFAULT_BITS, Survival
 from jaxmark.watermark.perception.budget import Budget, write
 from jaxmark.watermark.perception.capacity import NOISE
-from jaxmark.watermark.perception.masking import hiding_directions
-from jaxmark.watermark.perception.visibility import apply_mask
+from jaxmark.watermark.perception.masking import apply_mask, hiding_directions
 
 _RIDGE = 3e-3  # of the mean square of a row: values that contradict each other are met halfway
 _HELD_RIDGE = 1e-4  # of the rows of what is held, which are scaled to the others' size

@@ -20,7 +20,7 @@ from jaxmark.spectral.laplacian import per_row
 from jaxmark.spectral.precision import matmul, sum_and_norm
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.interfaces import Claim, Displacement, Room, Strength, check_strength
-from jaxmark.watermark.perception.visibility import apply_mask
+from jaxmark.watermark.perception.masking import apply_mask
 from jaxmark.watermark.probes import probe_signs
 from jaxmark.watermark.reading.reception import (
     Host,

@@ -1,1 +1,1 @@
-"""What a reading proves: `bounds` has formulas, `ledger` what each choice after the suspect costs, `detection` the result."""
+"""What a reading proves: `bounds` has formulas, `ledger` what each choice costs, `detection` the result."""

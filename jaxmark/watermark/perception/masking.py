@@ -11,7 +11,7 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float64, Int
+from jaxtyping import Array, Bool, Float, Float64, Int
 from scipy import sparse
 
 from jaxmark.alignment.original import Original
@@ -20,6 +20,7 @@ from jaxmark.geometry.clouds import spacings
 from jaxmark.geometry.mesh import Mesh, area, edges, face_normals, open_sides, unit
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import filter
+from jaxmark.spectral.precision import matmul
 from jaxmark.spectral.shapes import pad_rows
 
 Found = TypeVar("Found")
@@ -187,3 +188,15 @@ def _sums(
         sums += incidence @ forms[start : start + _ROWS_AT_ONCE]
         total += np.bincount(some.ravel(), heavy.ravel(), size)
     return sums[:, _PLACES], total
+
+
+def apply_mask(
+    mask: Float[Array | np.ndarray, " rows *axes"] | None, x: Float[Array, "rows 3"]
+) -> Float[Array, "rows 3"]:
+    """Mask displacements by a factor or a symmetric matrix `[3, 3]` for each vertex; this is its own adjoint."""
+    if mask is None:
+        return x
+    factor = jnp.asarray(mask)
+    if factor.ndim == 1:
+        return factor[:, None] * x
+    return matmul(factor, x[:, :, None])[:, :, 0]

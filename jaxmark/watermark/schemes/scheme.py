@@ -23,7 +23,6 @@ from jaxmark.watermark.coding.keys import SCHEME_VERSION, Choices
 from jaxmark.watermark.coding.message import TAG_BITS, code_length
 from jaxmark.watermark.coding.sequences import orthogonal_sequences
 from jaxmark.watermark.perception.masking import hiding_directions
-from jaxmark.watermark.perception.visibility import masking
 from jaxmark.watermark.reading.detectors import Detector, decorrelate, joint
 from jaxmark.watermark.reading.reception import Host, Receiver, make_host, make_receiver
 
@@ -61,6 +60,8 @@ _MAX_COMPONENTS = 512
 
 # Values of the fields that are missing from a record because it was written before they existed; by scheme.
 _FIELDS_OF_OLD_RECORDS: Mapping[str, Mapping[str, Any]] = {"keyed": {"passband": "narrow", "hiding": False}}
+# Fields that schemes had, and the one value of each that is still read; keyed choices stay bound to them.
+_RETIRED_FIELDS: Mapping[str, Mapping[str, Any]] = {"keyed": {"masking": False}}
 
 # Values of fields that marks of version 1 had by default; by scheme.
 _FIELDS_OF_VERSION_1: Mapping[str, Mapping[str, Any]] = {"keyed": {"hiding": False}}
@@ -68,8 +69,9 @@ _FIELDS_OF_VERSION_1: Mapping[str, Mapping[str, Any]] = {"keyed": {"hiding": Fal
 
 @runtime_checkable
 class Fields(Protocol):
-    """Any dataclass."""
+    """Any dataclass with a name, such as a scheme of either kind."""
 
+    name: ClassVar[str]
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
 
@@ -196,7 +198,6 @@ class KeyedScheme(Scheme):
     bands: int = 64  # number of Jackson-damped scaling functions over the whole spectrum; the lowest pass
     direction: Literal["coordinates", "normals"] = "coordinates"  # along which vertices are displaced
     profile: tuple[float, ...] = ()  # relative strengths of the lowest bands, from `tune`; by default by `passband`
-    masking: bool = False  # whether rough regions move more; see `jaxmark.watermark.perception.visibility.masking`
     passband: Literal["tapered", "narrow", "low", "lowest"] = "tapered"  # how bands and nuisance are chosen
     hiding: bool = True  # whether points move where and as it is hidden; see `jaxmark.watermark.perception.masking`
 
@@ -283,9 +284,8 @@ class KeyedScheme(Scheme):
     def mask(self, original: Original) -> Float[Array, " rows *axes"] | None:
         """See `TunableScheme`."""
         if not self.hiding or self.direction != "coordinates":
-            return masking(original) if self.masking else None
-        directions = original.to_traced(hiding_directions(original))
-        return masking(original)[:, None, None] * directions if self.masking else directions
+            return None
+        return original.to_traced(hiding_directions(original))
 
     def receiver(self, original: Original, bits: int) -> Receiver:
         """See `TunableScheme`."""
@@ -432,6 +432,9 @@ def get_scheme(
     given: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value for name, value in (parameters or {}).items()
     }
+    for name, value in _RETIRED_FIELDS.get(scheme, {}).items():
+        if given.pop(name, value) != value:
+            raise JaxmarkError(f"Marks of the scheme {scheme!r} with {name} other than {value} are no longer read.")
     if any(
         name not in known
         or type(value) is not known[name]
@@ -457,7 +460,7 @@ def stands_for(scheme: Scheme) -> tuple[Scheme, ...]:
 
 def parameters_of(scheme: Fields) -> dict[str, Any]:
     """The fields of a scheme, as a record stores them."""
-    return asdict(scheme)
+    return {**_RETIRED_FIELDS.get(scheme.name, {}), **asdict(scheme)}
 
 
 def _make_modulated(
