@@ -24,7 +24,8 @@ from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.evidence import bounds as evidence
 from jaxmark.watermark.reading.detectors import decorrelate
 from jaxmark.watermark.reading.reception import Reception, make_host, make_receiver
-from jaxmark.watermark.schemes.scheme import EigenScheme, HostScheme, KeyedScheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
+from jaxmark.watermark.schemes.modulated import EigenScheme, HostScheme
 from tests.samples import bumpy_sphere
 
 pytestmark = pytest.mark.core

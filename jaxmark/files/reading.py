@@ -1,6 +1,7 @@
 """Read whole files that end."""
 
 import errno
+import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -28,6 +29,21 @@ def read_file(path: str | os.PathLike, most: int | None = None) -> bytes:
     if most is not None and found.st_size > most:
         raise OSError(errno.EFBIG, f"it has {found.st_size} bytes, more than {most}", os.fspath(path))
     return target.read_bytes()
+
+
+def file_hash(path: str | os.PathLike[str]) -> str:
+    """Compute the SHA-256 of a file's bytes, hexadecimal.
+
+    Raises:
+        JaxmarkError: if it cannot be read.
+    """
+    if Path(path).exists() and not Path(path).is_file():  # a pipe may never end
+        raise JaxmarkError(f"Cannot read {path}: it is no ordinary file.")
+    try:
+        with Path(path).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise JaxmarkError(f"Cannot read {path}: {error.strerror or error}.") from None
 
 
 def read_beside(folder: Path) -> Callable[[str], bytes]:

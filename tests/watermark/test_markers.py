@@ -13,8 +13,10 @@ from jaxmark.alignment.original import make_original
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.watermark.carriers import KeyedReader
 from jaxmark.watermark.evidence import bounds as evidence
-from jaxmark.watermark.marking import Marker
-from jaxmark.watermark.schemes.scheme import EigenScheme, HostScheme, KeyedScheme, get_scheme
+from jaxmark.watermark.markers import NonBlindMarker
+from jaxmark.watermark.schemes.keyed import KeyedScheme
+from jaxmark.watermark.schemes.modulated import EigenScheme, HostScheme
+from jaxmark.watermark.schemes.registry import get_nonblind
 from tests.samples import bumpy_sphere, exact_sheet
 
 MESSAGE = bytes.fromhex("0123456789abcdef")
@@ -53,12 +55,12 @@ def test_round_trip_within_the_budget(sphere: Mesh, key: jm.Key, scheme, dtype):
     assert found.detected()
     assert found.coverage == 1.0
     marker = jm.make_marker(sphere, key, bits=64, scheme=scheme)
-    soft, code = marker.soft_values(marker.receive(marked)), marker.codeword(MESSAGE)
+    soft, code = marker.soft_decisions(marker.receive(marked)), marker.codeword(MESSAGE)
     assert np.mean(soft * code) > 0.85 * np.sqrt(np.mean(soft**2))
     assert np.mean(found.scores * code) > 0.7  # of what mere correlations read, where they do
     claimed = jm.detect(marked, original=sphere, key=key, scheme=scheme, message=MESSAGE)
     assert claimed.log10_p < -6
-    assert jm.detect(marked, original=sphere, key=key, scheme=scheme, message=b"somebody").remarks
+    assert jm.detect(marked, original=sphere, key=key, scheme=scheme, message=b"somebody").notes
     assert jm.detect(marked, original=sphere, key=jm.new_key(), scheme=scheme, message=MESSAGE).log10_p > -6
 
 
@@ -97,7 +99,7 @@ def test_what_correlations_read_is_not_decoded_jointly_and_is_paid_for(sphere: M
     flat = evidence.log10_p_tag(28, 1)
     monkeypatch.setattr(evidence, "log10_p_read", lambda *_: 0.0)  # what the tag alone proves is left
     with monkeypatch.context() as without:
-        without.setattr(Marker, "soft_values", None)
+        without.setattr(NonBlindMarker, "soft_values", None)
         quick = marker.detect(marked)
     monkeypatch.setattr(KeyedReader, "correlate", lambda *_: np.zeros(marker.code_bits))
     slow = marker.detect(marked)
@@ -148,7 +150,7 @@ def test_golden_displacement(key: jm.Key):
         ),
     ]:
         marker = jm.make_marker(mesh, key, bits=8 * len(message), scheme=scheme, version=1)
-        marked, _ = marker.embed(message, 8e-4, noise=0.0)
+        marked, _ = marker.embed(message, jm.Budget(rms=8e-4, noise=0.0))
         shift = 1e3 * (marked.vertices - mesh.vertices)[[0, 50, 100, 150]]
         np.testing.assert_allclose(shift, golden, atol=0.02)
 
@@ -241,7 +243,7 @@ def test_a_claim_is_refuted_by_another_message(sphere: Mesh, key: jm.Key):
     # That the key's mark is there stays proven, by the message that reads.
     read = jm.detect(marked, original=sphere, key=key)
     assert read.log10_p < found.log10_p < -6
-    assert "Another message of this key reads than the one claimed" in found.remarks[0]
+    assert "Another message of this key reads than the one claimed" in found.notes[0]
 
 
 def test_the_mean_of_two_copies_shows_both(sphere: Mesh, key: jm.Key):
@@ -252,10 +254,10 @@ def test_the_mean_of_two_copies_shows_both(sphere: Mesh, key: jm.Key):
     found = marker.detect(mean, b"cd")
     assert found.message == b"ab"
     assert found.detected()
-    both = float(found.remarks[0].partition("log10 p about ")[2].split()[0])
+    both = float(found.notes[0].partition("log10 p about ")[2].split()[0])
     assert both < -3
     absent = marker.detect(copies[0], b"cd")
-    assert float(absent.remarks[0].partition("log10 p about ")[2].split()[0]) > -3
+    assert float(absent.notes[0].partition("log10 p about ")[2].split()[0]) > -3
 
 
 def test_a_vertex_thrown_away_is_masked(sphere: Mesh, key: jm.Key):
@@ -343,20 +345,20 @@ def test_refusals(sphere: Mesh, key: jm.Key):
             jm.detect(suspect, original=sphere, key=key, align=align)
     with pytest.raises(jm.JaxmarkError, match="multiple of 8"):
         jm.detect(sphere, original=sphere, key=key, bits=7)
-    jm.embed(bumpy_sphere(2), b"", key, noise=0.005)  # the presence mark that is advised
+    jm.embed(bumpy_sphere(2), b"", key, budget=jm.Budget(noise=0.005))  # the presence mark that is advised
 
 
 def test_schemes_are_data():
     for scheme in (KeyedScheme(direction="normals"), HostScheme(), EigenScheme(pairs=10)):
-        again = get_scheme(scheme.name, dataclasses.asdict(scheme))
+        again = get_nonblind(scheme.name, dataclasses.asdict(scheme))
         assert again == scheme
     # Records from before pass bands were tapered do not say so.
-    assert get_scheme("keyed", {"bands": 64}) == KeyedScheme(passband="narrow", hiding=False)
-    assert get_scheme("keyed") == KeyedScheme(passband="tapered", hiding=True)
-    assert get_scheme("keyed", version=1) == KeyedScheme(passband="tapered", hiding=False)
+    assert get_nonblind("keyed", {"bands": 64}) == KeyedScheme(passband="narrow", hiding=False)
+    assert get_nonblind("keyed") == KeyedScheme(passband="tapered", hiding=True)
+    assert get_nonblind("keyed", version=1) == KeyedScheme(passband="tapered", hiding=False)
     for parameters in ({"bands": "many"}, {"colour": 1}):
         with pytest.raises(jm.JaxmarkError, match="takes the parameters bands"):
-            get_scheme("host", parameters)
+            get_nonblind("host", parameters)
 
 
 def test_narrow_bands_stay_where_old_marks_have_them(sphere: Mesh):
@@ -411,5 +413,5 @@ def test_a_remeshed_suspect_of_a_shape_that_is_its_own_mirror_image(key: jm.Key)
     mirrored = make_mesh(np.asarray(suspect.vertices) * [-1, 1, 1], np.asarray(suspect.faces)[:, ::-1])
     plain, other = marker.detect(suspect), marker.detect(mirrored)
     assert plain.message == other.message == b"ok"
-    assert plain.alignment.pose.mirrors != other.alignment.pose.mirrors
+    assert plain.alignment.pose.mirrors != other.registration.pose.mirrors
     assert other.log10_p == pytest.approx(plain.log10_p, rel=0.1)

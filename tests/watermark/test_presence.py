@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from jaxmark.app.telling import told_message
 
 import jaxmark as jm
-from jaxmark.app.telling import told_message
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.perception.capacity import NOISE
 from tests.app.test_cli import MESSAGE, Workshop
@@ -38,14 +38,14 @@ def test_what_a_mark_survives_is_as_said(key: jm.Key):
     assert sum(marker.detect(noisy(marked, found.whole, seed)).message == b"ok" for seed in range(4)) == 4
     assert sum(marker.detect(noisy(marked, 8 * found.whole, seed)).message == b"ok" for seed in range(4)) == 0
     # What is asked for can be had, and no more.
-    marker.embed(b"ok", noise=0.99 * info.survives.half)
+    marker.embed(b"ok", jm.Budget(noise=0.99 * info.survives.half))
     with pytest.raises(jm.JaxmarkError, match=r"budget of at least .*dame would be"):
-        marker.embed(b"ok", noise=1.2 * info.survives.half)
+        marker.embed(b"ok", jm.Budget(noise=1.2 * info.survives.half))
 
 
 def test_a_model_that_meets_no_demand_is_marked(small: Mesh, key: jm.Key):
     with pytest.raises(jm.JaxmarkError, match="at most"):
-        jm.embed(small, b"k", key, noise=NOISE)
+        jm.embed(small, b"k", key, budget=jm.Budget(noise=NOISE))
     marked, info = jm.embed(small, b"k", key)
     assert jm.detect(marked, original=small, key=key, record=info.record).detected()
 
@@ -64,7 +64,7 @@ def test_a_presence_mark_is_proven_where_messages_do_not_fit(small: Mesh, key: j
         found.log10_p, abs=0.4
     )  # without a record, two versions and three pass bands are paid for
     # It pays for no messages, whether dated or not.
-    assert found.log10_p_undated == pytest.approx(min(0.0, found.log10_p + 64 * np.log10(2)), abs=0.05)
+    assert found.evidence.log10_p_uncommitted == pytest.approx(min(0.0, found.log10_p + 64 * np.log10(2)), abs=0.05)
     for other in (
         jm.detect(small, original=small, key=key, bits=0),
         jm.detect(suspect, original=small, key=jm.new_key(), bits=0),

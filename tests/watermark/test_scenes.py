@@ -11,7 +11,9 @@ import jaxmark as jm
 from jaxmark.files import load_scene
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark import scenes
-from jaxmark.watermark.scenes import SceneDetection, SceneRecord, detect_scene, embed_scene, load_record
+from jaxmark.watermark.everyday import detect_scene, embed_scene
+from jaxmark.watermark.evidence.detection import Detection
+from jaxmark.watermark.record import SceneRecord, load_record
 from tests.app.test_cli import Workshop
 from tests.samples import bumpy_sphere
 
@@ -47,7 +49,7 @@ def test_what_cannot_carry_is_named(marked):
         assert one.rms == pytest.approx(BUDGET, rel=1e-3)
 
 
-def read(marked, originals, key: jm.Key, noise: float, **options) -> SceneDetection:
+def read(marked, originals, key: jm.Key, noise: float, **options) -> Detection:
     meshes, info = marked
     record = SceneRecord({name: info.record.meshes[name] for name in NAMES})
     # In another order, under other names, turned and scaled.
@@ -179,7 +181,7 @@ def test_commands_on_a_file_of_several_meshes(tmp_path, monkeypatch, capfd, orig
     assert "faces" in workshop.refused("attack", "b.glb", "f.glb", "midpoint", "1")
     deposit = workshop.json("deposit", "b.glb.jaxmark.json", "--output", "d.json")
     assert deposit["records"] == 1
-    assert workshop.json("detect", "b.glb", *read, "--deposit", "d.json")["log10_p_deposited"] < -6
+    assert workshop.json("detect", "b.glb", *read, "--deposit", "d.json")["log10_p_timestamped"] < -6
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -16,7 +16,7 @@ from jaxmark.watermark import EmbedInfo, LocalScheme
 from jaxmark.watermark.blind import local, reading
 from jaxmark.watermark.blind.reading import context
 from jaxmark.watermark.blind.scheme import measure
-from jaxmark.watermark.combined import unite
+from jaxmark.watermark.markers import unite
 from tests.app.test_cli import MESSAGE as CLI_MESSAGE
 from tests.app.test_cli import Workshop
 from tests.dense import laplacian_matrix
@@ -193,6 +193,6 @@ def test_commands_for_several_marks(shape: Mesh, tmp_path: Path, monkeypatch, ca
     assert (blind["message"], blind["scheme"]) == (CLI_MESSAGE, "local")
     both = workshop.json("detect", "marked.ply", *key, "--original", "model.ply", "--scheme", "keyed,local")
     assert both["message"] == CLI_MESSAGE
-    assert any("'local' alone" in remark for remark in both["remarks"])
+    assert any("'local' alone" in remark for remark in both["notes"])
     assert "not one of" in workshop.refused("embed", "model.ply", "x.ply", *key, "--scheme", "keyed,nothing")
     assert "an informed one" in workshop.refused("embed", "model.ply", "x.ply", *key, "--scheme", "field,keyed")

@@ -20,7 +20,7 @@ from jaxmark.watermark.evidence.bounds import (
     share_of,
     undated,
 )
-from jaxmark.watermark.marking import make_marker
+from jaxmark.watermark.markers import make_marker
 from tests import ROOT
 from tests.samples import bumpy_sphere
 
@@ -102,7 +102,7 @@ def test_wrong_keys_and_other_suspects_read_nothing():
         for seed in range(3):
             found = make_marker(mesh, jm.Key(bytes([seed] * 32))).detect(suspect)
             assert found.message is None
-            assert found.log10_p == found.log10_p_fitted == 0.0
+            assert found.log10_p == found.evidence.log10_p_gaussian == 0.0
             assert not found.detected()
 
 
@@ -114,7 +114,7 @@ def test_both_proofs_of_a_message_read():
     found, claimed = marker.detect(marked), marker.detect(marked, b"original")
     assert found.log10_p < log10_p_tag(28, 32)
     assert claimed.log10_p < found.log10_p
-    assert claimed.log10_p_fitted < claimed.log10_p
+    assert claimed.evidence.log10_p_gaussian < claimed.log10_p
     assert found.detected(1e-20)
 
 

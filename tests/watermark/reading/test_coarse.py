@@ -13,7 +13,7 @@ from jaxmark.geometry.mesh import Mesh, face_normals
 from jaxmark.geometry.simplified import simplify
 from jaxmark.geometry.surfaces import Surface
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
-from jaxmark.watermark.marking import Marker
+from jaxmark.watermark.markers import NonBlindMarker
 from jaxmark.watermark.reading.coarse import receive_coarse
 from jaxmark.watermark.reading.reception import Reception
 from tests.samples import bumpy_sphere
@@ -25,13 +25,13 @@ SHAPE, MESSAGE = bumpy_sphere(4), b"ab"
 
 
 @cache
-def marker_of(number: int) -> Marker:
+def marker_of(number: int) -> NonBlindMarker:
     return jm.make_marker(SHAPE, jm.Key(bytes([number] * 32)), bits=16)
 
 
 @cache
 def suspect() -> Mesh:
-    marked = marker_of(3).embed(MESSAGE, 1e-3, noise=0)[0]
+    marked = marker_of(3).embed(MESSAGE, jm.Budget(rms=1e-3, noise=0))[0]
     return jm.attack(marked, "simplification", 0.9, seed=0)
 
 
@@ -52,7 +52,7 @@ def coarse(number: int) -> Reception:
     return found
 
 
-def ratio(marker: Marker, received: Reception) -> float:
+def ratio(marker: NonBlindMarker, received: Reception) -> float:
     """S/‖a‖ of the claim."""
     score, norm = marker.reader.claim(received, jnp.asarray(marker.codeword(MESSAGE), received.residual.dtype))
     return float(score) / float(norm)
