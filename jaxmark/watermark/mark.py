@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +28,9 @@ from jaxmark.watermark.schemes.registry import SCHEMES, parameters_of
 
 _MIN_ORIGINAL_SHARE = 0.5  # share of an original's points from which on an edited copy is read with, as an estimate
 _SAME_SHAPE = 0.01  # distance of shapes, over their size, below which an original looks like a marked or edited copy
+
+
+_AnyMark = TypeVar("_AnyMark", bound="Mark")
 
 
 class EmbedInfo(NamedTuple):
@@ -154,7 +157,7 @@ class Mark:
         """Share of the original's points that a suspect gives evidence for."""
         return float(np.mean(self.original.to_host(observed.weights)[self.original.used] > 0))
 
-    def with_scheme(self, scheme: Scheme, bits: int | None = None) -> Self:
+    def with_scheme(self: "_AnyMark", scheme: Scheme, bits: int | None = None) -> "_AnyMark":
         """Return the same mark, which has no record, with another scheme of this library, or another payload size.
 
         Raises:

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -50,6 +50,7 @@ _SHARES_OF_NOISE = (1.0, 0.7, 0.5, 0.3, 0.1)  # of a predicted noise that are tr
 _LEAST_SHARE, _MOST_SHARE = 0.3, 0.9  # of what is allowed, for a mark that is not the last
 
 
+@runtime_checkable
 class Marker(Protocol):
     """Marks one original, and reads any number of suspects."""
 

@@ -5,7 +5,7 @@ Evidence is weighed in one way for all readings: the least of several proofs cou
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -178,6 +178,7 @@ def accuse(
     return np.array([figure(one, [charge]) for one in bounds.log10_p_fingerprint(scores, values, biases)])
 
 
+@runtime_checkable
 class Registration(Protocol):
     """How a suspect was brought to where it was read: an `Alignment`, or the pose of a blind reading."""
 

@@ -6,7 +6,7 @@ with other fields stays readable.
 
 from collections.abc import Mapping
 from dataclasses import asdict, fields
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.blind.field import FieldScheme
@@ -36,6 +36,7 @@ _FIELDS_OF_OLD_RECORDS: Mapping[str, Mapping[str, Any]] = {"keyed": {"passband":
 _RETIRED_FIELDS: Mapping[str, Mapping[str, Any]] = {"keyed": {"masking": False}}
 
 
+@runtime_checkable
 class Named(Protocol):
     """A dataclass with a name, such as a scheme of either kind."""
 
