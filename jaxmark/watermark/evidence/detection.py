@@ -54,7 +54,7 @@ class Evidence(NamedTuple):
         return best._replace(
             log10_p_uncommitted=min(one.log10_p_uncommitted for one in alternatives),
             log10_p_unfloored=min(one.log10_p_unfloored for one in alternatives),
-            caveats=tuple(dict.fromkeys(caveat for one in alternatives for caveat in one.caveats)),
+            caveats=_all_caveats(alternatives),
         )
 
     @classmethod
@@ -72,7 +72,12 @@ class Evidence(NamedTuple):
             log10_p_uncommitted=figure(min(one.log10_p_uncommitted for one in marks), [one_mark], UNFLOORED),
             log10_p_unfloored=united([one.log10_p_unfloored for one in marks], UNFLOORED),
             charges=(ledger.MARKS.charge("product", 10**factor),),
+            caveats=_all_caveats(marks),
         )
+
+
+def _all_caveats(evidence: Sequence[Evidence]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(caveat for one in evidence for caveat in one.caveats))
 
 
 class Tag(NamedTuple):

@@ -215,7 +215,3 @@ def table() -> str:
                 shares = f"{shares}: equal shares, counted: {choice.counted}".removeprefix("each: ")
             lines.append(f"| {path} | {choice.name} | {shares} |")
     return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    print(table(), end="")
