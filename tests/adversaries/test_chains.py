@@ -64,9 +64,9 @@ def test_costs_are_distortions_over_the_mark_and_more_where_it_is_still_proven(s
     steps = [("noise", 0.002)]
     suspect = run_chain(marked, steps, seed=0)
     paid = jm.compare(marked, suspect, ["rms"]).rms / jm.compare(sphere, marked, ["rms"]).rms
-    log10_p = marker.detect(suspect, b"m").log10_p_unfloored
+    log10_p = marker.detect(suspect, b"m").evidence.log10_p_unfloored
     assert log10_p < -6
-    first = marker.detect(marked, b"m").log10_p_unfloored
+    first = marker.detect(marked, b"m").evidence.log10_p_unfloored
     assert judge(steps) == pytest.approx(paid * math.sqrt((first / -6 - 1) / (first / log10_p - 1)))
     dear = [("noise", 0.3)]
     far = run_chain(marked, dear, seed=0)

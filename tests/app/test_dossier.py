@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from jaxmark.app.telling import power
 
 import jaxmark as jm
 from jaxmark.alignment.alignment import align
 from jaxmark.alignment.original import make_original
-from jaxmark.app import report
+from jaxmark.app import dossier
+from jaxmark.app.output import power
 from jaxmark.watermark.coding.keys import commitment
 from jaxmark.watermark.record import TimestampedCommitment
 from tests.app.test_cli import Workshop
@@ -111,8 +111,8 @@ def test_a_dossier_shows_all_but_the_secret(workshop: Workshop):
 
     _, said, _ = workshop(*detect, "--deposit", "all.json")
     assert f"{power(told['log10_p'])} if key, original, message and record were fixed" in said
-    assert f"{power(told['log10_p_undated'])} if nothing dates them" in said
-    assert f"{power(told['log10_p_deposited'])} if the deposit is older than the suspect" in said
+    assert f"{power(told['log10_p_uncommitted'])} if nothing dates them" in said
+    assert f"{power(told['log10_p_timestamped'])} if the deposit is older than the suspect" in said
 
 
 def test_there_is_no_dossier_of_less_than_a_proof(workshop: Workshop):
@@ -177,7 +177,7 @@ def test_reports_show_the_points_where_they_are(monkeypatch: pytest.MonkeyPatch,
     original, dent = make_original(mesh), mesh.vertices.copy()
     dent[7] *= 1.02
     drawn = {}
-    monkeypatch.setattr(report, "save_views", lambda panels, path: drawn.update({one.title: one for one in panels}))
+    monkeypatch.setattr(dossier, "save_views", lambda panels, path: drawn.update({one.title: one for one in panels}))
     suspect = mesh._replace(vertices=dent)
-    report.save_report(tmp_path, original, suspect, align(original, suspect))
+    dossier.save_report(tmp_path, original, suspect, align(original, suspect))
     assert np.flatnonzero(drawn["Weight"].values == 0).tolist() == [7]  # so far off is masked

@@ -81,7 +81,7 @@ def test_rows_are_what_marker_attack_and_detect_say(results):
                 one = marker.detect(jm.attack(before, attack, strength, seed=seed))
                 # Attacks at once round otherwise than one by one.
                 assert row.log10_p == pytest.approx(one.log10_p, abs=0.05)
-                assert row.log10_p_unfloored == pytest.approx(one.log10_p_unfloored, rel=0.01, abs=0.05)
+                assert row.log10_p_unfloored == pytest.approx(one.evidence.log10_p_unfloored, rel=0.01, abs=0.05)
                 assert row.read == (one.message == message)
                 assert row.detected == (one.log10_p <= -6)
                 assert row.rms == (0 if control == "unmarked" else info.rms)

@@ -29,7 +29,7 @@ def mesh() -> jm.Mesh:
 @pytest.fixture(scope="module")
 def trials(mesh) -> Trials:
     attacks = [partial(apply_attack, one) for one in ATTACKS]
-    return Trials(make_original(mesh), 16, jm.Budget(rms=RMS).bounds(MESH), attacks, [7], "evidence")
+    return Trials(make_original(mesh), 16, jm.Budget(rms=RMS).bounds(mesh), attacks, [7], "evidence")
 
 
 @pytest.fixture(scope="module")

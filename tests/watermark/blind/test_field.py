@@ -171,7 +171,7 @@ def test_a_message_is_read_without_the_original(marked, key: jm.Key, mirrored: b
     found = jm.detect(turned(mesh, mirrored), key=key, bits=32, scheme=SCHEME)
     assert found.message == MESSAGE
     assert found.log10_p < -15
-    assert found.agreement > 0.6
+    assert found.registration.agreement > 0.6
     assert ("It is the mirror image of what was marked." in found.notes) == mirrored
 
 
@@ -206,7 +206,9 @@ def test_nothing_is_detected_where_nothing_is(shape: Mesh, marked, key: jm.Key, 
     mesh, info = marked
     assert not jm.detect(shape, key=key, message=claimed, record=info.record).detected(1e-3)
     step = info.record.parameters["step"]
-    assert not reading.detect(mesh, jm.Key(bytes(32)), 32, SCHEME.fixed(WIDTH, step), claimed).detected(1e-3)
+    assert not reading.read(reading.register(mesh), jm.Key(bytes(32)), 32, SCHEME.fixed(WIDTH, step), claimed).detected(
+        1e-3
+    )
 
 
 @pytest.mark.long
@@ -222,7 +224,7 @@ def test_values_do_not_go_beyond_the_lattice(shape: Mesh, key: jm.Key):
     assert info.record.beta == 1
     assert info.rms < 1e-3
     assert jm.compare(shape, marked, ("rms",)).rms == pytest.approx(info.rms, rel=1e-3)
-    assert jm.detect(marked, key=key, bits=32, scheme=scheme).agreement > 0.95
+    assert jm.detect(marked, key=key, bits=32, scheme=scheme).registration.agreement > 0.95
 
 
 def test_a_claimed_message_is_proven_or_refuted(marked, key: jm.Key):

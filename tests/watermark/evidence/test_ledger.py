@@ -169,13 +169,13 @@ def test_detections_of_all_other_kinds_are_charged_along_a_path(original: Mesh, 
     field = jm.embed(original, b"blind", key, scheme="field")[0]
     both = jm.embed(original, b"both", key, scheme=("keyed", "field"))[0]
     scene = {"a": original, "b": bumpy_sphere(4, seed=3)}
-    written, info = jm.embed_scene(scene, b"scene", key)
+    written, info = jm.watermark.embed_scene(scene, b"scene", key)
     remeshed = jm.attack(jm.embed(original, b"original", key)[0], "simplification", 0.3, seed=0)
     found = {
         "blind": jm.detect(field, key=key, bits=40),
         "blind, claimed": jm.detect(field, key=key, message=b"blind"),
         "together": jm.detect(both, original=original, key=key, message=b"both", scheme=("keyed", "field")),
-        "scene": jm.detect_scene(written, originals=scene, key=key, record=info.record),
+        "scene": jm.watermark.detect_scene(written, originals=scene, key=key, record=info.record),
         "surface": jm.detect(remeshed, original=original, key=key),
     }
     for kind, one in found.items():

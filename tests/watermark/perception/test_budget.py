@@ -32,15 +32,15 @@ def noise(mesh: Mesh) -> np.ndarray:
 def test_a_limit_is_reached_and_never_passed(name, mesh: Mesh, noise: np.ndarray):
     original = make_original(mesh)
     goal = 0.02 if name in ("dame", "fmpd", "msdm") else 3e-4
-    written = displace_within(original, noise, {name: goal})
+    written = displace_within(original, noise, jm.Budget(limits={name: goal}).bounds(mesh))
     assert 0.98 * goal <= jm.compare(mesh, written.mesh)._asdict()[name] <= goal
 
 
 def test_the_tightest_of_several_bounds_counts(mesh: Mesh, noise: np.ndarray):
     original = make_original(mesh)
-    for budget in (jm.Budget(rms=1e-4, limits={"dame": 1.0}).bounds(MESH), jm.Budget(rms=1e-4).bounds(MESH)):
-        assert displace_within(original, noise, budget).moved.rms == pytest.approx(1e-4)
-    budget = jm.Budget(rms=0.5, limits={"dame": 0.01, "msdm": 0.9}).bounds(MESH)
+    for budget in (jm.Budget(rms=1e-4, limits={"dame": 1.0}), jm.Budget(rms=1e-4)):
+        assert displace_within(original, noise, budget.bounds(mesh)).moved.rms == pytest.approx(1e-4)
+    budget = jm.Budget(rms=0.5, limits={"dame": 0.01, "msdm": 0.9}).bounds(mesh)
     found = jm.compare(mesh, displace_within(original, noise, budget).mesh)
     assert 0.0098 <= (found.dame or 0) <= 0.01
     assert (found.msdm or 0) <= 0.9
@@ -57,14 +57,14 @@ def largest_stretch(original: Mesh, distorted: Mesh) -> float:
 
 
 def test_a_metric_of_ones_own_can_be_limited(mesh: Mesh, noise: np.ndarray, key: jm.Key):
-    budget = jm.Budget(limits={largest_stretch: 0.02, "max": 0.1}).bounds(MESH)
+    budget = jm.Budget(limits={largest_stretch: 0.02, "max": 0.1}).bounds(mesh)
     assert str(budget) == "largest_stretch of at most 0.02 and max of at most 0.1"
     found = largest_stretch(mesh, displace_within(make_original(mesh), noise, budget).mesh)
     assert 0.98 * 0.02 <= found <= 0.02
     marked, _ = jm.embed(mesh, MESSAGE, key, budget=jm.Budget(limits={largest_stretch: 0.02}, noise=0))
     assert 0.98 * 0.02 <= largest_stretch(mesh, marked) <= 0.02
     with pytest.raises(jm.JaxmarkError, match="The limit of largest_stretch must be a positive number"):
-        jm.Budget(limits={largest_stretch: 0.0}).bounds(MESH)
+        jm.Budget(limits={largest_stretch: 0.0})
 
 
 @pytest.mark.slow
@@ -149,14 +149,14 @@ def test_limits_from_the_shell(mesh: Mesh, tmp_path, monkeypatch, capsys):
 )
 def test_budgets_out_of_range_are_refused(budget, limits, sentence):
     with pytest.raises(jm.JaxmarkError, match=sentence):
-        jm.Budget(rms=budget, limits=limits).bounds(MESH)
+        jm.Budget(rms=budget, limits=limits)
 
 
 def test_limits_that_bind_nothing_are_refused_without_a_budget(mesh: Mesh, noise: np.ndarray):
     original = make_original(mesh)
     with pytest.raises(jm.JaxmarkError, match="give a budget"):
-        displace_within(original, noise, {"rms": 0.5})
+        displace_within(original, noise, jm.Budget(limits={"rms": 0.5}).bounds(mesh))
     # Three triangles without a common edge have no dihedral angle.
     loose = make_original(make_mesh(np.random.default_rng(0).normal(size=(9, 3)), np.arange(9).reshape(3, 3)))
     with pytest.raises(jm.JaxmarkError, match="give a budget"):
-        displace_within(loose, np.ones((9, 3)) * [1, 2, 3], None)
+        displace_within(loose, np.ones((9, 3)) * [1, 2, 3], jm.Budget().bounds(loose.mesh))

@@ -13,6 +13,7 @@ from jaxmark.alignment.original import make_original
 from jaxmark.geometry.mesh import Mesh, make_mesh, vertex_normals
 from jaxmark.spectral.bands import scaling
 from jaxmark.watermark.coding.keys import Choices
+from jaxmark.watermark.perception.budget import Bounds
 from jaxmark.watermark.perception.capacity import (
     Capacity,
     Conditions,
@@ -26,7 +27,7 @@ from jaxmark.watermark.schemes.keyed import KeyedScheme
 from tests.dense import chebyshev_matrices
 from tests.samples import bumpy_sphere, rough_sphere
 
-USUAL = Conditions(jm.Budget(rms=8e-4).bounds(MESH), noise=0.005, coverage=0.5)
+USUAL = Conditions(Bounds(8e-4, {}), noise=0.005, coverage=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +146,7 @@ def test_least_budget_scales(known: Capacity):
     least = known.least_budget(16, USUAL)
     assert known.least_budget(16, USUAL._replace(noise=0.015)) == pytest.approx(3 * least, rel=1e-9)
     assert known.least_budget(16, USUAL._replace(noise=0.0)) == 0
-    assert known.least_budget(16, USUAL._replace(budget=jm.Budget(rms=1e-9).bounds(MESH))) == least
+    assert known.least_budget(16, USUAL._replace(bounds=Bounds(1e-9, {}))) == least
     # As 1/√coverage, but for the interference of the bits, which a smaller coverage raises.
     whole = known.least_budget(16, USUAL._replace(coverage=1.0))
     assert 1.05 * math.sqrt(2) < least / whole < 2
@@ -159,10 +160,7 @@ def test_least_budget_scales(known: Capacity):
 @pytest.mark.slow
 def test_bits_are_monotone(coarse: Capacity):
     rising = {
-        "budget": [
-            coarse.bits(USUAL._replace(budget=jm.Budget(rms=b).bounds(MESH)))
-            for b in (1e-4, 4e-4, 8e-4, 1.2e-3, 1.6e-3)
-        ],
+        "budget": [coarse.bits(USUAL._replace(bounds=Bounds(rms, {}))) for rms in (1e-4, 4e-4, 8e-4, 1.2e-3, 1.6e-3)],
         "noise": [coarse.bits(USUAL._replace(noise=n)) for n in (0.1, 0.01, 0.005, 0.003, 0.002)],
         "coverage": [coarse.bits(USUAL._replace(coverage=c)) for c in (0.05, 0.3, 0.5, 0.7, 1.0)],
     }
@@ -177,7 +175,7 @@ def test_bits_are_monotone(coarse: Capacity):
 @pytest.mark.parametrize("budget", [8e-4, 1.16e-3, 1.5e-3])
 def test_bits_is_the_largest_payload(budget, coarse: Capacity):
     """No larger one fits, and every smaller one does."""
-    conditions = USUAL._replace(budget=jm.Budget(rms=budget).bounds(MESH))
+    conditions = USUAL._replace(bounds=Bounds(budget, {}))
     most = coarse.bits(conditions)
     assert most > 0
     for bits in range(8, 400, 8):

@@ -16,13 +16,13 @@ from jaxmark.distortion import stretch, texture_drift
 from jaxmark.geometry.mesh import Mesh, edges, face_normals, make_mesh
 from jaxmark.watermark.carriers import KeyedCarrier
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.perception.budget import VISIBILITY
+from jaxmark.watermark.perception.budget import VISIBILITY, visibility_of
 from jaxmark.watermark.perception.masking import hiding_directions
 from jaxmark.watermark.perception.visibility import band_visibility
 from jaxmark.watermark.schemes.keyed import KeyedScheme
-from jaxmark.watermark.schemes.registry import get_nonblind, parameters_of
+from jaxmark.watermark.schemes.registry import make_scheme, parameters_of
 from tests.distortion.test_shading import sheet
-from tests.samples import rough_sphere
+from tests.samples import bumpy_sphere, rough_sphere
 
 pytestmark = pytest.mark.core
 
@@ -203,14 +203,17 @@ def test_capacity_counts_the_dimensions_that_are_left(key: jm.Key):
 
 @pytest.mark.usefixtures("unchecked")
 def test_visibility_has_names():
-    assert jm.Budget().bounds(MESH) == jm.Budget(visibility="hidden").bounds(MESH)
-    assert jm.Budget(limits={"dame": 1.0}, visibility="visible").bounds(MESH).limits == {**VISIBILITY["visible"]}
-    assert jm.Budget(rms=1e-3, visibility="careful look").bounds(MESH).rms == 1e-3
-    assert jm.Budget(rms=1e-3).bounds(MESH).limits == {}
+    mesh = bumpy_sphere(3)
+    assert visibility_of(mesh)["hidden"]["shading"] == VISIBILITY["hidden"]["shading"]
+    assert jm.Budget().bounds(mesh) == jm.Budget(visibility="hidden").bounds(mesh)
+    visible = jm.Budget(limits={"dame": 1.0}, visibility="visible").bounds(mesh)
+    assert visible.limits == {**visibility_of(mesh)["visible"]}
+    assert jm.Budget(rms=1e-3, visibility="careful look").bounds(mesh).rms == 1e-3
+    assert jm.Budget(rms=1e-3).bounds(mesh).limits == {}
     for name in ("shading", "dame", "stretch"):
         assert VISIBILITY["hidden"][name] < VISIBILITY["careful look"][name] < VISIBILITY["visible"][name]
     with pytest.raises(jm.JaxmarkError, match="visibility is one of 'hidden', 'careful look', 'visible'"):
-        jm.Budget(visibility="invisible").bounds(MESH)  # pyright: ignore[reportArgumentType]
+        jm.Budget(visibility="invisible")  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.slow
@@ -224,9 +227,9 @@ def test_what_bands_show_is_measured_as_they_are_hidden():
 
 def test_records_keep_how_a_mark_was_hidden():
     assert parameters_of(KeyedScheme())["hiding"] is True
-    assert get_nonblind("keyed", parameters_of(KeyedScheme())) == KeyedScheme()
+    assert make_scheme("keyed", parameters_of(KeyedScheme())) == KeyedScheme()
     before = {name: value for name, value in parameters_of(KeyedScheme()).items() if name != "hiding"}
-    assert get_nonblind("keyed", before) == KeyedScheme(hiding=False)
+    assert make_scheme("keyed", before) == KeyedScheme(hiding=False)
 
 
 def test_a_texture_drifts_as_far_as_its_surface_moves():

@@ -14,7 +14,7 @@ from jaxmark.watermark.carriers import KeyedCarrier
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.perception.visibility import band_visibility
 from jaxmark.watermark.schemes.keyed import KeyedScheme
-from jaxmark.watermark.schemes.registry import get_nonblind, parameters_of
+from jaxmark.watermark.schemes.registry import make_scheme, parameters_of
 from tests.samples import rough_sphere
 
 pytestmark = pytest.mark.core
@@ -53,9 +53,9 @@ def test_rough_regions_mask_more(half_rough: Mesh):
 def test_masking_by_roughness_is_no_longer_read():
     fields = parameters_of(KeyedScheme())
     assert fields["masking"] is False
-    assert get_nonblind("keyed", fields) == KeyedScheme()
+    assert make_scheme("keyed", fields) == KeyedScheme()
     with pytest.raises(jm.JaxmarkError, match="no longer read"):
-        get_nonblind("keyed", {**fields, "masking": True})
+        make_scheme("keyed", {**fields, "masking": True})
 
 
 def test_a_profile_is_what_is_written(half_rough: Mesh, key: jm.Key, dtype):
@@ -88,7 +88,7 @@ def test_profiles_pass_through_records(half_rough: Mesh, key: jm.Key, tmp_path):
     file = tmp_path / "record.json"
     file.write_text(info.record.to_json())
     record = jm.Record.load(file)
-    assert get_nonblind(record.scheme, record.parameters) == scheme
+    assert make_scheme(record.scheme, record.parameters) == scheme
     assert jm.detect(marked, original=half_rough, key=key, record=record).message == b"\x5a"
     with pytest.raises(jm.JaxmarkError, match="takes the parameters"):
-        get_nonblind("keyed", parameters_of(scheme) | {"profile": ["1"]})
+        make_scheme("keyed", parameters_of(scheme) | {"profile": ["1"]})
