@@ -70,7 +70,7 @@ def test_every_edit_of_one_field_is_refused(marked, original: Mesh, key: jm.Key,
 
 
 def test_other_edits_are_refused_too(marked, original: Mesh, key: jm.Key, tmp_path):
-    suspect, record = marked
+    _, record = marked
     with pytest.raises(jm.JaxmarkError, match="fingerprint; identify"):
         jm.make_marker(original, key, record=dataclasses.replace(record, content="fingerprint"))
     with pytest.raises(jm.JaxmarkError, match="not the one that the record commits to"):

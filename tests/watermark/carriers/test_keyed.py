@@ -69,7 +69,7 @@ def make_carrier(case: Case, key: bytes, dtype, direction="coordinates", bits=BI
     x = jnp.asarray(case.x, dtype)
     host = make_host(case.operator, x, x, FAMILY, scales=2, degree=1)
     chips = make_chips(
-        Choices(jm.Key(key), GEOMETRY, 1),
+        Choices(jm.Key(key), GEOMETRY),
         places(case.moving if moving is None else moving),
         bits,
         channels=3 if direction == "coordinates" else 1,
@@ -219,11 +219,11 @@ def test_what_signs_multiply_depends_on_no_key(direction, small: Case, key: jm.K
 def test_golden_chips(key: jm.Key):
     """Held exactly, for ever."""
     moving = np.array([True, True, False, True, True])
-    chips = make_chips(Choices(key, GEOMETRY, 1), places(moving), 5)
+    chips = make_chips(Choices(key, GEOMETRY), places(moving), 5)
     assert chips.signs.tolist() == [[1, -1, 1], [-1, -1, -1], [0, 0, 0], [1, -1, 1], [1, -1, 1]]
     assert chips.slots.tolist() == [[0, 0, 1], [3, 2, 1], [0, 0, 0], [4, 0, 3], [2, 4, 1]]
     assert chips.population.tolist() == [3, 3, 2, 2, 2]
-    along = make_chips(Choices(key, GEOMETRY, 1), places(moving), 2, channels=1)
+    along = make_chips(Choices(key, GEOMETRY), places(moving), 2, channels=1)
     assert along.signs.ravel().tolist() == [1, 1, 0, -1, -1]
     assert along.slots.ravel().tolist() == [1, 0, 0, 0, 1]
 
@@ -232,7 +232,7 @@ def test_golden_chips(key: jm.Key):
 @pytest.mark.parametrize("bits", [1, 7, 64])
 def test_every_bit_has_as_many_chips(bits, channels, key: jm.Key):
     moving = np.random.default_rng(4).uniform(size=201) < 0.8
-    chips = make_chips(Choices(key, GEOMETRY, 1), places(moving), bits, channels=channels)
+    chips = make_chips(Choices(key, GEOMETRY), places(moving), bits, channels=channels)
     total = channels * moving.sum()
     assert chips.population.sum() == total
     assert set(chips.population.tolist()) <= {total // bits, -(-total // bits)}
@@ -240,19 +240,19 @@ def test_every_bit_has_as_many_chips(bits, channels, key: jm.Key):
     assert (chips.signs[~moving] == 0).all()
     assert (np.abs(chips.signs[moving]) == 1).all()
     for one, again in zip(
-        chips, make_chips(Choices(key, GEOMETRY, 1), places(moving), bits, channels=channels), strict=True
+        chips, make_chips(Choices(key, GEOMETRY), places(moving), bits, channels=channels), strict=True
     ):
         np.testing.assert_array_equal(one, again)
 
 
 def test_keys_meshes_and_layouts_share_nothing(key: jm.Key):
     moving = np.ones(6000, bool)
-    base = make_chips(Choices(key, GEOMETRY, 1), places(moving), 50)
+    base = make_chips(Choices(key, GEOMETRY), places(moving), 50)
     for other in (
-        make_chips(Choices(jm.Key(bytes(32)), GEOMETRY, 1), places(moving), 50),
-        make_chips(Choices(key, b"h" * 32, 1), places(moving), 50),
-        make_chips(Choices(key, GEOMETRY, 1), places(moving), 51),
-        make_chips(Choices(key, GEOMETRY, 1), places(moving), 50, channels=1),
+        make_chips(Choices(jm.Key(bytes(32)), GEOMETRY), places(moving), 50),
+        make_chips(Choices(key, b"h" * 32), places(moving), 50),
+        make_chips(Choices(key, GEOMETRY), places(moving), 51),
+        make_chips(Choices(key, GEOMETRY), places(moving), 50, channels=1),
     ):
         count = other.signs.size
         assert abs(np.vdot(base.signs.ravel()[:count].astype(int), other.signs.ravel())) < 6 * np.sqrt(count)
@@ -432,7 +432,7 @@ def test_differentiable_with_respect_to_suspect_original_and_strength(small: Cas
     """By finite differences. The ridge is not differentiated on purpose; here it is, and all else has to fit."""
     stop = jax.lax.stop_gradient
     monkeypatch.setattr(jax.lax, "stop_gradient", lambda x: x if getattr(x, "ndim", 1) == 0 else stop(x))
-    chips = make_chips(Choices(key, GEOMETRY, 1), places(small.moving), BITS)
+    chips = make_chips(Choices(key, GEOMETRY), places(small.moving), BITS)
     random = np.random.default_rng(9)
     message = jnp.asarray(random.choice([-1.0, 1.0], BITS))
 
