@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
 from jaxmark.adversaries.registry import ATTACKS
-from jaxmark.alignment.alignment import align
+from jaxmark.alignment.attempts import align
 from jaxmark.alignment.nearest import find_heights, find_partners
 from jaxmark.alignment.original import make_original
 from jaxmark.app import cli

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.sparse import linalg
 
 import jaxmark as jm
-from jaxmark.alignment.alignment import align
+from jaxmark.alignment.attempts import align
 from jaxmark.alignment.original import make_original
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.laplacian import Laplacian, sparse_matrices

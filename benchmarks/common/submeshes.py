@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Int, Int64
 from scipy.sparse import csgraph
 
-from jaxmark.alignment import alignment
+from jaxmark.alignment import attempts
 from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.errors import JaxmarkError
@@ -64,9 +64,9 @@ class PartMarker:
         The false-positive probability of each detection is that of its own part alone.
 
         Raises:
-            JaxmarkError: see `alignment.align`.
+            JaxmarkError: see `jaxmark.alignment.attempts.align`.
         """
-        whole = alignment.align(self.original, suspect, align)
+        whole = attempts.align(self.original, suspect, align)
         return [marker.read(self._restrict(whole, part)) for part, marker in enumerate(self.markers)]
 
     def _restrict(self, whole: Alignment, part: int) -> Alignment:

@@ -34,7 +34,7 @@ from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
-from jaxmark.alignment.alignment import align
+from jaxmark.alignment.attempts import align
 from jaxmark.alignment.original import make_original
 from jaxmark.attacks import Attack
 from jaxmark.attacks.meshlab import apply_filter

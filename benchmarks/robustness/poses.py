@@ -19,7 +19,7 @@ from scipy.sparse import csgraph
 from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
-from jaxmark.alignment.alignment import align, straightened
+from jaxmark.alignment.attempts import align
 from jaxmark.app.process import release_programs
 from jaxmark.files import load_skin
 from jaxmark.geometry import Skinning, unpose
@@ -86,7 +86,7 @@ def rows_of(path: Path, mesh: Mesh, bits: int, budget: float) -> list[Row]:
         moved = float(np.sqrt(np.mean(off**2))) / diagonal(mesh)
         ways = {"one map": aligned._replace(bent=None)}
         if aligned.bent is not None:
-            ways["own maps"] = straightened(marker.original, aligned, aligned.bent)
+            ways["own maps"] = aligned.straightened(marker.original, aligned.bent)
         if skin is not None:
             ways["skeleton"] = align(marker.original, unpose(mesh, skin, suspect))
         claims = {name: marker.read(way, subject.message).evidence.log10_p_unfloored for name, way in ways.items()}

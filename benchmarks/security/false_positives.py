@@ -23,7 +23,6 @@ import numpy as np
 import trimesh
 
 import jaxmark as jm
-from jaxmark.alignment.alignment import straightened
 from jaxmark.alignment.observation import Observation
 from jaxmark.confidence import clopper_pearson
 from jaxmark.geometry.mesh import Mesh
@@ -96,7 +95,7 @@ def suspects(marker: jm.watermark.NonBlindMarker) -> dict[str, Observation]:
     for name, straight in (("bent", mesh), ("marked under another key, bent", marked(204))):
         aligned = marker.register(jm.attack(straight, "twisting", 120, seed=5))
         assert aligned.bent is not None
-        seen[f"{name}, straightened"] = marker.observe(straightened(marker.original, aligned, aligned.bent))
+        seen[f"{name}, straightened"] = marker.observe(aligned.straightened(marker.original, aligned.bent))
     return stackable(seen)
 
 

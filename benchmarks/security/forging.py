@@ -28,7 +28,8 @@ import numpy as np
 from scipy.optimize import nnls
 
 import jaxmark as jm
-from jaxmark.alignment.alignment import Alignment, align
+from jaxmark.alignment.alignment import Alignment
+from jaxmark.alignment.attempts import align
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.chebyshev import band_components
 from jaxmark.spectral.laplacian import per_row
@@ -172,7 +173,7 @@ def strengths(mesh: Mesh, seen: dict[str, Mesh], keys: int, bands: int) -> Row:
     honest, hoped, printed, late = [], [], [], []
     for name, suspect in seen.items():
         aligned = align(original, suspect)
-        best = fitted(list(shares(markers[0], aligned)), chosen, ledger.ALIGNMENT.charge(aligned.how))
+        best = fitted(list(shares(markers[0], aligned)), chosen, ledger.ALIGNMENT.charge(aligned.align))
         honest.append(best.honest)
         hoped.append(best.log10_p)
         key, profile = key_of(best.key), best.profile
@@ -283,7 +284,7 @@ def message(mesh: Mesh, seen: dict[str, Mesh], bits: int) -> Row:
             soft = np.bincount(np.ravel(chips.slots), np.ravel(chips.signs * vector), marker.code_bits)
             word = polar.decode(soft[None] / np.abs(soft).max(), bits + TAG_BITS, 64)[0][0]
             score = soft @ (1.0 - 2.0 * polar.encode(word, marker.code_bits))
-            charges = ledger.ALIGNMENT.charge(aligned.how), ledger.PROOF.charge("score", 2)
+            charges = ledger.ALIGNMENT.charge(aligned.align), ledger.PROOF.charge("score", 2)
             best = min(best, (figure(bounds.log10_p_score(score, np.linalg.norm(vector)), charges), name))
     charged = min(0.0, best[0] + bits * math.log10(2))
     return {

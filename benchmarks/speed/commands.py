@@ -49,7 +49,7 @@ FUNCTIONS = (
     ("jaxmark.watermark.marking", "Marker.reads", "back"),
     ("jaxmark.watermark.marking", "Marker.tried", "back"),
     ("jaxmark.app.read_files", "save_mesh", "save"),
-    ("jaxmark.alignment.alignment", "align", "align"),
+    ("jaxmark.alignment.attempts", "align", "align"),
     ("jaxmark.watermark.marking", "Markers.detect", "receive"),
 )
 STAGES = ("start", *dict.fromkeys(stage for *_, stage in FUNCTIONS), "other")

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 import jaxmark as jm
-from jaxmark.alignment.alignment import align, observation
+from jaxmark.alignment.attempts import align
 from jaxmark.alignment.observation import observe
 from jaxmark.alignment.original import Original, displace, make_original, residual
 from jaxmark.attacks import mark_noise
@@ -193,7 +193,7 @@ def errors(
         for name, strength in [(kind, strength) for kind in kinds for strength in ATTACKS[kind][1]]:
             suspect = ATTACKS[name][0](marked, original.mesh, strength, trial)
             if name in ALIGNED:
-                seen = observation(original, align(original, suspect))
+                seen = align(original, suspect).observation(original)
             else:
                 seen = observe(original.to_traced(residual(original, suspect)))
             soft = detector(reader, reader.receive(seen), 1.0)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from jaxmark.alignment.alignment import align, observation
+from jaxmark.alignment.attempts import align
 from jaxmark.alignment.original import make_original
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, host_mesh, same_connectivity
@@ -79,7 +79,7 @@ def search_key(
     maker, ready, random = get_nonblind(scheme), make_original(original), np.random.default_rng(seed)
     bits = 8 * len(message)
     code_bits, tried = maker.code_length(ready, bits), [Key(random.bytes(KEY_BYTES)) for _ in range(keys)]
-    seen = observation(ready, align(ready, given))
+    seen = align(ready, given).observation(ready)
 
     def choices(key: Key) -> Choices:
         return bind_mark(key, ready, maker, bits, "message")

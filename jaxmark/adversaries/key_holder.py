@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64
 
 from jaxmark.adversaries.expected import strongest_evidence
-from jaxmark.alignment.alignment import align
+from jaxmark.alignment.attempts import align
 from jaxmark.alignment.observation import Observation
 from jaxmark.attacks.registry import Attack
 from jaxmark.distortion import rms

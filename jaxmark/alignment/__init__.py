@@ -5,7 +5,7 @@
 
 from jaxmark.alignment.alignment import Align as Align
 from jaxmark.alignment.alignment import Alignment as Alignment
-from jaxmark.alignment.alignment import align as align
+from jaxmark.alignment.attempts import align as align
 from jaxmark.alignment.observation import Observation as Observation
 from jaxmark.alignment.observation import observe as observe
 from jaxmark.alignment.original import Original as Original

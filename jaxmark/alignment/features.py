@@ -35,13 +35,14 @@ class FeatureSettings:
 
 
 FEATURE_SETTINGS = FeatureSettings()
+EITHER = (False, True)  # poses that do not mirror, and poses that mirror
 
 
 def poses_by_features(
     original: Geometry,
     suspect: Geometry,
     count: int,
-    hands: Sequence[bool] = (False, True),
+    reflections: Sequence[bool] = EITHER,
     *,
     settings: FeatureSettings = FEATURE_SETTINGS,
 ) -> list[Pose]:
@@ -50,22 +51,23 @@ def poses_by_features(
     Args:
         original: the original's shape, about 1 in size.
         suspect: in any pose and scale, with at least a fifth of the original's area.
-        count: largest number of poses for each hand.
-        hands: which poses are looked for: those that mirror (True), those that do not (False), or both.
+        count: largest number of poses, and as many that mirror.
+        reflections: which poses are looked for: those that mirror (True), those that do not (False), or both.
         settings: see `FeatureSettings`.
 
     Returns:
-        The poses, hand by hand, by descending number of matches that confirm them.
+        The poses, those that do not mirror first, by descending number of matches that confirm them.
     """
     target, source = original.sample(settings.points), suspect.sample(settings.points)
     wanted = descriptors(target.points, target.normals, settings.radius, settings=settings)
-    random, found = {mirrored: np.random.default_rng(0) for mirrored in hands}, {mirrored: [] for mirrored in hands}
+    random = {mirrored: np.random.default_rng(0) for mirrored in reflections}
+    found: dict[bool, list[tuple[int, Pose]]] = {mirrored: [] for mirrored in reflections}
     for share in settings.share_ratio ** np.arange(settings.shares):
         # The number of points makes them as dense as on the original if the suspect has this share of its area.
         points, normals = (array[: int(share * settings.points)] for array in source[:2])
         scale = float(np.sqrt(share * target.area / source.area))
         described = descriptors(points, normals, settings.radius / scale, settings=settings)
-        for mirrored in hands:
+        for mirrored in reflections:
             for seen in _reflected(described) if mirrored else (described,):
                 on_source, on_target = _mutually_nearest(seen, wanted)
                 matched = points[on_source], target.points[on_target]

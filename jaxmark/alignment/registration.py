@@ -3,8 +3,8 @@
 A whole suspect's principal axes are brought onto the original's in all 48 ways, of which half mirror, and what fits by
 far the worst is left out. Each pose is improved by trimmed closest points (Chetverikov et al., "Robust Euclidean
 alignment of 3D point sets: the trimmed iterative closest point algorithm", 2005), from either surface to the other, so
-that the scale is determined. If several poses of one hand fit, those by local shape (`jaxmark.alignment.features`) are
-tried, too, and turns about the axis of a round shape. A part is posed by local shape only. In both cases, the best pose
+that the scale is determined. If several poses fit, those by local shape (`jaxmark.alignment.features`) are tried,
+too, and turns about the axis of a round shape. A part is posed by local shape only. In both cases, the best pose
 is refined by distances along normals; a pose that mirrors must fit clearly better than the best that does not.
 trimesh's own registration is no alternative, because it compares against an absolute threshold.
 """
@@ -18,7 +18,7 @@ from jaxtyping import Float64
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from jaxmark.alignment.features import FEATURE_SETTINGS, FeatureSettings, poses_by_features
+from jaxmark.alignment.features import EITHER, FEATURE_SETTINGS, FeatureSettings, poses_by_features
 from jaxmark.geometry.mesh import unit
 from jaxmark.geometry.pose import IDENTITY, Points, Pose, similarity
 from jaxmark.geometry.surfaces import Geometry
@@ -53,13 +53,12 @@ class RegistrationSettings:
 
 SETTINGS = RegistrationSettings()
 Others = Float64[np.ndarray, "others 3"]  # points of a suspect, where those of an original are there, too
-BOTH_HANDS = (False, True)
 
 
 def register_whole(
     original: Geometry,
     suspect: Geometry,
-    hands: Sequence[bool] = BOTH_HANDS,
+    reflections: Sequence[bool] = EITHER,
     *,
     settings: RegistrationSettings = SETTINGS,
 ) -> Pose | None:
@@ -68,7 +67,7 @@ def register_whole(
     Args:
         original: the surface of the welded points, about 1 in size.
         suspect: in any pose and scale, with an area.
-        hands: whether the pose may be one that does not mirror, one that mirrors, or either.
+        reflections: whether the pose may be one that does not mirror (False), one that mirrors (True), or either.
         settings: see `RegistrationSettings`.
 
     Returns:
@@ -84,7 +83,7 @@ def register_whole(
     points, normals = original.anchors()
     chosen = np.random.default_rng(0).permutation(len(points))[: settings.fine_points]
     ends = []
-    for mirrored in hands:
+    for mirrored in reflections:
         alike = [start for start in starts if start.mirrors == mirrored]
         if len(alike) > 1:  # the principal axes of a shape that is nearly symmetric leave small features to decide
             count, features = settings.feature_poses, settings.features
@@ -116,7 +115,7 @@ def _best(
 def register_part(
     original: Geometry,
     suspect: Geometry,
-    hands: Sequence[bool] = BOTH_HANDS,
+    reflections: Sequence[bool] = EITHER,
     *,
     settings: RegistrationSettings = SETTINGS,
 ) -> Pose | None:
@@ -125,7 +124,7 @@ def register_part(
     Args:
         original: the surface of the welded points, about 1 in size.
         suspect: in any pose and scale, with an area.
-        hands: whether the pose may be one that does not mirror, one that mirrors, or either.
+        reflections: whether the pose may be one that does not mirror (False), one that mirrors (True), or either.
         settings: see `RegistrationSettings`.
 
     Returns:
@@ -137,7 +136,7 @@ def register_part(
     points, normals, _ = suspect.sample(settings.samples)
     fine, rounds = slice(settings.fine_points), settings.comparison_rounds
     ends = []
-    for start in poses_by_features(original, suspect, settings.feature_poses, hands, settings=settings.features):
+    for start in poses_by_features(original, suspect, settings.feature_poses, reflections, settings=settings.features):
         # Every point of a part has its place on the original, but not the other way round: the original is brought
         # onto the part, and that map is inverted.
         posed, along = start(points), unit(normals @ start.matrix.T)
@@ -153,7 +152,7 @@ def register_part(
 def _unlikeliness(distance: float, pose: Pose, settings: RegistrationSettings) -> float:
     """The distance that a pose leaves, by which poses are compared.
 
-    That of a pose that mirrors counts for more: where a shape is its own mirror image, either hand leaves no more than
+    That of a pose that mirrors counts for more: where a shape is its own mirror image, either leaves no more than
     the mark.
     """
     return distance * (settings.mirror_ratio if pose.mirrors else 1)
@@ -214,7 +213,7 @@ def refine(
 
 
 def _coarse(target: Points, source: Others, settings: RegistrationSettings) -> list[Pose]:
-    """Find the likeliest distinct poses of each hand by principal axes and closest points; none if all fit badly."""
+    """Find the likeliest distinct poses of both reflections by principal axes and closest points; none if all fit badly."""
     forward, backward = KDTree(target), KDTree(source)
     coarse, fine = slice(settings.coarse_points), slice(settings.fine_points)
     starts = poses_by_axes(target, source)
@@ -288,7 +287,7 @@ def _principal(points: Points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _closest_points(
     pose: Pose, target: Points, source: Others, forward: KDTree, backward: KDTree, settings: RegistrationSettings
 ) -> tuple[Pose, float]:
-    """Improve a similarity, of either hand, by trimmed iterative closest points, from source to target and back.
+    """Improve a similarity, which may mirror, by trimmed iterative closest points, from source to target and back.
 
     Returns:
         The pose, and the root mean square distance of the pairs that were kept in the last round.

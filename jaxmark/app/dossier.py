@@ -156,8 +156,8 @@ def _command(case: Case) -> str:
         words += ["--record", case.record.name]
     else:
         words += ["--bits", str(case.mark.bits), "--scheme", case.mark.scheme.name]
-    if case.found.registration.how != "auto":
-        words += ["--align", case.found.registration.how]
+    if case.found.registration.align != "auto":
+        words += ["--align", case.found.registration.align]
     return shlex.join(words) + (" --message CLAIMED" if case.claimed else "")
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64, Int8
 
 from jaxmark import distortion
-from jaxmark.alignment.alignment import align, observation
+from jaxmark.alignment.attempts import align
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, displace
 from jaxmark.errors import JaxmarkError
@@ -138,7 +138,7 @@ class Trials:
         signs = tuple(sign * jnp.asarray(one.chips.signs) for one in drawn for sign in (1, -1))
         seen = tuple(
             tuple(
-                observation(original, align(original, one(mark, seed + numbers.start)))
+                align(original, one(mark, seed + numbers.start)).observation(original)
                 for seed in self.seeds
                 for mark in marks
             )

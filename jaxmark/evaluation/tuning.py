@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64, Int64
 
 from jaxmark.adversaries.registry import attack, get_attack
-from jaxmark.alignment.alignment import align, observation
+from jaxmark.alignment.attempts import align
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.attacks import Kind
 from jaxmark.distortion import name_of
@@ -138,7 +138,7 @@ def tune(
     written = displace_within(original, probe, bounds)
     mark = original.to_traced(written.scale * probe)
     suspects = [[apply_attack(one, written.mesh, int(seed)) for seed in numbers] for one in attacks]
-    seen = [[observation(original, align(original, suspect)) for suspect in row] for row in suspects]
+    seen = [[align(original, suspect).observation(original) for suspect in row] for row in suspects]
 
     def measure_channels(profile: tuple[float, ...]) -> Channels:
         receiver = tunable.with_profile(profile).receiver(original, bits)

@@ -132,7 +132,7 @@ def detect(
 ) -> Detection:
     """Read a mark from a suspect, and compute what the reading proves.
 
-    With `original`, the suspect is first aligned with it (`jaxmark.alignment.alignment.align`); without it, marks of
+    With `original`, the suspect is first aligned with it (`jaxmark.alignment.attempts.align`); without it, marks of
     the blind schemes are read (`jaxmark.watermark.blind.reading`). Without `message`, what is read counts only if its
     keyed tag fits. With it, a mark is proven whose message can no longer be read; if another message is read, the claim
     is refuted, not the mark: the evidence is that for the message that was read, and a note says so. Every choice that
@@ -413,7 +413,7 @@ def _unite_meshes(seen: Sequence[_Seen], claimed: bytes | None) -> Detection:
             continue
         recorded = [is_recorded(one.marker.record, message, one.marker.choices) for one in seen]
         fixed = claimed is not None or all(recorded)
-        charges = [ledger.SCENE.charge("sum over meshes"), ledger.SUM_ALIGNMENT.charge(seen[0].aligned.how)]
+        charges = [ledger.SCENE.charge("sum over meshes"), ledger.SUM_ALIGNMENT.charge(seen[0].aligned.align)]
         if fixed or any(one is not None for one in recorded):
             charges.append(ledger.MESSAGE.charge("claimed or recorded" if fixed else "another"))
         scores, norms = zip(*(one.claim(message) for one in seen), strict=True)

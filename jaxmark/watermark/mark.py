@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from numpy.typing import ArrayLike
 
 from jaxmark import distortion
-from jaxmark.alignment.alignment import Alignment, observation
+from jaxmark.alignment.alignment import Alignment
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.errors import JaxmarkError
@@ -133,7 +133,7 @@ class Mark:
         """
         if weights is not None:
             aligned = aligned._replace(weights=aligned.weights * self._per_point(weights))
-        return observation(self.original, aligned)
+        return aligned.observation(self.original)
 
     def receive(self, aligned: Alignment, weights: ArrayLike | None = None) -> Received:
         """Find what the reader learns from a suspect, independently of the key; see `Reader.receive`."""

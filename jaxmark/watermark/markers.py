@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxmark import distortion
-from jaxmark.alignment import alignment
+from jaxmark.alignment import attempts
 from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.errors import JaxmarkError
@@ -159,7 +159,7 @@ class NonBlindMarker(Mark):
         Plain correlations nearly always read a keyed mark that was not attacked. They are tried first, because
         weighting the bands and joint decoding are most of the work of `detect`.
         """
-        return self._reads_in_order(alignment.align(self.original, marked, "same"), message)
+        return self._reads_in_order(attempts.align(self.original, marked, "same"), message)
 
     def _reads_in_order(self, aligned: Alignment, message: bytes) -> bool:
         # The reader's shortcut stands for the scheme's own detector, not for any other.
@@ -176,7 +176,7 @@ class NonBlindMarker(Mark):
 
     def measure_survival(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival | None:
         """See `Marker`; messages are read by plain correlations: joint decoding may read in still more noise."""
-        aligned, rng = alignment.align(self.original, marked, "same"), np.random.default_rng(0)
+        aligned, rng = attempts.align(self.original, marked, "same"), np.random.default_rng(0)
         if not self._reads_in_order(aligned, message):
             return None
         points, used = self.original.positions, self.original.used
@@ -196,8 +196,8 @@ class NonBlindMarker(Mark):
         return Survival(*found)
 
     def register(self, suspect: Mesh, align: Align = "auto") -> Alignment:
-        """Align a suspect with the original; see `jaxmark.alignment.alignment.align`."""
-        return alignment.align(self.original, suspect, align)
+        """Align a suspect with the original; see `jaxmark.alignment.attempts.align`."""
+        return attempts.align(self.original, suspect, align)
 
     def read(self, registered: Alignment, message: bytes | None = None, weights: ArrayLike | None = None) -> Detection:
         """See `Marker`, and `jaxmark.watermark.nonblind.read`."""

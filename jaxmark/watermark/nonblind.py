@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float64
 from numpy.typing import ArrayLike
 
-from jaxmark.alignment import alignment
+from jaxmark.alignment import attempts
 from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.alignment.heights import VertexHeights
 from jaxmark.alignment.nonrigid import Bent
@@ -76,14 +76,14 @@ class Alternatives(NamedTuple):
 
 def _registrations(original: Original, suspect: Mesh, align: Align) -> Iterator[tuple[Charges, Alignment]]:
     """The ways in which a suspect is aligned, the likeliest first, and what they cost."""
-    aligned = alignment.align(original, suspect, align)
+    aligned = attempts.align(original, suspect, align)
     if aligned.method != "surface":
         yield (), aligned
         return
     yield (ledger.REFLECTION.charge("the one that fits better"),), aligned
     # The surface of a shape that is nearly its own mirror image does not tell whether a suspect was mirrored.
     with suppress(JaxmarkError):
-        other = alignment.align(original, suspect, align, hands=(not aligned.pose.mirrors,))
+        other = attempts.align(original, suspect, align, reflections=(not aligned.pose.mirrors,))
         yield (ledger.REFLECTION.charge("the other"),), other
 
 
@@ -104,7 +104,7 @@ def read(
 
     Args:
         mark: the mark to look for.
-        aligned: the suspect, from `jaxmark.alignment.alignment.align`; whatever the key, it is aligned only once.
+        aligned: the suspect, from `jaxmark.alignment.attempts.align`; whatever the key, it is aligned only once.
         message: the message that is claimed; None to read without a claim.
         weights: see `detect`.
         charges: what was chosen before.
@@ -129,7 +129,7 @@ def read(
     # mark that can be read moves some.
     if np.abs(aligned.displacement).max() * mark.original.diagonal <= 0.75 * mark.original.grid:
         return found._replace(notes=("The suspect is the original itself, without a mark.",))
-    charges = (*charges, ledger.ALIGNMENT.charge(aligned.how))
+    charges = (*charges, ledger.ALIGNMENT.charge(aligned.align))
     reading = _Reading(mark, aligned, found, claimed)
     read_again = reading.alternative(received) if weights is None else None
     if read_again is None:
@@ -192,7 +192,7 @@ class _Reading(NamedTuple):
 
     def read_nonrigid(self, bent: Bent, charges: Charges) -> Detection:
         """Read a suspect by non-rigid registration; the detection's registration stays that of one map."""
-        received = self.mark.receive(alignment.straightened(self.mark.original, self.aligned, bent))
+        received = self.mark.receive(self.aligned.straightened(self.mark.original, bent))
         found = self.found._replace(
             coverage=self.mark.coverage(received.observed),
             notes=("Each point was brought back by a map of its own surroundings, as if the suspect was bent.",),

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
-from jaxmark.alignment.alignment import align, straightened
+from jaxmark.alignment.attempts import align
 from jaxmark.alignment.nonrigid import _STEPS, Bent, straighten
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.geometry import asteroid
@@ -86,7 +86,7 @@ def test_the_mark_turns_back_with_its_surroundings(mesh, original):
     aligned = align(original, folded(moved, 40))
     assert aligned.bent is not None
     assert aligned.residual > 0.005
-    found = straightened(original, aligned, aligned.bent)
+    found = aligned.straightened(original, aligned.bent)
     assert found.residual < 0.3 * aligned.residual
     sound = found.weights > np.median(found.weights)
     alike = [

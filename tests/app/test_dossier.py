@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.alignment.alignment import align
+from jaxmark.alignment.attempts import align
 from jaxmark.alignment.original import make_original
 from jaxmark.app import dossier
 from jaxmark.app.output import power

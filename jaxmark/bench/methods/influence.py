@@ -21,7 +21,7 @@ from jaxtyping import Float64, Int64
 from scipy import sparse, stats
 from scipy.sparse import csgraph
 
-from jaxmark.alignment.alignment import align
+from jaxmark.alignment.attempts import align
 from jaxmark.alignment.original import displace, make_original
 from jaxmark.bench.method import Bits, Method, Reading
 from jaxmark.bench.methods.draws import choices, normal

@@ -13,7 +13,8 @@ from itertools import chain, tee
 
 import numpy as np
 
-from jaxmark.alignment.alignment import Alignment, align
+from jaxmark.alignment.alignment import Alignment
+from jaxmark.alignment.attempts import align
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.bench.method import Bits, Method, Reading
 from jaxmark.bench.methods.harmonics import THRESHOLD, HarmonicMark, make_mark

@@ -8,7 +8,7 @@ never on that of the chips: another recipient's copy under the same key is not i
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from jaxmark.alignment import alignment
+from jaxmark.alignment import attempts
 from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
@@ -55,8 +55,8 @@ class Tracer:
         return self.identify(suspect, [recipient])[0].log10_p <= _MAX_LOG10_P
 
     def register(self, suspect: Mesh, align: Align = "auto") -> Alignment:
-        """Align a suspect with the original; see `jaxmark.alignment.alignment.align`."""
-        return alignment.align(self.mark.original, suspect, align)
+        """Align a suspect with the original; see `jaxmark.alignment.attempts.align`."""
+        return attempts.align(self.mark.original, suspect, align)
 
     def identify(
         self, suspect: Mesh, recipients: Iterable[str], top: int = 10, align: Align = "auto"
@@ -67,7 +67,7 @@ class Tracer:
     def read(self, aligned: Alignment, recipients: Iterable[str], top: int = 10) -> list[Accusation]:
         """Rank recipients by their scores in a suspect that was aligned; see `identify`."""
         soft = self.mark.soft_decisions(self.mark.receive(aligned))
-        charge = ledger.COPY_ALIGNMENT.charge(aligned.how)
+        charge = ledger.COPY_ALIGNMENT.charge(aligned.align)
         ranking = rank(soft, recipients, self.mark.choices, top=top)
         return [one.charged(charge)._replace(caveats=self.mark.caveats) for one in ranking]
 

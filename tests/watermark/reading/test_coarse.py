@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.alignment.alignment import Alignment, align
+from jaxmark.alignment.alignment import Alignment
+from jaxmark.alignment.attempts import align
 from jaxmark.alignment.heights import measure_heights
 from jaxmark.geometry.mesh import Mesh, face_normals
 from jaxmark.geometry.simplified import simplify
@@ -139,5 +140,5 @@ def test_fine_suspects_have_no_heights():
 
 
 def test_without_the_simplifier_suspects_are_read_by_closest_points(monkeypatch):
-    monkeypatch.setattr("jaxmark.alignment.alignment.available", lambda module: False)
+    monkeypatch.setattr("jaxmark.alignment.by_surface.available", lambda module: False)
     assert align(marker_of(3).original, suspect()).heights is None

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.alignment import alignment
+from jaxmark.alignment import attempts
 from jaxmark.app import diagnosis
 from jaxmark.evaluation.tuning import tune
 from jaxmark.watermark.everyday import alternatives
@@ -114,8 +114,8 @@ def test_faint_marks_are_read_with_their_record_and_without():
 
 
 def test_all_bands_are_tried_beside_one_alignment(monkeypatch):
-    calls, align = [], alignment.align
-    monkeypatch.setattr(alignment, "align", lambda *given, **options: (calls.append(1), align(*given, **options))[1])
+    calls, align = [], attempts.align
+    monkeypatch.setattr(attempts, "align", lambda *given, **options: (calls.append(1), align(*given, **options))[1])
     found, mark = alternatives(SHAPE, jm.new_key(), bits=16).read(jm.attack(SHAPE, "noise", 0.001, seed=0))
     assert len(calls) == 1
     assert not found.detected()

@@ -1,0 +1,137 @@
+"""Align a suspect whose vertices are recognised: by their order, or by the connectivity around them."""
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from jaxmark.alignment.alignment import Alignment, file_pose, rms
+from jaxmark.alignment.fitting import FAR_DISTANCE, fit_pieces, fit_whole, min_piece_points
+from jaxmark.alignment.nonrigid import Bent
+from jaxmark.alignment.original import Original, residual
+from jaxmark.alignment.replay import replay_smoothing_of_points
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.connectivity import matching_vertices
+from jaxmark.geometry.mesh import Mesh, component_of, same_connectivity, weld, weld_mesh
+from jaxmark.geometry.pose import Points, Pose
+
+MIN_COVERAGE = 0.05  # share of the original that an alignment must show
+_COPIES_APART = 0.1  # distance of copies of a point, over the size of the suspect, above which its order is another
+_ROUNDING = 1e-12  # error of sums over all points, in diagonals; if no coordinate is off by more, the displacement is 0
+
+
+def align_in_order(original: Original, suspect: Mesh) -> Alignment:
+    """Align a suspect whose vertices are the original's, one by one.
+
+    Raises:
+        JaxmarkError: if the suspect has other faces or another number of vertices, or the original's file has another
+            order than the one that was marked.
+    """
+    if not original.in_order:
+        raise JaxmarkError(
+            "The original's file has another order than the one that was marked, so that vertices cannot be compared in"
+            " order; align by 'auto'."
+        )
+    y = np.asarray(original.positions, np.float64) + residual(original, suspect)
+    back = file_pose(original).inverse()
+    return align_points(original, y, original.used, np.asarray(original.points.faces), "same", back)
+
+
+def has_same_order(original: Original, suspect: Mesh) -> bool:
+    """Whether a suspect's vertices seem to be in the order of the original that was marked."""
+    alike = original.in_order and same_connectivity(suspect, original.mesh)
+    return alike and _has_copies_together(original, suspect)
+
+
+def align_by_connectivity(original: Original, suspect: Mesh) -> Alignment | None:
+    """Align a suspect by vertices whose surroundings have the original's connectivity; None if there are too few."""
+    welded = weld_mesh(suspect, weld(suspect.vertices))
+    # If a suspect has no copies of points, the welded mesh is the suspect itself.
+    copies = len(welded.vertices) < len(suspect.vertices)
+    for points in (welded, suspect) if copies else (welded,):
+        match = matching_vertices(Mesh(original.positions, original.points.faces), points)
+        found = original.used & (match >= 0)
+        y = np.asarray(points.vertices)[match]
+        size = np.ptp(y[found], axis=0).max() if found.any() else 0.0
+        if found.sum() >= max(4, MIN_COVERAGE * original.used.sum()) and size > 0:
+            scale = Pose(np.eye(3) / size, np.zeros(3))
+            # The suspect's faces between points that were found, as indices of the original's points.
+            point = np.full(len(points.vertices), -1)
+            point[match[found]] = np.flatnonzero(found)
+            faces = point[np.asarray(points.faces)]
+            faces = faces[(faces >= 0).all(axis=1)]
+            return align_points(original, scale(y), found, faces, "connectivity", scale)
+    return None
+
+
+def with_faces_of(mesh: Mesh, suspect: Mesh) -> Mesh:
+    """Give a suspect a mesh's own faces, if its faces are these but for the order of corners.
+
+    Programs that mirror a mesh reverse its faces, so that normals point outwards again.
+    """
+    if len(mesh.vertices) != len(suspect.vertices) or len(mesh.faces) != len(suspect.faces):
+        return suspect
+    mine, theirs = (np.sort(faces, axis=1) for faces in (mesh.faces, suspect.faces))
+    return suspect._replace(faces=mesh.faces) if np.array_equal(mine, theirs) else suspect
+
+
+def align_points(
+    original: Original,
+    y: Points,
+    known: Bool[np.ndarray, " points"],
+    faces: Int64[np.ndarray, "faces 3"],
+    method: Literal["same", "connectivity", "points"],
+    before: Pose,
+) -> Alignment:
+    """Align a suspect by its recognised points.
+
+    Args:
+        original: the original.
+        y: position of each known point in the suspect, after the map `before`.
+        known: mask of the points that were recognised.
+        faces: the suspect's faces between known points.
+        method: how they were recognised.
+        before: a map that has been applied to the suspect's coordinates.
+    """
+    x = np.asarray(original.positions, np.float64)
+    moved = y - x
+    # A coordinate of 1e200 would spoil every sum; such a point is lost in any case.
+    spread = np.abs(moved - np.median(moved[known], axis=0)).max(axis=1)
+    sound = known & (spread <= 1e6 * max(np.quantile(spread[known], 0.6), 1e-6))
+    pose, agreeing = fit_whole(x, y, sound, spread)
+    error = np.where(agreeing[:, None], pose(y) - x, 0)
+    # Points that do not agree may belong to pieces that moved apart; if the residual is large, so may all points.
+    far = rms(error[agreeing]) > FAR_DISTANCE
+    has_pieces = far or np.sum(sound & ~agreeing) >= min_piece_points(x)
+    bent = Bent(pose(y), sound) if has_pieces else None
+    label = np.where(sound, component_of(Mesh(y, faces)), -1) if has_pieces else np.full(len(x), -1)
+    pieces = fit_pieces(x, y, label) if far else []
+    if 2 * sum(len(points) for points, _ in pieces) > known.sum():
+        agreeing, pose = np.zeros(len(x), bool), pieces[0][1]
+    else:
+        pieces = fit_pieces(x, y, np.where(agreeing, -1, label))
+    for points, back in pieces:
+        agreeing[points] = True
+        error[points] = back(y[points]) - x[points]
+    error = np.where(agreeing[:, None], error, 0)
+    if np.abs(error).max() < _ROUNDING:
+        error = np.zeros_like(error)
+    mesh = Mesh(original.positions, original.points.faces)
+    nuisance = replay_smoothing_of_points(original.operator, mesh, error, agreeing)
+    pose = before.then(pose).then(file_pose(original))
+    size = rms(error[agreeing])
+    return Alignment(error, agreeing.astype(float), None, nuisance, method, pose, size, bent=bent)
+
+
+def _has_copies_together(original: Original, suspect: Mesh) -> bool:
+    """Whether the copies of a point are still near each other in a suspect; of shuffled triangle soup they are not.
+
+    All triangle soups of one size have the same faces, so that their connectivity alone tells nothing of their order.
+    """
+    first = original.weld.first[original.weld.point]
+    copies = np.flatnonzero(first != np.arange(len(first)))
+    vertices = np.asarray(suspect.vertices, np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):  # a vertex may be thrown anywhere
+        apart = np.abs(vertices[copies] - vertices[first[copies]]).max(axis=1)
+        size = np.abs(vertices - np.median(vertices, axis=0)).max(axis=1)
+    return len(copies) == 0 or bool(np.median(apart) <= _COPIES_APART * np.median(size))
