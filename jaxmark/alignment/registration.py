@@ -213,7 +213,7 @@ def refine(
 
 
 def _coarse(target: Points, source: Others, settings: RegistrationSettings) -> list[Pose]:
-    """Find the likeliest distinct poses of both reflections by principal axes and closest points; none if all fit badly."""
+    """Find the likeliest poses of either reflection by principal axes and closest points; none if all fit badly."""
     forward, backward = KDTree(target), KDTree(source)
     coarse, fine = slice(settings.coarse_points), slice(settings.fine_points)
     starts = poses_by_axes(target, source)
