@@ -9,19 +9,15 @@ import time
 from collections.abc import Sequence
 from typing import get_args
 
-import numpy as np
-
 from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.alignment.by_cloud import align_cloud, align_cloud_in_order
 from jaxmark.alignment.by_surface import align_surfaces
-from jaxmark.alignment.by_vertices import align_by_connectivity, align_in_order, has_same_order, with_faces_of
+from jaxmark.alignment.by_vertices import align_by_connectivity, align_in_order
 from jaxmark.alignment.features import EITHER
 from jaxmark.alignment.original import Original
+from jaxmark.alignment.suspect import Suspect, make_suspect
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, host_mesh
-from jaxmark.geometry.pose import IDENTITY, Pose
-
-_SMALLEST = 1e-50  # size of a suspect, in its file's units, whose powers do not vanish
+from jaxmark.geometry.mesh import Mesh
 
 
 def align(
@@ -47,34 +43,21 @@ def align(
     if align not in get_args(Align):
         raise JaxmarkError(f"A suspect is aligned by {', '.join(get_args(Align))}, not {align!r}.")
     start = time.perf_counter()
-    suspect, back = _in_range(host_mesh(suspect))
-    found = _attempt(original, with_faces_of(original.mesh, suspect), align, reflections)
-    return found._replace(pose=back.then(found.pose), seconds=time.perf_counter() - start, align=align)
+    ready = make_suspect(original, suspect)
+    found = _attempt(original, ready, align, reflections)
+    return found._replace(pose=ready.pose.then(found.pose), seconds=time.perf_counter() - start, align=align)
 
 
-def _attempt(original: Original, suspect: Mesh, align: Align, reflections: Sequence[bool]) -> Alignment:
+def _attempt(original: Original, suspect: Suspect, align: Align, reflections: Sequence[bool]) -> Alignment:
     """Attempt the ways of aligning in their order, until one works."""
     if align == "same":
-        return align_in_order(original, suspect)
-    if len(suspect.faces) == 0 or len(original.points.faces) == 0:
+        return align_in_order(original, suspect.mesh)
+    if suspect.is_cloud or len(original.points.faces) == 0:
         in_order = align_cloud_in_order(original, suspect) if align == "auto" else None
         return in_order or align_cloud(original, suspect, align, reflections)
     if align == "auto":
-        if has_same_order(original, suspect):
-            return align_in_order(original, suspect)
+        if suspect.has_order_of(original):
+            return align_in_order(original, suspect.mesh)
         if (found := align_by_connectivity(original, suspect)) is not None:
             return found
     return align_surfaces(original, suspect, reflections, by_affine=align == "affine")
-
-
-def _in_range(suspect: Mesh) -> tuple[Mesh, Pose]:
-    """Scale a suspect to a size whose powers do not overflow or vanish; returns it, and the map to it, mostly none."""
-    vertices = np.asarray(suspect.vertices)
-    size = float(np.quantile(np.abs(vertices - np.median(vertices, axis=0)).max(axis=1), 0.6))  # of most points
-    if not 0 < size < np.inf or _SMALLEST < size < 1 / _SMALLEST:
-        return suspect, IDENTITY
-    # In two steps, as a factor may be out of range itself.
-    exponent = -int(np.floor(np.log2(size)))
-    half = np.ldexp(1.0, exponent // 2)
-    scaled = np.asarray(suspect.vertices) * half * np.ldexp(1.0, exponent - exponent // 2)
-    return suspect._replace(vertices=scaled), Pose(np.ldexp(1.0, min(exponent, 1000)) * np.eye(3), np.zeros(3))

@@ -11,9 +11,10 @@ from jaxmark.alignment.fitting import FAR_DISTANCE, agreeing
 from jaxmark.alignment.nearest import find_heights, settle
 from jaxmark.alignment.original import Original
 from jaxmark.alignment.registration import SETTINGS, refine, register_part, register_whole
+from jaxmark.alignment.suspect import Suspect
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.clouds import Cloud
-from jaxmark.geometry.mesh import Mesh, used_vertices
+from jaxmark.geometry.mesh import used_vertices
 from jaxmark.geometry.pose import Pose
 from jaxmark.geometry.surfaces import Surface
 
@@ -21,23 +22,23 @@ _MIN_IN_PLACE = 0.5  # share of a cloud's points that must be in order, or near 
 _SAMPLES_PER_POINT = 2  # points sampled from a surface for each of an original cloud, which they are compared with
 
 
-def align_cloud_in_order(original: Original, suspect: Mesh) -> Alignment | None:
+def align_cloud_in_order(original: Original, suspect: Suspect) -> Alignment | None:
     """Align a cloud by the order of its points; None if they seem to be in another order."""
-    if not original.in_order or len(suspect.vertices) != len(original.mesh.vertices):
+    if not original.in_order or len(suspect.mesh.vertices) != len(original.mesh.vertices):
         return None
-    found = align_in_order(original, suspect._replace(faces=original.mesh.faces))
+    found = align_in_order(original, suspect.mesh._replace(faces=original.mesh.faces))
     return found if found.residual <= FAR_DISTANCE and found.coverage(original) >= _MIN_IN_PLACE else None
 
 
-def align_cloud(original: Original, suspect: Mesh, align: Align, reflections: Sequence[bool]) -> Alignment:
+def align_cloud(original: Original, suspect: Suspect, align: Align, reflections: Sequence[bool]) -> Alignment:
     """Align a suspect by its points: the faces of either mesh tell nothing about the other one.
 
     Raises:
         JaxmarkError: if no pose brings its points near the original's.
     """
-    points = np.asarray(suspect.vertices, np.float64)[used_vertices(suspect)]
-    if len(suspect.faces):
-        sampled = Surface(suspect).sample(_SAMPLES_PER_POINT * int(original.used.sum())).points
+    points = np.asarray(suspect.mesh.vertices, np.float64)[used_vertices(suspect.mesh)]
+    if not suspect.is_cloud:
+        sampled = Surface(suspect.mesh).sample(_SAMPLES_PER_POINT * int(original.used.sum())).points
         points = np.concatenate([points, sampled])
     target, source = Cloud(original.positions[original.used]), Cloud(points)
     least, fitting = np.inf, []

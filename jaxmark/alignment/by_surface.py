@@ -12,6 +12,7 @@ from jaxmark.alignment.heights import measure_heights
 from jaxmark.alignment.original import Original
 from jaxmark.alignment.registration import refine, register_part, register_whole
 from jaxmark.alignment.replay import replay_smoothing
+from jaxmark.alignment.suspect import Suspect
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import available
 from jaxmark.geometry.mesh import (
@@ -21,8 +22,6 @@ from jaxmark.geometry.mesh import (
     face_normals,
     used_vertices,
     vertex_normals,
-    weld,
-    weld_mesh,
 )
 from jaxmark.geometry.pose import Points, Pose
 from jaxmark.geometry.surfaces import Surface, on_rim
@@ -35,16 +34,15 @@ _FULL_COVERAGE = 0.95  # share of the original from which on no further pieces a
 _FEW_VERTICES = 0.5  # of the original's: with so many or less, a surface is right at its vertices, and chords between
 
 
-def align_surfaces(original: Original, suspect: Mesh, reflections: Sequence[bool], *, by_affine: bool) -> Alignment:
+def align_surfaces(original: Original, suspect: Suspect, reflections: Sequence[bool], *, by_affine: bool) -> Alignment:
     """Align a suspect's surface: as the whole of the original, else as a part of it, else one component at a time.
 
     Raises:
         JaxmarkError: if no pose brings its surface near the original's.
     """
     surface = Surface(Mesh(original.positions, original.points.faces))
-    welded = weld_mesh(suspect, weld(suspect.vertices))
-    whole = Surface(welded)
-    parts = [Surface(part) for part in components(welded)[:_MAX_COMPONENTS] if area(part) > 0]
+    whole = Surface(suspect.welded)
+    parts = [Surface(part) for part in components(suspect.welded)[:_MAX_COMPONENTS] if area(part) > 0]
     parts = parts if len(parts) > 1 else []
     failed: list[Alignment] = []
     for part, register in ((whole, register_whole), (whole, register_part), *((p, register_whole) for p in parts)):

@@ -10,13 +10,13 @@ from jaxmark.alignment.fitting import FAR_DISTANCE, fit_pieces, fit_whole, min_p
 from jaxmark.alignment.nonrigid import Bent
 from jaxmark.alignment.original import Original, residual
 from jaxmark.alignment.replay import replay_smoothing_of_points
+from jaxmark.alignment.suspect import Suspect
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.connectivity import matching_vertices
-from jaxmark.geometry.mesh import Mesh, component_of, same_connectivity, weld, weld_mesh
+from jaxmark.geometry.mesh import Mesh, component_of
 from jaxmark.geometry.pose import Points, Pose
 
 MIN_COVERAGE = 0.05  # share of the original that an alignment must show
-_COPIES_APART = 0.1  # distance of copies of a point, over the size of the suspect, above which its order is another
 _ROUNDING = 1e-12  # error of sums over all points, in diagonals; if no coordinate is off by more, the displacement is 0
 
 
@@ -37,18 +37,11 @@ def align_in_order(original: Original, suspect: Mesh) -> Alignment:
     return align_points(original, y, original.used, np.asarray(original.points.faces), "same", back)
 
 
-def has_same_order(original: Original, suspect: Mesh) -> bool:
-    """Whether a suspect's vertices seem to be in the order of the original that was marked."""
-    alike = original.in_order and same_connectivity(suspect, original.mesh)
-    return alike and _has_copies_together(original, suspect)
-
-
-def align_by_connectivity(original: Original, suspect: Mesh) -> Alignment | None:
+def align_by_connectivity(original: Original, suspect: Suspect) -> Alignment | None:
     """Align a suspect by vertices whose surroundings have the original's connectivity; None if there are too few."""
-    welded = weld_mesh(suspect, weld(suspect.vertices))
     # If a suspect has no copies of points, the welded mesh is the suspect itself.
-    copies = len(welded.vertices) < len(suspect.vertices)
-    for points in (welded, suspect) if copies else (welded,):
+    copies = len(suspect.welded.vertices) < len(suspect.mesh.vertices)
+    for points in (suspect.welded, suspect.mesh) if copies else (suspect.welded,):
         match = matching_vertices(Mesh(original.positions, original.points.faces), points)
         found = original.used & (match >= 0)
         y = np.asarray(points.vertices)[match]
@@ -62,17 +55,6 @@ def align_by_connectivity(original: Original, suspect: Mesh) -> Alignment | None
             faces = faces[(faces >= 0).all(axis=1)]
             return align_points(original, scale(y), found, faces, "connectivity", scale)
     return None
-
-
-def with_faces_of(mesh: Mesh, suspect: Mesh) -> Mesh:
-    """Give a suspect a mesh's own faces, if its faces are these but for the order of corners.
-
-    Programs that mirror a mesh reverse its faces, so that normals point outwards again.
-    """
-    if len(mesh.vertices) != len(suspect.vertices) or len(mesh.faces) != len(suspect.faces):
-        return suspect
-    mine, theirs = (np.sort(faces, axis=1) for faces in (mesh.faces, suspect.faces))
-    return suspect._replace(faces=mesh.faces) if np.array_equal(mine, theirs) else suspect
 
 
 def align_points(
@@ -121,17 +103,3 @@ def align_points(
     pose = before.then(pose).then(file_pose(original))
     size = rms(error[agreeing])
     return Alignment(error, agreeing.astype(float), None, nuisance, method, pose, size, bent=bent)
-
-
-def _has_copies_together(original: Original, suspect: Mesh) -> bool:
-    """Whether the copies of a point are still near each other in a suspect; of shuffled triangle soup they are not.
-
-    All triangle soups of one size have the same faces, so that their connectivity alone tells nothing of their order.
-    """
-    first = original.weld.first[original.weld.point]
-    copies = np.flatnonzero(first != np.arange(len(first)))
-    vertices = np.asarray(suspect.vertices, np.float64)
-    with np.errstate(over="ignore", invalid="ignore"):  # a vertex may be thrown anywhere
-        apart = np.abs(vertices[copies] - vertices[first[copies]]).max(axis=1)
-        size = np.abs(vertices - np.median(vertices, axis=0)).max(axis=1)
-    return len(copies) == 0 or bool(np.median(apart) <= _COPIES_APART * np.median(size))

@@ -112,8 +112,8 @@ def test_a_message_is_read_in_another_pose_without_a_skeleton(mesh, key: jm.Key)
     marker = jm.make_marker(mesh, key, bits=16)
     marked, _ = marker.embed(b"ok", 8e-4)
     suspect = folded(marked, 40)
-    assert marker.decode(marker.soft_decisions(marker.receive(suspect))) is None  # by a single map
     aligned = align(marker.original, suspect)
+    assert marker.decode(marker.soft_decisions(marker.receive(aligned))) is None  # by a single map
     found = marker.detect(aligned)
     assert found.message == b"ok"
     assert found.detected()

@@ -1,0 +1,73 @@
+"""A suspect made ready for alignment: of a usual size, with the original's own faces where it has these."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from jaxmark.alignment.original import Original
+from jaxmark.geometry.mesh import Mesh, host_mesh, same_connectivity, weld, weld_mesh
+from jaxmark.geometry.pose import IDENTITY, Pose
+
+_SMALLEST = 1e-50  # size of a suspect, in its file's units, whose powers do not vanish
+_COPIES_APART = 0.1  # distance of copies of a point, over the size of the suspect, above which its order is another
+
+
+@dataclass(frozen=True, eq=False)
+class Suspect:
+    """A suspect made ready for alignment with an original; make one with `make_suspect`."""
+
+    mesh: Mesh  # of a size whose powers neither overflow nor vanish
+    pose: Pose  # from the file's coordinates to those of `mesh`
+
+    @property
+    def is_cloud(self) -> bool:
+        """Whether it has no faces."""
+        return len(self.mesh.faces) == 0
+
+    @cached_property
+    def welded(self) -> Mesh:
+        """The mesh with one vertex for each position."""
+        return weld_mesh(self.mesh, weld(self.mesh.vertices))
+
+    def has_order_of(self, original: Original) -> bool:
+        """Whether its vertices seem to be in the order of the original that was marked."""
+        alike = original.in_order and same_connectivity(self.mesh, original.mesh)
+        return alike and self._has_copies_together(original)
+
+    def _has_copies_together(self, original: Original) -> bool:
+        """Whether the copies of a point are still near each other; of shuffled triangle soup they are not.
+
+        All triangle soups of one size have the same faces, so that connectivity alone tells nothing about their order.
+        """
+        first = original.weld.first[original.weld.point]
+        copies = np.flatnonzero(first != np.arange(len(first)))
+        vertices = np.asarray(self.mesh.vertices, np.float64)
+        with np.errstate(over="ignore", invalid="ignore"):  # a vertex may be thrown anywhere
+            apart = np.abs(vertices[copies] - vertices[first[copies]]).max(axis=1)
+            size = np.abs(vertices - np.median(vertices, axis=0)).max(axis=1)
+        return len(copies) == 0 or bool(np.median(apart) <= _COPIES_APART * np.median(size))
+
+
+def make_suspect(original: Original, mesh: Mesh) -> Suspect:
+    """Check a mesh, scale it to a usual size, and give it the original's faces if these differ by corners' order only.
+
+    Programs that mirror a mesh reverse its faces, so that normals point outwards again.
+
+    Raises:
+        JaxmarkError: see `make_mesh`.
+    """
+    mesh = host_mesh(mesh)
+    vertices, faces, own = np.asarray(mesh.vertices), np.asarray(mesh.faces), np.asarray(original.mesh.faces)
+    alike = len(vertices) == len(original.mesh.vertices) and len(faces) == len(own)
+    if alike and np.array_equal(np.sort(faces, axis=1), np.sort(own, axis=1)):
+        mesh = mesh._replace(faces=own)
+    size = float(np.quantile(np.abs(vertices - np.median(vertices, axis=0)).max(axis=1), 0.6))  # of most points
+    if not 0 < size < np.inf or _SMALLEST < size < 1 / _SMALLEST:
+        return Suspect(mesh, IDENTITY)
+    # In two steps, as a factor may be out of range itself.
+    exponent = -int(np.floor(np.log2(size)))
+    half = np.ldexp(1.0, exponent // 2)
+    scaled = vertices * half * np.ldexp(1.0, exponent - exponent // 2)
+    pose = Pose(np.ldexp(1.0, min(exponent, 1000)) * np.eye(3), np.zeros(3))
+    return Suspect(mesh._replace(vertices=scaled), pose)
