@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Int64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import gltf, las, obj, off, ply, stl, threemf, xyz
-from jaxmark.files.atomic import write_atomically, write_together
-from jaxmark.files.reading import read_beside, read_file
+from jaxmark.files import obj, off, ply, point_cloud, stl, threemf
+from jaxmark.files.atomic import read_beside, read_file, write_atomically, write_together
+from jaxmark.files.gltf import asset
 from jaxmark.files.source import Patched, Source, Texture
 from jaxmark.geometry.mesh import Mesh, host_mesh, make_mesh
 from jaxmark.geometry.skinning import Skinning
@@ -46,12 +46,12 @@ _FORMATS: dict[str, _Parser] = {
     ".ply": _alone(ply.parse),
     ".off": _alone(off.parse),
     ".stl": _alone(stl.parse),
-    ".glb": gltf.parse,
-    ".gltf": gltf.parse,
+    ".glb": asset.parse,
+    ".gltf": asset.parse,
     ".3mf": _alone(threemf.parse),
-    ".xyz": _alone(xyz.parse),
-    ".las": _alone(las.parse),
-    ".laz": _alone(las.parse),
+    ".xyz": _alone(point_cloud.parse_xyz),
+    ".las": _alone(point_cloud.parse_las),
+    ".laz": _alone(point_cloud.parse_las),
 }
 SUFFIXES = tuple(_FORMATS)
 # A file's numbers keep a displacement well enough if its RMS is at least this many times their spacing.

@@ -1,47 +1,84 @@
 """Parsed mesh files, which can be written again with other positions and otherwise the same bytes."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
+from scipy import sparse
+from scipy.sparse import csgraph
 
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.pose import Points
 from jaxmark.geometry.skinning import Skinning
+
+Rows = Float64[np.ndarray, "rows 3"]
+Faces = Int64[np.ndarray, "faces 3"]
+Indices = Int64[np.ndarray, " _"]  # or byte offsets
+Texture = Float64[np.ndarray, "faces 3 2"] | None
 
 
 class Edits(NamedTuple):
     """Byte spans of a file to be replaced by other bytes; the spans do not overlap."""
 
-    starts: Int64[np.ndarray, " edits"]
-    ends: Int64[np.ndarray, " edits"]
+    starts: Indices
+    ends: Indices
     tokens: list[bytes]  # the new bytes of each span, of any length
 
 
 class Overlay(NamedTuple):
     """Numbers of a fixed size to be written at byte offsets, all at once, which is fast for a million of them."""
 
-    starts: Int64[np.ndarray, " numbers"]
+    starts: Indices
     bytes: UInt8[np.ndarray, "numbers size"]  # the new bytes of each number
+
+
+Changes = list[Edits | Overlay]
 
 
 @runtime_checkable
 class Numbers(Protocol):
     """Triples of numbers in a file: its positions or normals."""
 
-    values: Float64[np.ndarray, "rows 3"]
+    values: Rows
 
-    def edits(self, values: Float64[np.ndarray, "rows 3"]) -> list[Edits | Overlay]:
-        """The edits that write new values; numbers that did not change are not touched."""
+    def edits(self, values: Rows) -> Changes:
+        """Return the edits that write new values; numbers that did not change are not touched."""
         ...
 
-    def spacing(self, values: Float64[np.ndarray, "rows 3"], rows: Int64[np.ndarray, " some"]) -> float:
-        """The largest step between neighbouring numbers that can be written at the new values of some rows."""
+    def spacing(self, values: Rows, rows: Indices) -> float:
+        """Return the largest step between neighbouring numbers that can be written at the new values of some rows."""
         ...
 
     def advice(self, step: float) -> str:
         """Advise, as half a sentence, what would make the spacing as small as `step`."""
         ...
+
+
+class JoinedNumbers:
+    """Triples of numbers that follow each other in several parts; see `Numbers`."""
+
+    def __init__(self, parts: Sequence[Numbers]) -> None:
+        self._parts = parts
+        self._ends = np.cumsum([len(part.values) for part in parts])
+        self.values = np.concatenate([part.values for part in parts])
+
+    def edits(self, values: Rows) -> Changes:
+        """Return the edits of all parts."""
+        pieces = zip(self._parts, np.split(values, self._ends[:-1]), strict=True)
+        return [edit for part, piece in pieces for edit in part.edits(piece)]
+
+    def spacing(self, values: Rows, rows: Indices) -> float:
+        """Return the largest spacing of the parts that the rows are in."""
+        pieces, starts = np.split(values, self._ends[:-1]), [0, *self._ends]
+        place = np.searchsorted(self._ends, rows, side="right")
+        return max(self._parts[k].spacing(pieces[k], rows[place == k] - starts[k]) for k in np.unique(place))
+
+    def advice(self, step: float) -> str:
+        """Advise what the first part advises."""
+        return self._parts[0].advice(step)
 
 
 @runtime_checkable
@@ -50,35 +87,17 @@ class Normals(Protocol):
 
     numbers: Numbers  # the normals in the file
 
-    def moved(
-        self,
-        old: Float64[np.ndarray, "points 3"],
-        new: Float64[np.ndarray, "points 3"],
-        faces: Int64[np.ndarray, "faces 3"],
-    ) -> Float64[np.ndarray, "rows 3"]:
-        """The normals after the points moved from `old` to `new`."""
+    def moved(self, old: Points, new: Points, faces: Faces) -> Rows:
+        """Compute the normals after the points moved from `old` to `new`."""
         ...
-
-
-Texture = Float64[np.ndarray, "faces 3 2"] | None
-
-
-def no_texture() -> Texture:
-    """The texture coordinates of a file that has none."""
-    return None
-
-
-def no_skin() -> Skinning | None:
-    """The skin of a file that has none."""
-    return None
 
 
 class Part(NamedTuple):
     """One mesh of a file that may hold several."""
 
     name: str  # unique in the file
-    places: Int64[np.ndarray, " points"]  # its points, as rows of the file's positions
-    faces: Int64[np.ndarray, "faces 3"]  # indices into `places`
+    places: Indices  # its points, as rows of the file's positions
+    faces: Faces  # indices into `places`
 
 
 class Patched(NamedTuple):
@@ -97,38 +116,37 @@ class Source:
     Attributes:
         data: the file's bytes.
         coordinates: the positions in the file.
-        faces: `[F, 3]` zero-based indices into the positions; polygons are split into triangles.
+        faces: zero-based indices into the positions; polygons are split into triangles.
         normals: the normals that follow the positions, if the file has any.
         texture: reads the texture coordinates of each face's corners, NaN where there are none; None without any.
         skin: reads which joints move each point; None without any.
         parts: the meshes in the file that can be marked; empty if there is just one in it.
-        left: the others by name, and why they cannot.
+        left: the other meshes by name, and why they cannot be marked.
     """
 
     data: bytes
     coordinates: Numbers
-    faces: Int64[np.ndarray, "faces 3"]
+    faces: Faces
     normals: Normals | None = None
-    texture: Callable[[], Texture] = no_texture
-    skin: Callable[[], Skinning | None] = no_skin
+    texture: Callable[[], Texture] = lambda: None
+    skin: Callable[[], Skinning | None] = lambda: None
     parts: Sequence[Part] = ()
     left: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def positions(self) -> Float64[np.ndarray, "points 3"]:
+    def positions(self) -> Points:
         """The positions in file order."""
         return self.coordinates.values
 
-    def edits(self, positions: Float64[np.ndarray, "points 3"]) -> list[Edits | Overlay]:
-        """All edits that write these positions and the normals that follow them."""
+    def edits(self, positions: Points) -> Changes:
+        """Return all edits that write these positions and the normals that follow them."""
         edits = self.coordinates.edits(positions)
         if self.normals is not None:
-            moved = self.normals.moved(self.positions, positions, self.faces)
-            edits += self.normals.numbers.edits(moved)
+            edits += self.normals.numbers.edits(self.normals.moved(self.positions, positions, self.faces))
         return edits
 
-    def patch(self, positions: Float64[np.ndarray, "points 3"], name: str) -> Patched:
-        """The file with these positions; whatever is no coordinate or normal stays byte for byte.
+    def patch(self, positions: Points, name: str) -> Patched:
+        """Write these positions into the file; all bytes but those of coordinates and normals stay.
 
         Args:
             positions: the new ones.
@@ -140,8 +158,29 @@ class Source:
         return Patched(splice(self.data, self.edits(positions)))
 
 
+@contextmanager
+def concerning(where: object) -> Iterator[None]:
+    """Name the file or the part of it that a refusal in the block concerns."""
+    try:
+        yield
+    except JaxmarkError as error:
+        raise JaxmarkError(f"{where}: {error}") from error
+
+
+def none_usable(left: Mapping[str, str], count: int) -> str:
+    """Return the sentence that none of several meshes can be marked, with the first reasons."""
+    reasons = "; ".join(f"{name!r}: {reason}" for name, reason in list(left.items())[:3])
+    return f"None of its {count} meshes can be marked: {reasons}{'; …' if len(left) > 3 else ''}."
+
+
+def linked(one: Indices, other: Indices, count: int) -> Indices:
+    """Number the connected components of a graph of `count` nodes, and return that of each node."""
+    graph = sparse.coo_array((np.ones(len(one), np.int8), (one, other)), (count, count))
+    return csgraph.connected_components(graph, directed=False)[1]
+
+
 def unique_names(names: Iterable[str]) -> list[str]:
-    """Names of which no two are the same."""
+    """Number repeated names, so that no two are the same."""
     count: dict[str, int] = {}
     unique: list[str] = []
     for name in names:
@@ -150,8 +189,8 @@ def unique_names(names: Iterable[str]) -> list[str]:
     return unique
 
 
-def changed(old: Float64[np.ndarray, "rows 3"], new: Float64[np.ndarray, "rows 3"]) -> Bool[np.ndarray, "rows 3"]:
-    """Mask of the numbers to be written anew; a NaN normal is kept, though it does not equal itself."""
+def changed(old: Rows, new: Rows) -> Bool[np.ndarray, "rows 3"]:
+    """Return the mask of the numbers to be written; a NaN normal is kept, though it does not equal itself."""
     return (old != new) & np.isfinite(new)
 
 
@@ -164,26 +203,21 @@ def splice(data: bytes, changes: Iterable[Edits | Overlay]) -> bytes:
             for byte in range(change.bytes.shape[1]):
                 out[change.starts + byte] = change.bytes[:, byte]
         else:
-            edits.append(change)
-    data = out.tobytes()
+            edits += zip(change.starts.tolist(), change.ends.tolist(), change.tokens, strict=True)
+    data, at = out.tobytes(), 0
     pieces: list[bytes] = []
-    at = 0
-    for start, end, token in sorted(
-        edit for group in edits for edit in zip(group.starts.tolist(), group.ends.tolist(), group.tokens, strict=True)
-    ):
+    for start, end, token in sorted(edits):
         pieces += (data[at:start], token)
         at = end
-    pieces.append(data[at:])
-    return b"".join(pieces)
+    return b"".join([*pieces, data[at:]])
 
 
-def ranges(starts: Int64[np.ndarray, " rows"], sizes: Int64[np.ndarray, " rows"]) -> Int64[np.ndarray, " total"]:
+def ranges(starts: Indices, sizes: Indices) -> Int64[np.ndarray, " total"]:
     """Concatenate the ranges `[start, start + size)`."""
-    before = np.cumsum(sizes) - sizes
-    return np.repeat(starts - before, sizes) + np.arange(sizes.sum())
+    return np.repeat(starts - (np.cumsum(sizes) - sizes), sizes) + np.arange(sizes.sum())
 
 
-def fan(sizes: Int64[np.ndarray, " polygons"]) -> Int64[np.ndarray, "faces 3"]:
+def fan(sizes: Indices) -> Faces:
     """Split polygons into triangles (v0, v1, v2), (v0, v2, v3) and so on.
 
     Args:
@@ -192,6 +226,6 @@ def fan(sizes: Int64[np.ndarray, " polygons"]) -> Int64[np.ndarray, "faces 3"]:
     Returns:
         The three corner numbers of each triangle.
     """
-    first = np.repeat(np.cumsum(sizes) - sizes, sizes - 2)
-    second = ranges(np.cumsum(sizes) - sizes + 1, sizes - 2)
-    return np.stack([first, second, second + 1], axis=1)
+    first = np.cumsum(sizes) - sizes
+    second = ranges(first + 1, sizes - 2)
+    return np.stack([np.repeat(first, sizes - 2), second, second + 1], axis=1)

@@ -1,4 +1,4 @@
-"""Read the XML in a 3MF file: where in its bytes the numbers of meshes are, and how its members are related."""
+"""Read the XML in a 3MF file: the places of the numbers of meshes in its bytes, and relations of its members."""
 
 import re
 from typing import NamedTuple
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files.text import line_error
 
 _ENCODINGS = ("utf-8", "utf8", "us-ascii", "ascii")
 _COLUMNS = {"vertices": (b"x", b"y", b"z"), "triangles": (b"v1", b"v2", b"v3")}
@@ -25,22 +26,19 @@ _PLAIN = (
 _MAX_NAME = 200
 
 
-class Triples(NamedTuple):
-    """The byte spans of three numbers in each element of a list."""
-
-    starts: Int64[np.ndarray, "rows 3"]
-    ends: Int64[np.ndarray, "rows 3"]
+Spans = Int64[np.ndarray, "rows 3 2"]  # first byte and end of the three numbers in each element of a list
+NO_SPANS: Spans = np.zeros((0, 3, 2), np.int64)
 
 
 class RawMesh(NamedTuple):
     """A mesh whose numbers are not read yet."""
 
     name: str
-    lists: dict[str, Triples]  # vertices and triangles, as far as they are there
+    lists: dict[str, Spans]  # vertices and triangles, as far as they are there
 
 
 class _Parser:
-    """An XML parser that knows its byte offsets, also if it is not shown all bytes."""
+    """An XML parser that knows its byte offsets, also if bytes are skipped."""
 
     def __init__(self) -> None:
         self.expat = expat.ParserCreate("utf-8", " ")
@@ -50,7 +48,7 @@ class _Parser:
 
     @property
     def at(self) -> int:
-        """The byte offset of what is being handled."""
+        """The byte offset of the element that is being handled."""
         return self.expat.CurrentByteIndex + self.skipped
 
     def feed(self, data: bytes, start: int, end: int, *, final: bool) -> None:
@@ -62,8 +60,8 @@ class _Parser:
         try:
             self.expat.Parse(data[start:end], final)
         except expat.ExpatError as error:
-            line = data.count(b"\n", 0, max(0, self.expat.ErrorByteIndex + self.skipped)) + 1
-            raise JaxmarkError(f"line {line}: the XML is broken ({expat.ErrorString(error.code)}).") from None
+            at = max(0, self.expat.ErrorByteIndex + self.skipped)
+            raise line_error(data, at, f"the XML is broken ({expat.ErrorString(error.code)})") from None
 
     def _doctype(self, *_: object) -> None:
         raise JaxmarkError("The XML has a document type, which may define entities without end; remove it.")
@@ -77,19 +75,13 @@ def _not_utf8(encoding: str) -> JaxmarkError:
     return JaxmarkError(f"The XML is encoded in {encoding!a}; only UTF-8 is supported, so save it as that.")
 
 
-def _parse(parser: _Parser, data: bytes) -> None:
-    """Show a parser all of a document."""
-    _refuse_wide(data)
-    parser.feed(data, 0, len(data), final=True)
-
-
 def _refuse_wide(data: bytes) -> None:
     if b"\0" in data[:4] or data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise _not_utf8("UTF-16")
 
 
 def read_relationships(data: bytes) -> list[tuple[str, str]]:
-    """The type and the target of each relationship that a `.rels` member states.
+    """Read the type and the target of each relationship that a `.rels` member states.
 
     Raises:
         JaxmarkError: if it is not well-formed.
@@ -100,9 +92,10 @@ def read_relationships(data: bytes) -> list[tuple[str, str]]:
         if name.rpartition(" ")[2] == "Relationship":
             found.append((attributes.get("Type", ""), attributes.get("Target", "")))
 
+    _refuse_wide(data)
     parser = _Parser()
     parser.expat.StartElementHandler = start
-    _parse(parser, data)
+    parser.feed(data, 0, len(data), final=True)
     return found
 
 
@@ -147,11 +140,6 @@ class _Model:
                 at = end
         self._parser.feed(data, at, len(data), final=True)
 
-    def _error(self, at: int, what: str) -> JaxmarkError:
-        """The exception for an error at a byte offset, whose line it names."""
-        line = self._data.count(b"\n", 0, at) + 1
-        return JaxmarkError(f"line {line}: {what}.")
-
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         space, _, local = name.rpartition(" ")
         if self._space is None:
@@ -171,7 +159,7 @@ class _Model:
             self._list_at = self._parser.at
             self._rows = []
             if self._list in self.meshes[-1].lists:
-                raise self._error(self._list_at, f"a mesh has its {self._list} twice")
+                raise line_error(self._data, self._list_at, f"a mesh has its {self._list} twice")
 
     def _end(self, name: str) -> None:
         closed = self._path.pop()
@@ -181,7 +169,7 @@ class _Model:
             self._list = None
 
     def _read_plain(self, kind: str, start: int) -> int:
-        """Read a list that begins at an offset, if it is written plainly; the offset of what is left to be parsed."""
+        """Read a list that begins at an offset, if it is written plainly; returns where parsing goes on."""
         opened = _TAG.match(self._data, self._list_at)
         assert opened is not None, "the parser found a tag here"
         prefix = opened[0][1 : -len(kind)]
@@ -200,12 +188,11 @@ class _Model:
                 mine &= self._buffer[quotes[::2] - back] == char
             # No other attribute ends so, except behind a colon or in a longer word.
             mine &= self._buffer[quotes[::2] - len(column) - 2] <= ord(" ")
-            spans.append((quotes[::2][mine] + 1, quotes[1::2][mine]))
-        starts, ends = (np.stack(side, axis=1) for side in zip(*spans, strict=True))
-        self.meshes[-1].lists[kind] = Triples(starts, ends)
+            spans.append(np.stack([quotes[::2][mine] + 1, quotes[1::2][mine]], axis=1))
+        self.meshes[-1].lists[kind] = np.stack(spans, axis=1)
         return matched.end()
 
-    def _read_rows(self, kind: str) -> Triples:
+    def _read_rows(self, kind: str) -> Spans:
         """Read a list element by element."""
         spans = np.zeros((len(self._rows), 3, 2), np.int64)
         for row, at in enumerate(self._rows):
@@ -217,10 +204,12 @@ class _Model:
                     attributes[tag[1]] = tag.span(2 if tag[3] is None else 3)
             for column, name in enumerate(_COLUMNS[kind]):
                 if name not in attributes:
-                    raise self._error(at, f"a {_ROWS[kind]} has no {name.decode()}")
+                    raise line_error(self._data, at, f"a {_ROWS[kind]} has no {name.decode()}")
                 start, end = attributes[name]
                 value = self._data[start:end]
                 if len(value.split()) > 1:
-                    raise self._error(start, f"{value[:40].decode('ascii', 'backslashreplace')!r} is not a number")
+                    raise line_error(
+                        self._data, start, f"{value[:40].decode('ascii', 'backslashreplace')!r} is not a number"
+                    )
                 spans[row, column] = end - len(value.lstrip()), start + len(value.rstrip())
-        return Triples(spans[..., 0], spans[..., 1])
+        return spans

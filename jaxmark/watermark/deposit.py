@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.reading import read_file
+from jaxmark.files.atomic import read_file
 
 _MAX_FILE_BYTES = 2**30  # of a record of some hundred million points, or as many digests
 _FORMAT = "jaxmark-deposit"

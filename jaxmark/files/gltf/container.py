@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 from urllib.parse import quote, unquote, unquote_to_bytes
 
-import numpy as np
-
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.gltf.json_text import rewrite
+from jaxmark.files.source import Patched
 
 #: Reads a file by its path relative to the folder of the document.
 Read = Callable[[str], bytes]
@@ -43,12 +42,11 @@ class Container:
     data: bytes  # the buffers, and whatever is added behind them
 
     def add(self, data: bytes) -> int:
-        """Lay further bytes behind the others, and return where they begin."""
-        begin = len(self.data)
+        """Append bytes to the data, and return where they begin."""
         self.data += data
-        return begin
+        return len(self.data) - len(data)
 
-    def encode(self, document: dict[str, Any], contents: Sequence[bytes | None], name: str) -> "Encoded":
+    def encode(self, document: dict[str, Any], contents: Sequence[bytes | None], name: str) -> Patched:
         """The bytes of the file, and of those beside it, with other buffers.
 
         Args:
@@ -80,7 +78,7 @@ class Container:
                     path = f"{name}.{hashlib.sha256(content).hexdigest()[:8]}.bin"
                     entry["uri"] = quote(path)
                     beside[path] = content
-        return Encoded(self._file(rewrite(self.text, document), chunk), beside, self._companions(unchanged))
+        return Patched(self._file(rewrite(self.text, document), chunk), beside, companions=self._companions(unchanged))
 
     def _file(self, text: str, chunk: bytes | None) -> bytes:
         """The bytes of the file with another document and another binary chunk."""
@@ -110,15 +108,6 @@ class Container:
         return tuple(paths)
 
 
-@dataclass(frozen=True)
-class Encoded:
-    """A file, and others that belong beside it."""
-
-    file: bytes
-    beside: dict[str, bytes]  # by path, relative to the file's folder
-    companions: tuple[str, ...]  # paths of the files that it refers to and that did not change
-
-
 def open_container(data: bytes, read: Read) -> Container:
     """Read a document and its buffers.
 
@@ -143,7 +132,8 @@ def open_container(data: bytes, read: Read) -> Container:
         raise JaxmarkError(f"{where} cannot be read: {error}.") from None
     if not isinstance(document, dict):
         raise JaxmarkError(f"{where} is not an object.")
-    version = document.get("asset", {}).get("version", "2.0") if isinstance(document.get("asset", {}), dict) else "2.0"
+    asset = document.get("asset")
+    version = asset.get("version", "2.0") if isinstance(asset, dict) else "2.0"
     if data[:4] != _MAGIC and str(version).split(".")[0] != "2":
         raise JaxmarkError(f"Only version 2 of glTF is supported, not {ascii(version)[:40]}.")
     pieces: list[bytes] = []
@@ -201,9 +191,3 @@ def _content(entry: Any, index: int, chunk: bytes | None, read: Read) -> tuple[A
             raise JaxmarkError(f"buffers[{index}] is no data in base64") from None
     path = unquote(uri)
     return "file", path, read(path)
-
-
-def changed_range(old: bytes, new: bytes, place: range) -> bool:
-    """Whether bytes of two strings differ in a range."""
-    span = slice(place.start, place.stop)
-    return not np.array_equal(np.frombuffer(old, np.uint8)[span], np.frombuffer(new, np.uint8)[span])

@@ -1,5 +1,6 @@
-"""Checked access to a glTF document: its lists, and where the elements of accessors stand."""
+"""Checked access to a glTF document: its lists, and the places of the elements of accessors."""
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,6 +9,7 @@ from jaxtyping import Float64, Int64
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.binary import gather
 from jaxmark.files.gltf.container import Container
+from jaxmark.files.source import Indices
 
 FLOAT = np.dtype("<f4")
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -18,58 +20,79 @@ _MAX_READS = 16  # elements that are read for each byte of a file, on average; a
 
 
 class Elements(NamedTuple):
-    """Where the elements of an accessor stand."""
+    """The places of the elements of an accessor."""
 
-    starts: Int64[np.ndarray, " count"]  # byte offset of each in `Container.data`
+    starts: Indices  # byte offset of each in `Container.data`
     dtype: np.dtype  # of their components
     width: int  # number of components
-    unit: float  # what a component of 1 stands for: less than 1 if integers are normalised
+    unit: float  # the number that a component of 1 stands for: less than 1 if integers are normalised
 
     @property
     def size(self) -> int:
         """Number of bytes of an element."""
         return self.dtype.itemsize * self.width
 
+    @property
+    def span(self) -> slice:
+        """The bytes of `Container.data` from the first element to the last one."""
+        return slice(int(self.starts[0]), int(self.starts[-1]) + self.size)
+
+    @property
+    def offsets(self) -> Int64[np.ndarray, "count width"]:
+        """Byte offset of each component in `Container.data`."""
+        return self.starts[:, None] + self.dtype.itemsize * np.arange(self.width)
+
 
 class Document:
-    """The lists of a glTF document; every access is checked."""
+    """The lists of a glTF document; every access is checked.
+
+    Attributes:
+        container: the document and its buffers.
+        located: the elements of accessors that were read or decoded, by index.
+        decoded: the indices of those that were compressed.
+    """
 
     def __init__(self, container: Container) -> None:
         self.container = container
+        self.located: dict[int, Elements] = {}
+        self.decoded: set[int] = set()
         self._lists: dict[str, list[dict[str, Any]]] = {}
         self._reads = 0
 
     def items(self, kind: str) -> list[dict[str, Any]]:
-        """A list of objects at the top of the document, empty if absent."""
+        """Return a list of objects at the top of the document, empty if absent."""
         if kind not in self._lists:
             self._lists[kind] = objects(self.container.document, kind, "the document")
         return self._lists[kind]
 
     def item(self, kind: str, index: int) -> dict[str, Any]:
-        """One object of a list at the top of the document."""
+        """Return one object of a list at the top of the document."""
         items = self.items(kind)
         if index >= len(items):
             raise JaxmarkError(f"{kind}[{index}] is referred to, but there are {len(items)}.")
         return items[index]
 
     def form(self, index: int) -> tuple[np.dtype, int, float, int]:
-        """The component type of an accessor, its width, what a component of 1 stands for, and its count."""
+        """Return the component type of an accessor, its width, the number that 1 stands for, and its count."""
         where = f"accessors[{index}]"
         accessor = self.item("accessors", index)
         component, width = accessor.get("componentType"), accessor.get("type")
         if component not in list(COMPONENTS) or width not in list(WIDTHS):
             raise JaxmarkError(f"{where} is of an unknown type.")
         dtype = np.dtype(COMPONENTS[int(component)])
-        whole_unit = 1 / float(np.iinfo(dtype).max) if dtype.kind != "f" and accessor.get("normalized") is True else 1.0
+        unit = 1 / float(np.iinfo(dtype).max) if dtype.kind != "f" and accessor.get("normalized") is True else 1.0
         count = whole(accessor, "count", where)
         if not 0 < count < _MAX_COUNT:
             raise JaxmarkError(f"{where} has {count} elements.")
-        return dtype, WIDTHS[str(width)], whole_unit, count
+        return dtype, WIDTHS[str(width)], unit, count
 
     def elements(self, index: int) -> Elements:
-        """Where the elements of an accessor stand, which must lie inside its buffer."""
+        """Locate the elements of an accessor, which must lie inside its buffer."""
+        if index in self.decoded:
+            return self.located[index]
         where = f"accessors[{index}]"
         dtype, width, unit, count = self.form(index)
+        size = dtype.itemsize * width
         self._reads += count
         if self._reads > _MAX_READS * len(self.container.data) + 2**20:
             raise JaxmarkError(f"{where} and others read the same bytes too often; save the file with other software.")
@@ -78,15 +101,15 @@ class Document:
             raise JaxmarkError(f"{where} is sparse, which is not supported.")
         number = whole(accessor, "bufferView", where)
         begin, length = self.view(number)
-        stride = whole(self.item("bufferViews", number), "byteStride", f"bufferViews[{number}]", dtype.itemsize * width)
+        stride = whole(self.item("bufferViews", number), "byteStride", f"bufferViews[{number}]", size)
         first = whole(accessor, "byteOffset", where, 0)
-        last = first + (count - 1) * stride + dtype.itemsize * width
-        if stride < dtype.itemsize * width or last > length:
+        if stride < size or first + (count - 1) * stride + size > length:
             raise JaxmarkError(f"{where} does not lie inside its buffer view and its buffer.")
-        return Elements(begin + first + stride * np.arange(count), dtype, width, unit)
+        self.located[index] = Elements(begin + first + stride * np.arange(count), dtype, width, unit)
+        return self.located[index]
 
     def view(self, number: int) -> tuple[int, int]:
-        """Where a buffer view begins in `Container.data`, and its length."""
+        """Locate a buffer view: where it begins in `Container.data`, and its length."""
         where = f"bufferViews[{number}]"
         view = self.item("bufferViews", number)
         extensions = view.get("extensions")
@@ -105,14 +128,26 @@ class Document:
         return buffer.place.start + offset, length
 
     def numbers(self, index: int) -> Float64[np.ndarray, "count width"]:
-        """The numbers of an accessor."""
-        starts, dtype, width, unit = self.elements(index)
-        offsets = starts[:, None] + dtype.itemsize * np.arange(width)
-        return gather(self.container.data, offsets, dtype).astype(np.float64) * unit
+        """Read the numbers of an accessor."""
+        rows = self.elements(index)
+        return gather(self.container.data, rows.offsets, rows.dtype).astype(np.float64) * rows.unit
+
+
+def uses(mesh: dict[str, Any]) -> Iterator[tuple[str, int]]:
+    """Yield the accessors that a mesh uses, each after its role, such as POSITION; malformed entries are left out."""
+    primitives = mesh.get("primitives")
+    for primitive in primitives if isinstance(primitives, list) else []:
+        if isinstance(primitive, dict):
+            attributes, targets = primitive.get("attributes"), primitive.get("targets")
+            found = [("indices", primitive.get("indices"))]
+            found += attributes.items() if isinstance(attributes, dict) else ()
+            for target in targets if isinstance(targets, list) else []:
+                found += [("target", index) for index in target.values()] if isinstance(target, dict) else []
+            yield from (use for use in found if isinstance(use[1], int))
 
 
 def objects(parent: dict[str, Any], key: str, where: str) -> list[dict[str, Any]]:
-    """A list of objects in an object, empty if absent."""
+    """Return a list of objects in an object, empty if absent."""
     items = parent.get(key, [])
     if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
         raise JaxmarkError(f"{key} of {where} is not a list of objects.")
@@ -120,7 +155,7 @@ def objects(parent: dict[str, Any], key: str, where: str) -> list[dict[str, Any]
 
 
 def whole(parent: dict[str, Any], key: str, where: str, default: int | None = None) -> int:
-    """An index or a length in an object."""
+    """Return an index or a length in an object."""
     value = parent.get(key, default)
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**53:
         raise JaxmarkError(f"{key} of {where} is {ascii(value)[:40]}, not an index or a length.")
@@ -128,7 +163,7 @@ def whole(parent: dict[str, Any], key: str, where: str, default: int | None = No
 
 
 def attribute(primitive: dict[str, Any], name: str) -> int | None:
-    """The accessor of an attribute of a primitive; None if it has none."""
+    """Return the accessor of an attribute of a primitive; None if it has none."""
     attributes = primitive.get("attributes")
     if not isinstance(attributes, dict):
         raise JaxmarkError("A primitive has no attributes.")
