@@ -28,13 +28,13 @@ def read_file(path: str | os.PathLike, most: int | None = None) -> bytes:
         ValueError: if its name holds a NUL.
     """
     target = Path(path)
-    found = target.stat()  # raises where there is nothing
+    size = target.stat().st_size  # raises where there is nothing
     if target.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
     if not target.is_file():
         raise OSError(errno.EINVAL, "it is no ordinary file; write its content to one", os.fspath(path))
-    if most is not None and found.st_size > most:
-        raise OSError(errno.EFBIG, f"it has {found.st_size} bytes, more than {most}", os.fspath(path))
+    if most is not None and size > most:
+        raise OSError(errno.EFBIG, f"it has {size} bytes, more than {most}", os.fspath(path))
     return target.read_bytes()
 
 

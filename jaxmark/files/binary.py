@@ -54,7 +54,12 @@ class BinaryNumbers:
     values: Rows
 
     def __init__(
-        self, data: bytes, offsets: Int64[np.ndarray, "rows 3"], types: Sequence[np.dtype], unit: float = 1.0
+        self,
+        data: bytes,
+        offsets: Int64[np.ndarray, "rows 3"],
+        types: Sequence[np.dtype],
+        unit: float | np.ndarray = 1.0,
+        origin: np.ndarray | None = None,
     ) -> None:
         """Read the numbers at byte offsets, which must lie inside the data.
 
@@ -62,35 +67,33 @@ class BinaryNumbers:
             data: the file.
             offsets: of each number.
             types: of each column.
-            unit: the number that a stored 1 stands for.
+            unit: the number that a stored 1 stands for, or one a column.
+            origin: the number that a stored 0 stands for, one a column; by default 0.
         """
-        self._offsets, self._types, self._unit = offsets, types, unit
-        with np.errstate(invalid="ignore"):  # signalling NaNs
-            columns = [gather(data, offsets[:, axis], types[axis]).astype(np.float64) for axis in range(3)]
-        self.values = np.stack(columns, axis=1) * unit
+        self._offsets, self._types, self._unit, self._origin = offsets, types, unit, origin
+        self.values = self._read(data)
+
+    def _read(self, data: bytes) -> Rows:
+        with np.errstate(over="ignore", invalid="ignore"):  # signalling NaNs; numbers that are not finite are refused
+            columns = [gather(data, self._offsets[:, k], self._types[k]).astype(np.float64) for k in range(3)]
+            values = np.stack(columns, axis=1) * self._unit
+            return values if self._origin is None else values + self._origin
 
     def edits(self, values: Rows) -> Changes:
-        """Return the overlays, one a column, that write all numbers that changed.
-
-        Raises:
-            JaxmarkError: if a number is beyond the type's range.
-        """
+        """Return the overlays, one a column, that write all numbers that changed."""
         moved = changed(self.values, values)
+        stored = (values if self._origin is None else values - self._origin) / self._unit
         overlays: Changes = []
         for axis, dtype in enumerate(self._types):
             rows = np.flatnonzero(moved[:, axis])
-            overlays.append(overlay(self._offsets[rows, axis], encode(values[rows, axis] / self._unit, dtype)))
+            overlays.append(overlay(self._offsets[rows, axis], encode(stored[rows, axis], dtype)))
         return overlays
 
     def spacing(self, values: Rows, rows: Indices) -> float:
-        """Return the distance from a column's largest number to the next one, a unit for integers; the largest of all.
-
-        Raises:
-            JaxmarkError: if a number is beyond the type's range.
-        """
+        """Return the largest distance from a column's largest number to the next one, a unit for integers."""
         largest = np.abs(values[rows]).max(axis=0, initial=0.0) / self._unit
         coded = [encode(largest[axis : axis + 1], dtype) for axis, dtype in enumerate(self._types)]
-        return self._unit * max(float(np.spacing(top[0])) if top.dtype.kind == "f" else 1.0 for top in coded)
+        return float(self._unit) * max(float(np.spacing(top[0])) if top.dtype.kind == "f" else 1.0 for top in coded)
 
     def advice(self, step: float) -> str:
         """Advise a type that is fine enough."""

@@ -33,7 +33,7 @@ def parse(data: bytes) -> Source:
         return Lines(*(column[text.spells(lines.first, word)] for column in lines))
 
     vertices, normals, polygons, objects = (beginning(word) for word in (b"v", b"vn", b"f", b"o"))
-    sizes = polygons.count - 1
+    sizes = polygons.sizes - 1
     few = "a face needs at least three corners, this one has {}"
     text.refuse(sizes < 3, text.starts[polygons.first], lambda bad: few.format(sizes[bad]))
     coordinates = text.triples(vertices, 1, "a vertex needs three numbers")
@@ -59,7 +59,7 @@ def parse(data: bytes) -> Source:
 
     def texture() -> Texture:
         pairs = beginning(b"vt")
-        if not len(pairs.first) or (pairs.count < 3).any():
+        if not len(pairs.first) or (pairs.sizes < 3).any():
             return None
         try:
             values = text.read(pairs.first[:, None] + np.arange(1, 3), float)

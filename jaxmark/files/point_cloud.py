@@ -2,16 +2,14 @@
 
 import io
 import struct
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int64
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
-from jaxmark.files.binary import encode, overlay
-from jaxmark.files.source import Changes, Indices, Patched, Rows, Source, changed
+from jaxmark.files.binary import BinaryNumbers, overlay
+from jaxmark.files.source import Changes, Indices, Patched, Rows, Source, splice
 from jaxmark.files.text import Lines, Text, blank, is_numeral, unix, without_comments
 from jaxmark.geometry.pose import Points
 
@@ -50,47 +48,28 @@ def parse_las(data: bytes) -> Source:
         JaxmarkError: if laspy is missing or cannot read the file, or it has no points.
     """
     cloud = _read(data)
-    integers = np.stack([np.asarray(cloud[name], np.int64) for name in "XYZ"], axis=1)
-    kind = _Compressed if cloud.header.are_points_compressed else Source
-    return kind(data, ScaledNumbers(integers, cloud.header), _NO_FACES)
+    if not cloud.header.are_points_compressed:
+        return Source(data, ScaledNumbers(data, cloud.header), _NO_FACES)
+    data = _write(cloud, packed=False)
+    return _Compressed(data, ScaledNumbers(data, _read(data).header), _NO_FACES)
 
 
-class ScaledNumbers:
+class ScaledNumbers(BinaryNumbers):
     """Positions in the records of a LAS file, integers with a scale and an offset; see `Numbers`."""
 
-    values: Rows
-
-    def __init__(self, integers: Int64[np.ndarray, "rows 3"], header: Any) -> None:
-        """Scale the integers of all records as the header says."""
-        self._integers = integers
-        self._scales, self._offsets = (np.asarray(part, np.float64) for part in (header.scales, header.offsets))
-        self._start, self._size = int(header.offset_to_point_data), int(header.point_format.size)
-        with np.errstate(over="ignore", invalid="ignore"):  # numbers that are not finite are refused later
-            self.values = integers * self._scales + self._offsets
-
-    def integers(self, values: Rows) -> Int64[np.ndarray, "rows 3"]:
-        """Convert new values to integers; those of numbers that did not change stay.
-
-        Raises:
-            JaxmarkError: if a number is beyond the range of 32 bits.
-        """
-        coded = encode((values - self._offsets) / self._scales, _INTEGER).astype(np.int64)
-        return np.where(changed(self.values, values), coded, self._integers)
+    def __init__(self, data: bytes, header: Any) -> None:
+        """Read the integers of all records as the header says."""
+        self._data, self._scales = data, np.asarray(header.scales, np.float64)
+        records = int(header.offset_to_point_data) + int(header.point_format.size) * np.arange(header.point_count)
+        offsets = records[:, None] + _INTEGER.itemsize * np.arange(3)
+        super().__init__(data, offsets, (_INTEGER,) * 3, self._scales, np.asarray(header.offsets, np.float64))
 
     def edits(self, values: Rows) -> Changes:
-        """Return the overlays, one a column, that write all numbers that changed, and the box around all of them.
-
-        Raises:
-            JaxmarkError: if a number is beyond the range of 32 bits.
-        """
-        integers = self.integers(values)
-        overlays: Changes = []
-        for axis in range(3):
-            rows = np.flatnonzero(integers[:, axis] != self._integers[:, axis])
-            starts = self._start + self._size * rows + _INTEGER.itemsize * axis
-            overlays.append(overlay(starts, integers[rows, axis].astype(_INTEGER)))
-        if (integers != self._integers).any():
-            placed = integers * self._scales + self._offsets
+        """Return the overlays, one a column, that write all numbers that changed, and the box around all of them."""
+        overlays = super().edits(values)
+        data = splice(self._data, overlays)
+        if data != self._data:
+            placed = self._read(data)
             box = np.stack([placed.max(axis=0), placed.min(axis=0)], axis=1).ravel().astype("<f8")
             overlays.append(overlay(_BOX + 8 * np.arange(6), box))
         return overlays
@@ -104,19 +83,17 @@ class ScaledNumbers:
         return f"save it with a scale of at most {step:.1g}"
 
 
-@dataclass
 class _Compressed(Source):
-    """A LAZ file, whose records lie packed: they are unpacked, and packed again with other positions."""
+    """A LAZ file, whose records lie packed: `data` are those of the LAS file, and are packed again when written."""
 
     def patch(self, positions: Points, name: str) -> Patched:
-        cloud = _read(self.data)
-        assert isinstance(self.coordinates, ScaledNumbers)
-        integers = self.coordinates.integers(positions)
-        for axis, column in enumerate("XYZ"):
-            cloud[column] = integers[:, axis]
-        out = io.BytesIO()
-        cloud.write(out, do_compress=True)
-        return Patched(out.getvalue())
+        return Patched(_write(_read(super().patch(positions, name).file), packed=True))
+
+
+def _write(cloud: Any, *, packed: bool) -> bytes:
+    out = io.BytesIO()
+    cloud.write(out, do_compress=packed)
+    return out.getvalue()
 
 
 def _read(data: bytes) -> Any:

@@ -40,7 +40,10 @@ Changes = list[Edits | Overlay]
 
 @runtime_checkable
 class Numbers(Protocol):
-    """Triples of numbers in a file: its positions or normals."""
+    """Triples of numbers in a file: its positions or normals.
+
+    Edits and spacing raise a `JaxmarkError` if a new value is beyond the range of the file's numbers.
+    """
 
     values: Rows
 

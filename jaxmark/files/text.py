@@ -36,7 +36,7 @@ class Lines(NamedTuple):
     """Lines of a text that have any tokens."""
 
     first: Indices  # the first token of each
-    count: Indices  # the number of its tokens
+    sizes: Indices  # the number of its tokens
 
 
 class Text:
@@ -102,7 +102,7 @@ class Text:
         Raises:
             JaxmarkError: if a line has fewer tokens; the message says `what` and names the line.
         """
-        self.refuse(lines.count < skip + 3, self.starts[lines.first], what)
+        self.refuse(lines.sizes < skip + 3, self.starts[lines.first], what)
         return TextNumbers(self, lines.first[:, None] + np.arange(skip, skip + 3))
 
     def seek(self, char: str, starts: Indices, ends: Indices) -> Indices:

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.binary import BinaryNumbers, encode, gather
 from jaxmark.files.gltf import draco
-from jaxmark.files.gltf.container import Container, Read, open_container
+from jaxmark.files.gltf.container import Read
 from jaxmark.files.gltf.document import FLOAT, Document, Elements, attribute, objects, uses, whole
 from jaxmark.files.normals import Transported
 from jaxmark.files.source import (
@@ -49,7 +49,7 @@ def parse(data: bytes, read: Read) -> Source:
     Raises:
         JaxmarkError: if the document cannot be read, or no mesh of it can be marked.
     """
-    document = Document(open_container(data, read))
+    document = Document(data, read)
     meshes = document.items("meshes")
     if not meshes:
         raise JaxmarkError("The file has no meshes.")
@@ -79,7 +79,8 @@ def _groups(meshes: Sequence[dict[str, Any]]) -> list[list[int]]:
         for role, accessor in uses(mesh)
         if role in ("POSITION", "NORMAL")
     ]
-    group = linked(*np.array(links, np.int64).reshape(-1, 2).T, len(meshes) + len(nodes))
+    one, other = np.array(links, np.int64).reshape(-1, 2).T
+    group = linked(one, other, len(meshes) + len(nodes))
     members: dict[int, list[int]] = {}
     for index in range(len(meshes)):
         members.setdefault(int(group[index]), []).append(index)
@@ -150,7 +151,7 @@ def _corners(document: Document, primitive: dict[str, Any], count: int) -> Indic
     starts, dtype, width, _ = document.elements(number)
     if width != 1 or dtype.kind != "u":
         raise JaxmarkError(f"{where} holds no plain unsigned integers, as indices must.")
-    index = gather(document.container.data, starts, dtype).astype(np.int64)
+    index = gather(document.data, starts, dtype).astype(np.int64)
     if (index >= count).any():
         raise JaxmarkError(f"{where} refers to vertex {index.max()}, but there are {count}, numbered from 0.")
     return index
@@ -174,7 +175,7 @@ def _triangles(corners: Indices, mode: int, where: str) -> Faces:
 def _shared_bytes(document: Document, found: dict[str, list[_Primitive]]) -> dict[str, str]:
     """Find the meshes whose positions or normals something else reads, too; returns their names with the reason."""
     names = list(found)
-    owner = np.zeros(len(document.container.data), np.int32)  # number of the mesh that a byte moves with, from 1
+    owner = np.zeros(len(document.data), np.int32)  # number of the mesh that a byte moves with, from 1
     refused: dict[str, str] = {}
     mine: dict[int, str] = {}  # meshes by the accessors that are patched
 
@@ -221,7 +222,7 @@ def _shared_bytes(document: Document, found: dict[str, list[_Primitive]]) -> dic
 
 def _source(document: Document, found: dict[str, list[_Primitive]], left: dict[str, str]) -> Source:
     """Make the source of the meshes that were found."""
-    data = document.container.data
+    data = document.data
     primitives = [one for group in found.values() for one in group]
     points = {one.position: document.located[one.position] for one in primitives}
     normals = {one.normal: document.located[one.normal] for one in primitives if one.normal is not None}
@@ -248,7 +249,7 @@ def _source(document: Document, found: dict[str, list[_Primitive]], left: dict[s
         partial(_skin, document, list({one.position: one for one in primitives}.values())),
         parts if len(parts) + len(left) > 1 else (),
         left,
-        container=document.container,
+        document=document,
         points=points,
         compressed=[one for one in primitives if one.compressed is not None],
     )
@@ -322,19 +323,18 @@ def _part_of_skin(document: Document, primitive: _Primitive, skin: int | None) -
 class _GltfSource(Source):
     """A source that also keeps the `min` and `max` of its position accessors true, as glTF demands."""
 
-    container: Container
+    document: Document
     points: dict[int, Elements]  # the accessors of positions, in the order of the points
     compressed: Sequence[_Primitive]
 
     def patch(self, positions: Points, name: str) -> Patched:
         """Write these positions into the file; a primitive that cannot be compressed as it was is written without."""
-        container = self.container
         data = splice(self.data, self.edits(positions))
         contents: list[bytes | None] = [
             None if isinstance(buffer, str) else data[buffer.place.start : buffer.place.stop]
-            for buffer in container.buffers
+            for buffer in self.document.buffers
         ]
-        document = copy.deepcopy(container.document)
+        document = copy.deepcopy(self.document.content)
         for index, rows in _rows(self.points).items():
             _bound(document["accessors"][index], positions[rows.start : rows.stop], self.points[index])
         plain = []
@@ -349,7 +349,7 @@ class _GltfSource(Source):
             draco.forget_unused(document)
         why = "written without Draco, whose encoder does not know all types"
         remarks = (f"{', '.join(plain)}: {why}",) if plain else ()
-        return container.encode(document, contents, name)._replace(remarks=remarks)
+        return self.document.encode(document, contents, name)._replace(remarks=remarks)
 
 
 def _bound(accessor: dict[str, Any], positions: Points, elements: Elements) -> None:

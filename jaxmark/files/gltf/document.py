@@ -8,7 +8,7 @@ from jaxtyping import Float64, Int64
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.binary import gather
-from jaxmark.files.gltf.container import Container
+from jaxmark.files.gltf.container import Container, Read
 from jaxmark.files.source import Indices
 
 FLOAT = np.dtype("<f4")
@@ -43,17 +43,16 @@ class Elements(NamedTuple):
         return self.starts[:, None] + self.dtype.itemsize * np.arange(self.width)
 
 
-class Document:
-    """The lists of a glTF document; every access is checked.
+class Document(Container):
+    """A glTF document, every access to which is checked.
 
     Attributes:
-        container: the document and its buffers.
         located: the elements of accessors that were read or decoded, by index.
         decoded: the indices of those that were compressed.
     """
 
-    def __init__(self, container: Container) -> None:
-        self.container = container
+    def __init__(self, file: bytes, read: Read) -> None:
+        super().__init__(file, read)
         self.located: dict[int, Elements] = {}
         self.decoded: set[int] = set()
         self._lists: dict[str, list[dict[str, Any]]] = {}
@@ -62,7 +61,7 @@ class Document:
     def items(self, kind: str) -> list[dict[str, Any]]:
         """Return a list of objects at the top of the document, empty if absent."""
         if kind not in self._lists:
-            self._lists[kind] = objects(self.container.document, kind, "the document")
+            self._lists[kind] = objects(self.content, kind, "the document")
         return self._lists[kind]
 
     def item(self, kind: str, index: int) -> dict[str, Any]:
@@ -94,7 +93,7 @@ class Document:
         dtype, width, unit, count = self.form(index)
         size = dtype.itemsize * width
         self._reads += count
-        if self._reads > _MAX_READS * len(self.container.data) + 2**20:
+        if self._reads > _MAX_READS * len(self.data) + 2**20:
             raise JaxmarkError(f"{where} and others read the same bytes too often; save the file with other software.")
         accessor = self.item("accessors", index)
         if "sparse" in accessor:
@@ -117,9 +116,9 @@ class Document:
             if isinstance(extensions, dict) and name in extensions:
                 raise JaxmarkError(f"{where} is compressed with {name}, which is not supported; save it without.")
         index = whole(view, "buffer", where)
-        if index >= len(self.container.buffers):
-            raise JaxmarkError(f"buffers[{index}] is referred to, but there are {len(self.container.buffers)}.")
-        buffer = self.container.buffers[index]
+        if index >= len(self.buffers):
+            raise JaxmarkError(f"buffers[{index}] is referred to, but there are {len(self.buffers)}.")
+        buffer = self.buffers[index]
         if isinstance(buffer, str):
             raise JaxmarkError(f"{buffer}.")
         offset, length = whole(view, "byteOffset", where, 0), whole(view, "byteLength", where)
@@ -130,7 +129,7 @@ class Document:
     def numbers(self, index: int) -> Float64[np.ndarray, "count width"]:
         """Read the numbers of an accessor."""
         rows = self.elements(index)
-        return gather(self.container.data, rows.offsets, rows.dtype).astype(np.float64) * rows.unit
+        return gather(self.data, rows.offsets, rows.dtype).astype(np.float64) * rows.unit
 
 
 def uses(mesh: dict[str, Any]) -> Iterator[tuple[str, int]]:
@@ -139,7 +138,7 @@ def uses(mesh: dict[str, Any]) -> Iterator[tuple[str, int]]:
     for primitive in primitives if isinstance(primitives, list) else []:
         if isinstance(primitive, dict):
             attributes, targets = primitive.get("attributes"), primitive.get("targets")
-            found = [("indices", primitive.get("indices"))]
+            found: list[tuple[str, Any]] = [("indices", primitive.get("indices"))]
             found += attributes.items() if isinstance(attributes, dict) else ()
             for target in targets if isinstance(targets, list) else []:
                 found += [("target", index) for index in target.values()] if isinstance(target, dict) else []

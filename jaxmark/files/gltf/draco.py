@@ -48,7 +48,7 @@ def decompress(document: Document, primitive: dict[str, Any], where: str) -> Com
             raise JaxmarkError(f"{where} announces {count} points in {length} bytes.")
     decoder = require("DracoPy", "files")
     try:
-        found = decoder.decode(document.container.data[begin : begin + length])
+        found = decoder.decode(document.data[begin : begin + length])
         by_id = {item["unique_id"]: np.asarray(item["data"]) for item in found.attributes}
         faces = np.asarray(found.faces, np.int64).reshape(-1, 3)
     except Exception as error:  # the decoder has several kinds of its own
@@ -64,7 +64,7 @@ def decompress(document: Document, primitive: dict[str, Any], where: str) -> Com
         raise JaxmarkError(f"{where} holds no positions, or faces of other points.")
     places = {}
     for name, (dtype, width, unit, count) in forms.items():
-        starts = document.container.add(decoded[name]) + dtype.itemsize * width * np.arange(count)
+        starts = document.add(decoded[name]) + dtype.itemsize * width * np.arange(count)
         places[name] = Elements(starts, dtype, width, unit)
         if indices[name] not in document.decoded:
             document.decoded.add(indices[name])

@@ -12,9 +12,8 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files.source import Source
 from jaxmark.geometry.mesh import Mesh
 
-# As a share of the bounding-box diagonal; marks move vertices by about ten times that or more.
 _CLOUDS = (".xyz", ".las", ".laz")  # formats without faces
-_MAX_ROUNDING = 1e-5
+_MAX_ROUNDING = 1e-5  # of the bounding-box diagonal; marks move vertices by about ten times that or more
 
 
 def encode_new(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> bytes:
@@ -35,9 +34,8 @@ def encode_new(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> byt
     if suffix in (".stl", ".glb", ".gltf", ".3mf") and not len(faces):
         raise JaxmarkError(f"A new {suffix[1:].upper()} file holds faces; save the point cloud as PLY or XYZ.")
     if suffix in (".las", ".laz"):
-        raise JaxmarkError(
-            "A new LAS or LAZ file is not written; pass the one it came from as `like`, or use PLY or XYZ."
-        )
+        advice = "pass the one it came from as `like`, or use PLY or XYZ"
+        raise JaxmarkError(f"A new LAS or LAZ file is not written; {advice}.")
     if suffix in (".obj", ".off", ".xyz"):
         data = _text(vertices, faces, suffix)
     elif suffix == ".3mf":
