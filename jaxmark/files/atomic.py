@@ -146,7 +146,7 @@ def write_together(path: str | os.PathLike, data: bytes, beside: Mapping[str, by
         beside: the other files' bytes, by path relative to the folder of the first. None of them replaces a file.
 
     Raises:
-        JaxmarkError: if one of them is there already, with other bytes; or see `write_atomically`.
+        JaxmarkError: if one of the others is there already, with other bytes; see `write_atomically`.
     """
     written: list[Path] = []
     with _writing(path):

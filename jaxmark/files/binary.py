@@ -22,10 +22,9 @@ def gather(data: bytes, offsets: Int64[np.ndarray, "..."], dtype: np.dtype) -> S
 
 
 def encode(values: Float64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.ndarray, "..."]:
-    """Convert finite numbers to a type, rounded to nearest; integers that are hardly out of range, to its end.
+    """Convert finite numbers to a type, rounded to nearest; numbers beyond its range are refused.
 
-    Raises:
-        JaxmarkError: if a number is beyond the type's range.
+    Integers that are hardly out of range are clipped.
     """
     if dtype.kind == "f":
         with np.errstate(over="ignore", under="ignore"):
@@ -68,7 +67,7 @@ class BinaryNumbers:
             offsets: of each number.
             types: of each column.
             unit: the number that a stored 1 stands for, or one a column.
-            origin: the number that a stored 0 stands for, one a column; by default 0.
+            origin: the number that a stored 0 stands for in each column; by default 0.
         """
         self._offsets, self._types, self._unit, self._origin = offsets, types, unit, origin
         self.values = self._read(data)
@@ -81,9 +80,8 @@ class BinaryNumbers:
 
     def edits(self, values: Rows) -> Changes:
         """Return the overlays, one a column, that write all numbers that changed."""
-        moved = changed(self.values, values)
+        moved, overlays = changed(self.values, values), Changes()
         stored = (values if self._origin is None else values - self._origin) / self._unit
-        overlays: Changes = []
         for axis, dtype in enumerate(self._types):
             rows = np.flatnonzero(moved[:, axis])
             overlays.append(overlay(self._offsets[rows, axis], encode(stored[rows, axis], dtype)))

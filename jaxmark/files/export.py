@@ -19,14 +19,8 @@ _MAX_ROUNDING = 1e-5  # of the bounding-box diagonal; marks move vertices by abo
 def encode_new(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> bytes:
     """Encode a mesh as the bytes of a new file, which are read back as a check.
 
-    Args:
-        mesh: a validated mesh on the host.
-        suffix: the suffix of the format, such as `.obj`.
-        parse: the parser of the format.
-
-    Raises:
-        JaxmarkError: if the format cannot hold the mesh: single precision would move a coordinate by more than 1e-5
-            of the diagonal of the bounding box, as it does far from the origin.
+    A mesh is refused if the format cannot hold it: single precision would move a coordinate by more than 1e-5 of the
+    diagonal of the bounding box, as it does far from the origin.
     """
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if suffix in _CLOUDS and len(faces):
@@ -41,7 +35,11 @@ def encode_new(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> byt
     elif suffix == ".3mf":
         data = _threemf(vertices, faces)
     elif not len(faces):
-        data, vertices = _points_as_ply(vertices), _single(vertices, suffix)
+        vertices = _single(vertices, suffix)
+        # trimesh would write a face element, which viewers take for a mesh.
+        head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+        head += [*(f"property float {axis}" for axis in "xyz"), "end_header", ""]
+        data = "\n".join(head).encode() + vertices.astype("<f4").tobytes()
     else:
         with np.errstate(all="ignore"):
             whole = trimesh.Trimesh(vertices, faces, process=False)
@@ -68,14 +66,6 @@ def _single(vertices: np.ndarray, suffix: str) -> np.ndarray:
             " too far for this mesh; centre it on the origin, or use OBJ or OFF, which are written exactly."
         )
     return rounded
-
-
-def _points_as_ply(vertices: np.ndarray) -> bytes:
-    """Encode a point cloud, which trimesh would write with a face element for viewers of meshes."""
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    lines += [f"property float {axis}" for axis in "xyz"]
-    with np.errstate(all="ignore"):
-        return "\n".join([*lines, "end_header", ""]).encode() + vertices.astype("<f4").tobytes()
 
 
 def _text(vertices: np.ndarray, faces: np.ndarray, suffix: str) -> bytes:

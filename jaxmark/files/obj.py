@@ -85,12 +85,7 @@ def parse(data: bytes) -> Source:
 def _objects(text: Text, faces: Faces, owner: Indices, objects: Indices, size: int) -> Sequence[Part]:
     """Find the objects of a file, those together that share vertices; none if that leaves fewer than two.
 
-    Args:
-        text: the file.
-        faces: all faces.
-        owner: number of the object that each face is in, from 1; 0 before the first object.
-        objects: the first token of the lines that name objects.
-        size: number of vertices.
+    `owner` is the number of the object that each face is in, from 1, and `size` the number of vertices.
     """
     count = len(objects) + 1
     group = linked(np.repeat(owner, 3), count + faces.ravel(), count + size)[owner]

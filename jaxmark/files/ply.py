@@ -18,8 +18,6 @@ _TYPES = {
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-
-
 _SURFACES = ("face", "tristrips")  # the elements that hold triangles
 _NONE = np.zeros(0, np.int64)
 
@@ -41,25 +39,25 @@ class _Element:
     properties: dict[str, _Property] = field(default_factory=dict)
 
 
-class _Tokens:
+class _Tokens(Text):
     """A text body, whose units are tokens, numbered from 0 to `end`."""
 
     def __init__(self, data: bytes, start: int) -> None:
-        self._text = Text(data, b" " * start + unix(data)[start:])
-        self.end = len(self._text)
+        super().__init__(data, b" " * start + unix(data)[start:])
+        self.end = len(self)
 
     def width(self, dtype: np.dtype) -> int:
         return 1
 
     def integers(self, at: Indices, dtype: np.dtype) -> Indices:
-        return self._text.read(at, int)
+        return self.read(at, int)
 
     def integer(self, at: int, dtype: np.dtype) -> int:
-        token = self._text.token(at)
-        return int(token) if token.isdigit() and len(token) < 18 else int(self.integers(np.array([at]), dtype)[0])
+        token = self.token(at)
+        return int(token) if token.isdigit() and len(token) < 18 else int(self.read(np.array(at), int))
 
-    def triples(self, at: Int64[np.ndarray, "rows 3"], types: list[np.dtype]) -> TextNumbers:
-        return TextNumbers(self._text, at, whole=any(dtype.kind != "f" for dtype in types))
+    def numbers(self, at: Int64[np.ndarray, "rows 3"], types: list[np.dtype]) -> TextNumbers:
+        return TextNumbers(self, at, whole=any(dtype.kind != "f" for dtype in types))
 
 
 class _Bytes:
@@ -79,7 +77,7 @@ class _Bytes:
         order = "big" if dtype.str[0] == ">" else "little"
         return int.from_bytes(self._data[at : at + dtype.itemsize], order, signed=dtype.kind == "i")
 
-    def triples(self, at: Int64[np.ndarray, "rows 3"], types: list[np.dtype]) -> BinaryNumbers:
+    def numbers(self, at: Int64[np.ndarray, "rows 3"], types: list[np.dtype]) -> BinaryNumbers:
         return BinaryNumbers(self._data, at, types)
 
 
@@ -118,7 +116,7 @@ def parse(data: bytes) -> Source:
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
-    """The byte order, the elements, and the offset of the body."""
+    """Read the byte order, the elements, and the offset of the body."""
     begin = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
     if begin is None:
         raise JaxmarkError("line 1: a PLY file begins with a line that says ply.")
@@ -231,7 +229,7 @@ def _triples(
     kinds = [vertex[name] for name in names if name in vertex and vertex[name].length is None]
     if len(kinds) < 3:
         return None
-    return body.triples(np.stack([kind.starts for kind in kinds], axis=1), [kind.type for kind in kinds])
+    return body.numbers(np.stack([kind.starts for kind in kinds], axis=1), [kind.type for kind in kinds])
 
 
 def _surface(body: _Body, element: _Element) -> Faces:

@@ -64,8 +64,7 @@ class JoinedNumbers:
     """Triples of numbers that follow each other in several parts; see `Numbers`."""
 
     def __init__(self, parts: Sequence[Numbers]) -> None:
-        self._parts = parts
-        self._ends = np.cumsum([len(part.values) for part in parts])
+        self._parts, self._ends = parts, np.cumsum([len(part.values) for part in parts])
         self.values = np.concatenate([part.values for part in parts])
 
     def edits(self, values: Rows) -> Changes:
@@ -151,12 +150,7 @@ class Source:
     def patch(self, positions: Points, name: str) -> Patched:
         """Write these positions into the file; all bytes but those of coordinates and normals stay.
 
-        Args:
-            positions: the new ones.
-            name: name of the file that is written, without its suffix; files beside it are named after it.
-
-        Raises:
-            JaxmarkError: if a position does not fit the file's number type.
+        Files beside it are named after `name`, the name of the file without its suffix.
         """
         return Patched(splice(self.data, self.edits(positions)))
 
@@ -179,7 +173,7 @@ def none_usable(left: Mapping[str, str], count: int) -> str:
 def linked(one: Indices, other: Indices, count: int) -> Indices:
     """Number the connected components of a graph of `count` nodes, and return that of each node."""
     graph = sparse.coo_array((np.ones(len(one), np.int8), (one, other)), (count, count))
-    return csgraph.connected_components(graph, directed=False)[1]
+    return csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 def unique_names(names: Iterable[str]) -> list[str]:
@@ -221,13 +215,9 @@ def ranges(starts: Indices, sizes: Indices) -> Int64[np.ndarray, " total"]:
 
 
 def fan(sizes: Indices) -> Faces:
-    """Split polygons into triangles (v0, v1, v2), (v0, v2, v3) and so on.
+    """Split polygons of at least three corners into triangles (v0, v1, v2), (v0, v2, v3) and so on.
 
-    Args:
-        sizes: the number of corners of each polygon, at least 3; corners are numbered through all polygons.
-
-    Returns:
-        The three corner numbers of each triangle.
+    Corners are numbered through all polygons.
     """
     first = np.cumsum(sizes) - sizes
     second = ranges(first + 1, sizes - 2)

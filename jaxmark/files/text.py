@@ -47,12 +47,7 @@ class Text:
     """
 
     def __init__(self, data: bytes, work: bytes) -> None:
-        """Tokenise.
-
-        Args:
-            data: the file's bytes.
-            work: a copy of the same length, in which spaces stand for what is not to be read.
-        """
+        """Tokenise a copy of the file's bytes, of the same length, in which spaces stand for ignored text."""
         self._lines = unix(data)
         self.buffer = np.frombuffer(work + b"\n", np.uint8)
         space = _SPACE[self.buffer]
@@ -87,21 +82,13 @@ class Text:
         return line_error(self._lines, int(start), what)
 
     def refuse(self, wrong: Bool[np.ndarray, " spans"], starts: Indices, what: str | Callable[[int], str]) -> None:
-        """Refuse the first of some spans, given by their byte offsets, that is wrong.
-
-        Raises:
-            JaxmarkError: if one is wrong; the message names the line, and `what` may depend on the number of the span.
-        """
+        """Refuse the first of some spans that is wrong; the message, which may depend on its number, names the line."""
         if wrong.any():
             bad = int(np.argmax(wrong))
             raise self.error(starts[bad], what if isinstance(what, str) else what(bad))
 
     def triples(self, lines: Lines, skip: int, what: str) -> "TextNumbers":
-        """Read the three numbers of each line that follow `skip` tokens.
-
-        Raises:
-            JaxmarkError: if a line has fewer tokens; the message says `what` and names the line.
-        """
+        """Read the three numbers of each line that follow `skip` tokens; a line of fewer is refused by `what`."""
         self.refuse(lines.sizes < skip + 3, self.starts[lines.first], what)
         return TextNumbers(self, lines.first[:, None] + np.arange(skip, skip + 3))
 
@@ -118,12 +105,7 @@ class Text:
         return np.array(self._converted(int, starts, ends), np.int64)
 
     def read(self, tokens: Int64[np.ndarray, "..."], kind: type) -> Shaped[np.ndarray, "..."]:
-        """Read tokens, in any order, as numbers: `float`, exactly, or `int`.
-
-        Raises:
-            JaxmarkError: if a token is no such number, or a whole number of more than 18 digits; the message names the
-                line.
-        """
+        """Read tokens, in any order, as numbers: `float`, exactly, or `int`, of up to 18 digits."""
         order = np.argsort(self.starts[tokens], axis=None, kind="stable")
         flat = tokens.ravel()[order]
         values = np.empty(tokens.size, kind)
@@ -182,16 +164,7 @@ class TextNumbers:
     values: Rows
 
     def __init__(self, text: Text, tokens: Int64[np.ndarray, "rows 3"], *, whole: bool = False) -> None:
-        """Read tokens as numbers.
-
-        Args:
-            text: the file.
-            tokens: indices of the tokens, in any order.
-            whole: whether the file declares the numbers to be integers, so that nothing else may be written.
-
-        Raises:
-            JaxmarkError: if a token is not a number; the message names the line.
-        """
+        """Read tokens of a text, in any order; if the file declares `whole` numbers, no others may be written."""
         self._text, self._whole = text, whole
         self._starts, self._ends = text.starts[tokens.ravel()], text.ends[tokens.ravel()]
         self.values = text.read(tokens, float)

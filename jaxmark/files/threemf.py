@@ -21,7 +21,7 @@ from jaxmark.files.source import (
     unique_names,
 )
 from jaxmark.files.text import Spans, TextNumbers
-from jaxmark.files.threemf_xml import NO_SPANS, RawMesh, read_model, read_relationships
+from jaxmark.files.threemf_xml import NO_SPANS, Model, RawMesh, read_relationships
 from jaxmark.files.zipped import Archive, Member
 from jaxmark.geometry.pose import Points
 
@@ -42,7 +42,7 @@ class _Object(NamedTuple):
 class _Model(NamedTuple):
     member: Member
     data: bytes
-    objects: Sequence[_Object]
+    numbers: JoinedNumbers  # of all of its objects
 
 
 def parse(data: bytes) -> Source:
@@ -60,28 +60,29 @@ def parse(data: bytes) -> Source:
     for member in _model_members(archive):
         content = archive.read(member)
         with concerning(member.shown):
-            found.append((member, content, read_model(content)))
+            found.append((member, content, Model(content).meshes))
     names = iter(unique_names(mesh.name for _, _, meshes in found for mesh in meshes))
     models: list[_Model] = []
+    parts: list[Part] = []
     left: dict[str, str] = {}
+    size = 0
     for member, content, meshes in found:
         with concerning(member.shown):
-            models.append(_Model(member, content, _read_objects(content, meshes, names, left)))
-    objects = [item for model in models for item in model.objects]
-    if not objects and len(left) == 1:
+            objects = _read_objects(content, meshes, names, left)
+        for item in objects:
+            parts.append(Part(item.name, size + np.arange(len(item.numbers.values)), item.faces))
+            size += len(item.numbers.values)
+        if objects:
+            models.append(_Model(member, content, JoinedNumbers([item.numbers for item in objects])))
+    if not parts and len(left) == 1:
         raise JaxmarkError("The mesh {!r} cannot be marked: {}.".format(*left.popitem()))
-    if not objects:
+    if not parts:
         raise JaxmarkError(none_usable(left, len(left)) if left else "The file has no object with a mesh.")
-    ends = np.cumsum([len(item.numbers.values) for item in objects]).tolist()
-    parts = [
-        Part(item.name, np.arange(start, end), item.faces)
-        for item, start, end in zip(objects, [0, *ends[:-1]], ends, strict=True)
-    ]
     return _ThreemfSource(
         data,
-        JoinedNumbers([item.numbers for item in objects]),
+        JoinedNumbers([model.numbers for model in models]),
         np.concatenate([part.places[0] + part.faces for part in parts]),
-        parts=parts if len(objects) + len(left) > 1 else (),
+        parts=parts if len(parts) + len(left) > 1 else (),
         left=left,
         archive=archive,
         models=models,
@@ -90,11 +91,7 @@ def parse(data: bytes) -> Source:
 
 
 def _is_signed(archive: Archive) -> bool:
-    """Whether the archive has a signature, which a mark would break.
-
-    Raises:
-        JaxmarkError: if parts of it are encrypted.
-    """
+    """Whether the archive has a signature, which a mark would break; encrypted archives are refused."""
     signed = any(member.name.casefold().startswith(_SIGNATURES) for member in archive.members)
     for member in archive.members:
         if member.name.casefold().endswith(".rels"):
@@ -162,14 +159,9 @@ class _ThreemfSource(Source):
     def patch(self, positions: Points, name: str) -> Patched:
         """Write these positions into the file; members whose positions do not change stay as they are packed."""
         contents: dict[str, bytes] = {}
-        start = 0
-        for model in self.models:
-            edits = []
-            for item in model.objects:
-                end = start + len(item.numbers.values)
-                edits += item.numbers.edits(positions[start:end])
-                start = end
-            content = splice(model.data, edits)
+        ends = np.cumsum([len(model.numbers.values) for model in self.models])
+        for model, piece in zip(self.models, np.split(positions, ends[:-1]), strict=True):
+            content = splice(model.data, model.numbers.edits(piece))
             if content != model.data:
                 contents[model.member.name] = content
         if not contents:

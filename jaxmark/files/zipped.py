@@ -42,20 +42,13 @@ class Member:
 
 
 class Archive:
-    """A ZIP archive.
+    """A ZIP archive; refused if it is broken, encrypted, in several volumes, too large, or two members have one name.
 
     Attributes:
-        data: its bytes.
         members: its members, in the order of the central directory.
     """
 
     def __init__(self, data: bytes) -> None:
-        """Read the central directory and the members' headers, and no content.
-
-        Raises:
-            JaxmarkError: if the archive is broken, encrypted, in several volumes, has two members of one name, or would
-                be too large unpacked.
-        """
         self.data = data
         self._end = data.rfind(b"PK\5\6", max(0, len(data) - 22 - 0xFFFF))
         if self._end < 0 or self._end + 22 > len(data):
@@ -144,11 +137,7 @@ class Archive:
         return self._by_name.get(name.casefold())
 
     def read(self, member: Member) -> bytes:
-        """Unpack a member.
-
-        Raises:
-            JaxmarkError: if it is damaged, or packed in a way other than deflate.
-        """
+        """Unpack a member; refused if it is damaged, or packed in a way other than deflate."""
         packed = self.data[member.start : member.start + member.packed]
         if member.method == _DEFLATED:
             unpacker = zlib.decompressobj(-zlib.MAX_WBITS)
@@ -170,8 +159,7 @@ class Archive:
     def replaced(self, contents: Mapping[str, bytes]) -> bytes:
         """Replace the contents of some members, packed as these were; all other bytes stay.
 
-        Raises:
-            JaxmarkError: if the headers of these members are inconsistent, or the archive would become too large.
+        Members whose headers are inconsistent are refused, and archives that would become too large.
         """
         out = bytearray(self.data)  # numbers keep their widths, so that places stay until the contents are exchanged
         replaced = [member for member in self.members if member.name in contents]

@@ -12,8 +12,7 @@ from jaxtyping import Float64
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.binary import BinaryNumbers, encode, gather
 from jaxmark.files.gltf import draco
-from jaxmark.files.gltf.container import Read
-from jaxmark.files.gltf.document import FLOAT, Document, Elements, attribute, objects, uses, whole
+from jaxmark.files.gltf.document import FLOAT, Document, Elements, Read, attribute, objects, uses, whole
 from jaxmark.files.normals import Transported
 from jaxmark.files.source import (
     Faces,
@@ -40,11 +39,7 @@ def parse(data: bytes, read: Read) -> Source:
 
     Positions are local coordinates of each mesh: the transformations of nodes are not applied, so that all instances of
     a mesh change with it. Meshes that share positions are one. Where several primitives have several POSITION
-    accessors, their points follow each other in order of first use.
-
-    Args:
-        data: the bytes of a GLB or glTF file.
-        read: reads the files that it refers to.
+    accessors, their points follow each other in order of first use. Other files are read by `read`.
 
     Raises:
         JaxmarkError: if the document cannot be read, or no mesh of it can be marked.
@@ -103,8 +98,7 @@ def _primitives(document: Document, meshes: Sequence[tuple[int, dict[str, Any]]]
     """Read the triangles of meshes; refused if there are none, or if they cannot be marked."""
     found: list[_Primitive] = []
     for index, mesh in meshes:
-        primitives = objects(mesh, "primitives", f"meshes[{index}]")
-        for number, primitive in enumerate(primitives):
+        for number, primitive in enumerate(objects(mesh, "primitives", f"meshes[{index}]")):
             where = f"meshes[{index}].primitives[{number}]"
             if primitive.get("mode", 4) in (0, 1, 2, 3):  # points and lines
                 continue

@@ -28,8 +28,7 @@ class Compressed:
 def decompress(document: Document, primitive: dict[str, Any], where: str) -> Compressed | None:
     """Decode a primitive, and let the document read its accessors from there; None if it is not compressed.
 
-    Raises:
-        JaxmarkError: if the decoder is missing, or finds something else than the document promises.
+    It is refused if the decoder is missing, or finds something else than the document promises.
     """
     extensions = primitive.get("extensions")
     if not isinstance(extensions, dict) or EXTENSION not in extensions:
@@ -77,8 +76,7 @@ def _encode(
 ) -> tuple[bytes, dict[str, int]] | None:
     """Encode a primitive, points and faces in their order, all but positions without loss.
 
-    Returns:
-        The bytes, and the identifiers of the attributes in them; None where the encoder cannot do that.
+    Returns the bytes, and the identifiers of the attributes in them; None if the encoder cannot do that.
     """
     points = attributes["POSITION"]
     others = {name: data for name, data in attributes.items() if name != "POSITION"}
@@ -114,17 +112,15 @@ def write(
 ) -> bool:
     """Write changed attributes of a compressed primitive into a document and its buffers.
 
-    The bytes that were there are overwritten, for they hold the primitive as it was.
+    The bytes that were there are overwritten, for they hold the primitive as it was. Returns whether it is still
+    compressed: the encoder does not know all types.
 
     Args:
         document: the document to change.
-        contents: the buffers to change.
+        contents: its buffers, to be changed, too.
         primitive: the primitive in that document.
         old: its content as it was decoded.
-        data: the container's data with the new numbers.
-
-    Returns:
-        Whether it is still compressed; the encoder does not know all types.
+        data: the data of the container with the new numbers.
     """
     attributes = {
         name: np.frombuffer(data[rows.span], rows.dtype).reshape(-1, rows.width)

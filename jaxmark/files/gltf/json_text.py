@@ -9,12 +9,7 @@ _decode = json.JSONDecoder().raw_decode
 
 
 def rewrite(text: str, new: Any) -> str:
-    """Write a document over the text of another one, in which only the values that differ change.
-
-    Args:
-        text: valid JSON, perhaps with white space around it.
-        new: the document that the text shall state.
-    """
+    """Write a document over the JSON text of another one, in which only the values that differ change."""
     at = _skip(text, 0)
     old, end = _decode(text, at)
     pieces: list[str] = [text[:at]]
