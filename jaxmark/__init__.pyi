@@ -11,7 +11,7 @@ from . import geometry as geometry
 from . import plot as plot
 from . import spectral as spectral
 from . import watermark as watermark
-from .attacks import attack as attack
+from .adversaries import attack as attack
 from .catalogue import Catalogue as Catalogue
 from .distortion import compare as compare
 from .errors import JaxmarkError as JaxmarkError
@@ -23,14 +23,16 @@ from .files import load_mesh as load_mesh
 from .files import save_mesh as save_mesh
 from .geometry import Mesh as Mesh
 from .geometry import make_mesh as make_mesh
+from .watermark import Budget as Budget
 from .watermark import Key as Key
 from .watermark import Record as Record
 from .watermark import capacity as capacity
 from .watermark import detect as detect
+from .watermark import detect_bits as detect_bits
 from .watermark import embed as embed
+from .watermark import embed_bits as embed_bits
 from .watermark import fingerprint as fingerprint
 from .watermark import identify as identify
-from .watermark import load_key as load_key
+from .watermark import log_evidence as log_evidence
 from .watermark import make_marker as make_marker
 from .watermark import new_key as new_key
-from .watermark import save_key as save_key

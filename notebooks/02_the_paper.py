@@ -222,7 +222,7 @@ curves = {
 for name, curve in curves.items():
     print(f"{name:<13} read {curve.success.mean(axis=1).round(2)}, bits wrong {curve.bit_errors.mean(axis=1).round(2)}")
 assert curves["working form"].success[0].all()
-pictures.success(curves, jm.attacks.ATTACKS["diagonal-noise"].unit).save("02_5.png")
+pictures.success(curves, jm.adversaries.ATTACKS["diagonal-noise"].unit).save("02_5.png")
 
 # %% [markdown]
 # ## Figures 15 and 16: the Gibbs oscillation

@@ -79,7 +79,7 @@ plot.responses(shown).save("03_1.png")
 
 # %%
 marker = jm.make_marker(mesh, jm.new_key(), bits=64)
-marked, info = marker.embed(b"jaxmark!", 8e-4, noise=0)
+marked, info = marker.embed(b"jaxmark!", jm.Budget(rms=8e-4, noise=0))
 attacked = {
     "noise 0.5 %": jm.attack(marked, "noise", 0.005, seed=0),
     "50 steps of smoothing": jm.attack(marked, "smoothing", 50, seed=0),
@@ -151,7 +151,7 @@ pictures.band_visibility(original, ["rms", "gl", "dame"]).save("03_4.png")
 
 # %%
 for budget in (2e-4, 4e-4, 8e-4):
-    print(f"RMS {budget:.2%} of the diagonal: {jm.capacity(mesh, budget, noise=0.005):4} bits")
+    print(f"RMS {budget:.2%} of the diagonal: {jm.capacity(mesh, jm.Budget(rms=budget, noise=0.005)):4} bits")
 
 # %% [markdown]
 # More is refused, with the mend:
@@ -171,10 +171,10 @@ curves = {}
 for size in (2, 16):
     one = jm.make_marker(mesh, jm.Key(bytes(32)), bits=8 * size)
     message = bytes(range(size))
-    mesh_with, _ = one.embed(message, 4e-4, noise=0, read_back=False)
+    mesh_with, _ = one.embed(message, jm.Budget(rms=4e-4, noise=0), read_back=False)
     curves[f"{8 * size} bits"] = jm.robustness(one, mesh_with, message, "noise", [0.004, 0.012], samples=2)
     print(f"{8 * size} bits:", curves[f"{8 * size} bits"].success.mean(axis=1))
-pictures.success(curves, jm.attacks.ATTACKS["noise"].unit).save("03_5.png")
+pictures.success(curves, jm.adversaries.ATTACKS["noise"].unit).save("03_5.png")
 
 # %% [markdown]
 # ## In short

@@ -56,7 +56,7 @@ for band in (0, 1, 3, 7, 15, 31):
 # %%
 LIMITS = {"dame": 0.008}
 ATTACKS = [("jamming", 0.002), ("low-pass", 0.9)]
-tuned = jm.tune(mesh, ATTACKS, limits=LIMITS, key=jax.random.key(0), bits=16, margin="evidence")
+tuned = jm.tune(mesh, ATTACKS, LIMITS, key=jax.random.key(0), bits=16, margin="evidence")
 report = tuned.report
 print("kept: the default is as good" if report.kept else "found: better strengths than the default's")
 for (kind, strength), left, before in zip(ATTACKS, report.tried, report.tried_default, strict=True):
@@ -71,7 +71,7 @@ key, message = jm.new_key(), b"ok"
 shown, betas, worst = {}, {}, {}
 for name, scheme in (("default", "keyed"), ("tuned", tuned.scheme)):
     marker = jm.make_marker(mesh, key, bits=16, scheme=scheme)
-    marked, info = marker.embed(message, limits=LIMITS, noise=0)
+    marked, info = marker.embed(message, jm.Budget(limits=LIMITS, noise=0))
     print(f"{name}: RMS {info.rms:.4%} of the diagonal, DAME {jm.compare(mesh, marked, ['dame']).dame:.4f}")
     claims = [marker.detect(jm.attack(marked, *one, seed=1), message) for one in ATTACKS]
     for (kind, strength), found in zip(ATTACKS, claims, strict=True):

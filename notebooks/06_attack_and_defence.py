@@ -37,8 +37,8 @@ import numpy as np
 import jaxmark as jm
 from jaxmark import adversaries as enemies
 from jaxmark import plot
-from jaxmark.adversaries.blind import descend
 from jaxmark.adversaries.expected import evidence, make_surrogate, random_mark, rescale
+from jaxmark.adversaries.keyless import descend
 from jaxmark.geometry import asteroid
 from jaxmark.watermark.reading.detectors import claims
 

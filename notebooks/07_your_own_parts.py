@@ -43,8 +43,8 @@ from jaxmark.watermark.carriers import ModulatedCarrier
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import code_length
 from jaxmark.watermark.coding.sequences import orthogonal_sequences
-from jaxmark.watermark.reading.detectors import Detector, decorrelate
-from jaxmark.watermark.schemes.scheme import Scheme
+from jaxmark.watermark.interfaces import Detector, Scheme
+from jaxmark.watermark.reading.detectors import decorrelate
 
 mesh = asteroid(2800)
 key = jm.Key(bytes(range(32)))  # the same each time; real ones are `jm.new_key()`
@@ -79,8 +79,8 @@ plot.draw(
 
 # %%
 marker = jm.make_marker(mesh, key, bits=16)
-marked, info = marker.embed(b"ok", 8e-4, noise=0)
-both = jm.attacks.chain(marked, [(chattering, 0.001), ("quantisation", 10)], seed=1)
+marked, info = marker.embed(b"ok", jm.Budget(rms=8e-4, noise=0))
+both = jm.adversaries.chain(marked, [(chattering, 0.001), ("quantisation", 10)], seed=1)
 print("after chatter and quantisation:", marker.detect(both).message)
 curve = jm.robustness(marker, marked, b"ok", chattering, [0.02, 0.1], samples=1)
 print("read at 2 % and 10 % of the diagonal:", curve.success[:, 0])
@@ -112,7 +112,7 @@ for name, value in jm.distortion.measure(mesh, marked, ["rms", "dame", stretch])
 # stretched by high frequencies, as dihedral angles are bent by them.
 
 # %%
-gentle, _ = marker.embed(b"ok", limits={stretch: 0.01}, noise=0)
+gentle, _ = marker.embed(b"ok", jm.Budget(limits={stretch: 0.01}, noise=0))
 print(f"stretch {stretch(mesh, gentle):.4f}, RMS {jm.compare(mesh, gentle, ['rms']).rms:.3%} of the diagonal")
 assert 0.0098 < stretch(mesh, gentle) <= 0.01
 pictures.band_visibility(original, ["rms", "dame", stretch]).save("07_2.png")
@@ -195,7 +195,7 @@ class WaveScheme(Scheme):
 
 scheme = WaveScheme()
 waves = jm.make_marker(mesh, key, bits=16, scheme=scheme)
-waved, record = waves.embed(b"ok", limits={stretch: 0.01})
+waved, record = waves.embed(b"ok", {stretch: 0.01})
 print(f"RMS {record.rms:.3%} of the diagonal; read: {waves.detect(waved).message}, {record.record.parameters}")
 plot.draw(
     [plot.exaggerate(original, gentle), plot.exaggerate(original, waved), plot.displacement(original, waved)]
@@ -209,10 +209,10 @@ plot.draw(
 noisy = jm.attack(waved, "noise", 0.002, seed=0)
 found = jm.detect(noisy, original=mesh, key=key, record=record.record, scheme=scheme)
 print(f"read {found.message}, log10 p {found.log10_p:.1f}; claimed {waves.detect(noisy, b'ok').log10_p:.1f}")
-print("an estimate, for", *found.doubts)
+print("an estimate, for", *found.evidence.caveats)
 stranger = jm.make_marker(mesh, jm.Key(bytes(32)), bits=16, scheme=scheme)
 assert found.message == b"ok"
-assert found.doubts
+assert found.evidence.caveats
 assert stranger.detect(waved).message is None
 
 # %% [markdown]

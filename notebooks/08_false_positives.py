@@ -52,7 +52,7 @@ def key_of(number: int) -> jm.Key:
 
 owner = jm.make_marker(mesh, key_of(0), bits=64)
 original = owner.original
-marked, info = owner.embed(MESSAGE, 8e-4, noise=0)
+marked, info = owner.embed(MESSAGE, jm.Budget(rms=8e-4, noise=0))
 print(f"{len(mesh.vertices)} vertices, RMS displacement {info.rms:.3%} of the diagonal")
 
 # %% [markdown]
@@ -112,7 +112,7 @@ assert by_library < 0.99 * (by_hand + math.log10(2 / 0.97**2))
 
 # %%
 strangers = [(key_of(1000 + number), MESSAGE) for number in range(2000)]
-other, _ = jm.make_marker(mesh, key_of(1), bits=64).embed(b"another!", 8e-4, noise=0)
+other, _ = jm.make_marker(mesh, key_of(1), bits=64).embed(b"another!", jm.Budget(rms=8e-4, noise=0))
 unmarked = {
     "unmarked, with noise": jm.attack(mesh, "noise", 0.005, seed=1),
     "marked with another key": other,
@@ -209,9 +209,9 @@ pictures.p_values(both).save("08_4.png")
 # %%
 lie = lies[int(np.argmin(same_key))][1]
 refuted = owner.detect(marked, lie)
-print(f"claimed {lie.hex()}, but {refuted.message!r} reads, log10 p {refuted.log10_p:.1f}:", *refuted.remarks)
+print(f"claimed {lie.hex()}, but {refuted.message!r} reads, log10 p {refuted.log10_p:.1f}:", *refuted.notes)
 assert refuted.message == MESSAGE
-assert "Another message" in refuted.remarks[0]
+assert "Another message" in refuted.notes[0]
 try:
     jm.detect(marked, original=mesh, key=key_of(0), record=info.record, message=lie)
 except jm.JaxmarkError as refusal:
@@ -227,7 +227,7 @@ except jm.JaxmarkError as refusal:
 
 # %%
 forger = key_of(3)
-forged, _ = jm.make_marker(marked, forger, bits=64).embed(b"my mesh!", 8e-4, noise=0)
+forged, _ = jm.make_marker(marked, forger, bits=64).embed(b"my mesh!", jm.Budget(rms=8e-4, noise=0))
 made_up = marked._replace(vertices=2 * marked.vertices - forged.vertices)
 claim = jm.detect(marked, original=made_up, key=forger, message=b"my mesh!")
 print(f"the forger's claim: log10 p {claim.log10_p:.1f}")

@@ -41,7 +41,7 @@ MESSAGE = b"jaxmark!"
 SCHEME = FieldScheme(widths=(0.018,))  # one of three widths, so that this takes a minute; usually "field" will do
 mesh = asteroid(10_000)
 key = jm.new_key()
-marked, info = jm.embed(mesh, MESSAGE, key, scheme=SCHEME, limits={"msdm": 0.2, "rms": 8e-4})
+marked, info = jm.embed(mesh, MESSAGE, key, budget={"msdm": 0.2, "rms": 8e-4}, scheme=SCHEME)
 width, step = (info.record.parameters[name] for name in ("width", "step"))
 print(f"{len(mesh.vertices)} vertices moved by RMS {info.rms:.4%} of the diagonal; width {width}, step {step:.2e}")
 

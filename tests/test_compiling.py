@@ -15,7 +15,7 @@ from jaxmark.evaluation.allocation import allocate
 from jaxmark.evaluation.channels import Channels
 from jaxmark.spectral.chebyshev import band_energies, over_bands
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.schemes.scheme import KeyedScheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
 from tests.samples import rough_sphere
 
 pytestmark = pytest.mark.core

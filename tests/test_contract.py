@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
+from jaxmark.adversaries.registry import ATTACKS
 from jaxmark.alignment.original import make_original
-from jaxmark.attacks import ATTACKS
 from jaxmark.distortion import METRICS
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral import bands, filter, from_mesh
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark import SCHEMES
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.perception.budget import make_budget
-from jaxmark.watermark.schemes.scheme import EigenScheme, HostScheme, KeyedScheme, Scheme
+from jaxmark.watermark.interfaces import Scheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
+from jaxmark.watermark.schemes.modulated import EigenScheme, HostScheme
 from tests.samples import bumpy_sphere
 
 pytestmark = pytest.mark.core
@@ -172,7 +173,7 @@ def test_marks_move_copies_of_a_point_together(name, small: Mesh, key: jm.Key):
     soup = make_mesh(small.vertices[corners], np.arange(len(corners)).reshape(-1, 3))
     original = make_original(soup)
     marker = jm.make_marker(soup, key, bits=8, scheme=HostScheme(bands=32) if name == "host" else name)
-    marked, _ = marker.write(marker.codeword(b"c"), make_budget(1e-3))
+    marked, _ = marker.write(marker.codeword(b"c"), 1e-3)
     moved = np.asarray(marked.vertices) - soup.vertices
     np.testing.assert_array_equal(moved, moved[original.weld.first][original.weld.point])
 

@@ -21,10 +21,11 @@ from jaxmark.spectral.precision import compensated_sum, sum_and_norm
 from jaxmark.watermark.bits import detect_bits, embed_bits
 from jaxmark.watermark.carriers import Chips, KeyedCarrier, KeyedReader
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.evidence import bounds as evidence
+from jaxmark.watermark.evidence import bounds
 from jaxmark.watermark.reading.detectors import decorrelate
 from jaxmark.watermark.reading.reception import Reception, make_host, make_receiver
-from jaxmark.watermark.schemes.scheme import EigenScheme, HostScheme, KeyedScheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
+from jaxmark.watermark.schemes.modulated import EigenScheme, HostScheme
 from tests.samples import bumpy_sphere
 
 pytestmark = pytest.mark.core
@@ -72,10 +73,10 @@ def test_no_probability_is_too_small_through_rounding():
         assert score.dtype == norm.dtype == np.float32
         assert float(score) / float(norm) == pytest.approx(ratio, rel=4 * 1.2e-7 * (1 + 1 / ratio))
         bound = -(ratio**2) / 2 / math.log(10)
-        assert bound <= evidence.log10_p_claimed(score, norm) < bound * (1 - 3e-6)
+        assert bound <= bounds.log10_p_score(score, norm) < bound * (1 - 3e-6)
         # What is taken off is what was documented, and may have been needed.
         worst = np.float32(ratio * (1 + 3 * 1.2e-7))
-        assert bound <= evidence.log10_p_claimed(worst, np.float32(1)) < bound * (1 - 3e-6)
+        assert bound <= bounds.log10_p_score(worst, np.float32(1)) < bound * (1 - 3e-6)
 
 
 def test_sums_work_under_transformations(dtype):
@@ -214,4 +215,4 @@ def test_products_of_what_limits_and_proves(original):
     x = jnp.asarray(mesh.vertices, jnp.float32)
     views = msdm_views(mesh, mesh)
     assert check_products(lambda y: msdm(x, y, views), x)
-    assert check_products(evidence.correlation_bound, jnp.ones((2, 4)), jnp.ones(4), 0.5, 0.1)
+    assert check_products(bounds.correlation_bound, jnp.ones((2, 4)), jnp.ones(4), 0.5, 0.1)

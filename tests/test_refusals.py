@@ -112,7 +112,7 @@ def test_help_fits_a_screen(name: str):
     assert "typing." not in said
 
 
-@pytest.mark.parametrize("described", [jm.Study, Attack, jm.watermark.Detection, jm.watermark.BlindDetection])
+@pytest.mark.parametrize("described", [jm.Study, Attack, jm.watermark.Detection, jm.watermark.Evidence, jm.Budget])
 def test_help_describes_all_fields(described: type):
     names = described._fields if hasattr(described, "_fields") else described.__dataclass_fields__
     _, _, attributes = (described.__doc__ or "").partition("Attributes:")

@@ -40,7 +40,7 @@ from jaxmark.distortion import rms
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.surfaces import Surface
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
-from jaxmark.watermark.marking import Marker
+from jaxmark.watermark.markers import NonBlindMarker
 from jaxmark.watermark.reading.coarse import model_errors, orthonormal
 
 MOST_VERTICES = 5_000  # of a suspect, for matrices of M x M are dense
@@ -91,7 +91,13 @@ class Channel(NamedTuple):
 
 
 def make_bound(
-    marker: Marker, marked: Mesh, suspect: Mesh, attack: Callable[[Mesh], Mesh], *, others: int = OTHERS, seed: int
+    marker: NonBlindMarker,
+    marked: Mesh,
+    suspect: Mesh,
+    attack: Callable[[Mesh], Mesh],
+    *,
+    others: int = OTHERS,
+    seed: int,
 ) -> Bound | None:
     """Bound what a suspect can carry, as the module says.
 

@@ -9,7 +9,7 @@ from common.tables import Row
 from jaxmark import adversaries as enemies
 from jaxmark.evaluation._robustness import Breaking
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.schemes.scheme import Scheme
+from jaxmark.watermark.interfaces import Scheme
 
 BITS, ALPHA = 8 * len(MESSAGE), 1e-6
 METRICS = ("rms", "dame", "msdm2")
@@ -19,7 +19,7 @@ TOLERANCE = 0.1
 class Target(NamedTuple):
     """A marked mesh that enemies go against."""
 
-    marker: jm.watermark.Marker  # what reads it
+    marker: jm.watermark.NonBlindMarker  # what reads it
     marked: Mesh
     theory: float  # the least noise by theory over the mark
 
@@ -27,7 +27,7 @@ class Target(NamedTuple):
 def make_target(mesh: Mesh, scheme: str | Scheme, budget: float | None = BUDGET) -> Target:
     """Mark a mesh at a budget, or without one as strongly as is hidden."""
     marker = jm.make_marker(mesh, KEY, bits=BITS, scheme=scheme)
-    marked, _ = marker.embed(MESSAGE, budget, noise=0)
+    marked, _ = marker.embed(MESSAGE, jm.Budget(rms=budget, noise=0))
     evidence, needed = enemies.score_oracle(marker, MESSAGE)(marked) ** 2 / 2, -math.log(ALPHA)
     return Target(marker, marked, math.sqrt(max(evidence / needed - 1, 0.0)))
 

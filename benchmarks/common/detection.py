@@ -22,7 +22,7 @@ def compilation_cache() -> Iterator[None]:
 
 
 def detect(
-    marker: jm.watermark.Marker,
+    marker: jm.watermark.NonBlindMarker,
     suspect: Mesh,
     source: Path,
     suffix: str,
@@ -44,7 +44,7 @@ def detect(
     with tempfile.TemporaryDirectory() as folder:
         file, key = Path(folder) / f"suspect{suffix}", Path(folder) / "owner.key"
         jm.save_mesh(suspect, file, like=like)
-        jm.save_key(marker.key, key)
+        jm.watermark.save_key(marker.key, key)
         options = f"-m jaxmark detect --bits {marker.bits} --scheme {marker.scheme.name} --json".split()
         command = [sys.executable, *options, file, "--original", source, "--key", key]
         ended, seconds = timed(subprocess.run, command, capture_output=True, text=True)

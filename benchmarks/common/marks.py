@@ -7,10 +7,9 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.interfaces import Room
+from jaxmark.watermark.interfaces import Room, Scheme
 from jaxmark.watermark.perception.budget import Budget
 from jaxmark.watermark.perception.capacity import NOISE
-from jaxmark.watermark.schemes.scheme import Scheme
 
 KEY, MESSAGE, BUDGET = jm.Key(bytes(range(32))), b"jaxmark!", 8e-4
 
@@ -38,7 +37,7 @@ def add_schemes(parser: argparse.ArgumentParser, noise: float | None) -> None:
 class Subject(NamedTuple):
     """A marked mesh, and what is known of its mark."""
 
-    marker: jm.watermark.Marker  # what reads it
+    marker: jm.watermark.NonBlindMarker  # what reads it
     marked: Mesh
     message: bytes
     noise: float  # declared at embedding
@@ -49,18 +48,18 @@ def mark(mesh: Mesh, scheme: Scheme, bits: int, budget: float, noise: float | No
     rng = np.random.default_rng([bits, seed])
     marker, message = jm.make_marker(mesh, rng.bytes(32), bits=bits, scheme=scheme), rng.bytes(bits // 8)
     try:
-        return Subject(marker, marker.embed(message, budget, noise=NOISE)[0], message, NOISE)
+        return Subject(marker, marker.embed(message, jm.Budget(rms=budget, noise=NOISE))[0], message, NOISE)
     except jm.JaxmarkError:
         if noise is None:
             raise
-    return Subject(marker, marker.embed(message, budget, noise=noise)[0], message, noise)
+    return Subject(marker, marker.embed(message, jm.Budget(rms=budget, noise=noise))[0], message, noise)
 
 
-def write(marker: jm.watermark.Marker, message: bytes, budget: Budget) -> Mesh:
+def write(marker: jm.watermark.NonBlindMarker, message: bytes, budget: Budget) -> Mesh:
     """Embed without reading back, whether or not the mesh has room for the message."""
     return marker.write(marker.codeword(message), budget)[0]
 
 
-def room(marker: jm.watermark.Marker) -> Room | None:
+def room(marker: jm.watermark.NonBlindMarker) -> Room | None:
     """What the marker's reader leaves of its mark; None if it knows nothing of noise."""
     return marker.reader.room(marker.original.to_traced(marker.original.used))

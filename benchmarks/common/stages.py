@@ -26,8 +26,8 @@ from jaxmark.alignment.alignment import align
 from jaxmark.alignment.original import make_original
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.laplacian import Laplacian, sparse_matrices
-from jaxmark.watermark.perception.budget import make_budget
-from jaxmark.watermark.schemes.scheme import EigenScheme, Scheme
+from jaxmark.watermark.interfaces import Scheme
+from jaxmark.watermark.schemes.modulated import EigenScheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.filters import DEGREE, coefficients, graph, reordered, shifted
@@ -60,7 +60,7 @@ def embedding(folder: Path, **options: Any) -> Call:
 
 def writing(folder: Path, scheme: str | Scheme) -> Call:
     """Embedding without reading back."""
-    mesh, budget = jm.load_mesh(folder / "mesh.ply"), make_budget(BUDGET)
+    mesh, budget = jm.load_mesh(folder / "mesh.ply"), jm.Budget(rms=BUDGET).bounds(MESH)
     return lambda: write(jm.make_marker(mesh, KEY, bits=8 * len(MESSAGE), scheme=scheme), MESSAGE, budget)
 
 

@@ -54,10 +54,10 @@ def survival() -> bytes:
     mesh, curves = asteroid(3000), {}
     for name, title in (("keyed", "default"), ("host", "Sohn et al."), ("eigen", "Ohbuchi et al.")):
         marker = jm.make_marker(mesh, KEY, bits=8 * len(MESSAGE), scheme=name)
-        marked, _ = marker.embed(MESSAGE, RMS, noise=0)
+        marked, _ = marker.embed(MESSAGE, jm.Budget(rms=RMS, noise=0))
         strengths = [0.001, 0.002, 0.003, 0.004, 0.006, 0.008, 0.01, 0.012, 0.014, 0.016]
         curves[title] = jm.robustness(marker, marked, MESSAGE, "noise", strengths, samples=SAMPLES)
-    return narrow(pictures.success(curves, f"noise, {jm.attacks.ATTACKS['noise'].unit}"), 7.5, 3.2)
+    return narrow(pictures.success(curves, f"noise, {jm.adversaries.ATTACKS['noise'].unit}"), 7.5, 3.2)
 
 
 def bank() -> bytes:

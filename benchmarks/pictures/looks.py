@@ -18,7 +18,7 @@ from jaxmark.bench.shapes import SHAPES
 from jaxmark.geometry.mesh import Mesh, compact, host_mesh, weld, weld_mesh
 from jaxmark.geometry.raster import Frame
 from jaxmark.plot import Rendering, exaggerate, render
-from jaxmark.watermark.perception.budget import VISIBILITY, Budget, make_budget, visibility_of
+from jaxmark.watermark.perception.budget import VISIBILITY, Budget
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser
@@ -73,11 +73,11 @@ def main() -> None:
         say(name)
         mesh = host_mesh(compact(weld_mesh(given, weld(given.vertices))))
         frame = Frame.of(mesh)
-        frame, result = frame._replace(width=CLOSE * frame.width), marked(mesh, make_budget(named=visibility_of(mesh)))
+        frame, result = frame._replace(width=CLOSE * frame.width), marked(mesh, jm.Budget().bounds(mesh))
         more = exaggerate(jm.make_marker(mesh, KEY).original, result).mesh
         save(strip([mesh, result, more], frame), arguments.output / f"visibility_{name}.png")
         if name in arguments.levels:
-            levels = [marked(mesh, make_budget(visibility=level, named=visibility_of(mesh))) for level in VISIBILITY]
+            levels = [marked(mesh, jm.Budget(visibility=level).bounds(mesh)) for level in VISIBILITY]
             save(strip([mesh, *levels], frame), arguments.output / f"visibility_levels_{name}.png")
 
 

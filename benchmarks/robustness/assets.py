@@ -106,7 +106,7 @@ def try_file(path: Path, seconds: float, memory: float) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         key, marked, suspect = folder / "key", folder / f"marked{path.suffix}", folder / f"suspect{path.suffix}"
-        jm.save_key(jm.Key(KEY), key)
+        jm.watermark.save_key(jm.Key(KEY), key)
         call = functools.partial(run, seconds=seconds, memory=memory)
         status, told, said = call(["embed", path, marked, "--key", key, "--message", MESSAGE.hex()])
         if status != 0:

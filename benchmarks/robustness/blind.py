@@ -33,8 +33,8 @@ from jaxmark.geometry.mesh import Mesh, weld
 from jaxmark.watermark.blind.prediction import compare
 from jaxmark.watermark.blind.reading import TAG_BITS, context
 from jaxmark.watermark.blind.scheme import BlindScheme
-from jaxmark.watermark.everyday import BLIND_SCHEMES
-from jaxmark.watermark.marking import EmbedInfo
+from jaxmark.watermark.mark import EmbedInfo
+from jaxmark.watermark.schemes.registry import BLIND_SCHEMES
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser
@@ -118,7 +118,7 @@ def copies(
     """Mark a mesh with several keys, with a scheme or several together, and say how."""
     for seed in range(count):
         key, start = np.random.default_rng([seed, 64]).bytes(32), time.perf_counter()
-        marked, info = jm.embed(mesh, MESSAGE, key, scheme=together or scheme, limits=limits)
+        marked, info = jm.embed(mesh, MESSAGE, key, budget=limits, scheme=together or scheme)
         seconds, found = time.perf_counter() - start, jm.compare(mesh, marked, ("mrms", "msdm"))
         how = "" if together else ", width {width}, step {step:.2e}".format(**info.record.parameters)
         print(

@@ -42,7 +42,7 @@ from jaxmark.confidence import clopper_pearson
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, used_vertices, weld, weld_mesh
 from jaxmark.geometry.pose import Pose
-from jaxmark.watermark.schemes.scheme import get_scheme
+from jaxmark.watermark.schemes.registry import get_nonblind
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, make_parser
@@ -106,7 +106,7 @@ added-geometry 1"""
 
 def attacked(mesh: Mesh, steps: str, seed: int) -> Mesh:
     """A mesh after attacks one by one."""
-    return jm.attacks.chain(plain(mesh), [(KINDS.get(kind, kind), size) for kind, size in parse(steps)], seed=seed)
+    return jm.adversaries.chain(plain(mesh), [(KINDS.get(kind, kind), size) for kind, size in parse(steps)], seed=seed)
 
 
 def narrowest(mesh: Mesh, steps: str, seed: int) -> tuple[Mesh, str]:
@@ -132,7 +132,7 @@ def pose_error(original: Mesh, true: Pose, found: Pose) -> float:
     return float(jm.distortion.rms(found(true(points)) - points)) / diagonal(original)
 
 
-def read(marker: jm.watermark.Marker, suspect: Mesh, source: Path, suffix: str) -> Row:
+def read(marker: jm.watermark.NonBlindMarker, suspect: Mesh, source: Path, suffix: str) -> Row:
     """What a process of `jaxmark detect` says of a suspect's file."""
     run, seconds = detect(marker, suspect, source, suffix)
     row: Row = {"seconds": seconds}
@@ -215,7 +215,7 @@ def measured(source: Path, scheme: str, wanted: Case, options: argparse.Namespac
     for seed in range(options.seeds):
         row: Row = {"seed": seed, "attack": "all"}
         try:
-            made = mark(jm.load_mesh(source), get_scheme(scheme), wanted.bits, wanted.budget, options.noise, seed)
+            made = mark(jm.load_mesh(source), get_nonblind(scheme), wanted.bits, wanted.budget, options.noise, seed)
         except jm.JaxmarkError as error:
             yield row | {"note": f"not marked: {error}"}
             continue
@@ -235,7 +235,7 @@ def controls(sources: list[Path], scheme: str, wanted: Case, options: argparse.N
     suspect = original
     try:
         if kind == "other key":
-            suspect = mark(original, get_scheme(scheme), wanted.bits, wanted.budget, options.noise, trial).marked
+            suspect = mark(original, get_nonblind(scheme), wanted.bits, wanted.budget, options.noise, trial).marked
         elif kind == "other object":
             ball = trimesh.creation.icosphere(subdivisions=4)
             rough = Mesh(ball.vertices * (1 + 0.05 * rng.normal(size=(len(ball.vertices), 1))), ball.faces)

@@ -22,9 +22,9 @@ import jaxmark as jm
 from jaxmark.bench.shapes import SHAPES
 from jaxmark.distortion import shading
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, host_mesh, weld, weld_mesh
-from jaxmark.watermark.perception.budget import Budget, make_budget
+from jaxmark.watermark.perception.budget import Budget
 from jaxmark.watermark.reading.detectors import claims
-from jaxmark.watermark.schemes.scheme import KeyedScheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser
@@ -36,7 +36,7 @@ from common.turns import planes, turns
 ATTACKS = """noise 0.005; smoothing 50; quantisation 8; quantisation 7; simplification 0.9; isotropic 1"""
 
 
-def nats(marker: jm.watermark.Marker, suspect: Mesh) -> float:
+def nats(marker: jm.watermark.NonBlindMarker, suspect: Mesh) -> float:
     """The best of a claim's exponents."""
     received = marker.receive(suspect)
     word = jnp.asarray(marker.codeword(MESSAGE), received.observed.residual.dtype)
@@ -82,7 +82,7 @@ def main() -> None:
     arguments = parser.parse_args()
     limits = {name: float(value) for name, value in (limit.split("=") for limit in arguments.limit or [])}
     rms = limits.pop("rms", None)
-    budget = make_budget(rms, limits or None)
+    budget = jm.Budget(rms=rms, limits=limits or None).bounds(MESH)
     rows = []
     for name, mesh in [
         *((path.stem, load(parser, path)) for path in arguments.meshes),

@@ -43,13 +43,13 @@ def found_again(mesh: Mesh, hand: str, seed: int) -> Mesh:
     return jm.make_mesh(pose(np.asarray(mesh.vertices)), np.asarray(mesh.faces)[:, ::step])
 
 
-def read(marker: jm.watermark.Marker, suspect: Mesh, message: bytes) -> tuple[float, str]:
+def read(marker: jm.watermark.NonBlindMarker, suspect: Mesh, message: bytes) -> tuple[float, str]:
     """Evidence of the claimed message, 0 if the suspect is refused; and what to print."""
     try:
         found = marker.detect(suspect, message)
     except jm.JaxmarkError:
         return 0.0, "refused"
-    seconds = f"{found.alignment.method}, {found.alignment.seconds:.1f} s"
+    seconds = f"{found.registration.method}, {found.registration.seconds:.1f} s"
     return found.log10_p, f"{found.log10_p:.1f}{'*' * (found.message == message)} ({seconds})"
 
 

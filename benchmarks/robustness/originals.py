@@ -96,7 +96,7 @@ def read(original: Mesh, record: jm.Record, suspect: Mesh) -> Row:
     except jm.JaxmarkError as refusal:
         return {"refused": str(refusal)}
     times = {"prepare": preparing, "detect": reading}
-    how: dict[str, Any] = {"method": found.alignment.method, "doubts": found.doubts}
+    how: dict[str, Any] = {"method": found.registration.method, "caveats": found.evidence.caveats}
     return {"log10_p": found.log10_p, "reads": found.message == MESSAGE} | times | how
 
 
@@ -129,7 +129,7 @@ def summary(rows: list[dict[str, Row]]) -> list[Row]:
     lines = []
     for name in COPIES:
         pairs = [(row["exact"], row[name]) for row in rows if "log10_p" in row["exact"]]
-        good = [(exact, own) for exact, own in pairs if "log10_p" in own and not own["doubts"]]
+        good = [(exact, own) for exact, own in pairs if "log10_p" in own and not own["caveats"]]
         near = sum(own["log10_p"] <= 0.9 * exact["log10_p"] for exact, own in good)
         lines.append(
             {

@@ -116,7 +116,7 @@ def turned(mesh: Mesh, _: float, random: np.random.Generator) -> Mesh:
 OWN: Own = {"turned": turned}
 
 
-def reading(marker: jm.watermark.Marker, suspects: Callable[[int], Mesh], seeds: int) -> str:
+def reading(marker: jm.watermark.NonBlindMarker, suspects: Callable[[int], Mesh], seeds: int) -> str:
     """How many messages read, the worst evidence, what was seen, and how long it took."""
     reads, worst, unfloored, seen, seconds = 0, -np.inf, -np.inf, 1.0, 0.0
     for seed in range(seeds):
@@ -124,7 +124,7 @@ def reading(marker: jm.watermark.Marker, suspects: Callable[[int], Mesh], seeds:
         try:
             found = marker.detect(suspects(seed))
             reads += found.message == MESSAGE
-            claimed, seen = marker.detect(found.alignment, MESSAGE), min(seen, found.coverage)
+            claimed, seen = marker.detect(found.registration, MESSAGE), min(seen, found.coverage)
             worst, unfloored = max(worst, claimed.log10_p), max(unfloored, claimed.log10_p_unfloored)
         except jm.JaxmarkError:
             worst, unfloored, seen = 0.0, 0.0, 0.0
@@ -212,7 +212,7 @@ def splat_row(name: str, mesh: Mesh, key: jm.Key, folder: Path) -> str:
     path, marked, pruned = (folder / f"{part}.ply" for part in ("splats", "marked", "pruned"))
     write_splats(splats, path)
     marker = jm.make_marker(jm.load_mesh(path), key, bits=8 * len(MESSAGE))
-    jm.save_mesh(marker.embed(MESSAGE, noise=0)[0], marked, like=path)
+    jm.save_mesh(marker.embed(MESSAGE, jm.Budget(noise=0))[0], marked, like=path)
     moved = splats._replace(centres=np.asarray(jm.load_mesh(marked).vertices))
     cells = [f"{psnr(splats, moved):.1f}"]
     for share in (0.3, 0.5, 0.7):
@@ -241,7 +241,7 @@ def main() -> None:
     for name, cloud in clouds.items():
         markers[name] = jm.make_marker(cloud, key, bits=8 * len(MESSAGE))
         start = time.perf_counter()
-        marked[name], info = markers[name].embed(MESSAGE, arguments.budget, noise=0)
+        marked[name], info = markers[name].embed(MESSAGE, jm.Budget(rms=arguments.budget, noise=0))
         took = time.perf_counter() - start
         across = jm.compare(cloud, marked[name]).point_to_plane
         apart = spacings(np.asarray(cloud.vertices)).mean() / diagonal(cloud)

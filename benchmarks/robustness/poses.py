@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from jaxmark.app.programs import release_programs
 from numpy.random import Generator
 from scipy import sparse
 from scipy.sparse import csgraph
@@ -20,12 +21,11 @@ from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
 from jaxmark.alignment.alignment import align, straightened
-from jaxmark.app.programs import release_programs
 from jaxmark.files import load_skin
 from jaxmark.geometry import Skinning, unpose
 from jaxmark.geometry.mesh import Mesh, diagonal
 from jaxmark.geometry.pose import Pose, similarity
-from jaxmark.watermark.schemes.scheme import KeyedScheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser

@@ -19,7 +19,8 @@ import numpy as np
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh, weld, weld_mesh
 from jaxmark.watermark.perception.capacity import least_energy
-from jaxmark.watermark.schemes.scheme import KeyedScheme, get_scheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
+from jaxmark.watermark.schemes.registry import get_nonblind
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, make_parser
@@ -52,7 +53,7 @@ def as_bending(mesh: Mesh, bits: int, budget: float, noise: float | None) -> flo
     return budget
 
 
-def read(marker: jm.watermark.Marker, suspect: Mesh, source: Path | None) -> bytes | None:
+def read(marker: jm.watermark.NonBlindMarker, suspect: Mesh, source: Path | None) -> bytes | None:
     """What is read in this process, or in one of its own that is given files, key and payload."""
     if source is None:
         return marker.detect(suspect).message
@@ -84,7 +85,7 @@ def measure(mesh: Mesh, source: Path, wanted: Case, options: argparse.Namespace)
     kept = left.dimensions @ left.energy
     ceiling = f"{budget * math.sqrt(1.5 * kept / (10**0.25 * least_energy(bits))):.5f}"
     parts = [part for part in ("required", "strengths") if part not in options.skip]
-    cases = [(part, name, get_scheme(name), budget, options.noise) for part in parts for name in options.schemes]
+    cases = [(part, name, get_nonblind(name), budget, options.noise) for part in parts for name in options.schemes]
     if options.directions:
         equal = as_bending(mesh, bits, budget, options.noise)
         cases += [("directions", "coordinates", KeyedScheme(), budget, options.noise)]

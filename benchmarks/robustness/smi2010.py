@@ -30,9 +30,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation._robustness import NOTHING, read
 from jaxmark.evaluation.cells import Cell, processes, run
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.blind.marker import BlindMarker
-from jaxmark.watermark.everyday import prepare_alone
-from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.markers import BlindMarker, prepare
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, make_parser
@@ -55,12 +53,14 @@ UNMARKED, KEYS = -1, 5  # in place of a trial; how many keys the unmarked mesh i
 
 
 @lru_cache(maxsize=8)  # what one trial reads with, and the other keys
-def marker(method: str, mesh: str, trial: int) -> tuple[jm.watermark.Marker | BlindMarker | HarmonicMark, bytes]:
+def marker(
+    method: str, mesh: str, trial: int
+) -> tuple[jm.watermark.NonBlindMarker | BlindMarker | HarmonicMark, bytes]:
     """A key on an original, and its message."""
     rng, original = np.random.default_rng([trial, 64]), jm.load_mesh(mesh)
     if method == "harmonics":
         return make_mark(original, [trial, 20]), b""
-    return prepare_alone(original, rng.bytes(32), BITS, method), rng.bytes(BITS // 8)
+    return prepare(original, rng.bytes(32), BITS, method), rng.bytes(BITS // 8)
 
 
 @lru_cache(maxsize=2)
@@ -69,7 +69,7 @@ def marked(method: str, limits: str, mesh: str, trial: int) -> tuple[Mesh, Row]:
     made, message = marker(method, mesh, trial)
     bounds = LIMITS[limits]
     if isinstance(made, HarmonicMark):
-        written, seconds = timed(made.embed, make_budget(limits=bounds))
+        written, seconds = timed(made.embed, jm.Budget(limits=bounds).bounds(MESH))
     else:
         (written, _), seconds = timed(made.embed, message, limits=bounds, noise=0, read_back=False)
     found = jm.compare(jm.load_mesh(mesh), written, ("rms", "max", "mrms", "msdm", "msdm2", "dame"))._asdict()

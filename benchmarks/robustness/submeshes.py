@@ -24,12 +24,12 @@ import jaxmark as jm
 from jaxmark.alignment.original import Original
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.perception.capacity import NOISE
-from jaxmark.watermark.submeshes import make_part_marker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser
 from common.attacks import attacked
 from common.marks import BUDGET
+from common.submeshes import make_part_marker
 from common.tables import head, line
 from common.timing import timed
 
@@ -80,7 +80,7 @@ def capacities(mesh: Mesh, parts: int, budget: float) -> list[int]:
     for own in (one.original for one in marker.markers):
         scale = whole.diagonal / own.diagonal
         noise = NOISE * scale * radius(whole) / radius(own)
-        found.append(jm.capacity(own.mesh, budget * scale, noise=noise))
+        found.append(jm.capacity(own.mesh, jm.Budget(rms=budget * scale, noise=noise)))
     return found
 
 

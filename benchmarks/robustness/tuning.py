@@ -18,14 +18,14 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxmark.app.programs import release_programs
 
 import jaxmark as jm
 from jaxmark.alignment.original import make_original
-from jaxmark.app.programs import release_programs
 from jaxmark.evaluation.tuning import Tuned, tune
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.perception.budget import make_budget
-from jaxmark.watermark.schemes.scheme import KeyedScheme, Scheme
+from jaxmark.watermark.interfaces import Scheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, make_parser
@@ -50,7 +50,7 @@ def strength(word: str) -> tuple[str, float]:
 
 def tuned_on(mesh: Mesh, limits: Mapping[str, float], options: argparse.Namespace) -> Tuned:
     key = jax.random.key(0)
-    return tune(mesh, options.attacks, limits=limits, key=key, margin="evidence", bits=options.bits)
+    return tune(mesh, options.attacks, limits, key=key, margin="evidence", bits=options.bits)
 
 
 def profiles(
@@ -60,7 +60,7 @@ def profiles(
     found |= {f"low-pass {bands}": KeyedScheme(profile=(1.0,) * bands) for bands in LOW_PASS}
     if mean is not None:
         found["mean of the training meshes"] = mean
-    suited = jm.make_marker(mesh, KEY, bits=bits).suited(limits=limits).scheme
+    suited = jm.make_marker(mesh, KEY, bits=bits).adapted(limits).scheme
     found |= {"usual pass band": KeyedScheme(), "default": suited}
     if own is None:
         return found
@@ -89,14 +89,14 @@ def evidence(
         marker = jm.make_marker(mesh, key, bits=options.bits, scheme=scheme)
         message = bytes(options.bits // 8)
         word = marker.codeword(message)
-        marked, _ = marker.write(word, make_budget(limits=limits))
+        marked, _ = marker.write(word, limits)
         claimed = jnp.asarray(word, marker.original.signal.dtype)
         for seed in range(options.seeds):
             for place, (kind, strength) in enumerate(options.attacks):
                 received = marker.receive(jm.attack(marked, kind, strength, seed=UNSEEN + seed))
                 score, norm = marker.reader.claim(received, claimed)
                 found[number, seed, place] = max(float(score), 0) ** 2 / (2 * float(norm) ** 2)
-                read.append(marker.decode(marker.soft_values(received)) == message)
+                read.append(marker.decode(marker.soft_decisions(received)) == message)
     return found.mean(axis=(0, 1)).tolist(), float(np.mean(read))
 
 
@@ -106,7 +106,7 @@ def strengths(mesh: Mesh, scheme: Scheme, limits: Mapping[str, float], bits: int
     for seed in range(seeds):
         marker = jm.make_marker(mesh, jm.Key(bytes([seed + 1] * 32)), bits=bits, scheme=scheme)
         message = bytes(np.random.default_rng(seed).bytes(bits // 8))
-        subjects.append(Subject(marker, write(marker, message, make_budget(limits=limits)), message, 0.0))
+        subjects.append(Subject(marker, write(marker, message, limits), message, 0.0))
     return [largest(subjects, kind)["cell"] for kind in ("noise", "laplace", "taubin", "quantisation")]
 
 

@@ -28,7 +28,7 @@ import jaxmark as jm
 from jaxmark.bench.shapes import SHAPES
 from jaxmark.distortion import RENDERED, make_hiding, shading
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, host_mesh, weld, weld_mesh
-from jaxmark.watermark.perception.budget import Budget, make_budget
+from jaxmark.watermark.perception.budget import Budget
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser
@@ -81,7 +81,7 @@ def main() -> None:
     parser.add_argument("--pictures", action="store_true", help="compare pictures, too")
     arguments = parser.parse_args()
     limits = dict(limit.split("=") for limit in arguments.limit or [])
-    budget = make_budget(limits={name: float(value) for name, value in limits.items()} or None)
+    budget = jm.Budget(limits={name: float(value) for name, value in limits.items()} or None).bounds(MESH)
     rows = []
     for name, mesh in [
         *((path.stem, load(parser, path)) for path in arguments.meshes),

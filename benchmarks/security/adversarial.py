@@ -24,7 +24,7 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark import adversaries as enemies
-from jaxmark.attacks import low_pass
+from jaxmark.adversaries.filtering import low_pass
 from jaxmark.evaluation import cells
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -65,12 +65,12 @@ def visible(target: Target, scheme: str, steps: int) -> jm.attacks.Attack:
 def colluders(rule: enemies.Rule, count: int, target: Target, scheme: str, steps: int) -> jm.attacks.Attack:
     marker, _, theory = target
     messages = [bytes(np.random.default_rng(seed).bytes(BITS // 8)) for seed in range(1, count)]
-    others = [marker.embed(message, BUDGET, noise=0, read_back=False)[0] for message in messages]
+    others = [marker.embed(message, jm.Budget(rms=BUDGET, noise=0), read_back=False)[0] for message in messages]
     return around(enemies.collude(others, rule), theory / count)
 
 
 def named(kind: str, *strengths: float) -> Callable[..., jm.attacks.Attack]:
-    return lambda target, scheme, steps: jm.attacks.ATTACKS[kind]._replace(strengths=strengths)
+    return lambda target, scheme, steps: jm.adversaries.ATTACKS[kind]._replace(strengths=strengths)
 
 
 def asked(attack: Callable[..., jm.attacks.Attack], target: Target, scheme: str, steps: int) -> jm.attacks.Attack:

@@ -47,12 +47,12 @@ from jaxmark.watermark.blind import reading
 from jaxmark.watermark.blind.anchors import place, see
 from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.field import TURNS, FieldScheme
-from jaxmark.watermark.blind.marker import make_blind_marker
 from jaxmark.watermark.blind.scheme import AnchoredHost
 from jaxmark.watermark.blind.writing import Writer
-from jaxmark.watermark.everyday import BLIND_SCHEMES
 from jaxmark.watermark.evidence import bounds as evidence
-from jaxmark.watermark.marking import EmbedInfo
+from jaxmark.watermark.mark import EmbedInfo
+from jaxmark.watermark.markers import make_blind_marker
+from jaxmark.watermark.schemes.registry import BLIND_SCHEMES
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser
@@ -199,7 +199,7 @@ class Marked(NamedTuple):
 
 def mark(name: str, mesh: Mesh) -> Marked:
     """Mark within the limits."""
-    marked, info = jm.embed(mesh, MESSAGE, KEY, scheme=SCHEME, limits=LIMITS)
+    marked, info = jm.embed(mesh, MESSAGE, KEY, budget=LIMITS, scheme=SCHEME)
     found = Marked(name, mesh, marked, info)
     say(f"{name}: RMS {info.rms:.2e}, width {found.width:g}, step {found.step:.2e}, alpha {info.record.beta:.2f}")
     return found
@@ -283,7 +283,7 @@ def erasure(work: Marked) -> Iterator[Row]:
 def remarking(work: Marked) -> Iterator[Row]:
     """Mark a marked work again under another key."""
     second = MESSAGE[::-1]
-    again, _ = jm.embed(work.marked, second, OTHER, scheme=SCHEME, limits=LIMITS)
+    again, _ = jm.embed(work.marked, second, OTHER, budget=LIMITS, scheme=SCHEME)
     both = cost(work.marked, again, work.info.rms)
     yield {"mesh": work.name, "mark": "first"} | both | read(again)
     yield {"mesh": work.name, "mark": "second"} | both | read(again, OTHER, second)

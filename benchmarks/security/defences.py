@@ -30,7 +30,8 @@ from jaxmark.alignment.original import make_original
 from jaxmark.evaluation._robustness import Breaking
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.schemes.scheme import KeyedScheme, Scheme
+from jaxmark.watermark.interfaces import Scheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import load, make_parser
@@ -57,7 +58,7 @@ def descent(family: enemies.Family, known: Scheme, steps: int) -> jm.attacks.Att
 ATTACKERS = {
     "bands": Attacker(partial(descent, "bands"), 4 * BUDGET),
     "vertices": Attacker(partial(descent, "vertices"), 4 * BUDGET),
-    "shrinkage": Attacker(lambda known, steps: jm.attacks.ATTACKS["shrinkage"], None, (3e-5, 3e-2)),
+    "shrinkage": Attacker(lambda known, steps: jm.adversaries.ATTACKS["shrinkage"], None, (3e-5, 3e-2)),
     "remarking": Attacker(lambda known, steps: enemies.remarking(scheme=known, bits=BITS), None),
 }
 ELSEWHERE = (("noise", 0.005), ("smoothing", 50))

@@ -31,7 +31,6 @@ from jaxmark.watermark.carriers import make_chips
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
 from jaxmark.watermark.coding.message import encode
 from jaxmark.watermark.evidence.bounds import any_of, log10_p_claimed, log10_p_read
-from jaxmark.watermark.perception.budget import make_budget
 from jaxmark.watermark.reading.coarse import receive_coarse
 from jaxmark.watermark.reading.detectors import claims
 from jaxmark.watermark.reading.reception import Reception
@@ -60,14 +59,14 @@ def smooth_sample() -> Mesh:
     return jm.make_mesh(ball.vertices * radius[:, None] * [1.0, 1.2, 1.5], ball.faces)
 
 
-def suspects(marker: jm.watermark.Marker) -> dict[str, Observation]:
+def suspects(marker: jm.watermark.NonBlindMarker) -> dict[str, Observation]:
     """What `detect` sees of meshes that know nothing of the keys tried."""
     mesh, random = marker.original.mesh, np.random.default_rng(1)
     vertices, size = mesh.vertices, marker.original.diagonal
 
     def marked(seed: int, budget: float = BUDGET) -> Mesh:
         other = jm.make_marker(mesh, jm.Key(bytes([seed] * 32)), bits=marker.bits, scheme=marker.scheme)
-        return write(other, MESSAGE, make_budget(budget))
+        return write(other, MESSAGE, budget)
 
     half = (vertices[:, 0] > np.median(vertices[:, 0]))[:, None]
     spike = np.zeros_like(vertices)
@@ -101,11 +100,11 @@ def suspects(marker: jm.watermark.Marker) -> dict[str, Observation]:
     return stackable(seen)
 
 
-def surfaces(marker: jm.watermark.Marker) -> dict[str, Observation]:
+def surfaces(marker: jm.watermark.NonBlindMarker) -> dict[str, Observation]:
     """What `detect` sees of meshes that were meshed anew, of which only the surface is known."""
     mesh, random = marker.original.mesh, np.random.default_rng(2)
     other = jm.make_marker(mesh, jm.Key(bytes([204] * 32)), bits=marker.bits, scheme=marker.scheme)
-    marked = write(other, MESSAGE, make_budget(BUDGET))
+    marked = write(other, MESSAGE, BUDGET)
     near = mesh._replace(vertices=mesh.vertices * (1 + 0.01 * random.normal(size=(len(mesh.vertices), 1))))
     fine = jm.attack(mesh, "midpoint", 2, seed=0)
     inner = np.linalg.norm(fine.vertices - fine.vertices.mean(axis=0), axis=1)
@@ -128,11 +127,11 @@ def surfaces(marker: jm.watermark.Marker) -> dict[str, Observation]:
     return stackable(seen)
 
 
-def coarse(marker: jm.watermark.Marker) -> dict[str, Reception]:
+def coarse(marker: jm.watermark.NonBlindMarker) -> dict[str, Reception]:
     """What is received of meshes of few vertices by these."""
     mesh, original = marker.original.mesh, marker.original
     other = jm.make_marker(mesh, jm.Key(bytes([204] * 32)), bits=marker.bits, scheme=marker.scheme)
-    marked = write(other, MESSAGE, make_budget(BUDGET))
+    marked = write(other, MESSAGE, BUDGET)
     random = np.random.default_rng(3)
     near = mesh._replace(vertices=mesh.vertices * (1 + 0.003 * random.normal(size=(len(mesh.vertices), 1))))
     meshes = {
@@ -169,7 +168,7 @@ def stackable(seen: dict[str, Observation]) -> dict[str, Observation]:
 
 
 def best_claims(
-    marker: jm.watermark.Marker, seen: Mapping[str, Observation | Reception], keys: int, messages: list[bytes]
+    marker: jm.watermark.NonBlindMarker, seen: Mapping[str, Observation | Reception], keys: int, messages: list[bytes]
 ) -> tuple[np.ndarray, np.ndarray]:
     """The best score of several messages, and its norm, `[keys, suspects, ways]`, under fresh keys."""
     original = marker.original

@@ -38,10 +38,10 @@ from jaxmark.watermark.coding import polar
 from jaxmark.watermark.coding.keys import bind
 from jaxmark.watermark.coding.message import TAG_BITS, encode
 from jaxmark.watermark.evidence import bounds as evidence
-from jaxmark.watermark.marking import ALIGN_SHARES, Marker
-from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.markers import NonBlindMarker
 from jaxmark.watermark.record import Record, commit
-from jaxmark.watermark.schemes.scheme import KeyedScheme, parameters_of
+from jaxmark.watermark.schemes.keyed import KeyedScheme
+from jaxmark.watermark.schemes.registry import parameters_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import load, make_parser
@@ -78,7 +78,7 @@ def suspects(mesh: Mesh) -> dict[str, Mesh]:
     """Meshes that know nothing of the keys tried."""
     rival = jm.make_marker(mesh, jm.Key(bytes([200] * 32)))
     others = {name: jm.attack(mesh, *how, seed=1) for name, how in SUSPECTS.items()}
-    return {**others, "a rival's mark": write(rival, MESSAGE, make_budget(BUDGET))}
+    return {**others, "a rival's mark": write(rival, MESSAGE, BUDGET)}
 
 
 def flat(bands: int) -> KeyedScheme:
@@ -86,13 +86,13 @@ def flat(bands: int) -> KeyedScheme:
     return KeyedScheme(bands=bands, profile=(1.0,) * bands)
 
 
-def signs(marker: Marker) -> np.ndarray:
+def signs(marker: NonBlindMarker) -> np.ndarray:
     """The signs of the marker's codeword, as they are spread over the points."""
     carrier: Any = marker.carrier  # a keyed one
     return np.asarray(carrier.spread(jnp.asarray(marker.codeword(MESSAGE), jnp.float32)), np.float64).ravel()
 
 
-def shares(marker: Marker, aligned: Alignment) -> Iterator[np.ndarray]:
+def shares(marker: NonBlindMarker, aligned: Alignment) -> Iterator[np.ndarray]:
     """What each band adds to the vector that the signs multiply, `[bands, chips]`, for each way of weighing."""
     reader: Any = marker.reader
     for way in reader.ways(marker.receive(aligned)):
@@ -147,9 +147,9 @@ def claims_of(part: tuple[np.ndarray, np.ndarray], profile: np.ndarray, share: f
     return np.array([evidence.share_of(evidence.log10_p_claimed(score, norm), share) for score in profile @ along])
 
 
-def record_of(marker: Marker) -> Record:
+def record_of(marker: NonBlindMarker) -> Record:
     """The record that the owner would have of this mark."""
-    return marker.write(marker.codeword(MESSAGE), make_budget(BUDGET), told=MESSAGE)[1].record
+    return marker.write(marker.codeword(MESSAGE), BUDGET, told=MESSAGE)[1].record
 
 
 def remade(record: Record, key: jm.Key, mesh: Mesh, profile: Sequence[float]) -> Record:
@@ -181,7 +181,7 @@ def strengths(mesh: Mesh, seen: dict[str, Mesh], keys: int, bands: int, version:
             forged = jm.make_marker(mesh, key, record=remade(record_of(markers[best.key]), key, mesh, profile))
         found = forged.detect(aligned, MESSAGE)
         printed.append(found.log10_p)
-        late.append(found.log10_p_undated)
+        late.append(found.evidence.log10_p_uncommitted)
         say(version, bands, name, f"{hoped[-1]:.1f} hoped, {printed[-1]:.1f} printed, undated {late[-1]:.1f}", sep=", ")
     return {
         "version": version,
@@ -225,7 +225,7 @@ def grinding(mesh: Mesh, seen: dict[str, Mesh], tries: int) -> Row:
         "tries": tries * len(seen),
         "by chance": -math.log10(tries * len(seen)),
         "best printed": best.log10_p,
-        "undated": best.log10_p_undated,
+        "undated": best.evidence.log10_p_uncommitted,
         "suspect": name,
     }
 
@@ -234,7 +234,7 @@ def presented(mesh: Mesh) -> list[Row]:
     """Read with originals that were moved against the mark, from what was never marked."""
     key = key_of(0)
     marker = jm.make_marker(mesh, key)
-    marked, info = marker.write(marker.codeword(MESSAGE), make_budget(BUDGET), told=MESSAGE)
+    marked, info = marker.write(marker.codeword(MESSAGE), BUDGET, told=MESSAGE)
     shift = np.asarray(marked.vertices) - np.asarray(mesh.vertices)
     shift /= np.sqrt(np.mean(np.sum(shift**2, axis=1)))
     half = (mesh.vertices[:, 0] > np.median(mesh.vertices[:, 0]))[:, None]
@@ -250,17 +250,23 @@ def presented(mesh: Mesh) -> list[Row]:
             except jm.JaxmarkError as refusal:
                 rows.append(row | {"original": "refused: " + str(refusal).partition(": ")[2]})
                 continue
-            row["original"] = reading.doubts[0] if reading.doubts else "recovered exactly"
+            row["original"] = reading.evidence.caveats[0] if reading.evidence.caveats else "recovered exactly"
             for name, copy in copies.items():
                 found = reading.detect(copy, MESSAGE)
-                kind = "estimate" if found.doubts else "as the exact one" if found.log10_p == exact[name] else "differs"
+                kind = (
+                    "estimate"
+                    if found.evidence.caveats
+                    else "as the exact one"
+                    if found.log10_p == exact[name]
+                    else "differs"
+                )
                 row[f"log10 p from {name}"] = f"{found.log10_p:.2f}, {kind}"
-                row["proof"] = row.get("proof", False) or (found.detected() and not found.doubts)
+                row["proof"] = row.get("proof", False) or (found.detected() and not found.evidence.caveats)
             rows.append(row)
     return rows
 
 
-def marker_with(original: Mesh, key: jm.Key, record: Record) -> Marker:
+def marker_with(original: Mesh, key: jm.Key, record: Record) -> NonBlindMarker:
     return jm.make_marker(original, key, record=record)
 
 

@@ -90,7 +90,7 @@ def network(goal: enemies.Goal, folder: Path, target: Target) -> jm.attacks.Atta
 
 
 def named(kind: str, *strengths: float) -> Callable[[Path, Target], jm.attacks.Attack]:
-    return lambda folder, target: jm.attacks.ATTACKS[kind]._replace(strengths=strengths)
+    return lambda folder, target: jm.adversaries.ATTACKS[kind]._replace(strengths=strengths)
 
 
 ATTACKERS: dict[str, Callable[[Path, Target], jm.attacks.Attack]] = {

@@ -38,17 +38,17 @@ from common.timing import for_commands
 BORN = time.time()
 # The functions of each stage: module, name, and stage.
 FUNCTIONS = (
-    ("jaxmark.app.batch", "load_scene", "read"),
-    ("jaxmark.app.batch", "load_mesh", "read"),
-    ("jaxmark.app.batch", "load_texture", "read"),
-    ("jaxmark.app.batch", "prepare", "prepare"),
-    ("jaxmark.app.batch", "make_markers", "prepare"),
+    ("jaxmark.app.read_files", "load_scene", "read"),
+    ("jaxmark.app.read_files", "load_mesh", "read"),
+    ("jaxmark.app.read_files", "load_texture", "read"),
+    ("jaxmark.app.read_files", "prepare", "prepare"),
+    ("jaxmark.app.read_files", "make_markers", "prepare"),
     ("jaxmark.distortion", "Reference.measure", "limits"),
     ("jaxmark.watermark.marking", "Marker.suited", "write"),
     ("jaxmark.watermark.marking", "Marker.embed", "write"),
     ("jaxmark.watermark.marking", "Marker.reads", "back"),
     ("jaxmark.watermark.marking", "Marker.tried", "back"),
-    ("jaxmark.app.batch", "save_mesh", "save"),
+    ("jaxmark.app.read_files", "save_mesh", "save"),
     ("jaxmark.alignment.alignment", "align", "align"),
     ("jaxmark.watermark.marking", "Markers.detect", "receive"),
 )

@@ -29,7 +29,7 @@ from common.tables import Row
 
 
 @lru_cache(maxsize=1)  # cells of one mesh and key come one after another
-def marked(mesh: str, key: int) -> tuple[jm.watermark.Marker, Mesh, bytes]:
+def marked(mesh: str, key: int) -> tuple[jm.watermark.NonBlindMarker, Mesh, bytes]:
     """A marker, its mark and its message."""
     rng = np.random.default_rng(key)
     marker, message = jm.make_marker(jm.load_mesh(mesh), rng.bytes(32)), rng.bytes(8)

@@ -87,7 +87,7 @@ def measure(folder: Path, ways: dict[str, list[str]], words: dict[str, list[str]
     """Work on a folder in each way, twice."""
     files = sorted((folder / "models").iterdir())
     key, processors = folder / "owner.key", os.cpu_count() or 1
-    jm.save_key(jm.new_key(), key)
+    jm.watermark.save_key(jm.new_key(), key)
     for command, options in words.items():
         for turn in ("first", "second"):
             # A process each, of files of all sizes, with what it has in common with those before in the cache.

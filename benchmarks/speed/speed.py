@@ -46,7 +46,7 @@ from jaxmark.spectral.chebyshev import band_components, filter, moments
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.laplacian import Laplacian, sparse_matrices
 from jaxmark.spectral.recurrence import filter_scan
-from jaxmark.watermark.schemes.scheme import KeyedScheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import json_file, load, make_parser

@@ -1,8 +1,8 @@
 """How far from the limits of white noise: python benchmarks/theory/limit.py MESH [--payloads ...] [--trials 1000].
 
-Message error rate of the whole chain against Eb/N0: messages are written by `Marker.write`, white Gaussian noise is put
-on every coordinate, and the suspects are read by what `jaxmark.detect` calls: `Marker.observe` (affine alignment),
-`Marker.soft_values` (projection, joint detector) and `message.decode` (list decoder, keyed tag). A wrong message and
+Message error rate of the whole chain against Eb/N0: messages are written by `NonBlindMarker.write`, white Gaussian noise is put
+on every coordinate, and the suspects are read by what `jaxmark.detect` calls: `NonBlindMarker.observe` (affine alignment),
+`NonBlindMarker.soft_values` (projection, joint detector) and `message.decode` (list decoder, keyed tag). A wrong message and
 none are both errors. Before it the code alone: the same decoder on code bits in white Gaussian noise, where a word is
 read if it is on the list, as the tag picks it but with probability 64 · 2^-28. `--code-only` stops there; without a
 MESH, codes are then as long as is of use.
@@ -31,8 +31,7 @@ import jaxmark as jm
 from jaxmark.alignment.original import displace, shift_of
 from jaxmark.confidence import clopper_pearson
 from jaxmark.watermark.coding import message, polar
-from jaxmark.watermark.marking import Marker, make_marker
-from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.markers import NonBlindMarker, make_marker
 from jaxmark.watermark.perception.capacity import least_energy
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -111,17 +110,17 @@ def code_alone(bits: int, length: int, random: np.random.Generator, level: float
     return int(np.sum(~(listed == words[:, None]).all(axis=-1).any(axis=-1)))
 
 
-def prepare(marker: Marker, text: bytes, random: np.random.Generator) -> Callable[[float], bool]:
+def prepare(marker: NonBlindMarker, text: bytes, random: np.random.Generator) -> Callable[[float], bool]:
     """Write a mark; the result says whether one reading of it fails at an Eb/N0."""
     original = marker.original
-    mark = shift_of(original, write(marker, text, make_budget(BUDGET)))
+    mark = shift_of(original, write(marker, text, BUDGET))
     left = room(marker)
     assert left is not None
     energy = left.dimensions @ left.energy * np.sum(mark**2) / original.used.sum()
 
     def fails(level: float) -> bool:
         noise = math.sqrt(energy / (2 * marker.bits * level)) * random.normal(size=mark.shape)
-        soft = marker.soft_values(marker.receive(displace(original, mark + noise)))
+        soft = marker.soft_decisions(marker.receive(displace(original, mark + noise)))
         return marker.decode(soft) != text
 
     return fails

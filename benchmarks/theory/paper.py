@@ -44,8 +44,9 @@ from jaxmark.spectral.bands import hat, nodes, scaling
 from jaxmark.spectral.chebyshev import band_components, filter
 from jaxmark.watermark.carriers import host_bands
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.reading.detectors import Detector, correlate, decorrelate
-from jaxmark.watermark.schemes.scheme import EigenScheme, HostScheme, Scheme
+from jaxmark.watermark.interfaces import Detector, Scheme
+from jaxmark.watermark.reading.detectors import correlate, decorrelate
+from jaxmark.watermark.schemes.modulated import EigenScheme, HostScheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, json_file, load, make_parser

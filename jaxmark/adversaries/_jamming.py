@@ -11,7 +11,7 @@ from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.laplacian import Operator
-from jaxmark.watermark.schemes.scheme import DERIVED, KeyedScheme
+from jaxmark.watermark.schemes.keyed import DERIVED, KeyedScheme
 
 
 def jamming(mesh: Mesh, strength: float | Float[Array, ""], key: PRNGKeyArray) -> Mesh:

@@ -12,21 +12,24 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, host_mesh, same_connectivity
 from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key
 from jaxmark.watermark.coding.message import encode
-from jaxmark.watermark.evidence import bounds as evidence
-from jaxmark.watermark.marking import bind_mark, make_marker
+from jaxmark.watermark.evidence.detection import weigh
+from jaxmark.watermark.interfaces import Scheme
+from jaxmark.watermark.mark import bind_mark
+from jaxmark.watermark.markers import make_marker
+from jaxmark.watermark.perception.budget import BudgetLike
 from jaxmark.watermark.reading.detectors import claims
-from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, Scheme, get_scheme
+from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, get_nonblind
 
 
 class Search(NamedTuple):
     """The result of trying random keys."""
 
     key: Key  # the key with the strongest claim
-    log10_p: Float64[np.ndarray, " keys"]  # log10 p of the claim with each key, see `evidence.log10_p_claimed`
+    log10_p: Float64[np.ndarray, " keys"]  # of the claim with each key, see `Evidence`
 
 
 def forge_original(
-    given: Mesh, key: bytes, message: bytes, *, budget: float | None = None, scheme: str | Scheme = DEFAULT_SCHEME
+    given: Mesh, key: bytes, message: bytes, *, budget: BudgetLike = None, scheme: str | Scheme = DEFAULT_SCHEME
 ) -> Mesh:
     """Forge an original for a given mesh: the given mesh minus a mark that is made for it.
 
@@ -48,7 +51,7 @@ def forge_original(
         JaxmarkError: see `embed`.
     """
     marker = make_marker(given, key, bits=8 * len(message), scheme=scheme)
-    marked = marker.embed(message, budget, noise=0, read_back=False)[0]
+    marked = marker.embed(message, budget, read_back=False)[0]
     return Mesh(2 * np.asarray(given.vertices, np.float64) - np.asarray(marked.vertices), marked.faces)
 
 
@@ -73,7 +76,7 @@ def search_key(
     """
     if keys < 1:
         raise JaxmarkError(f"A search takes at least 1 key, got {keys}.")
-    maker, ready, random = get_scheme(scheme), make_original(original), np.random.default_rng(seed)
+    maker, ready, random = get_nonblind(scheme), make_original(original), np.random.default_rng(seed)
     bits = 8 * len(message)
     code_bits, tried = maker.code_length(ready, bits), [Key(random.bytes(KEY_BYTES)) for _ in range(keys)]
     seen = observation(ready, align(ready, given))
@@ -88,8 +91,8 @@ def search_key(
     def claim_log10_p(key: Key) -> float:
         codeword = jnp.asarray(encode(message, choices(key), code_bits), ready.signal.dtype)
         other = reader.with_carrier(maker.carrier(ready, choices(key), bits, code_bits))
-        ways = zip(*claims(other, received, codeword), strict=True)
-        return evidence.any_of(*(evidence.log10_p_claimed(score, norm) for score, norm in ways))
+        ways = list(zip(*claims(other, received, codeword), strict=True))
+        return weigh(ways, bits=bits, fixed=True).log10_p
 
     log10_p = np.array([claim_log10_p(key) for key in tried])
     return Search(tried[int(log10_p.argmin())], log10_p)

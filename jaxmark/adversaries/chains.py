@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxmark.attacks.registry import ATTACKS, Attack, attack
+from jaxmark.adversaries.registry import ATTACKS, attack
+from jaxmark.attacks.registry import Attack
 from jaxmark.distortion import METRICS, Reference
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.marking import Marker
+from jaxmark.watermark.markers import NonBlindMarker
 
 #: What a step may be by default, and its weakest and strongest strength; whole numbers stay whole.
 TOOLS: Mapping[str, tuple[float, float]] = {
@@ -113,7 +114,11 @@ def decode(genes: Sequence[Gene], tools: Mapping[str, tuple[float, float]] = TOO
 
 
 def projected_cost(
-    pairs: Sequence[tuple[Marker, Mesh, bytes]], metric: str = "msdm2", *, log10_alpha: float = -6.0, seed: int = 0
+    pairs: Sequence[tuple[NonBlindMarker, Mesh, bytes]],
+    metric: str = "msdm2",
+    *,
+    log10_alpha: float = -6.0,
+    seed: int = 0,
 ) -> Judge:
     """Judge chains by what it would cost to bring marks below detection: the mean over meshes.
 
@@ -186,9 +191,9 @@ def chain_attack(genes: Sequence[Gene], tools: Mapping[str, tuple[float, float]]
     return Attack(apply, "strengths over those that were found", (1 / _FACTOR, 1, _FACTOR), host=True, faces=True)
 
 
-def _log10_p(marker: Marker, suspect: Mesh, message: bytes) -> float:
+def _log10_p(marker: NonBlindMarker, suspect: Mesh, message: bytes) -> float:
     try:
-        return marker.detect(suspect, message).log10_p_unfloored
+        return marker.detect(suspect, message).evidence.log10_p_unfloored
     except JaxmarkError:  # what cannot be aligned is not detected
         return 0.0
 

@@ -6,7 +6,8 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float64
 
-from jaxmark.attacks.registry import Attack, attack
+from jaxmark.adversaries.registry import attack
+from jaxmark.attacks.registry import Attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, host_mesh, same_connectivity, weld, weld_mesh
 from jaxmark.seeds import Randomness, generator

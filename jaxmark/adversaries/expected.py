@@ -19,11 +19,10 @@ from jaxmark.spectral.chebyshev import band_energies, filter
 from jaxmark.spectral.laplacian import Laplacian
 from jaxmark.spectral.precision import matmul
 from jaxmark.watermark.coding.keys import new_key
-from jaxmark.watermark.interfaces import Displacement, Reader, Received
-from jaxmark.watermark.marking import make_marker
+from jaxmark.watermark.interfaces import Displacement, Reader, Received, Scheme
+from jaxmark.watermark.markers import make_marker
 from jaxmark.watermark.perception.visibility import band_visibility
 from jaxmark.watermark.reading.detectors import claims
-from jaxmark.watermark.schemes.scheme import Scheme
 
 _ATTACKER_BANDS = 64  # bands by which the attacker shapes displacements, over the whole spectrum
 _LOGSUMEXP_SHARPNESS = 4.0  # of the smooth maximum over ways of weighting a suspect

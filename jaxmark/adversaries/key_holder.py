@@ -20,8 +20,9 @@ from jaxmark.distortion import rms
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, weld
 from jaxmark.seeds import Randomness
+from jaxmark.watermark.coding.message import check_size
 from jaxmark.watermark.interfaces import Reader
-from jaxmark.watermark.marking import Marker
+from jaxmark.watermark.markers import NonBlindMarker
 
 _UNIT = "RMS over the diagonal"
 _STRENGTHS = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
@@ -31,7 +32,7 @@ _Way = Float64[np.ndarray, "points 3"]
 Slope = Callable[[Reader, Observation, Float[Array, " code"]], tuple[Float[Array, ""], Float[Array, "vertices 3"]]]
 
 
-def erasure(marker: Marker, message: bytes) -> Attack:
+def erasure(marker: NonBlindMarker, message: bytes) -> Attack:
     """Make an attack with the displacement that lowers the score of a claim most, in closed form.
 
     With weights, gains and powers as the receiver finds them in the marked mesh, the score is linear in the
@@ -53,7 +54,7 @@ def erasure(marker: Marker, message: bytes) -> Attack:
     return _attack(marker, message, _linear_slope, 1)
 
 
-def erasure_by_descent(marker: Marker, message: bytes, *, steps: int = 20) -> Attack:
+def erasure_by_descent(marker: NonBlindMarker, message: bytes, *, steps: int = 20) -> Attack:
     """Make the attack of `erasure` stronger by optimisation through all that the receiver does.
 
     It so attacks what weights the evidence, too. It starts from the closed form. Each step moves towards the
@@ -76,10 +77,10 @@ def erasure_by_descent(marker: Marker, message: bytes, *, steps: int = 20) -> At
     return _attack(marker, message, _slope, steps)
 
 
-def _attack(marker: Marker, message: bytes, slopes: Slope, steps: int) -> Attack:
+def _attack(marker: NonBlindMarker, message: bytes, slopes: Slope, steps: int) -> Attack:
     """Make an attack that goes against a slope of the evidence, with `steps` gradients."""
     original, reader = marker.original, marker.reader
-    marker.check_size(message)
+    check_size(message, marker.bits)
     copies = weld(original.mesh.vertices)
     codeword = jnp.asarray(marker.codeword(message), original.signal.dtype)
 

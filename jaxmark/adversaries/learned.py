@@ -14,8 +14,8 @@ import numpy as np
 from jax.example_libraries import optimizers
 from jaxtyping import Array, Float, Float64, PRNGKeyArray
 
-from jaxmark.adversaries.blind import MARK, make_attack
 from jaxmark.adversaries.expected import Surrogate, evidence, make_surrogate, random_mark, rescale, rms
+from jaxmark.adversaries.keyless import MARK, make_attack
 from jaxmark.attacks.registry import Attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
@@ -23,7 +23,7 @@ from jaxmark.spectral.bands import intervals
 from jaxmark.spectral.chebyshev import band_components
 from jaxmark.spectral.learned import cheb_conv, init_cheb_conv
 from jaxmark.watermark.interfaces import Displacement
-from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, Scheme
+from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, Scheme
 
 Goal = Literal["estimate", "removal"]
 Network = tuple[dict[str, Float[Array, "..."]], ...]  # parameters of convolutions, one after the other

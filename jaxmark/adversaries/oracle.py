@@ -23,7 +23,8 @@ from jaxmark.seeds import Randomness, generator
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.laplacian import Laplacian
 from jaxmark.watermark.coding.keys import Choices, Key
-from jaxmark.watermark.marking import Marker
+from jaxmark.watermark.coding.message import check_size
+from jaxmark.watermark.markers import NonBlindMarker
 from jaxmark.watermark.reading.detectors import claims
 
 _UNIT = "RMS over the diagonal"
@@ -56,7 +57,7 @@ class Counted(Generic[Answer]):
         return self.oracle(mesh)
 
 
-def score_oracle(marker: Marker, message: bytes) -> Score:
+def score_oracle(marker: NonBlindMarker, message: bytes) -> Score:
     """Make an oracle for the evidence √(-2 ln p) of a claim, with no floor on p; 0 for a suspect that is refused.
 
     The evidence is S/‖a‖ if the detector tries one way of weighting the suspect, and a little less if it takes the
@@ -69,13 +70,13 @@ def score_oracle(marker: Marker, message: bytes) -> Score:
     Raises:
         JaxmarkError: if message and payload differ in size.
     """
-    marker.check_size(message)
+    check_size(message, marker.bits)
     reader, dtype = marker.reader, marker.original.signal.dtype
     codeword = jnp.asarray(marker.codeword(message), dtype)
 
     def score(mesh: Mesh) -> float:
         try:
-            received = marker.receive(mesh)
+            received = marker.receive(marker.register(mesh))
         except JaxmarkError:
             return 0.0
         scores, norms = (np.asarray(one, np.float64) for one in claims(reader, received, codeword))
@@ -85,7 +86,7 @@ def score_oracle(marker: Marker, message: bytes) -> Score:
     return score
 
 
-def decision_oracle(marker: Marker, message: bytes, alpha: float = 1e-6) -> Decision:
+def decision_oracle(marker: NonBlindMarker, message: bytes, alpha: float = 1e-6) -> Decision:
     """Make an oracle for the decision whether a claim is proven; a suspect that is refused is not detected.
 
     Args:
@@ -96,7 +97,7 @@ def decision_oracle(marker: Marker, message: bytes, alpha: float = 1e-6) -> Deci
     Raises:
         JaxmarkError: if message and payload differ in size, or `alpha` is out of range.
     """
-    marker.check_size(message)
+    check_size(message, marker.bits)
     least = _log10(alpha)
 
     def decide(mesh: Mesh) -> bool:
@@ -147,7 +148,7 @@ def randomise_scores(oracle: Score, spread: float, key: bytes) -> Score:
     """
 
     def score(mesh: Mesh) -> float:
-        seed = int.from_bytes(Choices(Key(key), geometry_hash(mesh), 1).derive("oracle/noise", 16), "little")
+        seed = int.from_bytes(Choices(Key(key), geometry_hash(mesh)).derive("oracle/noise", 16), "little")
         return oracle(mesh) + spread * float(np.random.default_rng(seed).normal())
 
     return score

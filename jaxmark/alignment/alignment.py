@@ -10,7 +10,7 @@ was mirrored is read as it was before: any of these maps mirrors where that fits
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int64
@@ -80,6 +80,15 @@ class Alignment(NamedTuple):
     how: Align = "auto"  # how it was asked for
     heights: VertexHeights | None = None  # of the vertices of a surface that has few, above the original
     bent: Bent | None = None  # recognised points that no single map brings back
+
+    def facts(self) -> dict[str, Any]:
+        """What a report says of the registration, as values for JSON."""
+        return {
+            "method": self.method,
+            "pose": self.pose.facts(),
+            "residual": self.residual,
+            "seconds": self.seconds,
+        }
 
 
 def observation(original: Original, found: Alignment) -> Observation:

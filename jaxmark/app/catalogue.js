@@ -49,7 +49,7 @@ function show(found) {
   if (named.length) {
     box.append(make("p", `Such a naming would come about by chance with a probability of at most ${power(found.log10_p)}, if `
       + "keys, originals and records were fixed before the file existed; "
-      + `${power(found.log10_p_undated)} if nothing dates them. All ${found.tried} readings that could have been made are paid for.`));
+      + `${power(found.log10_p_uncommitted)} if nothing dates them. All ${found.tried} readings that could have been made are paid for.`));
   }
   if (found.dossier) {
     const link = make("a", "Dossier");

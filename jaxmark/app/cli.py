@@ -13,160 +13,54 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn, get_args
+from typing import NoReturn, get_args
 
 import click
 
 from jaxmark import distortion
+from jaxmark.adversaries.registry import ATTACKS, chain, get_attack
 from jaxmark.alignment.alignment import Align
-from jaxmark.app.answering import JSON as _JSON
-from jaxmark.app.answering import QUIET as _QUIET
-from jaxmark.app.answering import answer as _answer
-from jaxmark.app.answering import progress as _progress
-from jaxmark.app.answering import read_key as _key
-from jaxmark.app.answering import say as _say
-from jaxmark.app.batch import FileReader, mark_file
-from jaxmark.app.bench import bench_command, bench_corpus_command, bench_equal_command
-from jaxmark.app.blind import BlindReader
-from jaxmark.app.catalogue import catalogue_group
-from jaxmark.app.ending import end_by_exception
-from jaxmark.app.finding import ALIGN as _ALIGN
-from jaxmark.app.finding import identify_by_catalogue
+from jaxmark.app.bench_commands import bench_command, bench_corpus_command, bench_equal_command
+from jaxmark.app.catalogue_commands import catalogue_group, mark_for_command
+from jaxmark.app.find_commands import identify_by_catalogue
 from jaxmark.app.folders import Work, each, mesh_files
-from jaxmark.app.issuing import mark_for_command
-from jaxmark.app.outputs import check_distinct, check_suffix
-from jaxmark.app.posing import unpose_command
+from jaxmark.app.mark_files import mark_file
+from jaxmark.app.options import (
+    ALIGN,
+    ALPHA,
+    FILE,
+    JSON,
+    KEY,
+    MESHES,
+    QUIET,
+    WORKERS,
+    Schemes,
+    budget_options,
+    message_options,
+    read_key,
+)
+from jaxmark.app.output import FileOutcome, answer, check_distinct, check_suffix, error_text, power, say
+from jaxmark.app.process import end_by_exception
+from jaxmark.app.progress import current
+from jaxmark.app.read_files import FileReader
 from jaxmark.app.serving import serve_command
-from jaxmark.app.telling import Told, power, told_error
-from jaxmark.attacks import ATTACKS, chain, get_attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.cells import left_over
 from jaxmark.evaluation.pictures.studies import Measure
 from jaxmark.evaluation.study_file import load_study
 from jaxmark.extras import require
-from jaxmark.files import load_mesh, load_scene, save_mesh, save_scene
+from jaxmark.files import load_mesh, load_scene, load_skin, save_mesh, save_scene
 from jaxmark.files.atomic import replacing, write_atomically
+from jaxmark.geometry import unpose
 from jaxmark.geometry.mesh import same_connectivity
 from jaxmark.watermark.coding.keys import commitment, new_key, save_key
-from jaxmark.watermark.deposit import Deposit, make_deposit
-from jaxmark.watermark.everyday import NAMES, blind_scheme, capacity, split
-from jaxmark.watermark.marking import DEFAULT_BITS
-from jaxmark.watermark.perception.budget import VISIBILITY, Visibility, make_budget, visibility_of
+from jaxmark.watermark.coding.message import DEFAULT_BITS
+from jaxmark.watermark.everyday import capacity
+from jaxmark.watermark.perception.budget import Budget
 from jaxmark.watermark.perception.capacity import COVERAGE, NOISE
-from jaxmark.watermark.record import RECORD_SUFFIX, Record
-from jaxmark.watermark.scenes import load_record
-from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME
+from jaxmark.watermark.record import RECORD_SUFFIX, Record, TimestampedCommitment, load_record, make_commitment
+from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, DEFAULT_SCHEME, NAMES
 from jaxmark.watermark.tracing.tracer import identify
-
-
-class _Schemes(click.ParamType):
-    """The name of a scheme, or an informed and blind ones with commas between."""
-
-    name = "scheme"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
-        """Convert names to a tuple."""
-        names: tuple[str, ...] = value if isinstance(value, tuple) else tuple(value.split(","))
-        if unknown := [name for name in names if name not in NAMES]:
-            self.fail(f"{unknown[0]!r} is not one of {', '.join(map(repr, NAMES))}.", param, ctx)
-        if len(names) > 1:
-            split(names)  # refuses what cannot mark one mesh together
-        return names
-
-
-class _Hexadecimal(click.ParamType):
-    """A message as hexadecimal digits."""
-
-    name = "hex"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> bytes:
-        """Convert hexadecimal digits to bytes."""
-        if isinstance(value, bytes):
-            return value
-        try:
-            message = bytes.fromhex(value)
-        except ValueError:
-            message = b""
-        if not message:
-            self.fail(
-                f"{value!r} is not a message: give an even number of hexadecimal digits, e.g. c0ffee42.", param, ctx
-            )
-        return message
-
-
-class _Text(click.ParamType):
-    """A message as text."""
-
-    name = "text"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> bytes:
-        """Convert text to bytes of UTF-8."""
-        if isinstance(value, bytes):
-            return value
-        if not value:
-            self.fail("an empty text is no message; for a mark that says nothing use --presence.", param, ctx)
-        return value.encode()
-
-
-class _Limit(click.ParamType):
-    """A metric and its upper limit."""
-
-    name = "name=value"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
-        """Convert `name=value` to the name and the number."""
-        if isinstance(value, tuple):
-            return value
-        name, _, number = value.partition("=")
-        try:
-            return name, float(number)
-        except ValueError:
-            self.fail(f"{value!r} is no limit: give a metric and a number, e.g. dame=0.008.", param, ctx)
-
-
-_MESH = click.Path(path_type=Path)
-_KEY = click.option("--key", "key_file", type=_MESH, required=True, help="Key file, from `jaxmark keygen`.")
-_NOISE = click.option(
-    "--noise",
-    type=float,
-    default=NOISE,
-    show_default=True,
-    help="Noise that the message must survive: half width, relative to the mean distance of vertices to the centre.",
-)
-_MESHES = click.option(
-    "--mesh", "meshes", multiple=True, help="Of a file of several meshes, one to use, by name; may be repeated."
-)
-_WORKERS = click.option(
-    "--workers",
-    type=click.IntRange(1),
-    default=1,
-    show_default=True,
-    help="For a folder: number of processes at once, each with memory of its own.",
-)
-_ALPHA = click.option(
-    "--alpha",
-    type=float,
-    default=1e-6,
-    show_default=True,
-    help="Largest false-positive probability that counts as proof.",
-)
-_BUDGET = click.option(
-    "--budget",
-    type=float,
-    help="RMS displacement of the vertices, relative to the diagonal of the bounding box.",
-)
-_LIMIT = click.option(
-    "--limit",
-    "limits",
-    type=_Limit(),
-    multiple=True,
-    help="Upper limit on a metric of `jaxmark compare`; may be repeated.",
-)
-_VISIBILITY = click.option(
-    "--visibility",
-    type=click.Choice(list(VISIBILITY)),
-    help="How well people may see the mark.  [default, without --budget and --limit: hidden]",
-)
 
 
 @click.group(
@@ -191,8 +85,8 @@ def cli() -> None:
 
 
 @cli.command()
-@click.argument("keyfile", type=_MESH)
-@_JSON
+@click.argument("keyfile", type=FILE)
+@JSON
 def keygen(keyfile: Path, as_json: bool) -> None:
     """Make a key of 256 random bits in a new file that only you can read.
 
@@ -200,52 +94,45 @@ def keygen(keyfile: Path, as_json: bool) -> None:
     """
     key = new_key()
     save_key(key, keyfile)
-    _answer(as_json, {"key_file": str(keyfile), "commitment": commitment(key)}, f"key → {keyfile}")
+    answer(as_json, {"key_file": str(keyfile), "commitment": commitment(key)}, f"key → {keyfile}")
 
 
 @cli.command(name="embed")
-@click.argument("original", type=_MESH)
-@click.argument("marked", type=_MESH)
-@_KEY
-@click.option("--message", type=_Hexadecimal(), help="Hexadecimal digits; 16 of them are 64 bits.")
-@click.option("--text", type=_Text(), help="The message as text instead, in UTF-8: 8 bits for most letters.")
-@click.option("--presence", is_flag=True, help="Instead of a message: say nothing but that the mark is there.")
-@click.option("--recipient", help="Instead of a message: the recipient of this copy, for `jaxmark identify`.")
-@_BUDGET
-@_LIMIT
-@_VISIBILITY
-@click.option(
-    "--noise",
-    type=float,
-    help="Noise that the message must survive with half of the vertices lost: half width, relative to the mean distance"
-    " of vertices to the centre.  [default: none; what it survives is told]",
+@click.argument("original", type=FILE)
+@click.argument("marked", type=FILE)
+@KEY
+@message_options(
+    "Hexadecimal digits; 16 of them are 64 bits.",
+    "The message as text instead, in UTF-8: 8 bits for most letters.",
+    "Instead of a message: say nothing but that the mark is there.",
 )
-@_MESHES
+@click.option("--recipient", help="Instead of a message: the recipient of this copy, for `jaxmark identify`.")
+@budget_options(
+    noise_help="Noise that the message must survive with half of the vertices lost: half width, relative to the mean"
+    " distance of vertices to the centre.  [default: none; what it survives is told]"
+)
+@MESHES
 @click.option(
     "--scheme",
     "schemes",
-    type=_Schemes(),
+    type=Schemes(),
     default=DEFAULT_SCHEME,
     show_default=True,
     help=f"Scheme that carries the bits, of {', '.join(NAMES)}; marks of `field` and `local` are read without the"
     " original. Several with commas between, such as keyed,field, mark for both.",
 )
-@click.option("--record", "record_file", type=_MESH, help=f"File for the record.  [default: MARKED{RECORD_SUFFIX}]")
-@_WORKERS
-@_QUIET
-@_JSON
+@click.option("--record", "record_file", type=FILE, help=f"File for the record.  [default: MARKED{RECORD_SUFFIX}]")
+@WORKERS
+@QUIET
+@JSON
 def embed_command(
     original: Path,
     marked: Path,
     key_file: Path,
     message: bytes | None,
-    text: bytes | None,
     presence: bool,
     recipient: str | None,
-    budget: float | None,
-    limits: tuple[tuple[str, float], ...],
-    visibility: Visibility | None,
-    noise: float | None,
+    budget: Budget,
     meshes: tuple[str, ...],
     schemes: tuple[str, ...],
     record_file: Path | None,
@@ -261,7 +148,6 @@ def embed_command(
 
     For a folder, each file gets a line of output, and a refused file does not stop the others.
     """
-    message = _one_message(message, text)
     if presence and message is not None:
         raise JaxmarkError("Give either --message or --presence.")
     mark = partial(
@@ -269,9 +155,6 @@ def embed_command(
         message=b"" if presence else message,
         recipient=recipient,
         budget=budget,
-        limits=dict(limits) or None,
-        visibility=visibility,
-        noise=noise,
         scheme=schemes[0] if len(schemes) == 1 else schemes,
         meshes=meshes,
     )
@@ -280,67 +163,66 @@ def embed_command(
         record_file = record_file or marked.with_name(marked.name + RECORD_SUFFIX)
         check_suffix(original, marked)
         check_distinct(original=original, marked=marked, key=key_file, record=record_file)
-        told = mark(original, marked, record_file, key=_key(key_file), doing=_progress().doing)
-        return _answer(as_json, told.answer, told.said)
+        outcome = mark(original, marked, record_file, key=read_key(key_file), doing=current().doing)
+        return answer(as_json, outcome.values, outcome.text)
     if record_file is not None:
         raise JaxmarkError("Each file of a folder has a record beside it; leave out --record.")
-    work = partial(_mark_member, partial(mark, key=_key(key_file)), marked)
+    work = partial(_mark_member, partial(mark, key=read_key(key_file)), marked)
     mesh_files(original)  # refuses a folder without any before another is made
     marked.mkdir(parents=True, exist_ok=True)
     _each(original, as_json, work, workers)
 
 
 @cli.command(name="detect")
-@click.argument("suspect", type=_MESH)
-@click.option("--original", type=_MESH, help="The unmarked mesh; marks of `field` and `local` are read without it.")
-@_KEY
+@click.argument("suspect", type=FILE)
+@click.option("--original", type=FILE, help="The unmarked mesh; marks of `field` and `local` are read without it.")
+@KEY
 @click.option("--bits", type=int, help=f"Payload, a multiple of 8.  [default: the record's, else {DEFAULT_BITS}]")
-@click.option(
-    "--message",
-    type=_Hexadecimal(),
-    help="A message that you claim is there; it can be proven even where it cannot be read.",
+@message_options(
+    "A message that you claim is there; it can be proven even where it cannot be read.",
+    "The claimed message as text instead.",
+    "Claim that a presence mark is there; its record says so, too.",
 )
-@click.option("--text", type=_Text(), help="The claimed message as text instead.")
-@click.option("--presence", is_flag=True, help="Claim that a presence mark is there; its record says so, too.")
 @click.option(
     "--record",
     "record_file",
-    type=_MESH,
+    type=FILE,
     help="The mark's record, which gives scheme and payload, and binds key and original.",
 )
-@_MESHES
+@MESHES
 @click.option(
     "--scheme",
     "schemes",
-    type=_Schemes(),
+    type=Schemes(),
     help="Without a record: scheme that carries the bits; several as in `embed`, to unite what they prove."
     f"  [default: {DEFAULT_SCHEME}, without --original any blind one]",
 )
-@_ALIGN
-@click.option("--deposit", "deposit_file", type=_MESH, help="Deposit that dates the record, from `jaxmark deposit`.")
+@ALIGN
+@click.option("--deposit", "deposit_file", type=FILE, help="Deposit that dates the record, from `jaxmark deposit`.")
 @click.option("--obtained", default="", help="When and where SUSPECT was got, for the dossier.")
-@click.option("--report", type=_MESH, help="Folder for a picture of how SUSPECT was aligned (needs the extra `plot`).")
-@click.option("--dossier", type=_MESH, help="Folder for a page that shows a detection to others (extra `plot`).")
-@_ALPHA
-@_WORKERS
-@_QUIET
-@_JSON
+@click.option("--report", type=FILE, help="Folder for a picture of how SUSPECT was aligned (needs the extra `plot`).")
+@click.option("--dossier", type=FILE, help="Folder for a page that shows a detection to others (extra `plot`).")
+@click.option("--charges", is_flag=True, help="Say what each choice of the reading cost, too.")
+@ALPHA
+@WORKERS
+@QUIET
+@JSON
 def detect_command(
     suspect: Path,
     original: Path | None,
     key_file: Path,
     bits: int | None,
     message: bytes | None,
-    text: bytes | None,
     presence: bool,
     record_file: Path | None,
     meshes: tuple[str, ...],
     schemes: tuple[str, ...] | None,
-    how: Align,
+    align: Align,
     deposit_file: Path | None,
     obtained: str,
     report: Path | None,
     dossier: Path | None,
+    charges: bool,
     alpha: float,
     workers: int,
     as_json: bool,
@@ -361,63 +243,54 @@ def detect_command(
     For a folder, each file gets a line of output, and the exit status is the worst of all. --original and --record may
     then be folders, too, with files of the same names.
     """
-    deposit = None if deposit_file is None else Deposit.load(deposit_file)
-    if deposit is not None and record_file is None:
+    if deposit_file is not None and record_file is None:
         raise JaxmarkError("A deposit dates records: give the --record that is in it, too.")
-    message = _one_message(message, text)
     if presence and (message is not None or bits):
         raise JaxmarkError("A presence mark has no message; leave out --message and --bits, or --presence.")
-    payload = 0 if presence else bits
-    named = list(schemes or ())
-    blind_ones = [scheme for name in named if (scheme := blind_scheme(name)) is not None]
-    if original is None or len(named) == len(blind_ones) == 1:
-        if named and not blind_ones:
+    named = schemes or ()
+    blind = [name for name in named if name in BLIND_SCHEMES]
+    if original is None or len(named) == len(blind) == 1:
+        if named and not blind:
             raise JaxmarkError(f"The scheme {named[0]!r} is read beside the original; give --original.")
-        if how != "auto" or report is not None or dossier is not None:
+        if align != "auto" or report is not None or dossier is not None:
             raise JaxmarkError("--align, --report and --dossier are for reading beside the original; give --original.")
-        only = blind_ones[0] if len(blind_ones) == 1 else None
-        blind = BlindReader(_key(key_file), payload, message, alpha, deposit, obtained, meshes, only)
-        if suspect.is_dir():
-            _each(suspect, as_json, partial(_read_member_blindly, blind, record_file), workers)
-        told = replace(blind, doing=_progress().doing).read(suspect, record_file)
-        _answer(as_json, told.answer, told.said)
-        sys.exit(0 if told.done else 1)
+        original = None
     reader = FileReader(
-        _key(key_file),
-        payload,
+        read_key(key_file),
+        0 if presence else bits,
         message,
-        named[0] if named else None,
-        how,
+        named,
+        align,
         alpha,
-        deposit,
+        None if deposit_file is None else TimestampedCommitment.load(deposit_file),
         obtained,
-        guesses=not suspect.is_dir(),
+        diagnoses=not suspect.is_dir(),
         meshes=meshes,
-        also=blind_ones,
+        shows_charges=charges,
     )
     if suspect.is_dir():
         _each(suspect, as_json, partial(_read_member, reader, original, record_file, report, dossier), workers)
-    told = replace(reader, doing=_progress().doing).read(suspect, original, record_file, report, dossier)
-    _answer(as_json, told.answer, told.said)
-    sys.exit(0 if told.done else 1)
+    outcome = replace(reader, doing=current().doing).read(suspect, original, record_file, report, dossier)
+    answer(as_json, outcome.values, outcome.text)
+    sys.exit(0 if outcome.done else 1)
 
 
 @cli.command(name="identify")
-@click.argument("suspect", type=_MESH)
-@click.option("--original", type=_MESH, help="The unmarked mesh.")
-@_KEY
-@click.option("--recipients", type=_MESH, help="Text file with the recipients of copies, one identifier per line.")
+@click.argument("suspect", type=FILE)
+@click.option("--original", type=FILE, help="The unmarked mesh.")
+@KEY
+@click.option("--recipients", type=FILE, help="Text file with the recipients of copies, one identifier per line.")
 @click.option(
-    "--catalogue", "catalogue_file", type=_MESH, help="Catalogue that knows originals and recipients, in place of both."
+    "--catalogue", "catalogue_file", type=FILE, help="Catalogue that knows originals and recipients, in place of both."
 )
-@click.option("--record", "record_file", type=_MESH, help="The record of a copy, which binds key and original.")
+@click.option("--record", "record_file", type=FILE, help="The record of a copy, which binds key and original.")
 @click.option(
     "--top", type=click.IntRange(1), default=10, show_default=True, help="Number of recipients in the ranking."
 )
-@_ALIGN
-@_ALPHA
-@_QUIET
-@_JSON
+@ALIGN
+@ALPHA
+@QUIET
+@JSON
 def identify_command(
     suspect: Path,
     original: Path | None,
@@ -426,7 +299,7 @@ def identify_command(
     catalogue_file: Path | None,
     record_file: Path | None,
     top: int,
-    how: Align,
+    align: Align,
     alpha: float,
     as_json: bool,
 ) -> None:
@@ -440,7 +313,7 @@ def identify_command(
     if catalogue_file is not None:
         if original is not None or recipients is not None or record_file is not None:
             raise JaxmarkError("A catalogue knows originals, recipients and records; leave those out.")
-        identify_by_catalogue(suspect, catalogue_file, key_file, how, alpha, as_json)
+        identify_by_catalogue(suspect, catalogue_file, key_file, align, alpha, as_json)
     if original is None or recipients is None:
         raise JaxmarkError("Give --original and --recipients, or a --catalogue that knows them.")
     try:
@@ -450,31 +323,31 @@ def identify_command(
     if not names:
         raise JaxmarkError(f"{recipients} names nobody; give one identifier a line.")
     record = None if record_file is None else Record.load(record_file)
-    key = _key(key_file)
-    _progress().doing(f"reading {suspect} and {original}")
+    key = read_key(key_file)
+    current().doing(f"reading {suspect} and {original}")
     meshes = load_mesh(suspect), load_mesh(original)
-    _progress().doing(f"looking for the copies of {len(names)} recipients in {suspect}")
-    found = identify(meshes[0], names, original=meshes[1], key=key, record=record, top=top, align=how)
+    current().doing(f"looking for the copies of {len(names)} recipients in {suspect}")
+    found = identify(meshes[0], names, original=meshes[1], key=key, record=record, top=top, align=align)
     accused = [one for one in found if one.log10_p <= math.log10(alpha)]
-    answer = {
+    values = {
         "accused": [one.recipient for one in accused],
         "ranking": [one._asdict() for one in found],
         "recipients": len(names),
     }
     lines = [
         f"{one.recipient}: score {one.score:.1f}, probability "
-        + (f"about {power(one.log10_p)}, an estimate: {'; '.join(one.doubts)}" if one.doubts else "")
-        + ("" if one.doubts else f"at most {power(one.log10_p)}")
+        + (f"about {power(one.log10_p)}, an estimate: {'; '.join(one.caveats)}" if one.caveats else "")
+        + ("" if one.caveats else f"at most {power(one.log10_p)}")
         for one in accused
     ]
-    _answer(as_json, answer, "\n".join(lines) or f"nobody of {len(names)} is accused (--alpha {alpha:g})")
+    answer(as_json, values, "\n".join(lines) or f"nobody of {len(names)} is accused (--alpha {alpha:g})")
     sys.exit(0 if accused else 1)
 
 
 @cli.command(name="deposit")
-@click.argument("records", type=_MESH, nargs=-1, required=True)
-@click.option("--output", type=_MESH, required=True, help="File for the deposit; a request to date it goes beside it.")
-@_JSON
+@click.argument("records", type=FILE, nargs=-1, required=True)
+@click.option("--output", type=FILE, required=True, help="File for the deposit; a request to date it goes beside it.")
+@JSON
 def deposit_command(records: tuple[Path, ...], output: Path, as_json: bool) -> None:
     """Make a deposit of RECORDS, to be dated before anybody claims anything; it shows nothing of what they commit to.
 
@@ -482,14 +355,14 @@ def deposit_command(records: tuple[Path, ...], output: Path, as_json: bool) -> N
     keep the answer. `jaxmark detect --deposit OUTPUT` then counts a dated claim in full, less log10 of their number.
     """
     check_distinct(output=output, **{f"record {place}": path for place, path in enumerate(records)})
-    found = make_deposit(load_record(path).digest() for path in records)
+    found = make_commitment(load_record(path).digest() for path in records)
     request = output.with_name(output.name + ".tsq")
     with replacing(request) as draft:
         write_atomically(draft, found.timestamp_request())
         write_atomically(output, found.to_json().encode())
-    answer = {"root": found.root, "records": len(found.digests), "deposit": str(output), "request": str(request)}
+    values = {"root": found.root, "records": len(found.digests), "deposit": str(output), "request": str(request)}
     size = f"{len(found.digests)} record{'s' if len(found.digests) > 1 else ''}"
-    _answer(as_json, answer, f"{size} → {output}, root {found.root}, request → {request}")
+    answer(as_json, values, f"{size} → {output}, root {found.root}, request → {request}")
 
 
 # click keeps the lines of a paragraph that starts with \b.
@@ -497,8 +370,8 @@ _KINDS = "\n".join(["\b", "KIND, and what STRENGTH is:", *(f"{name}: {entry.unit
 
 
 @cli.command(name="attack", epilog=_KINDS)
-@click.argument("source", metavar="IN", type=_MESH)
-@click.argument("target", metavar="OUT", type=_MESH)
+@click.argument("source", metavar="IN", type=FILE)
+@click.argument("target", metavar="OUT", type=FILE)
 @click.argument("words", metavar="KIND STRENGTH [KIND STRENGTH]...", nargs=-1, required=True)
 @click.option(
     "--seed",
@@ -507,8 +380,8 @@ _KINDS = "\n".join(["\b", "KIND, and what STRENGTH is:", *(f"{name}: {entry.unit
     show_default=True,
     help="Seed of the attack's random choices.",
 )
-@_QUIET
-@_JSON
+@QUIET
+@JSON
 def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int, as_json: bool) -> None:
     """Apply one attack or several to a mesh, to see what a mark survives.
 
@@ -518,7 +391,7 @@ def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int
     steps = _steps(words)
     check_suffix(source, target)
     check_distinct(IN=source, OUT=target)
-    _progress().doing(f"attacking {source}: {' '.join(words)}")
+    current().doing(f"attacking {source}: {' '.join(words)}")
     scene = load_scene(source)
     if (
         len(scene.meshes) + len(scene.left) > 1 and source.suffix.lower() != ".obj"
@@ -530,11 +403,11 @@ def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int
         same = same_connectivity(mesh, attacked)
         save_mesh(attacked, draft, like=source if same else None)
         change = distortion.displacement_size(mesh, load_mesh(draft))._asdict() if same else {"rms": None, "max": None}
-    answer = {"attacks": steps, "seed": seed, "vertices": len(attacked.vertices), "faces": len(attacked.faces)}
+    values = {"attacks": steps, "seed": seed, "vertices": len(attacked.vertices), "faces": len(attacked.faces)}
     said = " + ".join(f"{kind} {strength:g}" for kind, strength in steps)
     size = f"{len(attacked.vertices)} vertices and {len(attacked.faces)} faces"
     how = f"RMS {change['rms']:.3g} of the diagonal" if same else f"a mesh of {size}"
-    _answer(as_json, {**answer, **change}, f"{said} → {target}, {how}")
+    answer(as_json, {**values, **change}, f"{said} → {target}, {how}")
 
 
 def _attack_scene(source: Path, target: Path, steps: list[tuple[str, float]], seed: int, as_json: bool) -> None:
@@ -550,11 +423,11 @@ def _attack_scene(source: Path, target: Path, steps: list[tuple[str, float]], se
         save_scene(attacked, draft, like=source)
         after = load_scene(draft).meshes
     sizes = {name: distortion.displacement_size(mesh, after[name])._asdict() for name, mesh in meshes.items()}
-    answer = {"attacks": steps, "seed": seed, "meshes": sizes, "left": scene.left}
+    values = {"attacks": steps, "seed": seed, "meshes": sizes, "left": scene.left}
     largest = max(one["rms"] for one in sizes.values())
     lines = [f"{said} → {target}, {len(meshes)} meshes, RMS up to {largest:.3g} of their diagonals"]
     lines += [f"left alone: {name!r}: {reason}" for name, reason in scene.left.items()]
-    _answer(as_json, answer, "\n".join(lines))
+    answer(as_json, values, "\n".join(lines))
 
 
 def _steps(words: tuple[str, ...]) -> list[tuple[str, float]]:
@@ -571,11 +444,11 @@ def _steps(words: tuple[str, ...]) -> list[tuple[str, float]]:
 
 
 @cli.command()
-@click.argument("original", type=_MESH)
-@click.argument("distorted", type=_MESH)
+@click.argument("original", type=FILE)
+@click.argument("distorted", type=FILE)
 @click.option("--pictures", is_flag=True, help="Compare pictures of the meshes, too; takes many seconds.")
-@_QUIET
-@_JSON
+@QUIET
+@JSON
 def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> None:
     """Measure how DISTORTED differs from ORIGINAL, by all metrics.
 
@@ -586,55 +459,47 @@ def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> N
     """
     first, second = load_mesh(original), load_mesh(distorted)
     metrics = distortion.metrics_of(first, second) + distortion.RENDERED * pictures
-    _progress().doing(f"comparing {original} and {distorted} by {', '.join(metrics)}")
+    current().doing(f"comparing {original} and {distorted} by {', '.join(metrics)}")
     compared = distortion.compare(first, second, metrics)._asdict()
     found = {name: compared[name] for name in metrics}
     lines = [
         f"{name:<14} {'needs the same connectivity' if value is None else f'{value:.6g}'}"
         for name, value in found.items()
     ]
-    _answer(as_json, found, "\n".join(lines))
+    answer(as_json, found, "\n".join(lines))
 
 
 @cli.command(name="capacity")
-@click.argument("mesh", type=_MESH)
-@_BUDGET
-@_LIMIT
-@_VISIBILITY
-@_NOISE
+@click.argument("mesh", type=FILE)
+@budget_options(
+    noise=NOISE,
+    noise_help="Noise that the message must survive: half width, relative to the mean distance of vertices to the"
+    " centre.",
+)
 @click.option(
     "--coverage", type=float, default=COVERAGE, show_default=True, help="Share of the vertices that may be left."
 )
 @click.option(
     "--scheme", type=click.Choice(NAMES), default=DEFAULT_SCHEME, show_default=True, help="Scheme that carries them."
 )
-@_QUIET
-@_JSON
-def capacity_command(
-    mesh: Path,
-    budget: float | None,
-    limits: tuple[tuple[str, float], ...],
-    visibility: Visibility | None,
-    noise: float,
-    coverage: float,
-    scheme: str,
-    as_json: bool,
-) -> None:
+@QUIET
+@JSON
+def capacity_command(mesh: Path, budget: Budget, coverage: float, scheme: str, as_json: bool) -> None:
     """Say how many bits can be hidden in MESH so that they survive noise and the loss of vertices."""
     loaded = load_mesh(mesh)
-    bounds = make_budget(budget, dict(limits) or None, visibility, named=visibility_of(loaded))
-    _progress().doing(f"measuring the room in {mesh}")
-    bits = capacity(loaded, bounds.rms, limits=bounds.limits, noise=noise, coverage=coverage, scheme=scheme)
-    answer = {"bits": bits, "budget": bounds.rms, "limits": bounds.limits, "noise": noise, "coverage": coverage}
+    bounds, noise = budget.bounds(loaded), budget.noise
+    current().doing(f"measuring the room in {mesh}")
+    bits = capacity(loaded, budget, coverage=coverage, scheme=scheme)
+    values = {"bits": bits, "budget": bounds.rms, "limits": bounds.limits, "noise": noise, "coverage": coverage}
     said = f"{bits} bits at {bounds}, noise {noise:g}, coverage {coverage:g}"
-    _answer(as_json, answer, said if bits else f"{said}; `embed` says what less a mark in it survives")
+    answer(as_json, values, said if bits else f"{said}; `embed` says what less a mark in it survives")
 
 
 @cli.command()
-@click.argument("mesh", type=_MESH, required=False)
-@click.option("--output", type=_MESH, default=Path("demo-output"), show_default=True, help="Folder for the results.")
-@_QUIET
-@_JSON
+@click.argument("mesh", type=FILE, required=False)
+@click.option("--output", type=FILE, default=Path("demo-output"), show_default=True, help="Folder for the results.")
+@QUIET
+@JSON
 def demo(mesh: Path | None, output: Path, as_json: bool) -> None:
     """Mark MESH, attack it, read it again, and write tables and pictures. Without MESH, a sample is used.
 
@@ -642,22 +507,22 @@ def demo(mesh: Path | None, output: Path, as_json: bool) -> None:
     """
     from jaxmark.app.demo import run_demo, verdict
 
-    rows = run_demo(mesh, output, partial(_say, err=as_json), _progress().doing)
+    rows = run_demo(mesh, output, partial(say, err=as_json), current().doing)
     if as_json:
-        _answer(True, {"output": str(output), "rows": [row._asdict() for row in rows], "verdict": verdict(rows)}, "")
+        answer(True, {"output": str(output), "rows": [row._asdict() for row in rows], "verdict": verdict(rows)}, "")
 
 
 @cli.command(name="study")
-@click.argument("file", type=_MESH)
-@click.option("--output", type=_MESH, default=Path("study-output"), show_default=True, help="Folder for the results.")
+@click.argument("file", type=FILE)
+@click.option("--output", type=FILE, default=Path("study-output"), show_default=True, help="Folder for the results.")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Number of processes.")
-@_QUIET
-@_JSON
+@QUIET
+@JSON
 def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None:
     """Run the study that a TOML FILE declares: what marks survive, with intervals and controls.
 
     \b
-      seeds = 5
+      samples = 5
       schemes = ["keyed", "host"]
       payloads = [64]
       budgets = [0.0008, "hidden", {dame = 0.008}]
@@ -674,8 +539,8 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
     """  # noqa: D301
     study = load_study(file)
     output.mkdir(parents=True, exist_ok=True)
-    _progress().doing(f"study {file}")
-    results = study.run(output / "results.jsonl", workers, _progress().doing)
+    current().doing(f"study {file}")
+    results = study.run(output / "results.jsonl", workers, current().doing)
     results.save_csv(output / "results.csv")
     table = results.markdown()
     write_atomically(output / "rates.md", table.encode())
@@ -683,20 +548,38 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
         for module in ("matplotlib", "jinja2"):
             require(module, "plot")
     except JaxmarkError as error:
-        _say(f"No page, no pictures: {error}")
+        say(f"No page, no pictures: {error}")
     else:
-        _progress().doing("drawing pictures")
+        current().doing("drawing pictures")
         for of in get_args(Measure):
             results.plot(of).save(output / f"{of}.png")
         results.save_page(output / "study.html")
-    _answer(as_json, {"output": str(output), "readings": len(results.rows), "rates": results.rates()}, table.rstrip())
+    answer(as_json, {"output": str(output), "readings": len(results.rows), "rates": results.rates()}, table.rstrip())
 
 
-for command in (bench_command, bench_equal_command, bench_corpus_command):
+@cli.command(name="unpose")
+@click.argument("suspect", type=FILE)
+@click.argument("original", type=FILE)
+@click.argument("target", metavar="OUT", type=FILE)
+@QUIET
+@JSON
+def unpose_command(suspect: Path, original: Path, target: Path, as_json: bool) -> None:
+    """Bring SUSPECT, in any pose of the skeleton of ORIGINAL, back to the pose in which ORIGINAL is stored.
+
+    ORIGINAL is a GLB or glTF file with a skin, as it is, unmarked; SUSPECT has its vertices in its order. OUT is the
+    file SUSPECT with other positions, which `jaxmark detect` reads.
+    """
+    check_suffix(suspect, target)
+    check_distinct(SUSPECT=suspect, ORIGINAL=original, OUT=target)
+    current().doing(f"bringing {suspect} back")
+    back = unpose(load_mesh(original), load_skin(original), load_mesh(suspect))
+    with replacing(target) as draft:
+        save_mesh(back, draft, like=suspect)
+    answer(as_json, {"vertices": len(back.vertices), "output": str(target)}, f"{suspect} as {original} lies → {target}")
+
+
+for command in (bench_command, bench_equal_command, bench_corpus_command, catalogue_group, mark_for_command):
     cli.add_command(command)
-cli.add_command(catalogue_group)
-cli.add_command(mark_for_command)
-cli.add_command(unpose_command)
 catalogue_group.add_command(serve_command)
 
 
@@ -710,7 +593,7 @@ def main() -> None:
     except click.Abort:
         _refuse("Interrupted.")
     except Exception as error:  # status 1 would say "nothing detected"
-        _refuse(told_error(error))
+        _refuse(error_text(error))
 
 
 def _refuse(sentence: str) -> NoReturn:
@@ -721,43 +604,37 @@ def _refuse(sentence: str) -> NoReturn:
 def _each(folder: Path, as_json: bool, work: Work, workers: int) -> NoReturn:
     """Work on the mesh files of a folder, print a line for each, and exit with the worst status."""
     files, status, start = mesh_files(folder), 0, time.monotonic()
-    _progress().doing(f"0/{len(files)} files of {folder}")
+    current().doing(f"0/{len(files)} files of {folder}")
     with closing(each(files, work, workers)) as told:
         for done, (file, one) in enumerate(told, 1):
             status = max(status, 2 if one.refused else 0 if one.done else 1)
-            _answer(as_json, {"file": file.name, **one.answer}, f"{file.name}: {one.said}")
+            answer(as_json, {"file": file.name, **one.values}, f"{file.name}: {one.text}")
             pace = (time.monotonic() - start) / done
-            _progress().doing(f"{done}/{len(files)} files of {folder}, {left_over((len(files) - done) * pace)}")
+            current().doing(f"{done}/{len(files)} files of {folder}, {left_over((len(files) - done) * pace)}")
     sys.exit(status)
 
 
-def _mark_member(mark: Callable[..., Told], folder: Path, file: Path) -> Told:
+def _mark_member(mark: Callable[..., FileOutcome], folder: Path, file: Path) -> FileOutcome:
     """Mark a file of a folder into another."""
     return mark(file, folder / file.name, folder / (file.name + RECORD_SUFFIX))
 
 
 def _read_member(
-    reader: FileReader, original: Path, record: Path | None, report: Path | None, dossier: Path | None, file: Path
-) -> Told:
+    reader: FileReader,
+    original: Path | None,
+    record: Path | None,
+    report: Path | None,
+    dossier: Path | None,
+    file: Path,
+) -> FileOutcome:
     """Read a file of a folder, with a folder each for originals, records, reports and dossiers, or one file for all."""
     return reader.read(
         file,
-        _member(original, file.name),
+        None if original is None else _member(original, file.name),
         None if record is None else _member(record, file.name + RECORD_SUFFIX),
         None if report is None else report / file.name,
         None if dossier is None else dossier / file.name,
     )
-
-
-def _read_member_blindly(reader: BlindReader, record: Path | None, file: Path) -> Told:
-    return reader.read(file, None if record is None else _member(record, file.name + RECORD_SUFFIX))
-
-
-def _one_message(message: bytes | None, text: bytes | None) -> bytes | None:
-    """The message that was given in either form."""
-    if message is not None and text is not None:
-        raise JaxmarkError("Give either --message or --text.")
-    return text if message is None else message
 
 
 def _member(path: Path, name: str) -> Path:

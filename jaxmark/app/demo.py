@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmark import distortion
+from jaxmark.adversaries.registry import attack
 from jaxmark.alignment.original import Original
+from jaxmark.app.output import power
 from jaxmark.app.progress import Doing, quietly
-from jaxmark.app.telling import power
-from jaxmark.attacks import attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation._rates import Control
 from jaxmark.extras import package_folder, require
@@ -20,11 +20,11 @@ from jaxmark.files.atomic import write_atomically
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.plot import View, displacement, exaggerate, save_views, visibility
 from jaxmark.watermark.coding.keys import new_key
-from jaxmark.watermark.evidence.bounds import MIN_LOG10_P
-from jaxmark.watermark.marking import Marker, make_marker
-from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.evidence.ledger import MIN_LOG10_P
+from jaxmark.watermark.markers import NonBlindMarker, make_marker
+from jaxmark.watermark.perception.budget import Budget
 from jaxmark.watermark.record import RECORD_SUFFIX
-from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, SCHEMES
+from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, SCHEMES
 
 _ATTACKS = (
     ("noise", 0.001),
@@ -50,7 +50,7 @@ _TERMS = (
 )
 
 
-class Outcome(NamedTuple):
+class DemoRow(NamedTuple):
     """One line of the demo's table."""
 
     scheme: str
@@ -82,7 +82,7 @@ def run_demo(
     output: str | os.PathLike[str],
     say: Callable[[str], None],
     doing: Doing = quietly,
-) -> list[Outcome]:
+) -> list[DemoRow]:
     """Mark a mesh with a fresh key and message, attack it, and read it again, by each scheme.
 
     The default scheme marks as strongly as the eye allows, the historical ones with the same displacement. The folder
@@ -113,8 +113,8 @@ def run_demo(
     say(f"{source.name}: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
     key = new_key()
     message = os.urandom(8)
-    say(f"message {message.hex()} (64 bits), as strong as the eye allows ({make_budget()})")
-    rows: list[Outcome] = []
+    say(f"message {message.hex()} (64 bits), as strong as the eye allows ({Budget().bounds(mesh)})")
+    rows: list[DemoRow] = []
     displacement: float | None = None
     for scheme in (DEFAULT_SCHEME, *(name for name in SCHEMES if name != DEFAULT_SCHEME)):
         doing(f"{scheme}: embedding {source.name}")
@@ -148,7 +148,7 @@ def run_demo(
     return rows
 
 
-def verdict(rows: Sequence[Outcome]) -> list[str]:
+def verdict(rows: Sequence[DemoRow]) -> list[str]:
     """What the table says, in sentences for somebody who does not read it."""
     said = []
     for scheme in dict.fromkeys(row.scheme for row in rows):
@@ -170,7 +170,7 @@ def verdict(rows: Sequence[Outcome]) -> list[str]:
     return [*said, f"In {len(controls)} controls, without a mark or with a wrong key, {told}."]
 
 
-def _attack_and_read(marker: Marker, marked: Mesh, message: bytes, doing: Doing) -> Iterator[Outcome]:
+def _attack_and_read(marker: NonBlindMarker, marked: Mesh, message: bytes, doing: Doing) -> Iterator[DemoRow]:
     """Read the marked mesh after each attack; then the controls."""
     name = marker.scheme.name
     for kind, strength in (("none", 0.0), *_ATTACKS):
@@ -185,35 +185,37 @@ def _attack_and_read(marker: Marker, marked: Mesh, message: bytes, doing: Doing)
     yield _read(stranger, marked, attack(marked, *_CONTROL_ATTACK, seed=0), message, control, "wrong-key")
 
 
-def _read(marker: Marker, before: Mesh, suspect: Mesh, message: bytes, attack_name: str, control: Control) -> Outcome:
+def _read(
+    marker: NonBlindMarker, before: Mesh, suspect: Mesh, message: bytes, attack_name: str, control: Control
+) -> DemoRow:
     """Read a suspect without and with a claim of the message."""
-    blind, claimed = marker.detect(suspect), marker.detect(suspect, message)
-    return Outcome(
+    unclaimed, claimed = marker.detect(suspect), marker.detect(suspect, message)
+    return DemoRow(
         marker.scheme.name,
         attack_name,
         control,
         distortion.displacement_size(before, suspect).rms,
-        float(np.mean(np.sign(blind.scores) != marker.codeword(message))),
-        blind.message == message,
-        blind.detected() or claimed.detected(),
-        blind.log10_p,
-        blind.log10_p_unfloored,
+        float(np.mean(np.sign(unclaimed.scores) != marker.codeword(message))),
+        unclaimed.message == message,
+        unclaimed.detected() or claimed.detected(),
+        unclaimed.log10_p,
+        unclaimed.evidence.log10_p_unfloored,
         claimed.log10_p,
     )
 
 
-def _outcome(row: Outcome) -> str:
+def _outcome(row: DemoRow) -> str:
     """What was read, in a word; of a control, nothing must be found."""
     if row.control == "marked":
         return "read" if row.message_read else "LOST"
     return "FALSE ALARM" if row.detected else "none"
 
 
-def _name(row: Outcome) -> str:
+def _name(row: DemoRow) -> str:
     return row.attack if row.control == "marked" else f"{row.attack}, {row.control.replace('-', ' ')}"
 
 
-def _line(row: Outcome) -> str:
+def _line(row: DemoRow) -> str:
     return (
         f"{_name(row):<22} attack RMS {row.rms:.6f}  {100 * row.wrong:4.1f} % of code bits wrong, message"
         f" {_outcome(row):<4} log10 p {row.log10_p:6.1f} (without floor {row.log10_p_unfloored:.0f}), claimed"
@@ -221,7 +223,7 @@ def _line(row: Outcome) -> str:
     )
 
 
-def _table(rows: Sequence[Outcome]) -> str:
+def _table(rows: Sequence[DemoRow]) -> str:
     head = (
         "| scheme | attack | attack RMS / diagonal | wrong code bits | message | log10 p | without floor"
         " | log10 p, claimed |\n|---|---|---|---|---|---|---|---|\n"
@@ -235,7 +237,7 @@ def _table(rows: Sequence[Outcome]) -> str:
     return f"{head}{''.join(lines)}\n{terms}\n{' '.join(verdict(rows))}\n"
 
 
-def _save_pictures(folder: Path, original: Original, marked: Mesh, read: Mapping[str, Outcome]) -> None:
+def _save_pictures(folder: Path, original: Original, marked: Mesh, read: Mapping[str, DemoRow]) -> None:
     save_views(
         [
             View("original", original.mesh),
@@ -254,7 +256,7 @@ def _save_pictures(folder: Path, original: Original, marked: Mesh, read: Mapping
     save_views(views, folder / "attacked.png")
 
 
-def _caption(row: Outcome) -> str:
+def _caption(row: DemoRow) -> str:
     if not row.message_read:
         return "message lost"
     return f"message read, chance of error ≤ {power(row.log10_p)}"

@@ -1,10 +1,10 @@
-"""The dossier of a detection: one page for people who are no engineers, and the same as JSON for those who check it.
+"""The dossier of a detection: one page for non-technical readers, and the same as JSON for those who check it.
 
-It holds nothing secret: no key, and of the original only pictures. Needs the extra `plot`.
+It holds nothing secret: no key, and of the original only pictures. `save_report` draws how a suspect was aligned. Both
+need the extra `plot`.
 """
 
 import base64
-import hashlib
 import json
 import math
 import platform
@@ -17,15 +17,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
+from jaxmark.alignment.alignment import Alignment
+from jaxmark.alignment.original import Original
+from jaxmark.app.output import make_folder
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
-from jaxmark.files.atomic import write_atomically
+from jaxmark.files.atomic import file_hash, write_atomically
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.plot import View, draw
-from jaxmark.watermark.coding.keys import commitment
-from jaxmark.watermark.deposit import Deposit
-from jaxmark.watermark.marking import Detection, Marker
+from jaxmark.plot import View, draw, save_views
+from jaxmark.watermark.coding.keys import commitment as commitment_to
+from jaxmark.watermark.evidence.detection import Detection
+from jaxmark.watermark.mark import Mark
+from jaxmark.watermark.record import TimestampedCommitment
 
 _SIDES = {"front": 25.0, "right": 115.0, "back": 205.0, "left": 295.0}  # azimuths in degrees
 _PACKAGES = ("jaxmark", "jax", "numpy", "scipy", "trimesh")
@@ -39,25 +44,41 @@ class Case:
     original: Path
     record: Path | None
     mesh: Mesh  # the suspect's
-    marker: Marker  # that read it
+    mark: Mark  # that was read
     found: Detection
     claimed: bool  # whether the message was claimed
-    deposit: Deposit | None
-    dated: float | None  # log10 of the bound if the deposit is older than the suspect
+    commitment: TimestampedCommitment | None
+    timestamped: float | None  # log10 of the bound if the commitment is older than the suspect
     obtained: str  # when and where the suspect was got
 
 
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file's bytes, hexadecimal.
+def save_report(folder: Path, original: Original, suspect: Mesh, alignment: Alignment) -> Path:
+    """Draw the original, the suspect in its pose, which points of it are seen, and how far they are off.
+
+    Args:
+        folder: folder of the picture `alignment.png`, which is made if it does not exist.
+        original: what was aligned to.
+        suspect: the mesh that was aligned.
+        alignment: alignment of the suspect to the original.
+
+    Returns:
+        The picture's path.
 
     Raises:
-        JaxmarkError: if it cannot be read.
+        JaxmarkError: if matplotlib is missing, or the picture cannot be written.
     """
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise JaxmarkError(f"Cannot read {path}: {error.strerror}.") from None
+    mesh, point = original.mesh, original.weld.point
+    off = _distances(alignment)
+    posed = suspect._replace(vertices=alignment.pose(np.asarray(suspect.vertices, np.float64)))
+    views = [
+        View("Original", mesh),
+        View(f"Suspect, aligned by {alignment.method}", posed),
+        View("Weight", mesh, alignment.weights[point], "1 seen, 0 masked"),
+        View("Residual", mesh, 100 * off[point], "% of the diagonal"),
+    ]
+    path = make_folder(folder) / "alignment.png"
+    save_views(views, path)
+    return path
 
 
 def save_dossier(folder: Path, case: Case) -> None:
@@ -67,18 +88,15 @@ def save_dossier(folder: Path, case: Case) -> None:
         JaxmarkError: if nothing was detected, if what was found is an estimate, if an extra is missing, or if a file
             cannot be read or written.
     """
-    if case.found.doubts:
-        raise JaxmarkError(f"There is no dossier of an estimate: {'; '.join(case.found.doubts)}.")
+    if case.found.evidence.caveats:
+        raise JaxmarkError(f"There is no dossier of an estimate: {'; '.join(case.found.evidence.caveats)}.")
     if not case.found.detected():
         raise JaxmarkError("Nothing was detected that a dossier could show (at a probability of 10^-6).")
     jinja2 = require("jinja2", "plot")
     facts = _facts(case)
     template = resources.files("jaxmark.app").joinpath("dossier.html").read_text(encoding="utf-8")
     page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(template)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise JaxmarkError(f"{folder} cannot be made a folder: {error.strerror}.") from None
+    make_folder(folder)
     text = page.render(**facts, pictures=_draw_sides(case))
     write_atomically(folder / "dossier.json", (json.dumps(facts, indent=2) + "\n").encode())
     write_atomically(folder / "dossier.html", text.encode())
@@ -86,42 +104,35 @@ def save_dossier(folder: Path, case: Case) -> None:
 
 def _facts(case: Case) -> dict[str, Any]:
     """Everything that the dossier says, as values for JSON."""
-    found, record, deposit = case.found, case.marker.record, case.deposit
+    found, record, commitment = case.found, case.mark.record, case.commitment
+    evidence, aligned = found.evidence, found.registration
     roles = {"suspect": case.suspect, "original": case.original, "record": case.record}
     files = [
         {"role": role, "name": path.name, "sha256": file_hash(path)} for role, path in roles.items() if path is not None
     ]
-    aligned = found.alignment
-    deposited = None
-    if deposit is not None and case.dated is not None:
-        deposited = {
-            "root": deposit.root,
-            "records": len(deposit.digests),
-            "log10_p": case.dated,
-        }
+    timestamped = None
+    if commitment is not None and case.timestamped is not None:
+        size = len(commitment.digests)
+        timestamped = {"root": commitment.root, "records": size, "log10_p": case.timestamped}
     return {
         "suspect": files[0],
         "original": files[1],
         "files": files,
         "message": None if found.message is None else found.message.hex(),
-        "remarks": list(found.remarks),
-        "log10_p": found.log10_p,
-        "log10_p_undated": found.log10_p_undated,
-        "chance": _in_words(found.log10_p_undated if deposited is None else deposited["log10_p"]),
-        "deposit": deposited,
+        "notes": list(found.notes),
+        "log10_p": evidence.log10_p,
+        "log10_p_uncommitted": evidence.log10_p_uncommitted,
+        "charges": [one._asdict() for one in evidence.charges],
+        "chance": _in_words(evidence.log10_p_uncommitted if timestamped is None else timestamped["log10_p"]),
+        "commitment": timestamped,
         "obtained": case.obtained,
         "coverage": found.coverage,
         "pose": "into the original's place, vertex by vertex"
         if aligned.method != "surface"
         else "into the original's place by its surface",
-        "alignment": {
-            "method": aligned.method,
-            "matrix": aligned.pose.matrix.tolist(),
-            "shift": aligned.pose.shift.tolist(),
-            "residual": aligned.residual,
-        },
+        "registration": aligned.facts(),
         "record_digest": None if record is None else record.digest(),
-        "key_commitment": commitment(case.marker.key),
+        "key_commitment": commitment_to(case.mark.key),
         "version": found.version,
         "command": _command(case),
         "made": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -143,15 +154,15 @@ def _command(case: Case) -> str:
     if case.record is not None:
         words += ["--record", case.record.name]
     else:
-        words += ["--bits", str(case.marker.bits), "--scheme", case.marker.scheme.name]
-    if case.found.alignment.how != "auto":
-        words += ["--align", case.found.alignment.how]
+        words += ["--bits", str(case.mark.bits), "--scheme", case.mark.scheme.name]
+    if case.found.registration.how != "auto":
+        words += ["--align", case.found.registration.how]
     return shlex.join(words) + (" --message CLAIMED" if case.claimed else "")
 
 
 def _draw_sides(case: Case) -> dict[str, str]:
     """Pictures of suspect and original from four sides, as PNG in base 64."""
-    original, aligned = case.marker.original, case.found.alignment
+    original, aligned = case.mark.original, case.found.registration
     posed = aligned.pose(np.asarray(case.mesh.vertices, np.float64))
     mesh = original.mesh
     both = Mesh(
@@ -159,11 +170,16 @@ def _draw_sides(case: Case) -> dict[str, str]:
         np.concatenate([mesh.faces, np.asarray(case.mesh.faces) + len(mesh.vertices)]),
     )
     which = np.repeat([0.0, 1.0], [len(mesh.vertices), len(posed)])
-    off = np.linalg.norm(aligned.displacement, axis=1)
-    if aligned.normals is not None:
-        off = np.abs(np.sum(aligned.normals * aligned.displacement, axis=1))
+    off = _distances(aligned)
     views = [
         View("original and suspect", both, which, "0 original, 1 suspect"),
         View("distance", mesh, 100 * off[original.weld.point], "% of the diagonal"),
     ]
     return {side: base64.b64encode(draw(views, azimuth=azimuth).png()).decode() for side, azimuth in _SIDES.items()}
+
+
+def _distances(aligned: Alignment) -> Float64[np.ndarray, " points"]:
+    """How far a suspect is from each point of the original, as far as that is known, in diagonals."""
+    if aligned.normals is not None:
+        return np.abs(np.sum(aligned.normals * aligned.displacement, axis=1))
+    return np.linalg.norm(aligned.displacement, axis=1)

@@ -12,9 +12,8 @@ from functools import lru_cache
 from multiprocessing import connection
 from pathlib import Path
 
-from jaxmark.app.ending import end_by_exception
-from jaxmark.app.programs import keep_programs, release_programs
-from jaxmark.app.telling import Told, told_error
+from jaxmark.app.output import FileOutcome, error_text
+from jaxmark.app.process import end_by_exception, keep_programs, release_programs
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.cells import processes
 from jaxmark.files import SUFFIXES
@@ -22,7 +21,7 @@ from jaxmark.files import SUFFIXES
 _MOST_TOGETHER = 16  # files that a worker takes at once
 _TURNS = 4  # that each worker has at least, if there are enough files, so that all end at about the same time
 
-Work = Callable[[Path], Told]
+Work = Callable[[Path], FileOutcome]
 
 
 def mesh_files(folder: Path) -> list[Path]:
@@ -41,7 +40,7 @@ def mesh_files(folder: Path) -> list[Path]:
     return found
 
 
-def each(files: Sequence[Path], work: Work, workers: int = 1) -> Generator[tuple[Path, Told], None, None]:
+def each(files: Sequence[Path], work: Work, workers: int = 1) -> Generator[tuple[Path, FileOutcome], None, None]:
     """Work on files, and tell of each; a file that is refused stops none of the others.
 
     Meshes of like size share compiled programs: the first of a size takes seconds, the next ones a fraction of one. So
@@ -57,7 +56,7 @@ def each(files: Sequence[Path], work: Work, workers: int = 1) -> Generator[tuple
         JaxmarkError: if a worker is killed.
     """
     if workers == 1:
-        yield from ((file, _tell(work, file)) for file in files)
+        yield from ((file, _run(work, file)) for file in files)
         return
     largest_first = sorted(files, key=lambda file: -file.stat().st_size)
     count = min(_MOST_TOGETHER, -(-len(files) // (_TURNS * workers)))
@@ -65,7 +64,7 @@ def each(files: Sequence[Path], work: Work, workers: int = 1) -> Generator[tuple
     pool = processes(min(workers, len(together)), begin_worker)()
     held = pickle.dumps(work)
     try:
-        for done in as_completed([pool.submit(_tell_of, held, some) for some in together]):
+        for done in as_completed([pool.submit(_work_on, held, some) for some in together]):
             yield from done.result()
     except BaseException as error:
         for process in multiprocessing.active_children():
@@ -79,12 +78,12 @@ def each(files: Sequence[Path], work: Work, workers: int = 1) -> Generator[tuple
     pool.shutdown()
 
 
-def _tell(work: Work, file: Path) -> Told:
+def _run(work: Work, file: Path) -> FileOutcome:
     try:
         return work(file)
     except Exception as error:
-        said = told_error(error)
-        return Told({"refused": said}, f"refused. {said}", done=False, refused=True)
+        said = error_text(error)
+        return FileOutcome({"refused": said}, f"refused. {said}", done=False, refused=True)
     finally:
         release_programs()
 
@@ -95,10 +94,10 @@ def _kept(work: bytes) -> Work:
     return pickle.loads(work)
 
 
-def _tell_of(work: bytes, files: Sequence[Path]) -> list[tuple[Path, Told]]:
+def _work_on(work: bytes, files: Sequence[Path]) -> list[tuple[Path, FileOutcome]]:
     """Tell of files, in a worker, which is ended while it works by ending the process: the pool would go on."""
     try:
-        return [(file, _tell(_kept(work), file)) for file in files]
+        return [(file, _run(_kept(work), file)) for file in files]
     except SystemExit as end:
         os._exit(end.code if isinstance(end.code, int) else 1)
 

@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable
 from typing import TextIO
 
+import click
 import jax
 
 Doing = Callable[[str], None]  # is told what begins now
@@ -56,3 +57,9 @@ class Progress:
             width = shutil.get_terminal_size().columns - 1
             self._stream.write(f"{_START_OF_LINE}{line[:width]}{_ERASE}")
             self._stream.flush()
+
+
+def current() -> Progress:
+    """The progress of the command that is running; one that says nothing for a command that takes no time."""
+    context = click.get_current_context(silent=True)
+    return (context and context.obj) or Progress(None)

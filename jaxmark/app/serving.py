@@ -17,12 +17,12 @@ from typing import Any
 
 import click
 
-from jaxmark.app.answering import answer, read_key
-from jaxmark.app.batch import FileReader
-from jaxmark.app.catalogue import CATALOGUE
-from jaxmark.app.finding import keep
-from jaxmark.app.programs import release_programs
-from jaxmark.app.telling import told_error
+from jaxmark.app.catalogue_commands import CATALOGUE
+from jaxmark.app.find_commands import keep
+from jaxmark.app.options import read_key
+from jaxmark.app.output import answer, error_text
+from jaxmark.app.process import release_programs
+from jaxmark.app.read_files import FileReader
 from jaxmark.catalogue import Catalogue, Finder, Match
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
@@ -116,7 +116,7 @@ class Desk:
             record = folder / "record.json"
             write_atomically(record, row["json"].encode())
         bits = None if record is not None else 4 * len(match.message)
-        reader = FileReader(key, bits, None, None, "auto", 1e-6, guesses=False)
+        reader = FileReader(key, bits, None, diagnoses=False)
         with suppress(JaxmarkError):  # without the extra `plot` there is a verdict, but no dossier
             reader.read(suspect, Path(match.original), record, dossier=folder / "dossier")
             token = secrets.token_urlsafe(16)
@@ -209,7 +209,7 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
         except ClientDisconnect:
             return refuse("Nobody is there any more.", 400)
         except Exception as error:
-            return refuse(told_error(error), 422 if isinstance(error, JaxmarkError) else 500)
+            return refuse(error_text(error), 422 if isinstance(error, JaxmarkError) else 500)
         finally:
             waiting -= 1
 

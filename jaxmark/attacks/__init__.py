@@ -1,13 +1,10 @@
 """Attacks: what may happen to a marked mesh, by accident or by a tool.
 
-`ATTACKS` lists them by the names that the command line uses. Under `jit`, `vmap` and `grad`, close over the faces,
-because graphs are prepared on the host. Vertices that no face uses are not part of the surface: they neither move nor
-count.
+`jaxmark.adversaries.ATTACKS` lists them by their names, with those of keyless attackers. Under `jit`, `vmap` and
+`grad`, close over the faces, because graphs are prepared on the host. Vertices that no face uses are not part of the
+surface: they neither move nor count.
 """
 
-from jaxmark.adversaries._jamming import jamming as jamming
-from jaxmark.adversaries.filtering import band_stop as band_stop
-from jaxmark.adversaries.filtering import low_pass as low_pass
 from jaxmark.attacks._affine import affine as affine
 from jaxmark.attacks._affine import similarity as similarity
 from jaxmark.attacks._cropping import cropping as cropping
@@ -29,14 +26,9 @@ from jaxmark.attacks.pieces import missing_pieces as missing_pieces
 from jaxmark.attacks.pieces import mosaic as mosaic
 from jaxmark.attacks.refitting import plane_fitting as plane_fitting
 from jaxmark.attacks.refitting import primitive_fitting as primitive_fitting
-from jaxmark.attacks.registry import ATTACKS as ATTACKS
 from jaxmark.attacks.registry import Attack as Attack
 from jaxmark.attacks.registry import Kind as Kind
 from jaxmark.attacks.registry import Step as Step
-from jaxmark.attacks.registry import attack as attack
-from jaxmark.attacks.registry import attack_each as attack_each
-from jaxmark.attacks.registry import chain as chain
-from jaxmark.attacks.registry import get_attack as get_attack
 from jaxmark.attacks.remeshing import iso_surface as iso_surface
 from jaxmark.attacks.remeshing import isotropic as isotropic
 from jaxmark.attacks.remeshing import poisson as poisson

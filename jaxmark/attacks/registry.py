@@ -1,7 +1,7 @@
-"""The list of attacks, and host functions that apply one or several of them to a mesh."""
+"""The list of attacks by accident or by a tool, and how one or several of a list are applied to a mesh."""
 
 from collections.abc import Callable, Mapping, Sequence
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any, NamedTuple
 
 import jax
@@ -9,8 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float64, Key, PRNGKeyArray
 
-from jaxmark.adversaries._jamming import jamming
-from jaxmark.adversaries.filtering import band_stop, low_pass
 from jaxmark.attacks._affine import affine, similarity
 from jaxmark.attacks._cropping import cropping, holes, region_cropping
 from jaxmark.attacks._points import floaters, merging, outliers, resampling, subsampling
@@ -44,7 +42,7 @@ from jaxmark.geometry.mesh import (
     weld,
     weld_mesh,
 )
-from jaxmark.seeds import generator
+from jaxmark.seeds import Seed, generator, random_key
 
 
 class Attack(NamedTuple):
@@ -66,7 +64,7 @@ class Attack(NamedTuple):
     faces: bool = False
 
 
-#: All attacks of the library, by their names.
+#: What happens to meshes, by accident or by a tool; `jaxmark.adversaries.registry` has all attacks.
 ATTACKS: Mapping[str, Attack] = {
     "noise": Attack(
         uniform_noise, "half width over the mean distance to the centre", (0.0005, 0.001, 0.003, 0.005, 0.01)
@@ -92,11 +90,6 @@ ATTACKS: Mapping[str, Attack] = {
     "non-local-means": Attack(
         nonlocal_means, "time of diffusion, whose detail is averaged", (1, 3, 10, 30, 100), host=True, faces=True
     ),
-    "low-pass": Attack(low_pass, "share of the spectrum, removed from the top", (0.3, 0.5, 0.7, 0.8, 0.9), faces=True),
-    "band-stop": Attack(
-        band_stop, "width in λ of the band that is removed, from 0.02 up", (0.02, 0.05, 0.1, 0.2, 0.4), faces=True
-    ),
-    "jamming": Attack(jamming, "RMS over the diagonal", (0.0001, 0.0002, 0.0005, 0.001, 0.002), faces=True),
     "quantisation": Attack(quantisation, "bits per coordinate", (11, 10, 9, 8, 7)),
     "similarity": Attack(
         similarity, "shift over the diagonal, and scale up or down less 1; any rotation", (0.1, 0.3, 1, 3, 9)
@@ -168,101 +161,107 @@ Kind = str | Attack  # a name in `ATTACKS`, or an attack of your own
 Step = tuple[Kind, float]  # an attack and its strength
 
 
-def attack(mesh: Mesh, kind: Kind, strength: float, *, seed: int) -> Mesh:
-    """Apply an attack as a modelling tool would: to the welded points, so that copies of a point move together.
+class Registry(NamedTuple):
+    """Attacks by their names, and functions of the host that apply them to meshes."""
 
-    A face that an attack changes refers to the first copy of each of its points: along a seam, where copies carry
-    different data in the file, it takes that of the first. An attack that makes a new mesh leaves no copies, and no
-    vertex that no face uses.
+    attacks: Mapping[str, Attack]
 
-    Args:
-        mesh: any mesh.
-        kind: a name in `ATTACKS`, or an `Attack` of your own.
-        strength: how strong the attack is, in its unit.
-        seed: seed of the attack's random choices, where it makes any.
+    def attack(self, mesh: Mesh, kind: Kind, strength: float, *, seed: Seed) -> Mesh:
+        """Apply an attack as a modelling tool would: to the welded points, so that copies of a point move together.
 
-    Returns:
-        The attacked mesh with float64 vertices, in the same number and order unless the attack makes a new mesh.
+        A face that an attack changes refers to the first copy of each of its points: along a seam, where copies carry
+        different data in the file, it takes that of the first. An attack that makes a new mesh leaves no copies, and no
+        vertex that no face uses.
 
-    Raises:
-        JaxmarkError: if there is no such attack, its strength is out of range, it is not possible on this mesh, or a
-            package that it needs is not installed.
-    """
-    return chain(mesh, [(kind, strength)], seed=seed)
+        Args:
+            mesh: any mesh.
+            kind: a name in `ATTACKS`, or an `Attack` of your own.
+            strength: how strong the attack is, in its unit.
+            seed: of the attack's random choices, where it makes any: a whole number or a JAX random key.
+
+        Returns:
+            The attacked mesh with float64 vertices, in the same number and order unless the attack makes a new mesh.
+
+        Raises:
+            JaxmarkError: if there is no such attack, its strength is out of range, it is not possible on this mesh, or
+                a package that it needs is not installed.
+        """
+        return self.chain(mesh, [(kind, strength)], seed=seed)
+
+    def chain(self, mesh: Mesh, steps: Sequence[Step], *, seed: Seed) -> Mesh:
+        """Apply several attacks one after the other; with one step this is `attack`.
+
+        Args:
+            mesh: any mesh.
+            steps: the attacks and their strengths, in order.
+            seed: seed of all random choices; each step makes its own.
+        """
+        entries = [(self.get(kind), strength) for kind, strength in steps]
+        for place, (entry, strength) in enumerate(entries):
+            _check_strength(strength)
+            key = random_key(seed)
+            mesh = host_mesh(mesh)
+            self._check_faces(entry, mesh)
+            mesh = _apply(mesh, entry, strength, jax.random.fold_in(key, place) if place else key)
+        return mesh
+
+    def attack_each(self, meshes: Sequence[Mesh], kind: Kind, strength: float, *, seeds: Sequence[Seed]) -> list[Mesh]:
+        """Apply one attack to several meshes, each with a seed of its own; with one mesh this is `attack`.
+
+        A traced attack on meshes with the same faces, such as differently marked copies, is one `jax.vmap`: its random
+        numbers are those of `attack`, and its positions differ by rounding at most.
+
+        Args:
+            meshes: at least one mesh.
+            kind: see `attack`.
+            strength: see `attack`.
+            seeds: the seed of the attack's random choices for each mesh.
+
+        Raises:
+            JaxmarkError: see `attack`; if one mesh is refused, all are.
+        """
+        entry, meshes = self.get(kind), [host_mesh(mesh) for mesh in meshes]
+        _check_strength(strength)
+        welded = weld(meshes[0].vertices)
+        self._check_faces(entry, meshes[0])
+        if entry.host or not all(
+            same_connectivity(mesh, meshes[0]) and np.array_equal(weld(mesh.vertices).point, welded.point)
+            for mesh in meshes[1:]
+        ):
+            return [self.attack(mesh, entry, strength, seed=seed) for mesh, seed in zip(meshes, seeds, strict=True)]
+        return _apply_to_all(meshes, welded, entry, strength, jnp.stack([random_key(seed) for seed in seeds]))
+
+    def get(self, kind: Kind) -> Attack:
+        """Look up an attack by its name; an `Attack` is returned as it is.
+
+        Raises:
+            JaxmarkError: if there is no attack of that name.
+        """
+        if isinstance(kind, Attack):
+            return kind
+        if not isinstance(kind, str):
+            raise JaxmarkError(
+                f"An attack is a name of ATTACKS or an Attack, such as Attack(function, 'unit', (0.1,)); got"
+                f" {getattr(kind, '__name__', kind)!r}."
+            )
+        if kind not in self.attacks:
+            raise JaxmarkError(f"There is no attack {kind!r}; there are {', '.join(self.attacks)}.")
+        return self.attacks[kind]
+
+    def _check_faces(self, entry: Attack, mesh: Mesh) -> None:
+        """Refuse a point cloud where an attack needs faces."""
+        if entry.faces:
+            names = (name for name, other in self.attacks.items() if other is entry)
+            check_faces(f"The attack {next(names, entry.apply.__name__)!r}", mesh)
 
 
-def chain(mesh: Mesh, steps: Sequence[Step], *, seed: int) -> Mesh:
-    """Apply several attacks one after the other; with one step this is `attack`.
-
-    Args:
-        mesh: any mesh.
-        steps: the attacks and their strengths, in order.
-        seed: seed of all random choices; each step makes its own.
-    """
-    entries = [(get_attack(kind), strength) for kind, strength in steps]
-    for place, (entry, strength) in enumerate(entries):
-        _check_numbers(strength, seed)
-        key = jax.random.key(seed)
-        mesh = _apply(host_mesh(mesh), entry, strength, jax.random.fold_in(key, place) if place else key)
-    return mesh
-
-
-def attack_each(meshes: Sequence[Mesh], kind: Kind, strength: float, *, seeds: Sequence[int]) -> list[Mesh]:
-    """Apply one attack to several meshes, each with a seed of its own; with one mesh this is `attack`.
-
-    A traced attack on meshes with the same faces, such as differently marked copies, is one `jax.vmap`: its random
-    numbers are those of `attack`, and its positions differ by rounding at most.
-
-    Args:
-        meshes: at least one mesh.
-        kind: see `attack`.
-        strength: see `attack`.
-        seeds: the seed of the attack's random choices for each mesh.
-
-    Raises:
-        JaxmarkError: see `attack`; if one mesh is refused, all are.
-    """
-    entry, meshes = get_attack(kind), [host_mesh(mesh) for mesh in meshes]
-    _check_numbers(strength, *seeds)
-    welded = weld(meshes[0].vertices)
-    _check_kind(entry, meshes[0])
-    if entry.host or not all(
-        same_connectivity(mesh, meshes[0]) and np.array_equal(weld(mesh.vertices).point, welded.point)
-        for mesh in meshes[1:]
-    ):
-        return [attack(mesh, entry, strength, seed=seed) for mesh, seed in zip(meshes, seeds, strict=True)]
-    return _apply_to_all(meshes, welded, entry, strength, jnp.stack([jax.random.key(seed) for seed in seeds]))
-
-
-def get_attack(kind: Kind) -> Attack:
-    """Look up an attack by its name; an `Attack` is returned as it is.
-
-    Raises:
-        JaxmarkError: if there is no attack of that name.
-    """
-    if isinstance(kind, Attack):
-        return kind
-    if not isinstance(kind, str):
-        raise JaxmarkError(
-            f"An attack is a name of ATTACKS or an Attack, such as Attack(function, 'unit', (0.1,)); got"
-            f" {getattr(kind, '__name__', kind)!r}."
-        )
-    if kind not in ATTACKS:
-        raise JaxmarkError(f"There is no attack {kind!r}; there are {', '.join(ATTACKS)}.")
-    return ATTACKS[kind]
-
-
-def _check_numbers(strength: float, *seeds: int) -> None:
+def _check_strength(strength: float) -> None:
     if not (isinstance(strength, Real) and np.isfinite(strength) and strength >= 0):
         raise JaxmarkError(f"The strength of an attack must be a number, not negative, got {strength!r}.")
-    for seed in seeds:
-        if not isinstance(seed, Integral):
-            raise JaxmarkError(f"The seed of an attack is a whole number, such as 0, got {type(seed).__name__}.")
 
 
 def _apply(mesh: Mesh, entry: Attack, strength: float, key: PRNGKeyArray) -> Mesh:
     """Apply an attack to the welded points of a mesh."""
-    _check_kind(entry, mesh)
     welded = weld(mesh.vertices)
     points = weld_mesh(mesh, welded)
     if entry.host:
@@ -271,13 +270,6 @@ def _apply(mesh: Mesh, entry: Attack, strength: float, key: PRNGKeyArray) -> Mes
         small = _normalise(points)
         found = small.back(entry.apply(small.mesh, strength, key))
     return _restore_copies(mesh, welded, points, found)
-
-
-def _check_kind(entry: Attack, mesh: Mesh) -> None:
-    """Refuse a point cloud where an attack needs faces."""
-    if entry.faces:
-        names = (name for name, other in ATTACKS.items() if other is entry)
-        check_faces(f"The attack {next(names, entry.apply.__name__)!r}", mesh)
 
 
 def _apply_to_all(

@@ -18,7 +18,7 @@ from jaxmark.bench.page import markdown as markdown
 from jaxmark.bench.page import save_page as save_page
 from jaxmark.bench.paired import Paired as Paired
 from jaxmark.bench.paired import compare_paired as compare_paired
-from jaxmark.bench.plugged import load_method as load_method
+from jaxmark.bench.plugins import load_method as load_method
 from jaxmark.bench.repeat import Repetition as Repetition
 from jaxmark.bench.repeat import hold_against as hold_against
 from jaxmark.bench.repeat import load_published as load_published

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from jaxmark.bench.calibration import RATE
 from jaxmark.bench.leagues import get_league
 from jaxmark.bench.method import Method
-from jaxmark.bench.plugged import Given, digest_of, load_method
+from jaxmark.bench.plugins import Given, digest_of, load_method
 from jaxmark.bench.results import BenchResults
 from jaxmark.bench.work import MARK, UNMARKED, Bench, Task, keep_mesh, work
 from jaxmark.errors import JaxmarkError

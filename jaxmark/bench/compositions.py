@@ -7,7 +7,8 @@ from jaxtyping import Float64
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from jaxmark.attacks import Attack, attack, chain
+from jaxmark.adversaries.registry import attack, chain
+from jaxmark.attacks import Attack
 from jaxmark.attacks.meshlab import apply_filter_to_points
 from jaxmark.distortion import Reference
 from jaxmark.errors import JaxmarkError

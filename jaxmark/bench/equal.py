@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxmark.attacks import attack
+from jaxmark.adversaries.registry import attack
 from jaxmark.bench.benchmark import name_of, named_files
 from jaxmark.bench.fitting import fit
 from jaxmark.bench.leagues import get_league
 from jaxmark.bench.method import Method
-from jaxmark.bench.plugged import Given, load_method
+from jaxmark.bench.plugins import Given, load_method
 from jaxmark.bench.tables import Table
 from jaxmark.bench.work import COSTS, draw, load, to_bits
 from jaxmark.distortion import Reference

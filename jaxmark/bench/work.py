@@ -16,7 +16,7 @@ import numpy as np
 from jaxmark.bench.fitting import Fitted, fit
 from jaxmark.bench.leagues import OVERWRITTEN, Line, get_league
 from jaxmark.bench.method import Bits, Method, Reading
-from jaxmark.bench.plugged import Given, load_method
+from jaxmark.bench.plugins import Given, load_method
 from jaxmark.distortion import Reference
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.cells import Cell

@@ -15,8 +15,7 @@ from jaxmark.catalogue.database import Database
 from jaxmark.catalogue.originals import Prepared, file_hash, meshes_of, prepare_file
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.record import Record
-from jaxmark.watermark.scenes import SceneRecord
+from jaxmark.watermark.record import Record, SceneRecord
 
 if TYPE_CHECKING:
     from jaxmark.catalogue.finding import Verdict

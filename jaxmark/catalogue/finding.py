@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
-from jaxmark.alignment.alignment import Align, align
+from jaxmark.alignment.alignment import Align
 from jaxmark.catalogue import descriptors
 from jaxmark.catalogue.catalogue import Catalogue
 from jaxmark.catalogue.fitting import Part, fit_whole
@@ -26,10 +26,10 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.pose import Points, Pose
 from jaxmark.watermark.coding.keys import Key, commitment
-from jaxmark.watermark.evidence import bounds as evidence
-from jaxmark.watermark.marking import make_markers
-from jaxmark.watermark.record import Record
-from jaxmark.watermark.tracing.tracer import make_tracer, pay
+from jaxmark.watermark.everyday import alternatives
+from jaxmark.watermark.evidence import ledger
+from jaxmark.watermark.record import Record, is_recorded
+from jaxmark.watermark.tracing.tracer import make_tracer
 
 _ALIKE = 100  # originals that a whole is fitted to
 _LIKELY = 2000  # originals of which a part may look like a piece
@@ -55,13 +55,13 @@ class Match:
     recipient: str | None = None
     accused: tuple[str, ...] = ()  # all recipients who are
     log10_p: float = 0.0  # log10 of a bound on the probability of any such naming, of all that could have been named
-    log10_p_undated: float = 0.0  # the same if nothing dates keys, originals and records
+    log10_p_uncommitted: float = 0.0  # the same if nothing fixes keys, originals and records beforehand
     key: str | None = None  # commitment to the key that was read with
     record: str | None = None  # digest of the record
     coverage: float = 0.0  # share of the original that the piece shows
     residual: float | None = None  # distance that the alignment leaves, in diagonals
-    doubts: tuple[str, ...] = ()  # why the probabilities are estimates
-    remarks: tuple[str, ...] = ()
+    caveats: tuple[str, ...] = ()  # why the probabilities are estimates
+    notes: tuple[str, ...] = ()
     refused: str | None = None  # why it could not be read
 
     @property
@@ -102,7 +102,7 @@ class Verdict:
         }
 
 
-_FIGURES = ("log10_p", "log10_p_undated")
+_FIGURES = ("log10_p", "log10_p_uncommitted")
 
 
 class _Held(NamedTuple):
@@ -121,7 +121,7 @@ class Finder:
         alpha: largest false-positive probability at which an original is named.
         bits: payload of messages without a record; by default 64.
         depth: how many originals are aligned and read for each piece of a suspect, for each way of finding them.
-        how: how suspects are aligned, see `detect`; other ways than "auto" are paid for.
+        align: how suspects are aligned, see `detect`; other ways than "auto" are charged.
         only_recipients: whether to look for recipients' copies only.
     """
 
@@ -133,7 +133,7 @@ class Finder:
         alpha: float = 1e-6,
         bits: int | None = None,
         depth: int = DEPTH,
-        how: Align = "auto",
+        align: Align = "auto",
         only_recipients: bool = False,
     ) -> None:
         """Check what is asked for.
@@ -147,10 +147,10 @@ class Finder:
             raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
         if depth < 1:
             raise JaxmarkError(f"At least one original is looked at, not {depth}.")
-        if how not in get_args(Align):
-            raise JaxmarkError(f"A suspect is aligned by {', '.join(get_args(Align))}, not {how!r}.")
+        if align not in get_args(Align):
+            raise JaxmarkError(f"A suspect is aligned by {', '.join(get_args(Align))}, not {align!r}.")
         self.catalogue, self.alpha, self.bits, self.depth = catalogue, alpha, bits, depth
-        self.how: Align = how
+        self.align: Align = align
         self.keys = {commitment(key): Key(key) for key in keys}
         self.only_recipients = only_recipients
         self._index: Index | None = None
@@ -309,27 +309,25 @@ class Finder:
                 continue
             for record in held.records or [None]:
                 bits = self.bits if record is None else None
-                markers = make_markers(original, key, bits=bits, record=record)
-                found, marker = markers.detect(suspect, align=self.how)
-                log10_p = evidence.share_of(found.log10_p, 1 / tried)
-                agrees = True
-                if record is not None and record.told and found.message is not None:
-                    agrees = record.commits_to(found.message, marker.choices)
+                found, mark = alternatives(original, key, bits=bits, record=record).read(suspect, align=self.align)
+                evidence = found.evidence.charged(ledger.ORIGINALS.charge("original", tried))
+                found = found._replace(evidence=evidence)
+                agrees = found.message is None or is_recorded(record, found.message, mark.choices) is not False
                 yield (
                     replace(
                         match,
-                        named=log10_p <= math.log10(self.alpha) and not found.doubts,
+                        named=found.detected(self.alpha),
                         message=None if found.message is None else found.message.hex(),
-                        log10_p=log10_p,
-                        log10_p_undated=evidence.share_of(found.log10_p_undated, 1 / tried),
+                        log10_p=evidence.log10_p,
+                        log10_p_uncommitted=evidence.log10_p_uncommitted,
                         key=name,
                         record=None if record is None else record.digest(),
                         coverage=found.coverage,
-                        residual=_finite(found.alignment.residual),
-                        doubts=found.doubts,
-                        remarks=found.remarks,
+                        residual=_finite(found.registration.residual),
+                        caveats=evidence.caveats,
+                        notes=found.notes,
                     ),
-                    found.alignment.pose,
+                    found.registration.pose,
                     agrees,
                 )
 
@@ -362,14 +360,13 @@ class Finder:
     ) -> tuple[Match, Pose]:
         """Look for recipients' copies in a piece."""
         tracer = make_tracer(original, key, record=record)
-        marker = tracer.marker
-        aligned = align(marker.original, suspect, self.how)
-        ranked = pay(tracer.identify(aligned, recipients), 1 / tried)
-        bounds = {one.recipient: one.log10_p for one in ranked}
+        mark, aligned = tracer.mark, tracer.register(suspect, self.align)
+        charge = ledger.ORIGINALS.charge("copy", tried)
+        bounds = {one.recipient: one.charged(charge).log10_p for one in tracer.read(aligned, recipients)}
         accused = tuple(name for name, log10_p in bounds.items() if log10_p <= math.log10(self.alpha))
-        accused = () if marker.doubts else accused
+        accused = () if mark.caveats else accused
         best = min(bounds.values(), default=0.0)
-        seen = aligned.weights[marker.original.used] > 0
+        seen = aligned.weights[mark.original.used] > 0
         return (
             replace(
                 match,
@@ -377,12 +374,12 @@ class Finder:
                 recipient=accused[0] if accused else None,
                 accused=accused,
                 log10_p=best,
-                log10_p_undated=evidence.undated(best),
+                log10_p_uncommitted=ledger.uncommitted(best),
                 key=commitment(key),
                 record=record.digest(),
                 coverage=float(seen.mean()),
                 residual=_finite(aligned.residual),
-                doubts=marker.doubts,
+                caveats=mark.caveats,
             ),
             aligned.pose,
         )

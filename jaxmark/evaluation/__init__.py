@@ -8,7 +8,7 @@ from jaxmark.evaluation import pictures as pictures
 from jaxmark.evaluation._rates import Control as Control
 from jaxmark.evaluation._rates import Row as Row
 from jaxmark.evaluation._rates import rates as rates
-from jaxmark.evaluation._robustness import Reading as Reading
+from jaxmark.evaluation._robustness import Outcome as Outcome
 from jaxmark.evaluation._robustness import Robustness as Robustness
 from jaxmark.evaluation._robustness import minimum_distortion as minimum_distortion
 from jaxmark.evaluation._robustness import robustness as robustness

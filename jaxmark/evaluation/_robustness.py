@@ -8,17 +8,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from jaxmark.alignment.alignment import Alignment
-from jaxmark.attacks import Kind, attack, get_attack
+from jaxmark.adversaries.registry import attack, get_attack
+from jaxmark.attacks import Kind
 from jaxmark.distortion import Comparison, compare
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.blind.marker import BlindMarker
-from jaxmark.watermark.coding.message import guess
-from jaxmark.watermark.marking import Marker
+from jaxmark.watermark.evidence.detection import Detection
+from jaxmark.watermark.markers import Marker
 
 
-class Reading(NamedTuple):
+class Outcome(NamedTuple):
     """What is read from one suspect, compared with what was written."""
 
     read: bool  # the exact message was read, and its tag fits
@@ -31,12 +30,12 @@ class Reading(NamedTuple):
 class Robustness(NamedTuple):
     """What is read in each sample at each strength; a refused suspect counts as not read."""
 
-    strengths: Float64[np.ndarray, " epsilons"]
-    success: Bool[np.ndarray, "epsilons samples"]  # whether the exact message was read
-    bit_errors: Float64[np.ndarray, "epsilons samples"]  # see `Reading`
-    log10_p: Float64[np.ndarray, "epsilons samples"]  # see `Reading`
-    log10_p_unfloored: Float64[np.ndarray, "epsilons samples"]
-    refusals: tuple[tuple[str, ...], ...]  # `[epsilons][samples]`; a sentence, empty where there is an answer
+    strengths: Float64[np.ndarray, " strengths"]
+    success: Bool[np.ndarray, "strengths samples"]  # whether the exact message was read
+    bit_errors: Float64[np.ndarray, "strengths samples"]  # see `Outcome`
+    log10_p: Float64[np.ndarray, "strengths samples"]  # see `Outcome`
+    log10_p_unfloored: Float64[np.ndarray, "strengths samples"]
+    refusals: tuple[tuple[str, ...], ...]  # `[strengths][samples]`; a sentence, empty where there is an answer
 
 
 class Trial(NamedTuple):
@@ -68,28 +67,23 @@ class Breaking(NamedTuple):
         return math.nan if attacked is None or not marked else attacked / marked
 
 
-NOTHING = Reading(False, False, 0.5, 0.0, 0.0)  # the reading of a refused suspect
+NOTHING = Outcome(False, False, 0.5, 0.0, 0.0)  # the reading of a refused suspect
 
 
-def read(marker: Marker | BlindMarker, suspect: Mesh | Alignment, message: bytes) -> Reading:
-    """Read a suspect as it is or as its marker aligns it, and compare what is read with the message.
-
-    Raises:
-        JaxmarkError: if the suspect cannot be aligned.
-    """
-    found = marker.detect(suspect)  # pyright: ignore[reportArgumentType] (what the marker's own `align` gave)
-    said = found.message or guess(found.scores, marker.bits, marker.tag_bits)
+def compare_with(message: bytes, marker: Marker, found: Detection) -> Outcome:
+    """Compare what a marker read with the message that was written."""
+    said = marker.guess(found)
     wrong = 0.5 if said is None else float(np.mean(_bits(said) != _bits(message)))
     other = found.message not in (None, message)
-    return Reading(found.message == message, other, wrong, found.log10_p, found.log10_p_unfloored)
+    return Outcome(found.message == message, other, wrong, found.log10_p, found.evidence.log10_p_unfloored)
 
 
 def robustness(
-    marker: Marker | BlindMarker,
+    marker: Marker,
     marked: Mesh,
     message: bytes,
     kind: Kind,
-    epsilons: Sequence[float] | None = None,
+    strengths: Sequence[float] | None = None,
     *,
     samples: int = 5,
 ) -> Robustness:
@@ -100,20 +94,21 @@ def robustness(
         marked: the mesh with the message in it.
         message: the message that was written.
         kind: a name in `ATTACKS`, or an `Attack` of your own.
-        epsilons: strengths, in the attack's unit; by default its usual ones.
+        strengths: in the attack's unit; by default its usual ones.
         samples: number of attacks at each strength, with the seeds 0, 1, …
 
     Raises:
         JaxmarkError: if there is no such attack, no strength, or no sample.
     """
     entry = get_attack(kind)
-    strengths = entry.strengths if epsilons is None else tuple(epsilons)
+    strengths = entry.strengths if strengths is None else tuple(strengths)
     if samples < 1 or not strengths:
         raise JaxmarkError(f"robustness needs a strength and a sample, got {len(strengths)} and {samples}.")
 
-    def try_attack(strength: float, seed: int) -> tuple[Reading, str]:
+    def try_attack(strength: float, seed: int) -> tuple[Outcome, str]:
         try:
-            return read(marker, attack(marked, entry, strength, seed=seed), message), ""
+            found = marker.detect(attack(marked, entry, strength, seed=seed))
+            return compare_with(message, marker, found), ""
         except JaxmarkError as error:
             return NOTHING, str(error)
 
@@ -134,7 +129,7 @@ def robustness(
 
 
 def minimum_distortion(
-    marker: Marker | BlindMarker,
+    marker: Marker,
     marked: Mesh,
     message: bytes,
     kind: Kind,

@@ -7,7 +7,6 @@ and is differentiable, `upper_bound` says how much better other strengths could 
 import warnings
 from functools import partial
 from types import ModuleType
-from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +17,6 @@ from scipy import optimize
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.channels import Channels, Margin, margins
-
-Solver = Literal["projected-gradient", "accelerated-gradient"]
 
 _ANNEALING_SHARES = (0.01, 0.1)  # of the final sharpness, in the stages before the last
 _BALANCING_ROUNDS = 30  # in which several limits are weighed against each other
@@ -34,15 +31,14 @@ def allocate(
     cap: float = 1.0,
     sharpness: float = 100.0,
     steps: int = 500,
-    solver: Solver = "projected-gradient",
     start: Float[Array, " bands"] | None = None,
 ) -> Float[Array, " bands"]:
     """Strengths per band that maximise the worst attack's margin under Σ_j cost_j β_j² = budget²; traceable.
 
-    The problem is solved for the bands' shares of the budget, which lie on a simplex cut off at `cap`, so that the
-    budget is met exactly. The worst margin is an annealed soft minimum, whose gap to the minimum is at most
-    log(attacks)/sharpness of the margin at equal shares. Reverse mode differentiates the solution implicitly with
-    respect to channels, cost and budget; there is no forward mode, and no derivative with respect to `start`.
+    The problem is solved by projected gradients for the bands' shares of the budget, which lie on a simplex cut off at
+    `cap`, so that the budget is met exactly. The worst margin is an annealed soft minimum, whose gap to the minimum is
+    at most log(attacks)/sharpness of the margin at equal shares. Reverse mode differentiates the solution implicitly
+    with respect to channels, cost and budget; there is no forward mode, and no derivative with respect to `start`.
 
     Args:
         channels: channels of the attacks to survive.
@@ -52,8 +48,6 @@ def allocate(
         cap: the largest share of the budget that one band gets, at least 1/bands.
         sharpness: sharpness of the soft minimum.
         steps: largest number of iterations.
-        solver: `"projected-gradient"` (jaxopt's `ProjectedGradient`) or `"accelerated-gradient"` (the same with FISTA's
-            momentum). `LBFGSB` on the box is not offered: it stops short of the best, and ends in NaN under newer JAX.
         start: strengths to start from; equal shares unless given.
 
     Returns:
@@ -74,15 +68,13 @@ def allocate(
         raise JaxmarkError(f"allocate needs a positive budget, got {budget}.")
     if not cap * bands >= 1:
         raise JaxmarkError(f"{bands} bands with at most {cap:g} of the budget each cannot spend it; raise the cap.")
-    if solver not in get_args(Solver):
-        raise JaxmarkError(f"solver must be one of {', '.join(get_args(Solver))}, got {solver!r}.")
     first = jnp.full_like(cost, 1 / bands) if start is None else cost * jnp.asarray(start, cost.dtype) ** 2
     first = _capped_simplex(first / first.sum(), min(cap, 1.0))
     numbers = (jnp.asarray(budget, cost.dtype), jnp.asarray(sharpness, cost.dtype))
-    return _allocate(channels, cost, *numbers, first, margin, min(cap, 1.0), steps, solver)
+    return _allocate(channels, cost, *numbers, first, margin, min(cap, 1.0), steps)
 
 
-@partial(jax.jit, static_argnames=("margin", "cap", "steps", "solver"))
+@partial(jax.jit, static_argnames=("margin", "cap", "steps"))
 def _allocate(
     channels: Channels,
     cost: Array,
@@ -92,7 +84,6 @@ def _allocate(
     margin: Margin,
     cap: float,
     steps: int,
-    solver: Solver,
 ) -> Array:
     jaxopt = import_jaxopt()
     # A band's share of the budget buys this much β².
@@ -101,17 +92,14 @@ def _allocate(
 
     # jaxopt differentiates its solution with respect to arguments, not to what a closure holds.
     def loss(shares: Array, scaled: Channels, level: Array, sharpness: Array) -> Array:
-        # Momentum may leave the simplex, where a margin has no meaning.
-        inside = jnp.where(shares < 0, 0, shares)
-        return jax.nn.logsumexp(-sharpness * level * margins(scaled, inside, margin)) / sharpness
+        return jax.nn.logsumexp(-sharpness * level * margins(scaled, shares, margin)) / sharpness
 
-    accelerated = solver == "accelerated-gradient"
     simplex = jaxopt.ProjectedGradient(
         fun=loss,
         projection=lambda x, _: _capped_simplex(x, cap),
         maxiter=steps,
         tol=1e-7,
-        acceleration=accelerated,
+        acceleration=False,
     )
     run = partial(simplex.run, hyperparams_proj=None)
 
@@ -121,7 +109,6 @@ def _allocate(
     with jax.numpy_dtype_promotion("standard"):  # jaxopt mixes integers into its floats
         warm = jax.lax.stop_gradient(jax.lax.scan(stage, first, jnp.asarray(_ANNEALING_SHARES, first.dtype))[0])
         shares = stage(warm, jnp.ones_like(sharpness))[0]
-    shares = _capped_simplex(shares, cap) if accelerated else shares
     # The root's slope at an empty band is infinite: select before it. NaN is not empty, and stays.
     empty = shares <= 0
     return jnp.where(empty, 0, budget * jnp.sqrt(jnp.where(empty, 1, shares) / cost))
@@ -204,7 +191,6 @@ def balance(
     cost: Float64[np.ndarray, "limits bands"],
     margin: Margin,
     cap: float,
-    solver: Solver,
     start: Float[np.ndarray, " bands"] | None,
 ) -> tuple[Float64[np.ndarray, " bands"], Float64[np.ndarray, " limits"]]:
     """Strengths within several limits at once, and the weights of the single budget that has the same solution.
@@ -217,7 +203,7 @@ def balance(
     for _ in range(_BALANCING_ROUNDS if len(cost) > 1 else 1):
         given = None if start is None else jnp.asarray(start, dtype)
         mixed = jnp.asarray(weights @ cost, dtype)
-        solved = allocate(channels, mixed, margin=margin, cap=cap, solver=solver, start=given)
+        solved = allocate(channels, mixed, margin=margin, cap=cap, start=given)
         power = np.asarray(solved, np.float64) ** 2
         used = cost @ power
         power /= used.max()

@@ -5,19 +5,20 @@ from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, PRNGKeyArray
+from jaxtyping import Float64
 
 from jaxmark import distortion
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.tuning import Attacker, apply_attack, check_attackers, seed_numbers
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.blind.marker import make_blind_marker
+from jaxmark.seeds import Seed
 from jaxmark.watermark.blind.prediction import Left, best_margin, compare
-from jaxmark.watermark.blind.reading import codeword
+from jaxmark.watermark.blind.reading import codeword, register
 from jaxmark.watermark.blind.scheme import BlindScheme, Look
 from jaxmark.watermark.blind.writing import Plan, carried, sureness
-from jaxmark.watermark.everyday import BLIND_SCHEMES, blind_scheme
-from jaxmark.watermark.perception.budget import Limits, make_budget
+from jaxmark.watermark.markers import make_blind_marker
+from jaxmark.watermark.perception.budget import Budget, BudgetLike
+from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, find_blind
 
 _PUBLIC_KEY = bytes(32)  # predictions hardly depend on the key
 
@@ -34,13 +35,12 @@ class TunedBlind(NamedTuple):
 def tune_blind(
     mesh: Mesh,
     attacks: Sequence[Attacker],
-    budget: float | None = None,
+    budget: BudgetLike = None,
     *,
-    limits: Limits | None = None,
-    key: PRNGKeyArray,
+    seed: Seed,
     bits: int = 64,
     scheme: str | BlindScheme = "field",
-    seeds: int = 1,
+    samples: int = 1,
 ) -> TunedBlind:
     """Choose width and step of a mark that is read without the original, for the attacks that it must survive.
 
@@ -54,35 +54,34 @@ def tune_blind(
         mesh: the original.
         attacks: see `jaxmark.evaluation.tuning.tune`.
         budget: see `jaxmark.watermark.everyday.embed`.
-        limits: see `jaxmark.watermark.everyday.embed`.
-        key: a JAX random key for the attacks' random choices; not secret.
+        seed: see `jaxmark.evaluation.tuning.tune`.
         bits: size of the payload in bits.
         scheme: a blind scheme, whose widths and steps are compared.
-        seeds: number of times that each attack is tried; predictions are averaged.
+        samples: number of times that each attack is tried; predictions are averaged.
 
     Raises:
         JaxmarkError: if the mesh, an attack, the budget or a number is unusable, the scheme is no blind one, or the
             budget leaves nothing to write in.
     """
-    if not attacks or seeds < 1:
-        raise JaxmarkError(f"tune_blind needs at least one attack and one seed, got {len(attacks)} and {seeds}.")
+    if not attacks or samples < 1:
+        raise JaxmarkError(f"tune_blind needs at least one attack and one sample, got {len(attacks)} and {samples}.")
     check_attackers(attacks)
-    blind = blind_scheme(scheme)
+    blind = find_blind(scheme)
     if blind is None:
         raise JaxmarkError(
             f"tune_blind tunes the schemes that are read without the original ({', '.join(BLIND_SCHEMES)}), not"
             f" {scheme!r}; for the others there is tune."
         )
-    numbers = seed_numbers("tune_blind", key, seeds)
+    numbers = seed_numbers(seed, samples)
     writer = make_blind_marker(mesh, _PUBLIC_KEY, bits=bits, scheme=blind).writer
     word = codeword(bytes(bits // 8), writer.choices)
-    allowances = writer.allowances(word, make_budget(budget, limits), distortion.Reference(writer.original.mesh))
+    allowances = writer.allowances(word, Budget.of(budget).bounds(mesh), distortion.Reference(mesh))
     plans = [one.plan(step) for one in allowances for step in writer.steps(one)]
     if not plans:
         raise JaxmarkError(f"This mesh, or the budget for it, leaves the scheme {blind.name!r} nothing to write in.")
 
     def looks(suspect: Mesh) -> dict[float, list[Look]]:
-        found = sorted(blind.views(suspect, writer.choices), key=lambda look: look.width)
+        found = sorted(blind.views(register(suspect), writer.choices), key=lambda look: look.width)
         return {width: list(some) for width, some in groupby(found, key=lambda look: look.width)}
 
     before = {width: some[0] for width, some in looks(mesh).items()}

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxmark.alignment.observation import Observation
+from jaxmark.seeds import probe_signs
 from jaxmark.spectral.chebyshev import band_energies
 from jaxmark.spectral.precision import matmul
 from jaxmark.watermark.interfaces import Displacement
-from jaxmark.watermark.probes import probe_signs
 from jaxmark.watermark.reading.reception import Receiver, clean, receive
 
 Margin = Literal["rate", "evidence", "snr"]

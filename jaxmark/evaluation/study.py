@@ -10,30 +10,30 @@ import pickle
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from itertools import product
 from numbers import Integral, Real
 from typing import Any
 
-from jaxmark.alignment.alignment import Alignment
-from jaxmark.attacks import Attack, attack_each, get_attack
+from jaxmark.adversaries.registry import attack_each, get_attack
+from jaxmark.attacks import Attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation._rates import LOG10_LEVEL, Control, Row
-from jaxmark.evaluation._robustness import NOTHING, Reading, read
+from jaxmark.evaluation._robustness import NOTHING, Outcome, compare_with
 from jaxmark.evaluation.cells import Cell, Pool, processes, run
 from jaxmark.evaluation.results import Results
 from jaxmark.files import load_mesh
 from jaxmark.files.atomic import read_file
 from jaxmark.geometry.hashing import geometry_hash
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.blind.marker import BlindMarker
 from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.coding.keys import Key
-from jaxmark.watermark.everyday import prepare_alone, scheme_named
-from jaxmark.watermark.marking import DEFAULT_BITS, Marker
-from jaxmark.watermark.perception.budget import Budget, Visibility, make_budget
-from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, Scheme, parameters_of
+from jaxmark.watermark.coding.message import DEFAULT_BITS
+from jaxmark.watermark.interfaces import Scheme
+from jaxmark.watermark.markers import Marker, prepare
+from jaxmark.watermark.perception.budget import Budget, BudgetLike
+from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, find_blind, get_nonblind, parameters_of
 
 _SEEDS_PER_CELL = 5  # attacked by one call
 
@@ -51,16 +51,16 @@ class Study:
             `{"noise": [0.001, 0.005], "mine": Attack(function, "unit", (0.1,))}`.
         schemes: names, or schemes of your own by any name.
         payloads: sizes of the message, in bits.
-        budgets: RMS displacements over the diagonal, names of visibilities, or limits by metric; see `embed`.
-        seeds: number of seeds: 0, 1, …
+        budgets: see `embed`: RMS displacements over the diagonal, names of visibilities, limits by metric, or budgets.
+        samples: number of samples of each cell, with the seeds 0, 1, …
     """
 
     meshes: Mapping[str, str | os.PathLike[str] | Mesh]
     attacks: Mapping[str, Sequence[float] | Attack]
     schemes: Sequence[str] | Mapping[str, str | Scheme | BlindScheme] = (DEFAULT_SCHEME,)
     payloads: Sequence[int] = (DEFAULT_BITS,)
-    budgets: Sequence[float | Visibility | Mapping[str, float]] = ("hidden",)
-    seeds: int = 5
+    budgets: Sequence[BudgetLike] = ("hidden",)
+    samples: int = 5
 
     def __post_init__(self) -> None:
         """Check the fields.
@@ -72,7 +72,7 @@ class Study:
         self._check_forms()
         parts = {"mesh": self.meshes, "attack": self.attacks, "scheme": self._schemes, "budget": self._budgets}
         parts |= {f"strength of {name!r}": self._strengths(name) for name in self.attacks if self._attack(name)}
-        for name, part in {**parts, "payload": self.payloads, "seed": range(self.seeds)}.items():
+        for name, part in {**parts, "payload": self.payloads, "sample": range(self.samples)}.items():
             if not part:
                 raise JaxmarkError(f"A study needs at least one {name}.")
         for name in self.attacks:
@@ -104,8 +104,8 @@ class Study:
             given = getattr(self, name)
             if isinstance(given, str) or not isinstance(given, Sequence | Mapping):
                 raise JaxmarkError(f"The {name} of a study are a list, such as {example}, got {given!r}.")
-        if not isinstance(self.seeds, Integral):
-            raise JaxmarkError(f"seeds is a number of seeds, such as 5, got {self.seeds!r}.")
+        if not isinstance(self.samples, Integral):
+            raise JaxmarkError(f"samples is a number of samples, such as 5, got {self.samples!r}.")
 
     def run(
         self,
@@ -143,22 +143,17 @@ class Study:
         return Results(tuple(row for cell in done for row in self._rows(cell)))
 
     @property
+    def _given_schemes(self) -> Mapping[str, str | Scheme | BlindScheme]:
+        return self.schemes if isinstance(self.schemes, Mapping) else {name: name for name in self.schemes}
+
+    @property
     def _schemes(self) -> dict[str, Scheme | BlindScheme]:
-        given = self.schemes if isinstance(self.schemes, Mapping) else {name: name for name in self.schemes}
-        return {name: scheme_named(scheme) for name, scheme in given.items()}
+        return {name: find_blind(scheme) or get_nonblind(scheme) for name, scheme in self._given_schemes.items()}
 
     @property
     def _budgets(self) -> dict[str, Budget]:
         """Budgets by the names that they have in rows: `0.0008`, `hidden`, or `dame=0.008`."""
-        found = {}
-        for one in self.budgets:
-            if isinstance(one, Mapping):
-                found[" ".join(f"{name}={value}" for name, value in one.items())] = make_budget(limits=one)
-            elif isinstance(one, str):
-                found[one] = make_budget(visibility=one)
-            else:
-                found[str(one)] = make_budget(one)
-        return found
+        return {str(one): one for one in map(Budget.of, self.budgets)}
 
     def _attack(self, name: str) -> Attack:
         given = self.attacks[name]
@@ -171,11 +166,11 @@ class Study:
     def _cells(self) -> Iterator[Cell]:
         """All cells; those with the same marked meshes follow each other, so that each mesh is marked once."""
         digests = {name: _digest(mesh) for name, mesh in self.meshes.items()}
-        schemes, budgets, count = self._schemes, self._budgets, self.seeds
+        schemes, budgets, count = self._schemes, self._budgets, self.samples
         blocks = [(first, min(_SEEDS_PER_CELL, count - first)) for first in range(0, count, _SEEDS_PER_CELL)]
         for mesh, scheme, bits, budget, block in product(self.meshes, schemes, self.payloads, budgets, blocks):
             # What an older file does not say of a reading is read again.
-            fields = json.dumps([digests[mesh], schemes[scheme].name, parameters_of(schemes[scheme]), Reading._fields])
+            fields = json.dumps([digests[mesh], schemes[scheme].name, parameters_of(schemes[scheme]), Outcome._fields])
             digest = hashlib.sha256(fields.encode()).hexdigest()[:16]
             for name in self.attacks:
                 for strength in self._strengths(name):
@@ -215,7 +210,7 @@ class _Point:
 
     cell: Cell  # identifies the point
     mesh: str | os.PathLike[str] | Mesh = field(compare=False)
-    scheme: Scheme | BlindScheme = field(compare=False)
+    scheme: str | Scheme | BlindScheme = field(compare=False)
     bits: int = field(compare=False)
     budget: Budget = field(compare=False)
 
@@ -226,7 +221,7 @@ def work(study: Study, cell: Cell) -> dict[str, Any]:
     point = _Point(
         (mesh, scheme, bits, budget, digest),
         study.meshes[str(mesh)],
-        study._schemes[str(scheme)],
+        study._given_schemes[str(scheme)],  # a name stands for any pass band
         int(bits),
         study._budgets[str(budget)],
     )
@@ -264,36 +259,32 @@ def _read(
     point: _Point, suspect: Mesh | str, seed: int, keys: Mapping[Control, int], rms: float
 ) -> Iterator[dict[str, Any]]:
     """Read a suspect with several keys, aligned once."""
-    found: Mesh | Alignment | str = suspect
+    refusal, registered = suspect if isinstance(suspect, str) else "", None
     for control, key in keys.items():
-        start, reading = time.perf_counter(), NOTHING
-        if not isinstance(found, str):
+        start, outcome = time.perf_counter(), NOTHING
+        if not refusal and not isinstance(suspect, str):
             try:
                 marker = _marker(point, key)
-                found = marker.align(found) if isinstance(found, Mesh) else found
-                reading = read(marker, found, _message(seed, point.bits))
+                registered = marker.register(suspect) if registered is None else registered
+                outcome = compare_with(_message(seed, point.bits), marker, marker.read(registered))
             except JaxmarkError as error:
-                found = str(error)
-        told = {"refusal": found if isinstance(found, str) else "", "seconds": time.perf_counter() - start}
-        yield {"seed": seed, "control": control, **reading._asdict(), **told, "rms": rms}
+                refusal = str(error)
+        said = {"refusal": refusal, "seconds": time.perf_counter() - start}
+        yield {"seed": seed, "control": control, **outcome._asdict(), **said, "rms": rms}
 
 
 @lru_cache(maxsize=_SEEDS_PER_CELL + 1)  # the keys that a cell reads with
-def _marker(point: _Point, seed: int) -> Marker | BlindMarker:
+def _marker(point: _Point, seed: int) -> Marker:
     mesh = point.mesh if isinstance(point.mesh, Mesh) else load_mesh(point.mesh)
-    rms, limits = point.budget
-    marker = prepare_alone(mesh, Key(_derive(seed, "key", 32)), point.bits, point.scheme)
-    return marker.suited(rms, limits=limits) if isinstance(point.scheme, str) else marker
+    return prepare(mesh, Key(_derive(seed, "key", 32)), point.bits, point.scheme, adapt_to=point.budget)
 
 
 @lru_cache(maxsize=_SEEDS_PER_CELL)
 def _mark(point: _Point, seed: int) -> tuple[Mesh | str, float]:
     """Mark as strongly as the budget allows, readable or not; return the mesh, or why not, and the mark's RMS."""
-    rms, limits = point.budget
+    budget = replace(point.budget, noise=0.0 if point.budget.noise is None else point.budget.noise)
     try:
-        mesh, info = _marker(point, seed).embed(
-            _message(seed, point.bits), rms, limits=limits or None, noise=0, read_back=False
-        )
+        mesh, info = _marker(point, seed).embed(_message(seed, point.bits), budget, read_back=False)
     except JaxmarkError as error:
         return f"Not marked: {error}", 0.0
     return mesh, info.rms

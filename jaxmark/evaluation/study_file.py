@@ -17,7 +17,7 @@ def load_study(path: str | os.PathLike[str]) -> Study:
     """Load a study from a TOML file.
 
     The tables `meshes` (files, relative to the TOML file's folder) and `attacks` (lists of strengths) are by name.
-    `schemes` (names), `payloads`, `budgets` (numbers, names, or tables of limits) and `seeds` are as in `Study`, and
+    `schemes` (names), `payloads`, `budgets` (numbers, names, or tables of limits) and `samples` are as in `Study`, and
     have its defaults.
 
     Raises:
@@ -76,5 +76,5 @@ _FIELDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
         "a list of numbers, names or tables of limits",
         _list(lambda one: _number(one) or _text(one) or (bool(one) and _table(_number)(one))),
     ),
-    "seeds": ("a whole number", _whole),
+    "samples": ("a whole number", _whole),
 }

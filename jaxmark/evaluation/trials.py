@@ -26,8 +26,8 @@ from jaxmark.evaluation.channels import Margin, measure
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.carriers.keyed import KeyedCarrier, KeyedReader
 from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key
-from jaxmark.watermark.perception.budget import Budget, Written, write
-from jaxmark.watermark.schemes.scheme import TunableScheme
+from jaxmark.watermark.perception.budget import Bounds, Written, displace_within
+from jaxmark.watermark.schemes.keyed import KeyedScheme
 
 Attack = Callable[[Mesh, int], Mesh]  # an attack of some strength on a mesh, with a seed
 
@@ -46,7 +46,7 @@ _LEAST_WORTH = 1.0  # nats or bits, of which a smaller gain is none: next to not
 class Trial(NamedTuple):
     """Marks of one profile of strengths, each attack applied to them, and what the detector makes of that."""
 
-    scheme: TunableScheme
+    scheme: KeyedScheme
     reader: KeyedReader
     word: Float[Array, " code"]  # of all marks
     signs: tuple[Int8[Array, "vertices channels"], ...]  # of each mark
@@ -84,12 +84,12 @@ class Trials:
 
     original: Original
     bits: int
-    bounds: Budget
+    bounds: Bounds
     attacks: Sequence[Attack]
     seeds: Sequence[int]
     margin: Margin
 
-    def fits(self, scheme: TunableScheme) -> bool:
+    def fits(self, scheme: KeyedScheme) -> bool:
         """Whether the bands of a scheme have room for the payload."""
         try:
             scheme.code_length(self.original, self.bits)
@@ -97,7 +97,7 @@ class Trials:
             return False
         return True
 
-    def run(self, scheme: TunableScheme) -> Trial:
+    def run(self, scheme: KeyedScheme) -> Trial:
         """Write, attack and read marks of a scheme, to choose among several.
 
         Raises:
@@ -105,7 +105,7 @@ class Trials:
         """
         return self._run(scheme, _CHOSEN)
 
-    def check(self, scheme: TunableScheme) -> Trial:
+    def check(self, scheme: KeyedScheme) -> Trial:
         """Write, attack and read more marks of a scheme than `run`, by which nothing was chosen before.
 
         Raises:
@@ -113,7 +113,7 @@ class Trials:
         """
         return self._run(scheme, _CHECKED)
 
-    def _run(self, scheme: TunableScheme, numbers: range) -> Trial:
+    def _run(self, scheme: KeyedScheme, numbers: range) -> Trial:
         """Write, attack and read marks of a scheme.
 
         Each mark is tried beside its opposite: what attacks have in common with its signs by chance cancels, so that
@@ -127,9 +127,9 @@ class Trials:
         code = scheme.code_length(original, self.bits)
         carrier = scheme.carrier(original, Choices(Key(bytes(KEY_BYTES)), b""), self.bits, code)
         word = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], code), original.signal.dtype)
-        drawn = [carrier.redraw(jax.random.key(number)) for number in numbers]
+        drawn = [carrier.redraw(number) for number in numbers]
         shifts = [original.to_host(one.displacement(word)) for one in drawn]
-        written = [write(original, shift, self.bounds, self._reference) for shift in shifts]
+        written = [displace_within(original, shift, self.bounds, self._reference) for shift in shifts]
         marks = [
             displace(original, sign * one.scale * shift)
             for one, shift in zip(written, shifts, strict=True)
@@ -166,7 +166,7 @@ class Trials:
             best, found = found, self.run(self._improved(found, cost))
         return best
 
-    def _improved(self, tried: Trial, cost: Float64[np.ndarray, "limits bands"]) -> TunableScheme:
+    def _improved(self, tried: Trial, cost: Float64[np.ndarray, "limits bands"]) -> KeyedScheme:
         """The scheme with the strengths that are best by what is seen of others, which are not far."""
         at = self._run(tried.scheme, _FITTED)
         carrier, dtype = at.reader.carrier, at.word.dtype
@@ -193,7 +193,7 @@ class Trials:
 
     def _left(
         self,
-        scheme: TunableScheme,
+        scheme: KeyedScheme,
         reader: KeyedReader,
         word: Float[Array, " code"],
         signs: Sequence[Int8[Array, "vertices channels"]],

@@ -12,27 +12,28 @@ from typing import NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int64, PRNGKeyArray
+from jaxtyping import Array, Float, Float64, Int64
 
+from jaxmark.adversaries.registry import attack, get_attack
 from jaxmark.alignment.alignment import align, observation
 from jaxmark.alignment.original import Original, make_original
-from jaxmark.attacks import Kind, attack, get_attack
+from jaxmark.attacks import Kind
 from jaxmark.distortion import name_of
 from jaxmark.errors import JaxmarkError
-from jaxmark.evaluation.allocation import Solver, balance, upper_bound
+from jaxmark.evaluation.allocation import balance, upper_bound
 from jaxmark.evaluation.channels import Channels, Margin, margins, measure
 from jaxmark.evaluation.trials import Trials
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.seeds import Seed, probe_signs, random_key
 from jaxmark.spectral.chebyshev import band_energies, filter
-from jaxmark.watermark.everyday import blind_scheme
-from jaxmark.watermark.interfaces import Displacement
-from jaxmark.watermark.perception.budget import Budget, Limits, make_budget, write
+from jaxmark.watermark.interfaces import Displacement, Scheme
+from jaxmark.watermark.perception.budget import Bounds, Budget, BudgetLike, displace_within
 from jaxmark.watermark.perception.capacity import Capacity
 from jaxmark.watermark.perception.masking import apply_mask
 from jaxmark.watermark.perception.visibility import band_visibility
-from jaxmark.watermark.probes import probe_signs
-from jaxmark.watermark.schemes.passband import suited
-from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, Scheme, TunableScheme, get_scheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
+from jaxmark.watermark.schemes.passband import choose_pass_band
+from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, find_blind, get_nonblind
 
 Attacker = tuple[Kind, float] | Callable[[Mesh, int], Mesh]  # an attack and a strength, or (mesh, seed) → mesh
 
@@ -61,7 +62,7 @@ class Report(NamedTuple):
 class Tuned(NamedTuple):
     """Strengths per band that are tuned to a mesh."""
 
-    scheme: TunableScheme  # has the strengths as its profile; `embed` takes it
+    scheme: KeyedScheme  # has the strengths as its profile; `embed` takes it
     beta: Float64[np.ndarray, " bands"]  # the strengths in diagonals, within the limits
     channels: Channels  # of the attacks, as measured
     cost: Float64[np.ndarray, "limits bands"]  # share of each limit, squared, that β_j² = 1 uses up
@@ -72,16 +73,14 @@ class Tuned(NamedTuple):
 def tune(
     mesh: Mesh,
     attacks: Sequence[Attacker],
-    budget: float | None = None,
+    budget: BudgetLike = None,
     *,
-    limits: Limits | None = None,
-    key: PRNGKeyArray,
+    seed: Seed,
     bits: int = 64,
     scheme: str | Scheme = DEFAULT_SCHEME,
-    seeds: int = 1,
+    samples: int = 1,
     margin: Margin = "rate",
     cap: float = 0.125,
-    solver: Solver = "projected-gradient",
     start: Float[np.ndarray, " bands"] | None = None,
 ) -> Tuned:
     """Tune the strengths of a scheme's bands to a mesh, a set of attacks and a budget.
@@ -99,16 +98,14 @@ def tune(
         attacks: the attacks to survive: pairs of a name in `ATTACKS`, or an `Attack`, and a strength; or functions of
             mesh and seed.
         budget: see `embed`.
-        limits: see `embed`.
-        key: a JAX random key for the attacks' random choices; not secret.
+        seed: of the attacks' random choices, a whole number or a JAX random key; not secret.
         bits: size of the payload in bits.
         scheme: the scheme whose bands are tuned; its profile is replaced.
-        seeds: number of times that each attack is tried; what is measured is averaged.
+        samples: number of times that each attack is tried; what is measured is averaged.
         margin: what the worst attack should leave: `"evidence"`, for a claimed message, or `"rate"`, for a message that
             is to be read; see `jaxmark.evaluation.channels.margins`. Trials have S²/2‖a‖² in nats of the claim, or the
             bits that the soft values of joint decoding transmit.
         cap: the largest share of the budget that one band gets, so that losing a band does not lose the mark.
-        solver: see `jaxmark.evaluation.allocation.allocate`.
         start: strengths to start from, such as those of an earlier tuning.
 
     Returns:
@@ -117,16 +114,16 @@ def tune(
     Raises:
         JaxmarkError: if the mesh, an attack, the budget or a number is unusable, or the scheme has no bands to tune.
     """
-    if not attacks or seeds < 1:
-        raise JaxmarkError(f"tune needs at least one attack and one seed, got {len(attacks)} and {seeds}.")
+    if not attacks or samples < 1:
+        raise JaxmarkError(f"tune needs at least one attack and one sample, got {len(attacks)} and {samples}.")
     check_attackers(attacks)
     if margin not in get_args(Margin):
         raise JaxmarkError(f"The margin to tune for is one of {', '.join(get_args(Margin))}, got {margin!r}.")
-    if blind_scheme(scheme) is not None:
+    if find_blind(scheme) is not None:
         raise JaxmarkError(f"The scheme {scheme!r} is read without the original, and has no bands; see tune_blind.")
-    numbers = seed_numbers("tune", key, seeds)
-    bounds, tunable = make_budget(budget, limits), get_scheme(scheme).tunable()
+    numbers, tunable = seed_numbers(seed, samples), get_nonblind(scheme).tunable()
     original, family = make_original(mesh), tunable.family()
+    bounds = Budget.of(budget).bounds(original.mesh)
     (signs,) = probe_signs("tuning", original.signal.shape, dtype=original.signal.dtype)
     signs = signs * original.to_traced(original.used)[:, None]
     mask = tunable.mask(original)
@@ -138,7 +135,7 @@ def tune(
     equal = 1 / np.sqrt(len(family) * cost.sum(axis=0))
     # Equal shares, so that each band is measured.
     probe = shape_signs(equal)
-    written = write(original, probe, bounds)
+    written = displace_within(original, probe, bounds)
     mark = original.to_traced(written.scale * probe)
     suspects = [[apply_attack(one, written.mesh, int(seed)) for seed in numbers] for one in attacks]
     seen = [[observation(original, align(original, suspect)) for suspect in row] for row in suspects]
@@ -150,14 +147,14 @@ def tune(
 
     # What the receiver projects off depends on the profile: once for a first one, and again for what it was tuned to.
     first = measure_channels(_profile(equal if start is None else np.asarray(start, np.float64)))
-    start, _ = balance(first, cost, margin, cap, solver, start)
+    start, _ = balance(first, cost, margin, cap, start)
     channels = measure_channels(_profile(start))
-    beta, weights = balance(channels, cost, margin, cap, solver, start)
+    beta, weights = balance(channels, cost, margin, cap, start)
     worth = np.asarray(margins(channels, jnp.asarray(beta**2, original.signal.dtype), margin), np.float64)
     bound = upper_bound(channels, weights @ cost, cap=cap, margin=margin)
 
     trials = Trials(original, bits, bounds, [partial(apply_attack, one) for one in attacks], numbers.tolist(), margin)
-    default = trials.run(suited(Capacity(original, tunable), bits, bounds).tunable())
+    default = trials.run(choose_pass_band(Capacity(original, tunable), bits, bounds).tunable())
     solved = tunable.with_profile(_profile(beta))
     low_pass = [tunable.with_profile((1.0,) * round(share * len(family))) for share in _LOW_PASS]
     others = [trials.run(one) for one in (solved, *low_pass) if trials.fits(one)]
@@ -188,7 +185,7 @@ def _costs(
     family: Float64[np.ndarray, "bands terms"],
     signs: Displacement,
     mask: Float[Array, " rows *axes"] | None,
-    bounds: Budget,
+    bounds: Bounds,
 ) -> Float64[np.ndarray, "limits bands"]:
     """Share of each limit, squared, that β_j = 1 uses up in band j."""
     whole = band_energies(original.operator, jnp.asarray(family, signs.dtype), signs, signs)
@@ -199,7 +196,7 @@ def _costs(
     return np.stack(rows + ([energy / bounds.rms**2] if bounds.rms is not None else []))
 
 
-def _names(bounds: Budget) -> list[str]:
+def _names(bounds: Bounds) -> list[str]:
     """Names of the limits, in the order of `_costs`."""
     return [*map(name_of, bounds.limits)] + (["budget"] if bounds.rms is not None else [])
 
@@ -215,19 +212,9 @@ def _mean(channels: list[Channels]) -> Channels:
     return jax.tree.map(lambda *values: jnp.mean(jnp.stack(values), axis=0), *channels)
 
 
-def seed_numbers(caller: str, key: PRNGKeyArray, count: int) -> Int64[np.ndarray, " seeds"]:
-    """Seeds of the attacks' random choices.
-
-    Raises:
-        JaxmarkError: if `key` is no random key of JAX.
-    """
-    try:
-        found = jax.random.randint(key, (count,), 0, 2**31 - 1)
-    except TypeError:
-        raise JaxmarkError(
-            f"{caller} needs a random key of JAX for the attacks, such as jax.random.key(0); got {type(key).__name__}."
-        ) from None
-    return np.asarray(found, np.int64)
+def seed_numbers(seed: Seed, count: int) -> Int64[np.ndarray, " samples"]:
+    """Draw seeds of the attacks' random choices."""
+    return np.asarray(jax.random.randint(random_key(seed), (count,), 0, 2**31 - 1), np.int64)
 
 
 def check_attackers(attacks: Sequence[Attacker]) -> None:

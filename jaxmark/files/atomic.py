@@ -1,6 +1,7 @@
 """Read whole files, and write files that appear whole or not at all."""
 
 import errno
+import hashlib
 import os
 import platform
 import re
@@ -36,6 +37,21 @@ def read_file(path: str | os.PathLike, most: int | None = None) -> bytes:
     if most is not None and size > most:
         raise OSError(errno.EFBIG, f"it has {size} bytes, more than {most}", os.fspath(path))
     return target.read_bytes()
+
+
+def file_hash(path: str | os.PathLike[str]) -> str:
+    """Compute the SHA-256 of a file's bytes, hexadecimal.
+
+    Raises:
+        JaxmarkError: if it cannot be read.
+    """
+    if Path(path).exists() and not Path(path).is_file():  # a pipe may never end
+        raise JaxmarkError(f"Cannot read {path}: it is no ordinary file.")
+    try:
+        with Path(path).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise JaxmarkError(f"Cannot read {path}: {error.strerror or error}.") from None
 
 
 def read_beside(folder: Path) -> Callable[[str], bytes]:

@@ -30,6 +30,10 @@ class Pose(NamedTuple):
         matrix = np.linalg.inv(self.matrix)
         return Pose(matrix, -matrix @ self.shift)
 
+    def facts(self) -> dict[str, list]:
+        """The map as values for JSON."""
+        return {"matrix": self.matrix.tolist(), "shift": self.shift.tolist()}
+
     @property
     def mirrors(self) -> bool:
         """Whether this one map makes left hands of right ones."""

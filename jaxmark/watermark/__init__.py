@@ -1,7 +1,8 @@
 """Watermarks in meshes: how messages and fingerprints are written under a key, read again, and what a reading proves.
 
 `embed`, `detect`, `capacity`, `fingerprint` and `identify` each do one job on a mesh; `make_marker` and `make_tracer`
-prepare an original once for many. A `Scheme` fixes how marks are written and read.
+prepare an original once for many. A `Scheme` fixes how marks are written and read, a `Budget` how strong they are.
+`embed_bits`, `detect_bits` and `log_evidence` are the same as pure functions of arrays.
 """
 
 from jaxmark.watermark.bits import detect_bits as detect_bits
@@ -9,33 +10,32 @@ from jaxmark.watermark.bits import embed_bits as embed_bits
 from jaxmark.watermark.bits import log_evidence as log_evidence
 from jaxmark.watermark.blind.field import FieldScheme as FieldScheme
 from jaxmark.watermark.blind.local import LocalScheme as LocalScheme
-from jaxmark.watermark.blind.reading import BlindDetection as BlindDetection
 from jaxmark.watermark.coding.keys import Key as Key
 from jaxmark.watermark.coding.keys import load_key as load_key
 from jaxmark.watermark.coding.keys import new_key as new_key
 from jaxmark.watermark.coding.keys import save_key as save_key
+from jaxmark.watermark.everyday import SceneInfo as SceneInfo
 from jaxmark.watermark.everyday import capacity as capacity
 from jaxmark.watermark.everyday import detect as detect
+from jaxmark.watermark.everyday import detect_scene as detect_scene
 from jaxmark.watermark.everyday import embed as embed
-from jaxmark.watermark.marking import Detection as Detection
-from jaxmark.watermark.marking import EmbedInfo as EmbedInfo
-from jaxmark.watermark.marking import Marker as Marker
-from jaxmark.watermark.marking import Survival as Survival
-from jaxmark.watermark.marking import make_marker as make_marker
+from jaxmark.watermark.everyday import embed_scene as embed_scene
+from jaxmark.watermark.evidence.detection import Detection as Detection
+from jaxmark.watermark.evidence.detection import Evidence as Evidence
+from jaxmark.watermark.interfaces import Scheme as Scheme
+from jaxmark.watermark.mark import EmbedInfo as EmbedInfo
+from jaxmark.watermark.markers import Marker as Marker
+from jaxmark.watermark.markers import NonBlindMarker as NonBlindMarker
+from jaxmark.watermark.markers import make_marker as make_marker
+from jaxmark.watermark.perception.budget import Budget as Budget
+from jaxmark.watermark.perception.capacity import Survival as Survival
 from jaxmark.watermark.record import Record as Record
-from jaxmark.watermark.scenes import SceneDetection as SceneDetection
-from jaxmark.watermark.scenes import SceneInfo as SceneInfo
-from jaxmark.watermark.scenes import SceneRecord as SceneRecord
-from jaxmark.watermark.scenes import detect_scene as detect_scene
-from jaxmark.watermark.scenes import embed_scene as embed_scene
-from jaxmark.watermark.scenes import load_record as load_record
-from jaxmark.watermark.schemes.scheme import SCHEMES as SCHEMES
-from jaxmark.watermark.schemes.scheme import EigenScheme as EigenScheme
-from jaxmark.watermark.schemes.scheme import HostScheme as HostScheme
-from jaxmark.watermark.schemes.scheme import KeyedScheme as KeyedScheme
-from jaxmark.watermark.schemes.scheme import Scheme as Scheme
-from jaxmark.watermark.submeshes import PartMarker as PartMarker
-from jaxmark.watermark.submeshes import make_part_marker as make_part_marker
+from jaxmark.watermark.record import SceneRecord as SceneRecord
+from jaxmark.watermark.record import load_record as load_record
+from jaxmark.watermark.schemes.keyed import KeyedScheme as KeyedScheme
+from jaxmark.watermark.schemes.modulated import EigenScheme as EigenScheme
+from jaxmark.watermark.schemes.modulated import HostScheme as HostScheme
+from jaxmark.watermark.schemes.registry import SCHEMES as SCHEMES
 from jaxmark.watermark.tracing.tardos import Accusation as Accusation
 from jaxmark.watermark.tracing.tracer import Tracer as Tracer
 from jaxmark.watermark.tracing.tracer import fingerprint as fingerprint

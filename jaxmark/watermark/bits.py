@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from jaxmark.alignment.observation import observe
 from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.carriers import Carrier
-from jaxmark.watermark.interfaces import Strength
-from jaxmark.watermark.reading.detectors import Detector, claims, decorrelate
+from jaxmark.watermark.interfaces import Detector, Strength
+from jaxmark.watermark.reading.detectors import claims, decorrelate
 
 
 def embed_bits(

@@ -1,142 +1,57 @@
-"""Everyday use: embed a message, and detect it, whichever way its scheme is read.
+"""The everyday verbs: embed and detect a mark, in one mesh or in a scene of several, and ask what a mesh can carry.
 
-Informed schemes are read beside the original (`jaxmark.watermark.marking`), blind ones without it
-(`jaxmark.watermark.blind`).
+Schemes are read with the original, or blind, without it; see `jaxmark.watermark.schemes.registry`. Keyed choices are
+bound to each mesh's geometry, so that the marks of different meshes of a scene are independent. Equal meshes carry
+equal marks, and count once.
 """
 
 from __future__ import annotations  # so that `help` shows names of types instead of what they stand for
 
-import math
-from collections.abc import Mapping, Sequence
-from functools import partial
-from typing import overload
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cache, partial
+from typing import NamedTuple
 
+import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxmark.alignment.alignment import Align
+from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.alignment.original import make_original
+from jaxmark.alignment.pairing import pair
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_mesh
-from jaxmark.watermark.blind import reading
-from jaxmark.watermark.blind.field import FieldScheme
-from jaxmark.watermark.blind.local import LocalScheme
-from jaxmark.watermark.blind.marker import BlindMarker, make_blind_marker, parameters_in
-from jaxmark.watermark.blind.reading import BlindDetection
+from jaxmark.watermark.blind import reading as blind_reading
 from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.coding.keys import KEY_BYTES, Key
-from jaxmark.watermark.combined import CombinedMarker, unite
-from jaxmark.watermark.marking import (
-    DEFAULT_BITS,
-    Detection,
-    EmbedInfo,
-    Marker,
-    make_marker,
-    make_markers,
-)
-from jaxmark.watermark.perception.budget import Limits, Visibility, make_budget, visibility_of
+from jaxmark.watermark.coding.message import DEFAULT_BITS, check_size
+from jaxmark.watermark.evidence import ledger
+from jaxmark.watermark.evidence.detection import Detection, Evidence, united_score, weigh
+from jaxmark.watermark.interfaces import Detector, Scheme
+from jaxmark.watermark.mark import EmbedInfo
+from jaxmark.watermark.markers import Marker, NonBlindMarker, make_blind_marker, make_marker, prepare, unite
+from jaxmark.watermark.nonblind import Alternatives, claims_of
+from jaxmark.watermark.perception.budget import Budget, BudgetLike
 from jaxmark.watermark.perception.capacity import COVERAGE, NOISE, Capacity, Conditions
-from jaxmark.watermark.reading.detectors import Detector
-from jaxmark.watermark.record import Record
-from jaxmark.watermark.schemes.scheme import DEFAULT_SCHEME, SCHEMES, Scheme, get_scheme
-
-#: The schemes that are read without the original, the soonest read first.
-BLIND_SCHEMES: Mapping[str, BlindScheme] = {LocalScheme.name: LocalScheme(), FieldScheme.name: FieldScheme()}
-NAMES = (*SCHEMES, *BLIND_SCHEMES)  # of all schemes
-#: A scheme of either kind, or the names of an informed one and blind ones, which mark one mesh together.
-AnyScheme = str | Scheme | BlindScheme | tuple[str, ...]
-AnyMarker = Marker | BlindMarker | CombinedMarker
-
-
-def name_of(scheme: AnyScheme) -> str:
-    """The name of a scheme, or of several with commas between."""
-    if isinstance(scheme, tuple):
-        return ",".join(scheme)
-    return scheme if isinstance(scheme, str) else scheme.name
-
-
-def blind_scheme(scheme: str | Scheme | BlindScheme) -> BlindScheme | None:
-    """The blind scheme of this name, or that it is; None if it is an informed one."""
-    if isinstance(scheme, BlindScheme):
-        return scheme
-    return BLIND_SCHEMES.get(scheme) if isinstance(scheme, str) else None
-
-
-def informed_scheme(scheme: str | Scheme | BlindScheme) -> str | Scheme:
-    """The scheme, which must be one that is read beside the original.
-
-    Raises:
-        JaxmarkError: if it is not.
-    """
-    if isinstance(scheme, BlindScheme) or (isinstance(scheme, str) and scheme not in SCHEMES):
-        kind = "informed scheme" if scheme in NAMES else "scheme"
-        raise JaxmarkError(f"There is no {kind} {scheme!r}; the schemes are {', '.join(NAMES)}.")
-    return scheme
-
-
-def split(schemes: tuple[str, ...]) -> tuple[str, tuple[BlindScheme, ...]]:
-    """The informed scheme and the blind ones that mark one mesh together, by their names.
-
-    Raises:
-        JaxmarkError: unless the first is informed and the others are blind, each once.
-    """
-    if len(schemes) < 2 or schemes[0] not in SCHEMES or any(name not in BLIND_SCHEMES for name in schemes[1:]):
-        raise JaxmarkError(
-            f"Several marks in one mesh are an informed one ({', '.join(SCHEMES)}) and then blind ones"
-            f" ({', '.join(BLIND_SCHEMES)}), not {', '.join(schemes)}."
-        )
-    if len(set(schemes)) < len(schemes):
-        raise JaxmarkError(f"Each scheme marks a mesh once, but one is twice among {', '.join(schemes)}.")
-    return schemes[0], tuple(BLIND_SCHEMES[name] for name in schemes[1:])
-
-
-def scheme_named(scheme: str | Scheme | BlindScheme) -> Scheme | BlindScheme:
-    """The scheme of this name, of either kind, or that it is.
-
-    Raises:
-        JaxmarkError: if there is none.
-    """
-    return blind_scheme(scheme) or get_scheme(informed_scheme(scheme))
-
-
-def prepare_alone(mesh: Mesh, key: bytes, bits: int, scheme: str | Scheme | BlindScheme) -> Marker | BlindMarker:
-    """Prepare an original for marking with one scheme of either kind.
-
-    Raises:
-        JaxmarkError: see `make_marker`.
-    """
-    blind = blind_scheme(scheme)
-    if blind is None:
-        return make_marker(mesh, key, bits=bits, scheme=informed_scheme(scheme))
-    return make_blind_marker(mesh, key, bits=bits, scheme=blind)
-
-
-def prepare(mesh: Mesh, key: bytes, bits: int, scheme: AnyScheme) -> AnyMarker:
-    """Prepare an original for marking, with a scheme of either kind or several.
-
-    Raises:
-        JaxmarkError: see `make_marker` and `split`.
-    """
-    if isinstance(scheme, tuple):
-        informed, blind = split(scheme)
-        return CombinedMarker(make_marker(mesh, key, bits=bits, scheme=informed), blind)
-    return prepare_alone(mesh, key, bits, scheme)
+from jaxmark.watermark.record import Record, SceneRecord, is_recorded
+from jaxmark.watermark.schemes.passband import ADAPTIVE, candidates
+from jaxmark.watermark.schemes.registry import (
+    BLIND_SCHEMES,
+    DEFAULT_SCHEME,
+    AnyScheme,
+    find_blind,
+    get_nonblind,
+    make_blind_scheme,
+    split,
+)
 
 
 def embed(
-    mesh: Mesh,
-    message: bytes,
-    key: bytes,
-    *,
-    budget: float | None = None,
-    limits: Limits | None = None,
-    visibility: Visibility | None = None,
-    noise: float | None = None,
-    scheme: AnyScheme = DEFAULT_SCHEME,
+    mesh: Mesh, message: bytes, key: bytes, *, budget: BudgetLike = None, scheme: AnyScheme = DEFAULT_SCHEME
 ) -> tuple[Mesh, EmbedInfo]:
     """Embed a message in the vertex positions of a mesh.
 
-    The mark is as strong as budget and limits allow; by default it is so weak that people do not notice it. The message
-    is read back before the mesh is returned, and a mesh that cannot carry it is refused. What noise it survives
+    The mark is as strong as the budget allows; by default it is so weak that people do not notice it. The message is
+    read back before the mesh is returned, and a mesh that cannot carry it is refused. What noise it survives
     (`EmbedInfo.survives`) depends on the mesh: much on scans, little on models of some hundred points.
 
     Args:
@@ -144,44 +59,32 @@ def embed(
         message: any bytes; none for a presence mark, which says nothing but that it is there, and fits where messages
             do not.
         key: 32 bytes, from `new_key`.
-        budget: RMS displacement of the welded vertices that faces use, unweighted, relative to the diagonal of their
-            axis-aligned bounding box: 0.0008 is 0.08 % of it. It is met exactly, unless a limit is reached first.
-        limits: the largest values that metrics of `distortion.METRICS` may reach, by name, in the units of
-            `distortion.Comparison`; or that metrics of your own may, by function (see `distortion.measure`).
-        visibility: how well people may see the mark: `"hidden"`, the default if budget and limits are not given;
-            `"careful look"`, seen beside the original; `"visible"`. See
-            `jaxmark.watermark.perception.budget.VISIBILITY`.
-        noise: a demand: the noise that the message must survive when half of the vertices are lost, see `capacity`; 0
-            requires only that there are enough dimensions. By default nothing is demanded but that the message reads.
-            It has no effect for schemes whose readers have no model of noise, such as `host` and `eigen`.
-        scheme: a name or a scheme, see `make_marker`; the default, by its name, takes the pass band that suits what
-            may be seen (see `Marker.suited`), a scheme the one it has. Or `"field"` or `"local"`, whose marks are read
-            without the original, after any remeshing or from any part; or several names, as `("keyed", "field")`, for
-            marks within one set of bounds, of which the first is informed and has the record.
+        budget: how strong the mark may be, and what it must survive: a `Budget`; or an RMS displacement relative to the
+            diagonal, the name of a visibility, or limits on metrics, which stand for one. By default it is hidden.
+        scheme: a name or a scheme, see `make_marker`; the default, by its name, takes the pass band that suits the
+            budget (`jaxmark.watermark.schemes.passband`), a scheme the one it has. Or `"field"` or `"local"`, whose
+            marks are read without the original, after any remeshing or from any part; or several names, as
+            `("keyed", "field")`, for marks within one budget, of which the first is read with the original and has the
+            record.
 
     Returns:
         The marked mesh (float64 vertices, same faces) and how it was marked.
 
     Raises:
-        JaxmarkError: if the mesh, key, budget or payload is unusable, or the message does not read back; or if what
-            `noise` demands cannot be met: the error then states the largest payload, and the least budget if there is
+        JaxmarkError: if the mesh, key, budget or payload is unusable, or the message does not read back; or if what the
+            budget demands cannot be met: the error then states the largest payload, and the least budget if there is
             one.
     """
     if not isinstance(message, bytes):
         raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
-    marker = prepare(mesh, key, 8 * len(message), scheme)
-    if isinstance(scheme, str | tuple):  # names stand for any pass band, objects for the one they have
-        marker = marker.suited(budget, limits=limits, visibility=visibility, noise=noise)
-    return marker.embed(message, budget, limits=limits, visibility=visibility, noise=noise)
+    budget = Budget.of(budget)
+    return prepare(mesh, key, 8 * len(message), scheme, adapt_to=budget).embed(message, budget)
 
 
 def capacity(
     mesh: Mesh,
-    budget: float | None = None,
+    budget: BudgetLike = None,
     *,
-    limits: Limits | None = None,
-    visibility: Visibility | None = None,
-    noise: float = NOISE,
     coverage: float = COVERAGE,
     scheme: str | Scheme | BlindScheme = DEFAULT_SCHEME,
 ) -> int:
@@ -192,11 +95,8 @@ def capacity(
 
     Args:
         mesh: the original.
-        budget: RMS displacement, see `embed`.
-        limits: limits on metrics, see `embed`; how much displacement they allow is tried for each payload size.
-        visibility: see `embed`.
-        noise: half width of uniform noise on each coordinate, relative to the mean distance of the vertices to their
-            centre; by default the strongest of the SMI 2010 protocol (Wang et al.), 0.5 %.
+        budget: see `embed`; how much displacement limits allow is tried for each payload size. Without a demand, the
+            noise to survive is the strongest of the SMI 2010 protocol (Wang et al.), 0.5 %.
         coverage: share of the vertices that may be left.
         scheme: a name or a scheme, see `make_marker`.
 
@@ -206,45 +106,15 @@ def capacity(
     Raises:
         JaxmarkError: if the mesh is unusable or a number is out of range.
     """
-    if not (0 <= noise < math.inf and 0 < coverage <= 1):
-        raise JaxmarkError(
-            f"capacity needs a noise of at least 0 and a coverage in (0, 1], got {noise:g} and {coverage:g}."
-        )
-    if (blind := blind_scheme(scheme)) is not None:
-        field = make_blind_marker(mesh, bytes(KEY_BYTES), scheme=blind)
-        return field.writer.capacity(make_budget(budget, limits, visibility, named=visibility_of(mesh)), noise)
+    if not 0 < coverage <= 1:
+        raise JaxmarkError(f"capacity needs a coverage in (0, 1], got {coverage:g}.")
+    budget = Budget.of(budget)
+    noise = NOISE if budget.noise is None else budget.noise
+    if (blind := find_blind(scheme)) is not None:
+        marker = make_blind_marker(mesh, bytes(KEY_BYTES), scheme=blind)
+        return marker.writer.capacity(budget.bounds(mesh), noise)
     original = make_original(mesh)
-    bounds = make_budget(budget, limits, visibility, named=visibility_of(original.mesh))
-    conditions = Conditions(bounds, noise, coverage)
-    return Capacity(original, get_scheme(informed_scheme(scheme))).bits(conditions)
-
-
-@overload
-def detect(
-    suspect: Mesh,
-    *,
-    original: Mesh,
-    key: bytes,
-    bits: int | None = None,
-    message: bytes | None = None,
-    record: Record | None = None,
-    scheme: str | Scheme | tuple[str, ...] = DEFAULT_SCHEME,
-    detector: Detector | None = None,
-    weights: ArrayLike | None = None,
-    align: Align = "auto",
-) -> Detection: ...
-
-
-@overload
-def detect(
-    suspect: Mesh,
-    *,
-    key: bytes,
-    bits: int | None = None,
-    message: bytes | None = None,
-    record: Record | None = None,
-    scheme: str | Scheme | BlindScheme | None = None,
-) -> BlindDetection: ...
+    return Capacity(original, get_nonblind(scheme)).bits(Conditions(budget.bounds(original.mesh), noise, coverage))
 
 
 def detect(
@@ -259,19 +129,20 @@ def detect(
     detector: Detector | None = None,
     weights: ArrayLike | None = None,
     align: Align = "auto",
-) -> Detection | BlindDetection:
+) -> Detection:
     """Read a mark from a suspect, and compute what the reading proves.
 
-    Without `original`, marks of the blind schemes are read; see `jaxmark.watermark.blind.reading`. Beside it, the
-    suspect is first aligned with it (`jaxmark.alignment.alignment.align`). Without `message`, what is read counts only
-    if its keyed tag fits. With it, a mark is proven whose message can no longer be read; if another message is read,
-    the claim is refuted, not the mark: log10_p is that of the message that was read, and a remark says so. All that was
-    tried, or left to choose, is paid for (`Marker.detect`).
+    With `original`, the suspect is first aligned with it (`jaxmark.alignment.alignment.align`); without it, marks of
+    the blind schemes are read (`jaxmark.watermark.blind.reading`). Without `message`, what is read counts only if its
+    keyed tag fits. With it, a mark is proven whose message can no longer be read; if another message is read, the claim
+    is refuted, not the mark: the evidence is that for the message that was read, and a note says so. Every choice that
+    was open is charged (`jaxmark.watermark.evidence.ledger`).
 
     **The bounds hold for any suspect independent of the key**, provided that key, original, message and record were
-    fixed before it existed; if nothing shows that, log10_p_undated counts. A mesh marked under the same key is not
-    independent of it: once its message can no longer be read, a claim of one that has many bits in common with it may
-    pass. Where the program cannot vouch for a condition, `doubts` says why, and the figures are estimates.
+    fixed before it existed; if nothing shows that, `evidence.log10_p_uncommitted` counts. A mesh marked under the same
+    key is not independent of it: once its message can no longer be read, a claim of one that has many bits in common
+    with it may pass. Where the program cannot vouch for a condition, `evidence.caveats` says why, and the figures are
+    estimates.
 
     Args:
         suspect: any mesh: moved, reordered, cropped, remeshed.
@@ -281,7 +152,7 @@ def detect(
             64. With 0, presence is claimed.
         message: the message that is claimed to be in the suspect; None to read without a claim.
         record: the record of the mark, see `make_marker`.
-        scheme: the scheme that the mark was embedded with, if there is no record; by default `"keyed"` beside an
+        scheme: the scheme that the mark was embedded with, if there is no record; by default `"keyed"` with an
             original, any blind one without it. Several names for marks that were embedded together: what they prove is
             united.
         detector: a detector, see `make_marker`.
@@ -298,32 +169,47 @@ def detect(
     """
     if bits is None and record is None and isinstance(message, bytes):
         bits = 8 * len(message)
-    others: tuple[BlindScheme, ...] = ()
+    together: tuple[BlindScheme, ...] = ()
     if isinstance(scheme, tuple):
-        scheme, others = split(scheme)
+        scheme, together = split(scheme)
     named = scheme if record is None else record.scheme
-    blind = None if named is None else blind_scheme(named)
+    blind = None if named is None else find_blind(named)
     if blind is not None or (named is None and original is None):
         if (detector, weights, align) != (None, None, "auto"):
             raise JaxmarkError("A blind mark is read without alignment, weights or a detector; leave them out.")
-        return read_blind(suspect, key, bits=bits, message=message, record=record, scheme=blind)
+        schemes = () if blind is None else (blind,)
+        return read_blind(suspect, key, bits=bits, message=message, record=record, schemes=schemes)
     if original is None:
-        raise JaxmarkError(f"The scheme {named!r} is read beside the original; give it, or mark with 'field'.")
-    informed = informed_scheme(scheme or DEFAULT_SCHEME)
-    markers = make_markers(original, key, bits=bits, record=record, scheme=informed, detector=detector)
-    found, marker = markers.detect(suspect, message, weights, align)
-    return also(found, others, suspect, key, marker.bits, message) if others else found
+        raise JaxmarkError(f"The scheme {named!r} is read with the original; give it, or mark with 'field'.")
+    marks = alternatives(original, key, bits=bits, record=record, scheme=scheme or DEFAULT_SCHEME, detector=detector)
+    found, mark = marks.read(suspect, message, weights, align)
+    return with_blind(found, together, suspect, key, mark.bits, message)
 
 
-def also(
-    found: Detection, schemes: Sequence[BlindScheme], suspect: Mesh, key: bytes, bits: int, message: bytes | None
-) -> Detection:
-    """Read blind marks of the same message, too, and unite what all of them prove.
+def alternatives(
+    original: Mesh,
+    key: bytes,
+    *,
+    bits: int | None = None,
+    record: Record | None = None,
+    scheme: str | Scheme | BlindScheme = DEFAULT_SCHEME,
+    detector: Detector | None = None,
+) -> Alternatives:
+    """Prepare an original for reading all marks that may be meant, the likeliest first.
 
-    Raises:
-        JaxmarkError: see `detect`.
+    With a record there is one. Without, marks of the default scheme have any pass band that is chosen by a budget.
+
+    Args and raises: see `make_marker`.
     """
-    return unite(found, [read_blind(suspect, key, bits=bits, message=message, scheme=scheme) for scheme in schemes])
+    usual = make_marker(original, key, bits=bits, record=record, scheme=scheme, detector=detector)
+    if record is not None or scheme != DEFAULT_SCHEME:
+        return Alternatives([((), lambda: usual)])
+    return Alternatives(
+        [
+            ((ledger.PASS_BAND.charge(name),), cache(partial(usual.with_scheme, one)))
+            for name, one in zip(ADAPTIVE, candidates(usual.scheme), strict=True)
+        ]
+    )
 
 
 def read_blind(
@@ -333,40 +219,214 @@ def read_blind(
     bits: int | None = None,
     message: bytes | None = None,
     record: Record | None = None,
-    scheme: BlindScheme | None = None,
-) -> BlindDetection:
-    """Read a mark without the original, of a scheme or else of any of `BLIND_SCHEMES`, all paid for; see `detect`.
+    schemes: Sequence[BlindScheme] = (),
+) -> Detection:
+    """Read a mark without the original, of a scheme or else of any of `BLIND_SCHEMES`; see `detect`.
 
     Raises:
         JaxmarkError: see `detect`.
     """
     check_mesh(suspect)
-    tried = [scheme] if scheme is not None else list(BLIND_SCHEMES.values())
-    if record is not None:
-        record.check("message" if record.bits else "presence", key)
-        if bits not in (None, record.bits):
-            raise JaxmarkError(f"The payload is {record.bits} bits by the record, not {bits}.")
-        blind = blind_scheme(record.scheme)
-        if blind is None:
-            raise JaxmarkError(
-                f"The record says that the scheme is {record.scheme!r}, which is read beside the original."
-            )
-        bits, tried = record.bits, [parameters_in(record, blind)]
+    tried = schemes or tuple(BLIND_SCHEMES.values())
     payload = DEFAULT_BITS if bits is None else bits
+    if record is not None:
+        payload = record.payload(key, bits)
+        if record.scheme not in BLIND_SCHEMES:
+            raise JaxmarkError(
+                f"The record says that the scheme is {record.scheme!r}, which is read with the original."
+            )
+        tried = (make_blind_scheme(record.scheme, record.parameters),)
     if message is not None:
-        if not isinstance(message, bytes):
-            raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
-        if 8 * len(message) != payload:
-            raise JaxmarkError(f"The message has {8 * len(message)} bits, but the payload is {payload} bits.")
-    if record is not None and record.told and message is not None:
-        choices = reading.context(Key(key), payload, record.scheme)
-        if not record.commits_to(message, choices):
-            raise JaxmarkError("The record commits to another message than the one claimed; claim that, or none.")
-    found: list[BlindDetection] = []
-    secret = Key(key)
-    reads = (partial(reading.detect, suspect, secret, payload, one, message, record) for one in tried)
-    for one in reading.try_each(reads):
+        check_size(message, payload)
+        if record is not None:
+            record.check_claim(message, blind_reading.context(Key(key), payload, record.scheme))
+    suspect, secret = blind_reading.register(suspect), Key(key)
+    found: list[Detection] = []
+    for one in blind_reading.try_each(
+        partial(blind_reading.read, suspect, secret, payload, scheme, message, record) for scheme in tried
+    ):
         found.append(one)
-        if reading.is_sure(one):
+        if blind_reading.is_sure(one):
             break
-    return reading.best_of(found, len(tried))
+    return blind_reading.best_of(found, ledger.BLIND_SCHEME, len(tried))
+
+
+def with_blind(
+    found: Detection, schemes: Sequence[BlindScheme], suspect: Mesh, key: bytes, bits: int, message: bytes | None
+) -> Detection:
+    """Read blind marks of the same message, too, if there are any, and unite what all of them prove.
+
+    Raises:
+        JaxmarkError: see `detect`.
+    """
+    blind = [read_blind(suspect, key, bits=bits, message=message, schemes=[scheme]) for scheme in schemes]
+    return unite(found, blind) if blind else found
+
+
+class SceneInfo(NamedTuple):
+    """How the meshes of a scene were marked."""
+
+    meshes: Mapping[str, EmbedInfo]  # of those that were marked, by name
+    skipped: Mapping[str, str]  # the others, and why they were left alone
+    record: SceneRecord
+
+
+def embed_scene(
+    meshes: Mapping[str, Mesh],
+    message: bytes,
+    key: bytes,
+    *,
+    budget: BudgetLike = None,
+    scheme: AnyScheme = DEFAULT_SCHEME,
+    after: Callable[[str, Marker, Mesh, EmbedInfo], EmbedInfo] = lambda name, marker, marked, info: info,
+) -> tuple[dict[str, Mesh], SceneInfo]:
+    """Embed one message in each mesh of a scene that can carry it.
+
+    Args:
+        meshes: by name, from `jaxmark.files.load_scene`.
+        message: see `embed`.
+        key: see `embed`.
+        budget: see `embed`; relative to each mesh's own diagonal.
+        scheme: see `embed`; the usual pass band is taken for each mesh.
+        after: is called with each mesh's name, marker, marked mesh and info; returns the info to keep, or raises a
+            `JaxmarkError` if the mesh must be left alone after all.
+
+    Returns:
+        The marked meshes, and how they were marked.
+
+    Raises:
+        JaxmarkError: if no mesh can carry the message; see `embed`.
+    """
+    marked: dict[str, Mesh] = {}
+    infos: dict[str, EmbedInfo] = {}
+    skipped: dict[str, str] = {}
+    for name, mesh in meshes.items():
+        try:
+            marker = prepare(mesh, key, 8 * len(message), scheme)
+            result, info = marker.embed(message, budget)
+            info = after(name, marker, result, info)
+        except JaxmarkError as error:
+            skipped[name] = str(error).rstrip(".")
+        else:
+            marked[name], infos[name] = result, info
+    if not marked:
+        raise JaxmarkError(f"None of the {len(meshes)} meshes can carry the mark: {_reasons(skipped)}.")
+    return marked, SceneInfo(infos, skipped, SceneRecord({name: info.record for name, info in infos.items()}))
+
+
+def detect_scene(
+    suspects: Mapping[str, Mesh],
+    *,
+    originals: Mapping[str, Mesh],
+    key: bytes,
+    record: SceneRecord | None = None,
+    bits: int | None = None,
+    message: bytes | None = None,
+    scheme: str | Scheme = DEFAULT_SCHEME,
+    align: Align = "auto",
+    after: Callable[[], None] = lambda: None,
+) -> Detection:
+    """Read the meshes of a scene, and unite what they prove.
+
+    Each original mesh is compared with the suspect mesh that looks like it, see `jaxmark.alignment.pairing.pair`. What
+    each mesh proves alone counts, and so does the weighted sum of all scores for one message.
+
+    Args:
+        suspects: meshes by name, from `jaxmark.files.load_scene`.
+        originals: the unmarked meshes by name.
+        key: see `detect`.
+        record: the record of the file, which says which meshes were marked; by default all may have been.
+        bits: see `detect`.
+        message: see `detect`.
+        scheme: see `detect`.
+        align: see `detect`.
+        after: is called after each mesh.
+
+    Returns:
+        What all meshes prove together; `parts` has the detection of each original mesh, `skipped` those that could not
+        be compared, and why. What belongs to one mesh is that of the mesh with most evidence.
+
+    Raises:
+        JaxmarkError: if no mesh can be compared; see `detect`.
+    """
+    chosen = dict(originals)
+    if record is not None:
+        if missing := record.meshes.keys() - originals.keys():
+            raise JaxmarkError(f"The original has no mesh {min(missing)!r}, which the record says was marked.")
+        chosen = {name: originals[name] for name in record.meshes}
+    if bits is None and record is None and message is not None:
+        bits = 8 * len(message)
+    seen: dict[str, _Seen] = {}
+    skipped: dict[str, str] = {}
+    known: set[tuple[bytes, bytes]] = set()
+    found = pair(chosen, suspects)
+    for name, original in chosen.items():
+        try:
+            if name not in found:
+                raise JaxmarkError("Nothing in the suspect looks like it.")
+            own = None if record is None else record.meshes[name]
+            marker = make_marker(original, key, bits=bits, record=own, scheme=get_nonblind(scheme))
+            mark = marker.original.geometry, marker.original.order
+            if mark in known:
+                raise JaxmarkError("It equals another mesh, and counts once.")
+            aligned = marker.register(suspects[found[name]], align)
+            # What a marker has computed to read is dropped: that of all meshes would not fit.
+            seen[name] = _Seen(replace(marker), aligned, marker.read(aligned, message))
+            known.add(mark)
+        except JaxmarkError as error:
+            skipped[name] = str(error).rstrip(".")
+        after()
+    if not seen:
+        raise JaxmarkError(f"None of the {len(chosen)} meshes could be compared: {_reasons(skipped)}.")
+    parts = {name: one.found for name, one in seen.items()}
+    return _unite_meshes(list(seen.values()), message)._replace(parts=parts, skipped=skipped)
+
+
+class _Seen(NamedTuple):
+    """A mesh of a scene that was read, in a pose in which the key had no part."""
+
+    marker: NonBlindMarker
+    aligned: Alignment
+    found: Detection
+
+    def claim(self, message: bytes) -> tuple[np.ndarray, np.ndarray]:
+        """Score and norm of a message, by the first way of weighting points, which is no choice of the key."""
+        received = self.marker.receive(self.aligned)
+        score, norm = claims_of(self.marker, received, message)[0]
+        return np.asarray(score), np.asarray(norm)
+
+
+def _unite_meshes(seen: Sequence[_Seen], claimed: bytes | None) -> Detection:
+    """Unite what meshes of a scene prove: one of them alone, or the sum of their scores for one message."""
+    alone = [one.found for one in seen]
+    best = min(alone, key=lambda one: one.rank)
+    if len(alone) == 1:
+        return best
+    charges = ledger.SCENE.charge("one mesh"), ledger.MESHES.charge("each", len(alone))
+    evidence = Evidence.least(*(one.evidence.charged(*charges) for one in alone))
+    read, bits = best.message, seen[0].marker.bits
+    if not bits:
+        claimed = b""
+    messages = {claimed} if claimed is not None else {one.message for one in alone if one.message is not None}
+    for message in messages:
+        if any(8 * len(message) != one.marker.bits for one in seen):
+            continue
+        recorded = [is_recorded(one.marker.record, message, one.marker.choices) for one in seen]
+        fixed = claimed is not None or all(recorded)
+        charges = [ledger.SCENE.charge("sum over meshes"), ledger.SUM_ALIGNMENT.charge(seen[0].aligned.how)]
+        if fixed or any(one is not None for one in recorded):
+            charges.append(ledger.MESSAGE.charge("claimed or recorded" if fixed else "another"))
+        scores, norms = zip(*(one.claim(message) for one in seen), strict=True)
+        # Meshes are weighted by the numbers of their points that the suspect shows.
+        score = united_score(scores, norms, [float(np.sum(one.aligned.weights > 0)) for one in seen])
+        united = weigh([(score, 1.0)], bits=bits, fixed=fixed, charges=charges)
+        if united.log10_p < evidence.log10_p:
+            read = message if any(one.message == message for one in alone) else None
+        evidence = Evidence.least(evidence, united)
+    return best._replace(message=read, evidence=evidence)
+
+
+def _reasons(skipped: Mapping[str, str]) -> str:
+    """Why meshes were skipped, the first three of them."""
+    said = "; ".join(f"{name!r}: {reason}" for name, reason in list(skipped.items())[:3])
+    return said + "; …" * (len(skipped) > 3)

@@ -4,14 +4,17 @@ D is the diagonal matrix of the vertex degrees of the original's Laplacian, and 
 `jaxmark.spectral.laplacian`). N is the number of vertices, k the number of code bits.
 """
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Array, Float, Float64, PRNGKeyArray
+from jaxtyping import Array, Float, Float64
 
 from jaxmark.alignment.observation import Observation
+from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
+from jaxmark.seeds import Seed
+from jaxmark.watermark.coding.keys import Choices
 
 Displacement = Float[Array, "vertices 3"]
 Strength = (
@@ -30,6 +33,11 @@ def check_strength(beta: Array, bands: int) -> Array:
             f"beta is one number, {bands} numbers (one per band), or {bands} × 3; got the shape {beta.shape}."
         )
     return beta
+
+
+#: A function of a reader, what it received from a suspect, and the strengths' profile as embedded; returns one soft
+#: value per bit.
+Detector = Callable[[Any, Any, Strength], Float[Array, " bits"]]
 
 
 class Claim(NamedTuple):
@@ -110,18 +118,55 @@ class Carrier(Protocol):
         """
         ...
 
-    def redraw(self, key: PRNGKeyArray) -> "Carrier":
+    def redraw(self, seed: Seed) -> "Carrier":
         """Replace the keyed signs by random ones.
 
         An attacker without the key computes expectations over such carriers.
 
         Args:
-            key: JAX random key.
+            seed: a whole number or a JAX random key.
         """
         ...
 
     def reader(self) -> "Reader":
         """Make the reader of this carrier; it computes once what reading any number of suspects needs."""
+        ...
+
+
+@runtime_checkable
+class ChipCarrier(Carrier, Protocol):
+    """A carrier that spreads bits over chips, several a vertex, which band filters shape into a displacement."""
+
+    @property
+    def host(self) -> Any:
+        """The original prepared for writing, a `jaxmark.watermark.reading.reception.Host`."""
+        ...
+
+    @property
+    def chips(self) -> Any:
+        """The keyed signs of the chips and the bits that they belong to."""
+        ...
+
+    def coefficients(self, beta: Strength, weight: Float[Array, " bands"] | None = None) -> Float[Array, "..."]:
+        """Chebyshev coefficients of the filter: Σ_j weight_j β_j f_j."""
+        ...
+
+    def modulate(self, bits: Float[Array, " bits"], coefficients: Float[Array, "..."]) -> Displacement:
+        """Spread the bits over their chips, and filter these into a displacement."""
+        ...
+
+    def correlate(self, residual: Displacement, coefficients: Float[Array, "..."]) -> Float[Array, " bits"]:
+        """Apply the plain adjoint of `modulate`: Σ_v ⟨modulate(a)_v, r_v⟩ is the dot product of a and this."""
+        ...
+
+    def filter_chips(self, chips: Float[Array, "vertices channels"], coefficients: Float[Array, "..."]) -> Displacement:
+        """Filter any chips into a displacement."""
+        ...
+
+    def match_chips(
+        self, residual: Displacement, coefficients: Float[Array, "..."]
+    ) -> Float[Array, "vertices channels"]:
+        """Apply the plain adjoint of `filter_chips`, which is a matched filter."""
         ...
 
 
@@ -148,8 +193,7 @@ class Reader(Protocol):
     def ways(self, received: Any) -> Sequence[Any]:
         """Return one version of `received` for each way of weighting the suspect.
 
-        Each version gives a claim of its own; `jaxmark.watermark.evidence.bounds.any_of` takes the best, and every
-        one is paid for.
+        Each version gives a claim of its own, which is charged in `jaxmark.watermark.evidence.ledger`.
         """
         ...
 
@@ -206,3 +250,63 @@ class Reader(Protocol):
     def with_carrier(self, carrier: Any) -> "Reader":
         """Return the reader for a carrier of the same scheme and original, but another key; nothing is recomputed."""
         ...
+
+
+@runtime_checkable
+class Scheme(Protocol):
+    """A dataclass that makes a carrier for an original, a key and a payload; the record of a mark stores its fields.
+
+    A scheme of your own inherits from this class and defines `name`, `detector`, `code_length` and `carrier`; `layout`,
+    `dimensions` and `tunable` have defaults.
+    """
+
+    name: ClassVar[str]  # the scheme's name in records and on the command line
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def detector(self) -> Detector:
+        """The detector that reads marks of this scheme, unless another one is chosen."""
+        ...
+
+    def code_length(self, original: Original, bits: int) -> int:
+        """Choose the number of code bits that carry a payload; see `jaxmark.watermark.coding.message.code_length`.
+
+        Args:
+            original: the mesh to mark.
+            bits: size of the payload in bits.
+
+        Raises:
+            JaxmarkError: if the payload is too large for this original, which `capacity` relies on, or is no positive
+                multiple of 8.
+        """
+        ...
+
+    def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> Carrier:
+        """Make the carrier of a mark.
+
+        Args:
+            original: the mesh to mark.
+            choices: the keyed choices of the mark.
+            bits: size of the payload in bits.
+            code_bits: number of code bits to carry: `code_length`, or the number of slots of a fingerprint.
+        """
+        ...
+
+    def layout(self, original: Original, bits: int) -> Hashable:
+        """Name what the room for a payload depends on: payloads of equal layout leave the same room.
+
+        The room (see `Reader.room`) is then measured only once for all of them.
+        """
+        return None
+
+    def dimensions(self, original: Original, bits: int) -> int:
+        """Number of dimensions of the pass band for a payload; 0 if the scheme has none and carries no fingerprints."""
+        return 0
+
+    def tunable(self) -> Any:
+        """Return the scheme in the form that `tune` needs: a `jaxmark.watermark.schemes.keyed.TunableScheme`.
+
+        Raises:
+            JaxmarkError: if the scheme has no bands whose strengths could be tuned.
+        """
+        raise JaxmarkError(f"The scheme {self.name!r} has no bands whose strengths could be tuned.")

@@ -2,7 +2,8 @@
 
 It holds neither the key nor the message, but commitments to both, and an imprint of the original by which a copy of it
 that was saved again will do (`jaxmark.geometry.imprint`). A code by a subkey covers all of it, so that nobody else can
-edit it. Its owner can make any record. Only a date before the suspect existed rules that out: that of `Record.digest`.
+edit it. Its owner can make any record: only a commitment to its digest that was timestamped before the suspect existed
+rules that out.
 """
 
 import base64
@@ -10,7 +11,8 @@ import hashlib
 import hmac
 import json
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
@@ -19,10 +21,19 @@ import numpy as np
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import read_file
 from jaxmark.geometry.imprint import Imprint
-from jaxmark.watermark.coding.keys import KEY_BYTES, SCHEME_VERSION, VERSIONS, Choices, Key, canonical_json, commitment
+from jaxmark.watermark.coding.keys import KEY_BYTES, SCHEME_VERSION, Choices, Key, canonical_json, commitment
+from jaxmark.watermark.evidence import ledger
+from jaxmark.watermark.evidence.ledger import Charge
 
 _MAX_FILE_BYTES = 2**30  # of a record of some hundred million points, or as many digests
 _FORMAT = "jaxmark-record"
+_SCENE_FORMAT, _SCENE_VERSION = "jaxmark-scene", 1
+_COMMITMENT = "jaxmark-deposit"  # the format of its file
+
+# TimeStampReq of RFC 3161, in DER: version 1, a SHA-256 imprint of 32 bytes, and the wish for the authority's
+# certificate.
+_REQUEST_HEAD = bytes.fromhex("30390201013031300d060960864801650304020105000420")
+_REQUEST_TAIL = bytes.fromhex("0101ff")
 _READERS = {
     "message": "detect",
     "presence": "detect",
@@ -32,8 +43,7 @@ RECORD_SUFFIX = ".jaxmark.json"  # is appended to the name of the marked file
 
 Content = Literal["message", "presence", "fingerprint"]
 
-# The fields in files of version 1, and those that version 2 added.
-_FIRST_FIELDS = {
+_FIELDS = {
     "scheme": str,
     "bits": int,
     "beta": float,
@@ -42,8 +52,10 @@ _FIRST_FIELDS = {
     "parameters": dict,
     "content": str,
     "version": int,
+    "told": str,
+    "imprint": dict,
+    "code": str,
 }
-_LATER_FIELDS = {"told": str, "imprint": dict, "code": str}
 
 
 @dataclass(frozen=True)
@@ -58,17 +70,22 @@ class Record:
     parameters: Mapping[str, Any] = field(default_factory=dict)  # fields of the scheme
     content: Content = "message"  # what the mark carries
     version: int = SCHEME_VERSION  # version of the keyed choices and of the record
-    told: str = ""  # commitment to the message or the recipient, see `commit`, hexadecimal; version 1 has none
-    imprint: Mapping[str, Any] = field(default_factory=dict)  # of the original, its tags sealed; version 1 has none
-    code: str = ""  # authentication code by the key, over all other fields, hexadecimal; version 1 has none
+    told: str = ""  # commitment to the message or the recipient, see `commit`, hexadecimal; empty for presence
+    imprint: Mapping[str, Any] = field(default_factory=dict)  # of the original, its tags sealed; a blind mark has none
+    code: str = ""  # authentication code by the key, over all other fields, hexadecimal
+
+    @property
+    def meshes(self) -> Mapping[str, "Record"]:
+        """The record itself, as that of a file of one mesh, which has no name."""
+        return {"": self}
 
     def to_json(self) -> str:
         """The record as JSON text."""
-        return json.dumps({"format": _FORMAT, **self._fields()}, indent=2) + "\n"
+        return json.dumps({"format": _FORMAT, **asdict(self)}, indent=2) + "\n"
 
     def digest(self) -> str:
         """SHA-256 of the record, hexadecimal, which anybody can compute: publish or date this, not the record."""
-        return hashlib.sha256(b"jaxmark/record" + canonical_json(self._fields())).hexdigest()
+        return hashlib.sha256(b"jaxmark/record" + canonical_json(asdict(self))).hexdigest()
 
     def sealed(self, key: bytes) -> "Record":
         """The record with the authentication code of its owner."""
@@ -88,12 +105,36 @@ class Record:
             raise JaxmarkError(f"The record is of a {self.content}; {_READERS[self.content]} reads it.")
         if self.key != commitment(key):
             raise JaxmarkError("The key is not the one that the record commits to.")
-        if self.version > 1 and not hmac.compare_digest(self.code, self._code(key)):
+        if not hmac.compare_digest(self.code, self._code(key)):
             raise JaxmarkError("The record was edited: its code is not that of its fields. Use an unedited copy.")
+
+    def payload(self, key: bytes, bits: int | None = None) -> int:
+        """Check the record of a message or a presence mark, and return its payload size.
+
+        Args:
+            key: 32 bytes.
+            bits: the payload that is expected; None if any.
+
+        Raises:
+            JaxmarkError: see `check`; or if it has another payload.
+        """
+        self.check("message" if self.bits else "presence", key)
+        if bits not in (None, self.bits):
+            raise JaxmarkError(f"The payload is {self.bits} bits by the record, not {bits}.")
+        return self.bits
 
     def commits_to(self, told: bytes, choices: Choices) -> bool:
         """Whether the record commits to this message or recipient."""
         return hmac.compare_digest(self.told, commit(told, choices))
+
+    def check_claim(self, message: bytes, choices: Choices) -> None:
+        """Check that the record does not commit to another message than the one claimed.
+
+        Raises:
+            JaxmarkError: if it does.
+        """
+        if is_recorded(self, message, choices) is False:
+            raise JaxmarkError("The record commits to another message than the one claimed; claim that, or none.")
 
     def open_imprint(self, key: bytes) -> Imprint:
         """The imprint of the original.
@@ -114,14 +155,9 @@ class Record:
         except (KeyError, ValueError, TypeError):
             raise JaxmarkError("The record is damaged: its imprint of the original is not whole.") from None
 
-    def _fields(self) -> dict[str, Any]:
-        """The fields that a file of this version has."""
-        names = _FIRST_FIELDS if self.version == 1 else _FIRST_FIELDS | _LATER_FIELDS
-        return {name: value for name, value in asdict(self).items() if name in names}
-
     def _code(self, key: bytes) -> str:
-        fields = canonical_json({name: value for name, value in self._fields().items() if name != "code"})
-        return Choices(Key(key), b"", 2).derive("record", KEY_BYTES, fields).hex()
+        fields = canonical_json({name: value for name, value in asdict(self).items() if name != "code"})
+        return Choices(Key(key), b"").derive("record", KEY_BYTES, fields).hex()
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "Record":
@@ -142,17 +178,66 @@ class Record:
         if not isinstance(data, dict) or data.get("format") != _FORMAT:
             raise JaxmarkError(f"{where} is not a record of jaxmark.")
         data = {name: value for name, value in data.items() if name != "format"}
-        if data.get("version") not in VERSIONS:
+        if data.get("version") != SCHEME_VERSION:
             raise JaxmarkError(
-                f"The record {where} is of version {data.get('version')}; this jaxmark reads versions"
-                f" {' and '.join(map(str, sorted(VERSIONS)))}."
+                f"The record {where} is of version {data.get('version')}; this jaxmark reads version {SCHEME_VERSION}."
             )
-        types = _FIRST_FIELDS if data["version"] == 1 else _FIRST_FIELDS | _LATER_FIELDS
-        if data.keys() != types.keys() or any(type(data[name]) is not kind for name, kind in types.items()):
+        if data.keys() != _FIELDS.keys() or any(type(data[name]) is not kind for name, kind in _FIELDS.items()):
             raise JaxmarkError(f"The record {where} is damaged: its fields are not those of a record.")
         if data["content"] not in _READERS:
             raise JaxmarkError(f"The record {where} is of a {data['content']}, which this jaxmark does not know.")
         return cls(**data)
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """The records of a file's meshes, by name; each of them reads its mesh alone, too."""
+
+    meshes: Mapping[str, Record]
+
+    @property
+    def scheme(self) -> str:
+        """Name of the scheme."""
+        return next(iter(self.meshes.values())).scheme
+
+    @property
+    def bits(self) -> int:
+        """Size of the payload in bits."""
+        return next(iter(self.meshes.values())).bits
+
+    @property
+    def told(self) -> str:
+        """What all records commit to, if they commit to anything."""
+        return "".join(record.told for record in self.meshes.values())
+
+    def to_json(self) -> str:
+        """The records as JSON text."""
+        meshes = {name: json.loads(record.to_json()) for name, record in self.meshes.items()}
+        return json.dumps({"format": _SCENE_FORMAT, "version": _SCENE_VERSION, "meshes": meshes}, indent=2) + "\n"
+
+    def digest(self) -> str:
+        """SHA-256 over all records, hexadecimal, which anybody can compute."""
+        digests = {name: record.digest() for name, record in self.meshes.items()}
+        return hashlib.sha256(b"jaxmark/scene" + canonical_json(digests)).hexdigest()
+
+
+def load_record(path: str | os.PathLike[str]) -> Record | SceneRecord:
+    """Read a record file, of one mesh or of several.
+
+    Raises:
+        JaxmarkError: see `Record.load`.
+    """
+    data = read_json(path)
+    if not isinstance(data, dict) or data.get("format") != _SCENE_FORMAT:
+        return Record.load(path)
+    meshes = data.get("meshes")
+    if data.get("version") != _SCENE_VERSION:
+        raise JaxmarkError(
+            f"The record {path} is of version {data.get('version')}; this jaxmark reads {_SCENE_VERSION}."
+        )
+    if not isinstance(meshes, dict) or not meshes:
+        raise JaxmarkError(f"The record {path} is damaged: it has no meshes.")
+    return SceneRecord({name: Record.of(item, f"{path}, mesh {name!r},") for name, item in meshes.items()})
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
@@ -167,6 +252,11 @@ def read_json(path: str | os.PathLike[str]) -> Any:
         raise JaxmarkError(f"The record {path} cannot be read: {error.strerror}.") from None
     except (ValueError, RecursionError):
         return None
+
+
+def is_recorded(record: Record | None, told: bytes, choices: Choices) -> bool | None:
+    """Whether a record commits to this message or recipient; None if there is no record, or it commits to nothing."""
+    return record.commits_to(told, choices) if record is not None and record.told else None
 
 
 def commit(told: bytes, choices: Choices) -> str:
@@ -192,4 +282,78 @@ def seal_imprint(imprint: Imprint, key: bytes) -> dict[str, Any]:
 
 def _stream(key: bytes, original: str, count: int) -> np.ndarray:
     """The key stream for an original's tags, which is never used for anything else."""
-    return np.frombuffer(Choices(Key(key), bytes.fromhex(original), 2).derive("imprint", 4 * count), "<u4")
+    return np.frombuffer(Choices(Key(key), bytes.fromhex(original)).derive("imprint", 4 * count), "<u4")
+
+
+@dataclass(frozen=True)
+class TimestampedCommitment:
+    """A set of records by their digests, to be timestamped as one; make one with `make_commitment`.
+
+    Anybody can make any record after the fact. A record whose digest was public, or signed by a timestamping authority,
+    before the suspect existed cannot have been made for it. The root shows nothing of what the records say. It commits
+    to their number, and a claim by one of K records is charged for K.
+    """
+
+    digests: tuple[str, ...]  # `Record.digest` of each, hexadecimal, in ascending order
+
+    @property
+    def root(self) -> str:
+        """What to publish: SHA-256 over the number of records and their Merkle tree (RFC 6962, 2.1), hexadecimal."""
+        level = [hashlib.sha256(b"\0" + bytes.fromhex(digest)).digest() for digest in self.digests]
+        while len(level) > 1:
+            pairs = [level[place : place + 2] for place in range(0, len(level), 2)]
+            level = [hashlib.sha256(b"\1" + b"".join(pair)).digest() if len(pair) == 2 else pair[0] for pair in pairs]
+        return hashlib.sha256(f"jaxmark/deposit/{len(self.digests)}/".encode() + level[0]).hexdigest()
+
+    def charges(self, record: Record | SceneRecord, *, claimed: bool) -> tuple[Charge, ...]:
+        """What a claim by one of these records is charged, if the commitment is older than the suspect.
+
+        Args:
+            record: the record that was read with.
+            claimed: whether the message was claimed, not read; all messages are charged if the record fixes none.
+
+        Raises:
+            JaxmarkError: if the record is not one of these.
+        """
+        if record.digest() not in self.digests:
+            raise JaxmarkError(f"The record (digest {record.digest()}) is not in the deposit; it is not dated by it.")
+        free = record.bits if claimed and not record.told else 0
+        return (ledger.COMMITMENT.charge("each", len(self.digests), bits=free),)
+
+    def timestamp_request(self) -> bytes:
+        """A request to a timestamping authority for the root (RFC 3161), as `curl` or `openssl ts` send it."""
+        return _REQUEST_HEAD + bytes.fromhex(self.root) + _REQUEST_TAIL
+
+    def to_json(self) -> str:
+        """The commitment as JSON text, with its root for those who only look."""
+        return json.dumps({"format": _COMMITMENT, "root": self.root, "digests": list(self.digests)}, indent=2) + "\n"
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "TimestampedCommitment":
+        """Read a file that `to_json` wrote.
+
+        Raises:
+            JaxmarkError: if the file cannot be read, is none, or its root is not that of its digests.
+        """
+        try:
+            data = json.loads(read_file(path, _MAX_FILE_BYTES))
+            found = make_commitment(data["digests"])
+            if data["format"] == _COMMITMENT and data["root"] == found.root:
+                return found
+        except OSError as error:
+            raise JaxmarkError(f"The deposit {path} cannot be read: {error.strerror}.") from None
+        except (ValueError, TypeError, KeyError, RecursionError):
+            pass
+        raise JaxmarkError(f"{path} is not a deposit of jaxmark, or was edited: its root is not that of its digests.")
+
+
+def make_commitment(digests: Iterable[str]) -> TimestampedCommitment:
+    """Commit to records by their digests; one that is given twice counts once.
+
+    Raises:
+        JaxmarkError: if there is none, or one is not 64 hexadecimal digits.
+    """
+    distinct = tuple(sorted(set(digests)))
+    if not distinct or not all(re.fullmatch("[0-9a-f]{64}", digest) for digest in distinct):
+        raise JaxmarkError("A deposit is made of at least one record's digest, 64 hexadecimal digits each.")
+    return TimestampedCommitment(distinct)

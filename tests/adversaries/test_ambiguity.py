@@ -10,8 +10,9 @@ import jaxmark as jm
 from jaxmark.adversaries.ambiguity import forge_original, search_key, transplant
 from jaxmark.alignment.original import make_original
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.marking import Marker, bind_mark
-from jaxmark.watermark.schemes.scheme import KeyedScheme
+from jaxmark.watermark.mark import bind_mark
+from jaxmark.watermark.markers import NonBlindMarker
+from jaxmark.watermark.schemes.keyed import KeyedScheme
 from tests.samples import bumpy_sphere
 
 MESSAGE, FORGED = b"ok", b"my"
@@ -25,7 +26,7 @@ def original() -> Mesh:
 
 @pytest.fixture(scope="module")
 def published(original: Mesh, key: jm.Key) -> tuple[Mesh, jm.Record]:
-    marked, info = jm.make_marker(original, key, bits=16).embed(MESSAGE, 8e-4, noise=0)
+    marked, info = jm.make_marker(original, key, bits=16).embed(MESSAGE, jm.Budget(rms=8e-4, noise=0))
     return marked, info.record
 
 
@@ -34,13 +35,13 @@ def forged(published: tuple[Mesh, jm.Record]) -> Mesh:
     return forge_original(published[0], FORGER, FORGED, budget=8e-4)
 
 
-def unbound(original: Mesh, other: Mesh, key: bytes) -> Marker:
+def unbound(original: Mesh, other: Mesh, key: bytes) -> NonBlindMarker:
     """A marker whose choices hang on another mesh's hash: what they would be if they did not depend on the original."""
     bound, scheme = make_original(other), KeyedScheme()
     ready = replace(make_original(original), geometry=bound.geometry, order=bound.order)
     code = scheme.code_length(ready, 16)
     choices = bind_mark(key, ready, scheme, 16, "message")
-    return Marker(ready, choices, 16, scheme, scheme.carrier(ready, choices, 16, code), code, scheme.detector)
+    return NonBlindMarker(ready, choices, 16, scheme, scheme.carrier(ready, choices, 16, code), code, scheme.detector)
 
 
 @pytest.mark.slow
@@ -63,7 +64,11 @@ def test_going_round_does_not_help(published):
     mesh, _ = published
     last, found = mesh, []
     for _ in range(4):
-        mark = jm.make_marker(last, FORGER, bits=16).embed(FORGED, 8e-4, noise=0, read_back=False)[0].vertices
+        mark = (
+            jm.make_marker(last, FORGER, bits=16)
+            .embed(FORGED, jm.Budget(rms=8e-4, noise=0), read_back=False)[0]
+            .vertices
+        )
         last = Mesh(mesh.vertices - (mark - last.vertices), mesh.faces)
         found.append(jm.detect(mesh, original=last, key=FORGER, message=FORGED).log10_p)
     assert min(found) > -6

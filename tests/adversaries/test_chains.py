@@ -8,7 +8,7 @@ import pytest
 import jaxmark as jm
 from jaxmark.adversaries import chain_attack, projected_cost, search_chain
 from jaxmark.adversaries.chains import Gene, decode, run_chain
-from jaxmark.attacks import ATTACKS
+from jaxmark.adversaries.registry import ATTACKS
 from jaxmark.geometry.mesh import Mesh
 
 TOOLS = {"noise": (1e-3, 1e-1), "smoothing": (1, 100), "quantisation": (12, 4)}
@@ -59,14 +59,14 @@ def test_a_chain_as_an_attack_grows_in_all_its_steps(sphere: Mesh):
 
 def test_costs_are_distortions_over_the_mark_and_more_where_it_is_still_proven(sphere: Mesh, key):
     marker = jm.make_marker(sphere, key, bits=8)
-    marked, _ = marker.embed(b"m", 2e-3, noise=0, read_back=False)
+    marked, _ = marker.embed(b"m", jm.Budget(rms=2e-3, noise=0), read_back=False)
     judge = projected_cost([(marker, marked, b"m")], "rms")
     steps = [("noise", 0.002)]
     suspect = run_chain(marked, steps, seed=0)
     paid = jm.compare(marked, suspect, ["rms"]).rms / jm.compare(sphere, marked, ["rms"]).rms
-    log10_p = marker.detect(suspect, b"m").log10_p_unfloored
+    log10_p = marker.detect(suspect, b"m").evidence.log10_p_unfloored
     assert log10_p < -6
-    first = marker.detect(marked, b"m").log10_p_unfloored
+    first = marker.detect(marked, b"m").evidence.log10_p_unfloored
     assert judge(steps) == pytest.approx(paid * math.sqrt((first / -6 - 1) / (first / log10_p - 1)))
     dear = [("noise", 0.3)]
     far = run_chain(marked, dear, seed=0)

@@ -13,14 +13,14 @@ RANDOM = np.random.default_rng(0)
 
 
 @pytest.fixture(scope="module")
-def marker(key: jm.Key) -> jm.watermark.Marker:
+def marker(key: jm.Key) -> jm.watermark.NonBlindMarker:
     return jm.make_marker(bumpy_sphere(3), key, bits=16)
 
 
 @pytest.fixture(scope="module")
-def copies(marker: jm.watermark.Marker) -> dict[bytes, Mesh]:
+def copies(marker: jm.watermark.NonBlindMarker) -> dict[bytes, Mesh]:
     messages = [b"ok", b"no", b"so", b"we", b"it", b"he"]
-    return {one: marker.embed(one, 8e-4, noise=0, read_back=False)[0] for one in messages}
+    return {one: marker.embed(one, jm.Budget(rms=8e-4, noise=0), read_back=False)[0] for one in messages}
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_points_are_mixed_whole(copies):
     assert np.bincount(which) / len(which) == pytest.approx(1 / 3, abs=0.1)
 
 
-def test_the_circumcentre_is_as_far_from_all_copies(copies, marker: jm.watermark.Marker):
+def test_the_circumcentre_is_as_far_from_all_copies(copies, marker: jm.watermark.NonBlindMarker):
     every = list(copies.values())
     centre = combine(every, "circumcentre", RANDOM).vertices
     far = [np.linalg.norm(one.vertices - centre) for one in every]
@@ -63,7 +63,7 @@ def test_enough_copies_give_the_original_back(key: jm.Key):
     """Marks of one key lie in a space of as many dimensions as the code has bits: more copies span it."""
     marker = jm.make_marker(bumpy_sphere(2), key, bits=16)
     messages = [bytes(one) for one in np.random.default_rng(0).integers(0, 256, (marker.code_bits + 20, 2), np.uint8)]
-    copies = [marker.embed(one, 8e-4, noise=0, read_back=False)[0] for one in messages]
+    copies = [marker.embed(one, jm.Budget(rms=8e-4, noise=0), read_back=False)[0] for one in messages]
     original = marker.original.mesh.vertices
 
     def left(rule: Rule, count: int) -> float:

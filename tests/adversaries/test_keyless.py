@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.adversaries import blind
+from jaxmark.adversaries import keyless as blind
 from jaxmark.adversaries.expected import evidence, make_surrogate, random_mark, rescale, rms, size
 from jaxmark.distortion import compare
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.perception.budget import make_budget
 from jaxmark.watermark.reading.detectors import claims
 from tests.samples import bumpy_sphere
 
@@ -21,12 +20,12 @@ SOUGHT = [("bands", 20), ("bands", 40), ("vertices", 40)]
 
 
 @pytest.fixture(scope="module")
-def marked(key: jm.Key) -> tuple[jm.watermark.Marker, Mesh]:
+def marked(key: jm.Key) -> tuple[jm.watermark.NonBlindMarker, Mesh]:
     marker = jm.make_marker(bumpy_sphere(3), key, bits=16)
-    return marker, marker.embed(MESSAGE, MARK, noise=0)[0]
+    return marker, marker.embed(MESSAGE, jm.Budget(rms=MARK, noise=0))[0]
 
 
-def owner_sees(marker: jm.watermark.Marker, suspect: Mesh) -> float:
+def owner_sees(marker: jm.watermark.NonBlindMarker, suspect: Mesh) -> float:
     """The largest S/‖a‖ of a claim of the message under the owner's key."""
     code = marker.codeword(MESSAGE)
     received = marker.receive(suspect)
@@ -45,7 +44,7 @@ def test_an_attacker_sees_on_average_what_the_owner_sees(marked):
 @pytest.mark.parametrize("scheme", [pytest.param("keyed", marks=pytest.mark.slow), "host"])
 def test_gradients_agree_with_finite_differences(scheme, key: jm.Key, x64):
     marker = jm.make_marker(bumpy_sphere(2), key, bits=8, scheme=scheme)
-    mesh = marker.embed(b"k", 5e-3, noise=0, read_back=False)[0]
+    mesh = marker.embed(b"k", jm.Budget(rms=5e-3, noise=0), read_back=False)[0]
     surrogate, _ = make_surrogate(mesh, scheme, 8, 5e-3)
     random = np.random.default_rng(0)
     place, way = (
@@ -76,7 +75,7 @@ def test_sizes(marked):
 )
 def test_who_optimises_does_more_than_who_writes_another_mark(scheme, key: jm.Key):
     marker = jm.make_marker(bumpy_sphere(3), key, bits=16, scheme=scheme)
-    mesh = marker.embed(MESSAGE, MARK, noise=0)[0]
+    mesh = marker.embed(MESSAGE, jm.Budget(rms=MARK, noise=0))[0]
     surrogate, original = make_surrogate(mesh, scheme, 16, MARK)
     strength = jnp.asarray(2 * MARK, surrogate.signal.dtype)
     fresh = jax.random.split(jax.random.key(7), 4)
@@ -105,7 +104,7 @@ def test_what_is_subtracted_is_some_of_the_mark(marked):
     gone, random = [], []
     for seed in range(6):
         marker = jm.make_marker(original, jm.Key(bytes([seed] * 32)), bits=16)
-        mesh = marker.write(marker.codeword(b"ok"), make_budget(MARK))[0]
+        mesh = marker.write(marker.codeword(b"ok"), MARK)[0]
         mark = np.asarray(mesh.vertices) - np.asarray(original.vertices)
         for found, attack in ((gone, blind.subtraction(bits=16, mark=MARK)), (random, "jamming")):
             shift = np.asarray(mesh.vertices) - np.asarray(jm.attack(mesh, attack, 1e-4, seed=seed).vertices)

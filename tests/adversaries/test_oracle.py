@@ -23,9 +23,9 @@ SCORED = [estimated_gradient, random_search]
 
 
 @pytest.fixture(scope="module")
-def marked(key: jm.Key) -> tuple[jm.watermark.Marker, Mesh]:
+def marked(key: jm.Key) -> tuple[jm.watermark.NonBlindMarker, Mesh]:
     marker = jm.make_marker(bumpy_sphere(3), key, bits=16)
-    return marker, marker.embed(MESSAGE, 8e-4, noise=0)[0]
+    return marker, marker.embed(MESSAGE, jm.Budget(rms=8e-4, noise=0))[0]
 
 
 def along(mesh: Mesh, way: np.ndarray) -> Counted:
@@ -150,7 +150,7 @@ def test_decisions_beat_chance(marked):
     moved = jm.attack(mesh, boundary(oracle), 100, seed=0)
     assert oracle.queries == 100
     assert not marker.detect(moved, MESSAGE).detected()
-    wide = jm.attacks.ATTACKS["jamming"]._replace(strengths=(1e-3, 0.1))
+    wide = jm.adversaries.ATTACKS["jamming"]._replace(strengths=(1e-3, 0.1))
     jammed = jm.evaluation.minimum_distortion(marker, mesh, MESSAGE, wide, metrics=("rms",)).weakest
     assert jammed is not None
     assert jm.distortion.displacement_size(mesh, moved).rms < jammed.strength

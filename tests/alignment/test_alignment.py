@@ -404,7 +404,7 @@ def test_smoothing_by_cotangents_is_noticed_and_taken_off():
     igl = pytest.importorskip("igl")
     message = b"16"
     marker = jm.make_marker(rippled_ball(), bytes(32), bits=16)
-    marked = marker.embed(message, budget=3e-4, noise=0)[0]
+    marked = marker.embed(message, jm.Budget(rms=3e-4, noise=0))[0]
     vertices, faces = np.asarray(marked.vertices, np.float64), np.asarray(marked.faces)
     mass = igl.massmatrix(vertices, faces, igl.MASSMATRIX_TYPE_VORONOI)
     smoothed = spsolve((mass - 2e-3 * igl.cotmatrix(vertices, faces)).tocsc(), mass @ vertices)
@@ -471,7 +471,7 @@ def test_without_libigl_surfaces_are_refused_by_the_name_of_the_extra(original: 
 def test_a_suspect_is_aligned_once_for_several_keys(original: Original):
     mesh, message = original.mesh, b"m"
     first, second = (jm.make_marker(mesh, bytes([i]) * 32, bits=8) for i in (1, 2))
-    suspect, _ = anywhere(first.embed(message, noise=0)[0], 6)
+    suspect, _ = anywhere(first.embed(message, jm.Budget(noise=0))[0], 6)
     aligned = align(first.original, suspect)
     found, again = first.detect(suspect), first.detect(aligned)
     assert found.message == again.message == message

@@ -112,14 +112,14 @@ def test_a_message_is_read_in_another_pose_without_a_skeleton(mesh, key: jm.Key)
     marker = jm.make_marker(mesh, key, bits=16)
     marked, _ = marker.embed(b"ok", 8e-4)
     suspect = folded(marked, 40)
-    assert marker.decode(marker.soft_values(marker.receive(suspect))) is None  # by a single map
+    assert marker.decode(marker.soft_decisions(marker.receive(suspect))) is None  # by a single map
     aligned = align(marker.original, suspect)
     found = marker.detect(aligned)
     assert found.message == b"ok"
     assert found.detected()
     # Whether bends were undone depends on the key, and what unites several meshes must not.
-    assert found.alignment is aligned
-    assert "map of its own" in found.remarks[0]
+    assert found.registration is aligned
+    assert "map of its own" in found.notes[0]
 
 
 @pytest.mark.long

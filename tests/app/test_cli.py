@@ -33,7 +33,7 @@ class Workshop:
         self.folder, self._monkeypatch, self._capfd = folder, monkeypatch, capfd
         monkeypatch.chdir(folder)
         trimesh.Trimesh(*bumpy_sphere(4), process=False).export(folder / "model.ply")
-        jm.save_key(jm.Key(bytes(range(32))), folder / "owner.key")
+        jm.watermark.save_key(jm.Key(bytes(range(32))), folder / "owner.key")
 
     def __call__(self, *arguments: object) -> tuple[int, str, str]:
         self._monkeypatch.setattr(sys, "argv", ["jaxmark", *map(str, arguments)])
@@ -97,7 +97,7 @@ def test_the_main_job(workshop: Workshop, scheme):
         assert len(found["scores"]) >= 92
         assert found["coverage"] == 1.0
         assert found["log10_p"] <= -6
-        assert found["log10_p_fitted"] <= found["log10_p"] or scheme != "keyed"
+        assert found["log10_p_gaussian"] <= found["log10_p"] or scheme != "keyed"
         assert found["log10_p_unfloored"] <= found["log10_p"]
     claimed = workshop.json("detect", "suspect.ply", *DETECT, "--scheme", scheme, "--message", MESSAGE)
     assert claimed["detected"] is True
@@ -120,7 +120,7 @@ def test_attacks_one_after_the_other(workshop: Workshop):
     told = workshop.json("attack", "model.ply", "both.ply", "smoothing", "3", "noise", "0.01", "--seed", "4")
     assert told["attacks"] == [["smoothing", 3.0], ["noise", 0.01]]
     before, both = (jm.load_mesh(name) for name in ("model.ply", "both.ply"))
-    expected = jm.attacks.chain(before, [("smoothing", 3), ("noise", 0.01)], seed=4)
+    expected = jm.adversaries.chain(before, [("smoothing", 3), ("noise", 0.01)], seed=4)
     np.testing.assert_allclose(both.vertices, expected.vertices, rtol=1e-6)
     assert told["rms"] == pytest.approx(jm.distortion.displacement_size(before, expected).rms, rel=1e-4)
 
@@ -338,7 +338,7 @@ def test_a_closed_pipe_does_not_change_the_status(workshop: Workshop):
 
 def test_an_interrupted_write_leaves_no_output(workshop: Workshop, monkeypatch):
     monkeypatch.setattr(
-        "jaxmark.app.batch.write_atomically", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left"))
+        "jaxmark.app.read_files.write_atomically", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left"))
     )
     assert "No space left" in workshop.refused(
         "embed", "model.ply", "out.ply", "--key", "owner.key", "--message", MESSAGE

@@ -11,10 +11,10 @@ import pytest
 import jaxmark as jm
 from jaxmark.alignment.alignment import align
 from jaxmark.alignment.original import make_original
-from jaxmark.app import report
-from jaxmark.app.telling import power
+from jaxmark.app import dossier
+from jaxmark.app.output import power
 from jaxmark.watermark.coding.keys import commitment
-from jaxmark.watermark.deposit import Deposit
+from jaxmark.watermark.record import TimestampedCommitment
 from tests.app.test_cli import Workshop
 from tests.samples import bumpy_sphere
 
@@ -30,7 +30,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("files")
     mesh = bumpy_sphere(3)
     jm.save_mesh(mesh, folder / "model.ply")
-    marked, info = jm.embed(jm.load_mesh(folder / "model.ply"), b"ok", KEY, budget=2e-3, noise=0)
+    marked, info = jm.embed(jm.load_mesh(folder / "model.ply"), b"ok", KEY, budget=jm.Budget(rms=2e-3, noise=0))
     jm.save_mesh(marked, folder / "marked.ply")
     jm.save_mesh(mesh._replace(vertices=1000 * mesh.vertices + 7), folder / "millimetres.stl")
     dented = np.where(mesh.vertices[:, :1] > 0.8, 1.01 * mesh.vertices, mesh.vertices)
@@ -49,7 +49,7 @@ def workshop(tmp_path, monkeypatch, capfd, files: Path) -> Workshop:
 def test_a_deposit_and_a_request_to_date_it_are_written(workshop: Workshop):
     Path("second.json").write_text(json.dumps(json.loads(Path(RECORD[1]).read_text()) | {"beta": 1.0}))
     told = workshop.json("deposit", RECORD[1], "second.json", "--output", "all.json")
-    deposit = Deposit.load("all.json")
+    deposit = TimestampedCommitment.load("all.json")
     assert told == {"root": deposit.root, "records": 2, "deposit": "all.json", "request": "all.json.tsq"}
     assert bytes.fromhex(deposit.root) in Path("all.json.tsq").read_bytes()
     assert jm.Record.load(RECORD[1]).digest() in deposit.digests
@@ -77,13 +77,13 @@ def test_a_dossier_shows_all_but_the_secret(workshop: Workshop):
     more = ("--deposit", "all.json", "--obtained", "a shop <b>& co</b>, 1 May", "--dossier", "case")
     told = workshop.json(*detect, *more)
     assert told["detected"] is told["proof"] is True
-    assert told["doubts"] == told["remarks"] == []
+    assert told["caveats"] == told["notes"] == []
     assert told["message"] == b"ok".hex()
     assert told["version"] == 2
     assert told["suspect_sha256"] == hashlib.sha256(Path("marked.ply").read_bytes()).hexdigest()
     assert told["record_digest"] == jm.Record.load(RECORD[1]).digest()
-    assert told["log10_p_deposited"] == pytest.approx(told["log10_p"] + np.log10(2))
-    assert told["log10_p"] < told["log10_p_undated"] < -6
+    assert told["log10_p_timestamped"] == pytest.approx(told["log10_p"] + np.log10(2))
+    assert told["log10_p"] < told["log10_p_uncommitted"] < -6
     assert told["dossier"] == "case"
     assert {path.name for path in Path("case").iterdir()} == {"dossier.html", "dossier.json"}
 
@@ -96,30 +96,30 @@ def test_a_dossier_shows_all_but_the_secret(workshop: Workshop):
         told["suspect_sha256"],
         told["record_digest"],
         commitment(KEY),
-        Deposit.load("all.json").root,
+        TimestampedCommitment.load("all.json").root,
     ):
         assert shown in page
         assert shown in json.dumps(facts)
     assert "a shop &lt;b&gt;&amp; co&lt;/b&gt;, 1 May" in page
     assert page.count("data:image/png;base64,") == 4
-    for name in ("log10_p", "log10_p_undated"):
+    for name in ("log10_p", "log10_p_uncommitted"):
         assert facts[name] == told[name]
         assert f"{told[name]:.1f}" in page
-    assert facts["deposit"]["log10_p"] == told["log10_p_deposited"]
+    assert facts["deposit"]["log10_p"] == told["log10_p_timestamped"]
     words = facts["command"].split()
     assert words == ["jaxmark", *(word.replace("secrets/mine.key", "KEYFILE") for word in detect)]
 
     _, said, _ = workshop(*detect, "--deposit", "all.json")
     assert f"{power(told['log10_p'])} if key, original, message and record were fixed" in said
-    assert f"{power(told['log10_p_undated'])} if nothing dates them" in said
-    assert f"{power(told['log10_p_deposited'])} if the deposit is older than the suspect" in said
+    assert f"{power(told['log10_p_uncommitted'])} if nothing dates them" in said
+    assert f"{power(told['log10_p_timestamped'])} if the deposit is older than the suspect" in said
 
 
 def test_there_is_no_dossier_of_less_than_a_proof(workshop: Workshop):
     told = workshop.json("detect", "marked.ply", *DETECT[2:], "--original", "dented.ply", *RECORD)
     assert told["detected"] is True
     assert told["proof"] is False
-    assert "the original was edited" in told["doubts"][0]
+    assert "the original was edited" in told["caveats"][0]
     said = workshop("detect", "marked.ply", *DETECT[2:], "--original", "dented.ply", *RECORD)[1]
     assert "an estimate: the original was edited" in said
     assert "no dossier of an estimate" in workshop.refused(
@@ -140,23 +140,23 @@ def test_a_claim_against_the_record_is_refused(workshop: Workshop):
     told = workshop.json(*claim, b"no".hex(), "--dossier", "case")
     facts = json.loads(Path("case/dossier.json").read_text())
     assert facts["command"].endswith("--bits 16 --scheme keyed --message CLAIMED")
-    assert facts["remarks"] == told["remarks"]
+    assert facts["notes"] == told["notes"]
     assert "in place of CLAIMED" in Path("case/dossier.html").read_text()
     assert told["message"] == b"ok".hex()
-    assert "Another message of this key reads" in told["remarks"][0]
+    assert "Another message of this key reads" in told["notes"][0]
     assert told["log10_p"] > workshop.json(*claim, b"ok".hex(), *RECORD)["log10_p"]
 
 
 @pytest.mark.slow
 def test_mistakes_are_said(workshop: Workshop):
     exchanged = ("detect", "model.ply", "--original", "marked.ply", "--key", "owner.key")
-    assert "The files look exchanged" in workshop.json(*exchanged, "--bits", "16", status=1)["remarks"][0]
+    assert "The files look exchanged" in workshop.json(*exchanged, "--bits", "16", status=1)["notes"][0]
     assert "exchange the two files" in workshop.refused(*exchanged, *RECORD)
     code, said, _ = workshop("detect", "marked.ply", *DETECT, "--bits", "24")
     assert code == 1
     assert "A message of 16 bits reads with the scheme 'keyed'" in said
     itself = workshop.json("detect", "millimetres.stl", *DETECT, "--bits", "16", status=1)
-    assert itself["remarks"] == ["The suspect is the original itself, without a mark."]
+    assert itself["notes"] == ["The suspect is the original itself, without a mark."]
 
 
 def test_how_copies_are_aligned_is_paid_for(workshop: Workshop):
@@ -177,7 +177,7 @@ def test_reports_show_the_points_where_they_are(monkeypatch: pytest.MonkeyPatch,
     original, dent = make_original(mesh), mesh.vertices.copy()
     dent[7] *= 1.02
     drawn = {}
-    monkeypatch.setattr(report, "save_views", lambda panels, path: drawn.update({one.title: one for one in panels}))
+    monkeypatch.setattr(dossier, "save_views", lambda panels, path: drawn.update({one.title: one for one in panels}))
     suspect = mesh._replace(vertices=dent)
-    report.save_report(tmp_path, original, suspect, align(original, suspect))
+    dossier.save_report(tmp_path, original, suspect, align(original, suspect))
     assert np.flatnonzero(drawn["Weight"].values == 0).tolist() == [7]  # so far off is masked

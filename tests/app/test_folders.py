@@ -11,7 +11,7 @@ import pytest
 
 import jaxmark as jm
 from jaxmark.app.folders import each
-from jaxmark.app.telling import Told
+from jaxmark.app.output import FileOutcome
 
 FILES = [Path(f"{name}.ply") for name in "abcdef"]
 
@@ -22,30 +22,30 @@ class Count:
 
     _seen: list[str] = field(default_factory=list)
 
-    def __call__(self, file: Path) -> Told:
+    def __call__(self, file: Path) -> FileOutcome:
         if file.stem == "c":
             raise jm.JaxmarkError(f"{file} is not to my liking.")
         self._seen.append(file.stem)
-        return Told({"worker": os.getpid(), "seen": len(self._seen)}, file.stem)
+        return FileOutcome({"worker": os.getpid(), "seen": len(self._seen)}, file.stem)
 
 
-def die(file: Path) -> Told:
+def die(file: Path) -> FileOutcome:
     """As a process does that takes too much memory."""
     os.kill(os.getpid(), signal.SIGKILL)
-    return Told({}, "")
+    return FileOutcome({}, "")
 
 
-def wait(file: Path) -> Told:
+def wait(file: Path) -> FileOutcome:
     """Leave a draft while it works, as jobs do, which is removed whatever ends it."""
     if file.stem == "f":
-        return Told({}, "")
+        return FileOutcome({}, "")
     draft = file.with_suffix(".draft")
     try:
         draft.touch()
         time.sleep(60)
     finally:
         draft.unlink()
-    return Told({}, "")
+    return FileOutcome({}, "")
 
 
 @pytest.fixture
@@ -58,23 +58,25 @@ def files(tmp_path: Path) -> list[Path]:
 
 
 @pytest.mark.slow
-def test_several_workers_tell_of_each_file(files):
+def test_several_workers_report_each_file(files):
     told = dict(each(files, Count(), workers=2))
     assert {file.stem for file in told} == set("abcdef")
-    assert told.pop(files[2]) == Told({"refused": f"{files[2]} is not to my liking."}, told_of_c(files), False, True)
+    assert told.pop(files[2]) == FileOutcome(
+        {"refused": f"{files[2]} is not to my liking."}, text_of_c(files), False, True
+    )
     # Each worker keeps what it has prepared, and counts on from file to file.
     by_worker: dict[int, list[int]] = {}
     for one in told.values():
-        by_worker.setdefault(one.answer["worker"], []).append(one.answer["seen"])
+        by_worker.setdefault(one.values["worker"], []).append(one.values["seen"])
     assert os.getpid() not in by_worker
     assert all(sorted(seen) == list(range(1, len(seen) + 1)) for seen in by_worker.values())
     alone = Count()
-    assert [(file.stem, one.said) for file, one in each(files, alone)] == [
-        (file.stem, told_of_c(files) if file.stem == "c" else file.stem) for file in files
+    assert [(file.stem, one.text) for file, one in each(files, alone)] == [
+        (file.stem, text_of_c(files) if file.stem == "c" else file.stem) for file in files
     ]
 
 
-def told_of_c(files: list[Path]) -> str:
+def text_of_c(files: list[Path]) -> str:
     return f"refused. {files[2]} is not to my liking."
 
 

@@ -31,7 +31,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
 )
 def test_marked_and_read_back_or_refused(path: Path, scheme, tmp_path, monkeypatch, capfd, unchecked):
     """Every third file, with one scheme each: every shape is compiled anew."""
-    jm.save_key(jm.Key(bytes(range(32))), tmp_path / "key")
+    jm.watermark.save_key(jm.Key(bytes(range(32))), tmp_path / "key")
     marked = tmp_path / f"marked{path.suffix}"
     embed = ("embed", path, marked, "--key", tmp_path / "key", "--message", MESSAGE, "--scheme", scheme, "--noise", 0)
     status = run(monkeypatch, *embed)
@@ -58,7 +58,7 @@ def test_not_all_are_refused(key, unchecked):
     marked = 0
     for path in FILES[::6]:
         try:
-            jm.embed(jm.load_mesh(path), b"\xc3", key, limits={"dame": 0.008}, scheme="host")
+            jm.embed(jm.load_mesh(path), b"\xc3", key, budget={"dame": 0.008}, scheme="host")
             marked += 1
         except jm.JaxmarkError:
             pass

@@ -42,11 +42,11 @@ def test_what_does_not_end_is_not_read(tmp_path: Path, ball: Path):
         with pytest.raises(jm.JaxmarkError, match="it is no ordinary file"):
             jm.load_mesh(path)
         with pytest.raises(jm.JaxmarkError, match="no ordinary file"):
-            jm.load_key(path)
+            jm.watermark.load_key(path)
         with pytest.raises(jm.JaxmarkError, match="no ordinary file"):
             Record.load(path)
     with pytest.raises(jm.JaxmarkError, match="more than 4096"):
-        jm.load_key(ball)
+        jm.watermark.load_key(ball)
 
 
 def test_a_key_that_cannot_be_written_leaves_no_file(tmp_path: Path, monkeypatch):
@@ -57,14 +57,14 @@ def test_a_key_that_cannot_be_written_leaves_no_file(tmp_path: Path, monkeypatch
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
         with pytest.raises(jm.JaxmarkError, match="No space left on device"):
-            jm.save_key(key, tmp_path / "me.key")
+            jm.watermark.save_key(key, tmp_path / "me.key")
     assert not (tmp_path / "me.key").exists()
-    jm.save_key(key, tmp_path / "me.key")
-    assert jm.load_key(tmp_path / "me.key") == key
+    jm.watermark.save_key(key, tmp_path / "me.key")
+    assert jm.watermark.load_key(tmp_path / "me.key") == key
 
 
 def test_a_key_that_others_may_read_is_told(tmp_path: Path, ball: Path, monkeypatch, capsys):
-    jm.save_key(jm.new_key(), tmp_path / "me.key")
+    jm.watermark.save_key(jm.new_key(), tmp_path / "me.key")
     arguments = ["embed", ball, tmp_path / "marked.obj", "--key", tmp_path / "me.key", "--message", "00" * 512]
     assert "may be read by others" not in run(arguments, monkeypatch, capsys)[1]
     (tmp_path / "me.key").chmod(0o644)
@@ -72,7 +72,7 @@ def test_a_key_that_others_may_read_is_told(tmp_path: Path, ball: Path, monkeypa
 
 
 def test_a_folder_without_meshes_leaves_no_folder(tmp_path: Path, monkeypatch, capsys):
-    jm.save_key(jm.new_key(), tmp_path / "me.key")
+    jm.watermark.save_key(jm.new_key(), tmp_path / "me.key")
     (tmp_path / "empty").mkdir()
     arguments = ["embed", tmp_path / "empty", tmp_path / "out", "--key", tmp_path / "me.key"]
     assert run(arguments, monkeypatch, capsys) == (
@@ -122,7 +122,7 @@ def test_links_are_followed_and_drafts_are_not_named(tmp_path: Path):
 @pytest.mark.slow
 def test_who_is_asked_to_end_leaves_nothing(tmp_path: Path):
     """A request to end, at several moments of a run."""
-    jm.save_key(jm.new_key(), tmp_path / "me.key")
+    jm.watermark.save_key(jm.new_key(), tmp_path / "me.key")
     jm.save_mesh(bumpy_sphere(5), tmp_path / "ball.obj")
     command = [sys.executable, "-c", "from jaxmark.app.start import main; main()", "embed", tmp_path / "ball.obj"]
     command += [tmp_path / "marked.obj", "--key", tmp_path / "me.key", "--budget", "1e-3"]

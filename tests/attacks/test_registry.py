@@ -7,10 +7,9 @@ from numpy.typing import ArrayLike
 from scipy.stats import kstest
 
 import jaxmark as jm
+from jaxmark.adversaries.registry import ATTACKS, attack_each
 from jaxmark.attacks import (
-    ATTACKS,
     affine,
-    attack_each,
     diagonal_noise,
     gaussian_noise,
     laplacian_smoothing,
@@ -245,7 +244,7 @@ def test_refusals(cap: Mesh):
 
 
 @pytest.fixture(scope="module")
-def marked(key: jm.Key) -> tuple[jm.watermark.Marker, Mesh]:
+def marked(key: jm.Key) -> tuple[jm.watermark.NonBlindMarker, Mesh]:
     marker = jm.make_marker(bumpy_sphere(4), key, bits=64)
     return marker, marker.embed(b"jaxmark!")[0]
 
@@ -261,7 +260,7 @@ def marked(key: jm.Key) -> tuple[jm.watermark.Marker, Mesh]:
         *(("similarity", 0.5), ("affine", 0.3), ("edge-flips", 0.005), ("edge-flips", 0.3)),
     ],
 )
-def test_marks_of_the_default_budget_read(kind, strength, marked: tuple[jm.watermark.Marker, Mesh]):
+def test_marks_of_the_default_budget_read(kind, strength, marked: tuple[jm.watermark.NonBlindMarker, Mesh]):
     marker, mesh = marked
     suspect = jm.attack(mesh, kind, strength, seed=1)
     if (kind, strength) == ("edge-flips", 0.3):
@@ -271,12 +270,14 @@ def test_marks_of_the_default_budget_read(kind, strength, marked: tuple[jm.water
     assert found.detected()
     # A few flips leave most vertices' surroundings as they were; many leave only the surface.
     assert (
-        found.alignment.method == {0.005: "connectivity", 0.3: "surface"}[strength] if kind == "edge-flips" else "same"
+        found.registration.method == {0.005: "connectivity", 0.3: "surface"}[strength]
+        if kind == "edge-flips"
+        else "same"
     )
 
 
 @pytest.mark.slow
-def test_a_mark_reads_in_noise_of_twice_its_size(marked: tuple[jm.watermark.Marker, Mesh]):
+def test_a_mark_reads_in_noise_of_twice_its_size(marked: tuple[jm.watermark.NonBlindMarker, Mesh]):
     marker, mesh = marked
     noisy = mark_noise(mesh, marker.original.mesh, 2.0, jax.random.key(0))
     assert marker.detect(noisy).message == b"jaxmark!"

@@ -7,10 +7,11 @@ import pytest
 from jax.test_util import check_grads
 
 import jaxmark as jm
-from jaxmark.attacks import bending, jamming, twisting, warp
+from jaxmark.adversaries._jamming import jamming
+from jaxmark.attacks import bending, twisting, warp
 from jaxmark.geometry.mesh import Mesh, diagonal, make_mesh
 from jaxmark.spectral.graphs import from_mesh
-from jaxmark.watermark.schemes.scheme import DERIVED
+from jaxmark.watermark.schemes.keyed import DERIVED
 from tests.dense import laplacian_matrix
 from tests.samples import exact_sheet, rough_sphere
 from tests.test_precision import check_products

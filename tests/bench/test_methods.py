@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 import jaxmark as jm
 from jaxmark.bench.method import Method
 from jaxmark.bench.methods import cho as norms
-from jaxmark.bench.methods import here
 from jaxmark.bench.methods import influence as spheres
+from jaxmark.bench.methods import library as here
 from jaxmark.bench.methods import moments as patches
 from jaxmark.bench.methods import radial as programme
 from jaxmark.bench.methods.draws import gather, normal, scatter

@@ -11,7 +11,7 @@ import pytest
 
 from jaxmark.geometry.mesh import Mesh, vertex_normals
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
-from jaxmark.watermark.marking import make_marker
+from jaxmark.watermark.markers import make_marker
 from jaxmark.watermark.reading.coarse import expected_errors
 from tests import ROOT
 from tests.samples import bumpy_sphere

@@ -13,7 +13,6 @@ from scipy import sparse
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh, edges, make_mesh, vertex_normals
 from jaxmark.geometry.pose import similarity
-from jaxmark.watermark.perception.budget import make_budget
 from tests import ROOT
 from tests.samples import bumpy_sphere
 
@@ -72,7 +71,7 @@ def test_the_carrier_of_the_tool_is_its_formula_and_its_adjoint(harmonics, x64):
 def test_the_tool_confirms_its_mark_in_noise_and_a_quarter_of_what_is_none(harmonics):
     mesh = bumpy_sphere(3)
     mark = harmonics.make_mark(mesh, [1])
-    marked = mark.embed(make_budget(1e-3))
+    marked = mark.embed(jm.Budget(rms=1e-3).bounds(mesh))
     expected = jm.distortion.displacement_size(mesh, marked).max
     assert mark.correlation(jm.attack(marked, "noise", 0.002, seed=0), expected) > 0.9
     assert mark.correlation(mesh, expected) == 0  # nothing moved

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
+from benchmarks.common.submeshes import farthest_vertices, make_part_marker, parts
 from jaxmark.geometry.mesh import Mesh, edges, make_mesh, weld
-from jaxmark.watermark.submeshes import farthest_vertices, make_part_marker, parts
 from tests.samples import bumpy_sphere
 
 pytestmark = pytest.mark.core

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.app.finding import describe
+from jaxmark.app.find_commands import describe
 from jaxmark.catalogue import Finder, Match, Verdict
 from jaxmark.catalogue.descriptors import centred
 from jaxmark.catalogue.fitting import Part, fit_whole

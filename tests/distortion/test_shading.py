@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 import jaxmark as jm
 from jaxmark.distortion import Hiding, make_hiding, shading, vertex_means, visible_turn
 from jaxmark.geometry.mesh import Mesh, make_mesh
-from jaxmark.watermark.perception.budget import make_budget
-from jaxmark.watermark.schemes.scheme import KeyedScheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
 from tests.samples import rough_sphere
 
 pytestmark = pytest.mark.core
@@ -153,5 +152,5 @@ def test_limits_are_kept(x64):
     """It bounds a mark as other metrics do."""
     mesh = make_mesh(*sheet(24))
     marker = jm.make_marker(mesh, bytes(32), bits=8, scheme=KeyedScheme(hiding=False))
-    marked, _ = marker.write(marker.codeword(b"c"), make_budget(limits={"shading": 1.0}))
+    marked, _ = marker.write(marker.codeword(b"c"), {"shading": 1.0})
     assert 0.98 < jm.compare(mesh, marked, ["shading"]).shading <= 1

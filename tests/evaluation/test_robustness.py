@@ -17,9 +17,9 @@ MESSAGE = b"ok"
 
 
 @pytest.fixture(scope="module")
-def marked(key: jm.Key) -> tuple[jm.watermark.Marker, Mesh]:
+def marked(key: jm.Key) -> tuple[jm.watermark.NonBlindMarker, Mesh]:
     marker = jm.make_marker(bumpy_sphere(3), key, bits=16)
-    return marker, marker.embed(MESSAGE, 2e-3, noise=0)[0]
+    return marker, marker.embed(MESSAGE, jm.Budget(rms=2e-3, noise=0))[0]
 
 
 def test_a_curve_is_what_attack_and_detect_say(marked):
@@ -77,7 +77,7 @@ def test_refusals(marked):
 @pytest.mark.slow
 def test_the_least_that_breaks_a_mark_lies_between_what_does_and_what_does_not(marked):
     marker, mesh = marked
-    wide = jm.attacks.ATTACKS["noise"]._replace(strengths=(0.001, 0.3))
+    wide = jm.adversaries.ATTACKS["noise"]._replace(strengths=(0.001, 0.3))
     found = minimum_distortion(marker, mesh, MESSAGE, wide, metrics=["rms", "dame"])
     held = [one for one in found.curve if one.log10_p <= -6]
     assert found.weakest is not None
@@ -95,12 +95,14 @@ def test_the_least_that_breaks_a_mark_lies_between_what_does_and_what_does_not(m
 @pytest.mark.slow
 def test_whole_strengths_and_attacks_that_never_or_always_succeed(marked):
     marker, mesh = marked
-    coarse = minimum_distortion(marker, mesh, MESSAGE, jm.attacks.ATTACKS["quantisation"]._replace(strengths=(10, 2)))
+    coarse = minimum_distortion(
+        marker, mesh, MESSAGE, jm.adversaries.ATTACKS["quantisation"]._replace(strengths=(10, 2))
+    )
     assert [one.strength for one in coarse.curve] == sorted((one.strength for one in coarse.curve), reverse=True)
     assert coarse.weakest is not None
     bits = int(coarse.weakest.strength)
     assert [one.strength for one in coarse.curve if one.log10_p <= -6][-1] == bits + 1
-    noise = jm.attacks.ATTACKS["noise"]
+    noise = jm.adversaries.ATTACKS["noise"]
     mild = minimum_distortion(marker, mesh, MESSAGE, noise._replace(strengths=(1e-4, 2e-4)), metrics=["rms"])
     assert (mild.weakest, mild.cost("rms"), len(mild.curve)) == (None, np.inf, 1)
     harsh = minimum_distortion(marker, mesh, MESSAGE, noise._replace(strengths=(1, 2)), metrics=["rms"])

@@ -69,7 +69,7 @@ def test_rows_are_what_marker_attack_and_detect_say(results):
     markers = [jm.make_marker(mesh, key, bits=16) for key in keys]
     for seed in range(2):
         message = hashlib.shake_256(f"jaxmark/study/message/{seed}".encode()).digest(2)
-        marked, info = markers[seed].embed(message, BUDGET, noise=0)
+        marked, info = markers[seed].embed(message, jm.Budget(rms=BUDGET, noise=0))
         for kind, strength in (("noise", 0.002), ("noise", 0.2), ("stretch", 0.1)):
             attack = study().attacks[kind] if kind == "stretch" else kind
             for control, before, marker in (
@@ -81,7 +81,7 @@ def test_rows_are_what_marker_attack_and_detect_say(results):
                 one = marker.detect(jm.attack(before, attack, strength, seed=seed))
                 # Attacks at once round otherwise than one by one.
                 assert row.log10_p == pytest.approx(one.log10_p, abs=0.05)
-                assert row.log10_p_unfloored == pytest.approx(one.log10_p_unfloored, rel=0.01, abs=0.05)
+                assert row.log10_p_unfloored == pytest.approx(one.evidence.log10_p_unfloored, rel=0.01, abs=0.05)
                 assert row.read == (one.message == message)
                 assert row.detected == (one.log10_p <= -6)
                 assert row.rms == (0 if control == "unmarked" else info.rms)
@@ -90,7 +90,7 @@ def test_rows_are_what_marker_attack_and_detect_say(results):
     assert found["stretch", 0.1, 0, "marked"].bit_errors == 0
     assert not found["noise", 0.2, 0, "marked"].read
     assert found["stretch", 0.1, 0, "marked"].unit == "share of the height"
-    assert found["noise", 0.2, 0, "marked"].unit == jm.attacks.ATTACKS["noise"].unit
+    assert found["noise", 0.2, 0, "marked"].unit == jm.adversaries.ATTACKS["noise"].unit
 
 
 def test_controls_are_always_there_and_never_read(results):

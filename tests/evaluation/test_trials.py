@@ -14,8 +14,7 @@ from jaxmark.evaluation import trials as module
 from jaxmark.evaluation.trials import Trials
 from jaxmark.evaluation.tuning import apply_attack, tune
 from jaxmark.spectral.chebyshev import band_components
-from jaxmark.watermark.perception.budget import make_budget
-from jaxmark.watermark.schemes.scheme import KeyedScheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
 from tests.samples import rough_sphere
 
 ATTACKS = (("noise", 0.004), ("smoothing", 10))
@@ -30,7 +29,7 @@ def mesh() -> jm.Mesh:
 @pytest.fixture(scope="module")
 def trials(mesh) -> Trials:
     attacks = [partial(apply_attack, one) for one in ATTACKS]
-    return Trials(make_original(mesh), 16, make_budget(RMS), attacks, [7], "evidence")
+    return Trials(make_original(mesh), 16, jm.Budget(rms=RMS).bounds(mesh), attacks, [7], "evidence")
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +44,7 @@ def test_what_is_tried_is_what_the_detector_has(mesh, trials, trial):
         for number in range(6):
             marker = jm.make_marker(mesh, jm.Key(bytes([number + 1] * 32)), bits=16, scheme=trial.scheme)
             word = marker.codeword(b"ok")
-            marked, _ = marker.write(word, make_budget(RMS))
+            marked, _ = marker.write(word, RMS)
             received = marker.receive(jm.attack(marked, *attack, seed=100 + number))
             score, norm = marker.reader.claim(received, jnp.asarray(word, jnp.float32))
             ratios.append(float(score / norm))

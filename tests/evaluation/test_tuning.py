@@ -18,7 +18,7 @@ from jaxmark.evaluation.tuning import tune
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.watermark.reading.reception import make_host, make_receiver
-from jaxmark.watermark.schemes.scheme import KeyedScheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
 from tests.samples import rough_sphere
 
 
@@ -193,7 +193,7 @@ ATTACKS = [("noise", 0.004), ("smoothing", 10), ("quantisation", 8)]
 @pytest.fixture(scope="module")
 def tuned():
     mesh = rough_sphere(2500)
-    return mesh, tune(mesh, ATTACKS, limits={"dame": 0.02}, key=jax.random.key(0), margin="evidence", bits=16)
+    return mesh, tune(mesh, ATTACKS, {"dame": 0.02}, key=jax.random.key(0), margin="evidence", bits=16)
 
 
 @pytest.mark.long
@@ -201,7 +201,7 @@ def test_what_was_predicted_is_measured(tuned, key: jm.Key):
     """Marks of the tuned profile, attacked anew, have the evidence that the channels say."""
     mesh, found = tuned
     marker = jm.make_marker(mesh, key, bits=16, scheme=found.scheme)
-    marked, info = marker.embed(b"ok", limits={"dame": 0.02}, noise=0)
+    marked, info = marker.embed(b"ok", jm.Budget(limits={"dame": 0.02}, noise=0))
     assert 0.98 * 0.02 <= (jm.compare(mesh, marked, ["dame"]).dame or 0) <= 0.02
     assert info.beta * max(found.scheme.profile) == pytest.approx(found.beta.max(), rel=0.05)
     word = jnp.asarray(marker.codeword(b"ok"), jnp.float32)
@@ -229,12 +229,14 @@ def test_tuning_beats_equal_strengths_and_says_how_far_it_is_from_the_best(tuned
 def test_several_limits_at_once(tuned):
     mesh = tuned[0]
     limits = {"dame": 0.02, "gl": 1e-4}
-    found = tune(mesh, ATTACKS[:2], 5e-4, limits=limits, key=jax.random.key(0), bits=16)
+    found = tune(mesh, ATTACKS[:2], jm.Budget(rms=5e-4, limits=limits), key=jax.random.key(0), bits=16)
     assert list(found.report.binding) == ["dame", "gl", "budget"]
     assert sum(found.report.binding.values()) == pytest.approx(1)
     assert (found.cost @ found.beta**2 < 1.6).all()
     assert 0 <= found.report.gap < 0.05
-    marked, info = jm.embed(mesh, b"ok", jm.new_key(), budget=5e-4, limits=limits, scheme=found.scheme, noise=0)
+    marked, info = jm.embed(
+        mesh, b"ok", jm.new_key(), budget=jm.Budget(rms=5e-4, limits=limits, noise=0), scheme=found.scheme
+    )
     compared = jm.compare(mesh, marked, limits)._asdict()
     used = [*(compared[name] / limit for name, limit in limits.items()), info.rms / 5e-4]
     assert 0.98 <= max(used) <= 1 + 1e-6
@@ -247,7 +249,7 @@ def test_any_function_is_an_attack_and_a_start_is_warm(tuned):
     def shrink(mesh, seed):
         return mesh._replace(vertices=0.5 * np.asarray(mesh.vertices))
 
-    named = (jm.attacks.ATTACKS["smoothing"], 5)
+    named = (jm.adversaries.ATTACKS["smoothing"], 5)
     found = tune(mesh, [shrink, named], 5e-4, key=jax.random.key(0), bits=16, start=before.beta)
     assert 0 <= found.report.gap < 0.02
     assert found.report.tried[0] > found.report.tried[1]  # a change of size takes nothing of a mark

@@ -10,8 +10,10 @@ import trimesh
 
 import jaxmark as jm
 from jaxmark.watermark.coding.keys import SCHEME_VERSION
+from jaxmark.watermark.interfaces import Scheme
 from jaxmark.watermark.record import RECORD_SUFFIX
-from jaxmark.watermark.schemes.scheme import EigenScheme, HostScheme, KeyedScheme, Scheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
+from jaxmark.watermark.schemes.modulated import EigenScheme, HostScheme
 from tests.samples import rough_sphere
 
 FOLDER = Path(__file__).parent / str(SCHEME_VERSION)
@@ -43,10 +45,10 @@ def main() -> None:
     ply = trimesh.Trimesh(rounded, shape.faces, process=False).export(file_type="ply", vertex_normal=False)
     assert isinstance(ply, bytes)
     (FOLDER / "original.ply").write_bytes(ply)
-    jm.save_key(KEY, FOLDER / "test.key")
+    jm.watermark.save_key(KEY, FOLDER / "test.key")
     original = jm.load_mesh(FOLDER / "original.ply")
     for name, scheme in MARKS.items():
-        save(*jm.embed(original, MESSAGE, KEY, budget=BUDGET, noise=0, scheme=scheme), name)
+        save(*jm.embed(original, MESSAGE, KEY, budget=jm.Budget(rms=BUDGET, noise=0), scheme=scheme), name)
     for recipient in RECIPIENTS:
         save(*jm.fingerprint(original, recipient, KEY, budget=BUDGET), recipient)
 

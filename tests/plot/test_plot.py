@@ -18,7 +18,8 @@ from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.plot.meshes import roughness_masking
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.spectrum import eigenpairs
-from jaxmark.watermark.evidence.bounds import MIN_LOG10_P, log10_p_claimed
+from jaxmark.watermark.evidence.bounds import log10_p_score
+from jaxmark.watermark.evidence.ledger import MIN_LOG10_P
 from tests.samples import bumpy_sphere
 
 matplotlib = pytest.importorskip("matplotlib")
@@ -185,7 +186,7 @@ def test_roc_counts_what_is_below_each_probability():
 def test_p_values_lie_below_a_bound_that_holds_and_above_one_that_does_not():
     rng = np.random.default_rng(1)
     scores = rng.normal(size=2000)
-    sound = np.array([log10_p_claimed(score, 1.0) for score in scores])
+    sound = np.array([log10_p_score(score, 1.0) for score in scores])
     picture = pictures.p_values({"bound": sound, "twice its exponent": 2 * sound})
     drawn = lines(picture)
     x, bound = drawn["the bound, 10^x"]

@@ -135,7 +135,7 @@ def test_the_completed_bound_3_holds(seed, x64):
 def test_evidence_is_what_a_detection_says(x64):
     """The pure function in nats, against the bound that is printed, which pays for other ways to align and to claim."""
     marker = jm.make_marker(bumpy_sphere(3), jm.Key(bytes(32)), bits=16)
-    marked, _ = marker.embed(b"ok", 4e-4, noise=0, read_back=False)
+    marked, _ = marker.embed(b"ok", jm.Budget(rms=4e-4, noise=0), read_back=False)
     suspect = jm.attack(marked, "noise", 0.006, seed=0)
     original = marker.original
     moved = (np.asarray(suspect.vertices) - original.mesh.vertices)[original.weld.first] / original.diagonal

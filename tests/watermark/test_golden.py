@@ -31,7 +31,7 @@ def files(version: str, name: str) -> tuple[Mesh, Mesh, jm.Key, jm.Record]:
     return (
         jm.load_mesh(folder / f"{name}.ply"),
         jm.load_mesh(folder / "original.ply"),
-        jm.load_key(folder / "test.key"),
+        jm.watermark.load_key(folder / "test.key"),
         jm.Record.load(folder / f"{name}.ply{RECORD_SUFFIX}"),
     )
 

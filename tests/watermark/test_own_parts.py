@@ -19,8 +19,8 @@ from jaxmark.spectral.precision import matmul, sum_and_norm
 from jaxmark.watermark.carriers import Carrier, Claim, PlainReader, Reader
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import code_length
-from jaxmark.watermark.reading.detectors import Detector, claims, correlate
-from jaxmark.watermark.schemes.scheme import Scheme
+from jaxmark.watermark.interfaces import Detector, Scheme
+from jaxmark.watermark.reading.detectors import claims, correlate
 from tests.samples import bumpy_sphere
 
 pytestmark = pytest.mark.core
@@ -91,12 +91,12 @@ class PatchScheme(Scheme):
 
 
 @pytest.fixture(scope="module")
-def marked(key: jm.Key) -> tuple[jm.watermark.Marker, Mesh]:
+def marked(key: jm.Key) -> tuple[jm.watermark.NonBlindMarker, Mesh]:
     marker = jm.make_marker(bumpy_sphere(3), key, bits=BITS, scheme=PatchScheme())
     return marker, marker.embed(MESSAGE, 2e-3)[0]
 
 
-def owner_sees(marker: jm.watermark.Marker, suspect: Mesh) -> float:
+def owner_sees(marker: jm.watermark.NonBlindMarker, suspect: Mesh) -> float:
     """S/‖a‖ of the claim of the message."""
     codeword = jnp.asarray(marker.codeword(MESSAGE), jnp.float32)
     score, norm = claims(marker.reader, marker.receive(suspect), codeword)

@@ -8,10 +8,13 @@ import pytest
 import trimesh
 
 import jaxmark as jm
+from jaxmark.alignment.pairing import pair
 from jaxmark.files import load_scene
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark import scenes
-from jaxmark.watermark.scenes import SceneDetection, SceneRecord, detect_scene, embed_scene, load_record
+from jaxmark.watermark.everyday import detect_scene, embed_scene
+from jaxmark.watermark.evidence.detection import Detection, united_score
+from jaxmark.watermark.nonblind import claims_of
+from jaxmark.watermark.record import SceneRecord, load_record
 from tests.app.test_cli import Workshop
 from tests.samples import bumpy_sphere
 
@@ -42,12 +45,12 @@ def marked(originals, key: jm.Key):
 def test_what_cannot_carry_is_named(marked):
     meshes, info = marked
     assert list(meshes) == [*NAMES, "again"] == list(info.record.meshes)
-    assert list(info.left) == ["small"]
+    assert list(info.skipped) == ["small"]
     for one in info.meshes.values():
         assert one.rms == pytest.approx(BUDGET, rel=1e-3)
 
 
-def read(marked, originals, key: jm.Key, noise: float, **options) -> SceneDetection:
+def read(marked, originals, key: jm.Key, noise: float, **options) -> Detection:
     meshes, info = marked
     record = SceneRecord({name: info.record.meshes[name] for name in NAMES})
     # In another order, under other names, turned and scaled.
@@ -57,15 +60,15 @@ def read(marked, originals, key: jm.Key, noise: float, **options) -> SceneDetect
 
 def test_together_they_prove_more_than_the_best_alone(marked, originals, key: jm.Key):
     found = read(marked, originals, key, 0.006, message=MESSAGE)
-    assert found.left == {}
-    best = min(one.log10_p for one in found.meshes.values())
+    assert found.skipped == {}
+    best = min(one.log10_p for one in found.parts.values())
     assert best > -60
-    assert found.united.log10_p < best - 5
-    assert found.united.log10_p_unfloored == found.united.log10_p
+    assert found.log10_p < best - 5
+    assert found.evidence.log10_p_unfloored == found.log10_p
     assert found.detected()
     # By Hoeffding's bound for the sum of scores over their norms, which have variances of at most 1 each.
-    ratios = [np.sqrt(-2 * np.log(10) * (one.log10_p - 0.5)) for one in found.meshes.values()]
-    assert found.united.log10_p >= -(np.sum(ratios) ** 2) / 3 / 2 / np.log(10) - 3
+    ratios = [np.sqrt(-2 * np.log(10) * (one.log10_p - 0.5)) for one in found.parts.values()]
+    assert found.log10_p >= -(np.sum(ratios) ** 2) / 3 / 2 / np.log(10) - 3
 
 
 def test_each_reads_alone(marked, originals, key: jm.Key):
@@ -82,20 +85,22 @@ def test_equal_meshes_count_once(marked, originals, key: jm.Key):
     record = SceneRecord({name: info.record.meshes[name] for name in twice})
     found = detect_scene({name: meshes[name] for name in twice}, originals=twice, key=key, record=record)
     alone = jm.detect(meshes["left"], original=originals["left"], key=key, record=record.meshes["left"])
-    assert list(found.meshes) == ["left"]
-    assert found.united.log10_p == alone.log10_p
+    assert list(found.parts) == ["left"]
+    assert found.log10_p == alone.log10_p
 
 
 @pytest.mark.long
 def test_sums_over_keys_have_the_variance_that_the_bound_assumes(originals, key: jm.Key):
     suspects = {name: moved(mesh, np.eye(3), 0.01, seed) for seed, (name, mesh) in enumerate(originals.items())}
     markers = {name: jm.make_marker(mesh, key, bits=16) for name, mesh in originals.items()}
-    found = {name: markers[name].detect(suspects[name], b"ok") for name in NAMES}
+    aligned = {name: markers[name].register(suspects[name]) for name in NAMES}
     sums = []
     for number in range(16):
-        other = jm.Key(bytes([number]) * 32)
-        seen = [scenes._Seen(jm.make_marker(mesh, other, bits=16), found[name]) for name, mesh in originals.items()]
-        sums.append(scenes._summed(seen, b"ok"))
+        others = {name: jm.make_marker(originals[name], jm.Key(bytes([number]) * 32), bits=16) for name in NAMES}
+        claims = [claims_of(others[name], others[name].receive(aligned[name]), b"ok")[0] for name in NAMES]
+        sums.append(
+            united_score(*zip(*claims, strict=True), [float(np.sum(aligned[name].weights > 0)) for name in NAMES])
+        )
     assert 0.4 < np.std(sums) < 1.6  # 16 numbers of variance 1: within 3.4 standard errors
     assert np.abs(sums).max() < 4
 
@@ -125,15 +130,13 @@ def test_records_of_files(marked, tmp_path: Path):
 def test_pairs(originals):
     turned = {name: moved(mesh, TURN) for name, mesh in originals.items()}
     # By connectivity, whatever the names say.
-    assert scenes.pair(originals, {"right": turned["left"], "left": turned["right"]}) == {
-        **{"left": "right", "right": "left"}
-    }
+    assert pair(originals, {"right": turned["left"], "left": turned["right"]}) == {**{"left": "right", "right": "left"}}
     # By shape, where it is another connectivity.
     other = {name: bumpy_sphere(4, seed) for seed, name in enumerate(NAMES)}
     stretched = originals["right"]._replace(vertices=np.asarray(originals["right"].vertices) * [1, 1, 5])
     shuffled = {"x": moved(stretched, TURN)._replace(faces=stretched.faces[::-1]), "y": other["left"]}
-    assert scenes.pair({"long": stretched, "round": originals["left"]}, shuffled) == {"long": "x", "round": "y"}
-    assert scenes.pair(originals, {"only": other["left"]}) == dict.fromkeys(NAMES, "only")
+    assert pair({"long": stretched, "round": originals["left"]}, shuffled) == {"long": "x", "round": "y"}
+    assert pair(originals, {"only": other["left"]}) == dict.fromkeys(NAMES, "only")
 
 
 def test_meshes_of_one_connectivity_are_paired_by_shape(sphere: Mesh):
@@ -143,10 +146,10 @@ def test_meshes_of_one_connectivity_are_paired_by_shape(sphere: Mesh):
         for name, size in zip("abc", (1, 2, 3), strict=True)
     }
     turned = {name: moved(mesh, TURN) for name, mesh in rocks.items()}
-    assert scenes.pair(rocks, {"c": turned["a"], "x": turned["c"], "a": turned["b"]}) == {"a": "c", "b": "a", "c": "x"}
+    assert pair(rocks, {"c": turned["a"], "x": turned["c"], "a": turned["b"]}) == {"a": "c", "b": "a", "c": "x"}
     # Names tell equal shapes apart.
     equal = {name: moved(rocks["a"], TURN, 0.001 * place) for place, name in enumerate("abc")}
-    assert scenes.pair(dict.fromkeys("abc", rocks["a"]), equal) == dict(zip("abc", "abc", strict=True))
+    assert pair(dict.fromkeys("abc", rocks["a"]), equal) == dict(zip("abc", "abc", strict=True))
 
 
 def exported(folder: Path, meshes: dict[str, Mesh], name: str) -> Path:
@@ -162,15 +165,15 @@ def test_commands_on_a_file_of_several_meshes(tmp_path, monkeypatch, capfd, orig
     message = ("--key", "owner.key", "--message", "c0ff")
     told = workshop.json("embed", "a.glb", "b.glb", *message)
     assert list(told["meshes"]) == ["left", "right"]
-    assert list(told["left"]) == ["small"]
+    assert list(told["skipped"]) == ["small"]
     assert all(one["survives"]["whole"] > one["survives"]["half"] > 0 for one in told["meshes"].values())
     workshop.json("attack", "b.glb", "c.glb", "noise", "0.002")
     read = ("--original", "a.glb", "--key", "owner.key", "--record", "b.glb.jaxmark.json")
     found = workshop.json("detect", "c.glb", *read)
     assert found["message"] == "c0ff"
-    assert all(one["detected"] for one in found["meshes"].values())
+    assert all(one["detected"] for one in found["parts"].values())
     assert workshop.json("detect", "b.glb", *read, "--mesh", "right")["message"] == "c0ff"
-    assert workshop.json("detect", "a.glb", *read, status=1)["meshes"].keys() == found["meshes"].keys()
+    assert workshop.json("detect", "a.glb", *read, status=1)["parts"].keys() == found["parts"].keys()
     assert "no mesh 'wrong'" in workshop.refused("embed", "a.glb", "d.glb", *message, "--mesh", "wrong")
     picked = workshop.json("embed", "a.glb", "e.glb", *message, "--mesh", "left")
     assert list(picked["meshes"]) == ["left"]
@@ -179,7 +182,7 @@ def test_commands_on_a_file_of_several_meshes(tmp_path, monkeypatch, capfd, orig
     assert "faces" in workshop.refused("attack", "b.glb", "f.glb", "midpoint", "1")
     deposit = workshop.json("deposit", "b.glb.jaxmark.json", "--output", "d.json")
     assert deposit["records"] == 1
-    assert workshop.json("detect", "b.glb", *read, "--deposit", "d.json")["log10_p_deposited"] < -6
+    assert workshop.json("detect", "b.glb", *read, "--deposit", "d.json")["log10_p_timestamped"] < -6
 
 
 @pytest.mark.usefixtures("unchecked")

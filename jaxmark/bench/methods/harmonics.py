@@ -23,7 +23,7 @@ from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, vertex_normals, weld, weld_mesh
 from jaxmark.spectral.precision import einsum, matmul
 from jaxmark.watermark.carriers import ModulatedCarrier
-from jaxmark.watermark.perception.budget import Budget, write
+from jaxmark.watermark.perception.budget import Bounds, displace_within
 from jaxmark.watermark.reading.detectors import correlate
 
 HARMONICS = 20
@@ -79,11 +79,11 @@ class HarmonicMark:
     vectors: Float64[np.ndarray, "points bands"]
     pattern: Float64[np.ndarray, " bands"]  # at length 1
 
-    def embed(self, budget: Budget) -> Mesh:
-        """As strong as a budget allows; the tool itself takes a 200th of the mean edge length at most."""
+    def embed(self, bounds: Bounds) -> Mesh:
+        """As strong as bounds allow; the tool itself takes a 200th of the mean edge length at most."""
         made = carrier(self.vectors.astype(np.float32), self.points)
         shift = made.displacement(jnp.asarray(self.pattern, jnp.float32))
-        return write(self.original, np.asarray(shift, np.float64), budget).mesh
+        return displace_within(self.original, np.asarray(shift, np.float64), bounds).mesh
 
     def correlation(self, suspect: Mesh, expected: float) -> float:
         """Of what the suspect shows with the pattern; 0 where the reader says beforehand that it is another shape.

@@ -74,7 +74,7 @@ def success(curves: Mapping[str, Robustness], unit: str, *, confidence: float = 
 
     Args:
         curves: results of `jaxmark.evaluation.robustness` for one attack, by the name of the line.
-        unit: unit of the attack's strength, as `jm.attacks.ATTACKS` has it.
+        unit: unit of the attack's strength, as `jm.adversaries.ATTACKS` has it.
         confidence: confidence level of the intervals, at each strength by itself.
 
     Raises:

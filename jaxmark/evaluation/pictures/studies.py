@@ -6,7 +6,7 @@ from typing import Any, Literal
 from jaxmark.evaluation._rates import LOG10_LEVEL, Control, Row, rates
 from jaxmark.extras import require
 from jaxmark.plot.figures import COLOURS, MARKERS, Picture, move_aside
-from jaxmark.watermark.evidence.bounds import MIN_LOG10_P
+from jaxmark.watermark.evidence.ledger import MIN_LOG10_P
 
 _LINE_STYLES = ("-", "--", "-.", (0, (3, 1, 1, 1, 1, 1)))
 _CONTROLS: dict[Control, str] = {"unmarked": "unmarked", "wrong-key": "another key"}

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Float64, Int
 
 from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, compact, edges, weld, weld_mesh
+from jaxmark.geometry.mesh import Mesh, edges
 from jaxmark.geometry.moments import Moments, surface_moments, volume_moments
 from jaxmark.spectral.bands import heat
 from jaxmark.spectral.chebyshev import filter
@@ -108,7 +108,6 @@ class FieldScheme:
         Raises:
             JaxmarkError: see `place` and `see`, of the suspect as it is.
         """
-        suspect = compact(weld_mesh(suspect, weld(suspect.vertices)))
         dtype = jnp.result_type(float)
         for steps in _UNDONE_STEPS:
             try:

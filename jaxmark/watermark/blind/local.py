@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Float64, Int, Int64
 
 from jaxmark.alignment.original import Original
 from jaxmark.geometry.connectivity import Rings
-from jaxmark.geometry.mesh import Mesh, check_faces, compact, diagonal, open_sides, weld, weld_mesh
+from jaxmark.geometry.mesh import Mesh, diagonal, open_sides
 from jaxmark.geometry.pose import Pose
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.laplacian import Laplacian
@@ -86,8 +86,6 @@ class LocalScheme:
         Raises:
             JaxmarkError: if the suspect is a point cloud, or has no extent.
         """
-        check_faces("A mark without an original", suspect)
-        suspect = compact(weld_mesh(suspect, weld(suspect.vertices)))
         size = diagonal(suspect)
         points, dtype = np.asarray(suspect.vertices, np.float64), jnp.result_type(float)
         operator, anchors = common_laplacian(suspect), _anchors(suspect, choices)

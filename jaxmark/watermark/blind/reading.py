@@ -1,4 +1,4 @@
-"""Reading without the original, and what it proves.
+"""Phases without the original, and what it proves.
 
 **The bound.** An anchor's phase is its value over the step, less its offset δ; c is the cosine of a whole turn of it.
 With the key's sign (-1)^b, of another subkey, and the code bit a of the anchor's slot, the score is S = Σ a (-1)^b c.
@@ -14,23 +14,24 @@ a geometry in the key's choices, as their reader has no original.
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh, check_faces, compact, weld, weld_mesh
 from jaxmark.geometry.pose import Pose
 from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.scheme import BlindScheme, Look
 from jaxmark.watermark.blind.search import moved, search
 from jaxmark.watermark.coding.keys import Choices, Key, bind
 from jaxmark.watermark.coding.message import decode_any, encode
-from jaxmark.watermark.evidence import bounds as evidence
-from jaxmark.watermark.marking import CLAIM_SHARE
-from jaxmark.watermark.record import Record
+from jaxmark.watermark.evidence import ledger
+from jaxmark.watermark.evidence.detection import Detection, Evidence, Tag, weigh
+from jaxmark.watermark.evidence.ledger import Choice
+from jaxmark.watermark.record import Record, is_recorded
 
 TAG_BITS = 40
 _CODE_SPREAD = 4  # code bits for each bit of message and tag, at least: of few anchors, few share one then
@@ -40,8 +41,8 @@ _CANDIDATES = 32  # messages of each reading whose tags are tried
 _SURE, _SURE_UNREAD = -12.0, -40.0
 
 
-class Reading(NamedTuple):
-    """One way in which a suspect may be read: a view, a turn, a step and a change of pose."""
+class Phases(NamedTuple):
+    """The phases of anchors in one way of reading a suspect: a view, a turn, a step and a change of pose."""
 
     view: Look
     turn: int
@@ -51,58 +52,24 @@ class Reading(NamedTuple):
     square: float  # Σ c²
     anchors: int  # that count
 
-
-class BlindDetection(NamedTuple):
-    """The result of reading a suspect without the original.
-
-    Attributes:
-        scheme: name of the scheme that it was read with.
-        message: the message that was read; None unless its keyed tag fits.
-        log10_p: log10 of a bound on the false-positive probability, in [-77, 0], if all that is claimed is dated.
-        log10_p_undated: the same if nothing is: for the best message of any of 2^64 keys.
-        log10_p_fitted: log10 of that probability if the score were Gaussian: an estimate, which decides nothing.
-        log10_p_unfloored: log10_p without the floor at -77: orders attacks and schemes, proves and decides nothing.
-        scores: soft values of the code bits, scaled to root mean square 1.
-        anchors: number of values that were read.
-        agreement: mean cosine of their phases, 1 if all are exactly where the mark put them.
-        width: of the averages, in the scheme's unit.
-        step: of the lattice of values, in the scheme's unit.
-        pose: from the suspect's file to where it was read.
-        version: version of the keyed choices that were read with.
-        doubts: why the probabilities are estimates, not proofs; empty if they are proofs.
-        remarks: what else the suspect looks like.
-    """
-
-    scheme: str
-    message: bytes | None
-    log10_p: float
-    log10_p_undated: float
-    log10_p_fitted: float
-    log10_p_unfloored: float
-    scores: Float64[np.ndarray, " code"]
-    anchors: int
-    agreement: float
-    width: float
-    step: float
-    pose: Pose
-    version: int
-    doubts: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
-
     @property
-    def premises(self) -> str:
-        """What must have been fixed before the suspect existed; a mesh marked under the same key is no such suspect."""
-        return "key, message and record"
+    def anchored(self) -> "Anchored":
+        """Where it is read."""
+        return Anchored(self.view.pose, self.view.width, self.step, self.anchors)
 
-    def detected(self, alpha: float = 1e-6) -> bool:
-        """Whether the false-positive probability is at most `alpha`, if all that is claimed is dated.
 
-        Raises:
-            JaxmarkError: if `alpha` is not in (0, 1).
-        """
-        if not 0 < alpha < 1:
-            raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
-        return self.log10_p <= math.log10(alpha)
+class Anchored(NamedTuple):
+    """Where a blind reading found its anchors: the `Registration` of a blind detection."""
+
+    pose: Pose  # from the suspect's file to where it was read
+    width: float = 0.0  # of the averages, in the scheme's unit
+    step: float = 0.0  # quantisation step of the values, in the scheme's unit
+    anchors: int = 0  # number of values that were read
+    agreement: float = 0.0  # mean cosine of their phases, 1 if all are exactly where the mark put them
+
+    def facts(self) -> dict[str, Any]:
+        """See `Registration`."""
+        return self._asdict() | {"pose": self.pose.facts()}
 
 
 def context(key: bytes, bits: int, scheme: str) -> Choices:
@@ -127,18 +94,28 @@ def codeword(message: bytes, choices: Choices) -> Float64[np.ndarray, " code"]:
     return encode(message, choices, code_length(8 * len(message)), TAG_BITS)
 
 
-def detect(
+def register(suspect: Mesh) -> Mesh:
+    """Weld a suspect and drop what no face uses, as `read` expects it; independent of the key.
+
+    Raises:
+        JaxmarkError: if it is a point cloud.
+    """
+    check_faces("A mark without an original", suspect)
+    return compact(weld_mesh(suspect, weld(suspect.vertices)))
+
+
+def read(
     suspect: Mesh,
     key: bytes,
     bits: int,
     scheme: BlindScheme,
     message: bytes | None = None,
     record: Record | None = None,
-) -> BlindDetection:
+) -> Detection:
     """Read a suspect without its original.
 
     Args:
-        suspect: any mesh.
+        suspect: from `register`.
         key: 32 bytes.
         bits: size of the payload in bits.
         scheme: the widths and steps to try.
@@ -146,26 +123,26 @@ def detect(
         record: the record of the mark, which was checked; it fixes the message, if it commits to one.
 
     Raises:
-        JaxmarkError: if the suspect is a point cloud, or has no extent.
+        JaxmarkError: if the suspect has no extent.
     """
     choices, length = context(Key(key), bits, scheme.name), code_length(bits)
-    claimed = b"" if message is None and not bits else message
-    tries = len(scheme.widths) * scheme.looks * len(scheme.steps) * _CHANGES
-    best = _nothing(scheme, choices, length)
+    claim = _Claim(choices, bits, b"" if message is None and not bits else message, record)
+    looks = len(scheme.widths) * scheme.looks * len(scheme.steps) * _CHANGES
+    best = _nothing(scheme, np.zeros(length), Anchored(Pose(np.eye(3), np.zeros(3))))
     before = 0  # messages whose tags were tried already
     for _, group in groupby(scheme.views(suspect, choices), key=lambda view: view.undone):
         readings = [one for view in group for one in _readings(view, scheme, choices, length)]
         if not readings:
             continue
-        found = _weigh(readings, scheme, choices, bits, claimed, record, tries, before)
+        found = _weigh(readings, scheme, claim, looks, before)
         before += len(readings) * _CANDIDATES
-        best = min(best, found, key=lambda one: (one.message is None, one.log10_p, -one.anchors))
+        best = min(best, found, key=lambda one: (one.message is None, one.log10_p, -one.registration.anchors))
         if is_sure(best):
             break
     return best
 
 
-def try_each(reads: Iterable[Callable[[], BlindDetection]]) -> Iterator[BlindDetection]:
+def try_each(reads: Iterable[Callable[[], Detection]]) -> Iterator[Detection]:
     """Read in several ways. One that refuses proves nothing: else who adds a part that is refused would hide a mark.
 
     Raises:
@@ -184,22 +161,18 @@ def try_each(reads: Iterable[Callable[[], BlindDetection]]) -> Iterator[BlindDet
         raise refusals[0]
 
 
-def best_of(found: Sequence[BlindDetection], tries: int) -> BlindDetection:
-    """Of several detections, one whose message reads, and then the one that proves most; all tries are paid for."""
+def best_of(found: Sequence[Detection], choice: Choice, tries: int) -> Detection:
+    """Return the detection whose message reads, and then the one that proves most, after a choice among `tries`."""
     best = min(found, key=lambda one: (one.message is None, one.log10_p))
-    return best._replace(
-        log10_p=evidence.share_of(best.log10_p, 1 / tries),
-        log10_p_undated=evidence.share_of(best.log10_p_undated, 1 / tries),
-        log10_p_unfloored=evidence.share_of(best.log10_p_unfloored, 1 / tries, evidence.UNFLOORED),
-    )
+    return best._replace(evidence=best.evidence.charged(choice.charge("each", tries)))
 
 
-def is_sure(found: BlindDetection) -> bool:
+def is_sure(found: Detection) -> bool:
     """Whether so much is proven that nothing else needs to be tried."""
     return found.log10_p <= (_SURE if found.message is not None else _SURE_UNREAD)
 
 
-def _readings(view: Look, scheme: BlindScheme, choices: Choices, length: int) -> list[Reading]:
+def _readings(view: Look, scheme: BlindScheme, choices: Choices, length: int) -> list[Phases]:
     """All ways of reading a view.
 
     Anchors of one name have one sign: the mean of their cosines is one term of the score.
@@ -230,82 +203,62 @@ def _readings(view: Look, scheme: BlindScheme, choices: Choices, length: int) ->
                 cosines = np.cos(2 * np.pi * (moved(view, change)[good] / step - offsets[turn, good]))
                 cosine = np.bincount(place, cosines) / np.bincount(place)
                 soft = np.bincount(dither.slot, dither.sign * cosine, length)
-                readings.append(Reading(view, turn, float(step), pilot, soft, float(cosine @ cosine), len(cosine)))
+                readings.append(Phases(view, turn, float(step), pilot, soft, float(cosine @ cosine), len(cosine)))
     return readings
 
 
-def _weigh(
-    readings: Sequence[Reading],
-    scheme: BlindScheme,
-    choices: Choices,
-    bits: int,
-    claimed: bytes | None,
-    record: Record | None,
-    tries: int,
-    before: int,
-) -> BlindDetection:
-    """What readings prove, of so many that might have been tried, after the tags of so many messages were tried."""
-    order = sorted(range(len(readings)), key=lambda place: -readings[place].pilot)
-    readings = [readings[place] for place in order]
+class _Claim(NamedTuple):
+    """What is looked for."""
+
+    choices: Choices
+    bits: int  # size of the payload
+    message: bytes | None  # that is claimed
+    record: Record | None
+
+
+def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks: int, before: int) -> Detection:
+    """Weigh readings, of so many that might have been tried, after the tags of so many messages were tried."""
+    readings = sorted(readings, key=lambda one: -one.pilot)
     soft = np.stack([one.soft for one in readings])
+    choices, bits, claimed, record = claim
     decoded = None if claimed == b"" else decode_any(soft, bits, choices, TAG_BITS, _CANDIDATES)
-    told = record is not None and bool(record.told)
-    fixed, share = claimed, 1.0
+    recorded = record is not None and bool(record.told)
+    message = claimed
     if decoded is not None and decoded.message != claimed:
-        fixed = decoded.message if told and record and record.commits_to(decoded.message, choices) else None
-    if claimed or told:  # what was fixed beforehand has nearly all of the probability, any other message the rest
-        share = CLAIM_SHARE if fixed is not None else 1 - CLAIM_SHARE
-    if decoded is None and fixed is None:
-        return _nothing(scheme, choices, code_length(bits), readings[0])
-    message = fixed if fixed is not None else decoded.message if decoded is not None else b""
+        message = decoded.message if is_recorded(record, decoded.message, choices) else None
+    fixed = message is not None
+    if decoded is None and not fixed:
+        return _nothing(scheme, readings[0].soft, readings[0].anchored)
+    if message is None:
+        message = decoded.message if decoded is not None else b""
     word = codeword(message, choices)
     # Readings are compared by what their scores prove.
     score, norm = soft @ word, np.sqrt([one.square for one in readings])
     chosen = int(np.argmax(np.maximum(score, 0) / np.maximum(norm, 1e-300)))
-    paid = math.log2(tries)
-    unknown = 0 if fixed is not None else bits
-    tag = [evidence.log10_p_tag(TAG_BITS, before + decoded.rank)] if decoded is not None and claimed is None else []
-
-    def proven(floor: float) -> float:
-        proofs = [evidence.log10_p_read(score[chosen], norm[chosen], unknown + paid, floor), *tag]
-        return evidence.share_of(evidence.any_of(*proofs, floor=floor), share, floor)
-
-    late = evidence.log10_p_read(score[chosen], norm[chosen], bits + paid)
+    charges = ()
+    if claimed or recorded:
+        charges = (ledger.BLIND_MESSAGE.charge("claimed or recorded" if fixed else "another"),)
+    tag = None
+    if decoded is not None and claimed is None:
+        tag = Tag(TAG_BITS, (ledger.RANK.charge("each", before + decoded.rank),))
+    ways = [(score[chosen], norm[chosen])]
     reading = readings[chosen]
-    remarks = []
-    if fixed is None and (claimed or told):
-        remarks.append(f"Another message of this key reads than the one {'claimed' if claimed else 'in the record'}.")
+    notes = []
+    if not fixed and (claimed or recorded):
+        notes.append(f"Another message of this key reads than the one {'claimed' if claimed else 'in the record'}.")
     if reading.view.undone:
-        remarks.append(f"It was read after {reading.view.undone} steps of smoothing were undone.")
+        notes.append(f"It was read after {reading.view.undone} steps of smoothing were undone.")
     if reading.view.mirrored[reading.turn]:
-        remarks.append("It is the mirror image of what was marked.")
-    return _nothing(scheme, choices, len(word), reading)._replace(
+        notes.append("It is the mirror image of what was marked.")
+    agreement = float(score[chosen] / reading.anchors)
+    return _nothing(scheme, reading.soft, reading.anchored._replace(agreement=agreement))._replace(
         message=None if decoded is None else decoded.message,
-        log10_p=proven(evidence.MIN_LOG10_P),
-        log10_p_undated=evidence.undated(evidence.share_of(late, share)),
-        log10_p_fitted=evidence.log10_p_fitted(score[chosen], norm[chosen], unknown + paid),
-        log10_p_unfloored=proven(evidence.UNFLOORED),
-        agreement=float(score[chosen] / reading.anchors),
-        remarks=tuple(remarks),
+        evidence=weigh(ways, bits=bits, fixed=fixed, tag=tag, charges=charges, looks=looks),
+        notes=tuple(notes),
     )
 
 
-def _nothing(scheme: BlindScheme, choices: Choices, length: int, reading: Reading | None = None) -> BlindDetection:
-    """A detection that proves nothing, of a reading."""
-    if reading is None:
-        pose = Pose(np.eye(3), np.zeros(3))
-        zeros = np.zeros(length)
-        return BlindDetection(scheme.name, None, 0.0, 0.0, 0.0, 0.0, zeros, 0, 0.0, 0.0, 0.0, pose, choices.version)
-    scores = reading.soft / (np.sqrt(np.mean(reading.soft**2)) or 1.0)
-    return BlindDetection(
-        scheme.name,
-        None,
-        *(0.0, 0.0, 0.0, 0.0),
-        scores,
-        reading.anchors,
-        0.0,
-        reading.view.width,
-        reading.step,
-        reading.view.pose,
-        choices.version,
-    )
+def _nothing(scheme: BlindScheme, soft: Float64[np.ndarray, " code"], anchored: Anchored) -> Detection:
+    """Make a detection that proves nothing."""
+    scores = soft / (np.sqrt(np.mean(soft**2)) or 1.0)
+    return Detection(None, Evidence(), anchored, scores, None, scheme.name, premises="key, message and record")

@@ -105,6 +105,10 @@ class BlindScheme(Protocol):
     def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:
         """Look at a suspect in all ways, the likeliest first.
 
+        Args:
+            suspect: from `jaxmark.watermark.blind.reading.register`.
+            choices: the keyed choices of the mark.
+
         Raises:
             JaxmarkError: if it cannot be looked at.
         """

@@ -27,9 +27,9 @@ from jaxmark.watermark.blind.prediction import Margin, margin, mean_cosine
 from jaxmark.watermark.blind.reading import TAG_BITS, codeword
 from jaxmark.watermark.blind.scheme import AnchoredHost, BlindScheme, Measured, measure
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.marking import DEFAULT_BITS, Survival
-from jaxmark.watermark.perception.budget import Budget, write
-from jaxmark.watermark.perception.capacity import NOISE
+from jaxmark.watermark.coding.message import DEFAULT_BITS
+from jaxmark.watermark.perception.budget import Bounds, displace_within
+from jaxmark.watermark.perception.capacity import NOISE, Survival
 from jaxmark.watermark.perception.masking import apply_mask, hiding_directions
 
 _RIDGE = 3e-3  # of the mean square of a row: values that contradict each other are met halfway
@@ -183,7 +183,7 @@ class Writer:
     def plan(
         self,
         word: Float64[np.ndarray, " code"],
-        budget: Budget,
+        bounds: Bounds,
         reference: distortion.Reference,
         bits: int,
     ) -> Plan:
@@ -196,7 +196,7 @@ class Writer:
             JaxmarkError: if there is nothing to write in, or the budget allows not even the least step.
         """
         fitting = []
-        for allowance in self.allowances(word, budget, reference):
+        for allowance in self.allowances(word, bounds, reference):
             if steps := self.steps(allowance):
                 fitting.append(allowance.plan(max(steps)))
         if not fitting:
@@ -209,7 +209,7 @@ class Writer:
     def write(
         self,
         word: Float64[np.ndarray, " code"],
-        budget: Budget,
+        bounds: Bounds,
         bits: int,
         reference: distortion.Reference | None = None,
     ) -> Written:
@@ -217,7 +217,7 @@ class Writer:
 
         Args:
             word: the code bits, ±1.
-            budget: the bounds to keep.
+            bounds: the bounds to keep.
             bits: size of the payload in bits.
             reference: what limits are measured against, if not the original.
 
@@ -225,10 +225,10 @@ class Writer:
             JaxmarkError: see `plan`.
         """
         reference = reference or distortion.Reference(self.original.mesh)
-        plan = self.plan(word, budget, reference, bits)
+        plan = self.plan(word, bounds, reference, bits)
         targets = plan.host.values - plan.alpha * plan.step * self.off(plan.host, plan.dither, word, plan.step)
         shift = self.shift(plan.host, targets, _ROUNDS)
-        written = write(self.original, shift, budget, reference, first=plan.size)
+        written = displace_within(self.original, shift, bounds, reference, first=plan.size)
         mesh, moved, alpha = written.mesh, written.moved, plan.alpha * written.scale
         if alpha > 1:  # beyond the lattice, values would be off again
             mesh, alpha = displace(self.original, shift / plan.alpha), 1.0
@@ -236,7 +236,7 @@ class Writer:
         return Written(mesh, moved, plan._replace(alpha=alpha))
 
     def allowances(
-        self, word: Float64[np.ndarray, " code"], budget: Budget, reference: distortion.Reference
+        self, word: Float64[np.ndarray, " code"], bounds: Bounds, reference: distortion.Reference
     ) -> list[Allowance]:
         """How much a budget allows with each width that there is anything to write with."""
         found: list[Allowance] = []
@@ -249,7 +249,7 @@ class Writer:
             size = float(distortion.rms(shift[self.original.used]))
             if math.isfinite(size) and size > 0:
                 first = found[-1].size if found else None
-                scale = write(self.original, shift, budget, reference, first=first, share=_ENOUGH).scale
+                scale = displace_within(self.original, shift, bounds, reference, first=first, share=_ENOUGH).scale
                 found.append(Allowance(width, host.step * scale, size * scale, host, dither))
         return found
 
@@ -275,16 +275,16 @@ class Writer:
 
         return Survival(strongest(1.0), strongest(0.5 if self.scheme.in_parts else 0.0))
 
-    def capacity(self, budget: Budget, noise: float) -> int:
+    def capacity(self, bounds: Bounds, noise: float) -> int:
         """The largest payload in bits, a multiple of 8, that is predicted to read in noise; 0 if not even 8.
 
         Args:
-            budget: bounds on the distortion by the mark.
+            bounds: on the distortion by the mark.
             noise: half width of uniform noise over the mean distance of the vertices to their centre.
         """
         word = codeword(bytes(DEFAULT_BITS // 8), self.choices)
         try:
-            plan = self.plan(word, budget, distortion.Reference(self.original.mesh), 0)
+            plan = self.plan(word, bounds, distortion.Reference(self.original.mesh), 0)
         except JaxmarkError:
             return 0
         spread, bits = self._spread(plan.host) * noise / NOISE, 0

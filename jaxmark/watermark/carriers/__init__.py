@@ -4,15 +4,15 @@
 `ModulatedCarrier` writes them on components of the host such as `host_bands` and `eigenspaces`.
 """
 
-from jaxmark.watermark.carriers.eigen import Eigenspaces as Eigenspaces
-from jaxmark.watermark.carriers.eigen import eigenspaces as eigenspaces
-from jaxmark.watermark.carriers.host import HostBands as HostBands
-from jaxmark.watermark.carriers.host import host_bands as host_bands
+from jaxmark.watermark.carriers.components import Components as Components
+from jaxmark.watermark.carriers.components import Eigenspaces as Eigenspaces
+from jaxmark.watermark.carriers.components import HostBands as HostBands
+from jaxmark.watermark.carriers.components import eigenspaces as eigenspaces
+from jaxmark.watermark.carriers.components import host_bands as host_bands
 from jaxmark.watermark.carriers.keyed import Chips as Chips
 from jaxmark.watermark.carriers.keyed import KeyedCarrier as KeyedCarrier
 from jaxmark.watermark.carriers.keyed import KeyedReader as KeyedReader
 from jaxmark.watermark.carriers.keyed import make_chips as make_chips
-from jaxmark.watermark.carriers.modulated import Components as Components
 from jaxmark.watermark.carriers.modulated import ModulatedCarrier as ModulatedCarrier
 from jaxmark.watermark.carriers.modulated import PlainReader as PlainReader
 from jaxmark.watermark.interfaces import Carrier as Carrier

@@ -11,17 +11,17 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Int64, PRNGKeyArray
+from jaxtyping import Array, Float, Int, Int64
 
 from jaxmark.alignment.observation import Observation, observe
 from jaxmark.errors import JaxmarkError
+from jaxmark.seeds import Seed, probe_signs, random_key
 from jaxmark.spectral.chebyshev import band_energies, filter, transpose
 from jaxmark.spectral.laplacian import per_row
 from jaxmark.spectral.precision import matmul, sum_and_norm
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.interfaces import Claim, Displacement, Room, Strength, check_strength
 from jaxmark.watermark.perception.masking import apply_mask
-from jaxmark.watermark.probes import probe_signs
 from jaxmark.watermark.reading.reception import (
     Host,
     Receiver,
@@ -106,10 +106,10 @@ class KeyedCarrier(NamedTuple):
         reader = self.reader()
         return reader.claim(reader.receive(seen), bits)
 
-    def redraw(self, key: PRNGKeyArray) -> "KeyedCarrier":
+    def redraw(self, seed: Seed) -> "KeyedCarrier":
         """See `Carrier`; the slots stay as they are, and so do signs of 0, on vertices that do not move."""
         moving = jnp.abs(jnp.asarray(self.chips.signs)).astype(jnp.int8)
-        signs = moving * jax.random.rademacher(key, moving.shape, jnp.int8)
+        signs = moving * jax.random.rademacher(random_key(seed), moving.shape, jnp.int8)
         return self._replace(chips=self.chips._replace(signs=signs))
 
     def with_bands(

@@ -1,38 +1,19 @@
 """Carriers that modulate components, which are fixed displacements of the vertices, by keyed sequences of signs."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxmark.alignment.observation import Observation
+from jaxmark.seeds import Seed, random_key
 from jaxmark.spectral.precision import einsum, sum_and_norm
+from jaxmark.watermark.carriers.components import Components
 from jaxmark.watermark.interfaces import Claim, Displacement, Strength, check_strength
-
-
-@runtime_checkable
-class Components(Protocol):
-    """The displacements that a carrier adds up: one vector [N] per band and coordinate.
-
-    They are fixed by the original and must not depend on the key.
-    """
-
-    @property
-    def gram(self) -> Float[Array, "3 bands bands"]:
-        """D inner products of the components, per coordinate."""
-        ...
-
-    def synthesise(self, amplitudes: Float[Array, "bands 3"]) -> Displacement:
-        """Add up the components: Σ_j amplitude_jc · component_jc for each coordinate c."""
-        ...
-
-    def analyse(self, residual: Displacement) -> Float[Array, "bands 3"]:
-        """Apply the D-adjoint of `synthesise`: ⟨residual_c, component_jc⟩_D for each band j and coordinate c."""
-        ...
 
 
 class PlainReader(NamedTuple):
@@ -112,9 +93,9 @@ class ModulatedCarrier(NamedTuple):
             found = found.sum(axis=1, keepdims=True)
         return Claim(*sum_and_norm(einsum("k,kjc->jc", self._as_real(bits), self._as_real(self.sequences)) * found))
 
-    def redraw(self, key: PRNGKeyArray) -> "ModulatedCarrier":
+    def redraw(self, seed: Seed) -> "ModulatedCarrier":
         """See `Carrier`."""
-        return self._replace(sequences=jax.random.rademacher(key, jnp.shape(self.sequences), jnp.int8))
+        return self._replace(sequences=jax.random.rademacher(random_key(seed), jnp.shape(self.sequences), jnp.int8))
 
     def reader(self) -> PlainReader:
         """See `Carrier`."""

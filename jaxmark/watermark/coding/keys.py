@@ -1,8 +1,8 @@
 """Keys, and the integer sequences that derive from a key, a context and a label; on the host.
 
-Every keyed choice is SHAKE-256(key ‖ context ‖ "jaxmark/version/label"): two meshes marked under one key share nothing,
+Every keyed choice is SHAKE-256(key ‖ context ‖ "jaxmark/2/label"): two meshes marked under one key share nothing,
 and no choice tells anything about another. The results are plain integer arrays, which traced code gets as data,
-because JAX does not promise that its random streams stay the same from version to version.
+because JAX does not promise that its random streams stay the same.
 """
 
 import hashlib
@@ -19,8 +19,7 @@ from jaxtyping import Int8, Int64
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import read_file
 
-SCHEME_VERSION = 2  # version of the keyed choices of new marks
-VERSIONS = (2, 1)  # versions that are read, the newest first
+SCHEME_VERSION = 2  # version of the keyed choices and of records
 KEY_BYTES = 32
 _MAX_FILE_BYTES = 4096  # of a key file, which has 65
 
@@ -96,25 +95,23 @@ def load_key(path: str | os.PathLike[str]) -> Key:
 
 @dataclass(frozen=True)
 class Choices:
-    """All keyed choices of one mark: what derives from its key, and from what the mark is bound to.
+    """All keyed choices of one mark: what derives from its key, and from all that reading it uses, see `bind`.
 
-    In version 1 that is the hash of the original's geometry; since version 2 a hash of all that reading uses, see
-    `bind`. Who changes any of it gets other choices, which know nothing of these.
+    Whoever changes any of that gets other choices, which are independent of these.
     """
 
     key: Key
     context: bytes  # what the choices are bound to
-    version: int = SCHEME_VERSION  # version of the keyed choices
 
     def derive(self, label: str, size: int, data: bytes = b"") -> bytes:
-        """Derive bytes: SHAKE-256(key ‖ context ‖ "jaxmark/version/label"), with ‖ 0 ‖ data appended if given.
+        """Derive bytes: SHAKE-256(key ‖ context ‖ "jaxmark/2/label"), with ‖ 0 ‖ data appended if given.
 
         Args:
             label: the purpose of the bytes.
             size: number of bytes.
             data: what else the bytes depend on.
         """
-        message = self.key + self.context + f"jaxmark/{self.version}/{label}".encode()
+        message = self.key + self.context + f"jaxmark/{SCHEME_VERSION}/{label}".encode()
         return hashlib.shake_256(message + b"\0" + data if data else message).digest(size)
 
     def signs(self, label: str, count: int) -> Int8[np.ndarray, " count"]:
@@ -128,24 +125,21 @@ class Choices:
         return np.argsort(words, kind="stable").astype(np.int64)
 
 
-def bind(key: bytes, geometry: bytes, fixed: Mapping[str, Any], version: int = SCHEME_VERSION) -> Choices:
+def bind(key: bytes, geometry: bytes, fixed: Mapping[str, Any]) -> Choices:
     """Bind the keyed choices of a mark to its original, and to everything else that reading uses.
 
     Args:
         key: 32 bytes.
         geometry: hash of the original's geometry.
-        fixed: all else that reading uses, such as scheme and payload: values that JSON has. Version 1 does not bind it.
-        version: version of the keyed choices.
+        fixed: all else that reading uses, such as scheme and payload: values that JSON has.
 
     Raises:
         JaxmarkError: if there is a value that JSON does not have, or the key is not 32 bytes.
     """
-    if version == 1:
-        return Choices(Key(key), geometry, version)
-    state = hashlib.sha256(f"jaxmark/{version}/context".encode())
+    state = hashlib.sha256(f"jaxmark/{SCHEME_VERSION}/context".encode())
     state.update(geometry)
     state.update(canonical_json(fixed))
-    return Choices(Key(key), state.digest(), version)
+    return Choices(Key(key), state.digest())
 
 
 def canonical_json(value: Mapping[str, Any]) -> bytes:
@@ -163,5 +157,5 @@ def canonical_json(value: Mapping[str, Any]) -> bytes:
 
 
 def commitment(key: bytes) -> str:
-    """Compute a hash that commits to a key without revealing it, hexadecimal; the same in all versions."""
-    return Choices(Key(key), b"", 1).derive("commitment", 32).hex()
+    """Compute a hash that commits to a key without revealing it, hexadecimal."""
+    return hashlib.shake_256(Key(key) + b"jaxmark/1/commitment").hexdigest(32)

@@ -13,6 +13,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.coding import polar
 from jaxmark.watermark.coding.keys import Choices
 
+DEFAULT_BITS = 64  # size of the payload
 TAG_BITS = 28
 CANDIDATES = 64  # number of messages whose tags the decoder tries
 
@@ -43,6 +44,18 @@ def code_length(bits: int, places: int, spread: int) -> int:
     return length
 
 
+def check_size(message: bytes, bits: int) -> None:
+    """Check that a message has exactly the payload's size.
+
+    Raises:
+        JaxmarkError: if it is not bytes, or of another size.
+    """
+    if not isinstance(message, bytes):
+        raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
+    if 8 * len(message) != bits:
+        raise JaxmarkError(f"The message has {8 * len(message)} bits, but the payload is {bits} bits.")
+
+
 def encode(message: bytes, choices: Choices, length: int, tag_bits: int = TAG_BITS) -> Float64[np.ndarray, " length"]:
     """Encode a message and its keyed tag as a codeword of signs: a code bit 0 is +1, a 1 is -1.
 
@@ -62,12 +75,8 @@ class Decoded(NamedTuple):
     """A message whose keyed tag fits."""
 
     message: bytes
-    rank: float  # how many messages were tried, this one included: chance fits its tag with rank · 2^-(size of tag)
+    rank: int  # how many messages were tried, this one included: chance fits its tag with rank · 2^-(size of tag)
     row: int = 0  # which of several readings it is from
-
-    def paid(self, share: float) -> "Decoded":
-        """The same, if only this share of the probability was left for it and others were tried with the rest."""
-        return self._replace(rank=self.rank / share)
 
 
 def decode(

@@ -1,29 +1,27 @@
-"""What a score proves: probabilities of false detection that hold for any suspect independent of the key.
+"""Formulas: bounds on the probability that a score is reached by a mesh that is independent of the key.
 
-All results but that of `log10_p_fitted` are log10 of an upper bound on the probability, at most 0, and at least -77: a
-256-bit key supports no claim below 2⁻²⁵⁶. With `floor=UNFLOORED` the same formulas go on below it: what they give there
-orders attacks and schemes, but no claim rests on it. Pass scores and norms in the dtype that they were summed in: the
-largest error that `precision.sum_and_norm` can make in it is subtracted from the score, so that rounding makes no
-probability too small.
+All results but that of `log10_p_gaussian` are log10 of an upper bound on the probability, at most 0, without a floor:
+`jaxmark.watermark.evidence.ledger` adds the cost of every choice, and the floor of a 256-bit key. Pass scores and norms
+in the dtype that they were summed in: the largest error that `precision.sum_and_norm` can make in it is subtracted from
+the score, so that rounding makes no probability too small.
 """
 
 import math
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Float64
 from numpy.typing import ArrayLike
 from scipy.special import log_ndtr  # scipy.stats takes long to import
 
 from jaxmark.spectral.precision import matmul
 
-MIN_LOG10_P = -77.0
-UNFLOORED = -math.inf
-_LOG10_TRIES = 64 * math.log10(2)
+_CHERNOFF_THETAS = np.geomspace(1e-2, 1e3, 512)  # so dense that log10 p loses only a few ten-thousandths
 
 
-def log10_p_claimed(score: ArrayLike, norm: ArrayLike) -> float:
-    """log10 of a bound on P(S ≥ score) for a codeword that was claimed beforehand (Hoeffding 1963, Theorem 2).
+def log10_p_score(score: ArrayLike, norm: ArrayLike) -> float:
+    """Bound P(S ≥ score) for a codeword that was fixed beforehand (Hoeffding 1963, Theorem 2), as log10.
 
     For S = Σ s·a over keyed independent signs s, P(S ≥ t‖a‖) ≤ exp(-t²/2). This holds for any suspect, provided that
     the suspect, and with it a, is independent of the signs (a mesh marked under the same key is not); that weights,
@@ -31,113 +29,73 @@ def log10_p_claimed(score: ArrayLike, norm: ArrayLike) -> float:
     suspect was seen.
 
     Args:
-        score: S, the plain linear correlation of the claimed codeword.
+        score: S, the plain linear correlation of the codeword.
         norm: ‖a‖ of the same vector a that the signs multiply.
 
     Returns:
-        A finite number in [-77, 0]; 0 if the score is not positive or the residual is zero.
+        A number of at most 0; 0 if score or norm is not positive or not finite.
     """
-    return _clip(_log10_tail(score, norm))
-
-
-def log10_p_fitted_strengths(score: ArrayLike, norm: ArrayLike, strengths: int) -> float:
-    """log10 of a bound on P(S ≥ score) if relative strengths of bands were chosen after the suspect was seen.
-
-    With m strengths, a lies in a space of m dimensions that is free of the key, and the supremum of S/‖a‖ over it is
-    the length of the signs' projection: P(sup ≥ t) ≤ exp(-u²) with u = (√(2t² - m) - √m)/2 for t² ≥ m (Hsu, Kakade,
-    Zhang, "A tail inequality for quadratic forms of subgaussian random vectors", Electronic Communications in
-    Probability 17, 2012, Theorem 2.1).
-
-    Args:
-        score: S, the plain linear correlation of the claimed codeword.
-        norm: ‖a‖ of the same vector a that the signs multiply.
-        strengths: m, the number of strengths that were free.
-
-    Returns:
-        A finite number in [-77, 0].
-    """
-    square = -2 * math.log(10) * _log10_tail(score, norm)
-    if square < strengths:
-        return 0.0
-    return _clip(-(((math.sqrt(2 * square - strengths) - math.sqrt(strengths)) / 2) ** 2) / math.log(10))
-
-
-def undated(log10_p: float) -> float:
-    """log10 of a bound on the probability that any of 2^64 keys, originals or records is so good.
-
-    Whoever makes a claim that nothing dates may have tried as many; 2^64 hashes are about what can be paid for. What
-    need not be tried one by one is paid for in `log10_p`: all messages, see `log10_p_read`, and in version 1 all
-    strengths, see `log10_p_fitted_strengths`.
-    """
-    return _clip(log10_p + _LOG10_TRIES)
-
-
-def share_of(log10_p: float, share: float, floor: float = MIN_LOG10_P) -> float:
-    """log10 of the bound for a proof that has only a share of the probability, as others were possible in its place.
-
-    Proofs whose shares add up to 1 have the stated probability together (a weighted Bonferroni bound).
-    """
-    return _clip(log10_p - math.log10(share), floor)
-
-
-def log10_p_read(score: ArrayLike, norm: ArrayLike, bits: float, floor: float = MIN_LOG10_P) -> float:
-    """log10 of a bound on the probability that any of 2^bits possible codewords scores so high (union bound).
-
-    Args:
-        score: S, the plain linear correlation of the codeword that was read.
-        norm: ‖a‖ of the same vector a that the signs multiply.
-        bits: size of the payload in bits, without the tag, which the message determines; and the logarithm to base 2
-            of how many other choices were tried, if any were.
-        floor: the least result.
-
-    Returns:
-        A finite number in [floor, 0].
-    """
-    return _clip(bits * math.log10(2) + _log10_tail(score, norm), floor)
-
-
-def log10_p_tag(bits: int, candidates: float) -> float:
-    """log10 of a bound on the probability that one of several messages fits its keyed tag by chance (union bound).
-
-    The tag's subkey is independent of everything that chose the messages, so the probability is 2^-bits for each.
-
-    Args:
-        bits: size of the tag in bits.
-        candidates: number of messages tried, or as how many this one counts, see `Decoded.paid`.
-    """
-    return _clip(math.log10(candidates) - bits * math.log10(2))
-
-
-def any_of(*log10_p: float, floor: float = MIN_LOG10_P) -> float:
-    """log10 of a bound on the probability that the best of several proofs is as good as it is (Bonferroni)."""
-    return _clip(min(log10_p) + math.log10(len(log10_p)), floor)
-
-
-def log10_p_fitted(score: ArrayLike, norm: ArrayLike, bits: float = 0) -> float:
-    """log10 of the probability if S were Gaussian with standard deviation ‖a‖: close to the true one, but no bound.
-
-    Args:
-        score: S.
-        norm: ‖a‖.
-        bits: size of the payload in bits if the message was read; 0 if it was claimed.
-    """
-    s, a = float(np.asarray(score, np.float64)), float(np.asarray(norm, np.float64))
-    if not (a > 0 and math.isfinite(s) and math.isfinite(a)):
-        return 0.0
-    return min(0.0, float(log_ndtr(-s / a)) / math.log(10) + bits * math.log10(2))
-
-
-def _log10_tail(score: ArrayLike, norm: ArrayLike) -> float:
-    """log10 of exp(-S²/2‖a‖²); 0 if score or norm is not positive or not finite."""
-    s, a = float(np.asarray(score, np.float64)), float(np.asarray(norm, np.float64))
+    s, a = _as_floats(score, norm)
     if not (s > 0 and a > 0 and math.isfinite(s) and math.isfinite(a)):
         return 0.0
     rounding = 4 * float(np.finfo(np.result_type(np.asarray(score), np.asarray(norm), np.float16)).eps)
     return -(max(s / a - rounding * (1 + s / a), 0.0) ** 2) / 2 / math.log(10)
 
 
-def _clip(log10_p: float, floor: float = MIN_LOG10_P) -> float:
-    return min(0.0, max(floor, log10_p))
+def log10_p_tag(bits: int) -> float:
+    """Return log10 of the probability that one message fits its keyed tag by chance.
+
+    The tag's subkey is independent of everything that chose the message, so it is 2^-bits.
+
+    Args:
+        bits: size of the tag in bits.
+    """
+    return -bits * math.log10(2)
+
+
+def log10_p_gaussian(score: ArrayLike, norm: ArrayLike) -> float:
+    """Return log10 P(S ≥ score) if S were Gaussian with standard deviation ‖a‖: close to the true one, but no bound."""
+    s, a = _as_floats(score, norm)
+    if not (a > 0 and math.isfinite(s) and math.isfinite(a)):
+        return 0.0
+    return float(log_ndtr(-s / a)) / math.log(10)
+
+
+def log10_p_product(log10_p: Sequence[float]) -> float:
+    """Return log10 of the probability that a product of independent p-values is as small as it is.
+
+    A product of n such is at most q with probability q Σ (-ln q)^i/i! over i < n (Fisher 1932).
+    """
+    nats = -sum(log10_p) * math.log(10)
+    return sum(log10_p) + math.log10(sum(nats**power / math.factorial(power) for power in range(len(log10_p))))
+
+
+def log10_p_fingerprint(
+    score: Float[np.ndarray, " scores"], values: Float[np.ndarray, " slots"], biases: Float[np.ndarray, " slots"]
+) -> Float64[np.ndarray, " scores"]:
+    """Bound the probability that an innocent recipient has such a score (Chernoff 1952), as log10.
+
+    P(S ≥ s) ≤ E exp(θS) / exp(θs) for every θ ≥ 0; the terms of S are independent and two-valued, which gives E
+    exactly. The least of these bounds over a grid of θ is a bound, too, and the grid serves all scores at once.
+
+    Args:
+        score: s from `jaxmark.watermark.tracing.tardos.scores`, `[scores]`.
+        values: y, **independent of the recipient's codeword**, `[slots]`.
+        biases: p of each slot, `[slots]`.
+
+    Returns:
+        Numbers of at most 0, `[scores]`; all are 0 if all values are 0.
+    """
+    norm = np.linalg.norm(values)
+    if norm == 0:
+        return np.zeros(len(score))
+    tilts = _CHERNOFF_THETAS[:, None] * (values / norm / np.sqrt(biases * (1 - biases)))
+    logs = np.logaddexp(np.log(biases) + tilts * (1 - biases), np.log1p(-biases) - tilts * biases).sum(1)
+    return np.minimum((logs - np.outer(score / norm, _CHERNOFF_THETAS)).min(1) / math.log(10), 0.0)
+
+
+def _as_floats(score: ArrayLike, norm: ArrayLike) -> tuple[float, float]:
+    return float(np.asarray(score, np.float64)), float(np.asarray(norm, np.float64))
 
 
 def correlation_bound(

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from typing import Literal, NamedTuple
@@ -43,11 +44,12 @@ _MIN_LIMIT_SHARE = 0.99  # share of a limit that is as good as all of it
 _SECANT_STEPS = 10  # then bisection, which cannot fail
 
 
+#: The largest values of metrics, by their names in `distortion.METRICS` or by functions of your own.
 Limits = Mapping[str, float] | Mapping[Metric, float]
 
 
-class Budget(NamedTuple):
-    """Upper bounds on the distortion that a mark may cause; make one with `make_budget`."""
+class Bounds(NamedTuple):
+    """Upper bounds on the distortion of one mesh, from `Budget.bounds`."""
 
     rms: float | None  # RMS displacement of the welded vertices that faces use, unweighted, over the diagonal
     limits: Mapping[Metric, float]  # on metrics, by their names in `distortion.METRICS`, or on functions of your own
@@ -59,8 +61,92 @@ class Budget(NamedTuple):
         )
 
 
+@dataclass(frozen=True)
+class Budget:
+    """How strong a mark may be, and what it must survive. Without `rms`, `visibility` and `limits`, it is hidden.
+
+    Where a budget is expected, a number stands for `Budget(rms=...)`, a name for `Budget(visibility=...)`, a mapping
+    for `Budget(limits=...)`, and None for `Budget()`.
+
+    Attributes:
+        rms: RMS displacement of the welded vertices that faces use, unweighted, relative to the diagonal of their
+            axis-aligned bounding box, in (0, 1): 0.0008 is 0.08 % of it. Met exactly, unless a limit is reached first.
+        visibility: how well people may see the mark: `"hidden"`, `"careful look"` (seen beside the original) or
+            `"visible"`; see `visibility_of` for the limits that these stand for.
+        limits: the largest values that metrics of `distortion.METRICS` may reach, by name, in the units of
+            `distortion.Comparison`; or that metrics of your own may, by function (see `distortion.measure`).
+        noise: the noise that the message must survive when half of the vertices are lost, as half width over the mean
+            distance of the vertices to their centre; 0 requires only that there are enough dimensions, None nothing
+            but that the message reads. It has no effect for schemes whose readers have no model of noise.
+    """
+
+    rms: float | None = None
+    visibility: Visibility | None = None
+    limits: Limits | None = None
+    noise: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the fields.
+
+        Raises:
+            JaxmarkError: if there is no such metric or visibility, or a number is out of range.
+        """
+        if self.rms is not None and not 0 < self.rms < 1:
+            raise JaxmarkError(f"The budget is relative to the bounding box's diagonal and in (0, 1), got {self.rms}.")
+        if self.noise is not None and not 0 <= self.noise < math.inf:
+            raise JaxmarkError(f"The noise to survive is a number of at least 0, got {self.noise}.")
+        if self.visibility not in (None, *VISIBILITY):
+            raise JaxmarkError(f"visibility is one of {', '.join(map(repr, VISIBILITY))}, not {self.visibility!r}.")
+        for metric, limit in (self.limits or {}).items():
+            if isinstance(metric, str) and metric not in distortion.METRICS:
+                known = ", ".join(distortion.METRICS)
+                raise JaxmarkError(f"There is no metric {metric!r} to limit; there are {known}.")
+            if not 0 < limit < math.inf:
+                raise JaxmarkError(f"The limit of {name_of(metric)} must be a positive number, got {limit}.")
+        if self.rms is None and self.visibility is None and self.limits is not None and not self.limits:
+            raise JaxmarkError("A mark needs a budget or at least one limit.")
+
+    @classmethod
+    def of(cls, given: "BudgetLike") -> "Budget":
+        """Make a budget from a number, a name, limits or None; a budget is returned as it is.
+
+        Raises:
+            JaxmarkError: see `Budget`.
+        """
+        match given:
+            case Budget():
+                return given
+            case str():
+                return cls(visibility=given)
+            case Mapping():
+                return cls(limits=given)
+            case _:
+                return cls(rms=given)
+
+    def bounds(self, mesh: Mesh) -> Bounds:
+        """Return the bounds for a mesh: the least of the limits that are given and those of the visibility."""
+        is_hidden = self.rms is None and self.limits is None and self.visibility is None
+        name = "hidden" if is_hidden else self.visibility
+        wanted: dict[Metric, float] = {} if name is None else {**visibility_of(mesh)[name]}
+        for metric, limit in (self.limits or {}).items():
+            wanted[metric] = min(limit, wanted.get(metric, math.inf))
+        return Bounds(self.rms, wanted)
+
+    def __str__(self) -> str:
+        """The name by which a study calls the budget: `0.0008`, `hidden` or `dame=0.008`, or several of these."""
+        parts = [] if self.rms is None else [str(self.rms)]
+        parts += [] if self.visibility is None else [self.visibility]
+        parts += [f"{name_of(metric)}={limit}" for metric, limit in (self.limits or {}).items()]
+        parts += [] if self.noise is None else [f"noise={self.noise}"]
+        return " ".join(parts) or "hidden"
+
+
+#: What stands for a budget: see `Budget`.
+BudgetLike = Budget | float | Visibility | Limits | None
+
+
 class Written(NamedTuple):
-    """The result of `write`: a mesh displaced as far as a budget allows."""
+    """The result of `displace_within`: a mesh displaced as far as a budget allows."""
 
     mesh: Mesh  # the displaced mesh
     scale: float  # factor on the given displacement, in diagonals
@@ -91,49 +177,10 @@ def _mean_edge(mesh: Mesh) -> float:
     return float(np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1).mean()) / diagonal(mesh)
 
 
-def make_budget(
-    rms: float | None = None,
-    limits: Limits | None = None,
-    visibility: Visibility | None = None,
-    *,
-    named: Mapping[Visibility, Mapping[str, float]] = VISIBILITY,
-) -> Budget:
-    """Make a budget; if no argument is given but `named`, the mark is hidden.
-
-    Args:
-        rms: RMS displacement relative to the bounding box's diagonal, in (0, 1).
-        limits: the largest values of metrics, by their names in `distortion.METRICS` or by functions of your own.
-        visibility: a name in `VISIBILITY`, whose limits hold beside the others given.
-        named: the limits that names stand for, see `visibility_of`.
-
-    Raises:
-        JaxmarkError: if there is no such metric, or a number is out of range.
-    """
-    if rms is not None and not 0 < rms < 1:
-        raise JaxmarkError(f"The budget is relative to the bounding box's diagonal and in (0, 1), got {rms}.")
-    if rms is None and limits is None and visibility is None:
-        visibility = "hidden"
-    if visibility is not None and visibility not in named:
-        raise JaxmarkError(f"visibility is one of {', '.join(map(repr, named))}, not {visibility!r}.")
-    wanted: dict[Metric, float] = {**named[visibility]} if visibility is not None else {}
-    for metric, value in (limits or {}).items():
-        wanted[metric] = min(value, wanted.get(metric, math.inf))
-    checked: dict[Metric, float] = {}
-    for metric, value in wanted.items():
-        if isinstance(metric, str) and metric not in distortion.METRICS:
-            raise JaxmarkError(f"There is no metric {metric!r} to limit; there are {', '.join(distortion.METRICS)}.")
-        if not 0 < value < math.inf:
-            raise JaxmarkError(f"The limit of {name_of(metric)} must be a positive number, got {value}.")
-        checked[metric] = value
-    if rms is None and not checked:
-        raise JaxmarkError("A mark needs a budget or at least one limit.")
-    return Budget(rms, checked)
-
-
-def write(
+def displace_within(
     original: Original,
     shift: Float64[np.ndarray, "points 3"],
-    budget: Budget,
+    bounds: Bounds,
     reference: distortion.Reference | None = None,
     *,
     first: float | None = None,
@@ -144,7 +191,7 @@ def write(
     Args:
         original: the mesh to displace.
         shift: displacement of each point, in diagonals, up to a common factor; not all zero.
-        budget: the bounds to keep.
+        bounds: the bounds to keep.
         reference: of the original's mesh, if there is one already: limits are measured against it.
         first: RMS displacement in diagonals that is tried first, if there are limits; by default see `first_rms`.
         share: of the limits, as good as all of them: with less, fewer displacements are tried.
@@ -161,18 +208,18 @@ def write(
     def limit_ratio(metrics: Collection[Metric], rms: float) -> float:
         """The largest ratio of a metric to its limit."""
         found = compared.measure(displace(original, rms / size * shift), metrics)
-        return max((found[metric] or 0.0) / budget.limits[metric] for metric in metrics)
+        return max((found[metric] or 0.0) / bounds.limits[metric] for metric in metrics)
 
-    rms = most = budget.rms or _MAX_RMS
-    if budget.limits:
+    rms = most = bounds.rms or _MAX_RMS
+    if bounds.limits:
         first = first or first_rms(original.mesh)
         # What single edges tell is quickly found; mostly it is as little as all limits allow, and they are tried once.
-        for metrics in dict.fromkeys((tuple(one for one in budget.limits if one in LOCAL), tuple(budget.limits))):
+        for metrics in dict.fromkeys((tuple(one for one in bounds.limits if one in LOCAL), tuple(bounds.limits))):
             if metrics:
                 rms = largest_within(partial(limit_ratio, metrics), rms, first if rms == most else rms, share)
-        if budget.rms is None and rms == _MAX_RMS:
+        if bounds.rms is None and rms == _MAX_RMS:
             raise JaxmarkError(
-                f"Moved by {_MAX_RMS:g} of its diagonal, this mesh still keeps {budget}; give a budget, too."
+                f"Moved by {_MAX_RMS:g} of its diagonal, this mesh still keeps {bounds}; give a budget, too."
             )
     marked = displace(original, rms / size * shift)
     reached = distortion.DisplacementSize.of(shift_of(original, marked)[original.used])

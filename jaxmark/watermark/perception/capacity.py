@@ -16,9 +16,8 @@ from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key
 from jaxmark.watermark.coding.message import TAG_BITS
-from jaxmark.watermark.interfaces import Carrier, Reader, Room
-from jaxmark.watermark.perception.budget import Budget, write
-from jaxmark.watermark.schemes.scheme import Scheme
+from jaxmark.watermark.interfaces import Carrier, Reader, Room, Scheme
+from jaxmark.watermark.perception.budget import Bounds, displace_within
 
 _MAX_PAYLOAD_BYTES = 2**20  # if nothing else bounds the payload
 
@@ -29,7 +28,7 @@ _CODE_GAP_DB = 1.0
 NOISE = 0.005  # half width over the mean distance to the centre: the strongest noise of the SMI 2010 protocol
 COVERAGE = 0.5  # share of the vertices that may be left
 
-_GLIMPSE = 0.8  # share of a limit that is as good as all of it for a glimpse
+_ROUGH = 0.8  # share of a limit that is as good as all of it for an estimate
 _PROBES = 5  # marks that are tried to see how strong limits allow them to be
 _SPREADS, _MIN_SPREAD = 3, 0.007  # standard deviations of their logarithms that are subtracted, and the least of these
 
@@ -85,10 +84,20 @@ def needed_dimensions(bits: int) -> float:
     return max(2 * math.log(2) * bits + 28, 2.0 * (bits + TAG_BITS) if bits else 0.0)
 
 
+class Survival(NamedTuple):
+    """The strongest uniform noise that a mark survives: half width over the mean distance of vertices to the centre.
+
+    It is infinite for schemes whose readers have no model of noise.
+    """
+
+    whole: float  # if all vertices are left
+    half: float  # if half of them are lost
+
+
 class Conditions(NamedTuple):
     """The conditions under which a message must still be readable."""
 
-    budget: Budget  # bounds on the distortion by the mark
+    bounds: Bounds  # on the distortion by the mark
     noise: float  # half width of uniform noise over the mean distance of the vertices to their centre
     coverage: float  # share of the vertices that are left
 
@@ -208,37 +217,37 @@ class Capacity:
         points = self.original.positions[self.original.used]
         return float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean())
 
-    def reach(self, bits: int, budget: Budget) -> float:
-        """RMS displacement, in diagonals, that a budget surely allows a mark with a payload of `bits` bits."""
-        if budget.rms is not None and not budget.limits:
-            return budget.rms
+    def reach(self, bits: int, bounds: Bounds) -> float:
+        """RMS displacement, in diagonals, that bounds surely allow a mark with a payload of `bits` bits."""
+        if bounds.rms is not None and not bounds.limits:
+            return bounds.rms
         layout = self.scheme.layout(self.original, bits)
         if layout not in self._reached:
             carrier = self._carrier(bits)
-            reached = [self._write(carrier, word, budget) for word in range(_PROBES)]
+            reached = [self._write(carrier, word, bounds) for word in range(_PROBES)]
             # Marks under the same limits differ: by a percent where a limit is a mean, by ten where it is a percentile.
             logs = np.log(reached)
             spread = max(float(logs.std(ddof=1)), _MIN_SPREAD)
             self._reached[layout] = math.exp(logs.mean() - _SPREADS * spread)
         return self._reached[layout]
 
-    def glimpse(self, bits: int, budget: Budget, enough: float = math.inf) -> float:
-        """RMS displacement, in diagonals, that a budget about allows a mark, found with few displacements.
+    def estimate_reach(self, bits: int, bounds: Bounds, enough: float = math.inf) -> float:
+        """Estimate the RMS displacement, in diagonals, that bounds allow a mark, from few displacements.
 
         Args:
             bits: size of the payload in bits.
-            budget: the bounds to keep.
+            bounds: the bounds to keep.
             enough: what need not be exceeded.
         """
-        most = min(enough, budget.rms or math.inf)
-        bounds = budget._replace(rms=most if most < 1 else None)
-        return self._write(self._carrier(bits), 0, bounds, share=_GLIMPSE) if bounds.limits else most
+        most = min(enough, bounds.rms or math.inf)
+        bounds = bounds._replace(rms=most if most < 1 else None)
+        return self._write(self._carrier(bits), 0, bounds, share=_ROUGH) if bounds.limits else most
 
-    def _write(self, carrier: Carrier, word: int, budget: Budget, **options: float) -> float:
+    def _write(self, carrier: Carrier, word: int, bounds: Bounds, **options: float) -> float:
         """RMS displacement of a mark with one of several codewords."""
         signs = np.random.default_rng(word).choice([-1.0, 1.0], carrier.code_bits)
         probe = self.original.to_host(carrier.displacement(jnp.asarray(signs, self.original.signal.dtype)))
-        return write(self.original, probe, budget, self.reference, **options).moved.rms
+        return displace_within(self.original, probe, bounds, self.reference, **options).moved.rms
 
     @cached_property
     def reference(self) -> distortion.Reference:
@@ -254,7 +263,7 @@ class Capacity:
 
         def fits(size: int) -> bool:
             least = self.least_budget(8 * size, conditions)
-            return least == 0 or (math.isfinite(least) and least <= self.reach(8 * size, conditions.budget))
+            return least == 0 or (math.isfinite(least) and least <= self.reach(8 * size, conditions.bounds))
 
         least, most = 0, 1
         while fits(most) and most < _MAX_PAYLOAD_BYTES:

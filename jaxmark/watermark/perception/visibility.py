@@ -8,9 +8,9 @@ from jaxtyping import Array, Float, Float64
 from jaxmark import distortion
 from jaxmark.alignment.original import Original, displace
 from jaxmark.distortion import Metric
+from jaxmark.seeds import probe_signs
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.watermark.perception.masking import apply_mask
-from jaxmark.watermark.probes import probe_signs
 
 _SAMPLED_BANDS = 16  # visibility varies smoothly from one band to the next
 _FIRST_RMS = 1e-3  # displacement in diagonals that is tried first

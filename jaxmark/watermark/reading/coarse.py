@@ -32,8 +32,7 @@ from jaxmark.alignment.original import Original
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.simplified import simplify
 from jaxmark.geometry.surfaces import Surface
-from jaxmark.watermark.carriers.keyed import KeyedCarrier
-from jaxmark.watermark.interfaces import Displacement
+from jaxmark.watermark.interfaces import ChipCarrier, Displacement
 from jaxmark.watermark.perception.budget import first_rms
 from jaxmark.watermark.reading.reception import Extent, Reception, nuisance_basis
 
@@ -47,7 +46,7 @@ _STEPS, _TOLERANCE = 40, 1e-2  # of conjugate gradients
 
 
 def receive_coarse(
-    carrier: KeyedCarrier, original: Original, there: VertexHeights, received: Reception
+    carrier: ChipCarrier, original: Original, there: VertexHeights, received: Reception
 ) -> Reception | None:
     """Receive a suspect by the heights of its vertices, in place of closest points; independent of the key.
 
@@ -112,14 +111,14 @@ def receive_coarse(
     )
 
 
-def _any_mark(carrier: KeyedCarrier, number: int) -> Displacement:
+def _any_mark(carrier: ChipCarrier, number: int) -> Displacement:
     """A mark of unit strength, of signs that are not keyed."""
     ones = jnp.ones(carrier.code_bits, carrier.host.signal.dtype)
-    return carrier.redraw(jax.random.key(number)).displacement(ones)
+    return carrier.redraw(number).displacement(ones)
 
 
 @jax.jit
-def _covariance(carrier: KeyedCarrier, x: Displacement) -> Float[Array, "vertices 3"]:
+def _covariance(carrier: ChipCarrier, x: Displacement) -> Float[Array, "vertices 3"]:
     """T Tᵀ x; signs cancel, but for those of chips that do not move."""
     coefficients = carrier.coefficients(1.0)
     moving = jnp.abs(jnp.asarray(carrier.chips.signs)).astype(x.dtype)
@@ -135,7 +134,7 @@ class Errors(NamedTuple):
 
 
 def model_errors(
-    carrier: KeyedCarrier,
+    carrier: ChipCarrier,
     original: Original,
     there: VertexHeights,
     elsewhere: Sequence[VertexHeights],

@@ -3,9 +3,8 @@
 `correlate` and `decorrelate` work with any carrier; `joint` needs the reader of a keyed carrier, which knows its host.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -14,16 +13,11 @@ from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.seeds import probe_signs
 from jaxmark.spectral.chebyshev import filter, transpose
 from jaxmark.spectral.precision import matmul
-from jaxmark.watermark.carriers.keyed import KeyedReader
-from jaxmark.watermark.interfaces import Reader, Received, Strength
-from jaxmark.watermark.probes import probe_signs
+from jaxmark.watermark.interfaces import ChipCarrier, Reader, Received, Strength
 from jaxmark.watermark.reading.reception import Reception, clean, whitening
-
-#: A function of a reader, what it received from a suspect, and the strengths' profile as embedded; returns one soft
-#: value per bit.
-Detector = Callable[[Any, Any, Strength], Float[Array, " bits"]]
 
 # The conjugate gradients of joint decoding stop here: what remains to be gained is below the noise of the soft values.
 _MAX_ITERATIONS = 12
@@ -84,16 +78,16 @@ def joint(reader: Reader, received: Any, beta: Strength = 1.0) -> Float[Array, "
     Raises:
         JaxmarkError: if it is not the reader of a keyed carrier.
     """
-    if not isinstance(reader, KeyedReader):
+    if not isinstance(received, Reception):
         raise JaxmarkError(f"The joint detector reads keyed carriers, not {type(reader.carrier).__name__}.")
     return _decode_jointly(reader, received, beta, _TOLERANCE, _MAX_ITERATIONS)
 
 
 @partial(jax.jit, static_argnames=("tolerance", "steps"))
 def _decode_jointly(
-    reader: KeyedReader, received: Reception, beta: Strength, tolerance: float, steps: int
+    reader: Reader, received: Reception, beta: Strength, tolerance: float, steps: int
 ) -> Float[Array, " bits"]:
-    carrier, receiver = reader.carrier, received.receiver
+    carrier, receiver = cast(ChipCarrier, reader.carrier), received.receiver
     model = carrier.coefficients(beta, received.gain)
     equaliser = whitening(receiver, received.power)
 

@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmark.alignment.observation import Observation
+from jaxmark.seeds import probe_signs
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import band_components, filter, gram, over_bands
 from jaxmark.spectral.laplacian import Laplacian, per_row
 from jaxmark.spectral.precision import check_precision, einsum, matmul
-from jaxmark.watermark.probes import probe_signs
 
 # Sixteen steps halfway to the neighbours' mean: over about a hundred points.
 _AROUND = (np.polynomial.chebyshev.Chebyshev([0.5, -0.5]) ** 16).coef

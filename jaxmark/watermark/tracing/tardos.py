@@ -15,7 +15,8 @@ from jaxtyping import Float, Float64, Int8
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.evidence.bounds import MIN_LOG10_P
+from jaxmark.watermark.evidence.detection import accuse
+from jaxmark.watermark.evidence.ledger import UNFLOORED, Charge, figure
 
 Slots = Float[np.ndarray, " slots"]
 
@@ -30,7 +31,6 @@ MIN_BIAS_LEVEL = 12
 _ANGLES = [math.asin(math.sqrt((level - 0.5) / 256)) for level in range(MIN_BIAS_LEVEL, 258 - MIN_BIAS_LEVEL)]
 _THRESHOLDS = np.array([round(2**32 * (a - _ANGLES[0]) / (_ANGLES[-1] - _ANGLES[0])) for a in _ANGLES[1:-1]], np.uint32)
 
-_CHERNOFF_THETAS = np.geomspace(1e-2, 1e3, 512)  # so dense that log10 p loses only a few ten-thousandths
 _CHUNK_RECIPIENTS = 1024  # whose codewords are in memory at a time
 
 
@@ -40,7 +40,11 @@ class Accusation(NamedTuple):
     recipient: str  # identifier
     score: float  # of mean 0 and variance 1 for innocents
     log10_p: float  # log10 of a bound on the probability that any innocent among those tried has such a score
-    doubts: tuple[str, ...] = ()  # why the probability is an estimate, not proven; empty if it is
+    caveats: tuple[str, ...] = ()  # why the probability is an estimate, not a proof; empty if it is a proof
+
+    def charged(self, *charges: Charge) -> "Accusation":
+        """Charge further choices, see `jaxmark.watermark.evidence.ledger`."""
+        return self._replace(log10_p=figure(self.log10_p, charges, UNFLOORED))
 
 
 def biases(choices: Choices, length: int) -> Float64[np.ndarray, " slots"]:
@@ -101,28 +105,6 @@ def scores(
     return words.astype(np.float64) @ weights - (2 * biases_ - 1) @ weights
 
 
-def log10_p(score: Float[np.ndarray, " scores"], values: Slots, biases_: Slots) -> Float64[np.ndarray, " scores"]:
-    """log10 of a bound on the probability that an innocent recipient has such a score (Chernoff 1952).
-
-    P(S ≥ s) ≤ E exp(θS) / exp(θs) for every θ ≥ 0; the terms of S are independent and two-valued, which gives E
-    exactly. The least of these bounds over a grid of θ is a bound, too, and the grid serves all scores at once.
-
-    Args:
-        score: s from `scores`, `[scores]`.
-        values: y, **independent of the recipient's codeword**, `[slots]`.
-        biases_: p, `[slots]`.
-
-    Returns:
-        Numbers in [-77, 0], `[scores]`; all are 0 if all values are 0.
-    """
-    norm = np.linalg.norm(values)
-    if norm == 0:
-        return np.zeros(len(score))
-    tilts = _CHERNOFF_THETAS[:, None] * (values / norm / np.sqrt(biases_ * (1 - biases_)))
-    logs = np.logaddexp(np.log(biases_) + tilts * (1 - biases_), np.log1p(-biases_) - tilts * biases_).sum(1)
-    return np.clip((logs - np.outer(score / norm, _CHERNOFF_THETAS)).min(1) / math.log(10), MIN_LOG10_P, 0.0)
-
-
 def rank(values: Slots, recipients: Iterable[str], choices: Choices, *, top: int = 10) -> list[Accusation]:
     """Find the recipients with the highest scores, and how surely they are not innocent.
 
@@ -148,8 +130,8 @@ def rank(values: Slots, recipients: Iterable[str], choices: Choices, *, top: int
     for i in range(0, len(tried), _CHUNK_RECIPIENTS):
         found[i : i + _CHUNK_RECIPIENTS] = scores(y, p, codewords(tried[i : i + _CHUNK_RECIPIENTS], choices, p))
     best = np.argsort(-found, kind="stable")[:top]
-    bounds = np.minimum(log10_p(found[best], y, p) + math.log10(max(len(tried), 1)), 0.0)
-    return [Accusation(tried[i], float(found[i]), float(bound)) for i, bound in zip(best, bounds, strict=True)]
+    log10_p = accuse(found[best], y, p, len(tried))
+    return [Accusation(tried[i], float(found[i]), float(bound)) for i, bound in zip(best, log10_p, strict=True)]
 
 
 def _remove_trend(y: np.ndarray, p: np.ndarray) -> np.ndarray:

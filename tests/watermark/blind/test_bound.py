@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from jaxmark.confidence import clopper_pearson
 from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.reading import context
-from jaxmark.watermark.evidence.bounds import log10_p_claimed
+from jaxmark.watermark.evidence.bounds import log10_p_score
 
 PAIRS, ANCHORS = 30_000, 80
 LEVELS = (1e-1, 1e-2, 1e-3, 1e-4)
@@ -30,7 +30,7 @@ def hits(score: Float64[np.ndarray, " pairs"], square: Float64[np.ndarray, " pai
     """How many pairs state a probability at most as small as each level."""
     norm = np.sqrt(square)
     near = score > 2 * norm  # no other states a tenth
-    stated = np.array([log10_p_claimed(*pair) for pair in zip(score[near], norm[near], strict=True)])
+    stated = np.array([log10_p_score(*pair) for pair in zip(score[near], norm[near], strict=True)])
     return {level: int(np.sum(stated <= math.log10(level))) for level in LEVELS}
 
 

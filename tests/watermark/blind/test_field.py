@@ -171,8 +171,8 @@ def test_a_message_is_read_without_the_original(marked, key: jm.Key, mirrored: b
     found = jm.detect(turned(mesh, mirrored), key=key, bits=32, scheme=SCHEME)
     assert found.message == MESSAGE
     assert found.log10_p < -15
-    assert found.agreement > 0.6
-    assert ("It is the mirror image of what was marked." in found.remarks) == mirrored
+    assert found.registration.agreement > 0.6
+    assert ("It is the mirror image of what was marked." in found.notes) == mirrored
 
 
 @pytest.mark.parametrize("attack", [("noise", 0.003), ("smoothing", 10), ("quantisation", 9), ("simplification", 0.5)])
@@ -206,7 +206,9 @@ def test_nothing_is_detected_where_nothing_is(shape: Mesh, marked, key: jm.Key, 
     mesh, info = marked
     assert not jm.detect(shape, key=key, message=claimed, record=info.record).detected(1e-3)
     step = info.record.parameters["step"]
-    assert not reading.detect(mesh, jm.Key(bytes(32)), 32, SCHEME.fixed(WIDTH, step), claimed).detected(1e-3)
+    assert not reading.read(reading.register(mesh), jm.Key(bytes(32)), 32, SCHEME.fixed(WIDTH, step), claimed).detected(
+        1e-3
+    )
 
 
 @pytest.mark.long
@@ -222,7 +224,7 @@ def test_values_do_not_go_beyond_the_lattice(shape: Mesh, key: jm.Key):
     assert info.record.beta == 1
     assert info.rms < 1e-3
     assert jm.compare(shape, marked, ("rms",)).rms == pytest.approx(info.rms, rel=1e-3)
-    assert jm.detect(marked, key=key, bits=32, scheme=scheme).agreement > 0.95
+    assert jm.detect(marked, key=key, bits=32, scheme=scheme).registration.agreement > 0.95
 
 
 def test_a_claimed_message_is_proven_or_refuted(marked, key: jm.Key):
@@ -232,7 +234,7 @@ def test_a_claimed_message_is_proven_or_refuted(marked, key: jm.Key):
     assert claimed.log10_p < read.log10_p
     other = jm.detect(mesh, key=key, message=bytes(4), scheme=SCHEME)
     assert other.message == MESSAGE
-    assert other.remarks
+    assert other.notes
     with pytest.raises(jm.JaxmarkError, match="commits to another message"):
         jm.detect(mesh, key=key, record=info.record, message=bytes(4))
 
@@ -266,11 +268,11 @@ def test_refusals(shape: Mesh, marked, key: jm.Key, sphere: Mesh, unchecked):
 
 @pytest.mark.long
 def test_capacity_is_what_embed_takes(shape: Mesh, key: jm.Key):
-    bits = jm.capacity(shape, 6e-4, noise=0.001, scheme=SCHEME)
+    bits = jm.capacity(shape, jm.Budget(rms=6e-4, noise=0.001), scheme=SCHEME)
     assert bits >= 32
-    assert jm.capacity(shape, 6e-4, noise=0.05, scheme=SCHEME) == 0
+    assert jm.capacity(shape, jm.Budget(rms=6e-4, noise=0.05), scheme=SCHEME) == 0
     message = bytes(range(bits // 8))
-    marked, _ = jm.embed(shape, message, key, budget=6e-4, scheme=SCHEME, noise=0.001)
+    marked, _ = jm.embed(shape, message, key, budget=jm.Budget(rms=6e-4, noise=0.001), scheme=SCHEME)
     assert jm.detect(jm.attack(marked, "noise", 0.001, seed=0), key=key, bits=bits, scheme=SCHEME).message == message
 
 

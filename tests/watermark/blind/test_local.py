@@ -16,7 +16,7 @@ from jaxmark.watermark import EmbedInfo, LocalScheme
 from jaxmark.watermark.blind import local, reading
 from jaxmark.watermark.blind.reading import context
 from jaxmark.watermark.blind.scheme import measure
-from jaxmark.watermark.combined import unite
+from jaxmark.watermark.markers import unite
 from tests.app.test_cli import MESSAGE as CLI_MESSAGE
 from tests.app.test_cli import Workshop
 from tests.dense import laplacian_matrix
@@ -157,7 +157,7 @@ def test_several_marks_are_read_each_alone_and_united(key: jm.Key):
     informed = jm.detect(suspect, key=key, message=MESSAGE, original=mesh)
     both = jm.detect(suspect, key=key, message=MESSAGE, original=mesh, scheme=schemes)
     assert both.log10_p == pytest.approx(unite(informed, [blind]).log10_p)
-    assert both.log10_p_unfloored < min(informed.log10_p_unfloored, blind.log10_p_unfloored)
+    assert both.evidence.log10_p_unfloored < min(one.evidence.log10_p_unfloored for one in (informed, blind))
     nats = -(informed.log10_p + blind.log10_p) * math.log(10)
     assert both.log10_p == pytest.approx(max(-77, (math.log1p(nats) - nats) / math.log(10)))
     assert jm.detect(marked, key=key, bits=8, scheme="local").message == MESSAGE
@@ -193,6 +193,6 @@ def test_commands_for_several_marks(shape: Mesh, tmp_path: Path, monkeypatch, ca
     assert (blind["message"], blind["scheme"]) == (CLI_MESSAGE, "local")
     both = workshop.json("detect", "marked.ply", *key, "--original", "model.ply", "--scheme", "keyed,local")
     assert both["message"] == CLI_MESSAGE
-    assert any("'local' alone" in remark for remark in both["remarks"])
+    assert any("'local' alone" in remark for remark in both["notes"])
     assert "not one of" in workshop.refused("embed", "model.ply", "x.ply", *key, "--scheme", "keyed,nothing")
     assert "an informed one" in workshop.refused("embed", "model.ply", "x.ply", *key, "--scheme", "field,keyed")

@@ -93,21 +93,21 @@ def test_key_files(tmp_path):
     key = jm.new_key()
     old = os.umask(0)
     try:
-        jm.save_key(key, path)
+        jm.watermark.save_key(key, path)
     finally:
         os.umask(old)
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    assert jm.load_key(path) == key
+    assert jm.watermark.load_key(path) == key
     with pytest.raises(JaxmarkError, match="never overwritten"):
-        jm.save_key(jm.new_key(), path)
-    assert jm.load_key(path) == key
+        jm.watermark.save_key(jm.new_key(), path)
+    assert jm.watermark.load_key(path) == key
     for content in (b"", b"12" * 31, b"zz" * 32, b"\xff\xfe", key):
         bad = tmp_path / "bad.key"
         bad.write_bytes(content)
         with pytest.raises(JaxmarkError, match="no key file") as refusal:
-            jm.load_key(bad)
+            jm.watermark.load_key(bad)
         assert key.hex() not in str(refusal.value)
     with pytest.raises(JaxmarkError, match="cannot be read"):
-        jm.load_key(tmp_path / "absent")
+        jm.watermark.load_key(tmp_path / "absent")
     with pytest.raises(JaxmarkError, match="cannot be written"):
-        jm.save_key(key, tmp_path / "no" / "folder.key")
+        jm.watermark.save_key(key, tmp_path / "no" / "folder.key")

@@ -11,7 +11,7 @@ import jaxmark as jm
 from jaxmark.alignment.original import make_original
 from jaxmark.app import cli
 from jaxmark.geometry.mesh import Mesh, make_mesh
-from jaxmark.watermark.perception.budget import VISIBILITY, largest_within, make_budget, visibility_of, write
+from jaxmark.watermark.perception.budget import VISIBILITY, displace_within, largest_within, visibility_of
 from tests.samples import rough_sphere
 
 MESSAGE = b"\xa5\x5a"
@@ -32,16 +32,16 @@ def noise(mesh: Mesh) -> np.ndarray:
 def test_a_limit_is_reached_and_never_passed(name, mesh: Mesh, noise: np.ndarray):
     original = make_original(mesh)
     goal = 0.02 if name in ("dame", "fmpd", "msdm") else 3e-4
-    written = write(original, noise, make_budget(limits={name: goal}))
+    written = displace_within(original, noise, jm.Budget(limits={name: goal}).bounds(mesh))
     assert 0.98 * goal <= jm.compare(mesh, written.mesh)._asdict()[name] <= goal
 
 
 def test_the_tightest_of_several_bounds_counts(mesh: Mesh, noise: np.ndarray):
     original = make_original(mesh)
-    for budget in (make_budget(1e-4, {"dame": 1.0}), make_budget(1e-4)):
-        assert write(original, noise, budget).moved.rms == pytest.approx(1e-4)
-    budget = make_budget(0.5, {"dame": 0.01, "msdm": 0.9})
-    found = jm.compare(mesh, write(original, noise, budget).mesh)
+    for budget in (jm.Budget(rms=1e-4, limits={"dame": 1.0}), jm.Budget(rms=1e-4)):
+        assert displace_within(original, noise, budget.bounds(mesh)).moved.rms == pytest.approx(1e-4)
+    budget = jm.Budget(rms=0.5, limits={"dame": 0.01, "msdm": 0.9}).bounds(mesh)
+    found = jm.compare(mesh, displace_within(original, noise, budget).mesh)
     assert 0.0098 <= (found.dame or 0) <= 0.01
     assert (found.msdm or 0) <= 0.9
 
@@ -57,19 +57,19 @@ def largest_stretch(original: Mesh, distorted: Mesh) -> float:
 
 
 def test_a_metric_of_ones_own_can_be_limited(mesh: Mesh, noise: np.ndarray, key: jm.Key):
-    budget = make_budget(limits={largest_stretch: 0.02, "max": 0.1})
+    budget = jm.Budget(limits={largest_stretch: 0.02, "max": 0.1}).bounds(mesh)
     assert str(budget) == "largest_stretch of at most 0.02 and max of at most 0.1"
-    found = largest_stretch(mesh, write(make_original(mesh), noise, budget).mesh)
+    found = largest_stretch(mesh, displace_within(make_original(mesh), noise, budget).mesh)
     assert 0.98 * 0.02 <= found <= 0.02
-    marked, _ = jm.embed(mesh, MESSAGE, key, limits={largest_stretch: 0.02}, noise=0)
+    marked, _ = jm.embed(mesh, MESSAGE, key, budget=jm.Budget(limits={largest_stretch: 0.02}, noise=0))
     assert 0.98 * 0.02 <= largest_stretch(mesh, marked) <= 0.02
     with pytest.raises(jm.JaxmarkError, match="The limit of largest_stretch must be a positive number"):
-        make_budget(limits={largest_stretch: 0.0})
+        jm.Budget(limits={largest_stretch: 0.0})
 
 
 @pytest.mark.slow
 def test_without_a_word_the_mark_stays_below_what_people_notice(mesh: Mesh, key: jm.Key):
-    marked, info = jm.embed(mesh, MESSAGE, key, noise=0)
+    marked, info = jm.embed(mesh, MESSAGE, key, budget=jm.Budget(noise=0))
     found = jm.compare(mesh, marked, ["shading", "dame", "stretch", "rms"])
     limits = visibility_of(mesh)["hidden"]
     assert limits.keys() == VISIBILITY["hidden"].keys()
@@ -103,12 +103,12 @@ def test_the_largest_size_is_found_for_any_rising_metric(rising):
 @pytest.mark.slow
 def test_capacity_under_limits_is_that_of_the_displacement_they_allow(mesh: Mesh, key: jm.Key):
     noise = 0.005
-    most = jm.capacity(mesh, limits={"dame": 0.02}, noise=noise)
-    assert 8 <= most < jm.capacity(mesh, limits={"dame": 0.04}, noise=noise)
-    _, info = jm.embed(mesh, bytes(most // 8), key, limits={"dame": 0.02}, noise=noise)
-    assert jm.capacity(mesh, info.rms, noise=noise) >= most
+    most = jm.capacity(mesh, jm.Budget(limits={"dame": 0.02}, noise=noise))
+    assert 8 <= most < jm.capacity(mesh, jm.Budget(limits={"dame": 0.04}, noise=noise))
+    _, info = jm.embed(mesh, bytes(most // 8), key, budget=jm.Budget(limits={"dame": 0.02}, noise=noise))
+    assert jm.capacity(mesh, jm.Budget(rms=info.rms, noise=noise)) >= most
     with pytest.raises(jm.JaxmarkError, match=f"carries at most {most} bits at dame of at most 0.02,"):
-        jm.embed(mesh, bytes(most // 8 + 3), key, limits={"dame": 0.02}, noise=noise)
+        jm.embed(mesh, bytes(most // 8 + 3), key, budget=jm.Budget(limits={"dame": 0.02}, noise=noise))
 
 
 @pytest.mark.slow
@@ -149,14 +149,14 @@ def test_limits_from_the_shell(mesh: Mesh, tmp_path, monkeypatch, capsys):
 )
 def test_budgets_out_of_range_are_refused(budget, limits, sentence):
     with pytest.raises(jm.JaxmarkError, match=sentence):
-        make_budget(budget, limits)
+        jm.Budget(rms=budget, limits=limits)
 
 
 def test_limits_that_bind_nothing_are_refused_without_a_budget(mesh: Mesh, noise: np.ndarray):
     original = make_original(mesh)
     with pytest.raises(jm.JaxmarkError, match="give a budget"):
-        write(original, noise, make_budget(limits={"rms": 0.5}))
+        displace_within(original, noise, jm.Budget(limits={"rms": 0.5}).bounds(mesh))
     # Three triangles without a common edge have no dihedral angle.
     loose = make_original(make_mesh(np.random.default_rng(0).normal(size=(9, 3)), np.arange(9).reshape(3, 3)))
     with pytest.raises(jm.JaxmarkError, match="give a budget"):
-        write(loose, np.ones((9, 3)) * [1, 2, 3], make_budget())
+        displace_within(loose, np.ones((9, 3)) * [1, 2, 3], jm.Budget().bounds(loose.mesh))

@@ -13,7 +13,7 @@ from jaxmark.alignment.original import make_original
 from jaxmark.geometry.mesh import Mesh, make_mesh, vertex_normals
 from jaxmark.spectral.bands import scaling
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.perception.budget import make_budget
+from jaxmark.watermark.perception.budget import Bounds
 from jaxmark.watermark.perception.capacity import (
     Capacity,
     Conditions,
@@ -23,11 +23,11 @@ from jaxmark.watermark.perception.capacity import (
     worth,
 )
 from jaxmark.watermark.reading.reception import make_receiver
-from jaxmark.watermark.schemes.scheme import KeyedScheme
+from jaxmark.watermark.schemes.keyed import KeyedScheme
 from tests.dense import chebyshev_matrices
 from tests.samples import bumpy_sphere, rough_sphere
 
-USUAL = Conditions(make_budget(8e-4), noise=0.005, coverage=0.5)
+USUAL = Conditions(Bounds(8e-4, {}), noise=0.005, coverage=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +146,7 @@ def test_least_budget_scales(known: Capacity):
     least = known.least_budget(16, USUAL)
     assert known.least_budget(16, USUAL._replace(noise=0.015)) == pytest.approx(3 * least, rel=1e-9)
     assert known.least_budget(16, USUAL._replace(noise=0.0)) == 0
-    assert known.least_budget(16, USUAL._replace(budget=make_budget(1e-9))) == least
+    assert known.least_budget(16, USUAL._replace(bounds=Bounds(1e-9, {}))) == least
     # As 1/√coverage, but for the interference of the bits, which a smaller coverage raises.
     whole = known.least_budget(16, USUAL._replace(coverage=1.0))
     assert 1.05 * math.sqrt(2) < least / whole < 2
@@ -160,7 +160,7 @@ def test_least_budget_scales(known: Capacity):
 @pytest.mark.slow
 def test_bits_are_monotone(coarse: Capacity):
     rising = {
-        "budget": [coarse.bits(USUAL._replace(budget=make_budget(b))) for b in (1e-4, 4e-4, 8e-4, 1.2e-3, 1.6e-3)],
+        "budget": [coarse.bits(USUAL._replace(bounds=Bounds(rms, {}))) for rms in (1e-4, 4e-4, 8e-4, 1.2e-3, 1.6e-3)],
         "noise": [coarse.bits(USUAL._replace(noise=n)) for n in (0.1, 0.01, 0.005, 0.003, 0.002)],
         "coverage": [coarse.bits(USUAL._replace(coverage=c)) for c in (0.05, 0.3, 0.5, 0.7, 1.0)],
     }
@@ -175,7 +175,7 @@ def test_bits_are_monotone(coarse: Capacity):
 @pytest.mark.parametrize("budget", [8e-4, 1.16e-3, 1.5e-3])
 def test_bits_is_the_largest_payload(budget, coarse: Capacity):
     """No larger one fits, and every smaller one does."""
-    conditions = USUAL._replace(budget=make_budget(budget))
+    conditions = USUAL._replace(bounds=Bounds(budget, {}))
     most = coarse.bits(conditions)
     assert most > 0
     for bits in range(8, 400, 8):
@@ -211,23 +211,23 @@ def test_what_is_stated_is_kept(thousand: Mesh, known: Capacity, key: jm.Key):
     most = jm.capacity(thousand, 8e-4)
     assert most == known.bits(USUAL)
     noise = USUAL.noise
-    jm.embed(thousand, bytes(most // 8), key, budget=8e-4, noise=noise)
+    jm.embed(thousand, bytes(most // 8), key, budget=jm.Budget(rms=8e-4, noise=noise))
     larger = bytes(most // 8 + 1)
     with pytest.raises(jm.JaxmarkError) as refusal:
-        jm.embed(thousand, larger, key, budget=8e-4, noise=noise)
+        jm.embed(thousand, larger, key, budget=jm.Budget(rms=8e-4, noise=noise))
     stated = re.search(r"at most (\d+) bits .* not (\d+)\. .*at least ([0-9.e-]+\d)\.$", str(refusal.value))
     assert stated is not None
     assert int(stated[1]) == most
     assert int(stated[2]) == most + 8
     least = known.least_budget(most + 8, USUAL)
     assert float(stated[3]) == pytest.approx(least, rel=0.05)
-    jm.embed(thousand, larger, key, budget=float(stated[3]), noise=noise)
+    jm.embed(thousand, larger, key, budget=jm.Budget(rms=float(stated[3]), noise=noise))
     with pytest.raises(jm.JaxmarkError, match="carries at most"):
-        jm.embed(thousand, larger, key, budget=0.99 * least, noise=noise)
+        jm.embed(thousand, larger, key, budget=jm.Budget(rms=0.99 * least, noise=noise))
     # Where nothing but the noise asked for is too much, less of it is accepted.
-    jm.embed(thousand, larger, key, budget=8e-4, noise=0.99 * 0.005 * 8e-4 / least)
+    jm.embed(thousand, larger, key, budget=jm.Budget(rms=8e-4, noise=0.99 * 0.005 * 8e-4 / least))
     with pytest.raises(jm.JaxmarkError, match=r"carries at most \d+ bits .* Use a shorter message\.$"):
-        jm.embed(thousand, bytes(110), key, budget=8e-4, noise=noise)
+        jm.embed(thousand, bytes(110), key, budget=jm.Budget(rms=8e-4, noise=noise))
 
 
 @pytest.mark.parametrize("bits", [16, 24, 48])
@@ -235,7 +235,7 @@ def test_a_stated_least_budget_is_never_below_the_least(bits, thousand: Mesh, kn
     """What a refusal names is rounded, but upwards."""
     marker = jm.make_marker(thousand, key, bits=bits)
     with pytest.raises(jm.JaxmarkError) as refusal:
-        marker.embed(bytes(bits // 8), 1e-5, noise=USUAL.noise)
+        marker.embed(bytes(bits // 8), jm.Budget(rms=1e-5, noise=USUAL.noise))
     stated = float(re.search(r"at least ([0-9.e-]+\d)\.$", str(refusal.value))[1])
     least = known.least_budget(bits, USUAL)
     assert least <= stated < 1.001 * least

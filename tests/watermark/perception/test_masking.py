@@ -16,12 +16,13 @@ from jaxmark.distortion import stretch, texture_drift
 from jaxmark.geometry.mesh import Mesh, edges, face_normals, make_mesh
 from jaxmark.watermark.carriers import KeyedCarrier
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.perception.budget import VISIBILITY, make_budget
+from jaxmark.watermark.perception.budget import VISIBILITY, visibility_of
 from jaxmark.watermark.perception.masking import hiding_directions
 from jaxmark.watermark.perception.visibility import band_visibility
-from jaxmark.watermark.schemes.scheme import KeyedScheme, get_scheme, parameters_of
+from jaxmark.watermark.schemes.keyed import KeyedScheme
+from jaxmark.watermark.schemes.registry import make_scheme, parameters_of
 from tests.distortion.test_shading import sheet
-from tests.samples import rough_sphere
+from tests.samples import bumpy_sphere, rough_sphere
 
 pytestmark = pytest.mark.core
 
@@ -178,9 +179,9 @@ def test_planes_stay_plane(key: jm.Key):
     # Without a record, as the scheme's defaults are.
     assert jm.detect(suspect, original=mesh, key=key, bits=40).message == b"plane"
     plain = jm.make_marker(mesh, key, bits=40, scheme=KeyedScheme(hiding=False))
-    isotropic, told = plain.write(plain.codeword(b"plane"), make_budget())
+    isotropic, told = plain.write(plain.codeword(b"plane"), None)
     assert told.rms < info.rms / 3
-    assert plain.glance(plain.observe(isotropic)) == b"plane"
+    assert plain.read_quickly(plain.observe(isotropic)) == b"plane"
 
 
 def test_capacity_counts_the_dimensions_that_are_left(key: jm.Key):
@@ -202,14 +203,17 @@ def test_capacity_counts_the_dimensions_that_are_left(key: jm.Key):
 
 @pytest.mark.usefixtures("unchecked")
 def test_visibility_has_names():
-    assert make_budget() == make_budget(visibility="hidden")
-    assert make_budget(limits={"dame": 1.0}, visibility="visible").limits == {**VISIBILITY["visible"]}
-    assert make_budget(1e-3, visibility="careful look").rms == 1e-3
-    assert make_budget(1e-3).limits == {}
+    mesh = bumpy_sphere(3)
+    assert visibility_of(mesh)["hidden"]["shading"] == VISIBILITY["hidden"]["shading"]
+    assert jm.Budget().bounds(mesh) == jm.Budget(visibility="hidden").bounds(mesh)
+    visible = jm.Budget(limits={"dame": 1.0}, visibility="visible").bounds(mesh)
+    assert visible.limits == {**visibility_of(mesh)["visible"]}
+    assert jm.Budget(rms=1e-3, visibility="careful look").bounds(mesh).rms == 1e-3
+    assert jm.Budget(rms=1e-3).bounds(mesh).limits == {}
     for name in ("shading", "dame", "stretch"):
         assert VISIBILITY["hidden"][name] < VISIBILITY["careful look"][name] < VISIBILITY["visible"][name]
     with pytest.raises(jm.JaxmarkError, match="visibility is one of 'hidden', 'careful look', 'visible'"):
-        make_budget(visibility="invisible")  # pyright: ignore[reportArgumentType]
+        jm.Budget(visibility="invisible")  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.slow
@@ -223,9 +227,9 @@ def test_what_bands_show_is_measured_as_they_are_hidden():
 
 def test_records_keep_how_a_mark_was_hidden():
     assert parameters_of(KeyedScheme())["hiding"] is True
-    assert get_scheme("keyed", parameters_of(KeyedScheme())) == KeyedScheme()
+    assert make_scheme("keyed", parameters_of(KeyedScheme())) == KeyedScheme()
     before = {name: value for name, value in parameters_of(KeyedScheme()).items() if name != "hiding"}
-    assert get_scheme("keyed", before) == KeyedScheme(hiding=False)
+    assert make_scheme("keyed", before) == KeyedScheme(hiding=False)
 
 
 def test_a_texture_drifts_as_far_as_its_surface_moves():

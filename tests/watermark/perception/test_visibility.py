@@ -13,7 +13,8 @@ from jaxmark.spectral.chebyshev import filter
 from jaxmark.watermark.carriers import KeyedCarrier
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.perception.visibility import band_visibility
-from jaxmark.watermark.schemes.scheme import KeyedScheme, get_scheme, parameters_of
+from jaxmark.watermark.schemes.keyed import KeyedScheme
+from jaxmark.watermark.schemes.registry import make_scheme, parameters_of
 from tests.samples import rough_sphere
 
 pytestmark = pytest.mark.core
@@ -52,9 +53,9 @@ def test_rough_regions_mask_more(half_rough: Mesh):
 def test_masking_by_roughness_is_no_longer_read():
     fields = parameters_of(KeyedScheme())
     assert fields["masking"] is False
-    assert get_scheme("keyed", fields) == KeyedScheme()
+    assert make_scheme("keyed", fields) == KeyedScheme()
     with pytest.raises(jm.JaxmarkError, match="no longer read"):
-        get_scheme("keyed", {**fields, "masking": True})
+        make_scheme("keyed", {**fields, "masking": True})
 
 
 def test_a_profile_is_what_is_written(half_rough: Mesh, key: jm.Key, dtype):
@@ -83,11 +84,11 @@ def test_a_profile_is_what_is_written(half_rough: Mesh, key: jm.Key, dtype):
 def test_profiles_pass_through_records(half_rough: Mesh, key: jm.Key, tmp_path):
     profile = (0.2, 0.7, 1.0, 1.0, 1.0, 0.5, 0.25, 0.125, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1)
     scheme = KeyedScheme(profile=profile)
-    marked, info = jm.embed(half_rough, b"\x5a", key, scheme=scheme, noise=0)
+    marked, info = jm.embed(half_rough, b"\x5a", key, budget=jm.Budget(noise=0), scheme=scheme)
     file = tmp_path / "record.json"
     file.write_text(info.record.to_json())
     record = jm.Record.load(file)
-    assert get_scheme(record.scheme, record.parameters) == scheme
+    assert make_scheme(record.scheme, record.parameters) == scheme
     assert jm.detect(marked, original=half_rough, key=key, record=record).message == b"\x5a"
     with pytest.raises(jm.JaxmarkError, match="takes the parameters"):
-        get_scheme("keyed", parameters_of(scheme) | {"profile": ["1"]})
+        make_scheme("keyed", parameters_of(scheme) | {"profile": ["1"]})

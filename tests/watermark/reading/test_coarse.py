@@ -13,7 +13,9 @@ from jaxmark.geometry.mesh import Mesh, face_normals
 from jaxmark.geometry.simplified import simplify
 from jaxmark.geometry.surfaces import Surface
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
-from jaxmark.watermark.marking import Marker
+from jaxmark.watermark.evidence import ledger
+from jaxmark.watermark.markers import NonBlindMarker
+from jaxmark.watermark.nonblind import read
 from jaxmark.watermark.reading.coarse import receive_coarse
 from jaxmark.watermark.reading.reception import Reception
 from tests.samples import bumpy_sphere
@@ -25,13 +27,13 @@ SHAPE, MESSAGE = bumpy_sphere(4), b"ab"
 
 
 @cache
-def marker_of(number: int) -> Marker:
+def marker_of(number: int) -> NonBlindMarker:
     return jm.make_marker(SHAPE, jm.Key(bytes([number] * 32)), bits=16)
 
 
 @cache
 def suspect() -> Mesh:
-    marked = marker_of(3).embed(MESSAGE, 1e-3, noise=0)[0]
+    marked = marker_of(3).embed(MESSAGE, jm.Budget(rms=1e-3, noise=0))[0]
     return jm.attack(marked, "simplification", 0.9, seed=0)
 
 
@@ -52,7 +54,7 @@ def coarse(number: int) -> Reception:
     return found
 
 
-def ratio(marker: Marker, received: Reception) -> float:
+def ratio(marker: NonBlindMarker, received: Reception) -> float:
     """S/‖a‖ of the claim."""
     score, norm = marker.reader.claim(received, jnp.asarray(marker.codeword(MESSAGE), received.residual.dtype))
     return float(score) / float(norm)
@@ -66,19 +68,7 @@ def test_vertices_tell_what_closest_points_do_not():
     found = marker.detect(suspect())
     assert found.message == MESSAGE
     # With weights of one's own, which say nothing of vertices, only closest points are read.
-    assert marker.detect(aligned(), weights=np.ones(len(SHAPE.vertices))).message is None
-
-
-def test_marks_of_version_1_are_not_read_by_vertices(monkeypatch):
-    """Their record does not bind the strengths, on which these weights depend, but not those of closest points."""
-    calls = []
-    monkeypatch.setattr("jaxmark.watermark.marking.receive_coarse", lambda *_: calls.append(1))
-    for version in (1, 2):
-        marker = jm.make_marker(SHAPE, jm.Key(bytes([9] * 32)), bits=0, version=version)
-        seen = align(marker.original, suspect())
-        assert seen.heights is not None
-        assert not marker.detect(seen).detected()
-        assert len(calls) == version - 1
+    assert marker.read(aligned(), weights=np.ones(len(SHAPE.vertices))).message is None
 
 
 def test_no_key_takes_part():
@@ -96,20 +86,19 @@ def test_other_keys_prove_nothing():
 def test_the_price_is_paid():
     """What is read by vertices has a twentieth of the probability, and so much more has to be proven."""
     marker = marker_of(3)
-    claimed = marker.detect(aligned(), MESSAGE).log10_p
+    claimed = marker.read(aligned(), MESSAGE).log10_p
     alone = -(ratio(marker, coarse(3)) ** 2) / 2 / np.log(10)
     # One of twenty, two ways of weighing, which are the same here, and the shares of claim and alignment.
     price = np.log10(20 * 2 / 0.97**2)
     assert claimed == pytest.approx(alone + price, abs=0.02)
 
 
-def test_a_share_is_paid_for_and_no_more_than_all():
-    marker = marker_of(3)
-    half = marker.detect(aligned(), MESSAGE, share=0.5).log10_p_unfloored
-    assert half == pytest.approx(marker.detect(aligned(), MESSAGE).log10_p_unfloored + np.log10(2), abs=1e-6)
-    for share in (0.0, 1.5, float("nan")):
-        with pytest.raises(jm.JaxmarkError, match="share"):
-            marker.detect(aligned(), MESSAGE, share=share)
+def test_what_was_chosen_before_is_charged():
+    marker, half = marker_of(3), ledger.SCENE.charge("sum over meshes")
+    charged = read(marker, aligned(), MESSAGE, charges=(half,)).evidence
+    alone = marker.read(aligned(), MESSAGE).evidence
+    assert charged.log10_p_unfloored == pytest.approx(alone.log10_p_unfloored + np.log10(2), abs=1e-6)
+    assert charged.charges == (half, *alone.charges)
 
 
 def test_heights_are_those_of_a_plane():

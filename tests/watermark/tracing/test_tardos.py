@@ -10,14 +10,15 @@ from scipy import special, stats
 
 import jaxmark as jm
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.evidence.bounds import MIN_LOG10_P
+from jaxmark.watermark.evidence.bounds import log10_p_fingerprint
+from jaxmark.watermark.evidence.detection import accuse
+from jaxmark.watermark.evidence.ledger import MIN_LOG10_P
 from jaxmark.watermark.tracing.tardos import (
     _THRESHOLDS,
     MIN_BIAS_LEVEL,
     Accusation,
     biases,
     codewords,
-    log10_p,
     rank,
     scores,
 )
@@ -91,7 +92,7 @@ def test_scores_and_bound_against_all_codewords(key: jm.Key, kind: str):
     assert chances @ found**2 == pytest.approx(y @ y)
     order = np.argsort(-found)
     tail = np.cumsum(chances[order])
-    bound = 10 ** log10_p(found[order], y, p)
+    bound = 10 ** log10_p_fingerprint(found[order], y, p)
     assert (bound >= tail * (1 - 1e-9)).all()
     assert bound[0] == pytest.approx(tail[0], rel=0.01)  # Chernoff's bound is exact at the highest score
     assert (bound < 30 * tail)[found[order] > 0].all()
@@ -99,10 +100,10 @@ def test_scores_and_bound_against_all_codewords(key: jm.Key, kind: str):
 
 def test_bound_is_finite_and_in_range(key: jm.Key):
     p = biases(Choices(key, b"", 1), 12)
-    found = log10_p(np.array([-1e9, -1.0, 0.0, 1.0, 1e9]), np.ones(12), p)
+    found = accuse(np.array([-1e9, -1.0, 0.0, 1.0, 1e9]), np.ones(12), p, 1)
     np.testing.assert_array_equal(found[[0, 1, 2, 4]], [0, 0, 0, MIN_LOG10_P])
     assert -1 < found[3] <= 0
-    np.testing.assert_array_equal(log10_p(np.zeros(2), np.zeros(12), p), [0, 0])
+    np.testing.assert_array_equal(accuse(np.zeros(2), np.zeros(12), p, 1), [0, 0])
 
 
 @pytest.mark.slow
@@ -125,7 +126,7 @@ def test_innocents_are_accused_as_seldom_as_said(key: jm.Key):
     for start in range(0, innocents, 10_000):
         words = codewords(names[start : start + 10_000], Choices(key, GEOMETRY, 1), p)
         for name, y in values.items():
-            found[name].append(log10_p(scores(y, p, words), y, p))
+            found[name].append(accuse(scores(y, p, words), y, p, 1))
     for name in values:
         claims = np.concatenate(found[name])
         for exponent in (-1, -2, -3, -4):
@@ -193,7 +194,7 @@ def test_rank_by_hand(key: jm.Key):
     order = np.argsort(-expected)[:5]
     assert [entry.recipient for entry in found] == [names[i] for i in order]
     np.testing.assert_allclose([entry.score for entry in found], expected[order])
-    joint = np.minimum(0, log10_p(expected[order], rest, p) + math.log10(3000))
+    joint = np.minimum(0, log10_p_fingerprint(expected[order], rest, p) + math.log10(3000))
     np.testing.assert_allclose([entry.log10_p for entry in found], joint, atol=1e-9)
     for scale in (1e-250, 1e250):
         again = rank(scale * y, names, Choices(key, GEOMETRY, 1), top=5)

@@ -21,12 +21,12 @@ def copies(tracer: jm.watermark.Tracer) -> np.ndarray:
 
 
 def accused(tracer: jm.watermark.Tracer, vertices: np.ndarray) -> set[str]:
-    suspect = tracer.marker.original.mesh._replace(vertices=vertices)
+    suspect = tracer.mark.original.mesh._replace(vertices=vertices)
     return {one.recipient for one in tracer.identify(suspect, NAMES) if one.log10_p <= -6}
 
 
 def test_a_copy_names_its_recipient(tracer: jm.watermark.Tracer, copies: np.ndarray):
-    mesh = tracer.marker.original.mesh
+    mesh = tracer.mark.original.mesh
     for name, vertices in zip(NAMES, copies, strict=False):
         assert accused(tracer, vertices) == {name}
         length = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
@@ -52,9 +52,9 @@ def test_colluders_are_found(tracer: jm.watermark.Tracer, copies: np.ndarray, co
 
 @pytest.mark.long
 def test_nobody_is_accused_by_strangers(tracer: jm.watermark.Tracer, copies: np.ndarray):
-    mesh = tracer.marker.original.mesh
+    mesh = tracer.mark.original.mesh
     other = jm.watermark.make_tracer(mesh, jm.new_key())
-    message, _ = jm.embed(mesh, b"message", tracer.marker.key)
+    message, _ = jm.embed(mesh, b"message", tracer.mark.key)
     for vertices in (mesh.vertices, other.fingerprint(NAMES[0])[0].vertices, message.vertices):
         assert accused(tracer, vertices) == set()
     # Four copies, of recipients who are not on the list.

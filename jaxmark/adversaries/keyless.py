@@ -1,0 +1,275 @@
+"""Attacks by somebody who has the marked mesh and the program, but neither key nor original.
+
+In closed form, the attacker estimates the mark and subtracts it, or writes another mark. By optimisation, he searches
+for the displacement that lowers the *expected* score of the detector most: among all displacements, among band filters
+with band-limited noise, or among smooth warps; by gradients, or by evolution, which uninformative gradients cannot
+mislead.
+
+Strengths are sizes of the displacement: its RMS relative to the diagonal; or, with another metric, the value that the
+metric would have if it grew in proportion to the displacement, each band weighted by how visible it is.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.example_libraries import optimizers
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxmark.adversaries.expected import (
+    Surrogate,
+    band_filter,
+    energies,
+    evidence,
+    make_surrogate,
+    random_mark,
+    rescale,
+)
+from jaxmark.alignment.original import displace
+from jaxmark.attacks.registry import Attack
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.seeds import Randomness, random_key
+from jaxmark.spectral.precision import matmul
+from jaxmark.watermark.interfaces import Displacement
+from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, Scheme
+
+Parameters = Any  # a pytree of arrays
+Family = Literal["vertices", "bands", "warps"]
+MARK = 8e-4  # RMS displacement, in diagonals, that the attacker assumes of marks by default
+
+_STRENGTHS = (2e-4, 5e-4, 2e-3, 5e-3, 2e-2, 5e-2)
+_LEARNING_RATE = 0.3  # of Adam, for parameters that usually change by about 1
+_POPULATION_SIZE, _PARENT_COUNT = 16, 4  # candidates in a generation, and the best of them, which make the next
+_WAVE_COUNT, _MIN_WAVELENGTH = 24, 0.2  # of a warp; wavelengths in diagonals
+
+
+def subtraction(*, scheme: str | Scheme = DEFAULT_SCHEME, bits: int = 64, mark: float = MARK) -> Attack:
+    """Subtract the best linear estimate of the mark: each band of the mesh times the mark's share of its energy.
+
+    This is the Wiener filter for a mark and a host that are independent (Su, Girod, "Power-spectrum condition for
+    energy-efficient watermarking", IEEE Transactions on Multimedia 4(4), 2002).
+
+    Args:
+        scheme: the scheme that the mesh was marked with.
+        bits: size of the payload in bits.
+        mark: RMS displacement that the mark is assumed to have, relative to the diagonal.
+    """
+
+    def way(surrogate: Surrogate, strength: Array, key: PRNGKeyArray) -> Displacement:
+        written, whole = energies(surrogate, random_mark(surrogate, key)[1]), energies(surrogate, surrogate.signal)
+        share = jnp.clip(written / jnp.maximum(whole, jnp.finfo(whole.dtype).tiny), 0, 1)
+        return -band_filter(surrogate, share, surrogate.signal)
+
+    return make_attack(way, scheme, bits, mark)
+
+
+def remarking(*, scheme: str | Scheme = DEFAULT_SCHEME, bits: int = 64) -> Attack:
+    """Write another mark over the first, with a key of the attacker's own.
+
+    Args:
+        scheme: see `subtraction`.
+        bits: see `subtraction`.
+    """
+    return make_attack(lambda surrogate, strength, key: random_mark(surrogate, key)[1], scheme, bits, MARK)
+
+
+def descent(
+    family: Family = "vertices",
+    *,
+    scheme: str | Scheme = DEFAULT_SCHEME,
+    bits: int = 64,
+    mark: float = MARK,
+    metric: str = "rms",
+    steps: int = 30,
+) -> Attack:
+    """Lower the expected evidence by its gradient, with new random keys at each step (Adam; Kingma, Ba, ICLR 2015).
+
+    Args:
+        family: the displacements to search: `"vertices"`, all of them; `"bands"`, lower gains of the mesh's own bands,
+            and another mark with any strength in each band; `"warps"`, smooth fields of wavelengths from 0.2 to 2
+            diagonals.
+        scheme: see `subtraction`.
+        bits: see `subtraction`.
+        mark: see `subtraction`.
+        metric: the metric of `distortion.METRICS` in which strengths are measured.
+        steps: number of gradient steps.
+
+    Raises:
+        JaxmarkError: if there is no such family, or `steps` is below 1.
+    """
+    _check(family, steps)
+    return make_attack(jax.jit(partial(descend, family=family, steps=steps)), scheme, bits, mark, metric)
+
+
+def evolution(
+    family: Family = "bands",
+    *,
+    scheme: str | Scheme = DEFAULT_SCHEME,
+    bits: int = 64,
+    mark: float = MARK,
+    metric: str = "rms",
+    generations: int = 10,
+) -> Attack:
+    """Lower the expected evidence without gradients, by the cross-entropy method (Rubinstein 1999).
+
+    Each generation draws the parameters 16 times from a normal distribution; the best four draws give the mean and the
+    spread of the next generation.
+
+    Args:
+        family: see `descent`; `"vertices"` has too many parameters.
+        scheme: see `subtraction`.
+        bits: see `subtraction`.
+        mark: see `subtraction`.
+        metric: see `descent`.
+        generations: number of generations.
+
+    Raises:
+        JaxmarkError: if there is no such family, it is `"vertices"`, or `generations` is below 1.
+    """
+    if family == "vertices":
+        raise JaxmarkError("All vertices are too many parameters for an evolution; choose 'bands' or 'warps'.")
+    _check(family, generations)
+    return make_attack(jax.jit(partial(evolve, family=family, generations=generations)), scheme, bits, mark, metric)
+
+
+def descend(
+    surrogate: Surrogate, strength: Float[Array, ""], key: PRNGKeyArray, *, family: Family, steps: int
+) -> Displacement:
+    """The displacement that `descent` finds, in diagonals; a pure function, so that `vmap` over keys gives restarts.
+
+    Args:
+        surrogate: the marked mesh, from `expected.make_surrogate`.
+        strength: size of the displacement.
+        key: a JAX random key.
+        family: see `descent`.
+        steps: see `descent`.
+    """
+    return _search(surrogate, strength, key, family, partial(_descend, steps=steps))
+
+
+def evolve(
+    surrogate: Surrogate, strength: Float[Array, ""], key: PRNGKeyArray, *, family: Family, generations: int
+) -> Displacement:
+    """The displacement that `evolution` finds; see `descend`."""
+    return _search(surrogate, strength, key, family, partial(_evolve, generations=generations))
+
+
+def _search(
+    surrogate: Surrogate, strength: Array, key: PRNGKeyArray, family: Family, seek: Callable[..., Parameters]
+) -> Displacement:
+    """Search a family for the displacement of a given size that lowers the expected evidence most."""
+    start, make = _FAMILIES[family](surrogate, jax.random.fold_in(key, 0))
+
+    def loss(parameters: Parameters, key: PRNGKeyArray) -> Array:
+        return evidence(surrogate, rescale(surrogate, make(parameters), strength), key)
+
+    return rescale(surrogate, make(seek(loss, start, jax.random.fold_in(key, 1))), strength)
+
+
+def _check(family: Family, steps: int) -> None:
+    if family not in get_args(Family):
+        raise JaxmarkError(f"There is no family of displacements {family!r}; there are {', '.join(get_args(Family))}.")
+    if steps < 1:
+        raise JaxmarkError(f"An attack by optimisation needs at least one step, got {steps}.")
+
+
+def make_attack(
+    way: Callable[[Surrogate, Array, PRNGKeyArray], Displacement],
+    scheme: str | Scheme,
+    bits: int,
+    mark: float,
+    metric: str = "rms",
+) -> Attack:
+    """Attack by a displacement in the direction that `way` finds for a surrogate, a size and a random key.
+
+    Args:
+        way: function (surrogate, size, key) → displacement, which is scaled to the size.
+        scheme: see `subtraction`.
+        bits: see `subtraction`.
+        mark: see `subtraction`.
+        metric: see `descent`.
+    """
+
+    def apply(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
+        surrogate, original = make_surrogate(mesh, scheme, bits, mark, metric)
+        wanted = jnp.asarray(strength, surrogate.signal.dtype)
+        moved = rescale(surrogate, way(surrogate, wanted, random_key(key)), wanted)
+        return displace(original, original.to_host(moved))
+
+    unit = "RMS over the diagonal" if metric == "rms" else f"{metric}, as small displacements make it"
+    return Attack(apply, unit, _STRENGTHS, host=True)
+
+
+def _descend(
+    loss: Callable[[Parameters, PRNGKeyArray], Array], start: Parameters, key: PRNGKeyArray, *, steps: int
+) -> Parameters:
+    """Adam, with a step proportional to 1/√iteration."""
+    init, update, get = optimizers.adam(lambda step: _LEARNING_RATE / jnp.sqrt(step + 1.0))
+
+    def step(state: Any, count: Array) -> tuple[Any, None]:
+        slope = jax.grad(loss)(get(state), jax.random.fold_in(key, count))
+        # The count takes the parameters' own dtype, because dtypes must not be mixed.
+        return update(count.astype(jax.tree.leaves(slope)[0].dtype), slope, state), None  # pyright: ignore
+
+    return get(jax.lax.scan(step, init(start), jnp.arange(steps))[0])
+
+
+def _evolve(
+    loss: Callable[[Parameters, PRNGKeyArray], Array], start: Parameters, key: PRNGKeyArray, *, generations: int
+) -> Parameters:
+    """The cross-entropy method; returns the mean of the last generation."""
+    mean, unravel = ravel_pytree(start)
+
+    def generation(state: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple[Array, Array], None]:
+        mean, spread = state
+        draw, same = jax.random.split(key)
+        drawn = mean + spread * jax.random.normal(draw, (_POPULATION_SIZE, len(mean)), mean.dtype)
+        # All candidates meet the same random key; one after the other, to save memory.
+        worth = jax.lax.map(lambda one: loss(unravel(one), same), drawn)
+        best = drawn[jnp.argsort(worth)[:_PARENT_COUNT]]
+        # Few parents make the spread too small by chance, so half of the old one is kept.
+        return (best.mean(axis=0), 0.5 * spread + 0.5 * best.std(axis=0)), None
+
+    keys = jax.random.split(key, generations)
+    return unravel(jax.lax.scan(generation, (mean, jnp.ones_like(mean)), keys)[0][0])
+
+
+def _vertices(surrogate: Surrogate, key: PRNGKeyArray) -> tuple[Parameters, Callable[[Parameters], Displacement]]:
+    """All displacements, with larger steps in bands that are harder to see; the start is a random mark."""
+    hidden = surrogate.seen.min() / surrogate.seen
+    return (
+        random_mark(surrogate, key)[1] / surrogate.mark,
+        lambda z: band_filter(surrogate, hidden, z),
+    )
+
+
+def _bands(surrogate: Surrogate, key: PRNGKeyArray) -> tuple[Parameters, Callable[[Parameters], Displacement]]:
+    """A loss from 0 to 1 in each of the mesh's own bands, and another mark with any strength in each band."""
+    other = random_mark(surrogate, key)[1]
+    start = jnp.full_like(surrogate.seen, -4), jnp.zeros_like(surrogate.seen)
+
+    def make(parameters: tuple[Array, Array]) -> Displacement:
+        lost, strengths = jax.nn.sigmoid(parameters[0]), jnp.exp(parameters[1])
+        return band_filter(surrogate, strengths, other) - band_filter(surrogate, lost, surrogate.signal)
+
+    return start, make
+
+
+def _warps(surrogate: Surrogate, key: PRNGKeyArray) -> tuple[Parameters, Callable[[Parameters], Displacement]]:
+    """Sums of plane waves in random directions; the parameters are their amplitudes."""
+    direct, length, begin = jax.random.split(key, 3)
+    dtype = surrogate.signal.dtype
+    waves = jax.random.normal(direct, (_WAVE_COUNT, 3), dtype)
+    per_diagonal = jax.random.uniform(length, (_WAVE_COUNT, 1), dtype, 0.5, 1 / _MIN_WAVELENGTH)
+    waves *= 2 * np.pi * per_diagonal / jnp.linalg.norm(waves, axis=1, keepdims=True)
+    turns = matmul(surrogate.signal, waves.T)
+    fields = jnp.concatenate([jnp.sin(turns), jnp.cos(turns)], axis=1)
+    return jax.random.normal(begin, (2 * _WAVE_COUNT, 3), dtype), lambda amplitudes: matmul(fields, amplitudes)
+
+
+_FAMILIES = {"vertices": _vertices, "bands": _bands, "warps": _warps}

@@ -1,0 +1,206 @@
+"""Options and arguments that several commands share."""
+
+import os
+import sys
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any, get_args
+
+import click
+
+from jaxmark.alignment.alignment import Align
+from jaxmark.app.output import say
+from jaxmark.app.progress import Progress
+from jaxmark.errors import JaxmarkError
+from jaxmark.watermark.coding.keys import Key, load_key
+from jaxmark.watermark.perception.budget import VISIBILITY, Budget
+from jaxmark.watermark.schemes.registry import NAMES, split
+
+FILE = click.Path(path_type=Path)
+JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON on standard output.")
+KEY = click.option("--key", "key_file", type=FILE, required=True, help="Key file, from `jaxmark keygen`.")
+KEYS = click.option(
+    "--key", "key_files", type=FILE, multiple=True, required=True, help="Key file; may be repeated, for several keys."
+)
+MESHES = click.option(
+    "--mesh", "meshes", multiple=True, help="Of a file of several meshes, one to use, by name; may be repeated."
+)
+WORKERS = click.option(
+    "--workers",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="For a folder: number of processes at once, each with memory of its own.",
+)
+ALPHA = click.option(
+    "--alpha",
+    type=float,
+    default=1e-6,
+    show_default=True,
+    help="Largest false-positive probability that counts as proof.",
+)
+ALIGN = click.option(
+    "--align",
+    type=click.Choice(get_args(Align)),
+    default="auto",
+    show_default=True,
+    help="same: vertex by vertex in order; similarity, affine: by surface, up to such a map; auto: first that fits.",
+)
+
+
+def _begin_progress(context: click.Context, quiet: bool) -> None:
+    """Let a command tell people at a terminal what it is doing, until it ends."""
+    context.obj = Progress(None if quiet or not sys.stderr.isatty() else sys.stderr)
+    context.call_on_close(context.obj.clear)
+
+
+QUIET = click.option(
+    "--quiet",
+    is_flag=True,
+    expose_value=False,
+    callback=lambda context, _, quiet: _begin_progress(context, quiet),
+    help="Say nothing of what is being done; nothing is said anyway where standard error is no terminal.",
+)
+
+
+class Schemes(click.ParamType):
+    """The name of a scheme, or of one that is read with the original and blind ones, with commas between."""
+
+    name = "scheme"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
+        """Convert names to a tuple."""
+        names: tuple[str, ...] = value if isinstance(value, tuple) else tuple(value.split(","))
+        if unknown := [name for name in names if name not in NAMES]:
+            self.fail(f"{unknown[0]!r} is not one of {', '.join(map(repr, NAMES))}.", param, ctx)
+        if len(names) > 1:
+            split(names)  # refuses what cannot mark one mesh together
+        return names
+
+
+class _Hexadecimal(click.ParamType):
+    name = "hex"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> bytes:
+        if isinstance(value, bytes):
+            return value
+        try:
+            message = bytes.fromhex(value)
+        except ValueError:
+            message = b""
+        if not message:
+            self.fail(
+                f"{value!r} is not a message: give an even number of hexadecimal digits, e.g. c0ffee42.", param, ctx
+            )
+        return message
+
+
+class _Text(click.ParamType):
+    name = "text"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> bytes:
+        if isinstance(value, bytes):
+            return value
+        if not value:
+            self.fail("an empty text is no message; for a mark that says nothing use --presence.", param, ctx)
+        return value.encode()
+
+
+class _Limit(click.ParamType):
+    name = "name=value"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
+        if isinstance(value, tuple):
+            return value
+        name, _, number = value.partition("=")
+        try:
+            return name, float(number)
+        except ValueError:
+            self.fail(f"{value!r} is no limit: give a metric and a number, e.g. dame=0.008.", param, ctx)
+
+
+def message_options(message: str, text: str, presence: str) -> Callable[[Callable], Callable]:
+    """Options for a message in either form, or none; the command gets `message`, bytes or None, and `presence`.
+
+    Args:
+        message: help for the message as hexadecimal digits.
+        text: help for the message as text.
+        presence: help for a mark without a message.
+    """
+
+    def decorate(command: Callable) -> Callable:
+        @click.option("--message", "digits", type=_Hexadecimal(), help=message)
+        @click.option("--text", type=_Text(), help=text)
+        @click.option("--presence", is_flag=True, help=presence)
+        @wraps(command)
+        def wrapped(*args: Any, digits: bytes | None, text: bytes | None, **options: Any) -> Any:
+            if digits is not None and text is not None:
+                raise JaxmarkError("Give either --message or --text.")
+            return command(*args, message=text if digits is None else digits, **options)
+
+        return wrapped
+
+    return decorate
+
+
+def budget_options(*, limits: bool = True, noise: float | None = None, noise_help: str = "") -> Callable:
+    """Options for a budget; the command gets it as `budget`.
+
+    Args:
+        limits: whether metrics may be limited.
+        noise: the default noise to survive.
+        noise_help: help for the noise; without it there is no such option.
+    """
+
+    def decorate(command: Callable) -> Callable:
+        @wraps(command)
+        def wrapped(
+            *args: Any,
+            rms: float | None,
+            visibility: Any,
+            limits: tuple[tuple[str, float], ...] = (),
+            noise: float | None = None,
+            **options: Any,
+        ) -> Any:
+            return command(*args, budget=Budget(rms, visibility, dict(limits) or None, noise), **options)
+
+        found = wrapped
+        if noise_help:
+            found = click.option("--noise", type=float, default=noise, show_default=noise is not None, help=noise_help)(
+                found
+            )
+        default = "without --budget and --limit" if limits else "without --budget"
+        found = click.option(
+            "--visibility",
+            type=click.Choice(list(VISIBILITY)),
+            help=f"How well people may see the mark.  [default, {default}: hidden]",
+        )(found)
+        if limits:
+            found = click.option(
+                "--limit",
+                "limits",
+                type=_Limit(),
+                multiple=True,
+                help="Upper limit on a metric of `jaxmark compare`; may be repeated.",
+            )(found)
+        return click.option(
+            "--budget",
+            "rms",
+            type=float,
+            help="RMS displacement of the vertices, relative to the diagonal of the bounding box.",
+        )(found)
+
+    return decorate
+
+
+def read_key(path: Path) -> Key:
+    """Load a key, and say so if others may read it.
+
+    Raises:
+        JaxmarkError: see `load_key`.
+    """
+    key = load_key(path)
+    if os.name == "posix" and path.stat().st_mode & 0o077:
+        say(f"jaxmark: the key file {path} may be read by others; chmod 600 {path} keeps it yours.")
+    return key

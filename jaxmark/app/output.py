@@ -1,0 +1,208 @@
+"""What commands print, in words for people and as JSON for programs, and the names of files that they write."""
+
+import json
+import math
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+
+from jaxmark.app.progress import current
+from jaxmark.errors import JaxmarkError
+from jaxmark.files.atomic import file_hash
+from jaxmark.watermark.evidence.detection import Detection
+from jaxmark.watermark.perception.capacity import Survival
+
+
+class FileOutcome(NamedTuple):
+    """The outcome for one file."""
+
+    values: dict[str, Any]  # for programs: values for JSON, except that numbers may not be finite
+    text: str  # for people: one sentence
+    done: bool = True  # False if nothing was detected, or the file was refused
+    refused: bool = False
+
+
+def say(line: str, err: bool = True) -> None:
+    """Say something beside the answer, mostly on standard error."""
+    current().clear()
+    click.echo(line, err=err)
+
+
+def answer(as_json: bool, values: Mapping[str, Any], text: str) -> None:
+    """Print an answer: its values as one line of JSON, or its text."""
+    current().clear()
+    try:
+        click.echo(json.dumps(_finite(values), allow_nan=False) if as_json else text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of our output has gone. The work is done, and the exit status still tells its outcome.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _finite(value: Any) -> Any:
+    """Replace numbers that JSON does not have by None."""
+    if isinstance(value, Mapping):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def error_text(error: Exception) -> str:
+    """What an exception says, in one line."""
+    match error:
+        case click.ClickException():
+            said = error.format_message()
+        case JaxmarkError():
+            said = str(error)
+        case OSError():
+            said = f"{error.filename or 'A file'} cannot be used: {error.strerror or error}."
+        case _:
+            said = f"Unexpected {type(error).__name__}: {error}. Please report it, with the command and the files."
+    return " ".join(said.split())
+
+
+def power(log10_p: float) -> str:
+    """A bound as a power of ten, which rounding makes no smaller."""
+    return f"10^{math.ceil(10 * log10_p - 1e-9) / 10 + 0.0:.1f}"
+
+
+def payload_text(bits: int) -> str:
+    """What a mark carries."""
+    return f"{bits} bits" if bits else "presence"
+
+
+def message_text(message: bytes) -> str:
+    """A message in hexadecimal digits, and as text if it is one."""
+    try:
+        text = message.decode()
+    except UnicodeDecodeError:
+        text = ""
+    return f'{message.hex()} ("{text}")' if text.isprintable() and text else message.hex()
+
+
+def survival_text(survives: Survival) -> str:
+    """What a mark survives, in words."""
+    if math.isinf(survives.whole):
+        return "an unknown noise, as this scheme has no model of it"
+    whole, half = (f"{100 * noise:.2g} %" if noise else "none" for noise in survives)
+    if not survives.whole:
+        return "no noise to speak of, only what leaves vertices in their places"
+    return f"noise of {whole} of the mean distance to the centre, {half} with half of the vertices lost"
+
+
+def detection_text(found: Detection, alpha: float, timestamped: float | None, *, charges: bool = False) -> str:
+    """What was detected, in words.
+
+    Args:
+        found: the detection.
+        alpha: largest false-positive probability of a detection.
+        timestamped: log10 of the bound if the commitment is older than the suspect; None without one.
+        charges: whether to say what each choice of the reading cost.
+    """
+    evidence = found.evidence
+    read = f"message {message_text(found.message)}" if found.message is not None else "no message could be read"
+    said = f"{'detected' if found.detected(alpha, allow_estimate=True) else 'nothing detected'}: {read}; "
+    if evidence.caveats:
+        said += f"false-positive probability about {power(found.log10_p)}, an estimate: {'; '.join(evidence.caveats)}"
+    else:
+        said += (
+            f"false-positive probability at most {power(found.log10_p)} if {found.premises} were fixed"
+            f" before the suspect existed, {power(evidence.log10_p_uncommitted)} if nothing dates them"
+        )
+        if timestamped is not None:
+            said += f", {power(timestamped)} if the deposit is older than the suspect"
+    said = " ".join([f"{said} (--alpha {alpha:g})", *found.notes])
+    if charges:
+        paid = [f"{one.choice}: {one.taken} {one.log10:.2f}" for one in evidence.charges]
+        said += f"\ncharged in log10 p: {', '.join(paid) or 'nothing'}"
+    return said
+
+
+def detection_values(
+    found: Detection,
+    alpha: float,
+    suspect: Path,
+    obtained: str,
+    timestamped: float | None,
+    record_digest: str | None,
+) -> dict[str, Any]:
+    """What was detected, as values for JSON.
+
+    Args:
+        found: the detection.
+        alpha: see `detection_text`.
+        suspect: its file.
+        obtained: when and where it was got.
+        timestamped: see `detection_text`.
+        record_digest: digest of the record that was read with.
+    """
+    values = {
+        **_figures(found, alpha),
+        "proof": not found.evidence.caveats,
+        "caveats": list(found.evidence.caveats),
+        "charges": [one._asdict() for one in found.evidence.charges],
+        "notes": list(found.notes),
+        "scheme": found.scheme,
+        "version": found.version,
+        "suspect_sha256": file_hash(suspect),
+        "obtained": obtained or None,
+        "scores": found.scores.tolist(),
+        "coverage": found.coverage,
+        "registration": found.registration.facts(),
+    }
+    if found.parts:
+        values["parts"] = {
+            name: {**_figures(one, alpha), "coverage": one.coverage, "registration": one.registration.facts()}
+            for name, one in found.parts.items()
+        }
+        values["skipped"] = dict(found.skipped)
+    if record_digest is not None:
+        values["record_digest"] = record_digest
+    if timestamped is not None:
+        values["log10_p_timestamped"] = timestamped
+    return values
+
+
+def _figures(found: Detection, alpha: float) -> dict[str, Any]:
+    evidence = found.evidence
+    return {
+        "detected": found.detected(alpha, allow_estimate=True),
+        "message": None if found.message is None else found.message.hex(),
+        "log10_p": evidence.log10_p,
+        "log10_p_uncommitted": evidence.log10_p_uncommitted,
+        "log10_p_gaussian": evidence.log10_p_gaussian,
+        "log10_p_unfloored": evidence.log10_p_unfloored,
+    }
+
+
+def check_suffix(source: Path, target: Path) -> None:
+    """Refuse an output of another format than its source."""
+    if source.suffix.lower() != target.suffix.lower():
+        raise JaxmarkError(f"{target} must have the suffix of {source}, whose bytes it takes over.")
+
+
+def check_distinct(**files: Path) -> None:
+    """Refuse two names for one file, which would write over an input."""
+    seen: dict[str, str] = {}
+    for name, path in files.items():
+        other = seen.setdefault(os.path.realpath(path), name)
+        if other != name:
+            raise JaxmarkError(f"{other} and {name} are the same file, {path}; give another name.")
+
+
+def make_folder(folder: Path) -> Path:
+    """Make a folder, if it does not exist.
+
+    Raises:
+        JaxmarkError: if it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise JaxmarkError(f"{folder} cannot be made a folder: {error.strerror}.") from None
+    return folder

@@ -1,0 +1,272 @@
+"""One mark that is read with the original: all that is fixed about it, and what writing and reading it compute."""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple, TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float64
+from numpy.typing import ArrayLike
+
+from jaxmark import distortion
+from jaxmark.alignment.alignment import Alignment, observation
+from jaxmark.alignment.observation import Observation
+from jaxmark.alignment.original import Original, make_original
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.canonical import Canonical
+from jaxmark.geometry.imprint import Imprint, make_imprint, restore
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.coding.keys import Choices, Key, bind, commitment
+from jaxmark.watermark.coding.message import CANDIDATES, Decoded, decode, encode
+from jaxmark.watermark.interfaces import Carrier, Detector, Reader, Received, Scheme
+from jaxmark.watermark.perception.budget import Budget, BudgetLike, displace_within
+from jaxmark.watermark.perception.capacity import Capacity, Survival
+from jaxmark.watermark.record import Content, Record, commit, seal_imprint
+from jaxmark.watermark.schemes.registry import SCHEMES, parameters_of
+
+_MIN_ORIGINAL_SHARE = 0.5  # share of an original's points from which on an edited copy is read with, as an estimate
+_SAME_SHAPE = 0.01  # distance of shapes, over their size, below which an original looks like a marked or edited copy
+
+
+_AnyMark = TypeVar("_AnyMark", bound="Mark")
+
+
+class EmbedInfo(NamedTuple):
+    """How a mesh was marked."""
+
+    rms: float  # RMS displacement of the welded vertices that faces use, unweighted, over the bounding-box diagonal
+    max: float  # the largest such displacement
+    beta: float  # strength: the factor on the carrier's unit displacement, in diagonals
+    record: Record  # what the owner needs to read the mark again
+    survives: Survival = Survival(0.0, 0.0)  # as predicted; `Marker.measure_survival` tries it
+
+
+@dataclass(frozen=True, eq=False)
+class Mark:
+    """A mark: its original, key, payload and scheme, prepared once for writing and for reading any number of suspects.
+
+    Make one with `make_mark`.
+    """
+
+    original: Original
+    choices: Choices  # what derives from the key
+    bits: int  # size of the payload in bits
+    scheme: Scheme
+    carrier: Carrier
+    code_bits: int  # number of code bits that are carried
+    detector: Detector
+    content: Content = "message"  # what the code bits say
+    record: Record | None = None  # the record of the mark that is read
+    caveats: tuple[str, ...] = ()  # why what is read is no proof
+
+    @property
+    def key(self) -> Key:
+        """The key."""
+        return self.choices.key
+
+    @cached_property
+    def reader(self) -> Reader:
+        """The reader of the carrier; made when it is first needed."""
+        return self.carrier.reader()
+
+    @cached_property
+    def capacity(self) -> Capacity:
+        """What the original can carry with the scheme."""
+        return Capacity(self.original, self.scheme, {self.bits: lambda: self.reader})
+
+    @property
+    def uses_own_detector(self) -> bool:
+        """Whether the detector is the scheme's own, for which the reader's shortcuts stand."""
+        return self.detector is self.scheme.detector
+
+    def choices_of(self, key: bytes) -> Choices:
+        """The keyed choices of the same mark under another key."""
+        return replace(self.choices, key=Key(key))
+
+    def codeword(self, message: bytes) -> Float64[np.ndarray, " code"]:
+        """The code bits of a message and its keyed tag, each -1 or +1."""
+        return encode(message, self.choices, self.code_bits)
+
+    def write(
+        self, amplitudes: Float64[np.ndarray, " code"], budget: BudgetLike = None, *, told: bytes = b""
+    ) -> tuple[Mesh, EmbedInfo]:
+        """Displace the original by the carrier, with any amplitudes of the code bits, as far as a budget allows.
+
+        Args:
+            amplitudes: one number for each code bit, up to a common factor.
+            budget: see `embed`.
+            told: what the amplitudes say, which the record commits to; nothing if it is empty.
+
+        Raises:
+            JaxmarkError: if the carrier does not displace this mesh at all; or see `displace_within`.
+        """
+        original, bounds = self.original, Budget.of(budget).bounds(self.original.mesh)
+        unit = original.to_host(self.carrier.displacement(jnp.asarray(amplitudes, original.signal.dtype)))
+        size = float(distortion.rms(unit[original.used]))
+        if not (math.isfinite(size) and size > 0):
+            raise JaxmarkError(
+                f"The {len(unit)} points of this mesh leave the scheme {self.scheme.name!r} nothing to write in."
+            )
+        written = displace_within(original, unit, bounds, self.capacity.reference if bounds.limits else None)
+        canonical = Canonical(original.points, original.weld, original.geometry)
+        record = Record(
+            scheme=self.scheme.name,
+            bits=self.bits,
+            beta=written.scale,
+            original=original.geometry.hex(),
+            key=commitment(self.key),
+            parameters=parameters_of(self.scheme),
+            content=self.content,
+            told=commit(told, self.choices) if told else "",
+            imprint=seal_imprint(make_imprint(canonical, original.grid, original.order), self.key),
+        ).sealed(self.key)
+        return written.mesh, EmbedInfo(written.moved.rms, written.moved.max, written.scale, record)
+
+    def observe(self, aligned: Alignment, weights: ArrayLike | None = None) -> Observation:
+        """Find what a suspect shows of each point's displacement, in diagonals; independent of the key.
+
+        Args:
+            aligned: the suspect's alignment with the original.
+            weights: one number for each vertex of the original, see `detect`.
+        """
+        if weights is not None:
+            aligned = aligned._replace(weights=aligned.weights * self._per_point(weights))
+        return observation(self.original, aligned)
+
+    def receive(self, aligned: Alignment, weights: ArrayLike | None = None) -> Received:
+        """Find what the reader learns from a suspect, independently of the key; see `Reader.receive`."""
+        return self.reader.receive(self.observe(aligned, weights))
+
+    def soft_decisions(self, received: Received) -> Float64[np.ndarray, " code"]:
+        """Compute one soft decision per code bit."""
+        return np.asarray(self.detector(self.reader, received, 1.0), np.float64)
+
+    def decode(self, soft: ArrayLike, candidates: int = CANDIDATES) -> Decoded | None:
+        """Decode the message in soft decisions; None if the keyed tag of none among so many candidates fits."""
+        return decode(np.asarray(soft, np.float64), self.bits, self.choices, candidates)
+
+    def read_quickly(self, seen: Observation) -> bytes | None:
+        """Read what was hardly attacked with little computation, see `Reader.glance`; None if nothing reads so."""
+        quick = self.reader.glance(seen)
+        found = self.decode(quick if quick is not None else self.soft_decisions(self.reader.receive(seen)))
+        return None if found is None else found.message
+
+    def coverage(self, observed: Observation) -> float:
+        """Share of the original's points that a suspect gives evidence for."""
+        return float(np.mean(self.original.to_host(observed.weights)[self.original.used] > 0))
+
+    def with_scheme(self: "_AnyMark", scheme: Scheme, bits: int | None = None) -> "_AnyMark":
+        """Return the same mark, which has no record, with another scheme of this library, or another payload size.
+
+        Raises:
+            JaxmarkError: if the payload does not fit.
+        """
+        bits = self.bits if bits is None else bits
+        if (scheme, bits) == (self.scheme, self.bits):
+            return self
+        detector = None if self.uses_own_detector else self.detector
+        return type(self)(**fields_of(self.original, self.key, scheme, bits, detector=detector))
+
+    def _per_point(self, weights: ArrayLike) -> Float64[np.ndarray, " points"]:
+        """Convert weights of vertices to weights of points, each the mean over the vertices at the point."""
+        given, point = np.asarray(weights, np.float64), self.original.weld.point
+        if given.shape != point.shape or not (np.isfinite(given) & (given >= 0)).all():
+            raise JaxmarkError(f"weights must be {len(point)} finite numbers, not negative, one for each vertex.")
+        return np.bincount(point, given) / np.bincount(point)
+
+
+def bind_mark(
+    key: bytes, original: Original, scheme: Scheme, bits: int, content: Content, record: Record | None = None
+) -> Choices:
+    """Bind the keyed choices of a mark to its original and to all that reading it uses.
+
+    The fields of the scheme are those in the record, if there is one: a later jaxmark may know more fields.
+    """
+    parameters = parameters_of(scheme) if record is None else record.parameters
+    fixed = {"content": content, "scheme": scheme.name, "parameters": parameters, "bits": bits}
+    fixed["order"] = original.order.hex()
+    return bind(key, original.geometry, fixed)
+
+
+def fields_of(
+    original: Original,
+    key: bytes,
+    scheme: Scheme,
+    bits: int,
+    *,
+    record: Record | None = None,
+    detector: Detector | None = None,
+    caveats: tuple[str, ...] = (),
+) -> dict[str, Any]:
+    """Return the fields of a `Mark` that carries a message, or without a payload nothing but its presence.
+
+    Raises:
+        JaxmarkError: if the payload does not fit.
+    """
+    code_bits = scheme.code_length(original, bits) if bits else 1
+    content: Content = "message" if bits else "presence"
+    choices = bind_mark(key, original, scheme, bits, content, record)
+    if not isinstance(scheme, tuple(SCHEMES.values())):
+        caveats += (f"the scheme {scheme.name!r} is not one of this library",)
+    if detector not in (None, scheme.detector):
+        caveats += ("the detector is not the scheme's own",)
+    return {
+        "original": original,
+        "choices": choices,
+        "bits": bits,
+        "scheme": scheme,
+        "carrier": scheme.carrier(original, choices, bits, code_bits),
+        "code_bits": code_bits,
+        "detector": detector or scheme.detector,
+        "content": content,
+        "record": record,
+        "caveats": caveats,
+    }
+
+
+def recall(original: Mesh, key: bytes, record: Record | None) -> tuple[Original, tuple[str, ...]]:
+    """Prepare the original of a mark exactly as it was when the mark was made.
+
+    Args:
+        original: the unmarked mesh as its owner has it now.
+        key: 32 bytes.
+        record: the record of the mark, if there is one.
+
+    Returns:
+        The original; and why what is read with it is no proof, which is if it was edited since.
+
+    Raises:
+        JaxmarkError: if the mesh is unusable, or not the one that the record was made for.
+    """
+    if record is None:
+        return make_original(original), ()
+    imprint = record.open_imprint(key)
+    ready = make_original(original, imprint.grid)
+    if ready.geometry == imprint.hash:
+        return _in_order_of(ready, imprint), ()
+    copy = restore(original, imprint)
+    ready = make_original(copy.mesh, imprint.grid)
+    if copy.exact:
+        return _in_order_of(ready, imprint), ()
+    if copy.share < _MIN_ORIGINAL_SHARE:
+        said = f"{100 * copy.share:.0f} % of that mesh's points are in it"
+        if copy.distance < _SAME_SHAPE:
+            raise JaxmarkError(
+                f"The original is not the mesh that the record was made for: {said}, though their shapes differ by only"
+                f" {100 * copy.distance:.2g} % of their size. It looks like the marked file, or another edited copy."
+            )
+        raise JaxmarkError(
+            f"The original is not the mesh that the record was made for: {said}, and their shapes differ by"
+            f" {100 * copy.distance:.2g} % of their size."
+        )
+    places = np.full(len(ready.used), -1)
+    places[ready.weld.point] = copy.places
+    ready = replace(ready, geometry=imprint.hash, places=places, count=len(imprint.tags))
+    return _in_order_of(ready, imprint), (f"the original was edited: {100 * copy.share:.1f} % of its points are left",)
+
+
+def _in_order_of(original: Original, imprint: Imprint) -> Original:
+    """The original, bound to the order that was marked, which its file may have no longer."""
+    return replace(original, order=imprint.order, in_order=original.order == imprint.order)

@@ -1,0 +1,554 @@
+"""Markers: each marks one original with one key and payload size, and reads the mark again; they prepare only once.
+
+`NonBlindMarker` makes marks that are read with the original, `BlindMarker` marks that are read without it, and
+`CombinedMarker` both in one mesh. All of them are a `Marker`.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxmark import distortion
+from jaxmark.alignment import alignment
+from jaxmark.alignment.alignment import Align, Alignment
+from jaxmark.alignment.original import Original, make_original
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh, check_faces
+from jaxmark.watermark.blind import reading as blind_reading
+from jaxmark.watermark.blind.scheme import BlindScheme
+from jaxmark.watermark.blind.writing import Writer, radius_of
+from jaxmark.watermark.coding import message as coding
+from jaxmark.watermark.coding.keys import Key, commitment
+from jaxmark.watermark.coding.message import DEFAULT_BITS, TAG_BITS, check_size
+from jaxmark.watermark.evidence.detection import Detection, Evidence
+from jaxmark.watermark.interfaces import Detector, Scheme
+from jaxmark.watermark.mark import EmbedInfo, Mark, fields_of, recall
+from jaxmark.watermark.nonblind import Alternatives, read
+from jaxmark.watermark.perception.budget import Bounds, Budget, BudgetLike
+from jaxmark.watermark.perception.capacity import COVERAGE, NOISE, Conditions, Survival
+from jaxmark.watermark.record import Record, commit
+from jaxmark.watermark.schemes.passband import choose_pass_band
+from jaxmark.watermark.schemes.registry import (
+    DEFAULT_SCHEME,
+    SCHEMES,
+    AnyScheme,
+    find_blind,
+    get_nonblind,
+    make_blind_scheme,
+    make_scheme,
+    parameters_of,
+    split,
+)
+
+_MAX_TRIED_NOISE = 0.05  # beyond which no shape is left
+_SHARES_OF_NOISE = (1.0, 0.7, 0.5, 0.3, 0.1)  # of a predicted noise that are tried, by blind marks all but the last
+_LEAST_SHARE, _MOST_SHARE = 0.3, 0.9  # of what is allowed, for a mark that is not the last
+
+
+@runtime_checkable
+class Marker(Protocol):
+    """Marks one original, and reads any number of suspects."""
+
+    @property
+    def original(self) -> Original:
+        """The mesh that is marked."""
+        ...
+
+    def embed(self, message: bytes, budget: BudgetLike = None, *, read_back: bool = True) -> tuple[Mesh, EmbedInfo]:
+        """Embed a message of exactly the payload's size in the original; see `jaxmark.embed`.
+
+        Pass `read_back=False` if you verify the written file yourself.
+        """
+        ...
+
+    def with_record(self, record: Record) -> "Marker":
+        """Return the marker that reads the mark of a record: one that this marker made."""
+        ...
+
+    def check(self, marked: Mesh, message: bytes) -> None:
+        """Check that a message can be read from a marked mesh that was not attacked.
+
+        Raises:
+            JaxmarkError: if it cannot be read.
+        """
+        ...
+
+    def measure_survival(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival | None:
+        """Try what a mark survives: add noise, lose half of the points, and read; the prediction where it reads.
+
+        Where it does not, less noise is tried; 0 if not even a fraction of what was predicted.
+
+        Args:
+            marked: the marked mesh, in the original's order.
+            message: its message.
+            predicted: from `EmbedInfo`.
+
+        Returns:
+            The noise; None if the message does not even read without any.
+        """
+        ...
+
+    def register(self, suspect: Mesh) -> Any:
+        """Find out about a suspect what does not depend on the key: once for any number of keys, see `read`."""
+        ...
+
+    def read(self, registered: Any, message: bytes | None = None) -> Detection:
+        """Read what `register` returned, with a claimed message or without."""
+        ...
+
+    def detect(self, suspect: Mesh, message: bytes | None = None) -> Detection:
+        """Read a suspect, with a claimed message or without; see `jaxmark.detect`."""
+        ...
+
+    def guess(self, found: Detection) -> bytes | None:
+        """Decode the most plausible message of a detection, whatever its tag, as a receiver without tags would."""
+        ...
+
+
+class NonBlindMarker(Mark):
+    """A `Marker` whose marks are read with the original; make one with `make_marker`."""
+
+    def embed(self, message: bytes, budget: BudgetLike = None, *, read_back: bool = True) -> tuple[Mesh, EmbedInfo]:
+        """See `Marker`."""
+        check_size(message, self.bits)
+        budget = Budget.of(budget)
+        bounds = budget.bounds(self.original.mesh)
+        marked, info = self.write(self.codeword(message), budget, told=message)
+        # A budget without limits is met up to rounding, so its own number is used.
+        reached = info.rms if bounds.limits else bounds.rms or 0.0
+        if budget.noise is not None:
+            self._check_capacity(reached, Conditions(bounds, budget.noise, COVERAGE))
+        conditions = (Conditions(bounds, 1.0, share) for share in (1.0, COVERAGE))
+        info = info._replace(survives=Survival(*(self.capacity.noise(self.bits, reached, one) for one in conditions)))
+        if read_back:
+            self.check(marked, message)
+        return marked, info
+
+    def adapted(self, budget: BudgetLike = None) -> "NonBlindMarker":
+        """Return the marker with the pass band that suits a budget, if its scheme is the default.
+
+        Without a demand, it suits the noise of `capacity.NOISE`; see `jaxmark.watermark.schemes.passband`.
+        """
+        budget = Budget.of(budget)
+        bounds = budget.bounds(self.original.mesh)
+        return self.with_scheme(choose_pass_band(self.capacity, self.bits, bounds, budget.noise or NOISE))
+
+    def with_record(self, record: Record) -> "NonBlindMarker":
+        """See `Marker`; claims are then checked against the record."""
+        same = replace(self, record=record)
+        same.__dict__.update({name: self.__dict__[name] for name in ("reader", "capacity") if name in self.__dict__})
+        return same
+
+    def check(self, marked: Mesh, message: bytes) -> None:
+        """See `Marker`."""
+        if not self.reads(marked, message):
+            raise JaxmarkError(
+                f"This mesh ({int(self.original.used.sum())} points) cannot carry {_payload(self.bits)} with the scheme"
+                f" {self.scheme.name!r}: it does not read back, even unattacked. Use a larger budget,"
+                f"{' a shorter message or a presence mark,' if self.bits else ''} or a finer or less regular mesh."
+            )
+
+    def reads(self, marked: Mesh, message: bytes) -> bool:
+        """Whether a message can be read from a mesh that has the original's vertex order.
+
+        Plain correlations nearly always read a keyed mark that was not attacked. They are tried first, because
+        weighting the bands and joint decoding are most of the work of `detect`.
+        """
+        return self._reads_in_order(alignment.align(self.original, marked, "same"), message)
+
+    def _reads_in_order(self, aligned: Alignment, message: bytes) -> bool:
+        # The reader's shortcut stands for the scheme's own detector, not for any other.
+        if message and self.uses_own_detector and self.read_quickly(self.observe(aligned)) == message:
+            return True
+        return self._reads(aligned, message)
+
+    def _reads(self, aligned: Alignment, message: bytes) -> bool:
+        """Whether a message is read, or without one a presence proven, from a suspect as it was aligned."""
+        if not self.bits:
+            return self.read(aligned, b"").detected(allow_estimate=True)
+        found = self.decode(self.soft_decisions(self.receive(aligned)))
+        return found is not None and found.message == message
+
+    def measure_survival(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival | None:
+        """See `Marker`; messages are read by plain correlations: joint decoding may read in still more noise."""
+        aligned, rng = alignment.align(self.original, marked, "same"), np.random.default_rng(0)
+        if not self._reads_in_order(aligned, message):
+            return None
+        points, used = self.original.positions, self.original.used
+        radius = float(np.linalg.norm(points[used] - points[used].mean(axis=0), axis=1).mean())
+        unit = radius * rng.uniform(-1, 1, points.shape)
+        near = points[:, 0] <= np.median(points[used, 0])  # half of the mesh, as if it was cut
+
+        def survives(noise: float, seen: np.ndarray) -> bool:
+            one = aligned._replace(displacement=aligned.displacement + noise * unit, weights=aligned.weights * seen)
+            return self.read_quickly(self.observe(one)) == message if message else self._reads(one, message)
+
+        found = []
+        for noise, seen in zip(predicted, (np.ones_like(near), near), strict=True):
+            strengths = (share * min(noise, _MAX_TRIED_NOISE) for share in _SHARES_OF_NOISE)
+            reads = (strength for strength in strengths if survives(strength, seen))
+            found.append(next(reads, 0.0) if 0 < noise < math.inf else noise)
+        return Survival(*found)
+
+    def register(self, suspect: Mesh, align: Align = "auto") -> Alignment:
+        """Align a suspect with the original; see `jaxmark.alignment.alignment.align`."""
+        return alignment.align(self.original, suspect, align)
+
+    def read(self, registered: Alignment, message: bytes | None = None, weights: ArrayLike | None = None) -> Detection:
+        """See `Marker`, and `jaxmark.watermark.nonblind.read`."""
+        return read(self, registered, message, weights)
+
+    def detect(
+        self,
+        suspect: Mesh,
+        message: bytes | None = None,
+        weights: ArrayLike | None = None,
+        align: Align = "auto",
+    ) -> Detection:
+        """See `Marker`; of a surface, both reflections are read, which `read` does not do."""
+        return Alternatives([((), lambda: self)]).read(suspect, message, weights, align)[0]
+
+    def guess(self, found: Detection) -> bytes | None:
+        """See `Marker`."""
+        return found.message or coding.guess(found.scores, self.bits, TAG_BITS)
+
+    def _check_capacity(self, reached: float, conditions: Conditions) -> None:
+        """Check that the payload is readable under these conditions at an RMS displacement of `reached` diagonals."""
+        capacity = self.capacity
+        least = capacity.least_budget(self.bits, conditions)
+        if least <= reached:
+            return
+        most = capacity.bits(conditions) if self.bits else 0
+        present = capacity.least_budget(0, conditions) <= reached
+        mend = ["a shorter message"] if most else ["a presence mark"] if present else []
+        if math.isfinite(least):
+            enough = _rounded_up(least)
+            mend.append(f"a budget of at least {enough:g}{self._distortion_at(enough, conditions.bounds)}")
+        carried = f"carries at most {most} bits" if most else "carries no message" if self.bits else "carries nothing"
+        wanted = f", not {self.bits}" if most else ""
+        raise JaxmarkError(
+            f"This mesh ({int(self.original.used.sum())} points) {carried} at {conditions.bounds}, with noise of"
+            f" {conditions.noise:g} and half of it lost{wanted}. Use {', or '.join(mend or ['less noise'])}."
+        )
+
+    def _distortion_at(self, rms: float, bounds: Bounds) -> str:
+        """How far a mark of a size would exceed the limits, as half a sentence."""
+        if not bounds.limits:
+            return ""
+        word = np.random.default_rng(0).choice([-1.0, 1.0], self.code_bits)
+        marked, _ = self.write(word, min(rms, 0.5))
+        seen = distortion.measure(self.original.mesh, marked, bounds.limits.keys())
+        said = ", ".join(f"{name} would be {value or 0:.2g}" for name, value in seen.items())
+        return f" (at which {said})"
+
+
+@dataclass(frozen=True, eq=False)
+class BlindMarker:
+    """A `Marker` whose marks are read without the original; make one with `make_blind_marker`."""
+
+    original: Original
+    key: Key
+    bits: int
+    scheme: BlindScheme
+    writer: Writer
+
+    def embed(self, message: bytes, budget: BudgetLike = None, *, read_back: bool = True) -> tuple[Mesh, EmbedInfo]:
+        """See `Marker`."""
+        budget = Budget.of(budget)
+        marked, info = self.write(message, budget)
+        if budget.noise is not None and info.survives.whole < budget.noise:
+            raise JaxmarkError(
+                f"This mark would survive noise of {info.survives.whole:.2g}, not {budget.noise:g}; use a larger"
+                " budget, a shorter message or another scheme."
+            )
+        if read_back:
+            self.with_record(info.record).check(marked, message)
+        return marked, info
+
+    def write(
+        self, message: bytes, budget: BudgetLike = None, reference: distortion.Reference | None = None
+    ) -> tuple[Mesh, EmbedInfo]:
+        """Write a message as far as a budget allows, against another mesh than the original if `reference` is given."""
+        choices, bounds = self.writer.choices, Budget.of(budget).bounds(self.original.mesh)
+        written = self.writer.write(blind_reading.codeword(message, choices), bounds, self.bits, reference)
+        record = Record(
+            scheme=self.scheme.name,
+            bits=self.bits,
+            beta=float(written.plan.alpha),
+            original="",
+            key=commitment(self.key),
+            parameters={"width": written.plan.width, "step": written.plan.step},
+            content="message" if self.bits else "presence",
+            told=commit(message, choices) if message else "",
+        ).sealed(self.key)
+        survives = self.writer.survives(written.plan, self.bits)
+        return written.mesh, EmbedInfo(written.moved.rms, written.moved.max, record.beta, record, survives)
+
+    def with_record(self, record: Record) -> "BlindMarker":
+        """See `Marker`; only the width and the step that were written are then read."""
+        return replace(self, scheme=make_blind_scheme(record.scheme, record.parameters))
+
+    def check(self, marked: Mesh, message: bytes) -> None:
+        """See `Marker`."""
+        if not self.reads(marked, message):
+            raise JaxmarkError(
+                f"This mesh ({int(self.original.used.sum())} points) cannot carry {_payload(self.bits)} with the scheme"
+                f" {self.scheme.name!r}: it does not read back, even unattacked. Use a larger budget, a shorter message"
+                f" or the scheme {DEFAULT_SCHEME!r}."
+            )
+
+    def reads(self, marked: Mesh, message: bytes) -> bool:
+        """Whether a message is read, or without one a presence proven."""
+        found = self.detect(marked)
+        return found.message == message if message else found.detected()
+
+    def measure_survival(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival | None:
+        """See `Marker`."""
+        if not self.reads(marked, message):
+            return None
+        points, rng = np.asarray(marked.vertices, np.float64), np.random.default_rng(0)
+        size = radius_of(self.original) * self.original.diagonal
+        unit = size * rng.uniform(-1, 1, self.original.positions.shape)[self.original.weld.point]
+        faces = np.asarray(marked.faces)
+        near = (points[faces, 0] <= np.median(points[faces, 0])).all(axis=1)
+        found = []
+        for most, seen in zip(predicted, (faces, faces[near]), strict=True):
+            strengths = [share * most for share in _SHARES_OF_NOISE[:-1] if most > 0]
+            suspects = (Mesh(points + noise * unit, seen) for noise in strengths)
+            reads = (noise for noise, one in zip(strengths, suspects, strict=True) if self.reads(one, message))
+            found.append(next(reads, 0.0))
+        return Survival(*found)
+
+    def register(self, suspect: Mesh) -> Mesh:
+        """Weld a suspect, and drop what no face uses: all of it is read in a pose of its own."""
+        return blind_reading.register(suspect)
+
+    def read(self, registered: Mesh, message: bytes | None = None) -> Detection:
+        """See `Marker`, and `jaxmark.watermark.blind.reading.read`."""
+        return blind_reading.read(registered, self.key, self.bits, self.scheme, message)
+
+    def detect(self, suspect: Mesh, message: bytes | None = None) -> Detection:
+        """See `Marker`."""
+        return self.read(self.register(suspect), message)
+
+    def guess(self, found: Detection) -> bytes | None:
+        """See `Marker`."""
+        return found.message or coding.guess(found.scores, self.bits, blind_reading.TAG_BITS)
+
+
+@dataclass(frozen=True, eq=False)
+class CombinedMarker:
+    """A `Marker` of several marks in one mesh, within one budget: one read with the original, and blind ones.
+
+    What each mark alone survives within the bounds says how to share these: so that all survive as much noise. Marks
+    are written one after another, the blind ones last, and the last has what the others left.
+    """
+
+    nonblind: NonBlindMarker
+    schemes: tuple[BlindScheme, ...]  # of the blind marks
+
+    @property
+    def original(self) -> Original:
+        """See `Marker`."""
+        return self.nonblind.original
+
+    def embed(self, message: bytes, budget: BudgetLike = None, *, read_back: bool = True) -> tuple[Mesh, EmbedInfo]:
+        """See `Marker`; the record is that of the mark that is read with the original."""
+        budget = Budget.of(budget)
+        mesh = self.original.mesh
+        bounds = budget.bounds(mesh)
+        reference = distortion.Reference(mesh)
+        _, alone = self.nonblind.embed(message, Budget(rms=bounds.rms, limits=bounds.limits), read_back=False)
+        sizes, survived = [alone.rms], [alone.survives.whole]
+        for marker in self._blind:
+            plan = marker.writer.plan(
+                blind_reading.codeword(message, marker.writer.choices), bounds, reference, marker.bits
+            )
+            sizes.append(plan.size)
+            survived.append(marker.writer.survives(plan, marker.bits).whole)
+        shares = _share(survived)
+        first = Budget(rms=shares[0] * sizes[0], noise=budget.noise)
+        marked, info = self.nonblind.embed(message, first, read_back=False)
+        survives = [info.survives]
+        limits = {**bounds.limits, **({} if bounds.rms is None else {"rms": bounds.rms})}
+        for place, scheme in enumerate(self.schemes, 1):
+            own = None if place == len(self.schemes) else shares[place] * sizes[place]
+            marked, other = self._make_blind(marked, scheme).write(message, Budget(rms=own, limits=limits), reference)
+            survives.append(other.survives)
+        if read_back:
+            self.check(marked, message)
+        change = distortion.displacement_size(mesh, marked)
+        least = Survival(min(one.whole for one in survives), max(one.half for one in survives))
+        return marked, info._replace(rms=change.rms, max=change.max, survives=least)
+
+    def with_record(self, record: Record) -> "CombinedMarker":
+        """See `Marker`."""
+        return replace(self, nonblind=self.nonblind.with_record(record))
+
+    def check(self, marked: Mesh, message: bytes) -> None:
+        """See `Marker`: each mark must read."""
+        for one in self._all:
+            one.check(marked, message)
+
+    def measure_survival(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival | None:
+        """See `Marker`: what all marks survive, or with half of the points lost, one of them."""
+        found: list[Survival] = []
+        for one in self._all:
+            if (survived := one.measure_survival(marked, message, predicted)) is None:
+                return None
+            found.append(survived)
+        return Survival(min(one.whole for one in found), max(one.half for one in found))
+
+    def register(self, suspect: Mesh) -> list[Any]:
+        """See `Marker`: once for each mark."""
+        return [one.register(suspect) for one in self._all]
+
+    def read(self, registered: Sequence[Any], message: bytes | None = None) -> Detection:
+        """See `Marker`: what all marks prove together."""
+        found = [one.read(part, message) for one, part in zip(self._all, registered, strict=True)]
+        return unite(found[0], found[1:])
+
+    def detect(self, suspect: Mesh, message: bytes | None = None) -> Detection:
+        """See `Marker`: what all marks prove together."""
+        found = [one.detect(suspect, message) for one in self._all]
+        return unite(found[0], found[1:])
+
+    def guess(self, found: Detection) -> bytes | None:
+        """See `Marker`: of the mark that is read with the original."""
+        return self.nonblind.guess(found)
+
+    @cached_property
+    def _blind(self) -> list[BlindMarker]:
+        return [self._make_blind(self.original.mesh, scheme) for scheme in self.schemes]
+
+    @property
+    def _all(self) -> Iterator[Marker]:
+        yield self.nonblind
+        yield from self._blind
+
+    def _make_blind(self, mesh: Mesh, scheme: BlindScheme) -> BlindMarker:
+        return make_blind_marker(mesh, self.nonblind.key, bits=self.nonblind.bits, scheme=scheme)
+
+
+def make_marker(
+    original: Mesh,
+    key: bytes,
+    *,
+    bits: int | None = None,
+    record: Record | None = None,
+    scheme: str | Scheme | BlindScheme = DEFAULT_SCHEME,
+    detector: Detector | None = None,
+) -> NonBlindMarker:
+    """Prepare an original for marking, or for reading many suspects.
+
+    Args:
+        original: the unmarked mesh. Vertices at the same position, or so near to each other that they round to the same
+            point (see `jaxmark.geometry.canonical`), move together; a vertex that no face uses stays where it is. With
+            a record, a copy that was saved again will do: rounded, reordered, moved or scaled.
+        key: 32 bytes, from `new_key`.
+        bits: size of the payload in bits, a multiple of 8; by default the record's, else 64. With 0, the mark says
+            nothing but that it is there.
+        record: the record of an earlier mark, which fixes scheme and payload size; original and key must be those that
+            it was made with.
+        scheme: a name (`"keyed"`, `"host"`, `"eigen"`), which a record overrides; or a scheme of
+            `jaxmark.watermark.schemes` or your own.
+        detector: a detector of `jaxmark.watermark.reading.detectors`; by default the scheme's own.
+
+    Returns:
+        The marker.
+
+    Raises:
+        JaxmarkError: if the mesh, key or payload is unusable, or the record was edited or is for another original, key
+            or payload.
+    """
+    key = Key(key)
+    if record is not None:
+        bits = record.payload(key, bits)
+        if isinstance(scheme, str):
+            scheme = make_scheme(record.scheme, record.parameters)
+        elif not _matches_record(get_nonblind(scheme), record):
+            raise JaxmarkError(
+                f"The record is of the scheme {record.scheme!r} with {dict(record.parameters)}, not {scheme}."
+            )
+    ready, caveats = recall(original, key, record)
+    payload = DEFAULT_BITS if bits is None else bits
+    fields = fields_of(ready, key, get_nonblind(scheme), payload, record=record, detector=detector, caveats=caveats)
+    return NonBlindMarker(**fields)
+
+
+def make_blind_marker(original: Mesh, key: bytes, *, bits: int = DEFAULT_BITS, scheme: BlindScheme) -> BlindMarker:
+    """Prepare an original for marks that are read without it.
+
+    Raises:
+        JaxmarkError: if the mesh or the key is unusable, or the payload is not a multiple of 8 bits.
+    """
+    blind_reading.code_length(bits)
+    check_faces("A mark that is read without the original", original)
+    ready, choices = make_original(original), blind_reading.context(Key(key), bits, scheme.name)
+    return BlindMarker(ready, Key(key), bits, scheme, Writer(ready, scheme, choices))
+
+
+def prepare(mesh: Mesh, key: bytes, bits: int, scheme: AnyScheme, *, adapt_to: Budget | None = None) -> Marker:
+    """Prepare an original for marking with any scheme, or with several.
+
+    Args:
+        mesh: the original.
+        key: 32 bytes.
+        bits: size of the payload in bits.
+        scheme: a scheme, its name, or several names.
+        adapt_to: the budget that the pass band of the default scheme suits, if it is meant by its name; None for the
+            usual pass band.
+
+    Raises:
+        JaxmarkError: see `make_marker` and `split`.
+    """
+    if isinstance(scheme, tuple):
+        name, blind = split(scheme)
+        marker = make_marker(mesh, key, bits=bits, scheme=name)
+        return CombinedMarker(marker if adapt_to is None else marker.adapted(adapt_to), blind)
+    if (blind := find_blind(scheme)) is not None:
+        return make_blind_marker(mesh, key, bits=bits, scheme=blind)
+    marker = make_marker(mesh, key, bits=bits, scheme=get_nonblind(scheme))
+    return marker if adapt_to is None or not isinstance(scheme, str) else marker.adapted(adapt_to)
+
+
+def unite(nonblind: Detection, blind: Sequence[Detection]) -> Detection:
+    """Unite what all marks of a mesh prove, whose signs are independent, as a detection with the original."""
+    every = (nonblind, *blind)
+    notes = tuple(f"The mark of {one.scheme!r} alone proves 10^{one.log10_p:.1f}." for one in blind)
+    return nonblind._replace(
+        message=next((one.message for one in every if one.message is not None), None),
+        evidence=Evidence.product(*(one.evidence for one in every)),
+        notes=(*nonblind.notes, *notes),
+        parts={one.scheme: one for one in every},
+    )
+
+
+def _payload(bits: int) -> str:
+    return f"a message of {bits} bits" if bits else "a presence mark"
+
+
+def _matches_record(scheme: Scheme, record: Record) -> bool:
+    """Whether a record names this scheme, which may be one of the caller's own, with these fields."""
+    if scheme.name in SCHEMES:
+        return scheme == make_scheme(record.scheme, record.parameters)
+    return (scheme.name, parameters_of(scheme)) == (record.scheme, dict(record.parameters))
+
+
+def _share(survived: Sequence[float]) -> list[float]:
+    """Share the bounds so that all marks survive as much, which grows with a mark's size; squares add up to 1."""
+    if not all(0 < one < math.inf for one in survived):
+        return [math.sqrt(1 / len(survived))] * len(survived)
+    norm = math.sqrt(sum(one**-2 for one in survived))
+    return [min(max(1 / one / norm, _LEAST_SHARE), _MOST_SHARE) for one in survived]
+
+
+def _rounded_up(value: float) -> float:
+    """A number to four digits, none of which makes it smaller."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 3)
+    return math.ceil(value / unit * (1 + 1e-9)) * unit
