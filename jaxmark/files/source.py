@@ -140,19 +140,19 @@ class Source:
         """The positions in file order."""
         return self.coordinates.values
 
-    def edits(self, positions: Points) -> Changes:
-        """Return all edits that write these positions and the normals that follow them."""
+    def spliced(self, positions: Points) -> bytes:
+        """Write these positions, and the normals that follow them, into the data."""
         edits = self.coordinates.edits(positions)
         if self.normals is not None:
             edits += self.normals.numbers.edits(self.normals.moved(self.positions, positions, self.faces))
-        return edits
+        return splice(self.data, edits)
 
     def patch(self, positions: Points, name: str) -> Patched:
         """Write these positions into the file; all bytes but those of coordinates and normals stay.
 
         Files beside it are named after `name`, the name of the file without its suffix.
         """
-        return Patched(splice(self.data, self.edits(positions)))
+        return Patched(self.spliced(positions))
 
 
 @contextmanager
@@ -164,7 +164,7 @@ def concerning(where: object) -> Iterator[None]:
         raise JaxmarkError(f"{where}: {error}") from error
 
 
-def none_usable(left: Mapping[str, str], count: int) -> str:
+def unusable(left: Mapping[str, str], count: int) -> str:
     """Return the sentence that none of several meshes can be marked, with the first reasons."""
     reasons = "; ".join(f"{name!r}: {reason}" for name, reason in list(left.items())[:3])
     return f"None of its {count} meshes can be marked: {reasons}{'; …' if len(left) > 3 else ''}."

@@ -9,19 +9,9 @@ from urllib.parse import unquote
 import numpy as np
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.source import (
-    Faces,
-    JoinedNumbers,
-    Part,
-    Patched,
-    Source,
-    concerning,
-    none_usable,
-    splice,
-    unique_names,
-)
+from jaxmark.files.source import Faces, JoinedNumbers, Part, Patched, Source, concerning, splice, unique_names, unusable
 from jaxmark.files.text import Spans, TextNumbers
-from jaxmark.files.threemf_xml import NO_SPANS, Model, RawMesh, read_relationships
+from jaxmark.files.threemf_xml import NO_TRIPLES, Model, RawMesh, read_relationships
 from jaxmark.files.zipped import Archive, Member
 from jaxmark.geometry.pose import Points
 
@@ -77,7 +67,7 @@ def parse(data: bytes) -> Source:
     if not parts and len(left) == 1:
         raise JaxmarkError("The mesh {!r} cannot be marked: {}.".format(*left.popitem()))
     if not parts:
-        raise JaxmarkError(none_usable(left, len(left)) if left else "The file has no object with a mesh.")
+        raise JaxmarkError(unusable(left, len(left)) if left else "The file has no object with a mesh.")
     return _ThreemfSource(
         data,
         JoinedNumbers([model.numbers for model in models]),
@@ -126,8 +116,8 @@ def _read_objects(
     content: bytes, meshes: Sequence[RawMesh], names: Iterator[str], left: dict[str, str]
 ) -> list[_Object]:
     """Read the numbers of a model's meshes; those that cannot be marked are put into `left`."""
-    lists = [mesh.lists.get(kind, NO_SPANS) for mesh in meshes for kind in ("vertices", "triangles")]
-    spans = np.concatenate([NO_SPANS, *lists])
+    lists = [mesh.lists.get(kind, NO_TRIPLES) for mesh in meshes for kind in ("vertices", "triangles")]
+    spans = np.concatenate([NO_TRIPLES, *lists])
     text = Spans(content, spans[..., 0].ravel(), spans[..., 1].ravel())
     tokens = np.arange(3 * len(spans)).reshape(-1, 3)
     pieces = iter(np.split(tokens, np.cumsum([len(one) for one in lists])))

@@ -26,15 +26,15 @@ _PLAIN = (
 _MAX_NAME = 200
 
 
-Spans = Int64[np.ndarray, "rows 3 2"]  # first byte and end of the three numbers in each element of a list
-NO_SPANS: Spans = np.zeros((0, 3, 2), np.int64)
+Triples = Int64[np.ndarray, "rows 3 2"]  # first byte and end of the three numbers in each element of a list
+NO_TRIPLES: Triples = np.zeros((0, 3, 2), np.int64)
 
 
 class RawMesh(NamedTuple):
     """A mesh whose numbers are not read yet."""
 
     name: str
-    lists: dict[str, Spans]  # vertices and triangles, as far as they are there
+    lists: dict[str, Triples]  # vertices and triangles, as far as they are there
 
 
 class _Parser:
@@ -172,7 +172,7 @@ class Model(_Parser):
         self.meshes[-1].lists[kind] = np.stack(spans, axis=1)
         return matched.end()
 
-    def _read_rows(self, kind: str) -> Spans:
+    def _read_rows(self, kind: str) -> Triples:
         """Read a list element by element."""
         spans = np.zeros((len(self._rows), 3, 2), np.int64)
         for row, at in enumerate(self._rows):

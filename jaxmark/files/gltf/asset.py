@@ -14,18 +14,7 @@ from jaxmark.files.binary import BinaryNumbers, encode, gather
 from jaxmark.files.gltf import draco
 from jaxmark.files.gltf.document import FLOAT, Document, Elements, Read, attribute, objects, uses, whole
 from jaxmark.files.normals import Transported
-from jaxmark.files.source import (
-    Faces,
-    Indices,
-    JoinedNumbers,
-    Part,
-    Patched,
-    Source,
-    linked,
-    none_usable,
-    splice,
-    unique_names,
-)
+from jaxmark.files.source import Faces, Indices, JoinedNumbers, Part, Patched, Source, linked, unique_names, unusable
 from jaxmark.geometry.pose import Points
 from jaxmark.geometry.skinning import Skinning
 
@@ -61,7 +50,7 @@ def parse(data: bytes, read: Read) -> Source:
         del found[name]
         left[name] = reason
     if not found:
-        raise JaxmarkError(f"{next(iter(left.values()))}." if len(left) == 1 else none_usable(left, len(meshes)))
+        raise JaxmarkError(f"{next(iter(left.values()))}." if len(left) == 1 else unusable(left, len(meshes)))
     return _source(document, found, left)
 
 
@@ -323,7 +312,7 @@ class _GltfSource(Source):
 
     def patch(self, positions: Points, name: str) -> Patched:
         """Write these positions into the file; a primitive that cannot be compressed as it was is written without."""
-        data = splice(self.data, self.edits(positions))
+        data = self.spliced(positions)
         contents: list[bytes | None] = [
             None if isinstance(buffer, str) else data[buffer.place.start : buffer.place.stop]
             for buffer in self.document.buffers
