@@ -64,9 +64,9 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
 
     Vertices are the file's own, in its order: none are merged or dropped, and isolated ones are kept. An STL file has
     three vertices of its own for each facet. A GLB, glTF or 3MF file gives local coordinates; transformations of nodes,
-    components and built items are not applied. Several meshes in a file follow each other as one; `load_scene` tells
-    them apart. A file without faces is a point cloud, as XYZ, LAS and LAZ files are. Polygons are split into triangles
-    (v0, v1, v2), (v0, v2, v3), …, for computing only.
+    components and built items are not applied. Several meshes in a file follow each other as one; `load_scene`
+    separates them. A file without faces is a point cloud, as XYZ, LAS and LAZ files are. Polygons are split into
+    triangles (v0, v1, v2), (v0, v2, v3), …, for computing only.
 
     Args:
         path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary), GLB, glTF, 3MF, XYZ (text), LAS or LAZ
@@ -85,10 +85,7 @@ def load_scene(path: str | os.PathLike) -> Scene:
     """Read the meshes of a file: those of a GLB or glTF file, or the objects of an OBJ or 3MF file.
 
     Objects of OBJ that share vertices are one mesh, and so are meshes that share positions. Instances and other nodes
-    that show the same mesh are not told apart. Files of other formats have one mesh.
-
-    Args:
-        path: see `load_mesh`.
+    that show the same mesh are not distinguished. Files of other formats have one mesh.
 
     Raises:
         JaxmarkError: see `load_mesh`; but of several meshes, some may be invalid.
@@ -111,9 +108,6 @@ def load_scene(path: str | os.PathLike) -> Scene:
 def load_texture(path: str | os.PathLike) -> Texture:
     """Read the texture coordinates of an OBJ, GLB or glTF file.
 
-    Args:
-        path: a mesh file, see `load_mesh`.
-
     Returns:
         One pair for each corner of the faces that `load_mesh` returns, NaN for those that have none; None if the file
         or its format has no texture coordinates, or none that can be read.
@@ -128,12 +122,9 @@ def load_texture(path: str | os.PathLike) -> Texture:
 def load_skin(path: str | os.PathLike) -> Skinning:
     """Read the skin of a GLB or glTF file: the joints that move each vertex, and their weights.
 
-    Args:
-        path: a mesh file, see `load_mesh`.
-
     Returns:
         One row for each vertex that `load_mesh` returns. The weights of a vertex sum to 1; joints of several skins
-        in one file are told apart.
+        in one file have different numbers.
 
     Raises:
         JaxmarkError: see `load_mesh`; or if not all meshes of the file have a skin.

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.normals import Transported
-from jaxmark.files.source import Faces, Indices, Part, Source, Texture, fan, linked, ranges, unique_names
+from jaxmark.files.source import Faces, Indices, Part, Source, Texture, Transported, fan, linked, ranges, unique_names
 from jaxmark.files.text import Lines, Text, unix, without_comments
 
 _MAX_NAME = 200  # bytes of an object's name

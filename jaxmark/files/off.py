@@ -5,8 +5,7 @@ import re
 import numpy as np
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.normals import Transported
-from jaxmark.files.source import Source, fan, ranges
+from jaxmark.files.source import Source, Transported, fan, ranges
 from jaxmark.files.text import Text, TextNumbers, unix, without_comments
 
 _HEADER = re.compile(rb"\s*((?:ST)?C?(N?)(4?n?)OFF)(?:(?=\d)|\s+|$)(BINARY)?")

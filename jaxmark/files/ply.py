@@ -8,8 +8,7 @@ from jaxtyping import Int64
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.binary import BinaryNumbers, gather
-from jaxmark.files.normals import Transported
-from jaxmark.files.source import Faces, Indices, Source, fan, ranges
+from jaxmark.files.source import Faces, Indices, Source, Transported, fan, ranges
 from jaxmark.files.text import Text, TextNumbers, unix
 
 _TYPES = {

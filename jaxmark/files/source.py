@@ -1,4 +1,4 @@
-"""Parsed mesh files, which can be written again with other positions and otherwise the same bytes."""
+"""Parsed mesh files, which can be written again with other positions, the normals that follow, and all other bytes."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -11,8 +11,11 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import cross_product
 from jaxmark.geometry.pose import Points
 from jaxmark.geometry.skinning import Skinning
+
+_ANTIPARALLEL = 1e-6  # largest 1 + cos of a rotation's angle at which the minimal rotation is ill-defined
 
 Rows = Float64[np.ndarray, "rows 3"]
 Faces = Int64[np.ndarray, "faces 3"]
@@ -83,15 +86,63 @@ class JoinedNumbers:
         return self._parts[0].advice(step)
 
 
-@runtime_checkable
-class Normals(Protocol):
-    """Normals of a file, which follow its positions."""
+@dataclass
+class Transported:
+    """Normals that turn with the faces that use them.
 
-    numbers: Numbers  # the normals in the file
+    The mean normal of these faces, weighted by area, turns from its old to its new direction by a minimal rotation; the
+    file's normal turns by the same one. So smoothing groups, flat normals and any weighting stay as they were, and
+    nothing turns where nothing moved.
+
+    Attributes:
+        numbers: the normals in the file.
+        corners: the index of the normal that each corner of each face uses; -1 for none.
+    """
+
+    numbers: Numbers
+    corners: Faces
+
+    def _mean(self, points: Points, faces: Faces) -> Rows:
+        """Average the normals of the faces that use each normal by area, each face counted once."""
+        vectors = _area_vectors(points, faces)
+        first, second, third = self.corners.T
+        once = np.stack([first >= 0, (second >= 0) & (second != first), (third >= 0) & (third != first)], axis=1)
+        once[:, 2] &= third != second
+        entries, rows = self.corners[once], np.nonzero(once)[0]
+        count = len(self.numbers.values)
+        with np.errstate(all="ignore"):
+            sums = [np.bincount(entries, vectors[rows, axis], count).astype(float) for axis in range(3)]
+        return _unit(np.stack(sums, axis=1))
 
     def moved(self, old: Points, new: Points, faces: Faces) -> Rows:
-        """Compute the normals after the points moved from `old` to `new`."""
-        ...
+        """Turn the normals; a normal that no face uses, or only faces without area, stays."""
+        normals = self.numbers.values
+        if not len(faces):
+            return normals
+        before, after = self._mean(old, faces), self._mean(new, faces)
+        with np.errstate(all="ignore"):
+            cosine = np.einsum("ij,ij->i", before, after)
+            turns = (before != after).any(axis=1) & (1 + cosine > _ANTIPARALLEL) & np.isfinite(normals).all(axis=1)
+        a, b, n = before[turns], after[turns], normals[turns]
+        axis = np.cross(a, b)  # the axis of the rotation, times the sine of its angle
+        along = np.einsum("ij,ij->i", axis, n) / (1 + cosine[turns])
+        result = normals.copy()
+        result[turns] = n * cosine[turns, None] + np.cross(axis, n) + axis * along[:, None]
+        return result
+
+
+@dataclass
+class PerFace:
+    """One normal for each face, as in STL files."""
+
+    numbers: Numbers
+
+    def moved(self, old: Points, new: Points, faces: Faces) -> Rows:
+        """Compute the unit normals of the faces that moved; a zero normal stays, and that of a face without area."""
+        normals = self.numbers.values
+        computed = _unit(_area_vectors(new, faces))
+        turns = (old != new).any(axis=1)[faces].any(axis=1) & normals.any(axis=1) & np.isfinite(computed).all(axis=1)
+        return np.where(turns[:, None], computed, normals)
 
 
 class Part(NamedTuple):
@@ -129,7 +180,7 @@ class Source:
     data: bytes
     coordinates: Numbers
     faces: Faces
-    normals: Normals | None = None
+    normals: Transported | PerFace | None = None
     texture: Callable[[], Texture] = lambda: None
     skin: Callable[[], Skinning | None] = lambda: None
     parts: Sequence[Part] = ()
@@ -222,3 +273,16 @@ def fan(sizes: Indices) -> Faces:
     first = np.cumsum(sizes) - sizes
     second = ranges(first + 1, sizes - 2)
     return np.stack([np.repeat(first, sizes - 2), second, second + 1], axis=1)
+
+
+def _area_vectors(points: Points, faces: Faces) -> Float64[np.ndarray, "faces 3"]:
+    """Compute normals of faces, as long as twice the face's area."""
+    with np.errstate(all="ignore"):  # huge coordinates give infinities, which callers exclude
+        first = points[faces[:, 0]]
+        return cross_product(points[faces[:, 1]] - first, points[faces[:, 2]] - first)
+
+
+def _unit(vectors: Rows) -> Rows:
+    """Normalise vectors to length 1; zero becomes NaN."""
+    with np.errstate(all="ignore"):
+        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -7,8 +7,7 @@ import numpy as np
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.binary import BinaryNumbers
-from jaxmark.files.normals import PerFace
-from jaxmark.files.source import Source
+from jaxmark.files.source import PerFace, Source
 from jaxmark.files.text import Text, TextNumbers, blank, unix
 
 _FLOAT = (np.dtype("<f4"),) * 3

@@ -13,8 +13,18 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files.binary import BinaryNumbers, encode, gather
 from jaxmark.files.gltf import draco
 from jaxmark.files.gltf.document import FLOAT, Document, Elements, Read, attribute, objects, uses, whole
-from jaxmark.files.normals import Transported
-from jaxmark.files.source import Faces, Indices, JoinedNumbers, Part, Patched, Source, linked, unique_names, unusable
+from jaxmark.files.source import (
+    Faces,
+    Indices,
+    JoinedNumbers,
+    Part,
+    Patched,
+    Source,
+    Transported,
+    linked,
+    unique_names,
+    unusable,
+)
 from jaxmark.geometry.pose import Points
 from jaxmark.geometry.skinning import Skinning
 

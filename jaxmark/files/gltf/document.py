@@ -93,8 +93,7 @@ class Document:
             raise JaxmarkError(f"Only version 2 of glTF is supported, not {ascii(version)[:40]}.")
         self.file, self.buffers = file, list[Buffer | str]()
         pieces, size = list[bytes](), 0
-        entries = self.content.get("buffers", [])
-        for index, entry in enumerate(entries if isinstance(entries, list) else []):
+        for index, entry in enumerate(_listed(self.content, "buffers")):
             try:
                 head, data = _content(entry, index, file[chunk.start : chunk.stop] if chunk else None, read)
             except JaxmarkError as error:
@@ -164,7 +163,7 @@ class Document:
         return self.located[index]
 
     def view(self, number: int) -> tuple[int, int]:
-        """Locate a buffer view: where it begins in `Container.data`, and its length."""
+        """Locate a buffer view: where it begins in `Document.data`, and its length."""
         where = f"bufferViews[{number}]"
         view = self.item("bufferViews", number)
         extensions = view.get("extensions")
@@ -215,8 +214,7 @@ class Document:
                 path = f"{name}.{hashlib.sha256(content).hexdigest()[:8]}.bin"
                 entry["uri"] = quote(path)
                 beside[path] = content
-        images = self.content.get("images", [])
-        for image in images if isinstance(images, list) else []:
+        for image in _listed(self.content, "images"):
             uri = image.get("uri") if isinstance(image, dict) else None
             if isinstance(uri, str) and not uri.startswith("data:") and "://" not in uri:
                 companions.append(unquote(uri))
@@ -242,15 +240,20 @@ class Document:
 
 def uses(mesh: dict[str, Any]) -> Iterator[tuple[str, int]]:
     """Yield the accessors that a mesh uses, each after its role, such as POSITION; malformed entries are left out."""
-    primitives = mesh.get("primitives")
-    for primitive in primitives if isinstance(primitives, list) else []:
+    for primitive in _listed(mesh, "primitives"):
         if isinstance(primitive, dict):
-            attributes, targets = primitive.get("attributes"), primitive.get("targets")
+            attributes = primitive.get("attributes")
             found: list[tuple[str, Any]] = [("indices", primitive.get("indices"))]
             found += attributes.items() if isinstance(attributes, dict) else ()
-            for target in targets if isinstance(targets, list) else []:
+            for target in _listed(primitive, "targets"):
                 found += [("target", index) for index in target.values()] if isinstance(target, dict) else []
             yield from (use for use in found if isinstance(use[1], int))
+
+
+def _listed(parent: dict[str, Any], key: str) -> list[Any]:
+    """Return a list in an object, empty if it is none."""
+    items = parent.get(key)
+    return items if isinstance(items, list) else []
 
 
 def objects(parent: dict[str, Any], key: str, where: str) -> list[dict[str, Any]]:
@@ -283,7 +286,7 @@ def _padded(data: bytes, filling: bytes) -> bytes:
 
 
 def _chunks(data: bytes) -> tuple[range, range]:
-    """Locate the JSON chunk and of the binary chunk of a GLB file."""
+    """Locate the JSON chunk and the binary chunk of a GLB file."""
     if len(data) < 20 or data[:4] != _MAGIC:
         raise JaxmarkError("byte 0: a GLB file begins with glTF and a header of 20 bytes.")
     version, length, size, kind = struct.unpack_from("<IIII", data, 4)
