@@ -140,7 +140,7 @@ _Catalogue = TypeVar("_Catalogue", bound=Originals)
 
 
 class Finder(Generic[_Catalogue]):
-    """Finds originals of one catalogue for many suspects; keeps the descriptors in memory.
+    """A search for the originals of many suspects in one catalogue, which keeps the descriptors in memory.
 
     Args:
         catalogue: may be opened for reading only.

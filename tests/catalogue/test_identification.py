@@ -87,7 +87,7 @@ def test_a_suspect_in_any_pose_is_named_with_its_message(shop: Shop):
 
 def test_other_ways_of_aligning_are_paid_for(shop: Shop):
     suspect = jm.attack(shop.marked[3], "noise", 0.02, seed=0)
-    auto, same = (named(shop, suspect, how=how)[1] for how in ("auto", "same"))
+    auto, same = (named(shop, suspect, align=align)[1] for align in ("auto", "same"))
     assert -70 < auto.named[0].log10_p < -10  # not at the floor, so that what is paid shows
     assert same.named[0].log10_p == pytest.approx(auto.named[0].log10_p + math.log10(0.97 / 0.01), abs=1e-6)
     refused = Match("3.obj", "", "", "landmarks", 1, 0.0, refused="The vertices are in another order.")
@@ -176,7 +176,7 @@ def test_what_cannot_be_sought_is_refused(shop: Shop, workshop: Workshop):
             ({"keys": []}, "key"),
             ({"alpha": 2.0}, "alpha"),
             ({"depth": 0}, "at"),
-            ({"how": "by eye"}, "by eye"),
+            ({"align": "by eye"}, "by eye"),
         ):
             with pytest.raises(jm.JaxmarkError, match=said):
                 Finder(catalogue, **({"keys": [shop.key]} | options))
