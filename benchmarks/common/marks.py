@@ -8,7 +8,7 @@ import numpy as np
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.interfaces import Room, Scheme
-from jaxmark.watermark.perception.budget import Budget
+from jaxmark.watermark.perception.budget import BudgetLike
 from jaxmark.watermark.perception.capacity import NOISE
 
 KEY, MESSAGE, BUDGET = jm.Key(bytes(range(32))), b"jaxmark!", 8e-4
@@ -55,7 +55,7 @@ def mark(mesh: Mesh, scheme: Scheme, bits: int, budget: float, noise: float | No
     return Subject(marker, marker.embed(message, jm.Budget(rms=budget, noise=noise))[0], message, noise)
 
 
-def write(marker: jm.watermark.NonBlindMarker, message: bytes, budget: Budget) -> Mesh:
+def write(marker: jm.watermark.NonBlindMarker, message: bytes, budget: BudgetLike) -> Mesh:
     """Embed without reading back, whether or not the mesh has room for the message."""
     return marker.write(marker.codeword(message), budget)[0]
 

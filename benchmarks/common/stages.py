@@ -60,8 +60,8 @@ def embedding(folder: Path, **options: Any) -> Call:
 
 def writing(folder: Path, scheme: str | Scheme) -> Call:
     """Embedding without reading back."""
-    mesh, budget = jm.load_mesh(folder / "mesh.ply"), jm.Budget(rms=BUDGET).bounds(MESH)
-    return lambda: write(jm.make_marker(mesh, KEY, bits=8 * len(MESSAGE), scheme=scheme), MESSAGE, budget)
+    mesh = jm.load_mesh(folder / "mesh.ply")
+    return lambda: write(jm.make_marker(mesh, KEY, bits=8 * len(MESSAGE), scheme=scheme), MESSAGE, BUDGET)
 
 
 def detecting(folder: Path) -> Call:
@@ -101,7 +101,7 @@ def aligning(folder: Path, by_surface: bool) -> Call:
 
 def tuning(folder: Path) -> Call:
     attacks = [("noise", 0.005), ("smoothing", 10)]
-    return partial(jm.tune, jm.load_mesh(folder / "mesh.ply"), attacks, BUDGET, key=jax.random.key(0))
+    return partial(jm.tune, jm.load_mesh(folder / "mesh.ply"), attacks, BUDGET, seed=0)
 
 
 WHOLE: Mapping[str, Callable[[Path], Call]] = {

@@ -73,11 +73,11 @@ def main() -> None:
         say(name)
         mesh = host_mesh(compact(weld_mesh(given, weld(given.vertices))))
         frame = Frame.of(mesh)
-        frame, result = frame._replace(width=CLOSE * frame.width), marked(mesh, jm.Budget().bounds(mesh))
+        frame, result = frame._replace(width=CLOSE * frame.width), marked(mesh, jm.Budget())
         more = exaggerate(jm.make_marker(mesh, KEY).original, result).mesh
         save(strip([mesh, result, more], frame), arguments.output / f"visibility_{name}.png")
         if name in arguments.levels:
-            levels = [marked(mesh, jm.Budget(visibility=level).bounds(mesh)) for level in VISIBILITY]
+            levels = [marked(mesh, jm.Budget(visibility=level)) for level in VISIBILITY]
             save(strip([mesh, *levels], frame), arguments.output / f"visibility_levels_{name}.png")
 
 

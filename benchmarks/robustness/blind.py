@@ -83,7 +83,9 @@ def read(suspect: Mesh, key: bytes, scheme: BlindScheme) -> Cell:
     except jm.JaxmarkError:
         return Cell(False, 0.0, 0.0, 0.0, time.perf_counter() - start)
     seconds = time.perf_counter() - start
-    return Cell(found.message == MESSAGE, found.log10_p, found.log10_p_unfloored, found.agreement, seconds)
+    evidence = found.evidence
+    agreement = found.registration.agreement
+    return Cell(found.message == MESSAGE, evidence.log10_p, evidence.log10_p_unfloored, agreement, seconds)
 
 
 def predict(mesh: Mesh, steps: str, one: Copy) -> float:

@@ -175,7 +175,7 @@ def bounded(subject: Subject, steps: str, seed: int, others: int) -> Row:
 def claimed(subject: Subject, suspect: Mesh) -> float | None:
     """log10 p of a claim of the true message, without floor; None for a suspect that is refused."""
     try:
-        return subject.marker.detect(suspect, subject.message).log10_p_unfloored
+        return subject.marker.detect(suspect, subject.message).evidence.log10_p_unfloored
     except jm.JaxmarkError:
         return None
 
@@ -190,10 +190,10 @@ def tried(subject: Subject, source: Path, steps: str, seed: int, others: int) ->
         return failed(error)
     suffix = str(rng.choice([".ply", ".obj"]))
     answer = read(marker, suspect, source, suffix)
-    alignment = answer.get("alignment") or {}
+    registration = answer.get("registration") or {}
     row = {"vertices": len(suspect.vertices), "faces": len(suspect.faces), "file": suffix}
     row |= {name: answer.get(name) for name in ("log10_p", "coverage", "seconds", "note")}
-    row |= {name: alignment.get(name) for name in ("method", "residual", "pose")}
+    row |= {name: registration.get(name) for name in ("method", "residual", "pose")}
     if row["pose"]:
         found = Pose(*(np.array(row["pose"][name]) for name in Pose._fields))
         row["pose_error"] = pose_error(marker.original.mesh, true, found)
@@ -251,7 +251,7 @@ def controls(sources: list[Path], scheme: str, wanted: Case, options: argparse.N
         yield row | {"note": f"refused: {error}"}
         return
     for _ in range(KEYS):
-        found = jm.make_marker(original, rng.bytes(32), bits=wanted.bits, scheme=scheme).detect(aligned)
+        found = jm.make_marker(original, rng.bytes(32), bits=wanted.bits, scheme=scheme).read(aligned)
         yield row | {"log10_p": found.log10_p, "coverage": found.coverage}
 
 

@@ -38,7 +38,7 @@ ATTACKS = """noise 0.005; smoothing 50; quantisation 8; quantisation 7; simplifi
 
 def nats(marker: jm.watermark.NonBlindMarker, suspect: Mesh) -> float:
     """The best of a claim's exponents."""
-    received = marker.receive(suspect)
+    received = marker.receive(marker.register(suspect))
     word = jnp.asarray(marker.codeword(MESSAGE), received.observed.residual.dtype)
     return max(
         float(max(score / norm, 0) ** 2 / 2) for score, norm in zip(*claims(marker.reader, received, word), strict=True)
@@ -82,7 +82,7 @@ def main() -> None:
     arguments = parser.parse_args()
     limits = {name: float(value) for name, value in (limit.split("=") for limit in arguments.limit or [])}
     rms = limits.pop("rms", None)
-    budget = jm.Budget(rms=rms, limits=limits or None).bounds(MESH)
+    budget = jm.Budget(rms=rms, limits=limits or None)
     rows = []
     for name, mesh in [
         *((path.stem, load(parser, path)) for path in arguments.meshes),

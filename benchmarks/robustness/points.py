@@ -122,9 +122,9 @@ def reading(marker: jm.watermark.NonBlindMarker, suspects: Callable[[int], Mesh]
     for seed in range(seeds):
         start = time.perf_counter()
         try:
-            found = marker.detect(suspects(seed))
-            reads += found.message == MESSAGE
-            claimed, seen = marker.detect(found.registration, MESSAGE), min(seen, found.coverage)
+            aligned = marker.register(suspects(seed))
+            found, claimed = marker.read(aligned), marker.read(aligned, MESSAGE).evidence
+            reads, seen = reads + (found.message == MESSAGE), min(seen, found.coverage or 0.0)
             worst, unfloored = max(worst, claimed.log10_p), max(unfloored, claimed.log10_p_unfloored)
         except jm.JaxmarkError:
             worst, unfloored, seen = 0.0, 0.0, 0.0

@@ -13,7 +13,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-from jaxmark.app.programs import release_programs
 from numpy.random import Generator
 from scipy import sparse
 from scipy.sparse import csgraph
@@ -21,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
 from jaxmark.alignment.alignment import align, straightened
+from jaxmark.app.process import release_programs
 from jaxmark.files import load_skin
 from jaxmark.geometry import Skinning, unpose
 from jaxmark.geometry.mesh import Mesh, diagonal
@@ -79,7 +79,7 @@ def rows_of(path: Path, mesh: Mesh, bits: int, budget: float) -> list[Row]:
         else:
             suspect = jm.attack(subject.marked, kind, strength, seed=0)
         aligned, start = align(marker.original, suspect), time.perf_counter()
-        read = marker.detect(aligned).message == subject.message
+        read = marker.read(aligned).message == subject.message
         seconds = time.perf_counter() - start
         places, before = np.asarray(suspect.vertices, np.float64), np.asarray(mesh.vertices, np.float64)
         off = np.linalg.norm(similarity(places, before)(places) - before, axis=1)
@@ -89,7 +89,7 @@ def rows_of(path: Path, mesh: Mesh, bits: int, budget: float) -> list[Row]:
             ways["own maps"] = straightened(marker.original, aligned, aligned.bent)
         if skin is not None:
             ways["skeleton"] = align(marker.original, unpose(mesh, skin, suspect))
-        claims = {name: marker.detect(way, subject.message).log10_p_unfloored for name, way in ways.items()}
+        claims = {name: marker.read(way, subject.message).evidence.log10_p_unfloored for name, way in ways.items()}
         rows.append({"mesh": path.name, "points": int(marker.original.used.sum()), "attack": f"{kind} {strength:g}"})
         rows[-1] |= {"moved": moved, "read": "yes" if read else "no", **{k: round(v, 1) for k, v in claims.items()}}
         rows[-1]["seconds"] = round(seconds, 1)

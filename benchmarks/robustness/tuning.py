@@ -15,13 +15,12 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxmark.app.programs import release_programs
 
 import jaxmark as jm
 from jaxmark.alignment.original import make_original
+from jaxmark.app.process import release_programs
 from jaxmark.evaluation.tuning import Tuned, tune
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.interfaces import Scheme
@@ -49,8 +48,7 @@ def strength(word: str) -> tuple[str, float]:
 
 
 def tuned_on(mesh: Mesh, limits: Mapping[str, float], options: argparse.Namespace) -> Tuned:
-    key = jax.random.key(0)
-    return tune(mesh, options.attacks, limits, key=key, margin="evidence", bits=options.bits)
+    return tune(mesh, options.attacks, limits, seed=0, margin="evidence", bits=options.bits)
 
 
 def profiles(
@@ -93,10 +91,12 @@ def evidence(
         claimed = jnp.asarray(word, marker.original.signal.dtype)
         for seed in range(options.seeds):
             for place, (kind, strength) in enumerate(options.attacks):
-                received = marker.receive(jm.attack(marked, kind, strength, seed=UNSEEN + seed))
+                suspect = jm.attack(marked, kind, strength, seed=UNSEEN + seed)
+                received = marker.receive(marker.register(suspect))
                 score, norm = marker.reader.claim(received, claimed)
                 found[number, seed, place] = max(float(score), 0) ** 2 / (2 * float(norm) ** 2)
-                read.append(marker.decode(marker.soft_decisions(received)) == message)
+                decoded = marker.decode(marker.soft_decisions(received))
+                read.append(decoded is not None and decoded.message == message)
     return found.mean(axis=(0, 1)).tolist(), float(np.mean(read))
 
 

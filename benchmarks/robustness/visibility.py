@@ -81,7 +81,7 @@ def main() -> None:
     parser.add_argument("--pictures", action="store_true", help="compare pictures, too")
     arguments = parser.parse_args()
     limits = dict(limit.split("=") for limit in arguments.limit or [])
-    budget = jm.Budget(limits={name: float(value) for name, value in limits.items()} or None).bounds(MESH)
+    budget = jm.Budget(limits={name: float(value) for name, value in limits.items()} or None)
     rows = []
     for name, mesh in [
         *((path.stem, load(parser, path)) for path in arguments.meshes),

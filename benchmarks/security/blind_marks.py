@@ -49,7 +49,8 @@ from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.field import TURNS, FieldScheme
 from jaxmark.watermark.blind.scheme import AnchoredHost
 from jaxmark.watermark.blind.writing import Writer
-from jaxmark.watermark.evidence import bounds as evidence
+from jaxmark.watermark.evidence import bounds, ledger
+from jaxmark.watermark.evidence.ledger import figure
 from jaxmark.watermark.mark import EmbedInfo
 from jaxmark.watermark.markers import make_blind_marker
 from jaxmark.watermark.schemes.registry import BLIND_SCHEMES
@@ -130,9 +131,7 @@ def simulate(way: str, pairs: int, rng: np.random.Generator) -> Scores:
 def stated(scores: Float64[np.ndarray, " pairs"], norms: Float64[np.ndarray, " pairs"]) -> Float64[np.ndarray, " some"]:
     """log10 p of each pair that may state one as small as the first level."""
     near = np.flatnonzero(scores > NEAR * norms)
-    return np.array(
-        [evidence.log10_p_claimed(score, norm) for score, norm in zip(scores[near], norms[near], strict=True)]
-    )
+    return np.array([bounds.log10_p_score(score, norm) for score, norm in zip(scores[near], norms[near], strict=True)])
 
 
 def bound(pairs: int) -> Iterator[Row]:
@@ -162,10 +161,10 @@ def key_of(number: int) -> jm.Key:
 def unmarked(meshes: Mapping[str, Mesh], keys: int) -> Iterator[Row]:
     """The smallest probability that is read from meshes without a mark, by each scheme."""
     for (name, mesh), scheme in product(meshes.items(), BLIND_SCHEMES.values()):
-        claimed, read = [], []
+        claimed, read, suspect = [], [], reading.register(mesh)
         for number in range(keys):
-            claimed.append(reading.detect(mesh, key_of(number), 8 * len(MESSAGE), scheme, MESSAGE).log10_p)
-            read.append(reading.detect(mesh, key_of(number), 8 * len(MESSAGE), scheme))
+            claimed.append(reading.read(suspect, key_of(number), 8 * len(MESSAGE), scheme, MESSAGE).log10_p)
+            read.append(reading.read(suspect, key_of(number), 8 * len(MESSAGE), scheme))
             say(name, number, claimed[-1], read[-1].log10_p)
         yield {
             "mesh": name,
@@ -260,7 +259,7 @@ def cost(before: Mesh, after: Mesh, mark: float) -> Row:
 def read(suspect: Mesh, key: jm.Key = KEY, message: bytes = MESSAGE) -> Row:
     """What is proven of the mark's message, and whether it reads."""
     found = jm.detect(suspect, key=key, message=message)
-    say(f"log10 p {found.log10_p:.1f}, agreement {found.agreement:.2f}")
+    say(f"log10 p {found.log10_p:.1f}, agreement {found.registration.agreement:.2f}")
     return {"log10 p": found.log10_p, "reads": "yes" if found.message == message else "no"}
 
 
@@ -383,7 +382,8 @@ class Detector:
         dither = make_dither(choices, SCHEME.name, seen.cells[seen.good], len(word))
         self.phases = seen.phases[seen.good] - dither.offset
         self.signs = dither.sign * word[dither.slot]
-        self.paid = math.log2(len(SCHEME.widths) * SCHEME.looks * len(SCHEME.steps) * 2)
+        looks = len(SCHEME.widths) * SCHEME.looks * len(SCHEME.steps) * 2
+        self.charges = [ledger.LOOKS.charge("each", looks)]
         self.asked = 0
 
     def score(self, change: Float64[np.ndarray, " anchors"]) -> float:
@@ -395,8 +395,8 @@ class Detector:
         """Whether the claimed message is proven."""
         self.asked += 1
         cosines = np.cos(2 * np.pi * (self.phases + change))
-        found = evidence.log10_p_read(float(self.signs @ cosines), float(np.linalg.norm(cosines)), self.paid)
-        return found <= THRESHOLD
+        log10_p = bounds.log10_p_score(self.signs @ cosines, np.linalg.norm(cosines))
+        return figure(log10_p, self.charges) <= THRESHOLD
 
     def least(self, way: Float64[np.ndarray, " anchors"], most: float, rounds: int) -> float:
         """How far values must go a way until no mark is detected, by halving; `most` if it is not detected there."""
@@ -460,12 +460,12 @@ def salts(name: str, mesh: Mesh) -> Iterator[Row]:
     choices = reading.context(KEY, 8 * len(MESSAGE), SCHEME.name)
     for _ in SCHEME.views(mesh, choices):  # compiles
         break
-    reading.detect(mesh, KEY, 8 * len(MESSAGE), SCHEME)
+    reading.read(reading.register(mesh), KEY, 8 * len(MESSAGE), SCHEME)
     start = time.perf_counter()
     looks = list(SCHEME.views(mesh, choices))
     looked = time.perf_counter() - start
     start = time.perf_counter()
-    reading.detect(mesh, KEY, 8 * len(MESSAGE), SCHEME)
+    reading.read(reading.register(mesh), KEY, 8 * len(MESSAGE), SCHEME)
     once = time.perf_counter() - start
     for count in (1, SALTS):
         seconds = looked + count * (once - looked)

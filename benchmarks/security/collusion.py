@@ -39,7 +39,7 @@ def main() -> None:
     names = [f"recipient {i}" for i in range(arguments.recipients)]
     guilty = names[: max(COALITIONS)]
     copies = [tracer.fingerprint(name, arguments.budget)[0] for name in guilty]
-    print(f"{len(weld(mesh.vertices).first)} points, {tracer.marker.code_bits} slots, {len(names)} recipients")
+    print(f"{len(weld(mesh.vertices).first)} points, {tracer.mark.code_bits} slots, {len(names)} recipients")
     print(head("colluders", "by", "members accused", "innocents accused", "best log10 p", "seconds"))
     random = np.random.default_rng(0)
     for count in COALITIONS:

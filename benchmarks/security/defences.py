@@ -21,7 +21,6 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 import jaxmark as jm
@@ -82,7 +81,7 @@ def tuned(mesh: Mesh, names: Sequence[str], steps: int, rounds: int) -> Iterator
                     continue
                 strength = weakest.strength
             attacks.append((ATTACKERS[name].attack(scheme, steps), strength))
-        found = jm.tune(mesh, attacks, BUDGET, key=jax.random.key(0), bits=BITS, margin="evidence")
+        found = jm.tune(mesh, attacks, BUDGET, seed=0, bits=BITS, margin="evidence")
         scheme = found.scheme
         yield f"tuned, round {count}" + (" (the default)" if found.report.kept else ""), scheme, scheme
 
@@ -106,7 +105,7 @@ def elsewhere(target: Target) -> Iterator[str]:
     yield from (f"{value:.3g}" for value in (seen.dame, seen.msdm2))
     for kind, strength in ELSEWHERE:
         found = target.marker.detect(jm.attack(target.marked, kind, strength, seed=1), MESSAGE)
-        yield f"{found.log10_p_unfloored:.1f}"
+        yield f"{found.evidence.log10_p_unfloored:.1f}"
 
 
 def marks(mesh: Mesh, names: Sequence[str], steps: int, rounds: int) -> None:

@@ -13,7 +13,7 @@ only their surface is known; with --vertices, few vertices are left, by which th
 
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.carriers import make_chips
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
 from jaxmark.watermark.coding.message import encode
-from jaxmark.watermark.evidence.bounds import any_of, log10_p_claimed, log10_p_read
+from jaxmark.watermark.evidence.detection import weigh
 from jaxmark.watermark.reading.coarse import receive_coarse
 from jaxmark.watermark.reading.detectors import claims
 from jaxmark.watermark.reading.reception import Reception
@@ -92,9 +92,9 @@ def suspects(marker: jm.watermark.NonBlindMarker) -> dict[str, Observation]:
         "affine": mesh._replace(vertices=vertices @ np.diag([1, 1.1, 0.9]) + 3),
         "sign of the position": mesh._replace(vertices=vertices + 1e-3 * size * np.sign(vertices)),
     }
-    seen = {name: marker.observe(suspect) for name, suspect in meshes.items()}
+    seen = {name: marker.observe(marker.register(suspect)) for name, suspect in meshes.items()}
     for name, straight in (("bent", mesh), ("marked under another key, bent", marked(204))):
-        aligned = marker.align(jm.attack(straight, "twisting", 120, seed=5))
+        aligned = marker.register(jm.attack(straight, "twisting", 120, seed=5))
         assert aligned.bent is not None
         seen[f"{name}, straightened"] = marker.observe(straightened(marker.original, aligned, aligned.bent))
     return stackable(seen)
@@ -122,7 +122,7 @@ def surfaces(marker: jm.watermark.NonBlindMarker) -> dict[str, Observation]:
         "quiet in one belt only": fine._replace(vertices=fine.vertices + ~edge * bumps),
         "isotropic": jm.attack(mesh, "isotropic", 1, seed=0),
     }
-    seen = {name: marker.observe(suspect) for name, suspect in meshes.items()}
+    seen = {name: marker.observe(marker.register(suspect)) for name, suspect in meshes.items()}
     assert all(one.normals is not None for one in seen.values()), "A suspect was compared point by point."
     return stackable(seen)
 
@@ -141,7 +141,7 @@ def coarse(marker: jm.watermark.NonBlindMarker) -> dict[str, Reception]:
         "marked under another key, simplified": jm.attack(marked, "simplification", 0.6, seed=0),
         "near shape, simplified": jm.attack(near, "simplification", 0.7, seed=0),
     }
-    aligned = {name: marker.align(suspect) for name, suspect in meshes.items()}
+    aligned = {name: marker.register(suspect) for name, suspect in meshes.items()}
     seen = stackable({name: marker.observe(one) for name, one in aligned.items()})
     carrier, found = marker.carrier, {}
     assert isinstance(carrier, KeyedCarrier)
@@ -201,9 +201,11 @@ def best_claims(
     return scores, norms
 
 
-def united(bound: Callable[[float, float], float], scores: np.ndarray, norms: np.ndarray) -> np.ndarray:
-    """log10 p of the best way of weighing, paid for, `[keys, suspects]`."""
-    return np.vectorize(any_of)(*np.moveaxis(np.vectorize(bound)(scores, norms), -1, 0))
+def weighed(scores: np.ndarray, norms: np.ndarray, *, bits: int, fixed: bool) -> np.ndarray:
+    """log10 p of the best way of weighting, after all charges, `[keys, suspects]`."""
+    pairs = np.stack([scores, norms], axis=-1)
+    found = [weigh(ways, bits=bits, fixed=fixed).log10_p for ways in pairs.reshape(-1, *pairs.shape[2:])]
+    return np.reshape(found, scores.shape[:2])
 
 
 def holds(values: np.ndarray, names: list[str], *, fires: bool, report: bool) -> bool:
@@ -237,15 +239,15 @@ def main() -> None:
     marker = jm.make_marker(mesh, jm.Key(bytes([255] * 32)), bits=8 * len(MESSAGE))
     seen = (coarse if arguments.vertices else surfaces if arguments.surfaces else suspects)(marker)
     names = list(seen)
-    values = united(log10_p_claimed, *best_claims(marker, seen, arguments.keys, [MESSAGE]))
+    values = weighed(*best_claims(marker, seen, arguments.keys, [MESSAGE]), bits=marker.bits, fixed=True)
     print("a message claimed: nominal, counted with 95 % interval")
     passed = holds(values, names, fires=True, report=True)
     control = holds(2 * values, names, fires=True, report=False)
     every = [bytes([byte]) for byte in range(256)]
     read = best_claims(marker, seen, max(BATCH, arguments.keys // 50 // BATCH * BATCH), every)
     print("the best of all 256 messages, by the union bound")
-    union = holds(united(lambda s, n: log10_p_read(s, n, 8), *read), names, fires=False, report=True)
-    unpaid = holds(united(log10_p_claimed, *read), names, fires=False, report=False)
+    union = holds(weighed(*read, bits=8, fixed=False), names, fires=False, report=True)
+    unpaid = holds(weighed(*read, bits=8, fixed=True), names, fires=False, report=False)
     print(f"the bound {'holds' if passed else 'FAILS'}; with its exponent doubled it {'holds' if control else 'fails'}")
     print(f"the union bound {'holds' if union else 'FAILS'}; left out, the bound {'holds' if unpaid else 'fails'}")
     sys.exit(0 if passed and union and not control and not unpaid else 1)

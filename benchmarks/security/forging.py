@@ -2,16 +2,16 @@
 
 For suspects without the owner's mark, five ways to choose afterwards what should have been fixed before:
 
-  strengths, version 1:  a profile of 64 and more bands is fitted to score and norm by non-negative least squares
-  strengths, version 2:  the same with the chips of an honest record, which is then made again with the fitted profile
-  grinding, version 2:   the profile's last entry is moved in its last digits; each time all chips are drawn anew
-  original, version 2:   the original that is presented is moved against the mark, as a whole or only half of it
-  message, version 2:    the message is the one that decodes best, whatever its tag
+  strengths  a profile of 64 and more bands is fitted to score and norm by non-negative least squares, with the chips of
+             an honest record, which is then made again with the fitted profile
+  grinding   the profile's last entry is moved in its last digits; each time all chips are drawn anew
+  original   the original that is presented is moved against the mark, as a whole or only half of it
+  message    the message is the one that decodes best, whatever its tag
 
-Printed are log10 p as `jaxmark.detect` prints it, dated and undated; the lowest over keys and suspects, where there are
-several. Exit status 1 if an undated figure, or a figure of version 2 that something dates, is not explained by chance:
-if it is lower than one in so many tries is, by two orders of magnitude. The search for the message stops short of its
-tag, which takes 2^28 hashes; it is judged by what it says would be printed.
+Printed are log10 p as `jaxmark.detect` prints it, committed and uncommitted; the lowest over keys and suspects, where
+there are several. Exit status 1 if a figure is not explained by chance: if it is lower than one in so many tries is, by
+two orders of magnitude. The search for the message stops short of its tag, which takes 2^28 hashes; it is judged by
+what it says would be printed.
 
     python benchmarks/security/forging.py MESH [--keys N] [--tries N] [--bands N ...]
 """
@@ -37,7 +37,8 @@ from jaxmark.watermark.carriers import make_chips
 from jaxmark.watermark.coding import polar
 from jaxmark.watermark.coding.keys import bind
 from jaxmark.watermark.coding.message import TAG_BITS, encode
-from jaxmark.watermark.evidence import bounds as evidence
+from jaxmark.watermark.evidence import bounds, ledger
+from jaxmark.watermark.evidence.ledger import Charge, figure, uncommitted
 from jaxmark.watermark.markers import NonBlindMarker
 from jaxmark.watermark.record import Record, commit
 from jaxmark.watermark.schemes.keyed import KeyedScheme
@@ -127,24 +128,24 @@ def fit(products: np.ndarray, along: np.ndarray) -> np.ndarray:
     return found / found.max()
 
 
-def fitted(ways: Sequence[np.ndarray], signs: np.ndarray, share: float) -> Fitted:
+def fitted(ways: Sequence[np.ndarray], signs: np.ndarray, charge: Charge) -> Fitted:
     """The best fit to either way of weighing under any of the keys, as a claim by both ways."""
     parts = [(each @ each.T, each @ signs.T) for each in ways]
     hopes = [roughly(*part) for part in parts]
     way, key = np.unravel_index(np.argmax(hopes), (len(parts), len(signs)))
     profile = fit(parts[way][0], parts[way][1][:, key])
     every = np.array(
-        [[claims_of(part, chosen, share) for part in parts] for chosen in (profile, np.ones_like(profile))]
+        [[claims_of(part, chosen, charge) for part in parts] for chosen in (profile, np.ones_like(profile))]
     )
     fits, honest = every.min(axis=1) + math.log10(len(parts))
     return Fitted(int(key), tuple(profile.tolist()), min(0.0, fits[key]), min(0.0, honest.min()))
 
 
-def claims_of(part: tuple[np.ndarray, np.ndarray], profile: np.ndarray, share: float) -> np.ndarray:
+def claims_of(part: tuple[np.ndarray, np.ndarray], profile: np.ndarray, charge: Charge) -> np.ndarray:
     """log10 p of a claim under each key by one way of weighing, with these strengths."""
     products, along = part
     norm = math.sqrt(profile @ products @ profile)
-    return np.array([evidence.share_of(evidence.log10_p_claimed(score, norm), share) for score in profile @ along])
+    return np.array([figure(bounds.log10_p_score(score, norm), [charge]) for score in profile @ along])
 
 
 def record_of(marker: NonBlindMarker) -> Record:
@@ -160,36 +161,33 @@ def remade(record: Record, key: jm.Key, mesh: Mesh, profile: Sequence[float]) ->
     return dataclasses.replace(fresh, told=told).sealed(key)
 
 
-def strengths(mesh: Mesh, seen: dict[str, Mesh], keys: int, bands: int, version: int) -> Row:
+def strengths(mesh: Mesh, seen: dict[str, Mesh], keys: int, bands: int) -> Row:
     """Fit a profile to each suspect under each key, and read the best with it as `detect` does."""
     scheme = flat(bands)
     try:
-        markers = [jm.make_marker(mesh, key_of(number), scheme=scheme, version=version) for number in range(keys)]
+        markers = [jm.make_marker(mesh, key_of(number), scheme=scheme) for number in range(keys)]
     except jm.JaxmarkError as refusal:
-        return {"version": version, "bands": bands, "honest": f"refused: {refusal}"}
+        return {"bands": bands, "honest": f"refused: {refusal}"}
     original, chosen = markers[0].original, np.array([signs(marker) for marker in markers])
     honest, hoped, printed, late = [], [], [], []
     for name, suspect in seen.items():
         aligned = align(original, suspect)
-        best = fitted(list(shares(markers[0], aligned)), chosen, ALIGN_SHARES[aligned.how])
+        best = fitted(list(shares(markers[0], aligned)), chosen, ledger.ALIGNMENT.charge(aligned.how))
         honest.append(best.honest)
         hoped.append(best.log10_p)
         key, profile = key_of(best.key), best.profile
-        if version == 1:
-            forged = jm.make_marker(mesh, key, scheme=dataclasses.replace(scheme, profile=profile), version=1)
-        else:
-            forged = jm.make_marker(mesh, key, record=remade(record_of(markers[best.key]), key, mesh, profile))
-        found = forged.detect(aligned, MESSAGE)
+        forged = jm.make_marker(mesh, key, record=remade(record_of(markers[best.key]), key, mesh, profile))
+        found = forged.read(aligned, MESSAGE)
         printed.append(found.log10_p)
         late.append(found.evidence.log10_p_uncommitted)
-        say(version, bands, name, f"{hoped[-1]:.1f} hoped, {printed[-1]:.1f} printed, undated {late[-1]:.1f}", sep=", ")
+        said = f"{hoped[-1]:.1f} hoped, {printed[-1]:.1f} printed, uncommitted {late[-1]:.1f}"
+        say(bands, name, said, sep=", ")
     return {
-        "version": version,
         "bands": bands,
         "honest": min(honest),
         "fitted": min(hoped),
         "printed": min(printed),
-        "undated": min(late),
+        "uncommitted": min(late),
     }
 
 
@@ -220,12 +218,12 @@ def grinding(mesh: Mesh, seen: dict[str, Mesh], tries: int) -> Row:
     place = np.unravel_index(np.argmax(scores / norms), scores.shape)
     name = list(seen)[place[1]]
     record = remade(record_of(marker), key, mesh, (*profile[:-1], last + int(place[0]) * math.ulp(last)))
-    best = jm.make_marker(mesh, key, record=record).detect(aligned[name], MESSAGE)
+    best = jm.make_marker(mesh, key, record=record).read(aligned[name], MESSAGE)
     return {
         "tries": tries * len(seen),
         "by chance": -math.log10(tries * len(seen)),
         "best printed": best.log10_p,
-        "undated": best.evidence.log10_p_uncommitted,
+        "uncommitted": best.evidence.log10_p_uncommitted,
         "suspect": name,
     }
 
@@ -250,7 +248,7 @@ def presented(mesh: Mesh) -> list[Row]:
             except jm.JaxmarkError as refusal:
                 rows.append(row | {"original": "refused: " + str(refusal).partition(": ")[2]})
                 continue
-            row["original"] = reading.evidence.caveats[0] if reading.evidence.caveats else "recovered exactly"
+            row["original"] = reading.caveats[0] if reading.caveats else "recovered exactly"
             for name, copy in copies.items():
                 found = reading.detect(copy, MESSAGE)
                 kind = (
@@ -261,7 +259,7 @@ def presented(mesh: Mesh) -> list[Row]:
                     else "differs"
                 )
                 row[f"log10 p from {name}"] = f"{found.log10_p:.2f}, {kind}"
-                row["proof"] = row.get("proof", False) or (found.detected() and not found.evidence.caveats)
+                row["proof"] = row.get("proof", False) or found.detected()
             rows.append(row)
     return rows
 
@@ -285,15 +283,15 @@ def message(mesh: Mesh, seen: dict[str, Mesh], bits: int) -> Row:
             soft = np.bincount(np.ravel(chips.slots), np.ravel(chips.signs * vector), marker.code_bits)
             word = polar.decode(soft[None] / np.abs(soft).max(), bits + TAG_BITS, 64)[0][0]
             score = soft @ (1.0 - 2.0 * polar.encode(word, marker.code_bits))
-            log10_p = evidence.any_of(evidence.log10_p_claimed(score, np.linalg.norm(vector)), 0.0)
-            best = min(best, (evidence.share_of(log10_p, ALIGN_SHARES[aligned.how]), name))
-    paid = min(0.0, best[0] + bits * math.log10(2))
+            charges = ledger.ALIGNMENT.charge(aligned.how), ledger.PROOF.charge("score", 2)
+            best = min(best, (figure(bounds.log10_p_score(score, np.linalg.norm(vector)), charges), name))
+    charged = min(0.0, best[0] + bits * math.log10(2))
     return {
         "payload": bits,
         "suspect": best[1],
-        "dated": best[0],
-        "undated": evidence.undated(paid),
-        "undated, without paying for messages": evidence.undated(best[0]),
+        "committed": best[0],
+        "uncommitted": uncommitted(charged),
+        "uncommitted, messages not charged": uncommitted(best[0]),
     }
 
 
@@ -307,7 +305,7 @@ def main() -> None:
     mesh = load(parser, options.mesh)
     seen = suspects(mesh)
     chance = -math.log10(options.keys * len(seen)) - SLACK
-    fits = [strengths(mesh, seen, options.keys, bands, version) for version in (1, 2) for bands in options.bands]
+    fits = [strengths(mesh, seen, options.keys, bands) for bands in options.bands]
     print(f"strengths fitted, lowest of {options.keys} keys and {len(seen)} suspects\n\n{table(fits)}\n")
     ground = grinding(mesh, seen, options.tries)
     print(f"chips drawn anew by the last digits of a strength\n\n{table([ground])}\n")
@@ -316,11 +314,11 @@ def main() -> None:
     chosen = [message(mesh, seen, bits) for bits in PAYLOADS]
     print(f"the message that decodes best, without its tag\n\n{table(chosen)}\n")
     checks = {
-        "undated claims by fitted strengths": all(row.get("undated", 0.0) >= chance for row in fits),
-        "dated claims of version 2": all(row.get("printed", 0.0) >= chance for row in fits if row["version"] == 2),
-        "grinding": ground["best printed"] >= ground["by chance"] - SLACK <= ground["undated"],
+        "claims by fitted strengths": all(row.get("printed", 0.0) >= chance for row in fits),
+        "uncommitted claims by fitted strengths": all(row.get("uncommitted", 0.0) >= chance for row in fits),
+        "grinding": ground["best printed"] >= ground["by chance"] - SLACK <= ground["uncommitted"],
         "moved originals": not any(row.get("proof", False) for row in moved),
-        "undated claims of a chosen message": all(row.get("undated", 0.0) >= -SLACK for row in chosen),
+        "uncommitted claims of a chosen message": all(row.get("uncommitted", 0.0) >= -SLACK for row in chosen),
     }
     for name, holds in checks.items():
         print(f"{name}: {'no more than chance' if holds else 'FORGED'}")

@@ -1,8 +1,8 @@
 """How far from the limits of white noise: python benchmarks/theory/limit.py MESH [--payloads ...] [--trials 1000].
 
-Message error rate of the whole chain against Eb/N0: messages are written by `NonBlindMarker.write`, white Gaussian noise is put
-on every coordinate, and the suspects are read by what `jaxmark.detect` calls: `NonBlindMarker.observe` (affine alignment),
-`NonBlindMarker.soft_values` (projection, joint detector) and `message.decode` (list decoder, keyed tag). A wrong message and
+Message error rate of the whole chain against Eb/N0: messages are written by `Mark.write`, white Gaussian noise is put
+on every coordinate, and the suspects are read by what `jaxmark.detect` calls: `alignment.align`, `Mark.receive`
+(projection), `Mark.soft_decisions` (joint detector) and `Mark.decode` (list decoder, keyed tag). A wrong message and
 none are both errors. Before it the code alone: the same decoder on code bits in white Gaussian noise, where a word is
 read if it is on the list, as the tag picks it but with probability 64 · 2^-28. `--code-only` stops there; without a
 MESH, codes are then as long as is of use.
@@ -28,6 +28,7 @@ import numpy as np
 from scipy import stats
 
 import jaxmark as jm
+from jaxmark.alignment.alignment import align
 from jaxmark.alignment.original import displace, shift_of
 from jaxmark.confidence import clopper_pearson
 from jaxmark.watermark.coding import message, polar
@@ -120,8 +121,9 @@ def prepare(marker: NonBlindMarker, text: bytes, random: np.random.Generator) ->
 
     def fails(level: float) -> bool:
         noise = math.sqrt(energy / (2 * marker.bits * level)) * random.normal(size=mark.shape)
-        soft = marker.soft_decisions(marker.receive(displace(original, mark + noise)))
-        return marker.decode(soft) != text
+        aligned = align(original, displace(original, mark + noise))
+        found = marker.decode(marker.soft_decisions(marker.receive(aligned)))
+        return found is None or found.message != text
 
     return fails
 

@@ -18,7 +18,7 @@ import jaxmark as jm
 from jaxmark.app.demo import sample_mesh
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import band_components, filter, gram, moments
-from jaxmark.watermark.evidence.bounds import log10_p_claimed
+from jaxmark.watermark.evidence.bounds import log10_p_score
 from jaxmark.watermark.reading.detectors import joint
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -44,7 +44,7 @@ def chain(mesh: jm.Mesh, suspect: jm.Mesh | None) -> tuple[Stages, jm.Mesh]:
     components = band_components(operator, family, signal)
     basis = np.asarray(reader.nuisance, np.float64)
     probe = np.random.default_rng(0).choice([-1.0, 1.0], len(basis))
-    received = reader.receive(marker.observe(suspect))
+    received = reader.receive(marker.observe(marker.register(suspect)))
     codeword = marker.codeword(MESSAGE)
     score, norm = reader.claim(received, jnp.asarray(codeword, signal.dtype))
     found = {
@@ -62,7 +62,7 @@ def chain(mesh: jm.Mesh, suspect: jm.Mesh | None) -> tuple[Stages, jm.Mesh]:
         * reader.matched_residual(received),
         "score": score,
         "norm": norm,
-        "log10 p": log10_p_claimed(score, norm),
+        "log10 p": log10_p_score(score, norm),
     }
     return {stage: np.asarray(value, np.float64) for stage, value in found.items()}, suspect
 

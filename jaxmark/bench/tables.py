@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from jaxmark.bench.results import BenchResults
 from jaxmark.bench.summary import NOT_VALIDATED, entries
+from jaxmark.bench.work import COSTS
 
 Entries = Mapping[str, dict[str, Any]]
 
@@ -53,6 +54,7 @@ def tables(results: BenchResults) -> list[Table]:
             bits = f", {payload} bits" if several else ""
             found += [_marks(f"{league}, {limits} limits{bits}: the marks", parts, every)]
             found += [_attacks(f"{league}, {limits} limits{bits}: what survives", parts, every)]
+            found += [_costs(f"{league}, {limits} limits{bits}: what attacks do to the shape", parts)]
     found += [*_refused(every), *_paired(results, every)]
     if results.skipped:
         lines = [[name, why] for name, why in results.skipped.items()]
@@ -178,12 +180,23 @@ def _attacks(title: str, parts: Mapping[str, Any], entries: Entries) -> Table:
             cell = f"detected {_share(one['detected'], one['trials'])}"
             if entries[name]["bits"]:
                 cell = f"{_share(one['read'], one['trials'])}, BER {one['bit_errors']:.2f}, {cell}"
-            line.append(cell)
+            line.append(cell if one["log10_p"] is None else f"{cell}, p 10^{one['log10_p']:.1f}")
         lines.append([*line, *(f"{published[name]:.2f}" if name in published else "-" for name in ("cho", "wang"))])
     heads = ["attack", *(_label(name, entries[name]) for name in parts), "Cho, published", "Wang, published"]
     if all(line[-2:] == ["-", "-"] for line in lines):  # this league is younger than they are
         heads, lines = heads[:-2], [line[:-2] for line in lines]
-    return Table(title, heads, lines, "How often the exact message is read; wrong bits of the best guess (BER).")
+    remark = (
+        "How often the exact message is read; wrong bits of the best guess (BER), the mean; false-positive probability"
+        " (p), the median, of methods that bound it."
+    )
+    return Table(title, heads, lines, remark)
+
+
+def _costs(title: str, parts: Mapping[str, Any]) -> Table:
+    """What attacks do to the mesh that the first method marked, the mean over meshes and seeds."""
+    attacks = next(iter(parts.values()))["attacks"]
+    lines = [[attack, *(_number(one["costs"][name]) for name in COSTS)] for attack, one in attacks.items()]
+    return Table(title, ["attack", *(name.upper() for name in COSTS)], lines)
 
 
 def _refused(entries: Entries) -> Iterator[Table]:

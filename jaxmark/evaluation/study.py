@@ -105,7 +105,7 @@ class Study:
             if isinstance(given, str) or not isinstance(given, Sequence | Mapping):
                 raise JaxmarkError(f"The {name} of a study are a list, such as {example}, got {given!r}.")
         if not isinstance(self.samples, Integral):
-            raise JaxmarkError(f"samples is a number of samples, such as 5, got {self.samples!r}.")
+            raise JaxmarkError(f"samples is a whole number, such as 5, got {self.samples!r}.")
 
     def run(
         self,

@@ -338,7 +338,7 @@ def test_a_closed_pipe_does_not_change_the_status(workshop: Workshop):
 
 def test_an_interrupted_write_leaves_no_output(workshop: Workshop, monkeypatch):
     monkeypatch.setattr(
-        "jaxmark.app.read_files.write_atomically", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left"))
+        "jaxmark.app.mark_files.write_atomically", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left"))
     )
     assert "No space left" in workshop.refused(
         "embed", "model.ply", "out.ply", "--key", "owner.key", "--message", MESSAGE

@@ -105,7 +105,7 @@ def test_a_dossier_shows_all_but_the_secret(workshop: Workshop):
     for name in ("log10_p", "log10_p_uncommitted"):
         assert facts[name] == told[name]
         assert f"{told[name]:.1f}" in page
-    assert facts["deposit"]["log10_p"] == told["log10_p_timestamped"]
+    assert facts["commitment"]["log10_p"] == told["log10_p_timestamped"]
     words = facts["command"].split()
     assert words == ["jaxmark", *(word.replace("secrets/mine.key", "KEYFILE") for word in detect)]
 
@@ -130,7 +130,7 @@ def test_there_is_no_dossier_of_less_than_a_proof(workshop: Workshop):
     workshop.json("deposit", RECORD[1], "--output", "all.json")
     Path(RECORD[1]).write_text(json.dumps(json.loads(Path(RECORD[1]).read_text()) | {"beta": 1.0}))
     assert "was edited" in workshop.refused("detect", "marked.ply", *DETECT, *RECORD, "--deposit", "all.json")
-    assert "not a deposit" in workshop.refused("detect", "marked.ply", *DETECT, "--deposit", RECORD[1])
+    assert "not a deposit" in workshop.refused("detect", "marked.ply", *DETECT, *RECORD, "--deposit", RECORD[1])
     assert not Path("case").exists()
 
 

@@ -61,9 +61,8 @@ def files(tmp_path: Path) -> list[Path]:
 def test_several_workers_report_each_file(files):
     told = dict(each(files, Count(), workers=2))
     assert {file.stem for file in told} == set("abcdef")
-    assert told.pop(files[2]) == FileOutcome(
-        {"refused": f"{files[2]} is not to my liking."}, text_of_c(files), False, True
-    )
+    refused = {"refused": f"{files[2]} is not to my liking."}
+    assert told.pop(files[2]) == FileOutcome(refused, text_of_c(files), done=False, refused=True)
     # Each worker keeps what it has prepared, and counts on from file to file.
     by_worker: dict[int, list[int]] = {}
     for one in told.values():

@@ -598,7 +598,8 @@ def test_the_command_writes_an_entry_for_each_method_and_a_page(tmp_path: Path, 
     mesh, output = tmp_path / "ball.ply", tmp_path / "out"
     jm.save_mesh(bumpy_sphere(3), mesh)
     command = [sys.executable, "-m", "jaxmark", "bench", str(mesh), "--methods", "keyed", "harmonics", "--method"]
-    command += [str(plain), "--attacks", "none", "--limits", "perceptual", "--workers", "1", "--keys", "1"]
+    command += [str(plain), "--attacks", "none", "noise 0.003", "--limits", "perceptual", "--workers", "1"]
+    command += ["--keys", "1"]
     done = subprocess.run([*command, "--output", str(output)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     found = json.loads((output / "results.json").read_text())
@@ -608,7 +609,10 @@ def test_the_command_writes_an_entry_for_each_method_and_a_page(tmp_path: Path, 
     page = (output / "page.html").read_text()
     assert "http" not in page.replace("http-equiv", "")
     assert "plain (not validated)" in page
-    assert "| attack |" in (output / "results.md").read_text()
+    text = (output / "results.md").read_text()
+    assert "| attack |" in text
+    assert re.search(r"\| noise 0.003 \| 1/1, BER 0.00, detected 1/1, p 10\^-\d", text)
+    assert "## smi2010, perceptual limits: what attacks do to the shape" in text
     refused = subprocess.run(
         [*command[:5], "--methods", "nothing", "--output", str(output)], capture_output=True, text=True
     )

@@ -1,14 +1,16 @@
+import importlib
 from collections import deque
 
 import numpy as np
 import pytest
 
 import jaxmark as jm
-from benchmarks.common.submeshes import farthest_vertices, make_part_marker, parts
 from jaxmark.geometry.mesh import Mesh, edges, make_mesh, weld
 from tests.samples import bumpy_sphere
 
 pytestmark = pytest.mark.core
+
+submeshes = importlib.import_module("benchmarks.common.submeshes")  # by name, as these tests have a folder of it, too
 
 MESSAGES = [b"one", b"two", b"six"]
 
@@ -20,7 +22,7 @@ def sphere() -> Mesh:
 
 @pytest.fixture(scope="module")
 def marker(sphere: Mesh, key: jm.Key):
-    return make_part_marker(sphere, key, len(MESSAGES), bits=24)
+    return submeshes.make_part_marker(sphere, key, len(MESSAGES), bits=24)
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +49,9 @@ def hops(mesh: Mesh, start: int) -> np.ndarray:
 
 def test_parts_are_nearest_by_breadth_first_search():
     mesh = bumpy_sphere(3)
-    features = farthest_vertices(mesh, 4)
+    features = submeshes.farthest_vertices(mesh, 4)
     distance = np.stack([hops(mesh, int(feature)) for feature in features])
-    label = parts(mesh, features)
+    label = submeshes.parts(mesh, features)
     np.testing.assert_array_equal(distance[label, np.arange(len(label))], distance.min(axis=0))
     # Each next feature is as far from those before it as any vertex is.
     for count in range(1, 4):
@@ -60,7 +62,7 @@ def test_parts_are_nearest_by_breadth_first_search():
 def test_copies_of_a_point_are_in_one_part():
     whole = bumpy_sphere(2)
     soup = make_mesh(np.asarray(whole.vertices)[whole.faces].reshape(-1, 3), np.arange(whole.faces.size).reshape(-1, 3))
-    label, point = parts(soup, farthest_vertices(soup, 3)), weld(soup.vertices).point
+    label, point = submeshes.parts(soup, submeshes.farthest_vertices(soup, 3)), weld(soup.vertices).point
     np.testing.assert_array_equal(label, label[np.unique(point, return_index=True)[1]][point])
     assert set(label) == {0, 1, 2}
 
@@ -70,9 +72,9 @@ def test_another_component_is_a_part_or_none():
     two = make_mesh(
         np.concatenate([whole.vertices, whole.vertices + 9]), np.concatenate([whole.faces, whole.faces + 42])
     )
-    features = farthest_vertices(two, 2)
+    features = submeshes.farthest_vertices(two, 2)
     assert (features < 42).sum() == 1
-    assert (parts(two, features[:1]) == -1).sum() == 42
+    assert (submeshes.parts(two, features[:1]) == -1).sum() == 42
 
 
 @pytest.mark.slow
@@ -100,7 +102,7 @@ def test_parts_read_after_similarity_noise_and_the_loss_of_one(marker, marked: M
 
 @pytest.mark.slow
 def test_what_is_unmarked_is_not_detected(marker, sphere: Mesh, key: jm.Key, marked: Mesh):
-    other = make_part_marker(sphere, jm.new_key(), len(MESSAGES), bits=24)
+    other = submeshes.make_part_marker(sphere, jm.new_key(), len(MESSAGES), bits=24)
     for one in [*marker.detect(sphere), *other.detect(marked)]:
         assert one.message is None
         assert not one.detected()
@@ -114,9 +116,9 @@ def test_refusals(marker, sphere: Mesh, key: jm.Key):
         ([3, 3], "different points"),
     ]:
         with pytest.raises(jm.JaxmarkError, match=sentence):
-            parts(sphere, np.array(features, int))
+            submeshes.parts(sphere, np.array(features, int))
     with pytest.raises(jm.JaxmarkError, match="not 0"):
-        farthest_vertices(sphere, 0)
+        submeshes.farthest_vertices(sphere, 0)
     with pytest.raises(jm.JaxmarkError, match="3 parts need as many"):
         marker.embed(MESSAGES[:2], 8e-4)
     with pytest.raises(jm.JaxmarkError, match="Part 0 of 3"):

@@ -57,11 +57,11 @@ def test_an_attack_of_ones_own_and_a_refusal(marked):
 
 
 def test_the_best_guess_is_the_message_without_its_tag(key: jm.Key):
-    code = encode(b"guess me", Choices(key, b"geometry", 1), 256)
+    code = encode(b"guess me", Choices(key, b"geometry"), 256)
     assert guess(code + 0.3 * np.random.default_rng(0).normal(size=256), 64) == b"guess me"
     assert guess(np.zeros(256), 64) is None
     # Under another key the tag fits no more, and the guess is the same.
-    assert decode(code, 64, Choices(jm.Key(bytes(32)), b"geometry", 1)) is None
+    assert decode(code, 64, Choices(jm.Key(bytes(32)), b"geometry")) is None
     wrong = guess(np.random.default_rng(1).normal(size=256), 64)
     assert wrong is not None
     assert wrong != b"guess me"

@@ -45,7 +45,7 @@ def study(**changes) -> jm.Study:
     """A small one."""
     attacks = {"noise": [0.002, 0.2], "stretch": Attack(stretched, "share of the height", (0.1,), host=True)}
     declared = {"meshes": {"ball": bumpy_sphere(3)}, "attacks": attacks, "payloads": [16], "budgets": [BUDGET]}
-    return jm.Study(**{**declared, "seeds": 2, **changes})
+    return jm.Study(**{**declared, "samples": 2, **changes})
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def test_a_study_that_is_ended_goes_on(results, output, tmp_path):
     said.clear()
     study(attacks={"noise": [0.002]}).run(again, say=said.append)
     assert said == []
-    study(attacks={"noise": [0.002]}, meshes={"ball": bumpy_sphere(3, seed=1)}, seeds=1).run(again, say=said.append)
+    study(attacks={"noise": [0.002]}, meshes={"ball": bumpy_sphere(3, seed=1)}, samples=1).run(again, say=said.append)
     assert len(said) == 1
 
 
@@ -150,7 +150,7 @@ def test_what_is_refused_is_in_the_rows_and_ends_nothing(tmp_path):
 @pytest.mark.long
 def test_what_cannot_be_aligned_is_in_the_rows(tmp_path):
     attacks = {"lost": Attack(scattered, "none", (1.0,), host=True)}
-    found = study(attacks=attacks, seeds=1).run(tmp_path / "lost.jsonl")
+    found = study(attacks=attacks, samples=1).run(tmp_path / "lost.jsonl")
     assert len(found.rows) == 3
     assert all("could not be aligned" in row.refusal for row in found.rows)
 
@@ -181,7 +181,7 @@ def test_studies_can_be_sent_to_workers():
         ({"budgets": [{"beauty": 1.0}]}, "no metric 'beauty'"),
         ({"budgets": [-1.0]}, "budget is relative"),
         ({"payloads": [12]}, "multiple of 8 bits, got 12"),
-        ({"seeds": 0}, "at least one seed"),
+        ({"samples": 0}, "at least one sample"),
     ],
 )
 def test_what_is_no_study(changes, sentence):
@@ -307,7 +307,7 @@ def test_a_page_of_a_study_has_all_of_it_and_loads_nothing(tmp_path):
     assert "unmarked, detected: 2/3, 95 % interval up to 99 %" in page
 
 
-TOML = 'seeds = 1\npayloads = [16]\nbudgets = [0.002]\n[meshes]\nball = "small.ply"\n[attacks]\nnoise = [0.002]\n'
+TOML = 'samples = 1\npayloads = [16]\nbudgets = [0.002]\n[meshes]\nball = "small.ply"\n[attacks]\nnoise = [0.002]\n'
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -315,13 +315,13 @@ TOML = 'seeds = 1\npayloads = [16]\nbudgets = [0.002]\n[meshes]\nball = "small.p
     ("text", "sentence"),
     [
         (None, "Cannot read study.toml"),
-        ("seeds = = 1", "study.toml is no TOML"),
-        ("seeds = 1", "declares no meshes"),
+        ("samples = = 1", "study.toml is no TOML"),
+        ("samples = 1", "declares no meshes"),
         ('meshes = {a = "a.ply"}', "declares no attacks"),
         (TOML + "[colours]\na = 1", "no field 'colours'"),
         (TOML.replace("[0.002]\n[m", '["much"]\n[m'), "study.toml: visibility is one of 'hidden'"),
         (TOML.replace("[0.002]\n[m", "[true]\n[m"), "budgets must be a list of numbers"),
-        (TOML.replace("seeds = 1", "seeds = true"), "seeds must be a whole number"),
+        (TOML.replace("samples = 1", "samples = true"), "samples must be a whole number"),
         (TOML.replace('"small.ply"', "3"), "meshes must be a table of files"),
         (TOML.replace("noise", "melting"), "study.toml: There is no attack 'melting'"),
         (TOML.replace("small", "absent"), r"absent\.ply"),

@@ -45,7 +45,7 @@ def test_what_is_tried_is_what_the_detector_has(mesh, trials, trial):
             marker = jm.make_marker(mesh, jm.Key(bytes([number + 1] * 32)), bits=16, scheme=trial.scheme)
             word = marker.codeword(b"ok")
             marked, _ = marker.write(word, RMS)
-            received = marker.receive(jm.attack(marked, *attack, seed=100 + number))
+            received = marker.receive(marker.register(jm.attack(marked, *attack, seed=100 + number)))
             score, norm = marker.reader.claim(received, jnp.asarray(word, jnp.float32))
             ratios.append(float(score / norm))
         # Six marks of ours beside three that were tried; after smoothing they differ by more than the score's noise.

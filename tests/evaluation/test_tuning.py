@@ -114,20 +114,12 @@ def test_channels_of_all_sizes(seed):
     assert worst <= upper_bound(channels, cost / 0.01) * (1 + 1e-5)
 
 
-def test_the_other_solver_agrees(x64):
+def test_channels_of_very_different_noise_keep_the_cap(x64):
     channels, cost = random_channels(4, 8, seed=1)
-    # Momentum leaves the simplex far enough for the logarithm of a negative number.
     channels = channels._replace(noise=channels.noise * 10.0 ** -np.arange(8))
-    both = [
-        allocate(channels, jnp.asarray(cost), 2.0, cap=0.3, steps=5000, solver=solver)
-        for solver in ("projected-gradient", "accelerated-gradient")
-    ]
-    worst = [float(rate(channels, beta).min()) for beta in both]
-    assert worst[1] == pytest.approx(worst[0], rel=0.01)
-    for beta in both:
-        share = cost * np.asarray(beta) ** 2 / 4
-        assert share.sum() == pytest.approx(1, rel=1e-9)
-        assert share.max() <= 0.3 * (1 + 1e-9)
+    share = cost * np.asarray(allocate(channels, jnp.asarray(cost), 2.0, cap=0.3, steps=5000)) ** 2 / 4
+    assert share.sum() == pytest.approx(1, rel=1e-9)
+    assert share.max() <= 0.3 * (1 + 1e-9)
 
 
 @pytest.mark.slow
@@ -193,7 +185,7 @@ ATTACKS = [("noise", 0.004), ("smoothing", 10), ("quantisation", 8)]
 @pytest.fixture(scope="module")
 def tuned():
     mesh = rough_sphere(2500)
-    return mesh, tune(mesh, ATTACKS, {"dame": 0.02}, key=jax.random.key(0), margin="evidence", bits=16)
+    return mesh, tune(mesh, ATTACKS, {"dame": 0.02}, seed=jax.random.key(0), margin="evidence", bits=16)
 
 
 @pytest.mark.long
@@ -229,7 +221,7 @@ def test_tuning_beats_equal_strengths_and_says_how_far_it_is_from_the_best(tuned
 def test_several_limits_at_once(tuned):
     mesh = tuned[0]
     limits = {"dame": 0.02, "gl": 1e-4}
-    found = tune(mesh, ATTACKS[:2], jm.Budget(rms=5e-4, limits=limits), key=jax.random.key(0), bits=16)
+    found = tune(mesh, ATTACKS[:2], jm.Budget(rms=5e-4, limits=limits), seed=jax.random.key(0), bits=16)
     assert list(found.report.binding) == ["dame", "gl", "budget"]
     assert sum(found.report.binding.values()) == pytest.approx(1)
     assert (found.cost @ found.beta**2 < 1.6).all()
@@ -250,7 +242,7 @@ def test_any_function_is_an_attack_and_a_start_is_warm(tuned):
         return mesh._replace(vertices=0.5 * np.asarray(mesh.vertices))
 
     named = (jm.adversaries.ATTACKS["smoothing"], 5)
-    found = tune(mesh, [shrink, named], 5e-4, key=jax.random.key(0), bits=16, start=before.beta)
+    found = tune(mesh, [shrink, named], 5e-4, seed=jax.random.key(0), bits=16, start=before.beta)
     assert 0 <= found.report.gap < 0.02
     assert found.report.tried[0] > found.report.tried[1]  # a change of size takes nothing of a mark
 
@@ -263,22 +255,20 @@ def test_refusals(x64, unchecked):
         allocate(channels, jnp.ones(3), 1.0)
     with pytest.raises(jm.JaxmarkError, match="raise the cap"):
         allocate(channels, jnp.asarray(cost), cap=0.2)
-    with pytest.raises(jm.JaxmarkError, match="solver must be one of"):
-        allocate(channels, jnp.asarray(cost), solver="newton")  # type: ignore[arg-type]
     with pytest.raises(jm.JaxmarkError, match="at least one attack"):
-        tune(rough_sphere(300), [], key=jax.random.key(0))
-    for wrong in (0, jm.new_key()):
-        with pytest.raises(jm.JaxmarkError, match=r"tune needs a random key of JAX .* such as jax.random.key\(0\)"):
-            tune(rough_sphere(300), ATTACKS, key=wrong)  # type: ignore[arg-type]
+        tune(rough_sphere(300), [], seed=jax.random.key(0))
+    for wrong in (0.5, jm.new_key()):
+        with pytest.raises(jm.JaxmarkError, match="A seed is a whole number, such as 0, or a random key of JAX"):
+            tune(rough_sphere(300), ATTACKS, seed=wrong)  # type: ignore[arg-type]
     with pytest.raises(jm.JaxmarkError, match=r"pair such as \('noise', 0.005\), got 'noise'"):
-        tune(rough_sphere(300), ["noise"], key=jax.random.key(0))  # type: ignore[list-item]
+        tune(rough_sphere(300), ["noise"], seed=jax.random.key(0))  # type: ignore[list-item]
     with pytest.raises(jm.JaxmarkError, match="one of rate, evidence, snr, got 'x'"):
-        tune(rough_sphere(300), ATTACKS, key=jax.random.key(0), margin="x")  # type: ignore[arg-type]
+        tune(rough_sphere(300), ATTACKS, seed=jax.random.key(0), margin="x")  # type: ignore[arg-type]
     with pytest.raises(jm.JaxmarkError, match="see tune_blind"):
-        tune(rough_sphere(300), ATTACKS, key=jax.random.key(0), scheme="field")
+        tune(rough_sphere(300), ATTACKS, seed=jax.random.key(0), scheme="field")
     with pytest.raises(jm.JaxmarkError, match="name of ATTACKS or an Attack"):
         jm.attack(rough_sphere(300), lambda mesh: mesh, 0.1, seed=0)  # type: ignore[arg-type]
     with pytest.raises(jm.JaxmarkError, match="not along normals"):
-        tune(rough_sphere(300), ATTACKS, key=jax.random.key(0), scheme=KeyedScheme(direction="normals"))
+        tune(rough_sphere(300), ATTACKS, seed=jax.random.key(0), scheme=KeyedScheme(direction="normals"))
     with pytest.raises(jm.JaxmarkError, match="profile is up to 64"):
         KeyedScheme(profile=(1.0,) * 65)

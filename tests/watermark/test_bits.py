@@ -31,7 +31,7 @@ def prepared():
 
 
 def carrier_of(operator, signal, key, bands=16, **options):
-    sequences = orthogonal_sequences(Choices(key, b"", 1), BITS, 3 * bands).reshape(BITS, bands, 3)
+    sequences = orthogonal_sequences(Choices(key, b""), BITS, 3 * bands).reshape(BITS, bands, 3)
     family = scaling(bands, damping=options.pop("damping", "jackson"), kernel=options.pop("kernel", "halved"))
     return ModulatedCarrier(host_bands(operator, signal, family, **options), sequences)
 
@@ -121,7 +121,7 @@ def test_the_completed_bound_3_holds(seed, x64):
     components /= np.linalg.norm(components, axis=0)
     products = components.T @ components
     coherence = np.abs(products - np.diag(np.diag(products))).max()
-    sequences = orthogonal_sequences(Choices(jm.Key(bytes([seed] * 32)), b"", 1), k, n).astype(float)
+    sequences = orthogonal_sequences(Choices(jm.Key(bytes([seed] * 32)), b""), k, n).astype(float)
     attack = 0.1 * random.normal(size=n)
     bits = random.choice([-1.0, 1.0], k)
     scores = sequences @ (products @ (beta * sequences.T @ bits + attack))

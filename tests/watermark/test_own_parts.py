@@ -138,7 +138,7 @@ def test_studies_and_curves_read_it(marked, tmp_path):
     assert jm.robustness(marker, mesh, MESSAGE, "noise", [2e-4], samples=1).success.all()
     study = jm.Study(
         meshes={"ball": bumpy_sphere(3)}, attacks={"noise": [2e-4]}, budgets=[2e-3], payloads=[BITS],
-        schemes={"patches": PatchScheme()}, seeds=1,
+        schemes={"patches": PatchScheme()}, samples=1,
     )  # fmt: skip
     rows = study.run(tmp_path / "rows.jsonl").rows
     assert [row.read for row in rows if row.control == "marked"] == [True]
@@ -147,4 +147,4 @@ def test_studies_and_curves_read_it(marked, tmp_path):
 
 def test_tuning_says_that_it_has_no_bands():
     with pytest.raises(jm.JaxmarkError, match="'patches' has no bands whose strengths could be tuned"):
-        jm.tune(bumpy_sphere(2), [("noise", 1e-3)], 1e-3, key=jax.random.key(0), scheme=PatchScheme())
+        jm.tune(bumpy_sphere(2), [("noise", 1e-3)], 1e-3, seed=0, scheme=PatchScheme())

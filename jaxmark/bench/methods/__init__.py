@@ -7,16 +7,16 @@ from dataclasses import replace
 from jaxmark.bench.method import Method
 from jaxmark.errors import JaxmarkError
 
-_HERE = "jaxmark.bench.methods"
+_FOLDER = "jaxmark.bench.methods"
 #: Where each method is made of the size of its message: a module of this folder, and a function in it.
 METHODS: Mapping[str, str] = {
-    "keyed": "here:keyed",
-    "eigen": "here:eigen",
-    "host": "here:host",
-    "paper": "here:paper",
-    "field": "here:field",
-    "local": "here:local",
-    "harmonics": "here:harmonics",
+    "keyed": "library:keyed",
+    "eigen": "library:eigen",
+    "host": "library:host",
+    "paper": "library:paper",
+    "field": "library:field",
+    "local": "library:local",
+    "harmonics": "library:harmonics",
     "cho": "cho:cho",
     "cho-variance": "cho:cho_variance",
     "radial": "radial:radial",
@@ -34,5 +34,5 @@ def get_method(name: str, bits: int) -> Method:
     if name not in METHODS:
         raise JaxmarkError(f"There is no method {name!r}; there are {', '.join(METHODS)}, and files of your own.")
     module, _, function = METHODS[name].partition(":")
-    made = getattr(importlib.import_module(f"{_HERE}.{module}"), function)(bits)
+    made = getattr(importlib.import_module(f"{_FOLDER}.{module}"), function)(bits)
     return replace(made, name=name)

@@ -360,4 +360,4 @@ def test_information_of_few_good_and_of_many_weak_values():
 
 def test_tuning_refuses_informed_schemes(shape: Mesh):
     with pytest.raises(jm.JaxmarkError, match="there is tune"):
-        jm.tune_blind(shape, [("noise", 0.003)], key=jax.random.key(0), scheme="keyed")
+        jm.tune_blind(shape, [("noise", 0.003)], seed=0, scheme="keyed")

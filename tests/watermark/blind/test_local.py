@@ -174,7 +174,7 @@ def test_united_probabilities_hold():
 
 
 def test_refusals(shape: Mesh, key: jm.Key):
-    with pytest.raises(jm.JaxmarkError, match="Several marks in one mesh are an informed one"):
+    with pytest.raises(jm.JaxmarkError, match="Several marks in one mesh are one that is read with the original"):
         jm.embed(shape, MESSAGE, key, scheme=("field", "local"))
     with pytest.raises(jm.JaxmarkError, match="marks a mesh once"):
         jm.embed(shape, MESSAGE, key, scheme=("keyed", "local", "local"))

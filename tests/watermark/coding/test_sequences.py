@@ -31,15 +31,15 @@ def test_no_three_signs_sequences_of_length_6_are_orthogonal():
 
 
 def test_keyed_sequences_are_orthogonal_and_keyed(key: jm.Key):
-    first = orthogonal_sequences(Choices(key, b"a" * 32, 1), 10, 48).astype(int)
+    first = orthogonal_sequences(Choices(key, b"a" * 32), 10, 48).astype(int)
     np.testing.assert_array_equal(first @ first.T, 48 * np.eye(10))
     for other in (
-        orthogonal_sequences(Choices(key, b"b" * 32, 1), 10, 48),
-        orthogonal_sequences(Choices(key, b"a" * 32, 1), 10, 48, label="other"),
-        orthogonal_sequences(Choices(key, b"a" * 32, 1), 10, 96)[:, :48],
+        orthogonal_sequences(Choices(key, b"b" * 32), 10, 48),
+        orthogonal_sequences(Choices(key, b"a" * 32), 10, 48, label="other"),
+        orthogonal_sequences(Choices(key, b"a" * 32), 10, 96)[:, :48],
     ):
         assert np.abs(first @ other.T.astype(int)).max() < 48
     with pytest.raises(JaxmarkError, match="There are 4"):
-        orthogonal_sequences(Choices(key, b"", 1), 5, 4)
+        orthogonal_sequences(Choices(key, b""), 5, 4)
     with pytest.raises(JaxmarkError, match="No construction here for 56"):
         hadamard(56)

@@ -1,8 +1,6 @@
-"""The field's protocol: its definitions by hand, the public tool's scheme, and a small run from start to end."""
+"""The protocol of SMI 2010: its definitions by hand, and the scheme of a public tool."""
 
 import importlib
-import subprocess
-import sys
 from types import ModuleType
 
 import jax
@@ -11,12 +9,10 @@ import pytest
 from scipy import sparse
 
 import jaxmark as jm
-from jaxmark.geometry.mesh import Mesh, edges, make_mesh, vertex_normals
+from jaxmark.bench.leagues import PROTOCOL
+from jaxmark.geometry.mesh import Mesh, edges, vertex_normals
 from jaxmark.geometry.pose import similarity
-from tests import ROOT
 from tests.samples import bumpy_sphere
-
-BENCHMARKS = ROOT / "benchmarks"
 
 
 @pytest.fixture
@@ -25,11 +21,9 @@ def harmonics() -> ModuleType:
     return importlib.import_module("jaxmark.bench.methods.harmonics")
 
 
-@pytest.fixture
-def smi2010(harmonics, monkeypatch) -> ModuleType:
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    monkeypatch.syspath_prepend(BENCHMARKS / "robustness")
-    return importlib.import_module("smi2010")
+def attacked(mesh: Mesh, attack: str, seed: int) -> list[Mesh]:
+    """What an attack of the protocol makes of a mesh."""
+    return PROTOCOL[attack].suspects(mesh, seed)
 
 
 def cotangents(mesh: Mesh) -> np.ndarray:
@@ -85,14 +79,14 @@ def test_the_tool_confirms_its_mark_in_noise_and_a_quarter_of_what_is_none(harmo
     assert 12 <= confirmed <= 42
 
 
-def test_attacks_of_the_protocol_are_what_it_says(smi2010):
+def test_attacks_of_the_protocol_are_what_it_says():
     mesh = bumpy_sphere(3)
     centred = mesh.vertices - mesh.vertices.mean(axis=0)
     radius = np.linalg.norm(centred, axis=1).mean()
-    assert len(smi2010.PROTOCOL) == 29
+    assert len(PROTOCOL) == 29
     scales, shifts = [], []
     for trial in range(40):
-        posed = smi2010.attacked(mesh, "similarity", trial, 0)
+        (posed,) = attacked(mesh, "similarity", trial)
         pose = similarity(mesh.vertices, posed.vertices)
         np.testing.assert_allclose(pose(mesh.vertices), posed.vertices, atol=1e-9)
         scales.append(np.cbrt(np.linalg.det(pose.matrix)))
@@ -100,15 +94,16 @@ def test_attacks_of_the_protocol_are_what_it_says(smi2010):
     assert 0.1 <= min(scales) < 2
     assert 8 < max(scales) <= 10
     assert 4 < np.abs(shifts).max() <= 5
-    simpler = smi2010.attacked(mesh, "simplification 0.7", 0, 0)
+    (simpler,) = attacked(mesh, "simplification 0.7", 0)
     assert len(edges(simpler.faces)) == pytest.approx(0.3 * len(edges(mesh.faces)), rel=0.01)
-    crops = [smi2010.attacked(mesh, "cropping 0.3", 0, crop) for crop in range(3)]
+    crops = attacked(mesh, "cropping 0.3", 0)
+    assert len(crops) == 3
     assert {len(crop.vertices) for crop in crops} <= set(
         range(int(0.68 * len(mesh.vertices)), int(0.71 * len(mesh.vertices)))
     )
     assert not np.array_equal(crops[0].vertices, crops[1].vertices)
     # One step for all, from what was before.
-    smooth, (i, j) = smi2010.attacked(mesh, "smoothing 5", 0, 0), edges(mesh.faces).T
+    (smooth,), (i, j) = attacked(mesh, "smoothing 5", 0), edges(mesh.faces).T
     graph = sparse.coo_array((np.ones(2 * len(i)), (np.r_[i, j], np.r_[j, i]))).tocsr()
     v = mesh.vertices
     for _ in range(5):
@@ -116,35 +111,9 @@ def test_attacks_of_the_protocol_are_what_it_says(smi2010):
     np.testing.assert_allclose(smooth.vertices, v, atol=1e-5)
 
 
-def test_published_rates_stand_beside_their_attacks(smi2010):
-    rates = {name: (line.cho, line.wang) for name, line in smi2010.PROTOCOL.items()}
+def test_published_rates_stand_beside_their_attacks():
+    rates = {name: (line.cho, line.wang) for name, line in PROTOCOL.items()}
     assert rates["noise 0.005"] == ((0.28, 0.24), (0.16, 0.40))
     assert rates["quantisation 7"] == ((0.46, 0.41), (0.17, 0.53))
     assert rates["loop 1"] == ((0.16, 0.09), (0.0, 0.01))
     assert rates["cropping 0.5"] == (None, None)
-
-
-@pytest.mark.long
-def test_a_run_from_start_to_end_and_again(tmp_path, smi2010):
-    source, output = tmp_path / "ball.ply", tmp_path / "out"
-    mesh = bumpy_sphere(3)
-    jm.save_mesh(make_mesh(mesh.vertices, mesh.faces), source)
-    options = ["--methods", "keyed", "harmonics", "--limits", "perceptual", "--trials", "1", "--workers", "1"]
-    options += ["--attacks", "none", "noise 0.003", "smoothing 10"]
-    command = [
-        sys.executable,
-        str(BENCHMARKS / "robustness" / "smi2010.py"),
-        str(source),
-        "--output",
-        str(output),
-        *options,
-    ]
-    first = subprocess.run(command, capture_output=True, text=True)
-    assert first.returncode == 0, first.stderr[-2000:]
-    table = (output / "smi2010.md").read_text()
-    assert "| noise 0.003 | 1/1, BER 0.00, p -" in table
-    assert "| keyed | 0/15 |" in table
-    assert "## What did not read\n\nnothing" in table
-    again = subprocess.run(command, capture_output=True, text=True)
-    assert "left" not in again.stderr
-    assert (output / "smi2010.md").read_text() == table
