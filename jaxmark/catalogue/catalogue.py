@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from jaxmark.catalogue import descriptors
 from jaxmark.catalogue.database import Database
 from jaxmark.catalogue.identification import Finder, Verdict
-from jaxmark.catalogue.originals import Prepared, meshes_of, prepare_file
+from jaxmark.catalogue.originals import meshes_of, prepare_file
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import file_hash
 from jaxmark.geometry.mesh import Mesh
@@ -98,8 +98,13 @@ class Catalogue:
         content = file_hash(path)
         if copies := self.database.rows("SELECT recipient FROM copies WHERE file = ?", content):
             raise JaxmarkError(f"{path} is no original, but the copy for {copies[0]['recipient']}.")
-        known = self._known(content, path)
-        return known if known is not None else self._insert(prepare_file(path, copy=copy))
+        if (known := self._known(content, path)) is not None:
+            return known
+        prepared = prepare_file(path, copy=copy)
+        with self.database.writing():  # another process may have added the same file meanwhile
+            number, new = self.database.insert_original({**prepared.file, "added": _now()}, prepared.shapes)
+        status = "added" if new else "known"
+        return Added(number, prepared.file["path"], status, len(prepared.shapes), prepared.left)
 
     def _known(self, content: str, path: str | os.PathLike[str]) -> Added | None:
         """Look for a known file, and describe it again if its descriptors are of another jaxmark."""
@@ -116,23 +121,13 @@ class Catalogue:
             update = f"UPDATE shapes SET {', '.join(f'{name} = ?' for name in names)} WHERE original = ? AND name = ?"
             with self.database.writing():
                 for shape in prepared.shapes:
-                    self.database.run(update, *(getattr(shape, name) for name in names), row["id"], shape.name)
+                    self.database.run(update, *(shape[name] for name in names), row["id"], shape["name"])
         status, here = "known", os.path.realpath(path)
         if row["path"] != here and not Path(row["path"]).is_file():
             with self.database.writing():
                 self.database.run("UPDATE originals SET path = ? WHERE id = ?", here, row["id"])
             status = "moved"
         return Added(row["id"], here if status == "moved" else row["path"], status, row["meshes"], {})
-
-    def _insert(self, prepared: Prepared) -> Added:
-        file = {name: getattr(prepared, name) for name in ("content", "path", "bytes", "copy", "thumbnail")}
-        with self.database.writing():
-            # Another process may have added the same file meanwhile.
-            new = self.database.insert("originals", {**file, "added": _now()})
-            (row,) = self.database.rows("SELECT id FROM originals WHERE content = ?", prepared.content)
-            for shape in prepared.shapes if new else ():
-                self.database.insert("shapes", {"original": row["id"], **vars(shape)})
-        return Added(row["id"], prepared.path, "added" if new else "known", len(prepared.shapes), prepared.left)
 
     def add_record(self, record: Record | SceneRecord) -> list[Kept]:
         """Add the record of a mark, or those of a file of several meshes, to the originals that they belong to.

@@ -7,9 +7,10 @@ logging). A process that is killed leaves nothing half done.
 import os
 import sqlite3
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from jaxmark.errors import JaxmarkError
 
@@ -134,6 +135,14 @@ class Database:
         places = ", ".join("?" * len(values))
         statement = f"INSERT INTO {table} ({', '.join(values)}) VALUES ({places}) ON CONFLICT DO NOTHING"
         return self.run(statement, *values.values()) == 1
+
+    def insert_original(self, file: Mapping[str, Any], shapes: Iterable[Mapping[str, Any]]) -> tuple[int, bool]:
+        """Insert an original and its meshes; returns its number, and whether it was not there."""
+        new = self.insert("originals", file)
+        (row,) = self.rows("SELECT id FROM originals WHERE content = ?", file["content"])
+        for shape in shapes if new else ():
+            self.insert("shapes", {"original": row["id"], **shape})
+        return row["id"], new
 
     @contextmanager
     def writing(self) -> Iterator[None]:

@@ -175,12 +175,7 @@ def _take_original(database: Database, values: Mapping[str, Any], rows: list[Map
             raise TypeError
     if not shapes:
         raise TypeError
-    if not database.insert("originals", values):
-        return False
-    (original,) = database.rows("SELECT id FROM originals WHERE content = ?", values["content"])
-    for shape in shapes:
-        database.insert("shapes", {"original": original["id"], **shape})
-    return True
+    return database.insert_original(values, shapes)[1]
 
 
 def _checked(row: Mapping[str, Any], types: Mapping[str, Any]) -> dict[str, Any]:

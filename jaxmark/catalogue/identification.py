@@ -348,7 +348,7 @@ class Finder(Generic[_Catalogue]):
     def _held(self, shape: int, key: str) -> tuple[list[Record], list[tuple[Record, list[str]]]]:
         """Return the records of messages and presence marks of an original under a key, and those of its copies.
 
-        Of copies there is one for each way of marking, with its recipients.
+        There is one record for each way of marking copies, with its recipients.
         """
         rows = self.catalogue.database.rows
         query = "SELECT digest, json FROM records WHERE shape = ? AND key = ? ORDER BY added DESC, digest"

@@ -4,8 +4,8 @@ import os
 import struct
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
@@ -29,32 +29,11 @@ _LIGHT = unit(np.array([0.3, 0.5, 0.8]))  # in the camera's directions
 _PAPER, _DARKEST = 255, 40
 
 
-@dataclass(frozen=True)
-class Shape:
-    """A mesh of an original, as a row of the catalogue."""
-
-    name: str  # in its file; empty if it is the only one
-    geometry: str  # hash of its canonical geometry, hexadecimal, as in records of version 2
-    exact: str  # the same of version 1
-    vertices: int
-    faces: int
-    described: int  # version of the descriptors
-    whole: bytes  # descriptor of the whole shape
-    parts: bytes  # descriptors of balls about points of it
-    points: bytes  # points spread over it
-    landmarks: bytes  # vertices that are known by their surroundings
-
-
-@dataclass(frozen=True)
-class Prepared:
+class Prepared(NamedTuple):
     """An original that is not in the catalogue yet."""
 
-    content: str  # SHA-256 of its file, hexadecimal
-    path: str  # absolute
-    copy: bytes | None  # the file itself
-    thumbnail: bytes  # PNG
-    bytes: int
-    shapes: tuple[Shape, ...]
+    file: dict[str, Any]  # its row in the table `originals`, but for the time
+    shapes: list[dict[str, Any]]  # the rows of its meshes in the table `shapes`, but for its number
     left: Mapping[str, str]  # meshes that cannot be used, by name, and why
 
 
@@ -87,7 +66,7 @@ def prepare_file(path: str | os.PathLike[str], *, copy: bool = False) -> Prepare
     scene = meshes_of(path)
     shapes, left = [], dict(scene.left)
     for name, mesh in scene.meshes.items():
-        if (shape := describe(name, mesh)) is None:
+        if (shape := _describe(name, mesh)) is None:
             left[name] = "it has no extent"
         else:
             shapes.append(shape)
@@ -96,32 +75,38 @@ def prepare_file(path: str | os.PathLike[str], *, copy: bool = False) -> Prepare
     shown = max(scene.meshes.values(), key=lambda mesh: len(mesh.vertices))
     seen = descriptors.spread(shown) or descriptors.spread(next(iter(scene.meshes.values())))
     assert seen is not None
-    data, picture = Path(path).read_bytes() if copy else None, _thumbnail(seen.points, seen.normals)
-    return Prepared(content, os.path.realpath(path), data, picture, size, tuple(shapes), left)
+    file = {
+        "content": content,
+        "path": os.path.realpath(path),
+        "bytes": size,
+        "copy": Path(path).read_bytes() if copy else None,
+        "thumbnail": _thumbnail(seen.points, seen.normals),
+    }
+    return Prepared(file, shapes, left)
 
 
-def describe(name: str, mesh: Mesh) -> Shape | None:
-    """Describe a mesh; None if it has no extent."""
+def _describe(name: str, mesh: Mesh) -> dict[str, Any] | None:
+    """Describe a mesh, as a row of the table `shapes`; None if it has no extent."""
     seen, local = descriptors.spread(mesh), descriptors.local(mesh)
     if seen is None or local is None:
         return None
-    whole, parts = descriptors.whole(seen), local.describe()
-    parts = parts[np.arange(descriptors.CENTRES) % len(parts)]  # a cloud may have fewer points
+    parts = local.describe()
     points, centre, size = descriptors.centred(mesh)
     known = landmarks(mesh)[:MOST]
     known["place"] = (known["place"] - centre) / size
-    return Shape(
-        name,
-        rounded(mesh, grid_spacing(mesh)).hash.hex(),
-        geometry_hash(mesh).hex(),
-        int(used_vertices(mesh).sum()),
-        len(mesh.faces),
-        descriptors.VERSION,
-        whole.astype("<f2").tobytes(),
-        parts.astype("<f2").tobytes(),
-        points.astype("<f2").tobytes(),
-        known.astype(KEPT).tobytes(),
-    )
+    return {
+        "name": name,
+        "geometry": rounded(mesh, grid_spacing(mesh)).hash.hex(),
+        "exact": geometry_hash(mesh).hex(),
+        "vertices": int(used_vertices(mesh).sum()),
+        "faces": len(mesh.faces),
+        "described": descriptors.VERSION,
+        "whole": descriptors.whole(seen).astype("<f2").tobytes(),
+        # A cloud may have fewer points.
+        "parts": parts[np.arange(descriptors.CENTRES) % len(parts)].astype("<f2").tobytes(),
+        "points": points.astype("<f2").tobytes(),
+        "landmarks": known.astype(KEPT).tobytes(),
+    }
 
 
 def _thumbnail(points: Points, normals: Points) -> bytes:

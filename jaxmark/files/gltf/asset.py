@@ -37,8 +37,8 @@ def parse(data: bytes, read: Read) -> Source:
     """Read the meshes of a glTF file.
 
     Positions are local coordinates of each mesh: the transformations of nodes are not applied, so that all instances of
-    a mesh change with it. Meshes that share positions are one. Where several primitives have several POSITION
-    accessors, their points follow each other in order of first use. Other files are read by `read`.
+    a mesh change with it. Meshes that share positions are one. The points of several POSITION accessors follow
+    each other in order of first use. Other files are read by `read`.
 
     Raises:
         JaxmarkError: if the document cannot be read, or no mesh of it can be marked.

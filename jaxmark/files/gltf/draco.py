@@ -112,15 +112,9 @@ def write(
 ) -> bool:
     """Write changed attributes of a compressed primitive into a document and its buffers.
 
-    The bytes that were there are overwritten, for they hold the primitive as it was. Returns whether it is still
-    compressed: the encoder does not know all types.
-
-    Args:
-        document: the document to change.
-        contents: its buffers, to be changed, too.
-        primitive: the primitive in that document.
-        old: its content as it was decoded.
-        data: the data of the container with the new numbers.
+    The bytes that were there are overwritten, for they hold the primitive as it was. `contents` are the buffers, which
+    change with the document, and `data` are those of the document with the new numbers. Returns whether the primitive
+    is still compressed: the encoder does not know all types.
     """
     attributes = {
         name: np.frombuffer(data[rows.span], rows.dtype).reshape(-1, rows.width)
