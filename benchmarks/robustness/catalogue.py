@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, make_parser
 from common.variants import deformed, load_models, rotation, simplified, variants
 from jaxmark.catalogue import Finder, descriptors
-from jaxmark.catalogue.search import Near
+from jaxmark.catalogue.retrieval import Near
 from jaxmark.confidence import clopper_pearson
 from jaxmark.geometry.mesh import Mesh, compact
 

@@ -14,9 +14,8 @@ from jaxmark.app.options import FILE, JSON, KEY, QUIET, budget_options, read_key
 from jaxmark.app.output import FileOutcome, answer, error_text, say
 from jaxmark.app.progress import current
 from jaxmark.catalogue import Catalogue, export_catalogue, import_catalogue
-from jaxmark.catalogue.originals import file_hash
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.atomic import replacing
+from jaxmark.files.atomic import file_hash, replacing
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.perception.budget import Budget
 from jaxmark.watermark.record import RECORD_SUFFIX, Record, load_record

@@ -24,8 +24,7 @@ from jaxmark.alignment.original import Original
 from jaxmark.app.output import make_folder
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
-from jaxmark.files.atomic import write_atomically
-from jaxmark.files.reading import file_hash
+from jaxmark.files.atomic import file_hash, write_atomically
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.plot import View, draw, save_views
 from jaxmark.watermark.coding.keys import commitment as commitment_to

@@ -12,7 +12,7 @@ import click
 
 from jaxmark.app.progress import current
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.reading import file_hash
+from jaxmark.files.atomic import file_hash
 from jaxmark.watermark.evidence.detection import Detection
 from jaxmark.watermark.perception.capacity import Survival
 

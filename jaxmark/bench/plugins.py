@@ -20,7 +20,7 @@ from jaxmark.bench.method import Bits, Method, Reading
 from jaxmark.bench.methods import METHODS, get_method
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
-from jaxmark.files.reading import read_file
+from jaxmark.files.atomic import read_file
 from jaxmark.geometry.mesh import Mesh
 
 Given = str | Path | Method  # a name in `METHODS`, a file, or a method itself

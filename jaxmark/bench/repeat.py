@@ -9,8 +9,7 @@ from typing import NamedTuple
 from jaxmark.bench.results import BenchResults
 from jaxmark.bench.work import Task
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.atomic import write_atomically
-from jaxmark.files.reading import read_file
+from jaxmark.files.atomic import read_file, write_atomically
 
 BITS = 0.1  # share of wrong bits by which two readings of a message may differ and still agree
 _FIELDS = (*Task._fields, "copy", "read", "bit_errors", "detected")

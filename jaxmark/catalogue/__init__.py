@@ -11,9 +11,9 @@ from jaxmark.catalogue.catalogue import Kept as Kept
 from jaxmark.catalogue.exchange import Counted as Counted
 from jaxmark.catalogue.exchange import export_catalogue as export_catalogue
 from jaxmark.catalogue.exchange import import_catalogue as import_catalogue
-from jaxmark.catalogue.finding import Finder as Finder
-from jaxmark.catalogue.finding import Match as Match
-from jaxmark.catalogue.finding import Verdict as Verdict
+from jaxmark.catalogue.identification import Finder as Finder
+from jaxmark.catalogue.identification import Match as Match
+from jaxmark.catalogue.identification import Verdict as Verdict
 from jaxmark.catalogue.stream import Done as Done
 from jaxmark.catalogue.stream import Plan as Plan
 from jaxmark.catalogue.stream import count as count

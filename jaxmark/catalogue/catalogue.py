@@ -1,24 +1,22 @@
-"""The catalogue: originals and what is known of them, in one file."""
+"""The catalogue: originals, and their records, recipients and verdicts, in one file."""
 
 import json
 import os
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from jaxmark.catalogue import descriptors
 from jaxmark.catalogue.database import Database
-from jaxmark.catalogue.originals import Prepared, file_hash, meshes_of, prepare_file
+from jaxmark.catalogue.identification import Finder, Verdict
+from jaxmark.catalogue.originals import meshes_of, prepare_file
 from jaxmark.errors import JaxmarkError
+from jaxmark.files.atomic import file_hash
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.record import Record, SceneRecord
-
-if TYPE_CHECKING:
-    from jaxmark.catalogue.finding import Verdict
 
 _PACKAGES = ("jaxmark", "jax", "numpy", "scipy")
 
@@ -39,7 +37,7 @@ class Entry(NamedTuple):
 
 
 class Added(NamedTuple):
-    """What became of a file that was added."""
+    """The outcome of adding a file."""
 
     id: int
     path: str
@@ -48,8 +46,7 @@ class Added(NamedTuple):
     left: Mapping[str, str]  # meshes that cannot be used, and why
 
 
-@dataclass(frozen=True)
-class Kept:
+class Kept(NamedTuple):
     """A record in the catalogue, and the mesh of an original that it belongs to."""
 
     record: Record
@@ -75,9 +72,7 @@ class Catalogue:
     def __enter__(self) -> "Catalogue":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -93,7 +88,7 @@ class Catalogue:
         """Add an original; one that is known changes nothing, unless its file is no longer where it was.
 
         Args:
-            path: a mesh file; what is too small to carry a mark is added, too.
+            path: a mesh file; meshes that are too small to carry a mark are added, too.
             copy: whether to keep the file itself in the catalogue.
 
         Raises:
@@ -103,11 +98,16 @@ class Catalogue:
         content = file_hash(path)
         if copies := self.database.rows("SELECT recipient FROM copies WHERE file = ?", content):
             raise JaxmarkError(f"{path} is no original, but the copy for {copies[0]['recipient']}.")
-        known = self._known(content, path)
-        return known if known is not None else self._insert(prepare_file(path, copy=copy))
+        if (known := self._known(content, path)) is not None:
+            return known
+        prepared = prepare_file(path, copy=copy)
+        with self.database.writing():  # another process may have added the same file meanwhile
+            number, new = self.database.insert_original({**prepared.file, "added": _now()}, prepared.shapes)
+        status = "added" if new else "known"
+        return Added(number, prepared.file["path"], status, len(prepared.shapes), prepared.left)
 
     def _known(self, content: str, path: str | os.PathLike[str]) -> Added | None:
-        """A known file, whose descriptors are those of this jaxmark."""
+        """Look for a known file, and describe it again if its descriptors are of another jaxmark."""
         query = (
             "SELECT o.id, o.path, count(*) AS meshes, min(s.described) AS described FROM originals o"
             " JOIN shapes s ON s.original = o.id WHERE content = ? GROUP BY o.id"
@@ -117,58 +117,17 @@ class Catalogue:
             return None
         (row,) = found
         if row["described"] != descriptors.VERSION:
-            self._describe_again(row["id"], prepare_file(path))
+            prepared, names = prepare_file(path), ("described", "whole", "parts", "points", "landmarks")
+            update = f"UPDATE shapes SET {', '.join(f'{name} = ?' for name in names)} WHERE original = ? AND name = ?"
+            with self.database.writing():
+                for shape in prepared.shapes:
+                    self.database.run(update, *(shape[name] for name in names), row["id"], shape["name"])
         status, here = "known", os.path.realpath(path)
         if row["path"] != here and not Path(row["path"]).is_file():
             with self.database.writing():
                 self.database.run("UPDATE originals SET path = ? WHERE id = ?", here, row["id"])
             status = "moved"
         return Added(row["id"], here if status == "moved" else row["path"], status, row["meshes"], {})
-
-    def _describe_again(self, original: int, prepared: Prepared) -> None:
-        with self.database.writing():
-            for shape in prepared.shapes:
-                self.database.run(
-                    "UPDATE shapes SET described = ?, whole = ?, parts = ?, points = ?, landmarks = ?"
-                    " WHERE original = ? AND name = ?",
-                    descriptors.VERSION,
-                    shape.whole,
-                    shape.parts,
-                    shape.points,
-                    shape.landmarks,
-                    original,
-                    shape.name,
-                )
-
-    def _insert(self, prepared: Prepared) -> Added:
-        with self.database.writing():
-            # Another process may have added the same file meanwhile.
-            statement = (
-                "INSERT INTO originals (content, path, bytes, copy, thumbnail, added) VALUES (?, ?, ?, ?, ?, ?)"
-                " ON CONFLICT DO NOTHING"
-            )
-            values = prepared.content, prepared.path, prepared.size, prepared.copy, prepared.thumbnail, _now()
-            fresh = self.database.run(statement, *values).rowcount == 1
-            (row,) = self.database.rows("SELECT id FROM originals WHERE content = ?", prepared.content)
-            for shape in prepared.shapes if fresh else ():
-                self.database.run(
-                    "INSERT INTO shapes (original, name, geometry, exact, vertices, faces, described, whole, parts,"
-                    " points, landmarks)"
-                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                    row["id"],
-                    shape.name,
-                    shape.geometry,
-                    shape.exact,
-                    shape.vertices,
-                    shape.faces,
-                    descriptors.VERSION,
-                    shape.whole,
-                    shape.parts,
-                    shape.points,
-                    shape.landmarks,
-                )
-        status = "added" if fresh else "known"
-        return Added(row["id"], prepared.path, status, len(prepared.shapes), prepared.left)
 
     def add_record(self, record: Record | SceneRecord) -> list[Kept]:
         """Add the record of a mark, or those of a file of several meshes, to the originals that they belong to.
@@ -210,7 +169,7 @@ class Catalogue:
         return kept
 
     def _shape_of(self, record: Record) -> int:
-        """The mesh that a record was made for."""
+        """Find the mesh that a record was made for."""
         if not record.original:
             raise JaxmarkError(
                 f"Marks of the scheme {record.scheme!r} belong to no original; `jaxmark detect` reads them without."
@@ -222,14 +181,13 @@ class Catalogue:
         return found[0]["id"]
 
     def _keep(self, record: Record, shape: int) -> Kept:
-        self.database.run("INSERT INTO keys VALUES (?, ?) ON CONFLICT DO NOTHING", record.key, _now())
-        statement = "INSERT INTO records VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING"
-        values = record.digest(), shape, record.key, record.content, record.to_json(), _now()
-        fresh = self.database.run(statement, *values).rowcount == 1
-        return Kept(record, shape, "added" if fresh else "known")
+        self.database.insert("keys", {"commitment": record.key, "added": _now()})
+        row = {"digest": record.digest(), "shape": shape, "key": record.key, "content": record.content}
+        new = self.database.insert("records", {**row, "json": record.to_json(), "added": _now()})
+        return Kept(record, shape, "added" if new else "known")
 
     def originals(self) -> list[Entry]:
-        """All originals, in the order in which they were added."""
+        """Return all originals, in the order in which they were added."""
         query = (
             "SELECT o.id, o.path, o.content, o.bytes, o.copy IS NOT NULL AS copied, count(*) AS meshes,"
             " sum(s.vertices) AS vertices,"
@@ -240,7 +198,7 @@ class Catalogue:
         return [Entry(*row)._replace(copied=bool(row["copied"])) for row in self.database.rows(query)]
 
     def find_original(self, name: str) -> Entry:
-        """The original of this number, path, or beginning of its hash (eight digits at least).
+        """Return the original of this number, path, or beginning of its hash (eight digits at least).
 
         Raises:
             JaxmarkError: if there is none, or several.
@@ -261,7 +219,7 @@ class Catalogue:
         return found[0]
 
     def show(self, name: str) -> dict[str, Any]:
-        """All that is known of an original, as values for JSON; see `find_original`."""
+        """Return all that is known of an original, as values for JSON; see `find_original`."""
         entry = self.find_original(name)
         shapes = "SELECT id, name, geometry, vertices, faces FROM shapes WHERE original = ? ORDER BY id"
         records = "SELECT digest, key, content, added FROM records WHERE shape = ? ORDER BY added, digest"
@@ -278,7 +236,7 @@ class Catalogue:
         }
 
     def thumbnail(self, original: int) -> bytes:
-        """The small picture of an original, PNG.
+        """Return the small picture of an original, PNG.
 
         Raises:
             JaxmarkError: if there is no original of this number.
@@ -309,14 +267,14 @@ class Catalogue:
         return entry
 
     def check(self) -> Iterator[tuple[Entry, str | None]]:
-        """For each original, what is wrong with its file: missing or changed; None if it is there as it was added."""
+        """Yield each original with its file's problem: missing or changed; None if it is there as it was added."""
         for entry in self.originals():
-            if not Path(entry.path).is_file():
-                yield entry, "its file is missing" + (", the catalogue holds a copy" if entry.copied else "")
-            elif Path(entry.path).stat().st_size != entry.bytes or file_hash(entry.path) != entry.content:
-                yield entry, "its file has changed" + (", the catalogue holds a copy" if entry.copied else "")
-            else:
-                yield entry, None
+            problem, path = None, Path(entry.path)
+            if not path.is_file():
+                problem = "its file is missing"
+            elif path.stat().st_size != entry.bytes or file_hash(path) != entry.content:
+                problem = "its file has changed"
+            yield entry, f"{problem}, the catalogue holds a copy" if problem and entry.copied else problem
 
     def load(self, shape: int) -> Mesh:
         """Read the mesh of an original again, from its file if that is unchanged, else from the copy that was kept.
@@ -336,25 +294,17 @@ class Catalogue:
             raise JaxmarkError(
                 f"The original {path} is missing or has changed; bring it back, or add it from where it is."
             )
-        return self._from_copy(row["copy"], path.suffix, row["name"])
-
-    @staticmethod
-    def _from_copy(data: bytes, suffix: str, name: str) -> Mesh:
-        import tempfile
-
         with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / f"original{suffix}"
-            file.write_bytes(data)
-            return meshes_of(file).meshes[name]
+            file = Path(folder) / f"original{path.suffix}"
+            file.write_bytes(row["copy"])
+            return meshes_of(file).meshes[row["name"]]
 
-    def find(self, suspect: str | os.PathLike[str] | Mesh, keys: Sequence[bytes], **options: Any) -> "Verdict":
+    def find(self, suspect: str | os.PathLike[str] | Mesh, keys: Sequence[bytes], **options: Any) -> Verdict:
         """Find the originals that a suspect was made of; for many suspects make a `Finder`, which takes these options.
 
         Raises:
             JaxmarkError: see `Finder`.
         """
-        from jaxmark.catalogue.finding import Finder  # which needs this module
-
         return Finder(self, keys, **options).find(suspect)
 
     def record_verdict(self, suspect: str, path: str, result: Mapping[str, Any]) -> None:
@@ -363,15 +313,15 @@ class Catalogue:
         Args:
             suspect: SHA-256 of the suspect's file, hexadecimal.
             path: the suspect's file.
-            result: what was found, values for JSON.
+            result: the verdict as values for JSON.
         """
         versions = json.dumps({name: version(name) for name in _PACKAGES})
+        row = {"suspect": suspect, "path": path, "given": _now(), "versions": versions, "result": json.dumps(result)}
         with self.database.writing():
-            statement = "INSERT INTO verdicts (suspect, path, given, versions, result) VALUES (?, ?, ?, ?, ?)"
-            self.database.run(statement, suspect, path, _now(), versions, json.dumps(result))
+            self.database.insert("verdicts", row)
 
     def verdicts(self) -> Iterator[dict[str, Any]]:
-        """All verdicts that were given, the oldest first."""
+        """Yield all verdicts that were given, the oldest first."""
         for row in self.database.each("SELECT suspect, path, given, versions, result FROM verdicts ORDER BY id"):
             yield dict(row) | {name: json.loads(row[name]) for name in ("versions", "result")}
 

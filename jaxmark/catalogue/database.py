@@ -1,4 +1,4 @@
-"""The SQLite file of a catalogue: its tables, how it is opened, and what is said where it cannot be used.
+"""The SQLite file of a catalogue: its tables, and access to them.
 
 Several processes may use it at once: writers wait for each other, and readers see only what was finished (write-ahead
 logging). A process that is killed leaves nothing half done.
@@ -7,9 +7,10 @@ logging). A process that is killed leaves nothing half done.
 import os
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from jaxmark.errors import JaxmarkError
 
@@ -112,46 +113,64 @@ class Database:
             self._connection.close()
 
     def rows(self, statement: str, *values: object) -> list[sqlite3.Row]:
-        """The rows that a query finds.
+        """Return the rows that a query finds.
 
         Raises:
             JaxmarkError: if the file is damaged, or was busy for a minute.
         """
-        with self._telling():
-            return self._connection.execute(statement, values).fetchall()
+        return list(self.each(statement, *values))
 
     def each(self, statement: str, *values: object) -> Iterator[sqlite3.Row]:
-        """The rows that a query finds, one after the other, for what is large; see `rows`."""
+        """Yield the rows that a query finds, one after the other, for large ones; see `rows`."""
         with self._telling():
             yield from self._connection.execute(statement, values)
 
-    def run(self, statement: str, *values: object) -> sqlite3.Cursor:
-        """Change something, within `writing`; see `rows`."""
+    def run(self, statement: str, *values: object) -> int:
+        """Change rows, within `writing`, and return how many changed; see `rows`."""
         with self._telling():
-            return self._connection.execute(statement, values)
+            return self._connection.execute(statement, values).rowcount
+
+    def insert(self, table: str, values: Mapping[str, object]) -> bool:
+        """Insert a row, within `writing`; returns whether it was not there; see `rows`."""
+        places = ", ".join("?" * len(values))
+        statement = f"INSERT INTO {table} ({', '.join(values)}) VALUES ({places}) ON CONFLICT DO NOTHING"
+        return self.run(statement, *values.values()) == 1
+
+    def insert_original(self, file: Mapping[str, Any], shapes: Iterable[Mapping[str, Any]]) -> tuple[int, bool]:
+        """Insert an original and its meshes; returns its number, and whether it was not there."""
+        new = self.insert("originals", file)
+        (row,) = self.rows("SELECT id FROM originals WHERE content = ?", file["content"])
+        for shape in shapes if new else ():
+            self.insert("shapes", {"original": row["id"], **shape})
+        return row["id"], new
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """All changes of the block happen, or none; other writers wait.
+        """Make all changes of the block, or none; other writers wait.
 
         Raises:
             JaxmarkError: if the catalogue is opened for reading only; see `rows`.
         """
         if self.read_only:
             raise JaxmarkError(f"The catalogue {self.path} was opened for reading only.")
+        with self._transaction("IMMEDIATE"):
+            yield
+
+    @contextmanager
+    def _transaction(self, kind: str) -> Iterator[None]:
         with self._telling():
-            self._connection.execute("BEGIN IMMEDIATE")
+            self._connection.execute(f"BEGIN {kind}")
         try:
             yield
+            with self._telling():
+                self._connection.execute("COMMIT")
         except BaseException:
             with suppress(sqlite3.Error):
                 self._connection.execute("ROLLBACK")
             raise
-        with self._telling():
-            self._connection.execute("COMMIT")
 
     def problems(self) -> list[str]:
-        """What SQLite finds damaged in the file."""
+        """Return the damages that SQLite finds in the file."""
         found = [row[0] for row in self.rows("PRAGMA integrity_check(5)") if row[0] != "ok"]
         return found + [f"a row of {row[0]} refers to a missing one" for row in self.rows("PRAGMA foreign_key_check")]
 
@@ -165,9 +184,8 @@ class Database:
             return connection
         except sqlite3.DatabaseError as error:
             connection.close()
-            if not isinstance(error, sqlite3.OperationalError):
-                raise
-            if self.path.with_name(self.path.name + "-wal").exists():
+            log = self.path.with_name(self.path.name + "-wal")
+            if not isinstance(error, sqlite3.OperationalError) or log.exists():
                 raise
             return self._open(f"{self.path.as_uri()}?mode=ro&immutable=1")
 
@@ -182,32 +200,22 @@ class Database:
         return connection
 
     def _prepare(self) -> None:
-        """Check what the file is, and bring it to the newest version."""
+        """Check the file, and bring it to the newest version."""
         version = self._version()
         if version == VERSION:
             return
         if self.read_only:
             raise JaxmarkError(f"{self.path} is of version {version}; open it once for writing, which brings it up.")
         self._use_log()
-        self._connection.execute("BEGIN EXCLUSIVE")
-        try:
+        with self._transaction("EXCLUSIVE"):
             for migration in _MIGRATIONS[self._version() :]:  # another process may have been faster
                 for statement in migration.split(";"):
                     self._connection.execute(statement)
             self._connection.execute(f"PRAGMA application_id = {_APPLICATION}")
             self._connection.execute(f"PRAGMA user_version = {VERSION}")
-            self._connection.execute("COMMIT")
-        except BaseException:
-            with suppress(sqlite3.Error):
-                self._connection.execute("ROLLBACK")
-            raise
 
     def _version(self) -> int:
-        """The version of the file, 0 if it is new.
-
-        Raises:
-            JaxmarkError: if it is no catalogue, or of a later version.
-        """
+        """Return the version of the file, 0 if it is new; a later version or another program's file is refused."""
         version, application, tables = (
             self._connection.execute(query).fetchone()[0]
             for query in ("PRAGMA user_version", "PRAGMA application_id", "SELECT count(*) FROM sqlite_master")

@@ -3,8 +3,8 @@
 A shape is described by how its surface lies about a centre: points are spread over it, expanded in spherical harmonics
 on concentric shells, and the energy of each degree is taken, and what neighbouring shells have in common (Kazhdan,
 Funkhouser, Rusinkiewicz, "Rotation invariant spherical harmonic representation of 3D shape descriptors", SGP 2003).
-These numbers do not change when the shape is turned or mirrored. Where noise crumples a surface, it has more area than
-it shows: points count less the more of them are about.
+These numbers do not change when the shape is turned or mirrored. As noise crumples a surface and adds to its area,
+points count less the more of them are near.
 
 `whole` describes a shape about its centre of mass, in units of its own size. `local` describes balls about points of
 it, for suspects of which only a part is there.
@@ -93,7 +93,7 @@ def whole(shape: Spread) -> Float[np.ndarray, " numbers"]:
 
 
 def centred(mesh: Mesh) -> tuple[Points, Float64[np.ndarray, "3"], float]:
-    """Points spread over a shape that has an extent, about their centre, in units of their mean distance to it.
+    """Spread points over a shape that has an extent, about their centre, in units of their mean distance to it.
 
     Returns:
         The points `[POINTS, 3]`, and the centre and the mean distance in the mesh's units.
@@ -107,7 +107,7 @@ def centred(mesh: Mesh) -> tuple[Points, Float64[np.ndarray, "3"], float]:
 
 @dataclass(frozen=True)
 class Locals:
-    """What a shape shows of itself about points on it."""
+    """The surroundings of some points of a shape."""
 
     points: Points
     weights: Float64[np.ndarray, " points"]
@@ -117,8 +117,7 @@ class Locals:
     def describe(self, share: float = 1.0) -> Float[np.ndarray, "centres numbers"]:
         """Describe the balls about the centres, `[centres, LOCAL_SIZE]`.
 
-        Args:
-            share: the share of its original's area that this shape is taken to have, which gives the balls' radius.
+        `share` is the share of its original's area that this shape is taken to have, which gives the balls' radius.
         """
         radius, tree = LOCAL_RADIUS * math.sqrt(self.area / share), KDTree(self.points)
         found = np.zeros((len(self.centres), LOCAL_SIZE), np.float32)
@@ -147,7 +146,7 @@ def local(mesh: Mesh, count: int = CENTRES) -> Locals | None:
 
 
 def _scattered(points: Points, far: Float64[np.ndarray, " points"], count: int) -> Int64[np.ndarray, " chosen"]:
-    """Points of which each is as far as possible from those before it, and from where `far` counts from."""
+    """Choose points, each as far as possible from those before it, and from the place that `far` counts from."""
     first = far if np.isfinite(far).all() else np.linalg.norm(points - points.mean(axis=0), axis=1)
     chosen = [int(np.argmax(first))]
     room = far
@@ -158,13 +157,13 @@ def _scattered(points: Points, far: Float64[np.ndarray, " points"], count: int) 
 
 
 def _centre(points: Points, weights: Float64[np.ndarray, " points"]) -> tuple[Float64[np.ndarray, "3"], float]:
-    """The centre of points, and their root mean square distance to it."""
+    """Compute the centre of points, and their root mean square distance to it."""
     centre = weights @ points
     return centre, max(math.sqrt(weights @ ((points - centre) ** 2).sum(axis=1)), np.finfo(float).tiny)
 
 
 def _weights(points: Points, radius: float) -> Float64[np.ndarray, " points"]:
-    """Weights that give each region as much as it covers, however many points are in it; their sum is 1."""
+    """Weight points so that each region counts by its area, however many points are in it; the sum is 1."""
     about = np.asarray(KDTree(points).query_ball_point(points, radius, return_length=True), np.float64)
     return (1 / about) / (1 / about).sum()
 
@@ -172,7 +171,7 @@ def _weights(points: Points, radius: float) -> Float64[np.ndarray, " points"]:
 def _describe(
     away: Points, weights: Float64[np.ndarray, " points"], degrees: int, shells: int, apart: int
 ) -> Float64[np.ndarray, " numbers"]:
-    """Energies of harmonics on shells of the unit ball, and of products of shells up to `apart` from each other."""
+    """Compute energies of harmonics on shells of the unit ball, and of products of shells up to `apart` apart."""
     radius = np.sqrt(np.einsum("pc,pc->p", away, away))
     harmonics = real_harmonics(away / np.maximum(radius, np.finfo(float).tiny)[:, None], degrees)
     place = np.minimum(radius, 1.0) * (shells - 1)
@@ -187,11 +186,7 @@ def _describe(
 
 
 def real_harmonics(directions: Points, degrees: int) -> Float64[np.ndarray, "points harmonics"]:
-    """Orthonormal real spherical harmonics up to a degree, by their recurrences, those of each degree together.
-
-    Args:
-        directions: unit vectors, `[points, 3]`.
-        degrees: the largest degree L.
+    """Evaluate orthonormal real spherical harmonics up to a degree L at unit vectors, by their recurrences.
 
     Returns:
         `[points, (L + 1)²]`; in a degree, orders from 0 up, each but 0 by its cosine and its sine.
@@ -220,7 +215,7 @@ def real_harmonics(directions: Points, degrees: int) -> Float64[np.ndarray, "poi
 
 
 def _along(points: Points) -> Int64[np.ndarray, " points"]:
-    """Places on a curve that passes near points one after the other (Morton 1966), of points about 1 in size."""
+    """Compute places on a curve that passes near points one after the other (Morton 1966), of points of size 1."""
     low = points.min(axis=0)
     cells = np.clip((points - low) / max(float(np.ptp(points, axis=0).max()), 1e-300) * 1023, 0, 1023).astype(np.int64)
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):

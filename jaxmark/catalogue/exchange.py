@@ -1,15 +1,16 @@
-"""A catalogue as JSON Lines: one line a thing, to be kept elsewhere, merged or read by other programs."""
+"""A catalogue as JSON Lines, one line a row, to be kept elsewhere, merged or read by other programs."""
 
 import base64
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxmark.catalogue.catalogue import Catalogue
+from jaxmark.catalogue.database import Database
 from jaxmark.catalogue.descriptors import CENTRES, LOCAL_SIZE, POINTS, VERSION, WHOLE_SIZE
 from jaxmark.catalogue.landmarks import is_whole
 from jaxmark.errors import JaxmarkError
@@ -18,30 +19,29 @@ from jaxmark.watermark.record import Record
 
 _FORMAT, _FORMAT_VERSION = "jaxmark-catalogue", 1
 _MAX_LINE_BYTES = 2**30
-_Row = Mapping[str, Any]
-
-_Types = Mapping[str, Any]
-_ORIGINAL: _Types = {
-    "content": str,
-    "path": str,
-    "bytes": int,
-    "copy": bytes | None,
-    "thumbnail": bytes | None,
-    "added": str,
+_TABLES = {"original": "originals", "key": "keys", "record": "records", "copy": "copies", "verdict": "verdicts"}
+# Fields of each kind of row; `original` and `shape` of records and copies name a mesh, which has a number in the file.
+_FIELDS: dict[str, dict[str, Any]] = {
+    "original": {
+        **dict.fromkeys(("content", "path"), str),
+        "bytes": int,
+        **dict.fromkeys(("copy", "thumbnail"), bytes | None),
+        "added": str,
+    },
+    "key": dict.fromkeys(("commitment", "added"), str),
+    "record": dict.fromkeys(("original", "shape", "added", "json"), str),
+    "copy": dict.fromkeys(("original", "shape", "key", "recipient", "record", "file", "added"), str),
+    "verdict": dict.fromkeys(("suspect", "path", "given", "versions", "result"), str),
 }
-_SHAPE: _Types = {
+_SHAPE: dict[str, Any] = {
     **dict.fromkeys(("name", "geometry", "exact"), str),
     **dict.fromkeys(("vertices", "faces", "described"), int),
     **dict.fromkeys(("whole", "parts", "points", "landmarks"), bytes),
 }
-_KEY: _Types = dict.fromkeys(("commitment", "added"), str)
-_RECORD: _Types = dict.fromkeys(("original", "shape", "added", "json"), str)
-_COPY: _Types = dict.fromkeys(("original", "shape", "key", "recipient", "record", "file", "added"), str)
-_VERDICT: _Types = dict.fromkeys(("suspect", "path", "given", "versions", "result"), str)
 
 
 class Counted(NamedTuple):
-    """How much was exported, or was new when it was imported."""
+    """Numbers of rows that were exported, or were new when they were imported."""
 
     originals: int
     records: int
@@ -55,59 +55,51 @@ def export_catalogue(catalogue: Catalogue, path: str | os.PathLike[str]) -> Coun
     Raises:
         JaxmarkError: if the file cannot be written.
     """
-    counts: dict[str, int] = {}
+    counts = dict.fromkeys(_TABLES, 0)
     with replacing(Path(path)) as draft:
         try:
             with draft.open("w", encoding="utf-8") as file:
                 file.write(json.dumps({"format": _FORMAT, "version": _FORMAT_VERSION}) + "\n")
-                for kind, row in _rows(catalogue):
-                    counts[kind] = counts.get(kind, 0) + 1
-                    file.write(json.dumps({kind: row}) + "\n")
+                for kind, row in _rows(catalogue.database):
+                    counts[kind] += 1
+                    file.write(json.dumps({kind: row}, default=lambda data: base64.b64encode(data).decode()) + "\n")
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
             raise JaxmarkError(f"Cannot write {path}: {error.strerror or error}.") from None
-    return Counted(*(counts.get(kind, 0) for kind in ("original", "record", "copy", "verdict")))
+    return _counted(counts)
 
 
-def _rows(catalogue: Catalogue) -> Iterator[tuple[str, dict[str, Any]]]:
-    """What a catalogue holds, what others refer to first."""
-    database = catalogue.database
+def _counted(counts: Mapping[str, int]) -> Counted:
+    return Counted(*(counts[kind] for kind in ("original", "record", "copy", "verdict")))
+
+
+def _rows(database: Database) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the rows of a catalogue with their kinds, those first that others refer to."""
     of = "JOIN shapes s ON s.id = t.shape JOIN originals o ON o.id = s.original"
-    for row in database.each(f"SELECT id, {', '.join(_ORIGINAL)} FROM originals ORDER BY id"):
+    columns = {kind: ", ".join(fields) for kind, fields in _FIELDS.items()}
+    for row in database.each(f"SELECT {columns['original']}, id FROM originals ORDER BY id"):
         shapes = database.rows(f"SELECT {', '.join(_SHAPE)} FROM shapes WHERE original = ? ORDER BY id", row["id"])
-        values = {name: _told(row[name]) for name in _ORIGINAL}
-        yield "original", values | {"shapes": [{name: _told(one[name]) for name in _SHAPE} for one in shapes]}
-    for row in database.each("SELECT commitment, added FROM keys ORDER BY commitment"):
-        yield "key", dict(row)
-    for kind, names in (("record", ("added", "json")), ("copy", ("key", "recipient", "record", "file", "added"))):
-        table = {"record": "records", "copy": "copies"}[kind]
-        columns = ", ".join(f"t.{name}" for name in names)
-        query = f"SELECT o.content AS original, s.name AS shape, {columns} FROM {table} t {of} ORDER BY t.rowid"
+        yield "original", {name: row[name] for name in _FIELDS["original"]} | {"shapes": [dict(one) for one in shapes]}
+    queries = {"key": f"SELECT {columns['key']} FROM keys ORDER BY commitment"}
+    for kind in ("record", "copy"):
+        own = ", ".join(f"t.{name}" for name in _FIELDS[kind] if name not in ("original", "shape"))
+        queries[kind] = (
+            f"SELECT o.content AS original, s.name AS shape, {own} FROM {_TABLES[kind]} t {of} ORDER BY t.rowid"
+        )
+    queries["verdict"] = f"SELECT {columns['verdict']} FROM verdicts ORDER BY id"
+    for kind, query in queries.items():
         for row in database.each(query):
             yield kind, dict(row)
-    for row in database.each(f"SELECT {', '.join(_VERDICT)} FROM verdicts ORDER BY id"):
-        yield "verdict", dict(row)
-
-
-def _told(value: Any) -> Any:
-    return base64.b64encode(value).decode() if isinstance(value, bytes) else value
 
 
 def import_catalogue(catalogue: Catalogue, path: str | os.PathLike[str]) -> Counted:
-    """Merge an exported file into a catalogue, all of it or nothing; what is known stays as it is.
+    """Merge an exported file into a catalogue, all of it or nothing; known rows stay as they are.
 
     Raises:
         JaxmarkError: if the file cannot be read, or is no export, or a line of it is damaged.
     """
-    fresh = {"original": 0, "record": 0, "copy": 0, "verdict": 0, "key": 0}
-    take: dict[str, Callable[[Catalogue, _Row], int]] = {
-        "original": _take_original,
-        "key": _take_key,
-        "record": _take_record,
-        "copy": _take_copy,
-        "verdict": _take_verdict,
-    }
+    counts = dict.fromkeys(_TABLES, 0)
     with catalogue.database.writing():
         for number, line in enumerate(_lines(path), 1):
             try:
@@ -119,32 +111,75 @@ def import_catalogue(catalogue: Catalogue, path: str | os.PathLike[str]) -> Coun
                         raise JaxmarkError(f"its version {data.get('version')} is not one that this jaxmark reads")
                     continue
                 ((kind, row),) = data.items()
-                fresh[kind] += take[kind](catalogue, row)
+                counts[kind] += _take(catalogue.database, kind, row)
             except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
                 said = str(error).rstrip(".") if isinstance(error, JaxmarkError) else "it is damaged"
                 raise JaxmarkError(f"{path} cannot be imported: line {number}: {said}.") from None
-    return Counted(fresh["original"], fresh["record"], fresh["copy"], fresh["verdict"])
+    return _counted(counts)
 
 
 def _lines(path: str | os.PathLike[str]) -> Iterator[str]:
-    there = False
     try:
         if not Path(path).is_file():
             raise JaxmarkError(f"{path} is no file that could be imported.")
         with Path(path).open(encoding="utf-8") as file:
-            while line := file.readline(_MAX_LINE_BYTES):
-                there = True
+            if not (line := file.readline(_MAX_LINE_BYTES)):
+                raise JaxmarkError(f"{path} is empty, no export of a catalogue.")
+            while line:
                 yield line
+                line = file.readline(_MAX_LINE_BYTES)
+    except JaxmarkError:
+        raise
     except (OSError, ValueError) as error:
-        if isinstance(error, JaxmarkError):
-            raise
         raise JaxmarkError(f"Cannot read {path}: {getattr(error, 'strerror', None) or 'it is no text'}.") from None
-    if not there:
-        raise JaxmarkError(f"{path} is empty, no export of a catalogue.")
 
 
-def _checked(row: _Row, types: _Types) -> dict[str, Any]:
-    """The fields of a row, of their types."""
+def _take(database: Database, kind: str, row: Mapping[str, Any]) -> bool:
+    """Insert a row unless it is there; returns whether it was not."""
+    values = _checked(row, _FIELDS[kind])
+    match kind:
+        case "original":
+            return _take_original(database, values, row["shapes"])
+        case "record":
+            record = Record.of(json.loads(values["json"]), "in it")
+            values |= {"digest": record.digest(), "key": record.key, "content": record.content}
+        case "copy":
+            if not values["recipient"]:
+                raise TypeError
+        case "verdict":
+            for name in ("versions", "result"):
+                json.loads(values[name])
+            query = f"SELECT 1 FROM verdicts WHERE {' AND '.join(f'{name} = ?' for name in values)}"
+            if database.rows(query, *values.values()):
+                return False
+    if "shape" in values:
+        query = "SELECT s.id FROM shapes s JOIN originals o ON o.id = s.original WHERE o.content = ? AND s.name = ?"
+        found = database.rows(query, values.pop("original"), values["shape"])
+        if not found:
+            raise JaxmarkError("it belongs to an original that is in neither catalogue")
+        values["shape"] = found[0]["id"]
+    return database.insert(_TABLES[kind], values)
+
+
+def _take_original(database: Database, values: Mapping[str, Any], rows: list[Mapping[str, Any]]) -> bool:
+    """Insert an original and its shapes unless it is there; returns whether it was not."""
+    bytes.fromhex(values["content"])
+    shapes = [_checked({"landmarks": "", **row}, _SHAPE) for row in rows]  # older exports have none
+    sizes = {"whole": 2 * WHOLE_SIZE, "parts": 2 * CENTRES * LOCAL_SIZE, "points": 2 * 3 * POINTS}
+    for shape in shapes:
+        if shape["described"] == VERSION and not (
+            all(len(shape[name]) == size for name, size in sizes.items())
+            and all(np.isfinite(np.frombuffer(shape[name], "<f2")).all() for name in sizes)
+            and is_whole(shape["landmarks"])
+        ):
+            raise TypeError
+    if not shapes:
+        raise TypeError
+    return database.insert_original(values, shapes)[1]
+
+
+def _checked(row: Mapping[str, Any], types: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a row; refused if one is missing, or of another type."""
     found: dict[str, Any] = {}
     for name, kind in types.items():
         value = row[name]
@@ -154,80 +189,3 @@ def _checked(row: _Row, types: _Types) -> dict[str, Any]:
             raise TypeError
         found[name] = value
     return found
-
-
-def _take_original(catalogue: Catalogue, row: _Row) -> int:
-    values = _checked(row, _ORIGINAL)
-    bytes.fromhex(values["content"])
-    shapes = [_checked({"landmarks": "", **shape}, _SHAPE) for shape in row["shapes"]]  # older exports have none
-    for shape in shapes:
-        if shape["described"] == VERSION and not (
-            len(shape["whole"]) == 2 * WHOLE_SIZE
-            and len(shape["parts"]) == 2 * CENTRES * LOCAL_SIZE
-            and len(shape["points"]) == 2 * 3 * POINTS
-            and all(np.isfinite(np.frombuffer(shape[name], "<f2")).all() for name in ("whole", "parts", "points"))
-            and is_whole(shape["landmarks"])
-        ):
-            raise TypeError
-    if not shapes:
-        raise TypeError
-    if not _insert(catalogue, "originals", values):
-        return 0
-    (original,) = catalogue.database.rows("SELECT id FROM originals WHERE content = ?", values["content"])
-    for shape in shapes:
-        _insert(catalogue, "shapes", {"original": original["id"], **shape})
-    return 1
-
-
-def _take_key(catalogue: Catalogue, row: _Row) -> int:
-    return _insert(catalogue, "keys", _checked(row, _KEY))
-
-
-def _take_record(catalogue: Catalogue, row: _Row) -> int:
-    values = _checked(row, _RECORD)
-    record = Record.of(json.loads(values["json"]), "in it")
-    return _insert(
-        catalogue,
-        "records",
-        {
-            "digest": record.digest(),
-            "shape": _shape(catalogue, values),
-            "key": record.key,
-            "content": record.content,
-            "json": values["json"],
-            "added": values["added"],
-        },
-    )
-
-
-def _take_copy(catalogue: Catalogue, row: _Row) -> int:
-    values = _checked(row, _COPY)
-    fields = {name: values[name] for name in ("key", "recipient", "record", "file", "added")}
-    if not values["recipient"]:
-        raise TypeError
-    return _insert(catalogue, "copies", {"shape": _shape(catalogue, values), **fields})
-
-
-def _take_verdict(catalogue: Catalogue, row: _Row) -> int:
-    values = _checked(row, _VERDICT)
-    for name in ("versions", "result"):
-        json.loads(values[name])
-    query = f"SELECT 1 FROM verdicts WHERE {' AND '.join(f'{name} = ?' for name in values)}"
-    if catalogue.database.rows(query, *values.values()):
-        return 0
-    return _insert(catalogue, "verdicts", values)
-
-
-def _shape(catalogue: Catalogue, row: _Row) -> int:
-    query = "SELECT s.id FROM shapes s JOIN originals o ON o.id = s.original WHERE o.content = ? AND s.name = ?"
-    found = catalogue.database.rows(query, row["original"], row["shape"])
-    if not found:
-        raise JaxmarkError("it belongs to an original that is in neither catalogue")
-    return found[0]["id"]
-
-
-def _insert(catalogue: Catalogue, table: str, values: Mapping[str, Any]) -> int:
-    """Insert a row unless it is there; returns how many there are more."""
-    places = ", ".join("?" for _ in values)
-    statement = f"INSERT INTO {table} ({', '.join(values)}) VALUES ({places}) ON CONFLICT DO NOTHING"
-    return catalogue.database.run(statement, *values.values()).rowcount

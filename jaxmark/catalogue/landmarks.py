@@ -2,8 +2,8 @@
 
 Most copies have the meshing of their original, whatever became of pose, positions and order, and whatever was cut off
 or added. Vertices whose surroundings no other vertex has (`jaxmark.geometry.connectivity`) then pair a suspect with its
-original, and a similarity fitted to the pairs leaves less on it than on near duplicates of the same meshing. Of each
-original those of the least colours are kept, which are the same in all copies (Broder, "On the resemblance and
+original, and a similarity fitted to the pairs leaves less on it than on near duplicates of the same meshing. Those of
+the least colours are kept of each original, as they are the same in all copies (Broder, "On the resemblance and
 containment of documents", 1997).
 """
 
@@ -18,14 +18,14 @@ LANDMARK = np.dtype([("colour", "<u8"), ("place", "<f8", (3,))])
 KEPT = np.dtype([("colour", "<u8"), ("place", "<f4", (3,))])  # in catalogues
 MOST = 256  # landmarks that are kept of each original
 _RINGS = 2  # of the neighbourhoods: one tells few vertices apart, more are lost where something was cut off
-_LEAST, _LEAST_SHARE = 8, 0.2  # pairs by which an original is known; up to a tenth are left by meshing anew
+_LEAST, _LEAST_SHARE = 8, 0.2  # pairs by which an original is known; remeshing leaves up to a tenth
 _FAR = 0.15  # the most that a distance counts, in an original's mean distances to its centre
 _ROUNDS, _KEPT_SHARE = 5, 0.7  # of fits, and of the closest pairs in each
 _CANDIDATES = 1000  # originals that a suspect is fitted to, those with the most pairs
 
 
 def landmarks(mesh: Mesh) -> np.ndarray:
-    """All landmarks of a mesh, in the order of their colours, an array of `LANDMARK`."""
+    """Find all landmarks of a mesh, in the order of their colours, as an array of `LANDMARK`."""
     points = weld_mesh(mesh, weld(mesh.vertices))
     vertices, colours = distinct_vertices(points, _RINGS)
     found = np.empty(len(vertices), LANDMARK)
@@ -44,11 +44,7 @@ class LandmarkIndex:
     """The landmarks of many originals, ready for search."""
 
     def __init__(self, kept: list[np.ndarray]) -> None:
-        """Sort them.
-
-        Args:
-            kept: of each original its landmarks, arrays of `KEPT`, with places in mean distances to its centre.
-        """
+        """Sort the landmarks of each original, arrays of `KEPT` with places in mean distances to its centre."""
         every = np.concatenate(kept) if kept else np.empty(0, KEPT)
         order = np.argsort(every["colour"], kind="stable")
         self._colours, self._places = every["colour"][order], every["place"][order]
@@ -59,13 +55,13 @@ class LandmarkIndex:
         self._owner = np.repeat(np.arange(len(kept), dtype=np.int32), [len(one) for one in kept])[order]
 
     def off(self, seen: np.ndarray) -> dict[int, float]:
-        """The originals that share landmarks with a suspect, and the mean distance that a similarity leaves.
+        """Find the originals that share landmarks with a suspect, and the mean distance that a similarity leaves.
 
         Args:
             seen: from `landmarks`, of the suspect.
 
         Returns:
-            By the number of the original, in mean distances to its centre.
+            Distances by the number of the original, in mean distances to its centre.
         """
         first, end = (np.searchsorted(self._colours, seen["colour"], side) for side in ("left", "right"))
         count = end - first
@@ -87,7 +83,7 @@ class LandmarkIndex:
 
 
 def _left(source: Points, target: Points) -> Float64[np.ndarray, " pairs"]:
-    """The distances of pairs after the similarity, which may mirror, that fits most of them best."""
+    """Compute the distances of pairs after the similarity or reflection that fits most of them best."""
     kept = np.arange(len(source))
     off = np.zeros(len(source))
     for _ in range(_ROUNDS):

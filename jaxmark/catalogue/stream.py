@@ -1,4 +1,4 @@
-"""Many suspects, one after the other, by any number of workers; what is done is in a file, from which it resumes.
+"""Many suspects, one after the other, by any number of workers; results are in a file, from which a run resumes.
 
 Any `concurrent.futures` executor will do, as for studies (`jaxmark.evaluation.cells`): processes here, or the workers
 of a Dask cluster. Workers open the catalogue for reading only. Suspects come from an iterator, of which only as many
@@ -9,24 +9,24 @@ import hashlib
 import json
 import os
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
     CancelledError,
-    Executor,
     Future,
     ThreadPoolExecutor,
     wait,
 )
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxmark.catalogue.catalogue import Catalogue
-from jaxmark.catalogue.finding import Finder
+from jaxmark.catalogue.identification import Finder
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.cells import Pool, append, processes
 from jaxmark.files import SUFFIXES
@@ -39,7 +39,7 @@ _MOST_BREAKS = 2  # times that a suspect may break a pool while it is alone in i
 
 @dataclass(frozen=True)
 class Plan:
-    """What workers do with each suspect; they keep what they have prepared for it."""
+    """The work on each suspect; workers keep what they have prepared for it."""
 
     catalogue: Path
     keys: tuple[bytes | Path, ...]  # keys, or files that each worker reads, so that no key is sent to it
@@ -48,7 +48,7 @@ class Plan:
 
 
 class Done(NamedTuple):
-    """How a run ended."""
+    """The result of a run, counted."""
 
     named: int
     nobodys: int
@@ -67,8 +67,8 @@ def find_each(
     Args:
         plan: the catalogue, the keys, and how to look.
         suspects: files.
-        output: file of JSON lines, one for each suspect, which grows. What is in it, or among the dead letters beside
-            it (`output` and ".dead.jsonl"), is not done again; delete the latter to have them tried again.
+        output: file of JSON lines, one for each suspect, which grows. Suspects in it, or among the dead letters beside
+            it (`output` and ".dead.jsonl"), are not done again; delete the latter to have them tried again.
         workers: number of processes, where 1 is this process; or a function that makes an executor.
         say: function that is called with a line about what goes wrong.
 
@@ -79,25 +79,26 @@ def find_each(
     known = _finished(target) | _finished(dead)
     _finder(plan).prepare()  # refuses before any worker starts
     pool, ahead = _pool(workers)
-    with _Keeper(plan, say) as keep:
-        for path, row, refused in _run(pool, ahead, plan, _fresh(suspects, known), say):
+    writable = os.access(plan.catalogue, os.W_OK) and os.access(plan.catalogue.resolve().parent, os.W_OK)
+    if not writable:
+        say("The catalogue cannot be written; verdicts are not kept in it.")
+    with Catalogue(plan.catalogue) if writable else nullcontext() as catalogue:
+        for path, row in _run(pool, ahead, plan, _fresh(suspects, known), say):
             line = {"suspect": path, "identity": _identity(path), **row}
-            if not refused:
-                keep(path, row)
-            append(dead if refused else target, line)
+            if catalogue is not None and "refused" not in row:
+                catalogue.record_verdict(row["suspect_sha256"], path, row)
+            append(dead if "refused" in row else target, line)
             yield line
 
 
 def count(rows: Iterable[Mapping[str, Any]]) -> Done:
-    """Count what `find_each` yields, and so let it run."""
-    counts = {"named": 0, "nobodys": 0, "dead": 0}
-    for row in rows:
-        counts["dead" if "refused" in row else "named" if row["named"] else "nobodys"] += 1
-    return Done(**counts)
+    """Count the results of `find_each`, which runs it."""
+    counts = Counter("dead" if "refused" in row else "named" if row["named"] else "nobodys" for row in rows)
+    return Done(counts["named"], counts["nobodys"], counts["dead"])
 
 
 def mesh_files_below(folder: Path) -> Iterator[Path]:
-    """The mesh files of a folder and of all below it, in order; links to folders are not followed."""
+    """Yield the mesh files of a folder and of all below it, in order; links to folders are not followed."""
     for place, folders, files in os.walk(folder):
         folders.sort()
         yield from (
@@ -108,7 +109,7 @@ def mesh_files_below(folder: Path) -> Iterator[Path]:
 
 
 def _fresh(suspects: Iterable[str | os.PathLike[str]], known: set[bytes]) -> Iterator[str]:
-    """Suspects that are not done, each once."""
+    """Yield the suspects that are not done, each once."""
     for suspect in suspects:
         path = os.path.realpath(suspect)
         digest = _digest(_identity(path))
@@ -118,7 +119,7 @@ def _fresh(suspects: Iterable[str | os.PathLike[str]], known: set[bytes]) -> Ite
 
 
 def _identity(path: str) -> list[str | int]:
-    """What tells a suspect from others without reading it."""
+    """Return values that distinguish a suspect from others without reading it."""
     try:
         found = Path(path).stat()
     except (OSError, ValueError):
@@ -131,11 +132,7 @@ def _digest(identity: list[str | int]) -> bytes:
 
 
 def _finished(path: Path) -> set[bytes]:
-    """What a file has; a last line that a killed run left incomplete is cut off.
-
-    Raises:
-        JaxmarkError: if the file cannot be read, or a line is damaged.
-    """
+    """Read the identities in a file; a last line that a killed run left incomplete is cut off."""
     found: set[bytes] = set()
     if not path.exists():
         return found
@@ -159,29 +156,8 @@ def _finished(path: Path) -> set[bytes]:
     return found
 
 
-class _Keeper:
-    """Keeps verdicts in the catalogue, unless it cannot be written."""
-
-    def __init__(self, plan: Plan, say: Callable[[str], None]) -> None:
-        writable = os.access(plan.catalogue, os.W_OK) and os.access(plan.catalogue.resolve().parent, os.W_OK)
-        self._catalogue = Catalogue(plan.catalogue) if writable else None
-        if not writable:
-            say("The catalogue cannot be written; verdicts are not kept in it.")
-
-    def __enter__(self) -> Callable[[str, Mapping[str, Any]], None]:
-        return self._keep
-
-    def __exit__(self, *error: object) -> None:
-        if self._catalogue is not None:
-            self._catalogue.close()
-
-    def _keep(self, path: str, row: Mapping[str, Any]) -> None:
-        if self._catalogue is not None:
-            self._catalogue.record_verdict(row["suspect_sha256"], path, row)
-
-
 def _pool(workers: int | Pool) -> tuple[Pool, int]:
-    """A maker of executors, and how many suspects to give it at a time."""
+    """Return a maker of executors, and the number of suspects to give it at a time."""
     if not isinstance(workers, int):
         return workers, _AHEAD * (os.cpu_count() or 1)
     if workers < 1:
@@ -192,84 +168,52 @@ def _pool(workers: int | Pool) -> tuple[Pool, int]:
 
 def _run(
     pool: Pool, ahead: int, plan: Plan, suspects: Iterator[str], say: Callable[[str], None]
-) -> Iterator[tuple[str, dict[str, Any], bool]]:
-    """Results of suspects as they come: the path, what was found, and whether that is a refusal.
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the results of suspects as they come: the path, and the verdict or a refusal.
 
-    Whenever a pool breaks, what was in it is done again one at a time, so that what breaks it is known.
+    Whenever a pool breaks, the suspects in it are done again one at a time, so that the one that breaks it is known.
     """
     alone: deque[str] = deque()
-    breaks: dict[str, int] = {}
-    more = True
-    while more or alone:
+    breaks: Counter[str] = Counter()
+    while True:
         running: dict[Future[dict[str, Any]], str] = {}
         try:
             with pool() as executor:
                 try:
                     while True:
-                        more = _fill(executor, running, plan, suspects, alone, ahead)
+                        most = 1 if alone else ahead
+                        while len(running) < most and (path := alone.popleft() if alone else next(suspects, None)):
+                            alone.appendleft(path)  # where it stays if the executor is broken already
+                            running[executor.submit(work, plan, path)] = path
+                            alone.popleft()
                         if not running:
-                            break
+                            return
                         done = wait(running, return_when=FIRST_COMPLETED).done
                         for future in [one for one in running if one in done]:
-                            path = running[future]
-                            row, refused = _outcome(future)
-                            del running[future]
-                            breaks.pop(path, None)
-                            yield path, row, refused
+                            path, row = running[future], _outcome(future)
+                            del running[future], breaks[path]
+                            yield path, row
                 except BaseException:
                     executor.shutdown(wait=False, cancel_futures=True)
                     raise
         except (BrokenExecutor, CancelledError) as error:
             lost = list(running.values())
             if len(lost) == 1:
-                breaks[lost[0]] = breaks.get(lost[0], 0) + 1
-            for path in [path for path in lost if breaks.get(path, 0) >= _MOST_BREAKS]:
+                breaks[lost[0]] += 1
+            for path in [path for path in lost if breaks[path] >= _MOST_BREAKS]:
                 lost.remove(path)
-                yield path, {"refused": "It killed the worker that read it."}, True
+                yield path, {"refused": "It killed the worker that read it."}
             alone.extend(lost)
             say(f"{error or 'A pool broke.'} A new pool goes on, one suspect at a time for those that were in it.")
 
 
-def _fill(
-    executor: Executor,
-    running: dict[Future[dict[str, Any]], str],
-    plan: Plan,
-    suspects: Iterator[str],
-    alone: deque[str],
-    ahead: int,
-) -> bool:
-    """Give an executor more to do; returns whether there may be more suspects."""
-    if alone:
-        if not running:
-            _submit(executor, running, plan, alone.popleft(), alone)
-        return True
-    while len(running) < ahead:
-        path = next(suspects, None)
-        if path is None:
-            return False
-        _submit(executor, running, plan, path, alone)
-    return True
-
-
-def _submit(
-    executor: Executor, running: dict[Future[dict[str, Any]], str], plan: Plan, path: str, alone: deque[str]
-) -> None:
-    """Give an executor a suspect; one that is broken already gets it again when it is whole."""
+def _outcome(future: Future[dict[str, Any]]) -> dict[str, Any]:
     try:
-        running[executor.submit(work, plan, path)] = path
-    except BrokenExecutor:
-        alone.appendleft(path)
-        raise
-
-
-def _outcome(future: Future[dict[str, Any]]) -> tuple[dict[str, Any], bool]:
-    try:
-        row = future.result()
+        return future.result()
     except (BrokenExecutor, CancelledError):
         raise
     except Exception as error:  # such as Dask's KilledWorker
-        row = {"refused": " ".join(f"{type(error).__name__}: {error}".split())}
-    return row, "refused" in row
+        return {"refused": " ".join(f"{type(error).__name__}: {error}".split())}
 
 
 def work(plan: Plan, path: str) -> dict[str, Any]:
@@ -287,6 +231,6 @@ def work(plan: Plan, path: str) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def _finder(plan: Plan) -> Finder:
-    """The finder of this process, which opens the catalogue for reading only."""
+    """Make the finder of this process, which opens the catalogue for reading only."""
     keys = [load_key(key) if isinstance(key, Path) else key for key in plan.keys]
     return Finder(Catalogue(plan.catalogue, read_only=True), keys, **dict(plan.options))

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.reading import read_file
+from jaxmark.files.atomic import read_file
 
 Cell = tuple[str | int | float, ...]  # values that JSON keeps as they are
 Row = Mapping[str, Any]

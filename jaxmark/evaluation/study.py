@@ -24,7 +24,7 @@ from jaxmark.evaluation._robustness import NOTHING, Outcome, compare_with
 from jaxmark.evaluation.cells import Cell, Pool, processes, run
 from jaxmark.evaluation.results import Results
 from jaxmark.files import load_mesh
-from jaxmark.files.reading import read_file
+from jaxmark.files.atomic import read_file
 from jaxmark.geometry.hashing import geometry_hash
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.scheme import BlindScheme

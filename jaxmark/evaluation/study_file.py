@@ -8,7 +8,7 @@ from typing import Any
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.study import Study
-from jaxmark.files.reading import read_file
+from jaxmark.files.atomic import read_file
 
 _MAX_FILE_BYTES = 2**24  # of a TOML file
 

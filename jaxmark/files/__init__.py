@@ -1,22 +1,24 @@
 """Read and write mesh files: OBJ, PLY, OFF, STL, GLB, glTF and 3MF; and point clouds: XYZ, LAS and LAZ, too.
 
-A file is saved by patching the one that it was loaded from: whatever is no position or normal stays byte for byte.
+A file is saved by patching the one that it was loaded from: all bytes but those of positions and normals stay.
 """
 
 import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import gltf, las, obj, off, ply, stl, threemf, xyz
-from jaxmark.files.atomic import write_atomically, write_together
-from jaxmark.files.reading import read_beside, read_file
-from jaxmark.files.source import Patched, Source, Texture
+from jaxmark.files import obj, off, ply, point_cloud, stl, threemf
+from jaxmark.files.atomic import read_beside, read_file, write_atomically, write_together
+from jaxmark.files.gltf import asset
+from jaxmark.files.source import Indices, Source, Texture, concerning
 from jaxmark.geometry.mesh import Mesh, host_mesh, make_mesh
+from jaxmark.geometry.pose import Points
 from jaxmark.geometry.skinning import Skinning
 
 __all__ = [
@@ -32,26 +34,17 @@ __all__ = [
     "write_atomically",
 ]
 
-# Parses a file's bytes; the second argument reads the files that it refers to.
-_Parser = Callable[[bytes, Callable[[str], bytes]], Source]
-
-
-def _alone(parse: Callable[[bytes], Source]) -> _Parser:
-    """The parser of a format whose files refer to no others."""
-    return lambda data, read: parse(data)
-
-
-_FORMATS: dict[str, _Parser] = {
-    ".obj": _alone(obj.parse),
-    ".ply": _alone(ply.parse),
-    ".off": _alone(off.parse),
-    ".stl": _alone(stl.parse),
-    ".glb": gltf.parse,
-    ".gltf": gltf.parse,
-    ".3mf": _alone(threemf.parse),
-    ".xyz": _alone(xyz.parse),
-    ".las": _alone(las.parse),
-    ".laz": _alone(las.parse),
+_FORMATS: dict[str, Callable[..., Source]] = {
+    ".obj": obj.parse,
+    ".ply": ply.parse,
+    ".off": off.parse,
+    ".stl": stl.parse,
+    ".glb": asset.parse,
+    ".gltf": asset.parse,
+    ".3mf": threemf.parse,
+    ".xyz": point_cloud.parse_xyz,
+    ".las": point_cloud.parse_las,
+    ".laz": point_cloud.parse_las,
 }
 SUFFIXES = tuple(_FORMATS)
 # A file's numbers keep a displacement well enough if its RMS is at least this many times their spacing.
@@ -71,9 +64,9 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
 
     Vertices are the file's own, in its order: none are merged or dropped, and isolated ones are kept. An STL file has
     three vertices of its own for each facet. A GLB, glTF or 3MF file gives local coordinates; transformations of nodes,
-    components and built items are not applied. Several meshes in a file follow each other as one; `load_scene` tells
-    them apart. A file without faces is a point cloud, as XYZ, LAS and LAZ files are. Polygons are split into triangles
-    (v0, v1, v2), (v0, v2, v3), …, for computing only.
+    components and built items are not applied. Several meshes in a file follow each other as one; `load_scene`
+    separates them. A file without faces is a point cloud, as XYZ, LAS and LAZ files are. Polygons are split into
+    triangles (v0, v1, v2), (v0, v2, v3), …, for computing only.
 
     Args:
         path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary), GLB, glTF, 3MF, XYZ (text), LAS or LAZ
@@ -92,10 +85,7 @@ def load_scene(path: str | os.PathLike) -> Scene:
     """Read the meshes of a file: those of a GLB or glTF file, or the objects of an OBJ or 3MF file.
 
     Objects of OBJ that share vertices are one mesh, and so are meshes that share positions. Instances and other nodes
-    that show the same mesh are not told apart. Files of other formats have one mesh.
-
-    Args:
-        path: see `load_mesh`.
+    that show the same mesh are not distinguished. Files of other formats have one mesh.
 
     Raises:
         JaxmarkError: see `load_mesh`; but of several meshes, some may be invalid.
@@ -118,9 +108,6 @@ def load_scene(path: str | os.PathLike) -> Scene:
 def load_texture(path: str | os.PathLike) -> Texture:
     """Read the texture coordinates of an OBJ, GLB or glTF file.
 
-    Args:
-        path: a mesh file, see `load_mesh`.
-
     Returns:
         One pair for each corner of the faces that `load_mesh` returns, NaN for those that have none; None if the file
         or its format has no texture coordinates, or none that can be read.
@@ -128,29 +115,26 @@ def load_texture(path: str | os.PathLike) -> Texture:
     Raises:
         JaxmarkError: see `load_mesh`.
     """
-    found = _read(path).texture()
-    return None if found is None or not np.isfinite(found).any() else found
+    texture = _read(path).texture()
+    return None if texture is None or not np.isfinite(texture).any() else texture
 
 
 def load_skin(path: str | os.PathLike) -> Skinning:
-    """Read the skin of a GLB or glTF file: which joints move each vertex.
-
-    Args:
-        path: a mesh file, see `load_mesh`.
+    """Read the skin of a GLB or glTF file: the joints that move each vertex, and their weights.
 
     Returns:
         One row for each vertex that `load_mesh` returns. The weights of a vertex sum to 1; joints of several skins
-        in one file are told apart.
+        in one file have different numbers.
 
     Raises:
         JaxmarkError: see `load_mesh`; or if not all meshes of the file have a skin.
     """
-    found = _read(path).skin()
-    if found is None:
+    skin = _read(path).skin()
+    if skin is None:
         raise JaxmarkError(
             f"{os.fspath(path)}: the file, or one of its meshes, has no skin; only GLB and glTF have one."
         )
-    return found
+    return skin
 
 
 def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | None = None) -> None:
@@ -171,14 +155,12 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | 
             spacing exceeds a tenth of the root mean square displacement of the vertices.
     """
     mesh = host_mesh(mesh)
-    parse = _parser(path)
     if like is None:
-        from jaxmark.files.fresh import encode_new
+        from jaxmark.files.export import encode_new
 
-        data = encode_new(mesh, Path(path).suffix.lower(), lambda data: parse(data, read_beside(Path(path).parent)))
-        write_atomically(path, data)
-        return
-    _save_whole(mesh, _source_of(path, like), path, like)
+        write_atomically(path, encode_new(mesh, _suffix(path), partial(_parse, path)))
+    else:
+        _save_whole(mesh, _source_of(path, like), path, like)
 
 
 def _save_whole(mesh: Mesh, source: Source, path: str | os.PathLike, like: str | os.PathLike) -> tuple[str, ...]:
@@ -201,7 +183,7 @@ def save_scene(meshes: Mapping[str, Mesh], path: str | os.PathLike, *, like: str
         like: the file that they were loaded from.
 
     Returns:
-        What could not stay as it was, in sentences; mostly nothing.
+        Sentences about content that could not stay as it was; usually none.
 
     Raises:
         JaxmarkError: see `save_mesh`; also if there is no mesh of such a name.
@@ -222,12 +204,12 @@ def save_scene(meshes: Mapping[str, Mesh], path: str | os.PathLike, *, like: str
 
 
 def number_check(like: str | os.PathLike) -> Callable[[str, Mesh], None]:
-    """A function that checks whether a file's numbers are fine enough for a mesh, by name, with other vertices.
+    """Make a function that checks whether a file's numbers are fine enough for a mesh, by name, with other vertices.
 
-    It raises a `JaxmarkError` if they are not, see `save_mesh`.
+    The function raises a `JaxmarkError` if they are not, see `save_mesh`.
     """
     source = _read(like)
-    places = {part.name: part.places for part in source.parts} or {_ONLY: np.arange(len(source.positions))}
+    places = _places(source)
 
     def check(name: str, mesh: Mesh) -> None:
         positions = source.positions.copy()
@@ -237,40 +219,47 @@ def number_check(like: str | os.PathLike) -> Callable[[str, Mesh], None]:
     return check
 
 
-def _parser(path: str | os.PathLike) -> _Parser:
-    """The parser of the format that a path's suffix names."""
+def _places(source: Source) -> dict[str, Indices]:
+    """Return the rows of the positions that each mesh has, by name."""
+    return {part.name: part.places for part in source.parts} or {_ONLY: np.arange(len(source.positions))}
+
+
+def _suffix(path: str | os.PathLike) -> str:
+    """Return the suffix of a path, which names a known format."""
     suffix = Path(path).suffix.lower()
     if suffix not in _FORMATS:
         known = ", ".join(known[1:].upper() for known in _FORMATS)
         raise JaxmarkError(f"{os.fspath(path)}: '{suffix}' is no suffix of a known mesh format ({known}).")
-    return _FORMATS[suffix]
+    return suffix
+
+
+def _parse(path: str | os.PathLike, data: bytes) -> Source:
+    """Parse the bytes of a file; those of some formats refer to other files beside it."""
+    suffix = _suffix(path)
+    beside = (read_beside(Path(path).parent),) if suffix in (".glb", ".gltf") else ()
+    return _FORMATS[suffix](data, *beside)
 
 
 def _read(path: str | os.PathLike) -> Source:
     """Read a file."""
-    parse = _parser(path)
+    _suffix(path)
     try:
         data = read_file(path)
     except (OSError, ValueError) as error:  # ValueError for a NUL in the name
         raise JaxmarkError(f"Cannot read {os.fspath(path)}: {getattr(error, 'strerror', None) or error}.") from error
-    try:
-        return parse(data, read_beside(Path(path).parent))
-    except JaxmarkError as error:
-        raise JaxmarkError(f"{os.fspath(path)}: {error}") from error
+    with concerning(os.fspath(path)):
+        return _parse(path, data)
 
 
 def _whole(source: Source, path: str | os.PathLike) -> Mesh:
-    """All meshes of a file as one."""
-    try:
+    """Join all meshes of a file."""
+    with concerning(os.fspath(path)):
         return make_mesh(source.positions, source.faces)
-    except JaxmarkError as error:
-        raise JaxmarkError(f"{os.fspath(path)}: {error}") from error
 
 
 def _source_of(path: str | os.PathLike, like: str | os.PathLike) -> Source:
     """Read the file that another one is written like."""
-    _parser(path)
-    if Path(path).suffix.lower() != Path(like).suffix.lower():
+    if _suffix(path) != Path(like).suffix.lower():
         raise JaxmarkError(
             f"{os.fspath(path)} must have the same suffix as {os.fspath(like)}, whose bytes it takes over."
         )
@@ -278,35 +267,22 @@ def _source_of(path: str | os.PathLike, like: str | os.PathLike) -> Source:
 
 
 def _save(source: Source, positions: np.ndarray, path: str | os.PathLike, like: str | os.PathLike) -> tuple[str, ...]:
-    """Write a source with other positions, and the files beside it."""
-    try:
-        patched = _patched(source, positions, Path(path).stem)
-    except JaxmarkError as error:
-        raise JaxmarkError(f"{os.fspath(like)}: {error}") from error
+    """Write a source with other positions, and the files beside it; refused if its numbers are too coarse."""
+    with concerning(os.fspath(like)):
+        moved = [_check_spacing(source, positions, places) for places in _places(source).values()]
+        patched = source.patch(positions if any(moved) else source.positions, Path(path).stem)
     beside = dict(patched.beside)
     here, there = Path(like).parent, Path(path).parent
     if os.path.realpath(here) != os.path.realpath(there):
-        read = read_beside(here)
         for companion in patched.companions:
-            try:
-                beside[companion] = read(companion)
-            except JaxmarkError:  # what is missing already, or lies elsewhere, is not ours to bring along
-                continue
+            with suppress(JaxmarkError):  # a file that is missing already, or lies elsewhere, does not come along
+                beside[companion] = read_beside(here)(companion)
     write_together(path, patched.file, beside)
     return patched.remarks
 
 
-def _patched(source: Source, positions: np.ndarray, name: str) -> Patched:
-    """The source with new positions; refused if its numbers are too coarse for the displacement."""
-    every = np.arange(len(positions))
-    any_moved = False
-    for places in [part.places for part in source.parts] or [every]:
-        any_moved |= _check_spacing(source, positions, places)
-    return source.patch(positions if any_moved else source.positions, name)
-
-
-def _check_spacing(source: Source, positions: np.ndarray, places: Int64[np.ndarray, " points"]) -> bool:
-    """Check that a mesh's numbers are fine enough for what changes; whether anything does."""
+def _check_spacing(source: Source, positions: Points, places: Indices) -> bool:
+    """Refuse numbers that are too coarse for the displacement of a mesh; returns whether anything moved."""
     with np.errstate(all="ignore"):
         moved = np.abs(positions[places] - source.positions[places])
         largest = moved.max(initial=0.0)

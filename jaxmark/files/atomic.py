@@ -1,28 +1,87 @@
-"""Write files that appear whole or not at all."""
+"""Read whole files, and write files that appear whole or not at all."""
 
+import errno
+import hashlib
 import os
 import platform
 import re
 import secrets
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 from jaxmark.errors import JaxmarkError
 
-_PREFIX = ".jaxmark-"  # of what is written before it gets its name
+_PREFIX = ".jaxmark-"  # of drafts, which are written before they get the file's name
+
+
+def read_file(path: str | os.PathLike, most: int | None = None) -> bytes:
+    """Read all bytes of an ordinary file; a device or a pipe, which may never end, is refused.
+
+    Args:
+        path: the file; symbolic links are followed.
+        most: the largest number of bytes that make sense.
+
+    Raises:
+        OSError: if it cannot be read, is no ordinary file, or is larger than that.
+        ValueError: if its name holds a NUL.
+    """
+    target = Path(path)
+    size = target.stat().st_size  # raises where there is nothing
+    if target.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
+    if not target.is_file():
+        raise OSError(errno.EINVAL, "it is no ordinary file; write its content to one", os.fspath(path))
+    if most is not None and size > most:
+        raise OSError(errno.EFBIG, f"it has {size} bytes, more than {most}", os.fspath(path))
+    return target.read_bytes()
+
+
+def file_hash(path: str | os.PathLike[str]) -> str:
+    """Compute the SHA-256 of a file's bytes, hexadecimal.
+
+    Raises:
+        JaxmarkError: if it cannot be read.
+    """
+    if Path(path).exists() and not Path(path).is_file():  # a pipe may never end
+        raise JaxmarkError(f"Cannot read {path}: it is no ordinary file.")
+    try:
+        with Path(path).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise JaxmarkError(f"Cannot read {path}: {error.strerror or error}.") from None
+
+
+def read_beside(folder: Path) -> Callable[[str], bytes]:
+    """Make a function that reads files by their paths relative to a folder, and none outside of it.
+
+    The function raises a `JaxmarkError`, half a sentence, for a file that cannot be read.
+    """
+
+    def read(path: str) -> bytes:
+        try:
+            inside = os.path.realpath(folder)
+            target = os.path.realpath(Path(inside) / path)
+            if os.path.commonpath([inside, target]) != inside:
+                raise JaxmarkError(f"the file {ascii(path)[:80]} that it refers to is outside of its folder")
+            return read_file(target)
+        except (OSError, ValueError) as error:
+            said = getattr(error, "strerror", None) or str(error)
+            raise JaxmarkError(f"the file {ascii(path)[:80]} that it refers to cannot be read: {said}") from None
+
+    return read
 
 
 def _own_prefix() -> str:
-    """The prefix of this process's drafts, by which others see whether it still runs."""
+    """Return the prefix of this process's drafts, by which others see whether it still runs."""
     return f"{_PREFIX}{re.sub('[^A-Za-z0-9]', '_', platform.node())}-{os.getpid()}-"
 
 
 def _clear_drafts(folder: Path) -> None:
     """Delete drafts of processes of this machine that were killed before they could do so themselves."""
-    if os.name != "posix":  # elsewhere nobody can be asked without being disturbed
+    if os.name != "posix":  # elsewhere a process cannot be asked without being disturbed
         return
     own = re.compile(_own_prefix().replace(f"-{os.getpid()}-", r"-(\d+)-") + ".*")
     for draft in folder.glob(_PREFIX + "*"):
@@ -41,9 +100,18 @@ def _runs(process: int) -> bool:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except OSError:  # it is somebody else's
-        return True
+    except OSError:  # it belongs to another user
+        pass
     return True
+
+
+@contextmanager
+def _writing(path: str | os.PathLike) -> Iterator[None]:
+    """Refuse in a sentence if the system refuses to write a file."""
+    try:
+        yield
+    except OSError as error:
+        raise JaxmarkError(f"Cannot write {os.fspath(path)}: {error.strerror or error}.") from error
 
 
 def write_atomically(path: str | os.PathLike, data: bytes, *, mode: int | None = None) -> None:
@@ -62,7 +130,7 @@ def write_atomically(path: str | os.PathLike, data: bytes, *, mode: int | None =
     """
     if "\0" in os.fspath(path):
         raise JaxmarkError("Cannot write a file whose name holds a NUL character.")
-    try:
+    with _writing(path):
         target = Path(os.path.realpath(path))
         if not target.parent.is_dir():
             raise JaxmarkError(f"Cannot write {os.fspath(path)}: the folder {target.parent} does not exist.")
@@ -70,9 +138,8 @@ def write_atomically(path: str | os.PathLike, data: bytes, *, mode: int | None =
             raise JaxmarkError(f"Cannot write {os.fspath(path)}: it is not an ordinary file.")
         _clear_drafts(target.parent)
         temporary = target.parent / f"{_own_prefix()}{secrets.token_hex(8)}.tmp"
-        descriptor = os.open(
-            temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), mode or 0o666
-        )
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+        descriptor = os.open(temporary, flags, mode or 0o666)
         try:
             with os.fdopen(descriptor, "wb") as file:
                 if mode is not None:
@@ -84,8 +151,6 @@ def write_atomically(path: str | os.PathLike, data: bytes, *, mode: int | None =
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
-    except OSError as error:
-        raise JaxmarkError(f"Cannot write {os.fspath(path)}: {error.strerror or error}.") from error
 
 
 def write_together(path: str | os.PathLike, data: bytes, beside: Mapping[str, bytes]) -> None:
@@ -97,38 +162,24 @@ def write_together(path: str | os.PathLike, data: bytes, beside: Mapping[str, by
         beside: the other files' bytes, by path relative to the folder of the first. None of them replaces a file.
 
     Raises:
-        JaxmarkError: if one of them is there already, with other bytes; or see `write_atomically`.
+        JaxmarkError: if one of the others is there already, with other bytes; see `write_atomically`.
     """
-    folder = Path(os.path.realpath(path)).parent
     written: list[Path] = []
-    try:
-        for name, content in beside.items():
-            target = folder / name
-            if _is_there(target, content):
-                continue
-            target.parent.mkdir(parents=True, exist_ok=True)
-            written.append(target)
-            write_atomically(target, content)
-        write_atomically(path, data)
-    except BaseException as error:
-        for target in written:
-            target.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise JaxmarkError(f"Cannot write {os.fspath(path)}: {error.strerror or error}.") from error
-        raise
-
-
-def _is_there(target: Path, content: bytes) -> bool:
-    """Whether a file is there already.
-
-    Raises:
-        JaxmarkError: if it has other bytes.
-    """
-    if not target.exists():
-        return False
-    if not target.is_file() or target.stat().st_size != len(content) or target.read_bytes() != content:
-        raise JaxmarkError(f"{target} is there already, and is another file; write into another folder.")
-    return True
+    with _writing(path):
+        try:
+            for name, content in beside.items():
+                target = Path(os.path.realpath(path)).parent / name
+                if not target.exists():
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    written.append(target)
+                    write_atomically(target, content)
+                elif not target.is_file() or target.read_bytes() != content:
+                    raise JaxmarkError(f"{target} is there already, and is another file; write into another folder.")
+            write_atomically(path, data)
+        except BaseException:
+            for target in written:
+                target.unlink(missing_ok=True)
+            raise
 
 
 @contextmanager
@@ -136,7 +187,7 @@ def replacing(target: Path) -> Iterator[Path]:
     """Yield the path of a draft that replaces a file if the block succeeds, and is deleted if it fails.
 
     The draft has the file's name, in a temporary folder beside it; files that are written beside it there come along. A
-    symbolic link is followed. What is refused of the draft is said of the file.
+    symbolic link is followed. Refusals of the draft name the file.
 
     Raises:
         JaxmarkError: if the file's folder does not exist, or the target is itself a folder.

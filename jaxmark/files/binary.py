@@ -6,9 +6,10 @@ import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.source import Edits, Numbers, Overlay, changed
+from jaxmark.files.source import Changes, Indices, Overlay, Rows, changed
 
 _MAX_CLIPPED = 1e-3  # of the range of integers
+INTEGER_ADVICE = "declare its coordinates as float or double instead of integers"
 
 
 def gather(data: bytes, offsets: Int64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.ndarray, "..."]:
@@ -21,10 +22,9 @@ def gather(data: bytes, offsets: Int64[np.ndarray, "..."], dtype: np.dtype) -> S
 
 
 def encode(values: Float64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.ndarray, "..."]:
-    """Convert finite numbers to a type, rounded to nearest; integers that are hardly out of range, to its end.
+    """Convert finite numbers to a type, rounded to nearest; numbers beyond its range are refused.
 
-    Raises:
-        JaxmarkError: if a number is beyond the type's range.
+    Integers that are hardly out of range are clipped.
     """
     if dtype.kind == "f":
         with np.errstate(over="ignore", under="ignore"):
@@ -33,28 +33,32 @@ def encode(values: Float64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.nda
     else:
         limits = np.iinfo(dtype)
         rounded = np.rint(values)
-        # What lies at the end of the range may be moved beyond it, by next to nothing.
-        over = _MAX_CLIPPED * (float(limits.max) - float(limits.min))
-        rounded = np.where(rounded > limits.max + over, rounded, np.minimum(rounded, limits.max))
-        rounded = np.where(rounded < limits.min - over, rounded, np.maximum(rounded, limits.min))
-        fits = (rounded >= limits.min) & (rounded <= limits.max)
-        coded = np.where(fits, rounded, 0).astype(dtype)
+        clipped = np.clip(rounded, limits.min, limits.max)
+        # Positions at the end of the range may be moved beyond it, by next to nothing.
+        fits = np.abs(rounded - clipped) <= _MAX_CLIPPED * (float(limits.max) - float(limits.min))
+        coded = np.where(fits, clipped, 0).astype(dtype)
     if not fits.all():
         raise JaxmarkError(f"The number {values[~fits][0]:g} is beyond the range of the file's {dtype.name} numbers.")
     return coded
 
 
+def overlay(starts: Indices, coded: Shaped[np.ndarray, " numbers"]) -> Overlay:
+    """Write encoded numbers at byte offsets."""
+    return Overlay(starts, coded.view(np.uint8).reshape(-1, coded.dtype.itemsize))
+
+
 class BinaryNumbers:
     """Triples of numbers in a binary file; see `Numbers`."""
 
-    values: Float64[np.ndarray, "rows 3"]
+    values: Rows
 
     def __init__(
         self,
         data: bytes,
         offsets: Int64[np.ndarray, "rows 3"],
-        types: tuple[np.dtype, ...],
-        unit: float = 1.0,
+        types: Sequence[np.dtype],
+        unit: float | np.ndarray = 1.0,
+        origin: np.ndarray | None = None,
     ) -> None:
         """Read the numbers at byte offsets, which must lie inside the data.
 
@@ -62,68 +66,35 @@ class BinaryNumbers:
             data: the file.
             offsets: of each number.
             types: of each column.
-            unit: what a stored 1 stands for.
+            unit: the number that a stored 1 stands for, or one a column.
+            origin: the number that a stored 0 stands for in each column; by default 0.
         """
-        self._offsets = offsets
-        self._types = types
-        self._unit = unit
-        with np.errstate(invalid="ignore"):  # signalling NaNs
-            columns = [gather(data, offsets[:, axis], types[axis]).astype(np.float64) for axis in range(3)]
-        self.values = np.stack(columns, axis=1) * unit
+        self._offsets, self._types, self._unit, self._origin = offsets, types, unit, origin
+        self.values = self._read(data)
 
-    def edits(self, values: Float64[np.ndarray, "rows 3"]) -> list[Edits | Overlay]:
-        """The overlays, one a column, that write all numbers that changed.
+    def _read(self, data: bytes) -> Rows:
+        with np.errstate(over="ignore", invalid="ignore"):  # signalling NaNs; numbers that are not finite are refused
+            columns = [gather(data, self._offsets[:, k], self._types[k]).astype(np.float64) for k in range(3)]
+            values = np.stack(columns, axis=1) * self._unit
+            return values if self._origin is None else values + self._origin
 
-        Raises:
-            JaxmarkError: if a number is beyond the type's range.
-        """
-        moved = changed(self.values, values)
-        overlays: list[Edits | Overlay] = []
+    def edits(self, values: Rows) -> Changes:
+        """Return the overlays, one a column, that write all numbers that changed."""
+        moved, overlays = changed(self.values, values), Changes()
+        stored = (values if self._origin is None else values - self._origin) / self._unit
         for axis, dtype in enumerate(self._types):
             rows = np.flatnonzero(moved[:, axis])
-            coded = encode(values[rows, axis] / self._unit, dtype)
-            overlays.append(Overlay(self._offsets[rows, axis], coded.view(np.uint8).reshape(-1, dtype.itemsize)))
+            overlays.append(overlay(self._offsets[rows, axis], encode(stored[rows, axis], dtype)))
         return overlays
 
-    def spacing(self, values: Float64[np.ndarray, "rows 3"], rows: Int64[np.ndarray, " some"]) -> float:
-        """The distance from the largest number of a column to the next one, a unit for integers; the largest of all.
-
-        Raises:
-            JaxmarkError: if a number is beyond the type's range.
-        """
+    def spacing(self, values: Rows, rows: Indices) -> float:
+        """Return the largest distance from a column's largest number to the next one, a unit for integers."""
         largest = np.abs(values[rows]).max(axis=0, initial=0.0) / self._unit
         coded = [encode(largest[axis : axis + 1], dtype) for axis, dtype in enumerate(self._types)]
-        return self._unit * max(float(np.spacing(top[0])) if top.dtype.kind == "f" else 1.0 for top in coded)
+        return float(self._unit) * max(float(np.spacing(top[0])) if top.dtype.kind == "f" else 1.0 for top in coded)
 
     def advice(self, step: float) -> str:
         """Advise a type that is fine enough."""
         if any(dtype.kind != "f" for dtype in self._types):
-            return "declare its coordinates as float or double instead of integers"
+            return INTEGER_ADVICE
         return "centre the mesh on the origin, or use a format with doubles such as PLY with double properties or OBJ"
-
-
-class JoinedNumbers:
-    """Triples of numbers that follow each other in several parts; see `Numbers`."""
-
-    def __init__(self, parts: Sequence[Numbers]) -> None:
-        self._parts = parts
-        self._ends = np.cumsum([len(part.values) for part in parts])
-        self.values = np.concatenate([part.values for part in parts])
-
-    def edits(self, values: Float64[np.ndarray, "rows 3"]) -> list[Edits | Overlay]:
-        """See `Numbers`."""
-        pieces = zip(self._parts, np.split(values, self._ends[:-1]), strict=True)
-        return [edit for part, piece in pieces for edit in part.edits(piece)]
-
-    def spacing(self, values: Float64[np.ndarray, "rows 3"], rows: Int64[np.ndarray, " some"]) -> float:
-        """See `Numbers`."""
-        place = np.searchsorted(self._ends, rows, side="right")
-        starts = np.concatenate([[0], self._ends])
-        return max(
-            self._parts[part].spacing(values[starts[part] : starts[part + 1]], rows[place == part] - starts[part])
-            for part in np.unique(place)
-        )
-
-    def advice(self, step: float) -> str:
-        """See `Numbers`."""
-        return self._parts[0].advice(step)

@@ -5,8 +5,7 @@ import re
 import numpy as np
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.normals import Transported
-from jaxmark.files.source import Source, fan, ranges
+from jaxmark.files.source import Source, Transported, fan, ranges
 from jaxmark.files.text import Text, TextNumbers, unix, without_comments
 
 _HEADER = re.compile(rb"\s*((?:ST)?C?(N?)(4?n?)OFF)(?:(?=\d)|\s+|$)(BINARY)?")
@@ -28,42 +27,33 @@ def parse(data: bytes) -> Source:
         raise JaxmarkError(f"line 1: binary OFF ({keyword} BINARY) is not supported; save it as text.")
     if header[3]:
         raise JaxmarkError(f"line 1: {keyword} is not supported, because its vertices do not have three coordinates.")
-    work = work[: header.start(1)] + b" " * len(keyword) + work[header.end(1) :]
-
-    text = Text(data, work)
+    text = Text(data, work[: header.start(1)] + b" " * len(keyword) + work[header.end(1) :])
     first, count = text.lines()
     if len(first) == 0 or count[0] < 2:
         raise text.error(header.end(1), "the numbers of vertices and faces are missing")
-    points, polygons = text.ints(text.starts[:2], text.ends[:2]).tolist()
+    points, polygons = text.read(np.arange(2), int).tolist()
     if min(points, polygons) < 0 or points + polygons > len(first) - 1:
         raise text.error(
             text.starts[0],
             f"{points} vertices and {polygons} faces are announced, each on a line of its own, but"
             f" {len(first) - 1} lines follow",
         )
-    vertices = first[1 : 1 + points]
+    of_vertices, of_faces = slice(1, 1 + points), slice(1 + points, 1 + points + polygons)
+    vertices, lines = first[of_vertices], first[of_faces]
     needed = 6 if header[2] else 3
-    short = np.flatnonzero(count[1 : 1 + points] < needed)
-    if len(short):
-        raise text.error(text.starts[vertices[short[0]]], f"a vertex of {keyword} needs {needed} numbers")
+    text.refuse(count[of_vertices] < needed, text.starts[vertices], f"a vertex of {keyword} needs {needed} numbers")
     coordinates = TextNumbers(text, vertices[:, None] + np.arange(3))
 
-    lines = first[1 + points : 1 + points + polygons]
-    sizes = text.ints(text.starts[lines], text.ends[lines])
-    for wrong, what in (
-        (sizes < 3, "a face needs at least three corners"),
-        (sizes >= count[1 + points : 1 + points + polygons], "the face has fewer indices than it announces"),
-    ):
-        if wrong.any():
-            raise text.error(text.starts[lines[np.argmax(wrong)]], what)
+    sizes = text.read(lines, int)
+    text.refuse(sizes < 3, text.starts[lines], "a face needs at least three corners")
+    text.refuse(sizes >= count[of_faces], text.starts[lines], "the face has fewer indices than it announces")
     corners = ranges(lines + 1, sizes)
-    index = text.ints(text.starts[corners], text.ends[corners])
-    outside = np.flatnonzero((index < 0) | (index >= points))
-    if len(outside):
-        raise text.error(
-            text.starts[corners[outside[0]]],
-            f"the face refers to vertex {index[outside[0]]}, but there are {points}, numbered from 0",
-        )
+    index = text.read(corners, int)
+    text.refuse(
+        (index < 0) | (index >= points),
+        text.starts[corners],
+        lambda bad: f"the face refers to vertex {index[bad]}, but there are {points}, numbered from 0",
+    )
     faces = index[fan(sizes)]
     normals = Transported(TextNumbers(text, vertices[:, None] + np.arange(3, 6)), faces) if header[2] else None
     return Source(data, coordinates, faces, normals)

@@ -7,8 +7,7 @@ import numpy as np
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.binary import BinaryNumbers
-from jaxmark.files.normals import PerFace
-from jaxmark.files.source import Source
+from jaxmark.files.source import PerFace, Source
 from jaxmark.files.text import Text, TextNumbers, blank, unix
 
 _FLOAT = (np.dtype("<f4"),) * 3
@@ -48,15 +47,10 @@ def _text(data: bytes) -> Source:
     facets = len(text) // len(_FACET)
     tokens = np.arange(facets * len(_FACET)).reshape(facets, len(_FACET))
     for column, word in enumerate(_FACET):
-        if word is None:
-            continue
-        starts, ends = text.starts[tokens[:, column]], text.ends[tokens[:, column]]
-        wrong = ends - starts != len(word)
-        for index, char in enumerate(word):
-            wrong |= text.buffer[np.minimum(starts + index, len(text.buffer) - 1)] | 0x20 != char
-        if wrong.any():
-            bad = int(np.argmax(wrong))
-            raise text.error(starts[bad], f"'{word.decode()}' is expected in facet {bad} (zero-based)")
+        if word is not None:
+            expected = f"'{word.decode()}' is expected in facet {{}} (zero-based)"
+            wrong = ~text.spells(tokens[:, column], word, any_case=True)
+            text.refuse(wrong, text.starts[tokens[:, column]], expected.format)
     if facets * len(_FACET) != len(text):
         raise text.error(text.starts[-1], f"the file ends inside facet {facets} (zero-based)")
     vertices = tokens[:, [8, 9, 10, 12, 13, 14, 16, 17, 18]].reshape(-1, 3)

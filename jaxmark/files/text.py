@@ -1,14 +1,16 @@
 """Read numbers of text files exactly, by their byte spans, and write them in the file's own style."""
 
 import re
+from collections.abc import Callable
 from functools import cached_property
 from typing import NamedTuple, SupportsInt
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Int64, Shaped
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.source import Edits, Overlay, changed
+from jaxmark.files.binary import INTEGER_ADVICE
+from jaxmark.files.source import Changes, Edits, Indices, Rows, changed
 
 # The bytes that bytes.split() takes for white space.
 _SPACE = np.zeros(256, dtype=bool)
@@ -30,64 +32,95 @@ def without_comments(work: bytes) -> bytes:
     return blank(rb"#[^\n\r]*", work) if b"#" in work else work
 
 
+class Lines(NamedTuple):
+    """Lines of a text that have any tokens."""
+
+    first: Indices  # the first token of each
+    sizes: Indices  # the number of its tokens
+
+
 class Text:
     """A text file as tokens between white space.
 
     Attributes:
-        starts, ends: the byte span of each token, ascending.
+        starts, ends: the byte span of each token.
     """
 
     def __init__(self, data: bytes, work: bytes) -> None:
-        """Tokenise.
-
-        Args:
-            data: the file's bytes.
-            work: a copy of the same length, in which spaces stand for what is not to be read.
-        """
+        """Tokenise a copy of the file's bytes, of the same length, in which spaces stand for ignored text."""
         self._lines = unix(data)
         self.buffer = np.frombuffer(work + b"\n", np.uint8)
         space = _SPACE[self.buffer]
-        edges = np.flatnonzero(space[1:] != space[:-1]) + 1
-        if not space[0]:
-            edges = np.concatenate([[0], edges])
-        self.starts: Int64[np.ndarray, " tokens"] = edges[0::2]
-        self.ends: Int64[np.ndarray, " tokens"] = edges[1::2]
+        edges = np.flatnonzero(np.diff(space, prepend=True))
+        self.starts: Indices = edges[0::2]
+        self.ends: Indices = edges[1::2]
 
     def __len__(self) -> int:
         return len(self.starts)
 
-    def lines(self) -> tuple[Int64[np.ndarray, " lines"], Int64[np.ndarray, " lines"]]:
-        """The first token and the number of tokens of every line that has any."""
+    def lines(self) -> Lines:
+        """Find the lines that have any tokens."""
         line = np.searchsorted(np.flatnonzero(self.buffer == ord("\n")), self.starts)
         first = np.flatnonzero(np.diff(line, prepend=-1))
-        return first, np.diff(first, append=len(self))
+        return Lines(first, np.diff(first, append=len(self)))
+
+    def spells(self, tokens: Indices, word: bytes, *, any_case: bool = False) -> Bool[np.ndarray, " tokens"]:
+        """Return the mask of the tokens that are a word, which is in lower case if case does not matter."""
+        match = self.ends[tokens] - self.starts[tokens] == len(word)
+        for index, char in enumerate(word):
+            # Offsets are clamped, as a last token that is shorter than the word would be read past the buffer's end.
+            found = self.buffer[np.minimum(self.starts[tokens] + index, len(self.buffer) - 1)]
+            match &= (found | 0x20 if any_case else found) == char
+        return match
 
     def token(self, index: int) -> bytes:
-        """The bytes of one token."""
+        """Return the bytes of one token."""
         return self.buffer[self.starts[index] : self.ends[index]].tobytes()
 
     def error(self, start: SupportsInt, what: str) -> JaxmarkError:
-        """The exception for an error at a byte offset, whose line it names."""
-        line = self._lines.count(b"\n", 0, int(start)) + 1
-        return JaxmarkError(f"line {line}: {what}.")
+        """Make the exception for an error at a byte offset, whose line it names."""
+        return line_error(self._lines, int(start), what)
 
-    def seek(
-        self, char: str, starts: Int64[np.ndarray, " spans"], ends: Int64[np.ndarray, " spans"]
-    ) -> Int64[np.ndarray, " spans"]:
-        """The offset of a character's first occurrence, in either case, in each span; the span's end if it has none."""
+    def refuse(self, wrong: Bool[np.ndarray, " spans"], starts: Indices, what: str | Callable[[int], str]) -> None:
+        """Refuse the first of some spans that is wrong; the message, which may depend on its number, names the line."""
+        if wrong.any():
+            bad = int(np.argmax(wrong))
+            raise self.error(starts[bad], what if isinstance(what, str) else what(bad))
+
+    def triples(self, lines: Lines, skip: int, what: str) -> "TextNumbers":
+        """Read the three numbers of each line that follow `skip` tokens; a line of fewer is refused by `what`."""
+        self.refuse(lines.sizes < skip + 3, self.starts[lines.first], what)
+        return TextNumbers(self, lines.first[:, None] + np.arange(skip, skip + 3))
+
+    def seek(self, char: str, starts: Indices, ends: Indices) -> Indices:
+        """Find a character's first occurrence, in either case, in each span; the span's end if it has none."""
         low, high = (int(starts.min()), int(ends.max())) if len(starts) else (0, 0)  # a file may have many such parts
         part = self.buffer[low:high]
         hits = low + np.flatnonzero((part == ord(char.lower())) | (part == ord(char.upper())))
         found = np.append(hits, len(self.buffer))[np.searchsorted(hits, starts)]
         return np.minimum(found, ends)
 
-    def _converted(self, kind: type, starts: Int64[np.ndarray, " spans"], ends: Int64[np.ndarray, " spans"]) -> list:
+    def ints(self, starts: Indices, ends: Indices) -> Int64[np.ndarray, " spans"]:
+        """Read the whole numbers in ascending byte spans; see `read`."""
+        return np.array(self._converted(int, starts, ends), np.int64)
+
+    def read(self, tokens: Int64[np.ndarray, "..."], kind: type) -> Shaped[np.ndarray, "..."]:
+        """Read tokens, in any order, as numbers: `float`, exactly, or `int`, of up to 18 digits."""
+        order = np.argsort(self.starts[tokens], axis=None, kind="stable")
+        flat = tokens.ravel()[order]
+        values = np.empty(tokens.size, kind)
+        values[order] = self._converted(kind, self.starts[flat], self.ends[flat])
+        return values.reshape(tokens.shape)
+
+    def _converted(self, kind: type, starts: Indices, ends: Indices) -> list:
         """Convert the bytes of each span by `kind`; the spans ascend."""
         name = "whole number" if kind is int else "number"
         if len(starts) == 0:
             return []
-        if (starts >= ends).any():
-            raise self.error(starts[np.argmax(starts >= ends)], f"a {name} is missing")
+        if kind is int:
+            too_long = "a whole number of more than 18 digits cannot be an index or a count"
+            self.refuse(ends - starts > 18, starts, too_long)
+        self.refuse(starts >= ends, starts, f"a {name} is missing")
         low, high = int(starts[0]), int(ends[-1]) + 1
         # With +1 where a span begins and -1 behind the byte that follows it, the running sum marks the bytes to keep.
         steps = np.zeros(high - low + 1, np.int8)
@@ -97,47 +130,23 @@ class Text:
         kept[np.cumsum(ends - starts + 1) - 1] = ord(" ")
         numerals = kept.tobytes().split()
         try:
-            if (kept == ord("_")).any():
+            if (kept == ord("_")).any():  # Python groups digits by underscores, no file format does
                 raise ValueError
             return list(map(kind, numerals))
         except ValueError:
-            bad = next(index for index, numeral in enumerate(numerals) if not _is_numeral(kind, numeral))
+            bad = next(k for k, numeral in enumerate(numerals) if b"_" in numeral or not is_numeral(kind, numeral))
             shown = numerals[bad][:40].decode("ascii", "backslashreplace")
             raise self.error(starts[bad], f"'{shown}' is not a {name}") from None
-
-    def floats(
-        self, starts: Int64[np.ndarray, " spans"], ends: Int64[np.ndarray, " spans"]
-    ) -> Float64[np.ndarray, " spans"]:
-        """The numbers in ascending spans, as Python's `float` reads them.
-
-        Raises:
-            JaxmarkError: if a span holds no number; the message names the line.
-        """
-        return np.array(self._converted(float, starts, ends), dtype=np.float64)
-
-    def ints(
-        self, starts: Int64[np.ndarray, " spans"], ends: Int64[np.ndarray, " spans"]
-    ) -> Int64[np.ndarray, " spans"]:
-        """The whole numbers in ascending spans.
-
-        Raises:
-            JaxmarkError: if a span holds no whole number, or one of more than 18 digits; the message names the line.
-        """
-        long = np.flatnonzero(ends - starts > 18)
-        if len(long):
-            raise self.error(starts[long[0]], "a whole number of more than 18 digits cannot be an index or a count")
-        return np.array(self._converted(int, starts, ends), dtype=np.int64)
 
 
 class Spans(Text):
     """A text file in which tokens are at known places, with anything between them."""
 
-    def __init__(self, data: bytes, starts: Int64[np.ndarray, " tokens"], ends: Int64[np.ndarray, " tokens"]) -> None:
-        """Take byte spans that ascend as the tokens."""
+    def __init__(self, data: bytes, starts: Indices, ends: Indices) -> None:
+        """Take byte spans, in any order."""
         self._lines = unix(data)
         self.buffer = np.frombuffer(data + b"\n", np.uint8)
-        self.starts = starts
-        self.ends = ends
+        self.starts, self.ends = starts, ends
 
 
 class Style(NamedTuple):
@@ -152,28 +161,13 @@ class Style(NamedTuple):
 class TextNumbers:
     """Triples of numbers in a text file; see `Numbers`."""
 
-    values: Float64[np.ndarray, "rows 3"]
+    values: Rows
 
     def __init__(self, text: Text, tokens: Int64[np.ndarray, "rows 3"], *, whole: bool = False) -> None:
-        """Read tokens as numbers.
-
-        Args:
-            text: the file.
-            tokens: indices of the tokens, in any order.
-            whole: whether the file declares the numbers to be integers, so that nothing else may be written.
-
-        Raises:
-            JaxmarkError: if a token is not a number; the message names the line.
-        """
-        self._text = text
-        self._whole = whole
-        flat = tokens.reshape(-1)
-        self._starts = text.starts[flat]
-        self._ends = text.ends[flat]
-        order = np.argsort(flat, kind="stable")
-        values = np.empty(len(flat))
-        values[order] = text.floats(self._starts[order], self._ends[order])
-        self.values = values.reshape(-1, 3)
+        """Read tokens of a text, in any order; if the file declares `whole` numbers, no others may be written."""
+        self._text, self._whole = text, whole
+        self._starts, self._ends = text.starts[tokens.ravel()], text.ends[tokens.ravel()]
+        self.values = text.read(tokens, float)
 
     @cached_property
     def _style(self) -> Style:
@@ -197,8 +191,8 @@ class TextNumbers:
         largest = int(np.floor(np.log10(size.max()))) + 1 if size.max(initial=0) > 0 else 0
         return Style(exponent, capital, max(0, min(decimals, 17 - largest)), min(mantissa, 16))
 
-    def edits(self, values: Float64[np.ndarray, "rows 3"]) -> list[Edits | Overlay]:
-        """The edits of the tokens whose number changes by enough to be written differently."""
+    def edits(self, values: Rows) -> Changes:
+        """Return the edits of the tokens whose number changes by enough to be written differently."""
         style = self._style
         moved = np.flatnonzero(changed(self.values, values))
         new = values.reshape(-1)[moved]
@@ -214,8 +208,8 @@ class TextNumbers:
         differs = read != self.values.reshape(-1)[moved]
         return [Edits(self._starts[moved[differs]], self._ends[moved[differs]], tokens[differs].tolist())]
 
-    def spacing(self, values: Float64[np.ndarray, "rows 3"], rows: Int64[np.ndarray, " some"]) -> float:
-        """The largest step of the last digit of numbers that change, or of double precision if that is larger."""
+    def spacing(self, values: Rows, rows: Indices) -> float:
+        """Return the largest step of the last digit of numbers that change, or that of double precision if larger."""
         style = self._style
         moved = changed(self.values[rows], values[rows]).reshape(-1)
         exponent = style.exponent.reshape(-1, 3)[rows].reshape(-1)
@@ -231,21 +225,28 @@ class TextNumbers:
     def advice(self, step: float) -> str:
         """Advise how many decimals are enough."""
         if self._whole:
-            return "declare its coordinates as float or double instead of integers"
+            return INTEGER_ADVICE
         if step < np.spacing(np.abs(self.values).max()):
             return "even double precision is too coarse there, so centre the mesh on the origin"
         decimals = max(0, int(np.ceil(-np.log10(max(step, 1e-300)))))
         return f"write its coordinates with at least {decimals} decimals"
 
 
-def _written(form: bytes, values: Float64[np.ndarray, " numbers"]) -> list[bytes]:
+def _written(form: bytes, values: np.ndarray) -> list[bytes]:
     """Format each value; one call for all of them is several times faster than one call each."""
     return (form * len(values) % tuple(values.tolist())).split()
 
 
-def _is_numeral(kind: type, token: bytes) -> bool:
+def is_numeral(kind: type, token: bytes) -> bool:
+    """Whether Python reads a token as a number of this kind."""
     try:
         kind(token)
     except ValueError:
         return False
-    return b"_" not in token  # Python groups digits by underscores, no file format does
+    return True
+
+
+def line_error(data: bytes, start: int, what: str) -> JaxmarkError:
+    """Make the exception for an error at a byte offset, whose line it names."""
+    line = data.count(b"\n", 0, start) + 1
+    return JaxmarkError(f"line {line}: {what}.")

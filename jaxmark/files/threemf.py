@@ -1,25 +1,23 @@
 """Parse 3MF: ZIP archives of models in XML."""
 
 import posixpath
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 from urllib.parse import unquote
 
 import numpy as np
-from jaxtyping import Float64, Int64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.binary import JoinedNumbers
-from jaxmark.files.source import Part, Patched, Source, splice, unique_names
+from jaxmark.files.source import Faces, JoinedNumbers, Part, Patched, Source, concerning, splice, unique_names, unusable
 from jaxmark.files.text import Spans, TextNumbers
-from jaxmark.files.threemf_xml import RawMesh, Triples, read_model, read_relationships
+from jaxmark.files.threemf_xml import NO_TRIPLES, Model, RawMesh, read_relationships
 from jaxmark.files.zipped import Archive, Member
+from jaxmark.geometry.pose import Points
 
 _MODEL = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
 _DEFAULT = "3D/3dmodel.model"
-# What relationships of encrypted content are called; namespaces alone are declared by programs that encrypt nothing.
+# Relationships of encrypted content; namespaces alone are declared by programs that encrypt nothing.
 _SECURED = (b"schemas.microsoft.com/3dmanufacturing/2019/04/keystore", b"package/2006/relationships/encryptedfile")
 _SIGNED = b"package/2006/relationships/digital-signature/"
 _SIGNATURES = ("_xmlsignatures/", "package/services/digital-signature/")
@@ -28,13 +26,13 @@ _SIGNATURES = ("_xmlsignatures/", "package/services/digital-signature/")
 class _Object(NamedTuple):
     name: str
     numbers: TextNumbers
-    faces: Int64[np.ndarray, "faces 3"]
+    faces: Faces
 
 
 class _Model(NamedTuple):
     member: Member
     data: bytes
-    objects: Sequence[_Object]
+    numbers: JoinedNumbers  # of all of its objects
 
 
 def parse(data: bytes) -> Source:
@@ -51,57 +49,39 @@ def parse(data: bytes) -> Source:
     found: list[tuple[Member, bytes, list[RawMesh]]] = []
     for member in _model_members(archive):
         content = archive.read(member)
-        with _of(member):
-            found.append((member, content, read_model(content)))
+        with concerning(member.shown):
+            found.append((member, content, Model(content).meshes))
     names = iter(unique_names(mesh.name for _, _, meshes in found for mesh in meshes))
     models: list[_Model] = []
+    parts: list[Part] = []
     left: dict[str, str] = {}
+    size = 0
     for member, content, meshes in found:
-        with _of(member):
-            models.append(_Model(member, content, _read_objects(content, meshes, names, left)))
-    objects = [item for model in models for item in model.objects]
-    if not objects:
-        raise JaxmarkError(_nothing(left))
-    ends = np.cumsum([len(item.numbers.values) for item in objects])
-    starts = [0, *ends.tolist()]
-    faces = np.concatenate([start + item.faces for start, item in zip(starts, objects, strict=False)])
-    source = _ThreemfSource(
-        data, JoinedNumbers([item.numbers for item in objects]), faces, archive=archive, models=models, signed=signed
+        with concerning(member.shown):
+            objects = _read_objects(content, meshes, names, left)
+        for item in objects:
+            parts.append(Part(item.name, size + np.arange(len(item.numbers.values)), item.faces))
+            size += len(item.numbers.values)
+        if objects:
+            models.append(_Model(member, content, JoinedNumbers([item.numbers for item in objects])))
+    if not parts and len(left) == 1:
+        raise JaxmarkError("The mesh {!r} cannot be marked: {}.".format(*left.popitem()))
+    if not parts:
+        raise JaxmarkError(unusable(left, len(left)) if left else "The file has no object with a mesh.")
+    return _ThreemfSource(
+        data,
+        JoinedNumbers([model.numbers for model in models]),
+        np.concatenate([part.places[0] + part.faces for part in parts]),
+        parts=parts if len(parts) + len(left) > 1 else (),
+        left=left,
+        archive=archive,
+        models=models,
+        signed=signed,
     )
-    if len(objects) + len(left) > 1:
-        source.parts = [
-            Part(item.name, np.arange(start, end), item.faces)
-            for item, start, end in zip(objects, starts, ends, strict=False)
-        ]
-        source.left = left
-    return source
-
-
-@contextmanager
-def _of(member: Member) -> Iterator[None]:
-    """Say of which member something is refused."""
-    try:
-        yield
-    except JaxmarkError as error:
-        raise JaxmarkError(f"{member.shown}: {error}") from error
-
-
-def _nothing(left: Mapping[str, str]) -> str:
-    """Why there is no mesh to be marked."""
-    if not left:
-        return "The file has no object with a mesh."
-    if len(left) == 1:
-        return f"The mesh {next(iter(left))!r} cannot be marked: {next(iter(left.values()))}."
-    told = "; ".join(f"{name!r}: {reason}" for name, reason in list(left.items())[:3])
-    return f"None of its {len(left)} meshes can be marked: {told}{'; …' if len(left) > 3 else ''}."
 
 
 def _is_signed(archive: Archive) -> bool:
-    """Whether the archive has a signature, which a mark would break.
-
-    Raises:
-        JaxmarkError: if parts of it are encrypted.
-    """
+    """Whether the archive has a signature, which a mark would break; encrypted archives are refused."""
     signed = any(member.name.casefold().startswith(_SIGNATURES) for member in archive.members)
     for member in archive.members:
         if member.name.casefold().endswith(".rels"):
@@ -113,11 +93,11 @@ def _is_signed(archive: Archive) -> bool:
 
 
 def _model_members(archive: Archive) -> list[Member]:
-    """The members that are models, in the order of the archive."""
+    """Find the members that are models, in the order of the archive."""
     root = _DEFAULT
     relationships = archive.find("_rels/.rels")
     if relationships is not None:
-        with _of(relationships):
+        with concerning(relationships.shown):
             targets = [target for kind, target in read_relationships(archive.read(relationships)) if kind == _MODEL]
         if targets:
             root = posixpath.normpath("/" + unquote(targets[0])).lstrip("/")
@@ -136,23 +116,14 @@ def _read_objects(
     content: bytes, meshes: Sequence[RawMesh], names: Iterator[str], left: dict[str, str]
 ) -> list[_Object]:
     """Read the numbers of a model's meshes; those that cannot be marked are put into `left`."""
-    none = Triples(np.zeros((0, 3), np.int64), np.zeros((0, 3), np.int64))
-    lists = [mesh.lists.get(kind, none) for mesh in meshes for kind in ("vertices", "triangles")]
-    starts = np.concatenate([none.starts, *(triples.starts for triples in lists)]).ravel()
-    ends = np.concatenate([none.ends, *(triples.ends for triples in lists)]).ravel()
-    # Attributes may come in any order, but tokens are numbered as they are in the file.
-    order = np.argsort(starts, kind="stable")
-    text = Spans(content, starts[order], ends[order])
-    tokens = np.empty_like(order)
-    tokens[order] = np.arange(len(order))
-    pieces = iter(np.split(tokens.reshape(-1, 3), np.cumsum([len(triples.starts) for triples in lists])))
+    lists = [mesh.lists.get(kind, NO_TRIPLES) for mesh in meshes for kind in ("vertices", "triangles")]
+    spans = np.concatenate([NO_TRIPLES, *lists])
+    text = Spans(content, spans[..., 0].ravel(), spans[..., 1].ravel())
+    tokens = np.arange(3 * len(spans)).reshape(-1, 3)
+    pieces = iter(np.split(tokens, np.cumsum([len(one) for one in lists])))
     objects = []
     for _ in meshes:
-        name, numbers, index = next(names), TextNumbers(text, next(pieces)), next(pieces)
-        flat = np.sort(index.ravel())
-        faces = np.empty(index.size, np.int64)
-        faces[np.argsort(index.ravel(), kind="stable")] = text.ints(text.starts[flat], text.ends[flat])
-        faces = faces.reshape(-1, 3)
+        name, numbers, faces = next(names), TextNumbers(text, next(pieces)), text.read(next(pieces), int)
         outside = ((faces < 0) | (faces >= len(numbers.values))).any(axis=1)
         if not len(faces):
             left[name] = "it has no triangles"
@@ -175,17 +146,12 @@ class _ThreemfSource(Source):
     models: Sequence[_Model]
     signed: bool
 
-    def patch(self, positions: Float64[np.ndarray, "points 3"], name: str) -> Patched:
-        """See `Source.patch`; members whose positions do not change stay as they are packed."""
+    def patch(self, positions: Points, name: str) -> Patched:
+        """Write these positions into the file; members whose positions do not change stay as they are packed."""
         contents: dict[str, bytes] = {}
-        start = 0
-        for model in self.models:
-            edits = []
-            for item in model.objects:
-                end = start + len(item.numbers.values)
-                edits += item.numbers.edits(positions[start:end])
-                start = end
-            content = splice(model.data, edits)
+        ends = np.cumsum([len(model.numbers.values) for model in self.models])
+        for model, piece in zip(self.models, np.split(positions, ends[:-1]), strict=True):
+            content = splice(model.data, model.numbers.edits(piece))
             if content != model.data:
                 contents[model.member.name] = content
         if not contents:

@@ -1,4 +1,4 @@
-"""Read the XML in a 3MF file: where in its bytes the numbers of meshes are, and how its members are related."""
+"""Read the XML in a 3MF file: the places of the numbers of meshes in its bytes, and relations of its members."""
 
 import re
 from typing import NamedTuple
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files.text import line_error
 
 _ENCODINGS = ("utf-8", "utf8", "us-ascii", "ascii")
 _COLUMNS = {"vertices": (b"x", b"y", b"z"), "triangles": (b"v1", b"v2", b"v3")}
@@ -25,11 +26,8 @@ _PLAIN = (
 _MAX_NAME = 200
 
 
-class Triples(NamedTuple):
-    """The byte spans of three numbers in each element of a list."""
-
-    starts: Int64[np.ndarray, "rows 3"]
-    ends: Int64[np.ndarray, "rows 3"]
+Triples = Int64[np.ndarray, "rows 3 2"]  # first byte and end of the three numbers in each element of a list
+NO_TRIPLES: Triples = np.zeros((0, 3, 2), np.int64)
 
 
 class RawMesh(NamedTuple):
@@ -40,30 +38,32 @@ class RawMesh(NamedTuple):
 
 
 class _Parser:
-    """An XML parser that knows its byte offsets, also if it is not shown all bytes."""
+    """An XML parser of some data that knows its byte offsets, also if bytes are skipped."""
 
-    def __init__(self) -> None:
+    def __init__(self, data: bytes) -> None:
+        self.data, self.skipped = data, 0
         self.expat = expat.ParserCreate("utf-8", " ")
         self.expat.StartDoctypeDeclHandler = self._doctype
         self.expat.XmlDeclHandler = self._declaration
-        self.skipped = 0
+        if b"\0" in data[:4] or data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+            raise _not_utf8("UTF-16")
 
     @property
     def at(self) -> int:
-        """The byte offset of what is being handled."""
+        """The byte offset of the element that is being handled."""
         return self.expat.CurrentByteIndex + self.skipped
 
-    def feed(self, data: bytes, start: int, end: int, *, final: bool) -> None:
-        """Parse some bytes.
-
-        Raises:
-            JaxmarkError: if they are not well-formed.
-        """
+    def feed(self, start: int, end: int, *, final: bool) -> None:
+        """Parse some bytes."""
         try:
-            self.expat.Parse(data[start:end], final)
+            self.expat.Parse(self.data[start:end], final)
         except expat.ExpatError as error:
-            line = data.count(b"\n", 0, max(0, self.expat.ErrorByteIndex + self.skipped)) + 1
-            raise JaxmarkError(f"line {line}: the XML is broken ({expat.ErrorString(error.code)}).") from None
+            at = max(0, self.expat.ErrorByteIndex + self.skipped)
+            raise self.error(at, f"the XML is broken ({expat.ErrorString(error.code)})") from None
+
+    def error(self, at: int, what: str) -> JaxmarkError:
+        """Make the exception for an error at a byte offset."""
+        return line_error(self.data, at, what)
 
     def _doctype(self, *_: object) -> None:
         raise JaxmarkError("The XML has a document type, which may define entities without end; remove it.")
@@ -77,54 +77,30 @@ def _not_utf8(encoding: str) -> JaxmarkError:
     return JaxmarkError(f"The XML is encoded in {encoding!a}; only UTF-8 is supported, so save it as that.")
 
 
-def _parse(parser: _Parser, data: bytes) -> None:
-    """Show a parser all of a document."""
-    _refuse_wide(data)
-    parser.feed(data, 0, len(data), final=True)
-
-
-def _refuse_wide(data: bytes) -> None:
-    if b"\0" in data[:4] or data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        raise _not_utf8("UTF-16")
-
-
 def read_relationships(data: bytes) -> list[tuple[str, str]]:
-    """The type and the target of each relationship that a `.rels` member states.
-
-    Raises:
-        JaxmarkError: if it is not well-formed.
-    """
+    """Read the type and the target of each relationship that a `.rels` member states."""
     found: list[tuple[str, str]] = []
 
     def start(name: str, attributes: dict[str, str]) -> None:
         if name.rpartition(" ")[2] == "Relationship":
             found.append((attributes.get("Type", ""), attributes.get("Target", "")))
 
-    parser = _Parser()
+    parser = _Parser(data)
     parser.expat.StartElementHandler = start
-    _parse(parser, data)
+    parser.feed(0, len(data), final=True)
     return found
 
 
-def read_model(data: bytes) -> list[RawMesh]:
-    """Find the meshes of objects in a model.
-
-    Raises:
-        JaxmarkError: if it is not well-formed, or an element lacks one of its three numbers.
-    """
-    return _Model(data).meshes
-
-
-class _Model:
-    """A model while it is parsed.
+class Model(_Parser):
+    """The meshes of objects in a model; refused if an element lacks one of its three numbers.
 
     Lists of vertices and triangles that are written as nearly all programs do are not shown to the parser: a regular
     expression checks that there is nothing else in them, which is many times faster.
     """
 
     def __init__(self, data: bytes) -> None:
+        super().__init__(data)
         self.meshes: list[RawMesh] = []
-        self._data = data
         self._buffer = np.frombuffer(data, np.uint8)
         self._space: str | None = None  # the namespace of the root with a space behind it
         self._path: list[str] = []  # local names of the open elements, empty where they are of another namespace
@@ -132,25 +108,18 @@ class _Model:
         self._list: str | None = None  # which list is open
         self._list_at = -1  # the offset of its start tag, while nothing was seen in it
         self._rows: list[int] = []  # offsets of its elements
-        self._parser = _Parser()
-        self._parser.expat.StartElementHandler = self._start
-        self._parser.expat.EndElementHandler = self._end
-        _refuse_wide(data)
+        self.expat.StartElementHandler = self._start
+        self.expat.EndElementHandler = self._end
         at = 0
         while (found := _LIST.search(data, at)) is not None:
-            self._parser.feed(data, at, found.end(), final=False)
+            self.feed(at, found.end(), final=False)
             at = found.end()
             # Nothing of this kind was opened where a comment, say, holds the word.
             if self._list is not None and self._list_at == found.start():
                 end = self._read_plain(self._list, at)
-                self._parser.skipped += end - at
+                self.skipped += end - at
                 at = end
-        self._parser.feed(data, at, len(data), final=True)
-
-    def _error(self, at: int, what: str) -> JaxmarkError:
-        """The exception for an error at a byte offset, whose line it names."""
-        line = self._data.count(b"\n", 0, at) + 1
-        return JaxmarkError(f"line {line}: {what}.")
+        self.feed(at, len(data), final=True)
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         space, _, local = name.rpartition(" ")
@@ -160,7 +129,7 @@ class _Model:
         self._list_at = -1
         if self._list is not None:
             if self._path[-2:] == [self._list, _ROWS[self._list]]:
-                self._rows.append(self._parser.at)
+                self._rows.append(self.at)
         elif self._path[-1] == "object":
             words = " ".join(attributes.get("name", "").split())[:_MAX_NAME]
             self._name = words or f"object {' '.join(attributes.get('id', '?').split())[:_MAX_NAME]}"
@@ -168,10 +137,10 @@ class _Model:
             self.meshes.append(RawMesh(self._name, {}))
         elif self._path[-1] in _ROWS and self._path[-3:-1] == ["object", "mesh"]:
             self._list = self._path[-1]
-            self._list_at = self._parser.at
+            self._list_at = self.at
             self._rows = []
             if self._list in self.meshes[-1].lists:
-                raise self._error(self._list_at, f"a mesh has its {self._list} twice")
+                raise self.error(self._list_at, f"a mesh has its {self._list} twice")
 
     def _end(self, name: str) -> None:
         closed = self._path.pop()
@@ -181,16 +150,15 @@ class _Model:
             self._list = None
 
     def _read_plain(self, kind: str, start: int) -> int:
-        """Read a list that begins at an offset, if it is written plainly; the offset of what is left to be parsed."""
-        opened = _TAG.match(self._data, self._list_at)
+        """Read a list that begins at an offset, if it is written plainly; returns where parsing goes on."""
+        opened = _TAG.match(self.data, self._list_at)
         assert opened is not None, "the parser found a tag here"
         prefix = opened[0][1 : -len(kind)]
         columns = dict(zip((b"first", b"second", b"third"), _COLUMNS[kind], strict=True))
         row = re.escape(prefix + _ROWS[kind].encode())
-        matched = re.compile(_PLAIN % {b"row": row, b"word": _WORD, b"value": _VALUE, **columns}).match(
-            self._data, start
-        )
-        if matched is None or not self._data.startswith(b"</" + opened[0][1:], matched.end()):
+        plain = re.compile(_PLAIN % {b"row": row, b"word": _WORD, b"value": _VALUE, **columns})
+        matched = plain.match(self.data, start)
+        if matched is None or not self.data.startswith(b"</" + opened[0][1:], matched.end()):
             return start
         quotes = start + np.flatnonzero(self._buffer[start : matched.end()] == ord('"'))
         spans = []
@@ -200,27 +168,27 @@ class _Model:
                 mine &= self._buffer[quotes[::2] - back] == char
             # No other attribute ends so, except behind a colon or in a longer word.
             mine &= self._buffer[quotes[::2] - len(column) - 2] <= ord(" ")
-            spans.append((quotes[::2][mine] + 1, quotes[1::2][mine]))
-        starts, ends = (np.stack(side, axis=1) for side in zip(*spans, strict=True))
-        self.meshes[-1].lists[kind] = Triples(starts, ends)
+            spans.append(np.stack([quotes[::2][mine] + 1, quotes[1::2][mine]], axis=1))
+        self.meshes[-1].lists[kind] = np.stack(spans, axis=1)
         return matched.end()
 
     def _read_rows(self, kind: str) -> Triples:
         """Read a list element by element."""
         spans = np.zeros((len(self._rows), 3, 2), np.int64)
         for row, at in enumerate(self._rows):
-            tag = _TAG.match(self._data, at)
+            tag = _TAG.match(self.data, at)
             attributes = {}
             while tag is not None:
-                tag = _ATTRIBUTE.match(self._data, tag.end())
+                tag = _ATTRIBUTE.match(self.data, tag.end())
                 if tag is not None:
                     attributes[tag[1]] = tag.span(2 if tag[3] is None else 3)
             for column, name in enumerate(_COLUMNS[kind]):
                 if name not in attributes:
-                    raise self._error(at, f"a {_ROWS[kind]} has no {name.decode()}")
+                    raise self.error(at, f"a {_ROWS[kind]} has no {name.decode()}")
                 start, end = attributes[name]
-                value = self._data[start:end]
+                value = self.data[start:end]
                 if len(value.split()) > 1:
-                    raise self._error(start, f"{value[:40].decode('ascii', 'backslashreplace')!r} is not a number")
+                    shown = value[:40].decode("ascii", "backslashreplace")
+                    raise self.error(start, f"{shown!r} is not a number")
                 spans[row, column] = end - len(value.lstrip()), start + len(value.rstrip())
-        return Triples(spans[..., 0], spans[..., 1])
+        return spans

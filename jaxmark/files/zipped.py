@@ -4,6 +4,7 @@ import struct
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -11,39 +12,12 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files.source import Edits, splice
 
 _MAX_TOTAL = 2**31  # bytes of all members together
-# Text is seldom packed to a fiftieth; what is packed further and is large was made to fill memories.
+# Text is seldom packed to a fiftieth; a large member that is packed further was made to fill memories.
 _MAX_RATIO, _MAX_SMALL = 200, 2**28
 _STORED, _DEFLATED = 0, 8
 _ENCRYPTED, _DESCRIBED, _UTF8 = 1 << 0, 1 << 3, 1 << 11  # flags; described: checksum and sizes follow the data
 _FULL = 0xFFFFFFFF  # stands for a number that is in the ZIP64 field instead
 _ENTRY, _LOCAL = struct.Struct("<4s4x2H4x3I3H8xI"), struct.Struct("<4s2x2H4x3I2H")
-
-
-class _Edits:
-    """Edits of an archive, in which numbers keep their widths."""
-
-    def __init__(self, data: bytes) -> None:
-        self._data = data
-        self._starts: list[int] = []
-        self._ends: list[int] = []
-        self._tokens: list[bytes] = []
-
-    def put(self, start: int, end: int, token: bytes) -> None:
-        self._starts.append(start)
-        self._ends.append(end)
-        self._tokens.append(token)
-
-    def renumber(self, at: int, width: int, old: int, new: int) -> bool:
-        """Write a number where the old one stands; whether it stands there."""
-        if int.from_bytes(self._data[at : at + width], "little") != old or at + width > len(self._data):
-            return False
-        if new >= min(_FULL, 1 << 8 * width):
-            raise JaxmarkError("The file would have 4 GB or more; leave some meshes out of it.")
-        self.put(at, at + width, new.to_bytes(width, "little"))
-        return True
-
-    def apply(self) -> bytes:
-        return splice(self._data, [Edits(np.array(self._starts), np.array(self._ends), self._tokens)])
 
 
 @dataclass
@@ -68,20 +42,13 @@ class Member:
 
 
 class Archive:
-    """A ZIP archive.
+    """A ZIP archive; refused if it is broken, encrypted, in several volumes, too large, or two members have one name.
 
     Attributes:
-        data: its bytes.
         members: its members, in the order of the central directory.
     """
 
     def __init__(self, data: bytes) -> None:
-        """Read the central directory and the members' headers, and no content.
-
-        Raises:
-            JaxmarkError: if the archive is broken, encrypted, in several volumes, has two members of one name, or would
-                be too large unpacked.
-        """
         self.data = data
         self._end = data.rfind(b"PK\5\6", max(0, len(data) - 22 - 0xFFFF))
         if self._end < 0 or self._end + 22 > len(data):
@@ -107,7 +74,7 @@ class Archive:
         self._locate()
 
     def _find_wide_end(self) -> int | None:
-        """The offset of the ZIP64 end record, if there is one."""
+        """Return the offset of the ZIP64 end record, if there is one."""
         locator = self._end - 20
         if locator < 0 or self.data[locator : locator + 4] != b"PK\6\7":
             return None
@@ -117,7 +84,7 @@ class Archive:
         return at
 
     def _entry(self, at: int) -> tuple[Member, int]:
-        """Read an entry of the central directory; the offset of what follows it."""
+        """Read an entry of the central directory, and return the offset behind it, too."""
         if at + 46 > self._end or self.data[at : at + 4] != b"PK\1\2":
             raise _broken(at)
         _, flags, method, checksum, packed, size, name, extra, comment, header = _ENTRY.unpack_from(self.data, at)
@@ -126,24 +93,20 @@ class Archive:
             raise _broken(at)
         word = self.data[at + 46 : at + 46 + name].decode("utf-8" if flags & _UTF8 else "cp437", "replace")
         member = Member(word.replace("\\", "/"), at, flags, method, checksum, packed, size, header)
-        start = _field(self.data, at + 46 + name, extra)
         # Only numbers that do not fit the entry should be in this field, but some programs repeat the sizes there.
-        for key in ("size", "packed", "header"):
-            if start is None or not (getattr(member, key) == _FULL or self._number(*start) == getattr(member, key)):
-                continue
-            if start[0] + 8 > start[1]:
-                raise _broken(start[0])
-            member.wide[key] = start[0]
-            setattr(member, key, self._number(*start))
-            start = start[0] + 8, start[1]
+        wide, stop = _field(self.data, at + 46 + name, extra)
+        for key in ("size", "packed", "header") if stop else ():
+            number = int.from_bytes(self.data[wide : wide + 8], "little") if wide + 8 <= stop else None
+            if getattr(member, key) in (_FULL, number):
+                if number is None:
+                    raise _broken(wide)
+                member.wide[key] = wide
+                setattr(member, key, number)
+                wide += 8
         return member, end
 
-    def _number(self, at: int, end: int) -> int:
-        """A number of eight bytes before an offset, or one that is none."""
-        return int.from_bytes(self.data[at : at + 8], "little") if at + 8 <= end else -1
-
     def _check(self) -> None:
-        """Refuse what cannot be unpacked, or ought not to be."""
+        """Refuse members that cannot be unpacked, or ought not to be."""
         for member in self.members:
             if member.flags & _ENCRYPTED:
                 raise JaxmarkError(f"The member {member.shown} is encrypted; save it without a password.")
@@ -157,7 +120,7 @@ class Archive:
             raise JaxmarkError(f"Unpacked, the archive has {total} bytes; 2 GB is the most, so split it.")
 
     def _locate(self) -> None:
-        """Find each member's data; refused where two of them overlap."""
+        """Find each member's data; members that overlap are refused."""
         last = 0
         for member in sorted(self.members, key=lambda member: member.header):
             at = member.header
@@ -170,15 +133,11 @@ class Archive:
                 raise JaxmarkError(f"The archive is broken: the member {member.shown} is not all there.")
 
     def find(self, name: str) -> Member | None:
-        """A member by its name, in which case does not matter."""
+        """Return a member by its name, in which case does not matter."""
         return self._by_name.get(name.casefold())
 
     def read(self, member: Member) -> bytes:
-        """The content of a member.
-
-        Raises:
-            JaxmarkError: if it is damaged, or packed in a way other than deflate.
-        """
+        """Unpack a member; refused if it is damaged, or packed in a way other than deflate."""
         packed = self.data[member.start : member.start + member.packed]
         if member.method == _DEFLATED:
             unpacker = zlib.decompressobj(-zlib.MAX_WBITS)
@@ -198,95 +157,101 @@ class Archive:
         return content
 
     def replaced(self, contents: Mapping[str, bytes]) -> bytes:
-        """The archive with other contents of some members, packed as these were; all other bytes stay.
+        """Replace the contents of some members, packed as these were; all other bytes stay.
 
-        Raises:
-            JaxmarkError: if the headers of these members are inconsistent, or the archive would become too large.
+        Members whose headers are inconsistent are refused, and archives that would become too large.
         """
-        edits = _Edits(self.data)
-        grown: list[tuple[int, int]] = []  # where data grow, and by how much
-        for member in self.members:
-            if member.name in contents:
-                content = contents[member.name]
-                packed = content
-                if member.method == _DEFLATED:
-                    packer = zlib.compressobj(wbits=-zlib.MAX_WBITS)
-                    packed = packer.compress(content) + packer.flush()
-                grown.append((member.start, len(packed) - member.packed))
-                edits.put(member.start, member.start + member.packed, packed)
-                self._renumber(edits, member, zlib.crc32(content), len(packed), len(content))
+        out = bytearray(self.data)  # numbers keep their widths, so that places stay until the contents are exchanged
+        replaced = [member for member in self.members if member.name in contents]
+        packed = [_pack(contents[member.name], member.method) for member in replaced]
+        for member, new in zip(replaced, packed, strict=True):
+            self._state(out, member, contents[member.name], len(new))
+        starts = np.array([member.start for member in replaced], np.int64)
+        ends = starts + [member.packed for member in replaced]
+        growth = np.array([len(new) for new in packed], np.int64) - (ends - starts)
 
-        def shifted(at: int) -> int:
-            return at + sum(by for start, by in grown if start < at)
+        def shift(place: int, width: int, at: int) -> None:
+            """Write at a place where the byte that was at an offset is now."""
+            _renumber(out, place, width, at, at + int(growth[starts < at].sum()))
 
         for member in self.members:
             if "header" in member.wide:
-                edits.renumber(member.wide["header"], 8, member.header, shifted(member.header))
-            edits.renumber(member.entry + 42, 4, member.header, shifted(member.header))
-        edits.renumber(self._end + 16, 4, self._directory, shifted(self._directory))
+                shift(member.wide["header"], 8, member.header)
+            shift(member.entry + 42, 4, member.header)
+        shift(self._end + 16, 4, self._directory)
         if self._wide_end is not None:
-            edits.renumber(self._wide_end + 48, 8, self._directory, shifted(self._directory))
-            edits.renumber(self._end - 12, 8, self._wide_end, shifted(self._wide_end))
-        return edits.apply()
+            shift(self._wide_end + 48, 8, self._directory)
+            shift(self._end - 12, 8, self._wide_end)
+        return splice(bytes(out), [Edits(starts, ends, packed)])
 
-    def _renumber(self, edits: _Edits, member: Member, checksum: int, packed: int, size: int) -> None:
-        """Write a member's new checksum and sizes wherever the old ones stand."""
-        edits.put(member.entry + 16, member.entry + 20, checksum.to_bytes(4, "little"))
-        for key, at, old, new in (("packed", 20, member.packed, packed), ("size", 24, member.size, size)):
-            edits.renumber(member.entry + at, 4, old, new)
-            if key in member.wide:
-                edits.renumber(member.wide[key], 8, old, new)
+    def _state(self, out: bytearray, member: Member, content: bytes, packed: int) -> None:
+        """Write the checksum and the sizes of a member's new content wherever the old ones stand."""
+        write = partial(_renumber, out)
+        checksum = partial(write, width=4, old=member.checksum, new=zlib.crc32(content), most=_FULL)
+        checksum(member.entry + 16)
         *_, name, extra = _LOCAL.unpack_from(self.data, member.header)
-        wide = _field(self.data, member.header + 30 + name, extra)
-        numbers = ((18, 8, member.packed, packed), (22, 0, member.size, size))
-        known = self._renumber_checksum(edits, member.header + 14, member.checksum, checksum)
-        for at, inner, old, new in numbers:
-            found = edits.renumber(member.header + at, 4, old, new)
-            if wide is not None and wide[0] + inner + 8 <= wide[1]:
-                found |= edits.renumber(wide[0] + inner, 8, old, new)
+        wide, stop = _field(self.data, member.header + 30 + name, extra)
+        known = checksum(member.header + 14)
+        sizes = (("packed", 20, 18, 8, packed), ("size", 24, 22, 0, len(content)))
+        for key, in_entry, in_header, in_field, new in sizes:
+            old = getattr(member, key)
+            write(member.entry + in_entry, 4, old, new)
+            if key in member.wide:
+                write(member.wide[key], 8, old, new)
+            found = write(member.header + in_header, 4, old, new)
+            if wide + in_field + 8 <= stop:
+                found |= write(wide + in_field, 8, old, new)
             known &= found
         if member.flags & _DESCRIBED:
             end = member.start + member.packed
             end += 4 * (self.data[end : end + 4] == b"PK\7\x08" and not self._described(end, member))
             width = self._described(end, member)
             if width:
-                self._renumber_checksum(edits, end, member.checksum, checksum)
-                edits.renumber(end + 4, width, member.packed, packed)
-                edits.renumber(end + 4 + width, width, member.size, size)
+                checksum(end)
+                write(end + 4, width, member.packed, packed)
+                write(end + 4 + width, width, member.size, len(content))
             known = bool(width)
         if not known:
             raise JaxmarkError(
                 f"The header of the member {member.shown} is not what the archive's directory says; pack it again."
             )
 
-    def _renumber_checksum(self, edits: _Edits, at: int, old: int, new: int) -> bool:
-        """Write a checksum, of which any four bytes will do, where the old one stands; whether it stands there."""
-        if self.data[at : at + 4] != old.to_bytes(4, "little"):
-            return False
-        edits.put(at, at + 4, new.to_bytes(4, "little"))
-        return True
-
     def _described(self, at: int, member: Member) -> int:
-        """How wide the sizes are that follow a checksum at an offset, behind a member's data; 0 if there are none."""
+        """Return the width of the sizes that follow a checksum behind a member's data; 0 if there are none."""
+        stated = member.checksum, member.packed, member.size
         for width, form in ((4, "<3I"), (8, "<I2Q")):
-            if at + 4 + 2 * width <= self._directory and struct.unpack_from(form, self.data, at) == (
-                member.checksum,
-                member.packed,
-                member.size,
-            ):
+            if at + 4 + 2 * width <= self._directory and struct.unpack_from(form, self.data, at) == stated:
                 return width
         return 0
 
 
-def _field(data: bytes, at: int, size: int) -> tuple[int, int] | None:
-    """The span of the ZIP64 field among the extra fields of a header, if it is there."""
+def _pack(content: bytes, method: int) -> bytes:
+    """Pack the content of a member as it was packed."""
+    if method != _DEFLATED:
+        return content
+    packer = zlib.compressobj(wbits=-zlib.MAX_WBITS)
+    return packer.compress(content) + packer.flush()
+
+
+def _renumber(out: bytearray, at: int, width: int, old: int, new: int, most: int = _FULL - 1) -> bool:
+    """Write a number where the old one stands; returns whether it stands there."""
+    if int.from_bytes(out[at : at + width], "little") != old or at + width > len(out):
+        return False
+    if new > most:
+        raise JaxmarkError("The file would have 4 GB or more; leave some meshes out of it.")
+    out[at : at + width] = new.to_bytes(width, "little")
+    return True
+
+
+def _field(data: bytes, at: int, size: int) -> tuple[int, int]:
+    """Find the span of the ZIP64 field among the extra fields of a header; zeros if it is not there."""
     end = at + size
     while at + 4 <= end:
         kind, length = struct.unpack_from("<2H", data, at)
         if kind == 1:
             return at + 4, min(at + 4 + length, end)
         at += 4 + length
-    return None
+    return 0, 0
 
 
 def _broken(at: int) -> JaxmarkError:

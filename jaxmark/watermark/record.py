@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.reading import read_file
+from jaxmark.files.atomic import read_file
 from jaxmark.geometry.imprint import Imprint
 from jaxmark.watermark.coding.keys import KEY_BYTES, SCHEME_VERSION, Choices, Key, canonical_json, commitment
 from jaxmark.watermark.evidence import ledger

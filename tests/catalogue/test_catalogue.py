@@ -17,7 +17,7 @@ from scipy.special import sph_harm_y
 
 import jaxmark as jm
 from jaxmark.catalogue import descriptors, export_catalogue, import_catalogue
-from jaxmark.catalogue.search import Index
+from jaxmark.catalogue.retrieval import Index
 from tests.app.test_cli import Workshop
 from tests.samples import rough_sphere
 

@@ -4,11 +4,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int64, Shaped
+from jaxtyping import Shaped
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
-from jaxmark.files.gltf.document import COMPONENTS, Document, whole
+from jaxmark.files.gltf.document import COMPONENTS, Document, Elements, whole
+from jaxmark.files.source import Faces
 
 EXTENSION = "KHR_draco_mesh_compression"
 _POSITION_BITS = 24  # as fine as single precision
@@ -20,16 +21,14 @@ class Compressed:
     """The content of a compressed primitive."""
 
     view: int  # index of the buffer view
-    ids: dict[str, int]  # of the attributes in it, by name
-    attributes: dict[str, Shaped[np.ndarray, "points width"]]  # in the component types of their accessors
-    faces: Int64[np.ndarray, "faces 3"]
+    attributes: dict[str, Elements]  # decoded, by name, behind the buffers of the container
+    faces: Faces
 
 
 def decompress(document: Document, primitive: dict[str, Any], where: str) -> Compressed | None:
-    """Decode a primitive; None if it is not compressed.
+    """Decode a primitive, and let the document read its accessors from there; None if it is not compressed.
 
-    Raises:
-        JaxmarkError: if the decoder is missing, or finds something else than the document promises.
+    It is refused if the decoder is missing, or finds something else than the document promises.
     """
     extensions = primitive.get("extensions")
     if not isinstance(extensions, dict) or EXTENSION not in extensions:
@@ -40,37 +39,44 @@ def decompress(document: Document, primitive: dict[str, Any], where: str) -> Com
         raise JaxmarkError(f"The extension {EXTENSION} of {where} is damaged.")
     view = whole(extension, "bufferView", where)
     begin, length = document.view(view)
-    forms = {name: document.form(whole(attributes, name, where)) for name in named}
-    # What is announced must be possible, before the decoder reserves memory for it.
+    indices = {name: whole(attributes, name, where) for name in named}
+    forms = {name: document.form(index) for name, index in indices.items()}
+    # The announced size must be possible, before the decoder reserves memory for it.
     for _, width, _, count in forms.values():
         if width * count > _MAX_EXPANSION * length:
             raise JaxmarkError(f"{where} announces {count} points in {length} bytes.")
     decoder = require("DracoPy", "files")
     try:
-        found = decoder.decode(document.container.data[begin : begin + length])
+        found = decoder.decode(document.data[begin : begin + length])
         by_id = {item["unique_id"]: np.asarray(item["data"]) for item in found.attributes}
         faces = np.asarray(found.faces, np.int64).reshape(-1, 3)
     except Exception as error:  # the decoder has several kinds of its own
         raise JaxmarkError(f"{where} cannot be decoded by Draco: {error}.") from None
-    decoded, ids = {}, {}
+    decoded = {}
     for name, (dtype, width, _, count) in forms.items():
-        ids[name] = whole(named, name, where)
-        data = by_id.get(ids[name])
+        data = by_id.get(whole(named, name, where))
         if data is None or data.reshape(len(data), -1).shape != (count, width):
             raise JaxmarkError(f"{where} holds other numbers of {name} than the document says.")
-        decoded[name] = np.ascontiguousarray(data.reshape(count, width).astype(dtype))
-    if "POSITION" not in decoded or ((faces < 0) | (faces >= len(decoded["POSITION"]))).any():
+        decoded[name] = data.astype(dtype).tobytes()
+    count = forms["POSITION"][3] if "POSITION" in forms else 0
+    if ((faces < 0) | (faces >= count)).any() or not count:
         raise JaxmarkError(f"{where} holds no positions, or faces of other points.")
-    return Compressed(view, ids, decoded, faces)
+    places = {}
+    for name, (dtype, width, unit, count) in forms.items():
+        starts = document.add(decoded[name]) + dtype.itemsize * width * np.arange(count)
+        places[name] = Elements(starts, dtype, width, unit)
+        if indices[name] not in document.decoded:
+            document.decoded.add(indices[name])
+            document.located[indices[name]] = places[name]
+    return Compressed(view, places, faces)
 
 
-def compress(
-    attributes: dict[str, Shaped[np.ndarray, "points width"]], faces: Int64[np.ndarray, "faces 3"]
+def _encode(
+    attributes: dict[str, Shaped[np.ndarray, "points width"]], faces: Faces
 ) -> tuple[bytes, dict[str, int]] | None:
     """Encode a primitive, points and faces in their order, all but positions without loss.
 
-    Returns:
-        The bytes, and the identifiers of the attributes in them; None where the encoder cannot do that.
+    Returns the bytes, and the identifiers of the attributes in them; None if the encoder cannot do that.
     """
     points = attributes["POSITION"]
     others = {name: data for name, data in attributes.items() if name != "POSITION"}
@@ -102,58 +108,51 @@ def write(
     contents: list[bytes | None],
     primitive: dict[str, Any],
     old: Compressed,
-    attributes: dict[str, Shaped[np.ndarray, "points width"]],
+    data: bytes,
 ) -> bool:
     """Write changed attributes of a compressed primitive into a document and its buffers.
 
-    The bytes that were there are overwritten, for they hold the primitive as it was.
-
-    Args:
-        document: the document to change.
-        contents: the buffers to change.
-        primitive: the primitive in that document.
-        old: what it was.
-        attributes: what it shall be.
-
-    Returns:
-        Whether it is still compressed; the encoder does not know all types.
+    The bytes that were there are overwritten, for they hold the primitive as it was. `contents` are the buffers, which
+    change with the document, and `data` are those of the document with the new numbers. Returns whether the primitive
+    is still compressed: the encoder does not know all types.
     """
+    attributes = {
+        name: np.frombuffer(data[rows.span], rows.dtype).reshape(-1, rows.width)
+        for name, rows in old.attributes.items()
+    }
     view = document["bufferViews"][old.view]
     buffer = view["buffer"]
     begin, length = view.get("byteOffset", 0), view["byteLength"]
     content = bytearray(contents[buffer] or b"")
     content[begin : begin + length] = bytes(length)
-    coded = compress(attributes, old.faces)
+
+    def append(added: bytes) -> dict[str, int]:
+        """Append bytes to the buffer at a multiple of four."""
+        content.extend(bytes(-len(content) % 4) + added)
+        return {"byteOffset": len(content) - len(added), "byteLength": len(added)}
+
+    coded = _encode(attributes, old.faces)
     if coded is not None:
-        blob, ids = coded
+        blob, primitive["extensions"][EXTENSION]["attributes"] = coded
         if len(blob) <= length:
             content[begin : begin + len(blob)] = blob
+            view["byteLength"] = len(blob)
         else:
-            content += bytes(-len(content) % 4)
-            view["byteOffset"] = len(content)
-            content += blob
-        view["byteLength"] = len(blob)
-        primitive["extensions"][EXTENSION]["attributes"] = ids
+            view |= append(blob)
     else:
-        arrays = [(primitive["attributes"][name], data) for name, data in attributes.items()]
-        corners = old.faces.ravel()
+        # Vertex attributes begin at multiples of four bytes.
+        arrays = [(primitive["attributes"][name], rows, 4) for name, rows in attributes.items()]
         if "indices" in primitive:
             component = document["accessors"][primitive["indices"]]["componentType"]
-            arrays.append((primitive["indices"], corners.astype(COMPONENTS[component])))
-        for accessor, data in arrays:
-            rows = data.reshape(len(data), -1)
+            arrays.append((primitive["indices"], old.faces.reshape(-1, 1).astype(COMPONENTS[component]), 1))
+        for index, rows, step in arrays:
             size = rows.shape[1] * rows.dtype.itemsize
-            stride = -(-size // 4) * 4 if data.ndim > 1 else size  # vertex attributes begin at multiples of four
-            padded = np.zeros((len(rows), stride), np.uint8)
-            padded[:, :size] = np.ascontiguousarray(rows).view(np.uint8).reshape(len(rows), -1)
-            content += bytes(-len(content) % 4)
-            new = {"buffer": buffer, "byteOffset": len(content), "byteLength": padded.size}
-            if stride != size:
-                new["byteStride"] = stride
-            document["bufferViews"].append(new)
-            document["accessors"][accessor]["bufferView"] = len(document["bufferViews"]) - 1
-            document["accessors"][accessor].pop("byteOffset", None)
-            content += padded.tobytes()
+            padded = np.pad(rows.view(np.uint8), ((0, 0), (0, -size % step)))
+            stride = {} if padded.shape[1] == size else {"byteStride": padded.shape[1]}
+            document["bufferViews"].append({"buffer": buffer} | append(padded.tobytes()) | stride)
+            accessor = document["accessors"][index]
+            accessor["bufferView"] = len(document["bufferViews"]) - 1
+            accessor.pop("byteOffset", None)
         del primitive["extensions"][EXTENSION]
         if not primitive["extensions"]:
             del primitive["extensions"]
@@ -162,7 +161,7 @@ def write(
 
 
 def forget_unused(document: dict[str, Any]) -> None:
-    """Remove the extension from the lists of those that a document uses, if no primitive is compressed any more."""
+    """Remove the extension from the lists of used extensions, if no primitive is compressed any more."""
     for mesh in document.get("meshes", []):
         if any(EXTENSION in primitive.get("extensions", {}) for primitive in mesh.get("primitives", [])):
             return

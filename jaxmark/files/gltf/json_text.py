@@ -9,18 +9,12 @@ _decode = json.JSONDecoder().raw_decode
 
 
 def rewrite(text: str, new: Any) -> str:
-    """Write a document over the text of another one, in which only what differs is written anew.
-
-    Args:
-        text: valid JSON, perhaps with white space around it.
-        new: the document that it shall say.
-    """
+    """Write a document over the JSON text of another one, in which only the values that differ change."""
     at = _skip(text, 0)
-    pieces: list[str] = [text[:at]]
     old, end = _decode(text, at)
+    pieces: list[str] = [text[:at]]
     _write(text, at, end, old, new, pieces)
-    pieces.append(text[end:])
-    return "".join(pieces)
+    return "".join([*pieces, text[end:]])
 
 
 def _write(text: str, at: int, end: int, old: Any, new: Any, pieces: list[str]) -> None:
@@ -28,22 +22,14 @@ def _write(text: str, at: int, end: int, old: Any, new: Any, pieces: list[str]) 
     if _same(old, new):
         pieces.append(text[at:end])
         return
-    alike = type(old) is type(new) and len(old) == len(new) if isinstance(old, dict | list) else False
-    if alike and (isinstance(old, list) or old.keys() == new.keys()):
+    longer = isinstance(old, list) and isinstance(new, list) and len(new) >= len(old) > 0
+    if longer or (isinstance(old, dict) and isinstance(new, dict) and old.keys() == new.keys()):
         for key, begin, stop in _members(text, at):
             pieces.append(text[at:begin])
             _write(text, begin, stop, old[key], new[key], pieces)
             at = stop
+        pieces += ("," + _dump(item) for item in new[len(old) :]) if longer else ()
         pieces.append(text[at:end])
-        return
-    if isinstance(old, list) and isinstance(new, list) and len(new) > len(old) > 0:  # some were appended
-        last = at
-        for key, begin, stop in _members(text, at):
-            pieces.append(text[last:begin])
-            _write(text, begin, stop, old[key], new[key], pieces)
-            last = stop
-        pieces += ("," + _dump(item) for item in new[len(old) :])
-        pieces.append(text[last:end])
         return
     pieces.append(_dump(new))
 
@@ -58,15 +44,15 @@ def _dump(value: Any) -> str:
 
 
 def _skip(text: str, at: int) -> int:
-    """The index of the next character that is not white space."""
+    """Return the index of the next character that is not white space."""
     match = _SPACE.match(text, at)
     return at if match is None else match.end()
 
 
 def _members(text: str, at: int) -> list[tuple[Any, int, int]]:
-    """The keys or numbers of the values of the object or list that begins at `at`, and their spans.
+    """Return the keys or numbers of the values of the object or list that begins at `at`, and their spans.
 
-    The last of equal keys counts, as it does for who reads the document.
+    The last of equal keys counts, as it does for readers of the document.
     """
     keyed = text[at] == "{"
     found: dict[Any, tuple[int, int]] = {}

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Int8, Int64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.reading import read_file
+from jaxmark.files.atomic import read_file
 
 SCHEME_VERSION = 2  # version of the keyed choices and of records
 KEY_BYTES = 32

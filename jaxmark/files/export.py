@@ -12,22 +12,15 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files.source import Source
 from jaxmark.geometry.mesh import Mesh
 
-# As a share of the bounding-box diagonal; marks move vertices by about ten times that or more.
 _CLOUDS = (".xyz", ".las", ".laz")  # formats without faces
-_MAX_ROUNDING = 1e-5
+_MAX_ROUNDING = 1e-5  # of the bounding-box diagonal; marks move vertices by about ten times that or more
 
 
 def encode_new(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> bytes:
     """Encode a mesh as the bytes of a new file, which are read back as a check.
 
-    Args:
-        mesh: a validated mesh on the host.
-        suffix: the suffix of the format, such as `.obj`.
-        parse: the parser of the format.
-
-    Raises:
-        JaxmarkError: if the format cannot hold the mesh: single precision would move a coordinate by more than 1e-5
-            of the diagonal of the bounding box, as it does far from the origin.
+    A mesh is refused if the format cannot hold it: single precision would move a coordinate by more than 1e-5 of the
+    diagonal of the bounding box, as it does far from the origin.
     """
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if suffix in _CLOUDS and len(faces):
@@ -35,15 +28,18 @@ def encode_new(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> byt
     if suffix in (".stl", ".glb", ".gltf", ".3mf") and not len(faces):
         raise JaxmarkError(f"A new {suffix[1:].upper()} file holds faces; save the point cloud as PLY or XYZ.")
     if suffix in (".las", ".laz"):
-        raise JaxmarkError(
-            "A new LAS or LAZ file is not written; pass the one it came from as `like`, or use PLY or XYZ."
-        )
+        advice = "pass the one it came from as `like`, or use PLY or XYZ"
+        raise JaxmarkError(f"A new LAS or LAZ file is not written; {advice}.")
     if suffix in (".obj", ".off", ".xyz"):
         data = _text(vertices, faces, suffix)
     elif suffix == ".3mf":
         data = _threemf(vertices, faces)
     elif not len(faces):
-        data, vertices = _points_as_ply(vertices), _single(vertices, suffix)
+        vertices = _single(vertices, suffix)
+        # trimesh would write a face element, which viewers take for a mesh.
+        head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+        head += [*(f"property float {axis}" for axis in "xyz"), "end_header", ""]
+        data = "\n".join(head).encode() + vertices.astype("<f4").tobytes()
     else:
         with np.errstate(all="ignore"):
             whole = trimesh.Trimesh(vertices, faces, process=False)
@@ -70,14 +66,6 @@ def _single(vertices: np.ndarray, suffix: str) -> np.ndarray:
             " too far for this mesh; centre it on the origin, or use OBJ or OFF, which are written exactly."
         )
     return rounded
-
-
-def _points_as_ply(vertices: np.ndarray) -> bytes:
-    """Encode a point cloud, which trimesh would write with a face element for viewers of meshes."""
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    lines += [f"property float {axis}" for axis in "xyz"]
-    with np.errstate(all="ignore"):
-        return "\n".join([*lines, "end_header", ""]).encode() + vertices.astype("<f4").tobytes()
 
 
 def _text(vertices: np.ndarray, faces: np.ndarray, suffix: str) -> bytes:

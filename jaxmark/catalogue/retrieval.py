@@ -1,4 +1,4 @@
-"""Search for the originals that look most like a shape, exactly, among all of a catalogue's."""
+"""Retrieve the originals that look most like a shape, exactly, among all of a catalogue's."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -15,9 +15,7 @@ from jaxmark.errors import JaxmarkError
 SHARES = tuple(0.8**step for step in range(1, 7))
 _BLOCK = 1024  # originals that are compared at a time
 _KEPT_BALLS = 0.5  # share of a part's balls, the most similar ones, that count: the others reach beyond its rim
-
-
-_ALIKE = 0.5  # of the median distance to the likeliest candidate, up to which two are of one kind
+_ALIKE = 0.5  # share of the median distance to the likeliest candidate, up to which two are of one kind
 
 
 class Near(NamedTuple):
@@ -38,29 +36,27 @@ class Index:
         """
         self.state = state_of(database)
         count, sizes = self.state[0], (descriptors.WHOLE_SIZE, descriptors.CENTRES * descriptors.LOCAL_SIZE)
-        self.shapes = np.empty(count, np.int64)
-        self._whole, self._parts = (np.empty((count, size), "<f2") for size in sizes)
-        landmarks: list[np.ndarray] = []
+        shapes = np.empty(count, np.int64)
+        whole, parts = (np.empty((count, size), "<f2") for size in sizes)
+        known: list[np.ndarray] = []
         rows = database.each("SELECT id, described, whole, parts, landmarks FROM shapes ORDER BY id LIMIT ?", count)
-        place = -1
         for place, row in enumerate(rows):
             if row["described"] != descriptors.VERSION:
                 raise JaxmarkError("The originals were described by another jaxmark; add their files again.")
-            if any(len(row[name]) != 2 * size for name, size in zip(("whole", "parts"), sizes, strict=True)):
+            if (len(row["whole"]), len(row["parts"])) != (2 * sizes[0], 2 * sizes[1]):
                 raise JaxmarkError(f"The catalogue {database.path} is damaged: a descriptor is not whole.")
             if not is_whole(row["landmarks"]):
                 raise JaxmarkError(f"The catalogue {database.path} is damaged: landmarks are not whole.")
-            self.shapes[place] = row["id"]
-            landmarks.append(np.frombuffer(row["landmarks"], KEPT))
-            for array, name in ((self._whole, "whole"), (self._parts, "parts")):
-                array[place] = np.frombuffer(row[name], "<f2")
-        if place < 0:
+            shapes[place] = row["id"]
+            whole[place], parts[place] = np.frombuffer(row["whole"], "<f2"), np.frombuffer(row["parts"], "<f2")
+            known.append(np.frombuffer(row["landmarks"], KEPT))
+        if not known:
             raise JaxmarkError(f"The catalogue {database.path} is empty; add originals first.")
-        self.shapes, self._whole, self._parts = (a[: place + 1] for a in (self.shapes, self._whole, self._parts))
-        self._landmarks = LandmarkIndex(landmarks)
+        self.shapes, self._whole, self._parts = (array[: len(known)] for array in (shapes, whole, parts))
+        self._landmarks = LandmarkIndex(known)
 
     def by_landmarks(self, seen: np.ndarray) -> list[Near]:
-        """The originals with the meshing of a suspect, those on which it fits best first; none if it was meshed anew.
+        """Retrieve the originals with the meshing of a suspect, the best fitting first; none if it was remeshed.
 
         Args:
             seen: from `landmarks.landmarks`.
@@ -69,30 +65,40 @@ class Index:
         return [Near(int(self.shapes[place]), off[place]) for place in sorted(off, key=off.__getitem__)]
 
     def by_whole(self, shape: Float[np.ndarray, " numbers"], count: int) -> list[Near]:
-        """The originals whose whole shape is most similar, the most similar first.
+        """Retrieve the originals whose whole shape is most similar, the most similar first.
 
         Args:
             shape: from `descriptors.whole`.
-            count: how many.
+            count: number of originals.
         """
         blocks = range(0, len(self.shapes), _BLOCK)
         off = [np.abs(self._whole[i : i + _BLOCK].astype(np.float32) - shape).sum(axis=1) for i in blocks]
         return self._nearest(np.concatenate(off), count)
 
     def by_parts(self, part: descriptors.Locals, count: int) -> list[Near]:
-        """The originals of which a part looks most like this one, the most similar first.
+        """Retrieve the originals of which a part looks most like this one, the most similar first.
 
         Each ball about a point of the part is compared with all balls of each original; the nearest one counts.
         """
-        return self._nearest(self._off_parts(part), count)
+        balls = [part.describe(share) for share in SHARES]
+        sought = np.concatenate(balls)
+        squares, kept = (sought**2).sum(axis=1), max(1, round(_KEPT_BALLS * len(balls[0])))
+        off = np.empty(len(self.shapes), np.float32)
+        for start in range(0, len(off), _BLOCK):
+            known = self._parts[start : start + _BLOCK].astype(np.float32).reshape(-1, descriptors.LOCAL_SIZE)
+            square = (known**2).sum(axis=1) - 2 * sought @ known.T + squares[:, None]
+            nearest = square.reshape(len(SHARES), len(balls[0]), -1, descriptors.CENTRES).min(axis=3)
+            best = np.sort(np.sqrt(np.maximum(nearest, 0)), axis=1)[:, :kept].mean(axis=1)
+            off[start : start + _BLOCK] = best.min(axis=0)
+        return self._nearest(off, count)
 
     def like(self, shape: int, count: int) -> list[int]:
-        """The originals whose whole shape is most like that of one of them, itself first."""
+        """Retrieve the originals whose whole shape is most like that of one of them, itself first."""
         (place,) = np.flatnonzero(self.shapes == shape)
         return [near.shape for near in self.by_whole(self._whole[place].astype(np.float32), count)]
 
     def unlike(self, near: Sequence[Near], count: int) -> list[Near]:
-        """Some of the originals that look like a suspect, the first of each kind of shape first."""
+        """Select some of the originals that look like a suspect, the first of each kind of shape first."""
         place = {int(shape): number for number, shape in enumerate(self.shapes)}
         whole = np.stack([self._whole[place[one.shape]].astype(np.float32) for one in near])
         chosen, apart = [0], np.abs(whole - whole[0]).sum(axis=1)
@@ -104,24 +110,11 @@ class Index:
             apart = np.minimum(apart, np.abs(whole - whole[chosen[-1]]).sum(axis=1))
         return [near[number] for number in chosen]
 
-    def _off_parts(self, part: descriptors.Locals) -> Float[np.ndarray, " shapes"]:
-        balls = [part.describe(share) for share in SHARES]
-        sought = np.concatenate(balls)
-        squares, kept = (sought**2).sum(axis=1), max(1, round(_KEPT_BALLS * len(balls[0])))
-        off = np.empty(len(self.shapes), np.float32)
-        for start in range(0, len(off), _BLOCK):
-            known = self._parts[start : start + _BLOCK].astype(np.float32).reshape(-1, descriptors.LOCAL_SIZE)
-            square = (known**2).sum(axis=1) - 2 * sought @ known.T + squares[:, None]
-            nearest = square.reshape(len(SHARES), len(balls[0]), -1, descriptors.CENTRES).min(axis=3)
-            best = np.sort(np.sqrt(np.maximum(nearest, 0)), axis=1)[:, :kept].mean(axis=1)
-            off[start : start + _BLOCK] = best.min(axis=0)
-        return off
-
     def _nearest(self, off: Float[np.ndarray, " shapes"], count: int) -> list[Near]:
         return [Near(int(self.shapes[place]), float(off[place])) for place in np.argsort(off, kind="stable")[:count]]
 
 
 def state_of(database: Database) -> tuple[int, int]:
-    """What changes when meshes are added or removed: their number, and that of the last one."""
+    """Return numbers that change when meshes are added or removed: their count, and that of the last one."""
     (row,) = database.rows("SELECT count(*) AS count, coalesce(max(id), 0) AS last FROM shapes")
     return row["count"], row["last"]

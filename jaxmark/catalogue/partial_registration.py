@@ -1,4 +1,4 @@
-"""Bring a part of a shape onto many originals, to tell which of those that look alike it was cut from.
+"""Register a part of a shape to many originals, to distinguish the one it was cut from among those that look alike.
 
 Local shape gives poses of the part on a few originals of different shape (`jaxmark.alignment.features`). Near
 duplicates have much the same frame, so that the poses which fit best are tried on those that look like these originals,
@@ -22,7 +22,7 @@ from jaxmark.geometry.pose import Points, Pose
 from jaxmark.geometry.surfaces import Surface
 
 _SAMPLES = 300  # points of the part
-_POSES = 3  # of each hand and reference
+_POSES = 3  # of each reference and its reflection
 _KEPT_POSES = 2  # of each reference that is kept
 _KEPT_REFERENCES = 3  # those that a part fits best
 _CLOSE = 40  # candidates that a part is fitted to as well as it can be
@@ -49,8 +49,8 @@ class Target:
 
     def fit(self, part: Points, pose: Pose, rounds: int = _ROUNDS) -> tuple[float, Pose]:
         """Improve a part's pose; returns the distance that it leaves, and the pose, never a worse one."""
-        first, start = (self.off(part, pose), pose), _scale(pose)
-        scale = start
+        first = self.off(part, pose), pose
+        scale = start = float(np.cbrt(abs(np.linalg.det(pose.matrix))))
         for _ in range(rounds):
             posed = pose(part)
             off, near = map(np.asarray, self.tree.query(posed))
@@ -64,10 +64,10 @@ class Target:
             pose, scale = pose.then(Pose(grown * (u @ vt), step[4:])), scale * grown
             if np.abs(step).max() < 1e-4:
                 break
-        return min(first, (self.off(part, pose), pose), key=lambda end: end[0])
+        return _least([first, (self.off(part, pose), pose)])
 
     def off(self, part: Points, pose: Pose) -> float:
-        """The mean distance of a part's points in a pose from the planes, without the largest."""
+        """Compute the mean distance of a part's points in a pose from the planes, without the largest."""
         posed = pose(part)
         off, near = map(np.asarray, self.tree.query(posed))
         height = np.abs(np.sum((posed - self.points[near]) * self.normals[near], axis=1))
@@ -84,14 +84,9 @@ class Placed(NamedTuple):
 
 
 class Part:
-    """A part of a shape, ready to be fitted."""
+    """A part of a shape, ready to be fitted; refused if it has no faces with an extent."""
 
     def __init__(self, mesh: Mesh) -> None:
-        """Spread points over it.
-
-        Raises:
-            JaxmarkError: if it has no faces with an extent.
-        """
         seen = descriptors.spread(mesh, _SAMPLES)
         if seen is None or not len(mesh.faces):
             raise JaxmarkError("A part without a surface fits nothing; it is compared as a whole.")
@@ -119,9 +114,7 @@ class Part:
             poses: on originals that look like it.
         """
         found = {
-            number: min(
-                (Target(points).fit(self.points, pose, _FIRST_ROUNDS) for pose in poses[number]), key=lambda end: end[0]
-            )
+            number: _least([Target(points).fit(self.points, pose, _FIRST_ROUNDS) for pose in poses[number]])
             for number, points in candidates.items()
         }
         close = sorted(found, key=lambda number: found[number][0])[:_CLOSE]
@@ -130,25 +123,20 @@ class Part:
 
 
 def fit_whole(shape: Mesh, candidates: Sequence[Points]) -> Float64[np.ndarray, " candidates"]:
-    """Find how well a whole shape fits each of several originals, the likeliest first; see `Part.fit`.
+    """Compute how well a whole shape fits each of several originals, the likeliest first; see `Part.fit`.
 
-    Its principal axes are brought onto those of the first ones.
+    Its principal axes are aligned with those of the first ones.
     """
     seen = descriptors.spread(shape, _SAMPLES)
     if seen is None:
         return np.full(len(candidates), np.inf)
-    few, found = seen.points, []
-    for points in candidates[:_WHOLE_REFERENCES]:
-        target = Target(points)
-        starts = poses_by_axes(points, few)
-        found += [target.fit(few, pose, rounds=_FIRST_ROUNDS) for pose in starts]
+    few, found, targets = seen.points, [], [Target(points) for points in candidates]
+    for target in targets[:_WHOLE_REFERENCES]:
+        found += [target.fit(few, pose, rounds=_FIRST_ROUNDS) for pose in poses_by_axes(target.points, few)]
     poses = [pose for _, pose in sorted(found, key=lambda end: end[0])[:_WHOLE_POSES]]
-    off = np.full(len(candidates), np.inf)
-    for place, points in enumerate(candidates):
-        target = Target(points)
-        off[place] = min((target.fit(few, pose)[0] for pose in poses), default=np.inf)
-    return off
+    return np.array([min((target.fit(few, pose)[0] for pose in poses), default=np.inf) for target in targets])
 
 
-def _scale(pose: Pose) -> float:
-    return float(np.cbrt(abs(np.linalg.det(pose.matrix))))
+def _least(ends: Sequence[tuple[float, Pose]]) -> tuple[float, Pose]:
+    """Return the fit that leaves the least distance."""
+    return min(ends, key=lambda end: end[0])

@@ -11,9 +11,9 @@ import jaxmark as jm
 from jaxmark.app.find_commands import describe
 from jaxmark.catalogue import Finder, Match, Verdict
 from jaxmark.catalogue.descriptors import centred
-from jaxmark.catalogue.fitting import Part, fit_whole
+from jaxmark.catalogue.identification import split
 from jaxmark.catalogue.landmarks import KEPT, MOST, LandmarkIndex, landmarks
-from jaxmark.catalogue.pieces import split
+from jaxmark.catalogue.partial_registration import Part, fit_whole
 from jaxmark.geometry.mesh import compact
 from jaxmark.watermark.coding.keys import commitment
 from tests.app.test_cli import Workshop
