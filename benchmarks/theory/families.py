@@ -131,7 +131,7 @@ def make_sample(name: str, mesh: jm.Mesh, degree: int) -> Sample:
     with jax.enable_x64(True):
         density, energy = (
             np.asarray(moments(operator, jnp.asarray(signal), degree=degree // 2 + 1)).sum(axis=1)[: degree + 1]
-            for signal in (white_probes(operator, jax.random.key(0), PROBES), x)
+            for signal in (white_probes(operator, 0, PROBES), x)
         )
     return Sample(name, operator, x, tuple(quadrature(operator, one, NODES) for one in x.T), density, energy)
 

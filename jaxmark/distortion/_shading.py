@@ -265,7 +265,7 @@ def _hidden(links: Laplacian, normals: Array, length: Array, count: int) -> tupl
     for some in _by_length(_diffusions(count)):
         # Each band's energy and the lengths are averaged by the same series: columns of one signal.
         columns = jnp.concatenate([energy[start : start + len(some)], jnp.tile(length, (len(some), 1))]).T
-        means.append(filter(links, jnp.tile(jnp.asarray(some, dtype).T, (1, 2)), columns).T.reshape(2, len(some), -1))
+        means.append(filter(links, jnp.tile(jnp.asarray(some, dtype), (2, 1)), columns).T.reshape(2, len(some), -1))
         start += len(some)
     around, local = jnp.concatenate(means, axis=1)
     contrast = math.tan(_INCIDENCE) * root(around)

@@ -28,7 +28,7 @@ _BANDS_AT_ONCE = 5  # band components that are formed together where each is use
 
 @jax.jit
 def filter(
-    operator: Operator, coefficients: Float[Array | np.ndarray, " terms *filters"], x: Signal
+    operator: Operator, coefficients: Float[Array | np.ndarray, "*filters terms"], x: Signal
 ) -> Float[Array, " vertices *columns"]:
     """Filter a signal: f(Δ)x for the Chebyshev series f(λ) = Σ_k c_k T_k(λ - 1), as one `lax.scan`.
 
@@ -39,7 +39,7 @@ def filter(
 
     Args:
         operator: the Laplacian, of N vertices.
-        coefficients: `[degree + 1]`, or `[degree + 1, C]` for one filter per column of `x`.
+        coefficients: `[degree + 1]`, or `[C, degree + 1]` for one filter per column of `x`.
         x: `[N]` or `[N, C]`.
 
     Returns:
@@ -51,17 +51,16 @@ def filter(
     x = jnp.asarray(x)
     check_signal("filter", operator, x)
     c = jnp.asarray(coefficients).astype(x.dtype)
-    if c.ndim not in (1, 2) or len(c) == 0 or (c.ndim == 2 and c.shape[1:] != x.shape[1:]):
+    if c.ndim not in (1, 2) or c.shape[-1] == 0 or (c.ndim == 2 and c.shape[:1] != x.shape[1:]):
         raise JaxmarkError(
-            f"filter needs coefficients [degree + 1] or [degree + 1, C] for a signal {x.shape}, got {c.shape}."
+            f"filter needs coefficients [degree + 1] or [C, degree + 1] for a signal {x.shape}, got {c.shape}."
         )
-    per_column = c if c.ndim == x.ndim else jnp.broadcast_to(c[:, None], (len(c), x.shape[1]))
-    return recurrence.filtered(operator, per_column, x)
+    return recurrence.filtered(operator, jnp.broadcast_to(c, (*x.shape[1:], c.shape[-1])).T, x)
 
 
 @jax.jit
 def transpose(
-    operator: Operator, coefficients: Float[Array | np.ndarray, " terms *filters"], y: Signal
+    operator: Operator, coefficients: Float[Array | np.ndarray, "*filters terms"], y: Signal
 ) -> Float[Array, " vertices *columns"]:
     """f(Δ)ᵀy = M f(Δ) M⁻¹y, by the self-adjointness of Δ: the Euclidean adjoint of `filter`, with its arguments."""
     y = jnp.asarray(y)

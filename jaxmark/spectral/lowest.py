@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.scipy.sparse.linalg import cg
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.seeds import Seed, random_key
 from jaxmark.spectral.lanczos import symmetric
 from jaxmark.spectral.laplacian import Operator
 from jaxmark.spectral.linear import Linear
@@ -31,7 +32,7 @@ class LowestPairs(NamedTuple):
 
 
 @partial(jax.jit, static_argnames=("count", "dtype"))
-def lowest_eigenpairs(operator: Operator, count: int, key: PRNGKeyArray, *, dtype: Any = jnp.float32) -> LowestPairs:
+def lowest_eigenpairs(operator: Operator, count: int, seed: Seed, *, dtype: Any = jnp.float32) -> LowestPairs:
     """Compute the lowest eigenpairs by iterating subspaces under Chebyshev filters; for up to a hundred of them.
 
     Unlike `eigenpairs`, which runs on the host, this works under `jit` and `vmap`, and has derivatives with respect to
@@ -42,8 +43,8 @@ def lowest_eigenpairs(operator: Operator, count: int, key: PRNGKeyArray, *, dtyp
     Args:
         operator: the Laplacian, of N vertices.
         count: number of pairs, null vectors included, at most the number of vertices.
-        key: any random key, from which the iteration starts; converged pairs depend on it by signs, and by the bases of
-            eigenspaces.
+        seed: a number or a JAX random key, of the start of the iteration; converged pairs depend on it by signs, and by
+            the bases of eigenspaces.
         dtype: float32 or float64.
 
     Returns:
@@ -58,7 +59,7 @@ def lowest_eigenpairs(operator: Operator, count: int, key: PRNGKeyArray, *, dtyp
         raise JaxmarkError(f"A graph of {size} vertices has 1 to {size} eigenpairs, not {count}.")
     if dtype not in (jnp.float32, jnp.float64):
         raise JaxmarkError(f"lowest_eigenpairs computes in float32 or float64, not in {jnp.dtype(dtype)}.")
-    start = jax.random.normal(key, (size, block), dtype)
+    start = jax.random.normal(random_key(seed), (size, block), dtype)
     values, vectors = _pairs(count, operator, jnp.where(operator.linked(start), start, 0))
     left = _product(operator, vectors)(vectors) - values * vectors
     residual = jnp.sqrt(jnp.max(jnp.sum(left**2, axis=0)[:count]))

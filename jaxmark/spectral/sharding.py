@@ -244,14 +244,14 @@ def place(parts: ShardedLaplacian, devices: Devices) -> ShardedLaplacian:
 @jax.jit
 def filter_sharded(
     operator: ShardedLaplacian,
-    coefficients: Float[Array | np.ndarray, " terms *filters"],
+    coefficients: Float[Array | np.ndarray, "*filters terms"],
     x: Float[Array, "devices rows *columns"],
 ) -> Float[Array, "devices rows *columns"]:
     """Filter a signal over several devices: f(Δ)x in O(N / devices) memory on each, derivatives included.
 
     Args:
         operator: the Laplacian, placed on its devices by `shard`.
-        coefficients: `[degree + 1]`, or `[degree + 1, C]` for one filter per column; the same on all devices.
+        coefficients: `[degree + 1]`, or `[C, degree + 1]` for one filter per column; the same on all devices.
         x: `[devices, rows]` or `[devices, rows, C]`, from `ShardedLaplacian.scatter`.
 
     Returns:

@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float64, Int64, PRNGKeyArray
+from jaxtyping import Float64, Int64
 from scipy import linalg, sparse
 from scipy.sparse import csgraph
 from scipy.sparse import linalg as sparse_linalg
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.seeds import Seed, random_key
 from jaxmark.spectral.laplacian import Laplacian, centre, sparse_matrices
 
 # Up to this number of vertices, a dense decomposition is faster than an iterative one, and finds every eigenvalue.
@@ -115,7 +116,7 @@ def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: 
     return Quadrature(nodes, norm**2 * vectors[0] ** 2)
 
 
-def white_probes(operator: Laplacian, key: PRNGKeyArray, probes: int) -> Float64[np.ndarray, "vertices probes"]:
+def white_probes(operator: Laplacian, seed: Seed, probes: int) -> Float64[np.ndarray, "vertices probes"]:
     """Random signals whose spectral measures sum, in expectation, to the counting measure of the eigenvalues.
 
     The signals are random signs over √M, as in Hutchinson's estimator: Σ_p ⟨u_p, f(Δ)u_p⟩_M estimates Σ_i f(λ_i), over
@@ -124,14 +125,14 @@ def white_probes(operator: Laplacian, key: PRNGKeyArray, probes: int) -> Float64
 
     Args:
         operator: the Laplacian, of N vertices.
-        key: any random key but a mark's, because bands must not depend on that one.
+        seed: a number or a JAX random key; nothing secret, because bands must not depend on a mark's key.
         probes: number of signals.
 
     Returns:
         `[N, probes]`, centred, 0 at isolated vertices.
     """
     mass = np.where(np.asarray(operator.degree) > 0, np.asarray(operator.mass, np.float64), 0)
-    signs = np.asarray(jax.random.rademacher(key, (len(mass), probes)), np.float64)
+    signs = np.asarray(jax.random.rademacher(random_key(seed), (len(mass), probes)), np.float64)
     scale = np.where(mass > 0, 1 / np.sqrt(np.where(mass > 0, probes * mass, 1)), 0)
     return centre(operator, scale[:, None] * signs)
 
