@@ -32,8 +32,7 @@ from scipy.sparse import linalg as sparse_linalg
 import jaxmark as jm
 from jaxmark.geometry.mesh import make_mesh, weld, weld_mesh
 from jaxmark.spectral import product, rational
-from jaxmark.spectral.bands import bernstein, equal_edges, hat, intervals, lagrange, nodes, report, scaling
-from jaxmark.spectral.bands.damping import Damping
+from jaxmark.spectral.bands import Damping, bernstein, equal_edges, hat, intervals, lagrange, nodes, report, scaling
 from jaxmark.spectral.chebyshev import band_components, filter, moments
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.laplacian import Laplacian, centre, sparse_matrices

@@ -13,8 +13,7 @@ from jaxmark.catalogue.landmarks import KEPT, MOST, landmarks
 from jaxmark.catalogue.thumbnails import thumbnail
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import Scene, load_mesh, load_scene
-from jaxmark.geometry.canonical import grid_spacing, rounded
-from jaxmark.geometry.hashing import geometry_hash
+from jaxmark.geometry.canonical import geometry_hash, grid_spacing, rounded
 from jaxmark.geometry.mesh import Mesh, used_vertices
 
 WHOLE = ""  # name of the mesh of a file that has only one, or of all meshes of a file together

@@ -8,7 +8,7 @@ that were reordered, cropped, merged into a scene or moved are found; those of a
 import numpy as np
 from jaxtyping import Int64, UInt64
 
-from jaxmark.geometry.hashing import mix
+from jaxmark.geometry.canonical import mix
 from jaxmark.geometry.mesh import Mesh, edges, sides, used_vertices
 
 _MIN_RINGS, _MAX_RINGS = 3, 40  # narrower neighbourhoods are alike by chance; wider ones tell no more vertices apart

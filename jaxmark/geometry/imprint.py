@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt32
 
-from jaxmark.geometry.canonical import Canonical, rounded
-from jaxmark.geometry.hashing import mix
+from jaxmark.geometry.canonical import Canonical, mix, rounded
 from jaxmark.geometry.mesh import Mesh, host_mesh, used_vertices, weld
 from jaxmark.geometry.pose import IDENTITY, Points, Pose, similarity
 

@@ -327,10 +327,7 @@ def _area_vectors(mesh: Mesh) -> Float64[np.ndarray, "faces 3"]:
 
 def cross_product(x: Float64[np.ndarray, "rows 3"], y: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3"]:
     """The cross product row by row; four times as fast as NumPy's, which is for any axes."""
-    found = np.empty_like(x)
-    for axis, (one, other) in enumerate(((1, 2), (2, 0), (0, 1))):
-        found[:, axis] = x[:, one] * y[:, other] - x[:, other] * y[:, one]
-    return found
+    return np.stack([x[:, i] * y[:, j] - x[:, j] * y[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
 
 
 def unit(x: Float64[np.ndarray, "*rows 3"]) -> Float64[np.ndarray, "*rows 3"]:

@@ -1,4 +1,4 @@
-"""Closest points on the surfaces of meshes, and points sampled from surfaces, on the host.
+"""Surfaces of meshes: closest points, samples and simplification on the host, and moments, also of traced arrays.
 
 Closest points come from libigl, which agrees with brute force at any scale of coordinates; trimesh does not.
 """
@@ -7,12 +7,27 @@ from functools import cached_property
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Array, Bool, Float, Float64, Int64
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
-from jaxmark.geometry.mesh import Mesh, area, boundary_vertices, unit, used_vertices, vertex_normals
+from jaxmark.geometry.mesh import (
+    Mesh,
+    area,
+    boundary_vertices,
+    compact,
+    diagonal,
+    unit,
+    used_vertices,
+    vertex_normals,
+)
 from jaxmark.geometry.pose import IDENTITY, Points, Pose
+
+Corners = Float[Array | np.ndarray, "faces 3 3"]  # of each face, in order
+
+# Diagonal to which meshes are scaled for fast-simplification. Its thresholds are absolute: in smaller meshes it
+# collapses many edges in arbitrary order, in much larger ones too few.
+_INPUT_DIAGONAL = 100
 
 
 class Samples(NamedTuple):
@@ -121,3 +136,65 @@ def barycentric(
     with np.errstate(all="ignore"):
         share = triangles.points_to_barycentric(np.asarray(mesh.vertices)[np.asarray(mesh.faces)[face]], points)
     return np.nan_to_num(share, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def simplify(mesh: Mesh, faces: int) -> Mesh:
+    """Collapse edges, those of least quadric error first, until about a number of faces is left.
+
+    The program is fast-simplification, which uses the quadrics of Garland and Heckbert, "Surface simplification using
+    quadric error metrics", SIGGRAPH 1997.
+
+    Args:
+        mesh: any mesh, concrete.
+        faces: the number of faces, positive.
+
+    Raises:
+        JaxmarkError: if no face is left, all vertices are at one point, or fast-simplification is missing.
+    """
+    if faces >= len(mesh.faces):
+        return mesh
+    simplifier = require("fast_simplification", "attacks").simplify
+    vertices, indices = map(np.asarray, compact(mesh))
+    centre, length = vertices.mean(axis=0), diagonal(mesh) / _INPUT_DIAGONAL
+    points, indices = simplifier((vertices - centre) / length, indices, target_count=faces)
+    if len(indices) == 0:
+        raise JaxmarkError("fast-simplification left no face of this mesh; ask for a smaller share.")
+    return Mesh(centre + length * points, indices.astype(np.int64))
+
+
+class Moments(NamedTuple):
+    """Mass, centre and covariance of a shape of density 1."""
+
+    mass: Any  # area, or signed volume: positive where normals point outwards
+    centre: Any  # `[3]`
+    covariance: Any  # `[3, 3]`, about the centre, per mass
+
+
+def surface_moments(corners: Corners) -> Moments:
+    """Moments of a surface."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    area = (_cross(b - a, c - a) ** 2).sum(axis=1) ** 0.5 / 2
+    return _moments(area, area.sum(), (a, b, c), (3, 12))
+
+
+def volume_moments(corners: Corners) -> Moments:
+    """Moments of what a closed surface encloses: sums over the tetrahedra that its faces and the origin span.
+
+    The mass is not positive if normals point inwards; centre and covariance do not depend on that.
+    """
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    volume = (a * _cross(b, c)).sum(axis=1) / 6
+    return _moments(volume, volume.sum(), (a, b, c), (4, 20))
+
+
+def _moments(weight: Any, mass: Any, corners: tuple[Any, Any, Any], over: tuple[int, int]) -> Moments:
+    """Moments of simplices: with the sum s of n corners p, they are s/n and (ssᵀ + Σ ppᵀ)/(n(n + 1))."""
+    total = corners[0] + corners[1] + corners[2]
+    centre = weight @ total / over[0] / mass
+    square = sum((part.T * weight) @ part for part in (total, *corners)) / over[1] / mass
+    return Moments(mass, centre, square - centre[:, None] * centre)
+
+
+def _cross(x: Any, y: Any) -> Any:
+    """The cross products of rows, of NumPy or traced arrays."""
+    return x[:, [1, 2, 0]] * y[:, [2, 0, 1]] - x[:, [2, 0, 1]] * y[:, [1, 2, 0]]

@@ -32,6 +32,7 @@ from jaxmark.spectral.learned import cheb_conv as cheb_conv
 from jaxmark.spectral.learned import init_cheb_conv as init_cheb_conv
 from jaxmark.spectral.lowest import LowestPairs as LowestPairs
 from jaxmark.spectral.lowest import lowest_eigenpairs as lowest_eigenpairs
+from jaxmark.spectral.padding import stack as stack
 from jaxmark.spectral.product import Factors as Factors
 from jaxmark.spectral.product import filter_by_factors as filter_by_factors
 from jaxmark.spectral.product import lagrange_factors as lagrange_factors
@@ -45,7 +46,6 @@ from jaxmark.spectral.spectrum import Quadrature as Quadrature
 from jaxmark.spectral.spectrum import eigenpairs as eigenpairs
 from jaxmark.spectral.spectrum import quadrature as quadrature
 from jaxmark.spectral.spectrum import white_probes as white_probes
-from jaxmark.spectral.stacking import stack as stack
 from jaxmark.spectral.weights import cotangent_weights as cotangent_weights
 from jaxmark.spectral.weights import inverse_length_weights as inverse_length_weights
 from jaxmark.spectral.weights import vertex_areas as vertex_areas

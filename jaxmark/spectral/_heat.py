@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.bands._heat import heat_degree
-from jaxmark.spectral.bands._scaling import nodes
+from jaxmark.spectral.bands._lowpasses import heat_degree
+from jaxmark.spectral.bands._partitions import nodes
 from jaxmark.spectral.chebyshev import Signal, filter
 from jaxmark.spectral.laplacian import Operator
 from jaxmark.spectral.precision import check_precision
@@ -60,4 +60,4 @@ def _flow(operator: Operator, x: Array, t: Array, degree: int) -> Array:
     values = jnp.exp(-jnp.multiply.outer(jnp.asarray(nodes(degree + 1), x.dtype), t.astype(x.dtype)))
     # The series that interpolates at the nodes; they ascend in λ, where the transform has them descend.
     series = jax.scipy.fft.dct(values[::-1], axis=0) / (degree + 1)
-    return filter(operator, series.at[0].divide(2), x)
+    return filter(operator, series.at[0].divide(2).T, x)

@@ -11,7 +11,7 @@ import pytest
 from jaxmark.spectral import kernels, recurrence
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.laplacian import Laplacian, graph_laplacian, sparse_matrices
-from jaxmark.spectral.shapes import common_laplacian, pad_edges
+from jaxmark.spectral.padding import common_laplacian, pad_edges
 from tests.dense import tolerance
 from tests.samples import bumpy_sphere
 
