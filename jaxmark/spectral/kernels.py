@@ -41,13 +41,15 @@ def installed() -> bool:
     return True
 
 
-def where_installed(kernel: Computation, scan: Computation) -> Computation:
-    """What computes a function of an operator and arrays on processors: a kernel, or if there is none, a scan.
+def where_installed(kernel: Computation | None, scan: Computation) -> Computation:
+    """Choose between two ways to compute a function of an operator and arrays on processors.
 
     Args:
-        kernel: called with `Rows` and the arrays, of which the last is the signal.
-        scan: called with the operator and the arrays.
+        kernel: called with `Rows` and the arrays, of which the last is the signal; None if there is none.
+        scan: called with the operator and the arrays, where no kernel is installed or the operator has no `Rows`.
     """
+    if kernel is None:
+        return scan
 
     def compute(operator: Any, *arrays: Array) -> Array:
         rows = operator.rows(arrays[-1]) if installed() and arrays[-1].size else None

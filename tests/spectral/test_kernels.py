@@ -94,7 +94,7 @@ def test_results_are_those_of_the_scans(name, double):
                 "constant": (recurrence.filtered(operator, c[:1], x), c[0] * x),
                 "projection": (
                     recurrence.projection(TERMS)(operator, x, u),
-                    recurrence._projection_scan(TERMS, operator, x, u),
+                    recurrence._projection_scan(recurrence.COLUMNS, TERMS, operator, x, u),
                 ),
             }
             for what, (found, expected) in pairs.items():
