@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, edges, face_pairs
-from jaxmark.spectral.laplacian import Laplacian, Lowering, graph_laplacian, sparse_matrices
+from jaxmark.spectral.laplacian import Laplacian, Lowering, graph_laplacian, symmetric_matrix
 from jaxmark.spectral.weights import cotangent_weights, inverse_length_weights, vertex_areas
 
 Weighting = Literal["valence", "inverse-length", "cotangent"]
@@ -332,15 +332,12 @@ def _with_mass(operator: Laplacian, mass: ArrayLike | None, bound: float | None)
 
 def _bound(operator: Laplacian) -> float:
     """A bound of the spectrum of M⁻¹(D - W): by its rows (Gershgorin), or a little above the largest eigenvalue."""
-    stiffness, mass = sparse_matrices(operator)
-    linked = np.flatnonzero(np.asarray(operator.degree) > 0)
+    linked, root, scaled = symmetric_matrix(operator)
     if len(linked) == 0:
         return 2.0
-    inverse = 1 / np.sqrt(mass.diagonal()[linked])
-    by_rows = 2 * float((stiffness.diagonal()[linked] * inverse**2).max())
+    by_rows = 2 * float((np.asarray(operator.degree)[linked] * (1 / root) ** 2).max())
     if len(linked) < 3:
         return by_rows
-    scaled = sparse.diags_array(inverse) @ stiffness[linked][:, linked] @ sparse.diags_array(inverse)
     start = np.cos(np.arange(len(linked), dtype=np.float64))  # a fixed start makes the result repeatable
     found: Any = linalg.eigsh(scaled, 1, which="LA", tol=1e-3, v0=start, return_eigenvectors=False)  # pyright: ignore[reportArgumentType]
     return min(by_rows, _BOUND_MARGIN * float(found[0]))

@@ -46,7 +46,7 @@ class Operator(Protocol):
         ...
 
     def linked(self, like: Shaped[Array, " vertices *columns"]) -> Bool[Array, " vertices *ones"]:
-        """Which vertices have edges, to select from signals like this."""
+        """A mask of the vertices that have edges, to select from signals like this."""
         ...
 
     @property
@@ -85,7 +85,7 @@ class Neighbours(NamedTuple):
     rest: Int[Array | np.ndarray, "rest 3"]  # vertex, neighbour, edge without a slot; padding is past the last vertex
     edges: Int[Array | np.ndarray, "slots vertices"] | None  # past the last edge if empty; None without edge weights
     order: Int[Array | np.ndarray, " vertices"] | None = None  # the vertex of each row; None if the orders are the same
-    rank: Int[Array | np.ndarray, " vertices"] | None = None  # the row of each vertex; None likewise
+    rank: Int[Array | np.ndarray, " vertices"] | None = None  # the row of each vertex; None if the orders are the same
 
 
 class Laplacian(NamedTuple):
@@ -152,12 +152,7 @@ class Laplacian(NamedTuple):
         if not jnp.issubdtype(like.dtype, jnp.floating):
             raise JaxmarkError(f"Laplacian.apply needs a floating-point signal, got {like.dtype}.")
         own, inverse = self._own(like)
-        if (table := self._table) is None:
-            total = self._segments(like)
-        elif self.weights is None:
-            total = _gather(table)
-        else:
-            total = _weighted_gather(table, self.weights, like)
+        total = self._by_edges(like) if self._table is None else self._by_table(self._table, like)
         return lambda x: own * x - inverse * total(x)
 
     def rows(self, like: Shaped[Array, " vertices *columns"]) -> Rows | None:
@@ -166,14 +161,11 @@ class Laplacian(NamedTuple):
         if table is None:
             return None
         own, inverse = self._own(flat)
-        weights = rest_weights = None
-        if self.weights is not None and table.edges is not None:
-            padded = jnp.append(jnp.asarray(self.weights).astype(like.dtype), 0)
-            weights, rest_weights = padded[table.edges], padded[table.rest[:, 2]]
+        weights, rest_weights = self._table_weights(table, like)
         return Rows(table.vertices, weights, own - 1, inverse, table.rest, rest_weights, table.order)
 
     def _own(self, like: Array) -> tuple[Array, Array]:
-        """What rows have of themselves in Δ, and by what their neighbours are divided, in the operator's own order."""
+        """The diagonal of Δ, and the factor of the sums over neighbours, in the operator's own order."""
         degree, inverse = (self.enter(rows) for rows in (per_row(self.degree, like), self.inverse_mass(like)))
         own = (degree > 0).astype(like.dtype) if self.lumped_mass is None else degree * inverse
         if self.weights is None and self._table is not None:
@@ -182,7 +174,7 @@ class Laplacian(NamedTuple):
         return own, inverse
 
     def linked(self, like: Shaped[Array, " vertices *columns"]) -> Bool[Array, " vertices *ones"]:
-        """Which vertices have edges, to select from signals like this."""
+        """A mask of the vertices that have edges; see `Operator`."""
         return per_row(self.degree, like) > 0
 
     def inverse_mass(self, like: Shaped[Array, " vertices *columns"]) -> Float[Array, " vertices *ones"]:
@@ -207,7 +199,27 @@ class Laplacian(NamedTuple):
         table = self.neighbours
         return None if table is None or (self.weights is not None and table.edges is None) else table
 
-    def _segments(self, like: Array) -> Callable[[Array], Array]:
+    def _table_weights(self, table: Neighbours, like: Array) -> tuple[Array | None, Array | None]:
+        """The weights of the edges in the table's slots, and of those without a slot; None if all are 1."""
+        if self.weights is None or table.edges is None:
+            return None, None
+        padded = jnp.append(jnp.asarray(self.weights).astype(like.dtype), 0)
+        return padded[table.edges], padded[table.rest[:, 2]]
+
+    def _by_table(self, table: Neighbours, like: Array) -> Callable[[Array], Array]:
+        """The map x → Wx, slot by slot; without weights, each empty slot adds the vertex's own row."""
+        weights, rest_weights = self._table_weights(table, like)
+        factors = [1.0] * len(table.vertices) if weights is None else [per_row(slot, like) for slot in weights]
+        slots, rest = list(zip(factors, table.vertices, strict=True)), jnp.asarray(table.rest)
+        factor = 1.0 if rest_weights is None else per_row(rest_weights, like)
+
+        def total(x: Array) -> Array:
+            found = sum((weight * x[vertex] for weight, vertex in slots), jnp.zeros_like(x))
+            return found.at[rest[:, 0]].add(factor * x[rest[:, 1]]) if len(rest) else found
+
+        return total
+
+    def _by_edges(self, like: Array) -> Callable[[Array], Array]:
         """The map x → Wx by two segment-sums over the edges."""
         tail, head = self.edges[:, 0], self.edges[:, 1]
         weights = 1 if self.weights is None else per_row(self.weights, like)
@@ -312,43 +324,24 @@ def adjacency(pairs: Int[np.ndarray, "edges 2"], size: int) -> sparse.csr_array:
     return sparse.csr_array(sparse.coo_array((edge, (tail, head)), shape=(size, size)))
 
 
-def _gather(table: Neighbours) -> Callable[[Array], Array]:
-    """The map x → Wx slot by slot, for edges without weights; each empty slot adds the vertex's own row."""
-    slots, rest = list(table.vertices), jnp.asarray(table.rest)
-    return lambda x: _with_rest(sum((x[vertex] for vertex in slots), jnp.zeros_like(x)), rest, x)
-
-
-def _weighted_gather(table: Neighbours, weights: Array | np.ndarray, like: Array) -> Callable[[Array], Array]:
-    """The map x → Wx slot by slot, for weighted edges."""
-    assert table.edges is not None
-    padded = jnp.append(jnp.asarray(weights).astype(like.dtype), 0)
-    slots = [(per_row(padded[edge], like), vertex) for edge, vertex in zip(table.edges, table.vertices, strict=True)]
-    rest = jnp.asarray(table.rest)
-    factor = per_row(padded[rest[:, 2]], like)
-    return lambda x: _with_rest(sum((w * x[vertex] for w, vertex in slots), jnp.zeros_like(x)), rest, x, factor)
-
-
-def _with_rest(total: Array, rest: Array, x: Array, factor: Array | float = 1.0) -> Array:
-    """Add the neighbours without a slot, one by one."""
-    return total.at[rest[:, 0]].add(factor * x[rest[:, 1]]) if len(rest) else total
-
-
 def per_row(values: Num[Array | np.ndarray, " rows"], x: Array | np.ndarray) -> Array:
     """Cast one value per row, such as D, to the dtype of `x`, and shape it to broadcast against its columns."""
     return jnp.asarray(values).astype(x.dtype).reshape(-1, *[1] * (x.ndim - 1))
 
 
-def check_signal(name: str, operator: Operator, x: Array | np.ndarray) -> None:
-    """Refuse a signal that is not of the operator's vertices, or in half precision.
+def checked_signal(name: str, operator: Operator, x: Array | np.ndarray) -> Array:
+    """Return a signal as a JAX array, and refuse one that is not of the operator's vertices, or in half precision.
 
     Raises:
         JaxmarkError: if it is not `[N]` or `[N, C]`, in float32 or float64.
     """
+    x = jnp.asarray(x)
     if x.ndim not in (1, 2) or x.shape[0] != operator.mass.shape[0]:
         raise JaxmarkError(
             f"{name} needs a signal [N] or [N, C] with N = {operator.mass.shape[0]} vertices, got {x.shape}."
         )
     check_precision(name, x)
+    return x
 
 
 def centre(
@@ -369,12 +362,10 @@ def centre(
     graph = sparse.coo_array((np.ones(len(tail)), (tail, head)), shape=(size, size))
     count, component = csgraph.connected_components(graph, directed=False)
     mass = np.where(mass > 0, mass, 1.0)
-    total = np.bincount(component, mass, count)
-    means = np.stack([np.bincount(component, mass * column, count) for column in x.T], axis=1) / total[:, None]
-    centred = x - means[component]
-    # A second pass removes the rounding errors that the first leaves at large offsets.
-    rest = np.stack([np.bincount(component, mass * column, count) for column in centred.T], axis=1) / total[:, None]
-    return centred - rest[component]
+    total = np.bincount(component, mass, count)[:, None]
+    for _ in range(2):  # the second pass removes the rounding errors that the first leaves at large offsets
+        x = x - (np.stack([np.bincount(component, mass * column, count) for column in x.T], axis=1) / total)[component]
+    return x
 
 
 def sparse_matrices(operator: Laplacian) -> tuple[sparse.csr_array, sparse.dia_array]:
@@ -387,6 +378,15 @@ def sparse_matrices(operator: Laplacian) -> tuple[sparse.csr_array, sparse.dia_a
     if operator.scale is not None:
         stiffness = stiffness / float(operator.scale)
     return stiffness, sparse.diags_array(np.asarray(operator.mass, np.float64))
+
+
+def symmetric_matrix(operator: Laplacian) -> tuple[Int64[np.ndarray, " linked"], np.ndarray, sparse.csr_array]:
+    """The vertices that have edges, √M on them, and the symmetric form M^½ΔM^-½ of Δ on them, on the host."""
+    stiffness, mass = sparse_matrices(operator)
+    linked = np.flatnonzero(np.asarray(operator.degree) > 0)
+    root = np.sqrt(mass.diagonal()[linked])
+    inverse = sparse.diags_array(1 / root)
+    return linked, root, inverse @ stiffness[linked][:, linked] @ inverse
 
 
 def host_edges(operator: Laplacian) -> tuple[Int[np.ndarray, "edges 2"], Float64[np.ndarray, " edges"]]:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import available, require
 from jaxmark.seeds import Seed, random_key
-from jaxmark.spectral.laplacian import Operator, check_signal
+from jaxmark.spectral.laplacian import Operator, checked_signal
 from jaxmark.spectral.recurrence import convolution, inner_mass
 
 Form = Literal["random-walk", "symmetric", "transposed"]
@@ -130,9 +130,8 @@ def cheb_conv(
     Raises:
         JaxmarkError: if shapes do not fit, the signal is not floating, or the form is unknown.
     """
-    x = jnp.asarray(x)
+    x = checked_signal("cheb_conv", operator, x)
     weight, bias = (jnp.asarray(parameters[name]) for name in ("weight", "bias"))
-    check_signal("cheb_conv", operator, x)
     if x.ndim != 2:
         raise JaxmarkError(f"cheb_conv needs a signal [N, inputs], got {x.shape}.")
     if weight.ndim != 3 or not weight.shape[2] or weight.shape[:2] != (x.shape[1], *bias.shape):

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.laplacian import Operator, check_signal
+from jaxmark.spectral.laplacian import Operator, checked_signal
 
 
 class Factors(NamedTuple):
@@ -99,9 +99,8 @@ def filter_by_factors(
     Raises:
         JaxmarkError: if the shapes do not fit.
     """
-    x = jnp.asarray(x)
+    x = checked_signal("filter_by_factors", operator, x)
     zeros, scales = (jnp.asarray(part).astype(x.dtype) for part in factors)
-    check_signal("filter_by_factors", operator, x)
     if zeros.ndim != 1 or zeros.shape != scales.shape:
         raise JaxmarkError(f"filter_by_factors needs factors [degree], got {zeros.shape} and {scales.shape}.")
     product = operator.product(x)

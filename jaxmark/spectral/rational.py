@@ -13,7 +13,7 @@ from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, Float64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.laplacian import Operator, check_signal, per_row
+from jaxmark.spectral.laplacian import Operator, checked_signal, per_row
 
 
 @partial(jax.jit, static_argnames=("tolerance", "iterations"))
@@ -51,9 +51,8 @@ def filter_rational(
     Raises:
         JaxmarkError: if the shapes do not fit.
     """
-    x = jnp.asarray(x)
+    x = checked_signal("filter_rational", operator, x)
     sections = jnp.asarray(sections).astype(x.dtype)
-    check_signal("filter_rational", operator, x)
     if sections.ndim != 2 or sections.shape[1] != 6:
         raise JaxmarkError(f"filter_rational needs sections [sections, 6], got {sections.shape}.")
     tolerance = 10 * float(jnp.finfo(x.dtype).eps) if tolerance is None else tolerance

@@ -49,12 +49,17 @@ def _scan_terms(
         carry, output = step(carry, following, current, datum)
         return (current, following, carry), output
 
-    # T_1 = Δ̃T_0 is the recurrence with factor 1 and T_{-1} = 0.
-    factors = jnp.full(len(data) - 1, 2, x.dtype).at[:1].set(1)
     # Unrolling saves a copy of the carry in each step, but leaves more to compile.
     unroll = 3 if x.size >= _MIN_UNROLLED_VALUES else 1
-    (_, _, carry), outputs = jax.lax.scan(body, (jnp.zeros_like(x), x, start), (factors, data[1:]), unroll=unroll)
+    (_, _, carry), outputs = jax.lax.scan(
+        body, (jnp.zeros_like(x), x, start), (_factors(len(data), x), data[1:]), unroll=unroll
+    )
     return carry, outputs
+
+
+def _factors(terms: int, x: Array) -> Array:
+    """The factors of the recurrence from T_1 on: T_1 = Δ̃T_0 is that with factor 1 and T_{-1} = 0."""
+    return jnp.full(terms - 1, 2, x.dtype).at[:1].set(1)
 
 
 @dataclass(frozen=True)
@@ -101,13 +106,10 @@ def _pulled_back(family: Family, operator: Operator, w: Array, x: Array, y: Arra
     mass = inner_mass(operator, x)
     x, y, mass = (operator.enter(rows) for rows in (x, y, mass))
     product = operator.product(x)
-
-    def up(state: tuple[Array, Array], factor: Array) -> tuple[tuple[Array, Array], None]:
-        before, t = state
-        return (t, factor * (product(t) - t) - before), None
-
-    factors = jnp.full(len(w) - 1, 2, x.dtype).at[:1].set(1)
-    (before, last), _ = jax.lax.scan(up, (jnp.zeros_like(x), x), factors)
+    (last, before), _ = _scan_terms(
+        operator, x, w, lambda _, t, before, __: ((t, before), None), (x, jnp.zeros_like(x))
+    )
+    factors = _factors(len(w), x)
 
     # Sums over edges have derivatives that only read rows; those of tables would add to them.
     edgewise = operator.by_segments

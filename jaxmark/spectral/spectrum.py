@@ -14,7 +14,7 @@ from scipy.sparse import linalg as sparse_linalg
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.seeds import Seed, random_key
-from jaxmark.spectral.laplacian import Laplacian, centre, sparse_matrices
+from jaxmark.spectral.laplacian import Laplacian, centre, symmetric_matrix
 
 # Up to this number of vertices, a dense decomposition is faster than an iterative one, and finds every eigenvalue.
 _DENSE_LIMIT = 2500
@@ -56,8 +56,8 @@ def eigenpairs(operator: Laplacian, count: int | None = None, *, tolerance: floa
     """
     if count is not None and count < 1:
         raise JaxmarkError(f"eigenpairs(count=...) must be at least 1, got {count}.")
-    linked, root, scaled = _symmetric(operator)
-    size = len(linked)
+    linked, root, matrix = symmetric_matrix(operator)
+    size, scaled = len(linked), sparse.csc_array(matrix)
     null, component = csgraph.connected_components(scaled, directed=False)
     # One pair more than asked for tells whether the last eigenspace is complete.
     wanted = size - null if count is None else min(count + 1, size - null)
@@ -93,8 +93,8 @@ def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: 
     Returns:
         Nodes in [0, 2], and non-negative weights that sum to ⟨x, x⟩_M.
     """
-    linked, root, scaled = _symmetric(operator)
-    vector = root * x[linked]
+    linked, root, matrix = symmetric_matrix(operator)
+    scaled, vector = sparse.csc_array(matrix), root * x[linked]
     norm = float(np.linalg.norm(vector))
     if norm == 0:
         return Quadrature(np.zeros(0), np.zeros(0))
@@ -135,15 +135,6 @@ def white_probes(operator: Laplacian, seed: Seed, probes: int) -> Float64[np.nda
     signs = np.asarray(jax.random.rademacher(random_key(seed), (len(mass), probes)), np.float64)
     scale = np.where(mass > 0, 1 / np.sqrt(np.where(mass > 0, probes * mass, 1)), 0)
     return centre(operator, scale[:, None] * signs)
-
-
-def _symmetric(operator: Laplacian) -> tuple[Int64[np.ndarray, " linked"], np.ndarray, sparse.csc_array]:
-    """The vertices that have edges, √M on them, and the symmetric form M^1/2 Δ M^-1/2 of Δ on them."""
-    stiffness, mass = sparse_matrices(operator)
-    linked = np.flatnonzero(np.asarray(operator.degree) > 0)
-    root = np.sqrt(mass.diagonal()[linked])
-    inverse = sparse.diags_array(1 / root)
-    return linked, root, sparse.csc_array(inverse @ stiffness[linked][:, linked] @ inverse)
 
 
 def _lowest(
