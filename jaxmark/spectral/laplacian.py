@@ -24,6 +24,7 @@ from jaxmark.spectral.kernels import Rows
 from jaxmark.spectral.precision import check_precision
 
 Lowering = Literal["auto", "gather", "segments"]
+Values = Shaped[Array, " vertices *columns"]
 
 # The cost of adding to a row at any index, in units of reading a row: on processors by measurement, elsewhere assumed,
 # because an atomic addition reads and writes.
@@ -45,7 +46,7 @@ class Operator(Protocol):
         """The diagonal of M; 0 where a vertex is isolated, unless it has a mass of its own."""
         ...
 
-    def linked(self, like: Shaped[Array, " vertices *columns"]) -> Bool[Array, " vertices *ones"]:
+    def linked(self, like: Values) -> Bool[Array, " vertices *ones"]:
         """A mask of the vertices that have edges, to select from signals like this."""
         ...
 
@@ -54,21 +55,22 @@ class Operator(Protocol):
         """The same operator in the vertices' order, by sums over edges, whose derivatives by weights only read rows."""
         ...
 
-    def product(
-        self, like: Shaped[Array, " vertices *columns"]
-    ) -> Callable[[Float[Array, " vertices *columns"]], Float[Array, " vertices *columns"]]:
-        """The map x → Δx in the operator's own order, for signals of the shape and dtype of `like`."""
+    def product(self, like: Values) -> Callable[[Values], Values]:
+        """Return the map x → Δx in the operator's own order, for signals of the shape and dtype of `like`.
+
+        Call this outside of loops, for it computes what all products share.
+        """
         ...
 
-    def rows(self, like: Shaped[Array, " vertices *columns"]) -> Rows | None:
+    def rows(self, like: Values) -> Rows | None:
         """The rows of Δ - I for compiled kernels, in the dtype of `like`; None if they are not all at hand."""
         ...
 
-    def enter(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+    def enter(self, x: Values) -> Values:
         """Reorder rows from the vertices' order to the operator's own."""
         ...
 
-    def leave(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+    def leave(self, x: Values) -> Values:
         """Reorder rows from the operator's own order to the vertices' order."""
         ...
 
@@ -111,7 +113,7 @@ class Laplacian(NamedTuple):
         weights: Float[Array | np.ndarray, " edges"],
         lumped_mass: Float[Array | np.ndarray, " vertices"] | None = None,
     ) -> "Laplacian":
-        """The operator of the same edges with other weights, and mass, as a pure function with derivatives.
+        """Replace the weights, and the mass, as a pure function with derivatives.
 
         Args:
             weights: not negative, in the order of `edges`. Products are by table only if the operator had weights.
@@ -131,20 +133,12 @@ class Laplacian(NamedTuple):
         return self._replace(neighbours=None)
 
     @jax.jit
-    def apply(self, x: Float[Array, " vertices *columns"]) -> Float[Array, " vertices *columns"]:
-        """Δx for one signal `[N]` or several `[N, C]`, in the dtype of `x`.
-
-        Raises:
-            JaxmarkError: if `x` is not floating.
-        """
+    def apply(self, x: Values) -> Values:
+        """Compute Δx for one signal `[N]` or several `[N, C]`, in the dtype of `x`, which must be floating."""
         return self.leave(self.product(x)(self.enter(x)))
 
-    def product(
-        self, like: Shaped[Array, " vertices *columns"]
-    ) -> Callable[[Float[Array, " vertices *columns"]], Float[Array, " vertices *columns"]]:
-        """The map x → Δx in the operator's own order, for signals of the shape and dtype of `like`.
-
-        Make it outside of loops, for it computes what all products share.
+    def product(self, like: Values) -> Callable[[Values], Values]:
+        """Return the map x → Δx; see `Operator`.
 
         Raises:
             JaxmarkError: if the signal is not floating.
@@ -155,7 +149,7 @@ class Laplacian(NamedTuple):
         total = self._by_edges(like) if self._table is None else self._by_table(self._table, like)
         return lambda x: own * x - inverse * total(x)
 
-    def rows(self, like: Shaped[Array, " vertices *columns"]) -> Rows | None:
+    def rows(self, like: Values) -> Rows | None:
         """The rows of Δ - I for compiled kernels; see `Operator`."""
         table, flat = self._table, like.reshape(len(like), -1)[:, 0]
         if table is None:
@@ -173,11 +167,11 @@ class Laplacian(NamedTuple):
             own += inverse * per_row(self._table.empty, like)
         return own, inverse
 
-    def linked(self, like: Shaped[Array, " vertices *columns"]) -> Bool[Array, " vertices *ones"]:
+    def linked(self, like: Values) -> Bool[Array, " vertices *ones"]:
         """A mask of the vertices that have edges; see `Operator`."""
         return per_row(self.degree, like) > 0
 
-    def inverse_mass(self, like: Shaped[Array, " vertices *columns"]) -> Float[Array, " vertices *ones"]:
+    def inverse_mass(self, like: Values) -> Float[Array, " vertices *ones"]:
         """1/(M s), by which sums over neighbours are divided, to multiply signals like this; 0 at isolated vertices."""
         # Select before dividing, so that isolated vertices keep finite gradients.
         linked = self.linked(like)
@@ -185,11 +179,11 @@ class Laplacian(NamedTuple):
         mass = mass if self.scale is None else mass * jnp.asarray(self.scale).astype(like.dtype)
         return jnp.where(linked, 1 / jnp.where(linked, mass, 1), 0)
 
-    def enter(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+    def enter(self, x: Values) -> Values:
         """Reorder rows to the operator's own order; see `Operator`."""
         return x if self._table is None or self._table.order is None else x[self._table.order]
 
-    def leave(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+    def leave(self, x: Values) -> Values:
         """Reorder rows to the vertices' order; see `Operator`."""
         return x if self._table is None or self._table.rank is None else x[self._table.rank]
 
@@ -229,10 +223,8 @@ class Laplacian(NamedTuple):
         )
 
     @jax.jit
-    def inner(
-        self, x: Float[Array, " vertices *columns"], y: Float[Array, " vertices *columns"]
-    ) -> Float[Array, " *columns"]:
-        """The inner product ⟨x, y⟩_M = Σ_v M_v x_v y_v, column by column: a scalar for `[N]`, `[C]` for `[N, C]`.
+    def inner(self, x: Values, y: Values) -> Float[Array, " *columns"]:
+        """Compute the inner product ⟨x, y⟩_M = Σ_v M_v x_v y_v: a scalar for `[N]`; `[C]`, by columns, for `[N, C]`.
 
         Raises:
             JaxmarkError: if the shapes differ.
@@ -255,7 +247,7 @@ def graph_laplacian(
         pairs: the edges, each once, none from a vertex to itself.
         size: number of vertices.
         weights: finite and not negative; all 1 unless given.
-        lowering: see `jaxmark.spectral.graphs.from_mesh`.
+        lowering: as in `jaxmark.spectral.graphs.from_mesh`.
     """
     degree = np.bincount(pairs.ravel(), None if weights is None else np.repeat(weights, 2), size).astype(np.float64)
     neighbours = None

@@ -42,25 +42,19 @@ def common_edges(count: int, size: int, valence: float) -> int:
 
 def pad_rows(rows: Shaped[np.ndarray, " rows *columns"], count: int, value: float = 0) -> Shaped[np.ndarray, "..."]:
     """Pad with `value` to `count` rows."""
-    padding = np.full((max(count - len(rows), 0), *rows.shape[1:]), value, rows.dtype)
-    return np.concatenate([rows, padding])
+    return np.concatenate([rows, np.full((max(count - len(rows), 0), *rows.shape[1:]), value, rows.dtype)])
 
 
 def common_laplacian(mesh: Mesh, weights: Weighting = "valence", lowering: Lowering = "auto") -> Laplacian:
-    """`from_mesh`, padded with isolated vertices and with edges past the last vertex.
+    """Build the operator of `from_mesh`, padded with isolated vertices and with edges past the last vertex.
 
     A mesh without faces is a cloud: its points are joined to the nearest ones, as `from_points` does, by edges of
-    weight 1 whatever the weights asked for.
-
-    Pad signals to the operator's size, such as by `pad_rows`.
-
-    Raises:
-        JaxmarkError: see `from_mesh`.
+    weight 1 whatever the weights asked for. Pad signals to the operator's size, such as by `pad_rows`.
     """
     vertices = np.asarray(mesh.vertices, np.float64)
     if len(mesh.faces) == 0:
         pairs, _ = nearest_pairs(vertices, min(_NEIGHBOURS, len(vertices) - 1))
-        # Where one point is near to another, the other mostly is near to the one.
+        # Mostly, of two points each is among the nearest of the other.
         return pad_edges(graph_laplacian(pairs, common_size(len(vertices)), lowering=lowering), 0.75 * _NEIGHBOURS)
     padded = mesh._replace(vertices=pad_rows(vertices, common_size(len(vertices))))
     return pad_edges(from_mesh(padded, weights, lowering=lowering), SURFACE_VALENCE)

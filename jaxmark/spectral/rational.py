@@ -40,13 +40,10 @@ def filter_rational(
         operator: the Laplacian, of N vertices.
         sections: `[sections, 6]`, applied in this order. `[[1, 0, 0, 1, τ, 0]] * p` is p steps of implicit smoothing,
             1/(1 + τλ)^p.
-        x: `[N]` or `[N, C]`.
+        x: `[N]` or `[N, C]`, whose dtype the result keeps.
         tolerance: bound of each solve's residual, relative to the right-hand side, in the M-norm over all columns
             together; by default ten times the machine epsilon of the dtype of `x`.
         iterations: largest number of iterations of each solve.
-
-    Returns:
-        f(Δ)x, in the shape and dtype of `x`.
 
     Raises:
         JaxmarkError: if the shapes do not fit.
@@ -79,13 +76,13 @@ def filter_rational(
 def response(
     sections: Float[np.ndarray, "*bands sections 6"], values: Float[np.ndarray, " values"]
 ) -> Float64[np.ndarray, "*bands values"]:
-    """Frequency response f(λ) at given λ, on the host: the factor by which `filter_rational` scales an eigenvector."""
+    """Evaluate f(λ), by which `filter_rational` scales an eigenvector, at given λ, on the host."""
     powers = np.stack([np.ones_like(values), values, values**2])
     return ((sections[..., :3] @ powers) / (sections[..., 3:] @ powers)).prod(axis=-2)
 
 
 def butterworth(edges: Float[np.ndarray, " edges"], order: int) -> Float64[np.ndarray, "bands sections 6"]:
-    """Bands as differences of Butterworth low-passes 1/(1 + (λ/e)^2p), one at each inner edge e.
+    """Make bands `[bands, 2 · order, 6]` as differences of Butterworth low-passes 1/(1 + (λ/e)^2p) at inner edges e.
 
     The bands are a partition of unity within [0, 1], without any overshoot. Every band but the first has a zero of
     order 2p at λ = 0, where meshes have their energy, and every band falls as (λ/e)^∓2p away from its edges. The
@@ -98,9 +95,6 @@ def butterworth(edges: Float[np.ndarray, " edges"], order: int) -> Float64[np.nd
     Args:
         edges: λ `[bands + 1]`, ascending in [0, 2]; the first and last stand for the ends of the spectrum.
         order: p, at least 1: half of what signal processing calls the order.
-
-    Returns:
-        `[bands, 2 · order, 6]`, by increasing frequency.
 
     Raises:
         JaxmarkError: if the edges do not ascend, there are fewer than three, or the order is below 1.

@@ -1,6 +1,6 @@
 """The spectrum of the Laplacian: eigenpairs, and the spectral measure of a signal, on the host in float64.
 
-Filters never need it; it is the reference for tests and reports, and what the eigenvector scheme is made of.
+Filters never need it; it is the reference for tests and reports, and the basis of the eigenvector scheme.
 """
 
 from typing import NamedTuple
@@ -86,7 +86,7 @@ def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: 
     Reference: Golub, Meurant, "Matrices, Moments and Quadrature with Applications", 2010, ch. 6.
 
     Args:
-        operator: the Laplacian, of N vertices.
+        operator: the Laplacian.
         x: one signal `[N]`, preferably centred.
         steps: number of nodes; the result has fewer if the signal lies in a smaller invariant subspace.
 

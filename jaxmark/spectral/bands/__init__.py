@@ -1,7 +1,8 @@
 """Families of filters as matrices of Chebyshev coefficients `[bands, degree + 1]`, one filter a row.
 
-Bands sum to the constant 1; the scales of `diffusion`, kernels of `heat` and wavelets do not. `report` measures how
-cleanly a family separates a mesh.
+Families are computed on the host in float64. Unless their functions say otherwise, rows go by increasing frequency, and
+sum to the constant 1; the scales of `diffusion`, kernels of `heat` and wavelets do not. `JaxmarkError` is raised for
+arguments outside of the ranges that are given. `report` measures how cleanly a family separates a mesh.
 """
 
 from jaxmark.spectral.bands._lowpasses import diffusion as diffusion

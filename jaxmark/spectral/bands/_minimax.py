@@ -90,12 +90,6 @@ def hat(knots: Float[np.ndarray, " bands"], degree: int) -> Float64[np.ndarray, 
     Args:
         knots: λ `[bands]`, two or more, ascending in [0, 2].
         degree: degree of the polynomials.
-
-    Returns:
-        `[bands, degree + 1]`, by increasing frequency.
-
-    Raises:
-        JaxmarkError: if the knots do not ascend within [0, 2].
     """
     if len(knots) < 2 or knots[0] < 0 or knots[-1] > 2 or not (np.diff(knots) > 0).all():
         raise JaxmarkError(f"hat needs two knots or more that ascend within [0, 2], got {knots}.")

@@ -23,9 +23,6 @@ def damping_factors(name: Damping, terms: int) -> Float64[np.ndarray, " terms"]:
     `"jackson"` is Jackson's kernel (Weiße et al., Rev. Mod. Phys. 78, 2006, eq. 71): the series of a non-negative
     function stays non-negative, and is blurred by about 1/terms in the angle arccos(λ - 1). `"lanczos"` are the
     σ-factors sinc(k/terms). `"none"` is 1 for all terms.
-
-    Raises:
-        JaxmarkError: if the name is unknown.
     """
     k = np.arange(terms)
     match name:
@@ -57,8 +54,8 @@ def scaling(
     """Chebyshev coefficients of the scaling functions, one band a row, of degree bands - 1 (Sohn et al., section 3.4).
 
     Band j of n + 1 is the kernel polynomial K_n(·; ξ_j) = Σ_k T_k(·)T_k(ξ_j), scaled, at the zero
-    ξ_j = cos((2j + 1)π/(2n + 2)) of T_{n+1}. Rows are ordered by *increasing* frequency. The paper counts from the
-    highest band, because the eigenvalues of Δ̃ rise with frequency and its ξ_j fall with j.
+    ξ_j = cos((2j + 1)π/(2n + 2)) of T_{n+1}. The paper counts from the highest band, because the eigenvalues of Δ̃ rise
+    with frequency and its ξ_j fall with j.
 
     Args:
         bands: number of bands, at least 1.
@@ -66,12 +63,6 @@ def scaling(
             at the other nodes but 1/2 of the scale 1/bands. `"halved"` halves that term and scales by 2/bands, which
             gives the Lagrange basis at the nodes. Both are partitions of unity.
         damping: name of the `damping_factors`; they keep the partition of unity.
-
-    Returns:
-        `[bands, bands]`.
-
-    Raises:
-        JaxmarkError: if `bands` is below 1 or a name is unknown.
     """
     if bands < 1:
         raise JaxmarkError(f"scaling needs at least one band, got {bands}.")
@@ -88,20 +79,11 @@ def scaling(
 
 
 def bernstein(bands: int) -> Float64[np.ndarray, "bands terms"]:
-    """Chebyshev coefficients of C(n, j) (λ/2)^j (1 - λ/2)^(n - j), n = bands - 1, one band a row.
+    """Chebyshev coefficients of C(n, j) (λ/2)^j (1 - λ/2)^(n - j), n = bands - 1 ≥ 0, one band a row.
 
     The bands are a partition of unity within [0, 1], without any oscillation, but wide (Sohn et al., section 3.3). Band
     j has its peak at λ = 2j/n and is about √(λ(2 - λ)/n) wide: bands half as wide take four times the degree, where
     other families take twice the degree.
-
-    Args:
-        bands: number of bands, at least 1.
-
-    Returns:
-        `[bands, bands]`, by increasing frequency.
-
-    Raises:
-        JaxmarkError: if `bands` is below 1.
     """
     if bands < 1:
         raise JaxmarkError(f"bernstein needs at least one band, got {bands}.")
@@ -129,10 +111,7 @@ def lagrange(eigenvalues: Float[np.ndarray, " bands"]) -> Float64[np.ndarray, "b
     factors of `product.lagrange_factors` mostly round less, but make no larger spectrum feasible.
 
     Args:
-        eigenvalues: λ `[bands]`, distinct, in [0, 2].
-
-    Returns:
-        `[bands, bands]`, in the order of the eigenvalues.
+        eigenvalues: λ `[bands]`, distinct, in [0, 2]; rows are in their order.
 
     Raises:
         JaxmarkError: if there is no eigenvalue, two coincide, or they crowd so much that the polynomials exceed 1e8.
@@ -169,12 +148,6 @@ def intervals(
         edges: λ `[bands + 1]`, ascending in [0, 2].
         terms: number of terms, degree + 1.
         damping: name of the `damping_factors`.
-
-    Returns:
-        `[bands, terms]`, by increasing frequency.
-
-    Raises:
-        JaxmarkError: if the edges do not ascend within [0, 2], or `damping` is unknown.
     """
     if len(edges) < 2 or edges[0] < 0 or edges[-1] > 2 or not (np.diff(edges) > 0).all():
         raise JaxmarkError(f"intervals needs two edges or more that ascend within [0, 2], got {edges}.")

@@ -1,6 +1,7 @@
 """Banks of graph wavelets: one low-pass and band-passes of growing frequency, as interpolated kernels.
 
 The kernels are those of PyGSP 0.6 for a largest eigenvalue of 2, so that a bank here is its filter of the same name.
+The low-pass is the first row.
 """
 
 import math
@@ -27,12 +28,6 @@ def mexican_hat(bands: int, degree: int | None = None, *, span: float = 20.0) ->
         degree: degree of the polynomials; by default 30√span, where they are within 3e-5 of the kernels. At half of it
             they are off by 2e-3.
         span: largest λ over the smallest that a wavelet resolves, PyGSP's `lpfactor`; at least 1.
-
-    Returns:
-        `[bands, degree + 1]`, the low-pass first, then by increasing frequency.
-
-    Raises:
-        JaxmarkError: if `bands` is below 2 or `span` below 1.
     """
 
     def low(x: np.ndarray) -> np.ndarray:
@@ -45,12 +40,9 @@ def abspline(bands: int, degree: int | None = None, *, span: float = 20.0) -> Fl
     """Chebyshev coefficients of spline wavelets g(sλ), of a scale s a row, and of a low-pass below them.
 
     g(x) is x² up to 1, 4/x² from 2 on, and between them the cubic -5 + 11x - 6x² + x³ that joins them smoothly. The
-    low-pass is γ exp(-(λ span/1.2)⁴) with γ = max g. Scales, reference, arguments and errors raised are those of
-    `mexican_hat`. With the default degree the polynomials are within 4e-3 of the kernels, of 1.38 at the peak. At half
-    of it they are off by 2e-2; the error falls slowly, for g has kinks in its second derivative.
-
-    Returns:
-        `[bands, degree + 1]`, the low-pass first, then by increasing frequency.
+    low-pass is γ exp(-(λ span/1.2)⁴) with γ = max g. Scales, reference and arguments are those of `mexican_hat`. With
+    the default degree the polynomials are within 4e-3 of the kernels, of 1.38 at the peak. At half of it they are off
+    by 2e-2; the error falls slowly, for g has kinks in its second derivative.
     """
 
     def low(x: np.ndarray) -> np.ndarray:
@@ -74,12 +66,6 @@ def meyer(bands: int, degree: int | None = None) -> Float64[np.ndarray, "bands t
         bands: number of filters, at least 2: the low-pass, and bands - 1 wavelets.
         degree: degree of the polynomials; by default 16 · 2^(bands/2), where they are within 2e-3 of the kernels, and
             the squares within 4e-3 of 1. At half of it both are off by a tenth.
-
-    Returns:
-        `[bands, degree + 1]`, the low-pass first, then by increasing frequency.
-
-    Raises:
-        JaxmarkError: if `bands` is below 2.
     """
     _check("meyer", bands)
     scales = 2 / 3 * 2.0 ** np.arange(bands - 2, -1, -1)[:, None]
@@ -104,12 +90,6 @@ def itersine(bands: int, degree: int | None = None) -> Float64[np.ndarray, "band
         degree: degree of the polynomials; by default 16 · bands, where they are within 3e-3 of the kernels, and the
             squares within 1e-3 of 1. The error falls as the square of the degree, for the kernels have kinks in their
             second derivative.
-
-    Returns:
-        `[bands, degree + 1]`, by increasing frequency.
-
-    Raises:
-        JaxmarkError: if `bands` is below 2.
     """
     _check("itersine", bands)
 
