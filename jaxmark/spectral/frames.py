@@ -12,21 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.scipy.signal import fftconvolve
-from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, Float64
 from scipy import fft
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.chebyshev import check_parts, filter, synthesise
+from jaxmark.spectral.chebyshev import Bank, check_parts, filter, synthesise
 from jaxmark.spectral.laplacian import Operator
-from jaxmark.spectral.recurrence import inner_mass
+from jaxmark.spectral.recurrence import inner_mass, solve
 
 _POINTS_PER_DEGREE = 256  # which bound a polynomial to 2e-5 of its range
 _MAX_DEGREE = 2**13  # of the filters of a tight frame
 _MAX_ITERATIONS = 10_000  # enough for float64 where A/B = 1e-5, the smallest that frame_bounds resolves
 
 
-def frame_bounds(coefficients: Float[Array | np.ndarray, "bands terms"]) -> tuple[float, float]:
+def frame_bounds(coefficients: Bank) -> tuple[float, float]:
     """Compute bounds A ≤ Σ_j g_j(λ)² ≤ B on [0, 2] of a bank `[bands, degree + 1]`, on the host.
 
     They hold for certain, up to rounding: a polynomial of degree n is evaluated at the M = 256 n zeros of T_M, and is
@@ -43,9 +42,7 @@ def frame_bounds(coefficients: Float[Array | np.ndarray, "bands terms"]) -> tupl
     return max(middle - radius, 0.0), middle + radius
 
 
-def tight(
-    coefficients: Float[Array | np.ndarray, "bands terms"], *, tolerance: float = 1e-6
-) -> Float64[np.ndarray, "bands more_terms"]:
+def tight(coefficients: Bank, *, tolerance: float = 1e-6) -> Float64[np.ndarray, "bands more_terms"]:
     """Divide a bank's filters by √(Σ_j g_j²), so that `synthesise` inverts `band_components`.
 
     The quotients are no polynomials. They are interpolated, by degrees that double from the bank's own on until the
@@ -73,9 +70,7 @@ def tight(
 
 
 def inverse(
-    operator: Operator,
-    coefficients: Float[Array | np.ndarray, "bands terms"],
-    parts: Float[Array | np.ndarray, "bands vertices *columns"],
+    operator: Operator, coefficients: Bank, parts: Float[Array | np.ndarray, "bands vertices *columns"]
 ) -> Float[Array, " vertices *columns"]:
     """Recover the signal from its parts: x with g_j(Δ)x = y_j, or as close as any signal comes to changed parts.
 
@@ -106,14 +101,8 @@ def inverse(
 @jax.jit
 def _inverse(operator: Operator, c: Array, parts: Array) -> Array:
     power, right = _power(c), synthesise(operator, c, parts)
-    root = jnp.sqrt(inner_mass(operator, right))
-    z, _ = cg(
-        lambda z: root * filter(operator, power, z / root),
-        root * right,
-        tol=10 * float(jnp.finfo(c.dtype).eps),
-        maxiter=_MAX_ITERATIONS,
-    )
-    return z / root
+    mass = inner_mass(operator, right)
+    return solve(lambda x: filter(operator, power, x), right, mass, _MAX_ITERATIONS)
 
 
 def _power(c: Array) -> Array:
@@ -128,7 +117,7 @@ def _at_nodes(row: np.ndarray, points: int) -> Float64[np.ndarray, " points"]:
     return np.asarray(fft.dct(np.concatenate([row[:1], row[1:] / 2]), type=3, n=points))
 
 
-def _matrix(name: str, coefficients: Array | np.ndarray) -> Float64[np.ndarray, "bands terms"]:
+def _matrix(name: str, coefficients: Bank) -> Float64[np.ndarray, "bands terms"]:
     c = np.asarray(coefficients, np.float64)
     if c.ndim != 2 or 0 in c.shape:
         raise JaxmarkError(f"{name} needs coefficients [bands, degree + 1], got {c.shape}.")

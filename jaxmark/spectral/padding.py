@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Array, Shaped
+from jaxtyping import Shaped
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
@@ -113,44 +113,34 @@ def stack(operators: Sequence[Laplacian]) -> Laplacian:
     slots = max((len(table.vertices) for table in tables), default=0)
     rest = max((len(table.rest) for table in tables), default=0)
     ordered = any(table.order is not None for table in tables)
-    padded = [
+    own = np.arange(size, dtype=np.int32)
+
+    def padded(table: Neighbours, edges: int) -> Neighbours:
+        """A table for a graph of more vertices, edges, slots and neighbours without a slot."""
+        old_slots, old_size = np.shape(table.vertices)
+        vertices, empty = np.tile(own, (slots, 1)), np.full(size, slots, np.int32)
+        vertices[:old_slots, :old_size] = table.vertices
+        empty[:old_size] = np.asarray(table.empty) + slots - old_slots
+        looked_up = None
+        if table.edges is not None:
+            looked_up = np.full((slots, size), count, np.int32)
+            looked_up[:old_slots, :old_size] = np.where(np.asarray(table.edges) < edges, table.edges, count)
+        left = np.asarray(table.rest)
+        orders = [
+            np.concatenate([own[:old_size] if order is None else order, own[old_size:]]) if ordered else None
+            for order in (table.order, table.rank)
+        ]
+        return Neighbours(vertices, empty, pad_rows(left[left[:, 0] < old_size], rest, size), looked_up, *orders)
+
+    batch = [
         Laplacian(
             pad_rows(pairs, count, size),
             pad_rows(weights, count) if weighted else None,
             pad_rows(np.asarray(one.degree), size),
-            _padded_table(one.neighbours, len(pairs), size, count, slots, rest, ordered)
-            if alike and one.neighbours is not None
-            else None,
+            padded(one.neighbours, len(pairs)) if alike and one.neighbours is not None else None,
             pad_rows(np.asarray(one.mass), size) if massive else None,
             np.asarray(1.0 if one.scale is None else one.scale) if massive else None,
         )
         for one, (pairs, weights) in zip(operators, found, strict=True)
     ]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *padded)
-
-
-def _padded_table(
-    table: Neighbours, edges: int, size: int, count: int, slots: int, rest: int, ordered: bool
-) -> Neighbours:
-    """A table for a graph of more vertices, edges, slots and neighbours without a slot."""
-    old_slots, old_size = np.shape(table.vertices)
-    own = np.arange(size, dtype=np.int32)
-    vertices = np.tile(own, (slots, 1))
-    vertices[:old_slots, :old_size] = table.vertices
-    empty = np.full(size, slots, np.int32)
-    empty[:old_size] = np.asarray(table.empty) + slots - old_slots
-    looked_up = None
-    if table.edges is not None:
-        looked_up = np.full((slots, size), count, np.int32)
-        looked_up[:old_slots, :old_size] = np.where(np.asarray(table.edges) < edges, table.edges, count)
-    left = np.asarray(table.rest)
-    left = pad_rows(left[left[:, 0] < old_size], rest, size)
-
-    def longer(order: Array | np.ndarray | None) -> np.ndarray | None:
-        if not ordered:
-            return None
-        whole = own.copy()
-        whole[:old_size] = own[:old_size] if order is None else order
-        return whole
-
-    return Neighbours(vertices, empty, left, looked_up, longer(table.order), longer(table.rank))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *batch)

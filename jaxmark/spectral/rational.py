@@ -9,11 +9,11 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, Float64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.laplacian import Operator, checked_signal, per_row
+from jaxmark.spectral.laplacian import Operator, checked_signal
+from jaxmark.spectral.recurrence import inner_mass, solve
 
 
 @partial(jax.jit, static_argnames=("tolerance", "iterations"))
@@ -52,25 +52,18 @@ def filter_rational(
     sections = jnp.asarray(sections).astype(x.dtype)
     if sections.ndim != 2 or sections.shape[1] != 6:
         raise JaxmarkError(f"filter_rational needs sections [sections, 6], got {sections.shape}.")
-    tolerance = 10 * float(jnp.finfo(x.dtype).eps) if tolerance is None else tolerance
-    product = operator.product(x)
-    mass = per_row(operator.enter(jnp.asarray(operator.mass)), x)
-    root = jnp.sqrt(jnp.where(mass > 0, mass, 1))  # an isolated vertex is its own block of Δ
+    product, mass = operator.product(x), operator.enter(inner_mass(operator, x))
 
     def quadratic(c: Array, y: Array) -> Array:
         first = product(y)
         return c[0] * y + c[1] * first + c[2] * product(first)
 
-    def solve(y: Array, section: Array) -> tuple[Array, None]:
-        z, _ = cg(
-            lambda z: root * quadratic(section[3:], z / root),
-            root * quadratic(section[:3], y),
-            tol=tolerance,
-            maxiter=iterations,
-        )
-        return z / root, None
+    def divide(y: Array, section: Array) -> tuple[Array, None]:
+        denominator = partial(quadratic, section[3:])
+        right = quadratic(section[:3], y)
+        return solve(denominator, right, mass, iterations, tolerance), None
 
-    return operator.leave(jax.lax.scan(solve, operator.enter(x), sections)[0])
+    return operator.leave(jax.lax.scan(divide, operator.enter(x), sections)[0])
 
 
 def response(

@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
+from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, PyTree
 
 from jaxmark.spectral.kernels import Computation, component_rows, filter_rows, project_rows, where_installed
@@ -239,6 +240,15 @@ filtered = _filtered(COLUMNS)
 
 #: Σ_k T_k(Δ̃)x W_k as a function of x `[N, inputs]`: `(operator, W, x)` with W `[terms, inputs, outputs]`.
 convolution = _filtered(Family(_mix, lambda t, y: matmul(t.T, y), lambda w: w.mT))
+
+
+def solve(
+    apply: Callable[[Array], Array], right: Array, mass: Array, iterations: int, tolerance: float | None = None
+) -> Array:
+    """Solve f(Δ)x = `right` by conjugate gradients, for the map x → f(Δ)x of a positive f; see `filter_rational`."""
+    root, tolerance = jnp.sqrt(mass), 10 * float(jnp.finfo(right.dtype).eps) if tolerance is None else tolerance
+    z, _ = cg(lambda z: root * apply(z / root), root * right, tol=tolerance, maxiter=iterations)
+    return z / root
 
 
 def inner_mass(operator: Operator, x: Array) -> Array:

@@ -55,9 +55,7 @@ def quadratic_form(operator: Operator, function: Function, x: Signal, *, steps: 
     Raises:
         JaxmarkError: if shapes do not fit, the signal is neither float32 nor float64, or there is no step.
     """
-    x = checked_signal("quadratic_form", operator, x)
-    _check_steps("quadratic_form", steps)
-    return _forms(operator, function, jnp.sqrt(inner_mass(operator, x)) * x, steps)
+    return _forms("quadratic_form", operator, function, x, steps)
 
 
 @partial(jax.jit, static_argnames=("function", "steps"))
@@ -77,18 +75,21 @@ def trace(
         probes: from `white_probes`, which says how large the variance is.
         steps: see `quadratic_form`.
     """
-    u = checked_signal("trace", operator, probes)
-    _check_steps("trace", steps)
-    return jnp.sum(_forms(operator, function, jax.lax.stop_gradient(jnp.sqrt(inner_mass(operator, u))) * u, steps))
+    return jnp.sum(_forms("trace", operator, function, probes, steps, held=True))
 
 
-def _check_steps(name: str, steps: int) -> None:
+def _forms(
+    name: str, operator: Operator, function: Function, x: Array | np.ndarray, steps: int, held: bool = False
+) -> Array:
+    """vᵀf(A)v of v = M^½x column by column, one after the other, as each takes the memory of all its steps.
+
+    If v is held fixed, derivatives with respect to the operator do not pass through it.
+    """
+    x = checked_signal(name, operator, x)
     if steps < 1:
         raise JaxmarkError(f"{name} needs one step or more, got {steps}.")
-
-
-def _forms(operator: Operator, function: Function, v: Array, steps: int) -> Array:
-    """vᵀf(A)v column by column, one after the other, as each takes the memory of all its steps."""
+    root = jnp.sqrt(inner_mass(operator, x))
+    v = (jax.lax.stop_gradient(root) if held else root) * x
     columns = jnp.where(operator.linked(v), v, 0).reshape(len(v), -1).T
     one = jax.checkpoint(lambda column: _form(function, steps, operator, column))
     return jax.lax.map(one, columns).reshape(v.shape[1:])
