@@ -24,10 +24,9 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.spectral import recurrence
 from jaxmark.spectral.bands._lowpasses import heat_degree
 from jaxmark.spectral.bands._partitions import nodes
-from jaxmark.spectral.laplacian import Laplacian, Operator, checked_signal, per_row
+from jaxmark.spectral.laplacian import Laplacian, Operator, Signal, checked_signal, per_row
 from jaxmark.spectral.precision import check_precision, einsum, matmul
 
-Signal = Float[Array | np.ndarray, " vertices *columns"]
 Series = Float[Array | np.ndarray, "*filters terms"]
 Bank = Float[Array | np.ndarray, "bands terms"]
 

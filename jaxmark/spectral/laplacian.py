@@ -24,6 +24,7 @@ from jaxmark.spectral.kernels import Rows
 from jaxmark.spectral.precision import check_precision
 
 Lowering = Literal["auto", "gather", "segments"]
+Signal = Float[Array | np.ndarray, " vertices *columns"]
 Values = Shaped[Array, " vertices *columns"]
 
 # The cost of adding to a row at any index, in units of reading a row: on processors by measurement, elsewhere assumed,

@@ -46,10 +46,15 @@ class Linear:
         if self.derivatives is not None:
             return self.derivatives[index](*arguments, tangent)
 
-        def of_one(part: PyTree) -> Array:
-            return self.apply(*arguments[:index], combine(part, arguments[index]), *arguments[index + 1 :])
+        def of_one(changed: PyTree) -> Array:
+            return self.apply(*arguments[:index], changed, *arguments[index + 1 :])
 
-        return jax.jvp(of_one, (floats(arguments[index]),), (tangent,))[1]
+        return along(of_one, arguments[index], tangent)
+
+
+def along(function: Callable[[Any], Array], tree: PyTree, change: PyTree) -> Array:
+    """The derivative of a function in the direction of a change of a pytree's floating leaves."""
+    return jax.jvp(lambda part: function(combine(part, tree)), (floats(tree),), (change,))[1]
 
 
 def floats(tree: PyTree) -> PyTree:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.laplacian import Operator, checked_signal
+from jaxmark.spectral.laplacian import Operator, Signal, checked_signal
 
 
 class Factors(NamedTuple):
@@ -73,9 +73,7 @@ def leja(nodes: Float[np.ndarray, " nodes"]) -> Int64[np.ndarray, " nodes"]:
 
 
 @jax.jit
-def filter_by_factors(
-    operator: Operator, factors: Factors, x: Float[Array | np.ndarray, " vertices *columns"]
-) -> Float[Array, " vertices *columns"]:
+def filter_by_factors(operator: Operator, factors: Factors, x: Signal) -> Float[Array, " vertices *columns"]:
     """Filter a signal factor by factor: f(Δ)x as one `lax.scan`, with one product per factor.
 
     All bands at once are `jax.vmap(filter_by_factors, (None, 0, None))(operator, factors, x)`; they share no products,

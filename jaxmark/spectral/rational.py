@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.laplacian import Operator, checked_signal
+from jaxmark.spectral.laplacian import Operator, Signal, checked_signal
 from jaxmark.spectral.recurrence import inner_mass, solve
 
 
@@ -20,7 +20,7 @@ from jaxmark.spectral.recurrence import inner_mass, solve
 def filter_rational(
     operator: Operator,
     sections: Float[Array | np.ndarray, "sections 6"],
-    x: Float[Array | np.ndarray, " vertices *columns"],
+    x: Signal,
     *,
     tolerance: float | None = None,
     iterations: int = 2000,

@@ -22,7 +22,7 @@ from jaxtyping import Array, PyTree
 
 from jaxmark.spectral.kernels import Computation, component_rows, filter_rows, project_rows, where_installed
 from jaxmark.spectral.laplacian import Operator, per_row
-from jaxmark.spectral.linear import Linear, combine, floats
+from jaxmark.spectral.linear import Linear, along, combine, floats
 from jaxmark.spectral.precision import einsum, matmul
 
 _ROWS_AT_ONCE = 128  # rows that are summed as one wide row
@@ -132,11 +132,6 @@ def _pulled_back(family: Family, operator: Operator, w: Array, x: Array, y: Arra
     start = (before, last, family.mix(y, family.turn(w[-1])), jnp.zeros_like(x), jax.tree.map(jnp.zeros_like, parts))
     (*_, total), _ = jax.lax.scan(down, start, (factors, w[:-1]), reverse=True)
     return total
-
-
-def along(function: Callable[[Operator], Array], operator: Operator, change: PyTree) -> Array:
-    """The derivative of a function in the direction of a change of the operator's floating leaves."""
-    return jax.jvp(lambda part: function(combine(part, operator)), (floats(operator),), (change,))[1]
 
 
 def changes_of(operator: Operator, tangents: Any) -> PyTree | None:

@@ -16,11 +16,10 @@ from jaxtyping import Array, Float
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.seeds import Seed, random_key
-from jaxmark.spectral.chebyshev import Signal
-from jaxmark.spectral.laplacian import Operator, checked_signal
-from jaxmark.spectral.linear import Linear
+from jaxmark.spectral.laplacian import Operator, Signal, checked_signal
+from jaxmark.spectral.linear import Linear, along
 from jaxmark.spectral.precision import matmul
-from jaxmark.spectral.recurrence import along, changes_of, inner_mass
+from jaxmark.spectral.recurrence import changes_of, inner_mass
 
 Function = Callable[[Float[Array, " values"]], Float[Array, " values"]]
 

@@ -67,7 +67,6 @@ def meyer(bands: int, degree: int | None = None) -> Float64[np.ndarray, "bands t
         degree: degree of the polynomials; by default 16 · 2^(bands/2), where they are within 2e-3 of the kernels, and
             the squares within 4e-3 of 1. At half of it both are off by a tenth.
     """
-    _check("meyer", bands)
     scales = 2 / 3 * 2.0 ** np.arange(bands - 2, -1, -1)[:, None]
 
     def kernels(values: np.ndarray) -> np.ndarray:
@@ -76,7 +75,7 @@ def meyer(bands: int, degree: int | None = None) -> Float64[np.ndarray, "bands t
         rise[0], fall[0] = 1, np.cos(np.pi / 2 * _step(1.5 * x[0] - 1))
         return rise * fall
 
-    return _interpolate(kernels, math.ceil(16 * 2 ** (bands / 2)) if degree is None else degree)
+    return _interpolate("meyer", bands, kernels, math.ceil(16 * 2 ** (bands / 2)) if degree is None else degree)
 
 
 def itersine(bands: int, degree: int | None = None) -> Float64[np.ndarray, "bands terms"]:
@@ -91,13 +90,12 @@ def itersine(bands: int, degree: int | None = None) -> Float64[np.ndarray, "band
             squares within 1e-3 of 1. The error falls as the square of the degree, for the kernels have kinks in their
             second derivative.
     """
-    _check("itersine", bands)
 
     def kernels(values: np.ndarray) -> np.ndarray:
         x = (bands - 1) / 4 * values - np.arange(bands)[:, None] / 2
         return np.where(np.abs(x) <= 0.5, np.sin(np.pi / 2 * np.cos(np.pi * x) ** 2), 0)
 
-    return _interpolate(kernels, 16 * bands if degree is None else degree)
+    return _interpolate("itersine", bands, kernels, 16 * bands if degree is None else degree)
 
 
 def _step(x: np.ndarray) -> np.ndarray:
@@ -110,20 +108,17 @@ def _scaled(
     name: str, bands: int, degree: int | None, span: float, low: Kernel, wavelet: Kernel
 ) -> Float64[np.ndarray, "bands terms"]:
     """A low-pass, and a wavelet at scales from `span` to 1/2."""
-    _check(name, bands)
     if not span >= 1:
         raise JaxmarkError(f"{name}(span=...) must be at least 1, got {span}.")
-    scales = np.geomspace(span, 0.5, bands - 1)[:, None]
-    return _interpolate(
-        lambda values: np.vstack([low(span * values), wavelet(scales * values)]),
-        math.ceil(30 * math.sqrt(span)) if degree is None else degree,
-    )
+
+    def kernels(values: np.ndarray) -> np.ndarray:
+        scales = np.geomspace(span, 0.5, bands - 1)[:, None]
+        return np.vstack([low(span * values), wavelet(scales * values)])
+
+    return _interpolate(name, bands, kernels, math.ceil(30 * math.sqrt(span)) if degree is None else degree)
 
 
-def _check(name: str, bands: int) -> None:
+def _interpolate(name: str, bands: int, kernels: Kernel, degree: int) -> Float64[np.ndarray, "bands terms"]:
     if bands < 2:
         raise JaxmarkError(f"{name} needs at least two bands, got {bands}.")
-
-
-def _interpolate(kernels: Kernel, degree: int) -> Float64[np.ndarray, "bands terms"]:
     return kernels(nodes(degree + 1)) @ scaling(degree + 1)
