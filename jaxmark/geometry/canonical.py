@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int64, UInt64
+from jaxtyping import UInt64
 from numpy.typing import ArrayLike
 
 from jaxmark.errors import JaxmarkError
@@ -48,11 +48,7 @@ def geometry_hash(mesh: Mesh) -> bytes:
 
 
 def grid_spacing(mesh: Mesh) -> float:
-    """The spacing of the grid for a mesh, in its units: a power of two, so that rounding is exact.
-
-    Raises:
-        JaxmarkError: see `diagonal`.
-    """
+    """The spacing of the grid for a mesh, in its units: a power of two, so that rounding is exact; see `diagonal`."""
     return 2.0 ** math.floor(math.log2(diagonal(mesh) / _CELLS))
 
 
@@ -91,11 +87,12 @@ def rounded(mesh: Mesh, spacing: float) -> Canonical:
     point = place[point]
     first = np.empty(len(used), np.int64)
     first[point[::-1]] = np.arange(len(point))[::-1]
-    points = Mesh(cells[first], _sorted_faces(place[corners]))
-    count = int(used.sum())
-    vertices, faces = np.asarray(points.vertices)[:count], points.faces
-    found = _digest(b"jaxmark/2/geometry", count, len(faces), spacing, vertices, faces)
-    return Canonical(points, Weld(point, first), found)
+    faces = place[corners]
+    faces = np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    faces = faces[np.lexsort(faces.T[::-1])]
+    points, count = cells[first], int(used.sum())
+    found = _digest(b"jaxmark/2/geometry", count, len(faces), spacing, points[:count], faces)
+    return Canonical(Mesh(points, faces), Weld(point, first), found)
 
 
 def order_hash(mesh: Mesh, welded: Weld) -> bytes:
@@ -124,9 +121,3 @@ def _digest(label: bytes, *arrays: ArrayLike) -> bytes:
     for array in map(np.asarray, arrays):
         state.update(array.astype("<f8" if array.dtype.kind == "f" else "<i8").tobytes())
     return state.digest()
-
-
-def _sorted_faces(faces: Int64[np.ndarray, "faces 3"]) -> Int64[np.ndarray, "faces 3"]:
-    """Faces in ascending order, each from its lowest corner on."""
-    turned = np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
-    return turned[np.lexsort(turned.T[::-1])]

@@ -1,4 +1,4 @@
-"""Surfaces of meshes: closest points, samples and simplification on the host, and moments, also of traced arrays.
+"""Surfaces of meshes: closest points and samples on the host, and moments, also of traced arrays.
 
 Closest points come from libigl, which agrees with brute force at any scale of coordinates; trimesh does not.
 """
@@ -11,23 +11,10 @@ from jaxtyping import Array, Bool, Float, Float64, Int64
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
-from jaxmark.geometry.mesh import (
-    Mesh,
-    area,
-    boundary_vertices,
-    compact,
-    diagonal,
-    unit,
-    used_vertices,
-    vertex_normals,
-)
+from jaxmark.geometry.mesh import Mesh, area, boundary_vertices, unit, used_vertices, vertex_normals
 from jaxmark.geometry.pose import IDENTITY, Points, Pose
 
 Corners = Float[Array | np.ndarray, "faces 3 3"]  # of each face, in order
-
-# Diagonal to which meshes are scaled for fast-simplification. Its thresholds are absolute: in smaller meshes it
-# collapses many edges in arbitrary order, in much larger ones too few.
-_INPUT_DIAGONAL = 100
 
 
 class Samples(NamedTuple):
@@ -40,14 +27,14 @@ class Samples(NamedTuple):
 
 @runtime_checkable
 class Geometry(Protocol):
-    """What registration brings onto each other: the surface of a mesh, or the points of a cloud."""
+    """A shape that registration aligns: the surface of a mesh, or the points of a cloud."""
 
     def anchors(self) -> tuple[Points, Points]:
         """Points of the shape itself, and unit normals there."""
         ...
 
     def closest(self, points: Points, pose: Pose = IDENTITY) -> tuple[Points, Int64[np.ndarray, " points"]]:
-        """The closest places on the shape, placed by a pose, and what of the shape each lies on."""
+        """The closest places on the shape, placed by a pose, and the face or point of each."""
         ...
 
     def sample(self, count: int) -> Samples:
@@ -69,14 +56,9 @@ class Surface:
         return tree
 
     def closest(self, points: Points, pose: Pose = IDENTITY) -> tuple[Points, Int64[np.ndarray, " points"]]:
-        """Find the closest points on the surface, placed by a pose, and the faces they lie on.
+        """Find the closest points `[P, 3]` on the surface, placed by a pose, and the index of a face for each.
 
-        Args:
-            points: the query points `[P, 3]`.
-            pose: a map of the surface, a similarity or nearly.
-
-        Returns:
-            The closest points `[P, 3]` on the placed surface, and the index of a face for each.
+        The pose is a similarity, or nearly one.
 
         Raises:
             JaxmarkError: if libigl is missing.
@@ -91,7 +73,7 @@ class Surface:
         return np.asarray(self.mesh.vertices)[used], vertex_normals(self.mesh)[used]
 
     def sample(self, count: int) -> Samples:
-        """Sample points, see `sample`."""
+        """Sample points; see `sample`."""
         return sample(self.mesh, count)
 
 
@@ -136,30 +118,6 @@ def barycentric(
     with np.errstate(all="ignore"):
         share = triangles.points_to_barycentric(np.asarray(mesh.vertices)[np.asarray(mesh.faces)[face]], points)
     return np.nan_to_num(share, nan=0.0, posinf=0.0, neginf=0.0)
-
-
-def simplify(mesh: Mesh, faces: int) -> Mesh:
-    """Collapse edges, those of least quadric error first, until about a number of faces is left.
-
-    The program is fast-simplification, which uses the quadrics of Garland and Heckbert, "Surface simplification using
-    quadric error metrics", SIGGRAPH 1997.
-
-    Args:
-        mesh: any mesh, concrete.
-        faces: the number of faces, positive.
-
-    Raises:
-        JaxmarkError: if no face is left, all vertices are at one point, or fast-simplification is missing.
-    """
-    if faces >= len(mesh.faces):
-        return mesh
-    simplifier = require("fast_simplification", "attacks").simplify
-    vertices, indices = map(np.asarray, compact(mesh))
-    centre, length = vertices.mean(axis=0), diagonal(mesh) / _INPUT_DIAGONAL
-    points, indices = simplifier((vertices - centre) / length, indices, target_count=faces)
-    if len(indices) == 0:
-        raise JaxmarkError("fast-simplification left no face of this mesh; ask for a smaller share.")
-    return Mesh(centre + length * points, indices.astype(np.int64))
 
 
 class Moments(NamedTuple):

@@ -8,12 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 
-from jaxmark.geometry.mesh import edges, sides
+from jaxmark.geometry.mesh import Faces, edges, sides
 
 _MIN_COTANGENT = 1e-6  # over the largest weight
 
 Positions = Float[Array | np.ndarray, "points 3"]
-Faces = Int[Array | np.ndarray, "faces 3"]
 
 
 def inverse_length_weights(

@@ -9,8 +9,8 @@ import pytest
 import jaxmark as jm
 from jaxmark.alignment.alignment import Alignment, align
 from jaxmark.alignment.heights import measure_heights
-from jaxmark.geometry.mesh import Mesh, face_normals
-from jaxmark.geometry.surfaces import Surface, simplify
+from jaxmark.geometry.mesh import Mesh, face_normals, simplify
+from jaxmark.geometry.surfaces import Surface
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
 from jaxmark.watermark.marking import Marker
 from jaxmark.watermark.reading.coarse import receive_coarse
