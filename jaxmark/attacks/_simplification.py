@@ -11,8 +11,8 @@ def simplification(mesh: Mesh, strength: float, key: Randomness | None = None) -
     """Collapse edges, those of least quadric error first, until only a share of the faces is left; on the host.
 
     The program is fast-simplification (`jaxmark.geometry.mesh.simplify`). The protocol of SMI 2010 (Wang et al.) has
-    the same strengths, but uses the simplifier of CGAL, that of Lindstrom and Turk, "Fast and memory efficient polygonal
-    simplification", 1998.
+    the same strengths, but uses the simplifier of CGAL, that of Lindstrom and Turk, "Fast and memory efficient
+    polygonal simplification", 1998.
 
     Args:
         mesh: any mesh, concrete.

@@ -94,15 +94,8 @@ def over_bands(
 ) -> Any:
     """Apply a function to each band component f_j(Δ)x, a few at a time, so that it takes O(N) memory.
 
-    Args:
-        function: maps one component, in the shape of `x`, to an array or a tuple of arrays. Eager calls compile once
-            for each function object, so define it outside of loops.
-        operator: the Laplacian, of N vertices.
-        coefficients: `[bands, degree + 1]`.
-        x: `[N]` or `[N, C]`.
-
-    Returns:
-        The function's results, stacked along a leading axis of bands.
+    The function maps one component, in the shape of `x`, to an array or a tuple of arrays, which are stacked along a
+    leading axis of bands. Eager calls compile once for each function object, so define it outside of loops.
     """
     c = _check_bands(coefficients)
     groups = jnp.pad(c, ((0, -len(c) % _BANDS_AT_ONCE), (0, 0))).reshape(-1, _BANDS_AT_ONCE, c.shape[1])
@@ -202,9 +195,6 @@ def heat(
         degree: degree of the polynomial; by default the truncation is below the epsilon of the dtype of `x`. It is an
             array's shape, so it must be given where t is traced (under `jit`, `grad` or `vmap` of t): for times up to
             T, `bands.heat([T]).shape[1] - 1` is enough.
-
-    Returns:
-        e^{-tΔ}x, in the shape and dtype of `x`.
 
     Raises:
         JaxmarkError: if t is negative or not finite, or it is traced and no degree is given.

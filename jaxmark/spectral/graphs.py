@@ -80,7 +80,11 @@ def from_mesh(
         }
         values = by_name[weights]()
         if values is not None and not traced:
-            _check_found(values, pairs, weights)
+            if not np.isfinite(values).all():
+                bad = pairs[int(np.argmax(values))]
+                raise JaxmarkError(f"Edge {bad.tolist()} has length zero; weld its vertices or use valence weights.")
+            if not values.max(initial=0.0) > 0:
+                raise JaxmarkError(f"No edge has a positive {weights} weight; use valence weights.")
     else:
         values = checked_weights(weights, len(pairs))
     masses: Any = mass
@@ -321,14 +325,6 @@ def _bound(operator: Laplacian) -> float:
     start = np.cos(np.arange(len(linked), dtype=np.float64))  # a fixed start makes the result repeatable
     found: Any = linalg.eigsh(scaled, 1, which="LA", tol=1e-3, v0=start, return_eigenvectors=False)  # pyright: ignore[reportArgumentType]
     return min(by_rows, _BOUND_MARGIN * float(found[0]))
-
-
-def _check_found(values: np.ndarray, pairs: np.ndarray, weights: str) -> None:
-    if not np.isfinite(values).all():
-        bad = pairs[int(np.argmax(values))]
-        raise JaxmarkError(f"Edge {bad.tolist()} has length zero; weld its vertices or use valence weights.")
-    if not values.max(initial=0.0) > 0:
-        raise JaxmarkError(f"No edge has a positive {weights} weight; use valence weights.")
 
 
 def _check_name(sentence: str, name: str, names: Any) -> None:

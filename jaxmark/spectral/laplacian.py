@@ -242,13 +242,10 @@ def graph_laplacian(
     *,
     lowering: Lowering = "auto",
 ) -> Laplacian:
-    """Build the Laplacian of any graph, such as that of a mesh's faces, on the host.
+    """Build the Laplacian of a graph of `size` vertices, on the host; nothing is checked.
 
-    Args:
-        pairs: the edges, each once, none from a vertex to itself.
-        size: number of vertices.
-        weights: finite and not negative; all 1 unless given.
-        lowering: as in `jaxmark.spectral.graphs.from_mesh`.
+    Each edge is there once, none from a vertex to itself. Weights are finite and not negative, all 1 unless given;
+    `lowering` is as in `jaxmark.spectral.graphs.from_mesh`.
     """
     degree = np.bincount(pairs.ravel(), None if weights is None else np.repeat(weights, 2), size).astype(np.float64)
     neighbours = None
@@ -267,15 +264,11 @@ def make_neighbours(
     if_it_pays: bool = False,
     slots: int | None = None,
 ) -> Neighbours | None:
-    """Build the table of neighbours.
+    """Build the table of neighbours in a graph of `size` vertices, which looks weights up if edges are `weighted`.
 
-    Args:
-        pairs: the edges.
-        size: number of vertices.
-        order: the vertex of each row of the table; the vertices' own order unless given.
-        weighted: whether the edges have weights, which the table then looks up.
-        if_it_pays: whether to return None where segment-sums are cheaper.
-        slots: number of slots; by default the even number, or the next one, that makes a product cheapest.
+    The rows are in the vertices' own order unless their `order` is given. The number of slots is by default the even
+    number, or the next one, that makes a product cheapest. With `if_it_pays`, None is returned where segment-sums are
+    cheaper.
     """
     rank = None if order is None else np.argsort(order).astype(np.int32)
     graph = adjacency(pairs if rank is None else rank[pairs], size)

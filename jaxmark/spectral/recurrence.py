@@ -135,7 +135,7 @@ def _pulled_back(family: Family, operator: Operator, w: Array, x: Array, y: Arra
 
 
 def changes_of(operator: Operator, tangents: Any) -> PyTree | None:
-    """What a rule of `jax.custom_jvp` is given as tangents of an operator, for `along`; None if it does not change."""
+    """Convert the tangents of an operator in a rule of `jax.custom_jvp` for `along`; None if it does not change."""
     leaves: list[Any] = jax.tree.leaves(tangents, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
     if all(isinstance(leaf, SymbolicZero) for leaf in leaves):
         return None

@@ -234,10 +234,8 @@ def filter_sharded(
     Args:
         operator: the Laplacian, placed on its devices by `shard`.
         coefficients: `[degree + 1]`, or `[C, degree + 1]` for one filter per column; the same on all devices.
-        x: `[devices, rows]` or `[devices, rows, C]`, from `ShardedLaplacian.scatter`.
-
-    Returns:
-        f(Δ)x, in the shape, dtype and placement of `x`; 0 past the last vertex if `x` is 0 there.
+        x: `[devices, rows]` or `[devices, rows, C]`, from `ShardedLaplacian.scatter`. The result keeps its shape, dtype
+            and placement, and is 0 past the last vertex if `x` is.
 
     Raises:
         JaxmarkError: if shapes do not fit, or the operator is not on devices.

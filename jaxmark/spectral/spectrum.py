@@ -88,10 +88,8 @@ def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: 
     Args:
         operator: the Laplacian.
         x: one signal `[N]`, preferably centred.
-        steps: number of nodes; the result has fewer if the signal lies in a smaller invariant subspace.
-
-    Returns:
-        Nodes in [0, 2], and non-negative weights that sum to ⟨x, x⟩_M.
+        steps: number of nodes; the result has fewer if the signal lies in a smaller invariant subspace. Nodes are in
+            [0, 2]; weights are not negative, and sum to ⟨x, x⟩_M.
     """
     linked, root, matrix = symmetric_matrix(operator)
     scaled, vector = sparse.csc_array(matrix), root * x[linked]
@@ -126,10 +124,7 @@ def white_probes(operator: Laplacian, seed: Seed, probes: int) -> Float64[np.nda
     Args:
         operator: the Laplacian, of N vertices.
         seed: a number or a JAX random key; nothing secret, because bands must not depend on a mark's key.
-        probes: number of signals.
-
-    Returns:
-        `[N, probes]`, centred, 0 at isolated vertices.
+        probes: number of signals, which are centred, and 0 at isolated vertices.
     """
     mass = np.where(np.asarray(operator.degree) > 0, np.asarray(operator.mass, np.float64), 0)
     signs = np.asarray(jax.random.rademacher(random_key(seed), (len(mass), probes)), np.float64)

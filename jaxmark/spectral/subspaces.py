@@ -31,7 +31,7 @@ _MAX_SOLVER_ITERATIONS = 2000
 
 @partial(jax.jit, static_argnames=("function", "steps"))
 def quadratic_form(operator: Operator, function: Function, x: Signal, *, steps: int) -> Float[Array, " *columns"]:
-    """Compute ⟨x, f(Δ)x⟩_M by Gauss quadrature, column by column.
+    """Compute ⟨x, f(Δ)x⟩_M by Gauss quadrature, a scalar or `[C]`, column by column.
 
     It is exact for polynomials of degree below twice the steps, and converges for any function that is smooth on the
     eigenvalues that `x` has a part of. Reference: Golub, Meurant, "Matrices, Moments and Quadrature with Applications",
@@ -47,9 +47,6 @@ def quadratic_form(operator: Operator, function: Function, x: Signal, *, steps: 
             `centre`, or by the probes of `white_probes`.
         x: `[N]` or `[N, C]`.
         steps: number of nodes, at least 1. Memory is O(steps · N), as all steps are kept orthogonal to each other.
-
-    Returns:
-        A scalar, or `[C]`.
 
     Raises:
         JaxmarkError: if shapes do not fit, the signal is neither float32 nor float64, or there is no step.
@@ -68,11 +65,8 @@ def trace(
     derivatives with respect to the operator, signals are held fixed as √M times the probes, whose squares do not depend
     on the mass: so the derivative estimates that of the sum.
 
-    Args:
-        operator: see `quadratic_form`.
-        function: see `quadratic_form`.
-        probes: from `white_probes`, which says how large the variance is.
-        steps: see `quadratic_form`.
+    The arguments are those of `quadratic_form`, with probes `[N, probes]` from `white_probes`, which says how large the
+    variance is.
     """
     return jnp.sum(_forms("trace", operator, function, probes, steps, held=True))
 
@@ -188,10 +182,7 @@ def lowest_eigenpairs(operator: Operator, count: int, seed: Seed, *, dtype: Any 
         count: number of pairs, null vectors included, at most the number of vertices.
         seed: a number or a JAX random key, of the start of the iteration; converged pairs depend on it by signs, and by
             the bases of eigenspaces.
-        dtype: float32 or float64.
-
-    Returns:
-        The pairs. They are iterated for until the residual is a hundred times the machine epsilon, or 60 times.
+        dtype: float32 or float64. Iteration ends at a residual of a hundred times its epsilon, or after 60 times.
 
     Raises:
         JaxmarkError: if there are fewer vertices than pairs, no pair is asked for, or the dtype is another.
@@ -218,7 +209,7 @@ def _product(operator: Operator, like: Array) -> Callable[[Array], Array]:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _pairs(count: int, operator: Operator, start: Array) -> tuple[Array, Array]:
-    """The lowest eigenpairs of A = M^½ΔM^-½, as many as the start has columns, of which `count` have converged."""
+    """The lowest eigenpairs of A = M^½ΔM^-½, one for each column of the start, of which `count` have converged."""
     product, small = _product(operator, start), 100 * jnp.finfo(start.dtype).eps
 
     def rotate(block: Array) -> tuple[Array, Array, Array]:
