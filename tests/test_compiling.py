@@ -39,7 +39,7 @@ def carrier(seed: int) -> Any:
 
 
 def layer(seed: int) -> dict[str, jax.Array]:
-    return spectral.init_cheb_conv(jax.random.key(seed), 3, 2, 4)
+    return spectral.init_cheb_conv(seed, 3, 2, 4)
 
 
 def miss(parameters: dict[str, jax.Array], operator: Any, x: jax.Array) -> jax.Array:
@@ -61,7 +61,7 @@ CALLS: dict[str, Callable[[Any, Any, int], Any]] = {
     "cross_moments": lambda operator, x, seed: spectral.cross_moments(operator, x, x, degree=5),
     "gram": lambda operator, x, seed: spectral.gram(operator, BANDS, x),
     "trace": lambda operator, x, seed: spectral.trace(operator, jnp.exp, x, steps=5),
-    "lowest_eigenpairs": lambda operator, x, seed: spectral.lowest_eigenpairs(operator, 5, jax.random.key(seed)).values,
+    "lowest_eigenpairs": lambda operator, x, seed: spectral.lowest_eigenpairs(operator, 5, seed).values,
     "filter_rational": lambda operator, x, seed: spectral.filter_rational(operator, SECTIONS, x),
     "filter_by_factors": lambda operator, x, seed: spectral.filter_by_factors(operator, factors(), x),
     "cheb_conv": lambda operator, x, seed: spectral.cheb_conv(operator, layer(seed), x),

@@ -143,7 +143,7 @@ FILTERS: Programs = {
 
 def layer_parameters(columns: int) -> dict[str, np.ndarray]:
     random = np.random.default_rng(0)
-    weight = random.normal(size=(DEGREE + 1, columns, columns)) / DEGREE
+    weight = np.moveaxis(random.normal(size=(DEGREE + 1, columns, columns)), 0, -1) / DEGREE
     return {"weight": weight.astype(np.float32), "bias": random.normal(size=columns).astype(np.float32)}
 
 
@@ -159,7 +159,7 @@ def by_geometric(operator: Laplacian, x: jax.Array) -> Work:
     device = "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"
     layer, parameters = layers.ChebConv(x.shape[1], x.shape[1], DEGREE + 1), layer_parameters(x.shape[1])
     layer.load_state_dict(
-        {f"lins.{k}.weight": torch.tensor(w.T) for k, w in enumerate(parameters["weight"])}
+        {f"lins.{k}.weight": torch.tensor(w.T) for k, w in enumerate(np.moveaxis(parameters["weight"], -1, 0))}
         | {"bias": torch.tensor(parameters["bias"])}
     )
     pairs, weights = host_edges(operator)

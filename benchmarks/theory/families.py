@@ -32,8 +32,7 @@ from scipy.sparse import linalg as sparse_linalg
 import jaxmark as jm
 from jaxmark.geometry.mesh import make_mesh, weld, weld_mesh
 from jaxmark.spectral import product, rational
-from jaxmark.spectral.bands import bernstein, equal_edges, hat, intervals, lagrange, nodes, report, scaling
-from jaxmark.spectral.bands.damping import Damping
+from jaxmark.spectral.bands import Damping, bernstein, equal_edges, hat, intervals, lagrange, nodes, report, scaling
 from jaxmark.spectral.chebyshev import band_components, filter, moments
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.laplacian import Laplacian, centre, sparse_matrices
@@ -131,7 +130,7 @@ def make_sample(name: str, mesh: jm.Mesh, degree: int) -> Sample:
     with jax.enable_x64(True):
         density, energy = (
             np.asarray(moments(operator, jnp.asarray(signal), degree=degree // 2 + 1)).sum(axis=1)[: degree + 1]
-            for signal in (white_probes(operator, jax.random.key(0), PROBES), x)
+            for signal in (white_probes(operator, 0, PROBES), x)
         )
     return Sample(name, operator, x, tuple(quadrature(operator, one, NODES) for one in x.T), density, energy)
 

@@ -17,7 +17,7 @@ from jaxmark.adversaries._jamming import through_bands
 from jaxmark.attacks.registry import Attack
 from jaxmark.distortion import rms
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.hashing import geometry_hash
+from jaxmark.geometry.canonical import geometry_hash
 from jaxmark.geometry.mesh import Mesh, diagonal, host_mesh, used_vertices
 from jaxmark.seeds import Randomness, generator
 from jaxmark.spectral.graphs import from_mesh

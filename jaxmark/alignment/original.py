@@ -11,14 +11,14 @@ from jaxtyping import Array, Bool, Float, Float64, Int64, Shaped
 from jaxmark.geometry.canonical import exact, grid_spacing, order_hash, rounded
 from jaxmark.geometry.mesh import Mesh, Weld, diagonal, displacement, host_mesh, used_vertices
 from jaxmark.spectral.laplacian import Laplacian, centre
-from jaxmark.spectral.shapes import common_laplacian, pad_rows
+from jaxmark.spectral.padding import common_laplacian, pad_rows
 
 
 @dataclass(frozen=True, eq=False)
 class Original:
     """An original as embedding and detection need it; lengths are in units of its bounding-box diagonal.
 
-    Traced arrays are padded with rows of isolated vertices beyond the points: see `jaxmark.spectral.shapes`.
+    Traced arrays are padded with rows of isolated vertices beyond the points: see `jaxmark.spectral.padding`.
     """
 
     mesh: Mesh  # as in its file; what is displaced

@@ -16,7 +16,7 @@ from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import band_components
 from jaxmark.spectral.graphs import Weighting
 from jaxmark.spectral.laplacian import Laplacian
-from jaxmark.spectral.shapes import common_laplacian, pad_rows
+from jaxmark.spectral.padding import common_laplacian, pad_rows
 
 _SCALES = 9  # smoothing by 1, 2, 4 … 256 steps, each halfway to the neighbours' mean
 _WEIGHTINGS: tuple[Weighting, ...] = ("valence", "cotangent")

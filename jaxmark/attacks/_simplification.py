@@ -2,8 +2,7 @@
 
 from jaxmark.attacks.host import on_host
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh
-from jaxmark.geometry.simplified import simplify
+from jaxmark.geometry.mesh import Mesh, simplify
 from jaxmark.seeds import Randomness
 
 
@@ -11,9 +10,9 @@ from jaxmark.seeds import Randomness
 def simplification(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
     """Collapse edges, those of least quadric error first, until only a share of the faces is left; on the host.
 
-    The program is fast-simplification (`jaxmark.geometry.simplified`). The protocol of SMI 2010 (Wang et al.) has the
-    same strengths, but uses the simplifier of CGAL, that of Lindstrom and Turk, "Fast and memory efficient polygonal
-    simplification", 1998.
+    The program is fast-simplification (`jaxmark.geometry.mesh.simplify`). The protocol of SMI 2010 (Wang et al.) has
+    the same strengths, but uses the simplifier of CGAL, that of Lindstrom and Turk, "Fast and memory efficient
+    polygonal simplification", 1998.
 
     Args:
         mesh: any mesh, concrete.

@@ -16,7 +16,7 @@ from jaxmark.seeds import Randomness
 from jaxmark.spectral.bands import heat, meyer
 from jaxmark.spectral.chebyshev import band_components, synthesise
 from jaxmark.spectral.graphs import from_mesh
-from jaxmark.spectral.shapes import common_laplacian, pad_rows
+from jaxmark.spectral.padding import common_laplacian, pad_rows
 
 _OCTAVES = 7  # of wavelets, and a low-pass below λ = 0.03, which is the shape and stays
 _COARSER = 4  # times of diffusion, each twice the one before, by which places are compared

@@ -22,7 +22,7 @@ from jaxmark.evaluation import cells
 from jaxmark.evaluation.cells import Pool, processes
 from jaxmark.extras import require
 from jaxmark.files import load_mesh
-from jaxmark.geometry.hashing import geometry_hash
+from jaxmark.geometry.canonical import geometry_hash
 from jaxmark.geometry.mesh import Mesh
 
 ROWS = "cells.jsonl"

@@ -17,7 +17,7 @@ from jaxmark.bench.shapes import SHAPES, torus
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
 from jaxmark.geometry import asteroid
-from jaxmark.geometry.hashing import geometry_hash
+from jaxmark.geometry.canonical import geometry_hash
 from jaxmark.geometry.mesh import Mesh, make_mesh
 
 _DIGITS = 6  # after the point, of coordinates: what processors compute differently is cut off
@@ -94,7 +94,7 @@ def make_member(member: Member) -> Mesh:
 
 
 def known_hashes() -> Mapping[str, str]:
-    """The hash of each mesh as it was made for this version, see `jaxmark.geometry.hashing.geometry_hash`."""
+    """The hash of each mesh as it was made for this version, see `jaxmark.geometry.canonical.geometry_hash`."""
     return json.loads(resources.files("jaxmark.bench").joinpath("corpus.json").read_text())
 
 

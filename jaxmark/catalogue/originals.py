@@ -15,8 +15,7 @@ from jaxmark.catalogue.landmarks import KEPT, MOST, landmarks
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import Scene, load_mesh, load_scene
 from jaxmark.files.atomic import file_hash
-from jaxmark.geometry.canonical import grid_spacing, rounded
-from jaxmark.geometry.hashing import geometry_hash
+from jaxmark.geometry.canonical import geometry_hash, grid_spacing, rounded
 from jaxmark.geometry.mesh import Mesh, unit, used_vertices
 from jaxmark.geometry.pose import Points
 

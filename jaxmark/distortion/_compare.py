@@ -37,7 +37,7 @@ from jaxmark.geometry.mesh import (
     weld,
     weld_mesh,
 )
-from jaxmark.spectral.shapes import SURFACE_VALENCE, common_edges, common_size, pad_rows
+from jaxmark.spectral.padding import SURFACE_VALENCE, common_edges, common_size, pad_rows
 
 Prepared = TypeVar("Prepared")
 Metric = str | Callable[[Mesh, Mesh], float]  # a name in `METRICS` or `RENDERED`, or a function: see `measure`

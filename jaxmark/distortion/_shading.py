@@ -46,7 +46,7 @@ from jaxmark.geometry.mesh import cross_product, face_pairs
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import band_components, filter
 from jaxmark.spectral.laplacian import Laplacian, graph_laplacian
-from jaxmark.spectral.shapes import common_size, pad_edges, pad_rows
+from jaxmark.spectral.padding import common_size, pad_edges, pad_rows
 
 SHARE = 0.99  # share of the area on which less is seen than the metric says
 _INCIDENCE = math.radians(60)  # angle between the light and the surroundings' mean normal
@@ -73,7 +73,7 @@ class Hiding(NamedTuple):
     faces: Int[Array | np.ndarray, "faces 3"]
     area: Float[Array | np.ndarray, " faces"]  # share of the whole; 0 for faces without a normal
     turned: Float[Array | np.ndarray, " faces"]  # -1 for faces that run against their neighbours, otherwise 1
-    links: Laplacian  # of the graph of faces that share an edge that is no crease; padded, see `spectral.shapes`
+    links: Laplacian  # of the graph of faces that share an edge that is no crease; padded, see `spectral.padding`
     threshold: Float[Array | np.ndarray, "bands faces"]  # normals' just noticeable turn in each band, in radians
     bare: Float[Array | np.ndarray, "bands faces"]  # the same if the surface had nothing that hides
     bend: Float[Array | np.ndarray, " faces"]  # second largest angle to a neighbour: 0 on planes and along their edges
@@ -265,7 +265,7 @@ def _hidden(links: Laplacian, normals: Array, length: Array, count: int) -> tupl
     for some in _by_length(_diffusions(count)):
         # Each band's energy and the lengths are averaged by the same series: columns of one signal.
         columns = jnp.concatenate([energy[start : start + len(some)], jnp.tile(length, (len(some), 1))]).T
-        means.append(filter(links, jnp.tile(jnp.asarray(some, dtype).T, (1, 2)), columns).T.reshape(2, len(some), -1))
+        means.append(filter(links, jnp.tile(jnp.asarray(some, dtype), (2, 1)), columns).T.reshape(2, len(some), -1))
         start += len(some)
     around, local = jnp.concatenate(means, axis=1)
     contrast = math.tan(_INCIDENCE) * root(around)

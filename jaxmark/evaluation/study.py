@@ -25,7 +25,7 @@ from jaxmark.evaluation.cells import Cell, Pool, processes, run
 from jaxmark.evaluation.results import Results
 from jaxmark.files import load_mesh
 from jaxmark.files.atomic import read_file
-from jaxmark.geometry.hashing import geometry_hash
+from jaxmark.geometry.canonical import geometry_hash
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.coding.keys import Key

@@ -4,8 +4,8 @@ All of it runs on the host with NumPy; a `Mesh` itself also goes through `jit`, 
 """
 
 from jaxmark.geometry._asteroid import asteroid as asteroid
+from jaxmark.geometry.canonical import geometry_hash as geometry_hash
 from jaxmark.geometry.connectivity import matching_vertices as matching_vertices
-from jaxmark.geometry.hashing import geometry_hash as geometry_hash
 from jaxmark.geometry.mesh import Mesh as Mesh
 from jaxmark.geometry.mesh import Weld as Weld
 from jaxmark.geometry.mesh import area as area

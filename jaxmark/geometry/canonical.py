@@ -1,4 +1,4 @@
-"""Canonical geometry: the points that a mark is written in, and a hash of them that tells originals apart.
+"""Canonical geometry: the points that a mark is written in, and a hash of them that distinguishes originals.
 
 Version 1 takes a mesh as its file has it, to the last bit and in its order. Version 2 rounds positions to a grid and
 orders points and faces by position, so that the geometry survives what rounds, reorders or splits vertices; see
@@ -10,10 +10,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import UInt64
+from numpy.typing import ArrayLike
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.hashing import points_hash
 from jaxmark.geometry.mesh import Mesh, Weld, diagonal, weld, weld_mesh
 
 # Six significant digits are off by up to 5e-6 of the largest coordinate, float32 by 6e-8. Both stay below a quarter of
@@ -26,31 +26,38 @@ class Canonical(NamedTuple):
 
     points: Mesh  # the distinct points, and the mesh's faces as indices of these
     weld: Weld  # which vertices of the mesh stand at which point
-    hash: bytes  # SHA-256 of what tells this geometry from others
+    hash: bytes  # SHA-256 that identifies this geometry
 
 
 def exact(mesh: Mesh) -> Canonical:
     """The geometry of version 1: points at exactly the same position are one, in order of first occurrence."""
     welded = weld(mesh.vertices)
     points = weld_mesh(mesh, welded)
-    return Canonical(points, welded, points_hash(points))
+    vertices = np.asarray(points.vertices, np.float64) + 0.0  # turns -0.0 into 0.0
+    found = _digest(b"jaxmark/1/geometry", len(vertices), len(points.faces), vertices, points.faces)
+    return Canonical(points, welded, found)
+
+
+def geometry_hash(mesh: Mesh) -> bytes:
+    """Return the hash of version 1 (SHA-256), the same for every file that stores the geometry exactly.
+
+    It covers the welded points in order of first occurrence, as little-endian float64 with -0.0 as 0.0, and the
+    triangles that refer to them, as little-endian int64.
+    """
+    return exact(mesh).hash
 
 
 def grid_spacing(mesh: Mesh) -> float:
-    """The spacing of the grid for a mesh, in its units: a power of two, so that rounding is exact.
-
-    Raises:
-        JaxmarkError: see `diagonal`.
-    """
+    """The spacing of the grid for a mesh, in its units: a power of two, so that rounding is exact; see `diagonal`."""
     return 2.0 ** math.floor(math.log2(diagonal(mesh) / _CELLS))
 
 
 def rounded(mesh: Mesh, spacing: float) -> Canonical:
     """The geometry of version 2: points on a grid, in the order of their coordinates; those that no face uses are last.
 
-    Faces begin at their lowest corner and are sorted, and those without three different corners are left out: neither
-    tells anything of the order in a file, nor of what a format leaves out. The hash covers the spacing, the points that
-    faces use, and the faces; of a point cloud, all points and no faces.
+    Faces begin at their lowest corner and are sorted, and those without three different corners are left out, so that
+    the result depends neither on the order in a file nor on what a format leaves out. The hash covers the spacing, the
+    points that faces use, and the faces; of a point cloud, all points and no faces.
 
     Args:
         mesh: any mesh.
@@ -80,13 +87,12 @@ def rounded(mesh: Mesh, spacing: float) -> Canonical:
     point = place[point]
     first = np.empty(len(used), np.int64)
     first[point[::-1]] = np.arange(len(point))[::-1]
-    points = Mesh(cells[first], _sorted_faces(place[corners]))
-    state = hashlib.sha256(b"jaxmark/2/geometry")
-    state.update(np.array([used.sum(), len(points.faces)], "<i8").tobytes())
-    state.update(np.array(spacing, "<f8").tobytes())
-    state.update(np.asarray(points.vertices)[: used.sum()].astype("<f8").tobytes())
-    state.update(np.asarray(points.faces).astype("<i8").tobytes())
-    return Canonical(points, Weld(point, first), state.digest())
+    faces = place[corners]
+    faces = np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    faces = faces[np.lexsort(faces.T[::-1])]
+    points, count = cells[first], int(used.sum())
+    found = _digest(b"jaxmark/2/geometry", count, len(faces), spacing, points[:count], faces)
+    return Canonical(Mesh(points, faces), Weld(point, first), found)
 
 
 def order_hash(mesh: Mesh, welded: Weld) -> bytes:
@@ -95,14 +101,23 @@ def order_hash(mesh: Mesh, welded: Weld) -> bytes:
     A suspect may be compared vertex by vertex only with an original of this very order: whoever could choose the order
     when the suspect is known could choose what is compared with what.
     """
-    state = hashlib.sha256(b"jaxmark/2/order")
-    state.update(np.array([len(welded.point), len(mesh.faces)], "<i8").tobytes())
-    state.update(welded.point.astype("<i8").tobytes())
-    state.update(np.asarray(mesh.faces).astype("<i8").tobytes())
+    return _digest(b"jaxmark/2/order", len(welded.point), len(mesh.faces), welded.point, mesh.faces)
+
+
+def mix(values: UInt64[np.ndarray, "*values"]) -> UInt64[np.ndarray, "*values"]:
+    """Hash integers by a 64-bit finaliser (Steele, Lea, Flood, "Fast splittable pseudorandom number generators", 2014).
+
+    It is no cryptographic hash: collisions are easy to make.
+    """
+    values = values + np.uint64(0x9E3779B97F4A7C15)
+    values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return values ^ (values >> np.uint64(31))
+
+
+def _digest(label: bytes, *arrays: ArrayLike) -> bytes:
+    """SHA-256 of a label and arrays, as little-endian float64 or int64."""
+    state = hashlib.sha256(label)
+    for array in map(np.asarray, arrays):
+        state.update(array.astype("<f8" if array.dtype.kind == "f" else "<i8").tobytes())
     return state.digest()
-
-
-def _sorted_faces(faces: Int64[np.ndarray, "faces 3"]) -> Int64[np.ndarray, "faces 3"]:
-    """Faces in ascending order, each from its lowest corner on."""
-    turned = np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
-    return turned[np.lexsort(turned.T[::-1])]

@@ -1,6 +1,6 @@
-"""Point clouds as surfaces: planes through nearest points, points as far apart everywhere, and closest points.
+"""Point clouds as surfaces: planes through nearest points, evenly spaced points, and closest points.
 
-Nothing here asks for the order of points, nor for how densely a scanner has seen what.
+Results depend neither on the order of points nor on how densely a scanner covers each region.
 """
 
 from functools import cached_property
@@ -57,7 +57,7 @@ def planes(tree: KDTree, places: Points, neighbours: int = _PLANE_POINTS) -> Pla
 
 
 class Cloud:
-    """Points that stand for the surface they lie on: what `jaxmark.geometry.surfaces.Surface` is for a mesh."""
+    """Points that stand for the surface they lie on, as `jaxmark.geometry.surfaces.Surface` is of a mesh."""
 
     def __init__(self, points: Points) -> None:
         """Take over points, each of which counts."""
@@ -79,7 +79,7 @@ class Cloud:
         return planes(self.tree, self.points)
 
     def without_strays(self) -> "Cloud":
-        """The points that are not much further from the nearest others than most: no floaters, nothing thrown off."""
+        """The points that are not much further from the nearest others than most, without floaters and outliers."""
         apart = spacings(self.points, _STRAY_POINTS)
         return Cloud(self.points[apart <= _STRAY_RATIO * np.median(apart)])
 
@@ -89,11 +89,7 @@ class Cloud:
         return self.points[chosen], self.planes.normals[chosen]
 
     def closest(self, points: Points, pose: Pose = IDENTITY) -> tuple[Points, Int64[np.ndarray, " points"]]:
-        """Find where the planes around the nearest points come closest; see `Surface.closest`.
-
-        Returns:
-            The closest places `[P, 3]` on the placed planes, and the index of the nearest point for each.
-        """
+        """Find the closest places `[P, 3]` on the placed planes of the nearest points, and these points' indices."""
         queries = pose.inverse()(points)
         nearest = np.asarray(self.tree.query(queries)[1])
         normals = self.planes.normals[nearest]
@@ -103,7 +99,7 @@ class Cloud:
         return pose(np.where(beside[:, None], self.points[nearest], foot)), nearest
 
     def sample(self, count: int) -> Samples:
-        """Choose points that are as far apart everywhere: means of the points in cells, in random order.
+        """Choose evenly spaced points: means of the points in cells, in random order.
 
         The area is that of the cells' faces, up to a factor that clouds of like density have in common.
         """

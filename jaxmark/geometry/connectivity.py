@@ -1,4 +1,4 @@
-"""Recognise vertices by the connectivity around them, whatever became of their order and positions.
+"""Recognise vertices by the connectivity around them, independently of their order and positions.
 
 Each vertex is coloured by its neighbourhood, ring by ring (colour refinement: Weisfeiler, Leman 1968). A colour that
 exactly one vertex of each mesh has matches these two vertices; from such pairs, matches spread face by face. Vertices
@@ -8,7 +8,7 @@ that were reordered, cropped, merged into a scene or moved are found; those of a
 import numpy as np
 from jaxtyping import Int64, UInt64
 
-from jaxmark.geometry.hashing import mix
+from jaxmark.geometry.canonical import mix
 from jaxmark.geometry.mesh import Mesh, edges, sides, used_vertices
 
 _MIN_RINGS, _MAX_RINGS = 3, 40  # narrower neighbourhoods are alike by chance; wider ones tell no more vertices apart
@@ -36,7 +36,8 @@ def matching_vertices(mesh: Mesh, other: Mesh) -> Int64[np.ndarray, " vertices"]
             found[unique[i]] = unique_there[j]
             if len(i) == 0 or len(i) == len(found):
                 break
-    found = _one_to_one(found, len(other.vertices))
+    taken = np.bincount(found[found >= 0], minlength=len(other.vertices))
+    found = np.where((found >= 0) & (taken[found] == 1), found, -1)  # drop vertices that are matched more than once
     if np.sum(found >= 0) < _MIN_MATCHED_SHARE * min(used_vertices(mesh).sum(), used_vertices(other).sum()):
         return np.full_like(found, -1)
     # Only vertices of equal valence match as matches spread, or a few chance matches would flood a regular mesh.
@@ -49,7 +50,7 @@ def matching_vertices(mesh: Mesh, other: Mesh) -> Int64[np.ndarray, " vertices"]
 
 
 def distinct_vertices(mesh: Mesh, rings: int) -> tuple[Int64[np.ndarray, " distinct"], UInt64[np.ndarray, " distinct"]]:
-    """Vertices whose neighbourhoods of so many rings no other vertex has, and their colours, in the colours' order."""
+    """Find vertices whose neighbourhood of `rings` rings is unique, and their colours, in the order of these."""
     grown = Rings(mesh)
     colours = np.zeros(len(mesh.vertices), np.uint64)
     for _ in range(rings):
@@ -96,12 +97,6 @@ def _unique(colours: Colours) -> Int64[np.ndarray, " unique"]:
     return first[count == 1]
 
 
-def _one_to_one(found: Int64[np.ndarray, " vertices"], size: int) -> Int64[np.ndarray, " vertices"]:
-    """Drop all matches with a vertex that is matched more than once."""
-    taken = np.bincount(found[found >= 0], minlength=size)
-    return np.where((found >= 0) & (taken[found] == 1), found, -1)
-
-
 class _Apexes:
     """The corner opposite to each directed side of a mesh, looked up by a code of the side's two vertices."""
 
@@ -137,13 +132,7 @@ def _spread(
 ) -> Int64[np.ndarray, " vertices"]:
     """Spread matches over faces: where two corners have matches, the third matches the apex of the side between these.
 
-    Args:
-        found: the matches to begin with.
-        corners: the directed sides of the faces.
-        wanted: the third corner of the face of each.
-        apexes: those of the other mesh.
-        valence: of each vertex.
-        valence_there: of each vertex of the other mesh.
+    `corners` are the directed sides of the faces, `wanted` the third corner of each, `apexes` those of the other mesh.
     """
     taken = np.zeros(len(valence_there), bool)
     taken[found[found >= 0]] = True

@@ -1,9 +1,9 @@
-"""Imprints of originals: by one, a copy that was saved again is brought back to exactly the geometry that was hashed.
+"""Imprints of originals, by which a copy that was saved again is restored to exactly the geometry that was hashed.
 
-Where a coordinate lies between two planes of the grid, rounding a copy may choose the other plane. So the imprint keeps
-a short hash of each point, and of the eight corners of the grid's cube around a point of the copy, the one whose hash
-is among them is taken. The order of points and faces, copies of points and isolated vertices do not count, as canonical
-geometry has none; and a copy that was moved, turned and scaled as a whole is brought back by its moments.
+If a coordinate lies between two planes of the grid, rounding a copy may choose the other plane. So the imprint keeps a
+short hash of each point: of the eight corners of the grid's cube around a point of the copy, the one with a known hash
+is taken. The order of points and faces, copies of points and isolated vertices do not count, as canonical geometry has
+none. A copy that was moved, turned and scaled as a whole is aligned by its moments.
 """
 
 from collections.abc import Sequence
@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt32
 
-from jaxmark.geometry.canonical import Canonical, rounded
-from jaxmark.geometry.hashing import mix
+from jaxmark.geometry.canonical import Canonical, mix, rounded
 from jaxmark.geometry.mesh import Mesh, host_mesh, used_vertices, weld
 from jaxmark.geometry.pose import IDENTITY, Points, Pose, similarity
 
@@ -25,7 +24,7 @@ _MAX_ROUNDS = 4  # of fitting the pose to the points that were found, and findin
 
 
 class Imprint(NamedTuple):
-    """What is kept of a canonical geometry; whoever has it can tell the geometry's points from all others."""
+    """A record of a canonical geometry that distinguishes its points from all others."""
 
     hash: bytes
     grid: float  # spacing of the grid, in the original's units
@@ -36,7 +35,7 @@ class Imprint(NamedTuple):
 
 
 class Restored(NamedTuple):
-    """A copy that was brought back to an original's grid as far as possible."""
+    """A copy, restored to an original's grid as far as possible."""
 
     mesh: Mesh  # the copy, in the original's pose; the points that were found are exactly the original's
     exact: bool  # whether its canonical geometry is the original's
@@ -52,16 +51,10 @@ def make_imprint(canonical: Canonical, grid: float, order: bytes = b"") -> Impri
 
 
 def restore(copy: Mesh, imprint: Imprint) -> Restored:
-    """Bring a copy of an original back to exactly the geometry that was hashed, or as near to it as it goes.
+    """Restore a copy of an original to exactly the geometry that was hashed, or as near to it as possible.
 
-    A copy that was moved, turned or scaled is recognised only as a whole, and not if it is a ball or so.
-
-    Args:
-        copy: any mesh.
-        imprint: the imprint of the original.
-
-    Raises:
-        JaxmarkError: see `make_mesh`.
+    A copy that was moved, turned or scaled is recognised only as a whole, and not if it is nearly a ball.
+    `JaxmarkError` is raised as by `make_mesh`.
     """
     copy = host_mesh(copy)
     vertices = np.array(copy.vertices, np.float64)
@@ -70,9 +63,10 @@ def restore(copy: Mesh, imprint: Imprint) -> Restored:
     points = vertices[used][welded.first]
     centre, covariance = _moments(copy)
     table = np.sort(imprint.tags)
+    some = np.unique(np.linspace(0, len(points) - 1, min(len(points), _SAMPLE)).astype(np.int64))
     best, found, cells = IDENTITY, np.zeros(len(points), bool), points.copy()
     for pose in (IDENTITY, *_poses(centre, covariance, imprint)):
-        if np.mean(_find(pose(points[_spread(len(points))]), imprint.grid, table)[1]) < _MIN_SHARE:
+        if np.mean(_find(pose(points[some]), imprint.grid, table)[1]) < _MIN_SHARE:
             continue
         for _ in range(_MAX_ROUNDS):
             corners, there = _find(pose(points), imprint.grid, table)
@@ -125,19 +119,12 @@ def _tags(cells: Float64[np.ndarray, "*points 3"]) -> UInt32[np.ndarray, "*point
     return (mix(mix(mix(x) + y) + z) >> np.uint64(32)).astype(np.uint32)
 
 
-def _spread(count: int) -> Int64[np.ndarray, " some"]:
-    """Indices of some of `count` points, spread evenly."""
-    return np.unique(np.linspace(0, count - 1, min(count, _SAMPLE)).astype(np.int64))
-
-
 def _find(
     points: Points, grid: float, table: UInt32[np.ndarray, " tags"], planes: Sequence[float] = _NEAR
 ) -> tuple[Points, Bool[np.ndarray, " points"]]:
-    """Find the corner of the grid near each point whose tag is in a sorted table.
+    """Find the corner of the grid near each point whose tag is in a sorted table, and whether there is one.
 
-    Returns:
-        The corner, and whether there is one. If there are several, because tags are short, it is one that no other
-        point needs; then the nearest.
+    If there are several, because tags are short, it is one that no other point needs; then the nearest.
     """
     low = np.floor(points / grid)
     corners = low[:, None] + np.array(list(product(planes, repeat=3)))
@@ -171,7 +158,7 @@ def _poses(centre: Float64[np.ndarray, " 3"], covariance: Float64[np.ndarray, "3
 def _distance(centre: Float64[np.ndarray, " 3"], covariance: Float64[np.ndarray, "3 3"], imprint: Imprint) -> float:
     """Distance of two ellipsoids by their centres and widths, after one is scaled and turned like the other if needed.
 
-    What a shift, a turn and a scale explain is no difference: it is the smaller of the distances with it and without.
+    It is the smaller of the distances with that alignment and without, as a shift, a turn or a scale is no difference.
     """
     here, there = (np.sqrt(np.maximum(np.linalg.eigvalsh(one), 0)) for one in (covariance, imprint.covariance))
     size = max(float(np.linalg.norm(there)), 1e-300)

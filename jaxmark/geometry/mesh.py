@@ -1,7 +1,7 @@
 """Triangle meshes and point clouds as arrays, checked once on the host.
 
-A `Mesh` is plain data: it goes through `jit`, `vmap` and `grad`. Everything in this module except the type itself
-runs on the host with NumPy, keeps float64, and says what is wrong before anything is traced.
+A `Mesh` is plain data: it goes through `jit`, `vmap` and `grad`. The functions run on the host with NumPy, in float64,
+and refuse unusable input before anything is traced.
 """
 
 import math
@@ -15,6 +15,14 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.extras import require
+
+# Diagonal to which meshes are scaled for fast-simplification. Its thresholds are absolute: in smaller meshes it
+# collapses many edges in arbitrary order, in much larger ones too few.
+_INPUT_DIAGONAL = 100
+
+
+Faces = Int[Array | np.ndarray, "faces 3"]
 
 
 class Mesh(NamedTuple):
@@ -25,26 +33,23 @@ class Mesh(NamedTuple):
     """
 
     vertices: Float[Array | np.ndarray, "vertices 3"]  # in the file's own units and order
-    faces: Int[Array | np.ndarray, "faces 3"]  # zero-based indices into `vertices`
+    faces: Faces  # zero-based indices into `vertices`
 
 
 class Weld(NamedTuple):
-    """Which vertices are copies of one point (UV seams, triangle soup), and so must move together."""
+    """The vertices that are copies of one point (UV seams, triangle soup), and so must move together."""
 
     point: Int64[np.ndarray, " vertices"]  # the point of each vertex; points are numbered by first occurrence
     first: Int64[np.ndarray, " points"]  # the first vertex of each point
 
 
 def make_mesh(vertices: ArrayLike, faces: ArrayLike) -> Mesh:
-    """Validate arrays on the host and make a `Mesh` of them.
+    """Validate arrays on the host and make a `Mesh` of NumPy arrays of them: float64 vertices, int64 faces.
 
     Args:
-        vertices: `[N, 3]` finite numbers; kept in float64.
+        vertices: `[N, 3]` finite numbers.
         faces: `[F, 3]` integers, zero-based, each in `[0, N)`. Degenerate faces, duplicate vertices, isolated
             vertices, boundaries and non-manifold edges are all accepted. Without any, the mesh is a point cloud.
-
-    Returns:
-        A mesh of NumPy arrays: float64 vertices, int64 faces.
 
     Raises:
         JaxmarkError: if a shape is wrong, there is no vertex, a coordinate is not finite, or an index is not an
@@ -90,35 +95,19 @@ def host_mesh(mesh: Mesh) -> Mesh:
 
 
 def check_mesh(mesh: Mesh) -> None:
-    """Refuse what is no mesh, such as the name of a file.
-
-    Raises:
-        JaxmarkError: if it has no vertices and faces.
-    """
+    """Raise `JaxmarkError` for an object without vertices and faces, such as the name of a file."""
     if not (hasattr(mesh, "vertices") and hasattr(mesh, "faces")):
         raise JaxmarkError(f"A mesh is needed, got {type(mesh).__name__}; jaxmark.load_mesh reads one from a file.")
 
 
 def check_faces(name: str, mesh: Mesh) -> None:
-    """Refuse a point cloud, for functions of surfaces.
-
-    Args:
-        name: what needs faces, as a sentence begins with it.
-        mesh: any mesh.
-
-    Raises:
-        JaxmarkError: if the mesh has no faces.
-    """
+    """Raise `JaxmarkError` for a point cloud; `name` is the subject of the sentence, the function that needs faces."""
     if len(mesh.faces) == 0:
         raise JaxmarkError(f"{name} needs faces, and a point cloud of {len(mesh.vertices)} points has none; mesh it.")
 
 
 def check_concrete(name: str, *values: Any) -> None:
-    """Refuse values that JAX traces, for functions of the host.
-
-    Raises:
-        JaxmarkError: if one of them is traced.
-    """
+    """Raise `JaxmarkError` if JAX traces one of the values, for functions of the host."""
     if any(isinstance(value, Tracer) for value in values):
         raise JaxmarkError(
             f"{name} runs on the host, where nothing can be traced: call it outside of jit, vmap and grad, or hold its"
@@ -127,13 +116,9 @@ def check_concrete(name: str, *values: Any) -> None:
 
 
 def weld(vertices: Float[Array | np.ndarray, "vertices 3"]) -> Weld:
-    """Find the vertices at exactly the same position (-0.0 equals 0.0).
+    """Find the vertices at exactly the same finite position (-0.0 equals 0.0).
 
-    Args:
-        vertices: `[N, 3]` finite positions.
-
-    Returns:
-        The maps from vertices to points and back; `vertices[weld.first]` are the distinct points.
+    The result maps vertices to points and back; `vertices[weld.first]` are the distinct points.
     """
     canonical = np.asarray(vertices, np.float64) + 0.0  # turns -0.0 into 0.0
     # The sort is stable: the copies of a point stand together, its first vertex first.
@@ -151,7 +136,7 @@ def weld_mesh(mesh: Mesh, welded: Weld) -> Mesh:
     return Mesh(np.asarray(mesh.vertices)[welded.first], welded.point[np.asarray(mesh.faces)])
 
 
-def edges(faces: Int[Array | np.ndarray, "faces 3"]) -> Int64[np.ndarray, "edges 2"]:
+def edges(faces: Faces) -> Int64[np.ndarray, "edges 2"]:
     """The undirected edges of the faces, sorted, as `[E, 2]` with the smaller index first.
 
     An edge counts once, whether one face has it, two, or more. A side of a degenerate face that joins a vertex to
@@ -160,9 +145,7 @@ def edges(faces: Int[Array | np.ndarray, "faces 3"]) -> Int64[np.ndarray, "edges
     return _count_sides(faces)[0]
 
 
-def sides(
-    faces: Int[Array | np.ndarray, "faces 3"],
-) -> tuple[Int64[np.ndarray, "sides 2"], Int64[np.ndarray, " sides"]]:
+def sides(faces: Faces) -> tuple[Int64[np.ndarray, "sides 2"], Int64[np.ndarray, " sides"]]:
     """The directed sides of the faces, and the corner opposite to each.
 
     The first sides of all faces come first, then all second sides, then all third.
@@ -172,15 +155,11 @@ def sides(
     return np.concatenate([face[:, :2] for face in turned]), np.concatenate([face[:, 2] for face in turned])
 
 
-def face_pairs(
-    faces: Int[Array | np.ndarray, "faces 3"],
-) -> tuple[Int64[np.ndarray, "pairs 2"], Bool[np.ndarray, " pairs"]]:
+def face_pairs(faces: Faces) -> tuple[Int64[np.ndarray, "pairs 2"], Bool[np.ndarray, " pairs"]]:
     """Pairs of faces that alone share an edge, each once, and whether they run along it in the same direction."""
     faces = np.asarray(faces, np.int64)
-    start, end = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
-    face = np.tile(np.arange(len(faces)), 3)
-    base = int(faces.max(initial=0)) + 1
-    code = np.minimum(start, end) * base + np.maximum(start, end)
+    start, face = faces.T.ravel(), np.tile(np.arange(len(faces)), 3)
+    code = _side_codes(faces)[0].T.ravel()
     order = np.argsort(code, kind="stable")
     code = code[order]
     starts = np.flatnonzero(np.diff(code, prepend=-1))
@@ -222,19 +201,17 @@ def face_normals(mesh: Mesh) -> Float64[np.ndarray, "faces 3"]:
     return unit(_area_vectors(mesh))
 
 
-def boundary_vertices(faces: Int[Array | np.ndarray, "faces 3"]) -> Int64[np.ndarray, " boundary"]:
+def boundary_vertices(faces: Faces) -> Int64[np.ndarray, " boundary"]:
     """Indices of the vertices on edges that only one face has, ascending."""
     pairs, count = _count_sides(faces)
     return np.unique(pairs[count == 1])
 
 
-def open_sides(faces: Int[Array | np.ndarray, "faces 3"]) -> Bool[np.ndarray, "faces 3"]:
-    """Which sides of each face no other side runs along; side k goes from corner k to corner k + 1."""
-    faces = np.asarray(faces, np.int64)
-    low, high = np.minimum(faces, np.roll(faces, -1, axis=1)), np.maximum(faces, np.roll(faces, -1, axis=1))
-    bits = int(faces.max(initial=0)).bit_length()
-    _, which, count = np.unique((low << bits | high).ravel(), return_inverse=True, return_counts=True)
-    return ((count == 1)[which.reshape(-1)] & (low != high).ravel()).reshape(faces.shape)
+def open_sides(faces: Faces) -> Bool[np.ndarray, "faces 3"]:
+    """Mask of the sides of each face that no other side runs along; side k goes from corner k to corner k + 1."""
+    codes, proper, _ = _side_codes(faces)
+    _, which, count = np.unique(codes, return_inverse=True, return_counts=True)
+    return (count == 1)[which.reshape(codes.shape)] & proper
 
 
 def face_areas(mesh: Mesh) -> Float64[np.ndarray, " faces"]:
@@ -277,11 +254,33 @@ def compact(mesh: Mesh) -> Mesh:
     return Mesh(np.asarray(mesh.vertices)[used], (np.cumsum(used) - 1)[np.asarray(mesh.faces)])
 
 
+def simplify(mesh: Mesh, faces: int) -> Mesh:
+    """Collapse edges, those of least quadric error first, until about a number of faces is left.
+
+    The program is fast-simplification, which uses the quadrics of Garland and Heckbert, "Surface simplification using
+    quadric error metrics", SIGGRAPH 1997.
+
+    Args:
+        mesh: any mesh, concrete.
+        faces: the number of faces, positive.
+
+    Raises:
+        JaxmarkError: if no face is left, all vertices are at one point, or fast-simplification is missing.
+    """
+    if faces >= len(mesh.faces):
+        return mesh
+    simplifier = require("fast_simplification", "attacks").simplify
+    vertices, indices = map(np.asarray, compact(mesh))
+    centre, length = vertices.mean(axis=0), diagonal(mesh) / _INPUT_DIAGONAL
+    points, indices = simplifier((vertices - centre) / length, indices, target_count=faces)
+    if len(indices) == 0:
+        raise JaxmarkError("fast-simplification left no face of this mesh; ask for a smaller share.")
+    return Mesh(centre + length * points, indices.astype(np.int64))
+
+
 def same_connectivity(first: Mesh, second: Mesh) -> bool:
     """Whether two meshes have the same number of vertices and the same faces, index by index."""
-    return len(first.vertices) == len(second.vertices) and np.array_equal(
-        np.asarray(first.faces), np.asarray(second.faces)
-    )
+    return len(first.vertices) == len(second.vertices) and np.array_equal(first.faces, second.faces)
 
 
 def displacement(mesh: Mesh, suspect: Mesh, welded: Weld, length: float) -> Float64[np.ndarray, "points 3"]:
@@ -295,9 +294,6 @@ def displacement(mesh: Mesh, suspect: Mesh, welded: Weld, length: float) -> Floa
         suspect: a mesh of the same connectivity.
         welded: from `weld`, of the original's vertices.
         length: the unit of the result, such as the original's `diagonal`.
-
-    Returns:
-        `[points, 3]`, in units of `length`.
 
     Raises:
         JaxmarkError: if the suspect does not share the mesh's connectivity, index by index.
@@ -327,10 +323,7 @@ def _area_vectors(mesh: Mesh) -> Float64[np.ndarray, "faces 3"]:
 
 def cross_product(x: Float64[np.ndarray, "rows 3"], y: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3"]:
     """The cross product row by row; four times as fast as NumPy's, which is for any axes."""
-    found = np.empty_like(x)
-    for axis, (one, other) in enumerate(((1, 2), (2, 0), (0, 1))):
-        found[:, axis] = x[:, one] * y[:, other] - x[:, other] * y[:, one]
-    return found
+    return np.stack([x[:, i] * y[:, j] - x[:, j] * y[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
 
 
 def unit(x: Float64[np.ndarray, "*rows 3"]) -> Float64[np.ndarray, "*rows 3"]:
@@ -339,14 +332,18 @@ def unit(x: Float64[np.ndarray, "*rows 3"]) -> Float64[np.ndarray, "*rows 3"]:
     return np.divide(x, length, out=np.zeros_like(x), where=length > 0)
 
 
-def _count_sides(
-    faces: Int[Array | np.ndarray, "faces 3"],
-) -> tuple[Int64[np.ndarray, "edges 2"], Int64[np.ndarray, " edges"]]:
+def _count_sides(faces: Faces) -> tuple[Int64[np.ndarray, "edges 2"], Int64[np.ndarray, " edges"]]:
     """The undirected edges, sorted, and the number of face sides that each stands for."""
-    faces = np.asarray(faces, np.int64)
-    tail, head = np.ravel(faces.T), np.ravel(np.roll(faces, -1, axis=1).T)
-    low, high = np.minimum(tail, head), np.maximum(tail, head)
-    # One integer per pair sorts many times faster than rows do.
-    bits = int(faces.max(initial=0)).bit_length()
-    codes, count = np.unique((low << bits | high)[low != high], return_counts=True)
+    codes, proper, bits = _side_codes(faces)
+    codes, count = np.unique(codes[proper], return_counts=True)
     return np.stack([codes >> bits, codes & ((1 << bits) - 1)], axis=1), count
+
+
+def _side_codes(faces: Faces) -> tuple[Int64[np.ndarray, "faces 3"], Bool[np.ndarray, "faces 3"], int]:
+    """A number for each undirected side, whether its ends differ, and the bits of the larger end in the number.
+
+    One integer per pair sorts many times faster than rows do.
+    """
+    faces = np.asarray(faces, np.int64)
+    ends, bits = np.roll(faces, -1, axis=1), int(faces.max(initial=0)).bit_length()
+    return np.minimum(faces, ends) << bits | np.maximum(faces, ends), faces != ends, bits

@@ -1,4 +1,4 @@
-"""What each pixel of a picture of a mesh shows, by casting rays with libigl; orthographic, on the host."""
+"""Orthographic pictures of meshes: the face that each pixel shows, by casting rays with libigl, on the host."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -21,24 +21,20 @@ SIDES: Mapping[str, Float64[np.ndarray, "3 3"]] = {
 
 
 class Frame(NamedTuple):
-    """Where pictures of an object look, and how far they reach; several meshes may share one."""
+    """The square that pictures of an object show; several meshes may share one."""
 
     centre: Float64[np.ndarray, "3"]
     width: float  # of the square that a picture shows, in the units of the positions
 
     @classmethod
     def of(cls, mesh: Mesh) -> "Frame":
-        """The frame in which a mesh is seen whole from everywhere.
-
-        Raises:
-            JaxmarkError: see `diagonal`.
-        """
+        """Make the frame in which a mesh is seen whole from everywhere; raises as `diagonal` does."""
         points = np.asarray(mesh.vertices, np.float64)[used_vertices(mesh)]
         return cls((points.min(axis=0) + points.max(axis=0)) / 2, diagonal(mesh))
 
 
 class Raster(NamedTuple):
-    """What the pixels of a square picture show, from the upper left one on."""
+    """The faces that the pixels of a square picture show, from the upper left one on."""
 
     mesh: Mesh
     camera: Float64[np.ndarray, "3 3"]  # right, up and towards the eye, as rows
@@ -47,7 +43,7 @@ class Raster(NamedTuple):
 
     @property
     def shown(self) -> Bool[np.ndarray, "rows columns"]:
-        """Whether a pixel shows the object."""
+        """Mask of the pixels that show the object."""
         return self.face >= 0
 
     def normals(self, *, smooth: bool) -> Float64[np.ndarray, "rows columns 3"]:

@@ -1,4 +1,4 @@
-"""Skins: which joints of a skeleton move each vertex, and how a posed shape is brought back by them."""
+"""Skins: which joints of a skeleton move each vertex, and how the pose of a shape is undone by them."""
 
 from typing import NamedTuple
 
@@ -16,19 +16,14 @@ _FLAT = 1e-3  # least volume of a unit cube after a pose that can be undone
 
 
 class Skinning(NamedTuple):
-    """Linear blend skinning: each vertex moves by a weighted mean of what some joints do.
+    """Linear blend skinning: each vertex moves by a weighted mean of the maps of some joints."""
 
-    Attributes:
-        joints: numbers of the joints that move each vertex; those of weight 0 do not matter.
-        weights: their weights, which sum to 1.
-    """
-
-    joints: Int64[np.ndarray, "vertices slots"]
-    weights: Float64[np.ndarray, "vertices slots"]
+    joints: Int64[np.ndarray, "vertices slots"]  # numbers of the joints that move each vertex; any, with weight 0
+    weights: Float64[np.ndarray, "vertices slots"]  # which sum to 1
 
 
 def unpose(original: Mesh, skin: Skinning, suspect: Mesh) -> Mesh:
-    """Bring a suspect in another pose of the original's skeleton back to the original's pose.
+    """Undo the pose of a suspect: move it from another pose of the original's skeleton to the original's.
 
     The pose is fitted: one affine map for each joint, so that the original, blended by its weights, comes closest to
     the suspect by least squares, and each vertex of the suspect is moved by the inverse of its blended map. No key
@@ -37,10 +32,7 @@ def unpose(original: Mesh, skin: Skinning, suspect: Mesh) -> Mesh:
     Args:
         original: the mesh as its file has it, in the pose that its skin is bound in.
         skin: of the original, as `jaxmark.files.load_skin` reads it.
-        suspect: the same vertices in the same order, posed.
-
-    Returns:
-        The suspect's shape in the original's pose, place and size, with its own faces.
+        suspect: the same vertices in the same order, posed; the result keeps its faces.
 
     Raises:
         JaxmarkError: if the numbers of vertices differ, there are too many joints, or the pose flattens the surface, so

@@ -1,4 +1,4 @@
-"""Closest points on the surfaces of meshes, and points sampled from surfaces, on the host.
+"""Surfaces of meshes: closest points and samples on the host, and moments, also of traced arrays.
 
 Closest points come from libigl, which agrees with brute force at any scale of coordinates; trimesh does not.
 """
@@ -7,12 +7,14 @@ from functools import cached_property
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Array, Bool, Float, Float64, Int64
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, area, boundary_vertices, unit, used_vertices, vertex_normals
 from jaxmark.geometry.pose import IDENTITY, Points, Pose
+
+Corners = Float[Array | np.ndarray, "faces 3 3"]  # of each face, in order
 
 
 class Samples(NamedTuple):
@@ -25,14 +27,14 @@ class Samples(NamedTuple):
 
 @runtime_checkable
 class Geometry(Protocol):
-    """What registration brings onto each other: the surface of a mesh, or the points of a cloud."""
+    """A shape that registration aligns: the surface of a mesh, or the points of a cloud."""
 
     def anchors(self) -> tuple[Points, Points]:
         """Points of the shape itself, and unit normals there."""
         ...
 
     def closest(self, points: Points, pose: Pose = IDENTITY) -> tuple[Points, Int64[np.ndarray, " points"]]:
-        """The closest places on the shape, placed by a pose, and what of the shape each lies on."""
+        """The closest places on the shape, placed by a pose, and the face or point of each."""
         ...
 
     def sample(self, count: int) -> Samples:
@@ -54,14 +56,9 @@ class Surface:
         return tree
 
     def closest(self, points: Points, pose: Pose = IDENTITY) -> tuple[Points, Int64[np.ndarray, " points"]]:
-        """Find the closest points on the surface, placed by a pose, and the faces they lie on.
+        """Find the closest points `[P, 3]` on the surface, placed by a pose, and the index of a face for each.
 
-        Args:
-            points: the query points `[P, 3]`.
-            pose: a map of the surface, a similarity or nearly.
-
-        Returns:
-            The closest points `[P, 3]` on the placed surface, and the index of a face for each.
+        The pose is a similarity, or nearly one.
 
         Raises:
             JaxmarkError: if libigl is missing.
@@ -76,7 +73,7 @@ class Surface:
         return np.asarray(self.mesh.vertices)[used], vertex_normals(self.mesh)[used]
 
     def sample(self, count: int) -> Samples:
-        """Sample points, see `sample`."""
+        """Sample points; see `sample`."""
         return sample(self.mesh, count)
 
 
@@ -121,3 +118,41 @@ def barycentric(
     with np.errstate(all="ignore"):
         share = triangles.points_to_barycentric(np.asarray(mesh.vertices)[np.asarray(mesh.faces)[face]], points)
     return np.nan_to_num(share, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+class Moments(NamedTuple):
+    """Mass, centre and covariance of a shape of density 1."""
+
+    mass: Any  # area, or signed volume: positive where normals point outwards
+    centre: Any  # `[3]`
+    covariance: Any  # `[3, 3]`, about the centre, per mass
+
+
+def surface_moments(corners: Corners) -> Moments:
+    """Moments of a surface."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    area = (_cross(b - a, c - a) ** 2).sum(axis=1) ** 0.5 / 2
+    return _moments(area, area.sum(), (a, b, c), (3, 12))
+
+
+def volume_moments(corners: Corners) -> Moments:
+    """Moments of what a closed surface encloses: sums over the tetrahedra that its faces and the origin span.
+
+    The mass is not positive if normals point inwards; centre and covariance do not depend on that.
+    """
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    volume = (a * _cross(b, c)).sum(axis=1) / 6
+    return _moments(volume, volume.sum(), (a, b, c), (4, 20))
+
+
+def _moments(weight: Any, mass: Any, corners: tuple[Any, Any, Any], over: tuple[int, int]) -> Moments:
+    """Moments of simplices: with the sum s of n corners p, they are s/n and (ssᵀ + Σ ppᵀ)/(n(n + 1))."""
+    total = corners[0] + corners[1] + corners[2]
+    centre = weight @ total / over[0] / mass
+    square = sum((part.T * weight) @ part for part in (total, *corners)) / over[1] / mass
+    return Moments(mass, centre, square - centre[:, None] * centre)
+
+
+def _cross(x: Any, y: Any) -> Any:
+    """The cross products of rows, of NumPy or traced arrays."""
+    return x[:, [1, 2, 0]] * y[:, [2, 0, 1]] - x[:, [2, 0, 1]] * y[:, [1, 2, 0]]

@@ -1,4 +1,4 @@
-"""Frames: banks of filters whose parts determine the signal, and the way back from parts to signals.
+"""Frames: banks of filters whose parts determine the signal, and the inverse of such a bank.
 
 The parts g_j(Δ)x of a signal have the energy Σ_j ‖g_j(Δ)x‖² = ⟨x, G(Δ)x⟩_M with G = Σ_j g_j², between A‖x‖² and B‖x‖²
 where A ≤ G ≤ B on [0, 2]. If A > 0 the bank is a frame: different signals have different parts. Reference: Hammond,
@@ -12,35 +12,26 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.scipy.signal import fftconvolve
-from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, Float64
 from scipy import fft
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.chebyshev import check_parts, filter, synthesise
+from jaxmark.spectral.chebyshev import Bank, check_parts, filter, synthesise
 from jaxmark.spectral.laplacian import Operator
-from jaxmark.spectral.recurrence import inner_mass
+from jaxmark.spectral.recurrence import inner_mass, solve
 
 _POINTS_PER_DEGREE = 256  # which bound a polynomial to 2e-5 of its range
 _MAX_DEGREE = 2**13  # of the filters of a tight frame
 _MAX_ITERATIONS = 10_000  # enough for float64 where A/B = 1e-5, the smallest that frame_bounds resolves
 
 
-def frame_bounds(coefficients: Float[Array | np.ndarray, "bands terms"]) -> tuple[float, float]:
-    """Bounds A ≤ Σ_j g_j(λ)² ≤ B on [0, 2], of the polynomials themselves, on the host.
+def frame_bounds(coefficients: Bank) -> tuple[float, float]:
+    """Compute bounds A ≤ Σ_j g_j(λ)² ≤ B on [0, 2] of a bank `[bands, degree + 1]`, on the host.
 
     They hold for certain, up to rounding: a polynomial of degree n is evaluated at the M = 256 n zeros of T_M, and is
     nowhere further from the middle of these values than half their range over cos(πn/2M) (Ehlich, Zeller, "Schwankung
-    von Polynomen zwischen Gitterpunkten", 1964). They are off by less than 1e-5 (B - A) from the best bounds.
-
-    Args:
-        coefficients: one Chebyshev series per row, `[bands, degree + 1]`.
-
-    Returns:
-        A, which is 0 if the bank is not shown to be a frame, and B.
-
-    Raises:
-        JaxmarkError: if the coefficients are not `[bands, degree + 1]`.
+    von Polynomen zwischen Gitterpunkten", 1964). They are off by less than 1e-5 (B - A) from the best bounds. A is 0 if
+    the bank is not shown to be a frame.
     """
     c = _matrix("frame_bounds", coefficients)
     degree = 2 * (c.shape[1] - 1)
@@ -51,10 +42,8 @@ def frame_bounds(coefficients: Float[Array | np.ndarray, "bands terms"]) -> tupl
     return max(middle - radius, 0.0), middle + radius
 
 
-def tight(
-    coefficients: Float[Array | np.ndarray, "bands terms"], *, tolerance: float = 1e-6
-) -> Float64[np.ndarray, "bands more_terms"]:
-    """Divide a bank's filters by √(Σ_j g_j²), so that `synthesise` brings back what `band_components` took apart.
+def tight(coefficients: Bank, *, tolerance: float = 1e-6) -> Float64[np.ndarray, "bands more_terms"]:
+    """Divide a bank's filters by √(Σ_j g_j²), so that `synthesise` inverts `band_components`.
 
     The quotients are no polynomials. They are interpolated, by degrees that double from the bank's own on until the
     frame bounds are within `tolerance` of 1; the closer A is to 0, the higher the degree.
@@ -62,9 +51,6 @@ def tight(
     Args:
         coefficients: a frame, `[bands, degree + 1]`.
         tolerance: largest |Σ_j g_j² - 1| over [0, 2] of the new filters.
-
-    Returns:
-        `[bands, degree + 1]`, in the order of the bank, with a degree that is mostly larger.
 
     Raises:
         JaxmarkError: if the bank is no frame, or a degree above 8192 would be needed.
@@ -84,11 +70,9 @@ def tight(
 
 
 def inverse(
-    operator: Operator,
-    coefficients: Float[Array | np.ndarray, "bands terms"],
-    parts: Float[Array | np.ndarray, "bands vertices *columns"],
+    operator: Operator, coefficients: Bank, parts: Float[Array | np.ndarray, "bands vertices *columns"]
 ) -> Float[Array, " vertices *columns"]:
-    """The signal of given parts: x with g_j(Δ)x = y_j, or as close as any signal comes if the parts were changed.
+    """Recover the signal from its parts: x with g_j(Δ)x = y_j, or as close as any signal comes to changed parts.
 
     It minimises Σ_j ‖g_j(Δ)x - y_j‖² in the M-norm: G(Δ)x = Σ_j g_j(Δ)y_j with G = Σ_j g_j², by conjugate gradients.
     Each iteration is one `filter` of twice the bank's degree; there are about √(B/A)/2 · ln(2/eps), for all columns
@@ -117,14 +101,8 @@ def inverse(
 @jax.jit
 def _inverse(operator: Operator, c: Array, parts: Array) -> Array:
     power, right = _power(c), synthesise(operator, c, parts)
-    root = jnp.sqrt(inner_mass(operator, right))
-    z, _ = cg(
-        lambda z: root * filter(operator, power, z / root),
-        root * right,
-        tol=10 * float(jnp.finfo(c.dtype).eps),
-        maxiter=_MAX_ITERATIONS,
-    )
-    return z / root
+    mass = inner_mass(operator, right)
+    return solve(lambda x: filter(operator, power, x), right, mass, _MAX_ITERATIONS)
 
 
 def _power(c: Array) -> Array:
@@ -139,7 +117,7 @@ def _at_nodes(row: np.ndarray, points: int) -> Float64[np.ndarray, " points"]:
     return np.asarray(fft.dct(np.concatenate([row[:1], row[1:] / 2]), type=3, n=points))
 
 
-def _matrix(name: str, coefficients: Array | np.ndarray) -> Float64[np.ndarray, "bands terms"]:
+def _matrix(name: str, coefficients: Bank) -> Float64[np.ndarray, "bands terms"]:
     c = np.asarray(coefficients, np.float64)
     if c.ndim != 2 or 0 in c.shape:
         raise JaxmarkError(f"{name} needs coefficients [bands, degree + 1], got {c.shape}.")

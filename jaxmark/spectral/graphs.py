@@ -1,4 +1,8 @@
-"""Laplacians of graphs that are no meshes: of any edges, and of points and their nearest neighbours."""
+"""Laplacians of meshes, of points and their nearest neighbours, of any edges, and of given matrices.
+
+They are built on the host, as a `Laplacian` of NumPy arrays in float64 that computes in the dtype of the signal it is
+applied to. Its `weights` are None if all are 1. `JaxmarkError` is raised for input that is not as described here.
+"""
 
 from typing import Any, Literal, get_args
 
@@ -13,7 +17,7 @@ from scipy.spatial import KDTree
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, edges, face_pairs
-from jaxmark.spectral.laplacian import Laplacian, Lowering, graph_laplacian, sparse_matrices
+from jaxmark.spectral.laplacian import Laplacian, Lowering, graph_laplacian, symmetric_matrix
 from jaxmark.spectral.weights import cotangent_weights, inverse_length_weights, vertex_areas
 
 Weighting = Literal["valence", "inverse-length", "cotangent"]
@@ -34,10 +38,10 @@ def from_mesh(
     elements: Elements = "vertices",
     lowering: Lowering = "auto",
 ) -> Laplacian:
-    """Build the graph Laplacian of a mesh, on the host.
+    """Build the graph Laplacian of a mesh.
 
     Vertices at the same position are *not* merged; see `jaxmark.geometry.mesh.weld`. Positions may be traced, for
-    derivatives of filters with respect to them through weights and areas.
+    derivatives of filters with respect to them through weights and areas, which are traced arrays then.
 
     Args:
         mesh: any mesh, its faces concrete; boundary edges, edges of three faces or more, and several components are
@@ -57,14 +61,10 @@ def from_mesh(
             each vertex's neighbours; `"auto"`, by the table unless the valences differ so much that it does not pay on
             this platform.
 
-    Returns:
-        A `Laplacian` of NumPy arrays in float64, but for what depends on traced positions; it computes in the dtype of
-        the signal it is applied to. Its `weights` are None if all are 1.
-
     Raises:
         JaxmarkError: if a name is unknown, weights or masses are not one for each edge or vertex, finite and not
             negative, an edge has length zero under `"inverse-length"`, no edge has a positive weight under
-            `"cotangent"`, a vertex with edges has no mass, the bound is none, or there is none for traced positions.
+            `"cotangent"`, a vertex with edges has no mass, or the bound is below the spectrum.
     """
     _check_name("Products are lowered by", lowering, Lowering)
     traced = isinstance(mesh.vertices, Tracer)
@@ -80,7 +80,11 @@ def from_mesh(
         }
         values = by_name[weights]()
         if values is not None and not traced:
-            _check_found(values, pairs, weights)
+            if not np.isfinite(values).all():
+                bad = pairs[int(np.argmax(values))]
+                raise JaxmarkError(f"Edge {bad.tolist()} has length zero; weld its vertices or use valence weights.")
+            if not values.max(initial=0.0) > 0:
+                raise JaxmarkError(f"No edge has a positive {weights} weight; use valence weights.")
     else:
         values = checked_weights(weights, len(pairs))
     masses: Any = mass
@@ -101,7 +105,7 @@ def from_mesh(
 def from_matrices(
     stiffness: Any, mass: Any = None, *, bound: float | None = None, lowering: Lowering = "auto"
 ) -> Laplacian:
-    """Build the operator of a stiffness matrix S = D - W, such as of `robust_laplacian` or `libigl`, on the host.
+    """Build the operator of a stiffness matrix S = D - W, such as of `robust_laplacian` or `libigl`.
 
     `from_matrices(*robust_laplacian.mesh_laplacian(vertices, faces))` has weights of an intrinsic Delaunay
     triangulation, none of which is negative (Sharp, Crane, "A Laplacian for nonmanifold triangle meshes", 2020).
@@ -109,13 +113,10 @@ def from_matrices(
     Args:
         stiffness: `[N, N]`, any sparse matrix of SciPy's, or a dense one: symmetric, with rows that sum to zero, and
             nothing positive off the diagonal.
-        mass: M, a diagonal matrix `[N, N]` or its diagonal `[N]`. By default the diagonal of the stiffness.
-        bound: see `from_mesh`.
-        lowering: see `from_mesh`.
-
-    Raises:
-        JaxmarkError: if the stiffness is not as above, or the mass no diagonal matrix that is positive at vertices
-            with edges.
+        mass: M, a diagonal matrix `[N, N]` or its diagonal `[N]`, positive at vertices with edges. By default the
+            diagonal of the stiffness.
+        bound: as in `from_mesh`.
+        lowering: as in `from_mesh`.
     """
     matrix: Any = sparse.coo_array(stiffness).astype(np.float64)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
@@ -142,11 +143,7 @@ def from_matrices(
 
 
 def checked_weights(weights: ArrayLike, count: int) -> Float64[np.ndarray, " edges"]:
-    """Weights of so many edges as an array.
-
-    Raises:
-        JaxmarkError: if there are more or fewer, or one is negative or not finite, or a vertex with edges has no mass.
-    """
+    """Return the weights of `count` edges as an array; refuse other numbers of them, and negative and infinite ones."""
     values = np.asarray(weights, np.float64)
     if values.shape != (count,):
         raise JaxmarkError(f"weights must have one value for each of the {count} edges, got {values.shape}.")
@@ -165,25 +162,19 @@ def from_edges(
     duplicates: Literal["refuse", "add"] = "refuse",
     lowering: Lowering = "auto",
 ) -> Laplacian:
-    """Build the Laplacian of an undirected graph from its edges, on the host.
+    """Build the Laplacian of an undirected graph from its edges.
 
     Args:
-        edges: pairs of vertices `[E, 2]`, numbered from 0; the direction of a pair does not matter.
+        edges: pairs of vertices `[E, 2]`, numbered from 0, none from a vertex to itself; their direction does not
+            matter.
         weights: `[E]`, finite and not negative; all 1 unless given.
         size: number of vertices; by default one more than the largest number.
-        mass: `[size]`, the lumped mass M of the generalised problem (D - W)x = λMx; see `from_mesh`, as for `bound`.
-        bound: of λ, with a mass.
-        duplicates: what to do with a pair that is there twice, in one direction or in both: `"refuse"`, or `"add"`
-            the weights, as SciPy's sparse matrices do. A graph of directed edges, each in both directions, doubles all
-            weights so, which leaves Δ as it is.
-        lowering: see `from_mesh`.
-
-    Returns:
-        A `Laplacian` of NumPy arrays in float64; its `weights` are None if all are 1.
-
-    Raises:
-        JaxmarkError: if an edge joins a vertex to itself, is there twice or has a vertex that is not there, or a weight
-            is negative or not finite, or a vertex with edges has no mass.
+        mass: `[size]`, the lumped mass M, as in `from_mesh`.
+        bound: as in `from_mesh`.
+        duplicates: what to do with a pair that occurs twice, in one direction or in both: `"refuse"`, or `"add"` the
+            weights, as SciPy's sparse matrices do. This doubles all weights of a graph of directed edges, each in both
+            directions, which leaves Δ as it is.
+        lowering: as in `from_mesh`.
     """
     given = np.asarray(edges)
     if given.ndim != 2 or given.shape[1] != 2 or not (np.issubdtype(given.dtype, np.integer) or given.size == 0):
@@ -216,23 +207,16 @@ def from_points(
     *,
     lowering: Lowering = "auto",
 ) -> Laplacian:
-    """Build the Laplacian of points, each joined to its nearest ones, on the host, in O(N log N) by SciPy's k-d tree.
+    """Build the Laplacian of points, each joined to its nearest ones, in O(N log N) by SciPy's k-d tree.
 
     Two points are joined if one is among the nearest of the other.
 
     Args:
         points: positions `[N, dimensions]`.
-        neighbours: number of nearest points that each is joined to, at least.
-        weights: `"valence"`, each edge 1; `"inverse-length"`, 1 over its length; `"gaussian"`, exp(-l²/2σ²) of its
-            length l, with σ the mean distance to the farthest of the nearest points.
-        lowering: see `from_mesh`.
-
-    Returns:
-        See `from_edges`.
-
-    Raises:
-        JaxmarkError: if the points are not finite, there are no more of them than neighbours, or two points are at the
-            same position under `"inverse-length"`.
+        neighbours: number of nearest points that each is joined to, at least; less than N.
+        weights: `"valence"`, each edge 1; `"inverse-length"`, 1 over its length, which must not be 0; `"gaussian"`,
+            exp(-l²/2σ²) of its length l, with σ the mean distance to the farthest of the nearest points.
+        lowering: as in `from_mesh`.
     """
     positions = np.asarray(points, np.float64)
     if positions.ndim != 2 or not np.isfinite(positions).all():
@@ -243,15 +227,15 @@ def from_points(
         )
     _check_name("weights are", weights, PointWeighting)
     pairs, reach = nearest_pairs(positions, neighbours)
-    if weights == "valence":
-        return graph_laplacian(pairs, len(positions), lowering=lowering)
-    lengths = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1)
+    lengths, values = np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1), None
     if weights == "gaussian":
-        return graph_laplacian(pairs, len(positions), np.exp(-(lengths**2) / (2 * reach**2 or 1.0)), lowering=lowering)
-    if (lengths == 0).any():
-        pair = pairs[int(np.argmin(lengths))].tolist()
-        raise JaxmarkError(f"Points {pair} are at the same position; merge them, or use other weights.")
-    return graph_laplacian(pairs, len(positions), 1 / lengths, lowering=lowering)
+        values = np.exp(-(lengths**2) / (2 * reach**2 or 1.0))
+    elif weights == "inverse-length":
+        if (lengths == 0).any():
+            pair = pairs[int(np.argmin(lengths))].tolist()
+            raise JaxmarkError(f"Points {pair} are at the same position; merge them, or use other weights.")
+        values = 1 / lengths
+    return graph_laplacian(pairs, len(positions), values, lowering=lowering)
 
 
 def nearest_pairs(
@@ -332,26 +316,15 @@ def _with_mass(operator: Laplacian, mass: ArrayLike | None, bound: float | None)
 
 def _bound(operator: Laplacian) -> float:
     """A bound of the spectrum of M⁻¹(D - W): by its rows (Gershgorin), or a little above the largest eigenvalue."""
-    stiffness, mass = sparse_matrices(operator)
-    linked = np.flatnonzero(np.asarray(operator.degree) > 0)
+    linked, root, scaled = symmetric_matrix(operator)
     if len(linked) == 0:
         return 2.0
-    inverse = 1 / np.sqrt(mass.diagonal()[linked])
-    by_rows = 2 * float((stiffness.diagonal()[linked] * inverse**2).max())
+    by_rows = 2 * float((np.asarray(operator.degree)[linked] * (1 / root) ** 2).max())
     if len(linked) < 3:
         return by_rows
-    scaled = sparse.diags_array(inverse) @ stiffness[linked][:, linked] @ sparse.diags_array(inverse)
     start = np.cos(np.arange(len(linked), dtype=np.float64))  # a fixed start makes the result repeatable
     found: Any = linalg.eigsh(scaled, 1, which="LA", tol=1e-3, v0=start, return_eigenvectors=False)  # pyright: ignore[reportArgumentType]
     return min(by_rows, _BOUND_MARGIN * float(found[0]))
-
-
-def _check_found(values: np.ndarray, pairs: np.ndarray, weights: str) -> None:
-    if not np.isfinite(values).all():
-        bad = pairs[int(np.argmax(values))]
-        raise JaxmarkError(f"Edge {bad.tolist()} has length zero; weld its vertices or use valence weights.")
-    if not values.max(initial=0.0) > 0:
-        raise JaxmarkError(f"No edge has a positive {weights} weight; use valence weights.")
 
 
 def _check_name(sentence: str, name: str, names: Any) -> None:

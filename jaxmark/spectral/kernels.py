@@ -2,8 +2,8 @@
 
 They compute several degrees on a block of rows while it is in cache (matrix-power blocking: Alappat, Hager, Schenk,
 Wellein, "Level-based blocking for sparse matrices: sparse matrix-power-vector multiplication", IEEE TPDS 34(2), 2023),
-where a scan in XLA reads all rows again for each degree. Their results agree with those of the scan to rounding, which
-is why nothing chooses between the two but what is installed, and the platform that a program is compiled for.
+where a scan in XLA reads all rows again for each degree. Their results agree with those of the scan to rounding, so
+that the two need no option: kernels are used where they are installed, in programs for processors.
 """
 
 from collections.abc import Callable
@@ -41,13 +41,15 @@ def installed() -> bool:
     return True
 
 
-def where_installed(kernel: Computation, scan: Computation) -> Computation:
-    """What computes a function of an operator and arrays on processors: a kernel, or if there is none, a scan.
+def where_installed(kernel: Computation | None, scan: Computation) -> Computation:
+    """Choose between two ways to compute a function of an operator and arrays on processors.
 
     Args:
-        kernel: called with `Rows` and the arrays, of which the last is the signal.
-        scan: called with the operator and the arrays.
+        kernel: called with `Rows` and the arrays, of which the last is the signal; None if there is none.
+        scan: called with the operator and the arrays, where no kernel is installed or the operator has no `Rows`.
     """
+    if kernel is None:
+        return scan
 
     def compute(operator: Any, *arrays: Array) -> Array:
         rows = operator.rows(arrays[-1]) if installed() and arrays[-1].size else None
@@ -57,12 +59,12 @@ def where_installed(kernel: Computation, scan: Computation) -> Computation:
 
 
 def filter_rows(rows: Rows, c: Float[Array, " terms *series"], x: Float[Array, " rows *columns"]) -> Array:
-    """f(Δ)x of a Chebyshev series, one for each column of x if it has columns, or one for all."""
+    """Compute f(Δ)x of a Chebyshev series for each column of x, if it has columns, or for all."""
     return component_rows(rows, c[None], x)[0]
 
 
 def component_rows(rows: Rows, c: Float[Array, "bands terms *series"], x: Float[Array, " rows *columns"]) -> Array:
-    """All f_b(Δ)x, as `filter_rows`: `[bands, *x.shape]`."""
+    """Compute all f_b(Δ)x, as `filter_rows`: `[bands, *x.shape]`."""
     columns = x.reshape(len(x), -1)
     series = c if c.ndim == 3 else c[..., None]
     result = jax.ShapeDtypeStruct((len(series), *columns.shape), x.dtype)
@@ -70,7 +72,7 @@ def component_rows(rows: Rows, c: Float[Array, "bands terms *series"], x: Float[
 
 
 def project_rows(terms: int, rows: Rows, x: Float[Array, " rows *columns"], u: Float[Array, " rows *columns"]) -> Array:
-    """Σ_v u_v (T_k(Δ - I)x)_v for so many k, column by column: `[terms, *columns]`."""
+    """Compute Σ_v u_v (T_k(Δ - I)x)_v for each of some k, column by column: `[terms, *columns]`."""
     columns = x.reshape(len(x), -1)
     result = jax.ShapeDtypeStruct((terms, columns.shape[1]), x.dtype)
     return _call("project", result, rows, columns, u.reshape(columns.shape)).reshape(terms, *x.shape[1:])
@@ -78,16 +80,7 @@ def project_rows(terms: int, rows: Rows, x: Float[Array, " rows *columns"], u: F
 
 def _call(name: str, result: jax.ShapeDtypeStruct, rows: Rows, *arrays: Array) -> Array:
     dtype = result.dtype
-    nothing, no_indices = np.zeros(0, dtype), np.zeros(0, np.int32)
-    given = (
-        rows.table,
-        nothing if rows.weights is None else rows.weights,
-        rows.own,
-        rows.inverse,
-        rows.rest,
-        nothing if rows.rest_weights is None else rows.rest_weights,
-        no_indices if rows.order is None else rows.order,
-        *arrays,
-    )
+    given = [np.zeros(0, dtype) if part is None else part for part in rows[:-1]]
+    order = np.zeros(0, np.int32) if rows.order is None else rows.order
     # Members of a batch run one after the other; each keeps all cores busy.
-    return jax.ffi.ffi_call(f"jaxmark_{name}_{dtype}", result, vmap_method="sequential")(*given)
+    return jax.ffi.ffi_call(f"jaxmark_{name}_{dtype}", result, vmap_method="sequential")(*given, order, *arrays)

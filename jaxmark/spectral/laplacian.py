@@ -24,6 +24,8 @@ from jaxmark.spectral.kernels import Rows
 from jaxmark.spectral.precision import check_precision
 
 Lowering = Literal["auto", "gather", "segments"]
+Signal = Float[Array | np.ndarray, " vertices *columns"]
+Values = Shaped[Array, " vertices *columns"]
 
 # The cost of adding to a row at any index, in units of reading a row: on processors by measurement, elsewhere assumed,
 # because an atomic addition reads and writes.
@@ -45,8 +47,8 @@ class Operator(Protocol):
         """The diagonal of M; 0 where a vertex is isolated, unless it has a mass of its own."""
         ...
 
-    def linked(self, like: Shaped[Array, " vertices *columns"]) -> Bool[Array, " vertices *ones"]:
-        """Which vertices have edges, to select from signals like this."""
+    def linked(self, like: Values) -> Bool[Array, " vertices *ones"]:
+        """A mask of the vertices that have edges, to select from signals like this."""
         ...
 
     @property
@@ -54,21 +56,22 @@ class Operator(Protocol):
         """The same operator in the vertices' order, by sums over edges, whose derivatives by weights only read rows."""
         ...
 
-    def product(
-        self, like: Shaped[Array, " vertices *columns"]
-    ) -> Callable[[Float[Array, " vertices *columns"]], Float[Array, " vertices *columns"]]:
-        """The map x → Δx in the operator's own order, for signals of the shape and dtype of `like`."""
+    def product(self, like: Values) -> Callable[[Values], Values]:
+        """Return the map x → Δx in the operator's own order, for signals of the shape and dtype of `like`.
+
+        Call this outside of loops, for it computes what all products share.
+        """
         ...
 
-    def rows(self, like: Shaped[Array, " vertices *columns"]) -> Rows | None:
+    def rows(self, like: Values) -> Rows | None:
         """The rows of Δ - I for compiled kernels, in the dtype of `like`; None if they are not all at hand."""
         ...
 
-    def enter(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+    def enter(self, x: Values) -> Values:
         """Reorder rows from the vertices' order to the operator's own."""
         ...
 
-    def leave(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+    def leave(self, x: Values) -> Values:
         """Reorder rows from the operator's own order to the vertices' order."""
         ...
 
@@ -85,7 +88,7 @@ class Neighbours(NamedTuple):
     rest: Int[Array | np.ndarray, "rest 3"]  # vertex, neighbour, edge without a slot; padding is past the last vertex
     edges: Int[Array | np.ndarray, "slots vertices"] | None  # past the last edge if empty; None without edge weights
     order: Int[Array | np.ndarray, " vertices"] | None = None  # the vertex of each row; None if the orders are the same
-    rank: Int[Array | np.ndarray, " vertices"] | None = None  # the row of each vertex; None likewise
+    rank: Int[Array | np.ndarray, " vertices"] | None = None  # the row of each vertex; None if the orders are the same
 
 
 class Laplacian(NamedTuple):
@@ -111,7 +114,7 @@ class Laplacian(NamedTuple):
         weights: Float[Array | np.ndarray, " edges"],
         lumped_mass: Float[Array | np.ndarray, " vertices"] | None = None,
     ) -> "Laplacian":
-        """The operator of the same edges with other weights, and mass, as a pure function with derivatives.
+        """Replace the weights, and the mass, as a pure function with derivatives.
 
         Args:
             weights: not negative, in the order of `edges`. Products are by table only if the operator had weights.
@@ -131,20 +134,12 @@ class Laplacian(NamedTuple):
         return self._replace(neighbours=None)
 
     @jax.jit
-    def apply(self, x: Float[Array, " vertices *columns"]) -> Float[Array, " vertices *columns"]:
-        """Δx for one signal `[N]` or several `[N, C]`, in the dtype of `x`.
-
-        Raises:
-            JaxmarkError: if `x` is not floating.
-        """
+    def apply(self, x: Values) -> Values:
+        """Compute Δx for one signal `[N]` or several `[N, C]`, in the dtype of `x`, which must be floating."""
         return self.leave(self.product(x)(self.enter(x)))
 
-    def product(
-        self, like: Shaped[Array, " vertices *columns"]
-    ) -> Callable[[Float[Array, " vertices *columns"]], Float[Array, " vertices *columns"]]:
-        """The map x → Δx in the operator's own order, for signals of the shape and dtype of `like`.
-
-        Make it outside of loops, for it computes what all products share.
+    def product(self, like: Values) -> Callable[[Values], Values]:
+        """Return the map x → Δx; see `Operator`.
 
         Raises:
             JaxmarkError: if the signal is not floating.
@@ -152,28 +147,20 @@ class Laplacian(NamedTuple):
         if not jnp.issubdtype(like.dtype, jnp.floating):
             raise JaxmarkError(f"Laplacian.apply needs a floating-point signal, got {like.dtype}.")
         own, inverse = self._own(like)
-        if (table := self._table) is None:
-            total = self._segments(like)
-        elif self.weights is None:
-            total = _gather(table)
-        else:
-            total = _weighted_gather(table, self.weights, like)
+        total = self._by_edges(like) if self._table is None else self._by_table(self._table, like)
         return lambda x: own * x - inverse * total(x)
 
-    def rows(self, like: Shaped[Array, " vertices *columns"]) -> Rows | None:
+    def rows(self, like: Values) -> Rows | None:
         """The rows of Δ - I for compiled kernels; see `Operator`."""
         table, flat = self._table, like.reshape(len(like), -1)[:, 0]
         if table is None:
             return None
         own, inverse = self._own(flat)
-        weights = rest_weights = None
-        if self.weights is not None and table.edges is not None:
-            padded = jnp.append(jnp.asarray(self.weights).astype(like.dtype), 0)
-            weights, rest_weights = padded[table.edges], padded[table.rest[:, 2]]
+        weights, rest_weights = self._table_weights(table, like)
         return Rows(table.vertices, weights, own - 1, inverse, table.rest, rest_weights, table.order)
 
     def _own(self, like: Array) -> tuple[Array, Array]:
-        """What rows have of themselves in Δ, and by what their neighbours are divided, in the operator's own order."""
+        """The diagonal of Δ, and the factor of the sums over neighbours, in the operator's own order."""
         degree, inverse = (self.enter(rows) for rows in (per_row(self.degree, like), self.inverse_mass(like)))
         own = (degree > 0).astype(like.dtype) if self.lumped_mass is None else degree * inverse
         if self.weights is None and self._table is not None:
@@ -181,11 +168,11 @@ class Laplacian(NamedTuple):
             own += inverse * per_row(self._table.empty, like)
         return own, inverse
 
-    def linked(self, like: Shaped[Array, " vertices *columns"]) -> Bool[Array, " vertices *ones"]:
-        """Which vertices have edges, to select from signals like this."""
+    def linked(self, like: Values) -> Bool[Array, " vertices *ones"]:
+        """A mask of the vertices that have edges; see `Operator`."""
         return per_row(self.degree, like) > 0
 
-    def inverse_mass(self, like: Shaped[Array, " vertices *columns"]) -> Float[Array, " vertices *ones"]:
+    def inverse_mass(self, like: Values) -> Float[Array, " vertices *ones"]:
         """1/(M s), by which sums over neighbours are divided, to multiply signals like this; 0 at isolated vertices."""
         # Select before dividing, so that isolated vertices keep finite gradients.
         linked = self.linked(like)
@@ -193,11 +180,11 @@ class Laplacian(NamedTuple):
         mass = mass if self.scale is None else mass * jnp.asarray(self.scale).astype(like.dtype)
         return jnp.where(linked, 1 / jnp.where(linked, mass, 1), 0)
 
-    def enter(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+    def enter(self, x: Values) -> Values:
         """Reorder rows to the operator's own order; see `Operator`."""
         return x if self._table is None or self._table.order is None else x[self._table.order]
 
-    def leave(self, x: Shaped[Array, " vertices *columns"]) -> Shaped[Array, " vertices *columns"]:
+    def leave(self, x: Values) -> Values:
         """Reorder rows to the vertices' order; see `Operator`."""
         return x if self._table is None or self._table.rank is None else x[self._table.rank]
 
@@ -207,7 +194,27 @@ class Laplacian(NamedTuple):
         table = self.neighbours
         return None if table is None or (self.weights is not None and table.edges is None) else table
 
-    def _segments(self, like: Array) -> Callable[[Array], Array]:
+    def _table_weights(self, table: Neighbours, like: Array) -> tuple[Array | None, Array | None]:
+        """The weights of the edges in the table's slots, and of those without a slot; None if all are 1."""
+        if self.weights is None or table.edges is None:
+            return None, None
+        padded = jnp.append(jnp.asarray(self.weights).astype(like.dtype), 0)
+        return padded[table.edges], padded[table.rest[:, 2]]
+
+    def _by_table(self, table: Neighbours, like: Array) -> Callable[[Array], Array]:
+        """The map x → Wx, slot by slot; without weights, each empty slot adds the vertex's own row."""
+        weights, rest_weights = self._table_weights(table, like)
+        factors = [1.0] * len(table.vertices) if weights is None else [per_row(slot, like) for slot in weights]
+        slots, rest = list(zip(factors, table.vertices, strict=True)), jnp.asarray(table.rest)
+        factor = 1.0 if rest_weights is None else per_row(rest_weights, like)
+
+        def total(x: Array) -> Array:
+            found = sum((weight * x[vertex] for weight, vertex in slots), jnp.zeros_like(x))
+            return found.at[rest[:, 0]].add(factor * x[rest[:, 1]]) if len(rest) else found
+
+        return total
+
+    def _by_edges(self, like: Array) -> Callable[[Array], Array]:
         """The map x → Wx by two segment-sums over the edges."""
         tail, head = self.edges[:, 0], self.edges[:, 1]
         weights = 1 if self.weights is None else per_row(self.weights, like)
@@ -217,10 +224,8 @@ class Laplacian(NamedTuple):
         )
 
     @jax.jit
-    def inner(
-        self, x: Float[Array, " vertices *columns"], y: Float[Array, " vertices *columns"]
-    ) -> Float[Array, " *columns"]:
-        """The inner product ⟨x, y⟩_M = Σ_v M_v x_v y_v, column by column: a scalar for `[N]`, `[C]` for `[N, C]`.
+    def inner(self, x: Values, y: Values) -> Float[Array, " *columns"]:
+        """Compute the inner product ⟨x, y⟩_M = Σ_v M_v x_v y_v: a scalar for `[N]`; `[C]`, by columns, for `[N, C]`.
 
         Raises:
             JaxmarkError: if the shapes differ.
@@ -237,13 +242,10 @@ def graph_laplacian(
     *,
     lowering: Lowering = "auto",
 ) -> Laplacian:
-    """Build the Laplacian of any graph, such as that of a mesh's faces, on the host.
+    """Build the Laplacian of a graph of `size` vertices, on the host; nothing is checked.
 
-    Args:
-        pairs: the edges, each once, none from a vertex to itself.
-        size: number of vertices.
-        weights: finite and not negative; all 1 unless given.
-        lowering: see `jaxmark.spectral.graphs.from_mesh`.
+    Each edge is there once, none from a vertex to itself. Weights are finite and not negative, all 1 unless given;
+    `lowering` is as in `jaxmark.spectral.graphs.from_mesh`.
     """
     degree = np.bincount(pairs.ravel(), None if weights is None else np.repeat(weights, 2), size).astype(np.float64)
     neighbours = None
@@ -262,15 +264,11 @@ def make_neighbours(
     if_it_pays: bool = False,
     slots: int | None = None,
 ) -> Neighbours | None:
-    """Build the table of neighbours.
+    """Build the table of neighbours in a graph of `size` vertices, which looks weights up if edges are `weighted`.
 
-    Args:
-        pairs: the edges.
-        size: number of vertices.
-        order: the vertex of each row of the table; the vertices' own order unless given.
-        weighted: whether the edges have weights, which the table then looks up.
-        if_it_pays: whether to return None where segment-sums are cheaper.
-        slots: number of slots; by default the even number, or the next one, that makes a product cheapest.
+    The rows are in the vertices' own order unless their `order` is given. The number of slots is by default the even
+    number, or the next one, that makes a product cheapest. With `if_it_pays`, None is returned where segment-sums are
+    cheaper.
     """
     rank = None if order is None else np.argsort(order).astype(np.int32)
     graph = adjacency(pairs if rank is None else rank[pairs], size)
@@ -312,43 +310,24 @@ def adjacency(pairs: Int[np.ndarray, "edges 2"], size: int) -> sparse.csr_array:
     return sparse.csr_array(sparse.coo_array((edge, (tail, head)), shape=(size, size)))
 
 
-def _gather(table: Neighbours) -> Callable[[Array], Array]:
-    """The map x → Wx slot by slot, for edges without weights; each empty slot adds the vertex's own row."""
-    slots, rest = list(table.vertices), jnp.asarray(table.rest)
-    return lambda x: _with_rest(sum((x[vertex] for vertex in slots), jnp.zeros_like(x)), rest, x)
-
-
-def _weighted_gather(table: Neighbours, weights: Array | np.ndarray, like: Array) -> Callable[[Array], Array]:
-    """The map x → Wx slot by slot, for weighted edges."""
-    assert table.edges is not None
-    padded = jnp.append(jnp.asarray(weights).astype(like.dtype), 0)
-    slots = [(per_row(padded[edge], like), vertex) for edge, vertex in zip(table.edges, table.vertices, strict=True)]
-    rest = jnp.asarray(table.rest)
-    factor = per_row(padded[rest[:, 2]], like)
-    return lambda x: _with_rest(sum((w * x[vertex] for w, vertex in slots), jnp.zeros_like(x)), rest, x, factor)
-
-
-def _with_rest(total: Array, rest: Array, x: Array, factor: Array | float = 1.0) -> Array:
-    """Add the neighbours without a slot, one by one."""
-    return total.at[rest[:, 0]].add(factor * x[rest[:, 1]]) if len(rest) else total
-
-
 def per_row(values: Num[Array | np.ndarray, " rows"], x: Array | np.ndarray) -> Array:
     """Cast one value per row, such as D, to the dtype of `x`, and shape it to broadcast against its columns."""
     return jnp.asarray(values).astype(x.dtype).reshape(-1, *[1] * (x.ndim - 1))
 
 
-def check_signal(name: str, operator: Operator, x: Array | np.ndarray) -> None:
-    """Refuse a signal that is not of the operator's vertices, or in half precision.
+def checked_signal(name: str, operator: Operator, x: Array | np.ndarray) -> Array:
+    """Return a signal as a JAX array, and refuse one that is not of the operator's vertices, or in half precision.
 
     Raises:
         JaxmarkError: if it is not `[N]` or `[N, C]`, in float32 or float64.
     """
+    x = jnp.asarray(x)
     if x.ndim not in (1, 2) or x.shape[0] != operator.mass.shape[0]:
         raise JaxmarkError(
             f"{name} needs a signal [N] or [N, C] with N = {operator.mass.shape[0]} vertices, got {x.shape}."
         )
     check_precision(name, x)
+    return x
 
 
 def centre(
@@ -369,12 +348,10 @@ def centre(
     graph = sparse.coo_array((np.ones(len(tail)), (tail, head)), shape=(size, size))
     count, component = csgraph.connected_components(graph, directed=False)
     mass = np.where(mass > 0, mass, 1.0)
-    total = np.bincount(component, mass, count)
-    means = np.stack([np.bincount(component, mass * column, count) for column in x.T], axis=1) / total[:, None]
-    centred = x - means[component]
-    # A second pass removes the rounding errors that the first leaves at large offsets.
-    rest = np.stack([np.bincount(component, mass * column, count) for column in centred.T], axis=1) / total[:, None]
-    return centred - rest[component]
+    total = np.bincount(component, mass, count)[:, None]
+    for _ in range(2):  # the second pass removes the rounding errors that the first leaves at large offsets
+        x = x - (np.stack([np.bincount(component, mass * column, count) for column in x.T], axis=1) / total)[component]
+    return x
 
 
 def sparse_matrices(operator: Laplacian) -> tuple[sparse.csr_array, sparse.dia_array]:
@@ -387,6 +364,15 @@ def sparse_matrices(operator: Laplacian) -> tuple[sparse.csr_array, sparse.dia_a
     if operator.scale is not None:
         stiffness = stiffness / float(operator.scale)
     return stiffness, sparse.diags_array(np.asarray(operator.mass, np.float64))
+
+
+def symmetric_matrix(operator: Laplacian) -> tuple[Int64[np.ndarray, " linked"], np.ndarray, sparse.csr_array]:
+    """The vertices that have edges, √M on them, and the symmetric form M^½ΔM^-½ of Δ on them, on the host."""
+    stiffness, mass = sparse_matrices(operator)
+    linked = np.flatnonzero(np.asarray(operator.degree) > 0)
+    root = np.sqrt(mass.diagonal()[linked])
+    inverse = sparse.diags_array(1 / root)
+    return linked, root, inverse @ stiffness[linked][:, linked] @ inverse
 
 
 def host_edges(operator: Laplacian) -> tuple[Int[np.ndarray, "edges 2"], Float64[np.ndarray, " edges"]]:

@@ -46,10 +46,15 @@ class Linear:
         if self.derivatives is not None:
             return self.derivatives[index](*arguments, tangent)
 
-        def of_one(part: PyTree) -> Array:
-            return self.apply(*arguments[:index], combine(part, arguments[index]), *arguments[index + 1 :])
+        def of_one(changed: PyTree) -> Array:
+            return self.apply(*arguments[:index], changed, *arguments[index + 1 :])
 
-        return jax.jvp(of_one, (floats(arguments[index]),), (tangent,))[1]
+        return along(of_one, arguments[index], tangent)
+
+
+def along(function: Callable[[Any], Array], tree: PyTree, change: PyTree) -> Array:
+    """The derivative of a function in the direction of a change of a pytree's floating leaves."""
+    return jax.jvp(lambda part: function(combine(part, tree)), (floats(tree),), (change,))[1]
 
 
 def floats(tree: PyTree) -> PyTree:
@@ -95,7 +100,7 @@ def _apply_on_processors(*leaves: Array, rule: Linear, structure: Any) -> Array:
 
 
 def _evaluate_abstractly(*avals: Any, rule: Linear, structure: Any) -> Any:
-    # Of the two ways, this is mostly the one that is traced anyway, and it takes less time to trace.
+    # This is mostly the function that is traced anyway, and it takes less time to trace than `apply`.
     jaxpr = jax.make_jaxpr(partial(_apply_on_processors, rule=rule, structure=structure))(*avals)
     (result,) = jaxpr.out_avals
     return result
@@ -129,20 +134,16 @@ def _transpose(cotangent: Any, *operands: Any, rule: Linear, structure: Any) -> 
 def _map(operands: Any, axes: Any, *, rule: Linear, structure: Any) -> tuple[Array, int]:
     """Move mapped axes to the front, and bind the primitive with mapped rules."""
     moved = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(operands, axes, strict=True)]
-    parts = _split(structure, [None if axis is None else 0 for axis in axes])
+    parts = tuple(_split(structure, [None if axis is None else 0 for axis in axes]))
     one = (jax.tree.structure(0), (0,))
-
-    def mapped(function: Rule, *of: Any, summed: tuple[int | None, ...] | None = None) -> _Mapped:
-        return _Mapped(function, tuple(of), summed)
-
-    derivatives = rule.derivatives
-    if derivatives is not None:
-        derivatives = tuple(mapped(function, *parts, part) for function, part in zip(derivatives, parts, strict=False))
+    derivatives = rule.derivatives and tuple(
+        _Mapped(function, (*parts, part)) for function, part in zip(rule.derivatives, parts, strict=False)
+    )
     over = Linear(
-        mapped(rule.apply, *parts),
-        mapped(rule.transposed, *parts[:-1], one, summed=parts[-1][1]),
+        _Mapped(rule.apply, parts),
+        _Mapped(rule.transposed, (*parts[:-1], one), parts[-1][1]),
         derivatives,
-        None if rule.on_processors is None else mapped(rule.on_processors, *parts),
+        rule.on_processors and _Mapped(rule.on_processors, parts),
     )
     return _primitive.bind(*moved, rule=over, structure=structure), 0
 

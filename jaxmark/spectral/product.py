@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.laplacian import Operator, check_signal
+from jaxmark.spectral.laplacian import Operator, Signal, checked_signal
 
 
 class Factors(NamedTuple):
@@ -25,7 +25,7 @@ class Factors(NamedTuple):
 
 
 def lagrange_factors(nodes: Float[np.ndarray, " bands"], *, order: Literal["leja", "printed"] = "leja") -> Factors:
-    """Factor the Lagrange polynomials Π_{i≠j} (λ - λ_i)/(λ_j - λ_i), one node a row.
+    """Factor the Lagrange polynomials Π_{i≠j} (λ - λ_i)/(λ_j - λ_i), one node a row: `[bands, bands - 1]`.
 
     At the zeros of a Chebyshev polynomial these are the scaling functions; `lagrange` gives their Chebyshev series.
 
@@ -34,9 +34,6 @@ def lagrange_factors(nodes: Float[np.ndarray, " bands"], *, order: Literal["leja
         order: `"printed"` applies the zeros in the order of the nodes and A_j = 1/Π_{i≠j}(λ_j - λ_i) as a whole at the
             end, as the paper does (its Method 1 omits A_j, which is an erratum). `"leja"` applies the zeros in Leja's
             order, each as far as possible from those before it, and A_j in equal parts (Reichel, BIT 30, 1990).
-
-    Returns:
-        Factors `[bands, bands - 1]` each.
 
     Raises:
         JaxmarkError: if there are fewer than two nodes, two coincide, or `order` is unknown.
@@ -61,12 +58,9 @@ def lagrange_factors(nodes: Float[np.ndarray, " bands"], *, order: Literal["leja
 
 
 def leja(nodes: Float[np.ndarray, " nodes"]) -> Int64[np.ndarray, " nodes"]:
-    """Leja's order: the largest node first, then always the one with the largest product of distances to those before.
+    """Order nodes by Leja: the largest first, then always the node with the largest product of distances to the others.
 
     So the products of the first factors are of similar size over the whole spectrum (Reichel, BIT 30, 1990).
-
-    Returns:
-        The indices of the nodes in that order.
     """
     chosen = [int(np.argmax(np.abs(nodes)))]
     with np.errstate(divide="ignore"):
@@ -79,9 +73,7 @@ def leja(nodes: Float[np.ndarray, " nodes"]) -> Int64[np.ndarray, " nodes"]:
 
 
 @jax.jit
-def filter_by_factors(
-    operator: Operator, factors: Factors, x: Float[Array | np.ndarray, " vertices *columns"]
-) -> Float[Array, " vertices *columns"]:
+def filter_by_factors(operator: Operator, factors: Factors, x: Signal) -> Float[Array, " vertices *columns"]:
     """Filter a signal factor by factor: f(Δ)x as one `lax.scan`, with one product per factor.
 
     All bands at once are `jax.vmap(filter_by_factors, (None, 0, None))(operator, factors, x)`; they share no products,
@@ -90,18 +82,14 @@ def filter_by_factors(
 
     Args:
         operator: the Laplacian, of N vertices.
-        factors: those of one band, `[degree]` each.
-        x: `[N]` or `[N, C]`.
-
-    Returns:
-        f(Δ)x, in the shape and dtype of `x`.
+        factors: the factors of one band, `[degree]` each.
+        x: `[N]` or `[N, C]`, whose dtype the result keeps.
 
     Raises:
         JaxmarkError: if the shapes do not fit.
     """
-    x = jnp.asarray(x)
+    x = checked_signal("filter_by_factors", operator, x)
     zeros, scales = (jnp.asarray(part).astype(x.dtype) for part in factors)
-    check_signal("filter_by_factors", operator, x)
     if zeros.ndim != 1 or zeros.shape != scales.shape:
         raise JaxmarkError(f"filter_by_factors needs factors [degree], got {zeros.shape} and {scales.shape}.")
     product = operator.product(x)

@@ -9,18 +9,18 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, Float64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.laplacian import Operator, check_signal, per_row
+from jaxmark.spectral.laplacian import Operator, Signal, checked_signal
+from jaxmark.spectral.recurrence import inner_mass, solve
 
 
 @partial(jax.jit, static_argnames=("tolerance", "iterations"))
 def filter_rational(
     operator: Operator,
     sections: Float[Array | np.ndarray, "sections 6"],
-    x: Float[Array | np.ndarray, " vertices *columns"],
+    x: Signal,
     *,
     tolerance: float | None = None,
     iterations: int = 2000,
@@ -40,53 +40,42 @@ def filter_rational(
         operator: the Laplacian, of N vertices.
         sections: `[sections, 6]`, applied in this order. `[[1, 0, 0, 1, τ, 0]] * p` is p steps of implicit smoothing,
             1/(1 + τλ)^p.
-        x: `[N]` or `[N, C]`.
+        x: `[N]` or `[N, C]`, whose dtype the result keeps.
         tolerance: bound of each solve's residual, relative to the right-hand side, in the M-norm over all columns
             together; by default ten times the machine epsilon of the dtype of `x`.
         iterations: largest number of iterations of each solve.
 
-    Returns:
-        f(Δ)x, in the shape and dtype of `x`.
-
     Raises:
         JaxmarkError: if the shapes do not fit.
     """
-    x = jnp.asarray(x)
+    x = checked_signal("filter_rational", operator, x)
     sections = jnp.asarray(sections).astype(x.dtype)
-    check_signal("filter_rational", operator, x)
     if sections.ndim != 2 or sections.shape[1] != 6:
         raise JaxmarkError(f"filter_rational needs sections [sections, 6], got {sections.shape}.")
-    tolerance = 10 * float(jnp.finfo(x.dtype).eps) if tolerance is None else tolerance
-    product = operator.product(x)
-    mass = per_row(operator.enter(jnp.asarray(operator.mass)), x)
-    root = jnp.sqrt(jnp.where(mass > 0, mass, 1))  # an isolated vertex is its own block of Δ
+    product, mass = operator.product(x), operator.enter(inner_mass(operator, x))
 
     def quadratic(c: Array, y: Array) -> Array:
         first = product(y)
         return c[0] * y + c[1] * first + c[2] * product(first)
 
-    def solve(y: Array, section: Array) -> tuple[Array, None]:
-        z, _ = cg(
-            lambda z: root * quadratic(section[3:], z / root),
-            root * quadratic(section[:3], y),
-            tol=tolerance,
-            maxiter=iterations,
-        )
-        return z / root, None
+    def divide(y: Array, section: Array) -> tuple[Array, None]:
+        denominator = partial(quadratic, section[3:])
+        right = quadratic(section[:3], y)
+        return solve(denominator, right, mass, iterations, tolerance), None
 
-    return operator.leave(jax.lax.scan(solve, operator.enter(x), sections)[0])
+    return operator.leave(jax.lax.scan(divide, operator.enter(x), sections)[0])
 
 
 def response(
     sections: Float[np.ndarray, "*bands sections 6"], values: Float[np.ndarray, " values"]
 ) -> Float64[np.ndarray, "*bands values"]:
-    """Frequency response f(λ) at given λ, on the host: the factor by which `filter_rational` scales an eigenvector."""
+    """Evaluate f(λ), by which `filter_rational` scales an eigenvector, at given λ, on the host."""
     powers = np.stack([np.ones_like(values), values, values**2])
     return ((sections[..., :3] @ powers) / (sections[..., 3:] @ powers)).prod(axis=-2)
 
 
 def butterworth(edges: Float[np.ndarray, " edges"], order: int) -> Float64[np.ndarray, "bands sections 6"]:
-    """Bands as differences of Butterworth low-passes 1/(1 + (λ/e)^2p), one at each inner edge e.
+    """Make bands `[bands, 2 · order, 6]` as differences of Butterworth low-passes 1/(1 + (λ/e)^2p) at inner edges e.
 
     The bands are a partition of unity within [0, 1], without any overshoot. Every band but the first has a zero of
     order 2p at λ = 0, where meshes have their energy, and every band falls as (λ/e)^∓2p away from its edges. The
@@ -99,9 +88,6 @@ def butterworth(edges: Float[np.ndarray, " edges"], order: int) -> Float64[np.nd
     Args:
         edges: λ `[bands + 1]`, ascending in [0, 2]; the first and last stand for the ends of the spectrum.
         order: p, at least 1: half of what signal processing calls the order.
-
-    Returns:
-        `[bands, 2 · order, 6]`, by increasing frequency.
 
     Raises:
         JaxmarkError: if the edges do not ascend, there are fewer than three, or the order is below 1.

@@ -2,25 +2,27 @@
 
 A filter f(Δ)x = Σ_k c_k T_k(Δ̃)x is linear in c and in x, and a projection p_k = Σ_v u_v (T_k(Δ̃)x)_v is linear in u and
 in x. As Δ is self-adjoint, each is the other's transpose, so that derivatives of any order are filters and projections
-again. So are the components of a bank of filters and their synthesis. For the derivative with respect to the operator,
-the recurrence is run backwards: T_{k-2} = 2Δ̃T_{k-1} - T_k.
+again. So are the components of a bank of filters and their synthesis, and convolutions with matrices of weights. For
+the derivative with respect to the operator, the recurrence is run backwards: T_{k-2} = 2Δ̃T_{k-1} - T_k.
 
-Coefficients are `[terms]` for signals `[N]`, and `[terms, C]` for signals `[N, C]`; those of a bank are
-`[bands, terms]`. Nothing is checked here.
+Here, terms come first, as a scan takes them: coefficients are `[terms]` for signals `[N]`, `[terms, C]` for signals
+`[N, C]`, and `[terms, inputs, outputs]` of convolutions; only those of a bank are `[bands, terms]`. Nothing is checked.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
+from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, PyTree
 
-from jaxmark.spectral.kernels import component_rows, filter_rows, project_rows, where_installed
+from jaxmark.spectral.kernels import Computation, component_rows, filter_rows, project_rows, where_installed
 from jaxmark.spectral.laplacian import Operator, per_row
-from jaxmark.spectral.linear import Linear, combine, floats
+from jaxmark.spectral.linear import Linear, along, combine, floats
 from jaxmark.spectral.precision import einsum, matmul
 
 _ROWS_AT_ONCE = 128  # rows that are summed as one wide row
@@ -48,64 +50,67 @@ def _scan_terms(
         carry, output = step(carry, following, current, datum)
         return (current, following, carry), output
 
-    # T_1 = Δ̃T_0 is the recurrence with factor 1 and T_{-1} = 0.
-    factors = jnp.full(len(data) - 1, 2, x.dtype).at[:1].set(1)
     # Unrolling saves a copy of the carry in each step, but leaves more to compile.
     unroll = 3 if x.size >= _MIN_UNROLLED_VALUES else 1
-    (_, _, carry), outputs = jax.lax.scan(body, (jnp.zeros_like(x), x, start), (factors, data[1:]), unroll=unroll)
+    (_, _, carry), outputs = jax.lax.scan(
+        body, (jnp.zeros_like(x), x, start), (_factors(len(data), x), data[1:]), unroll=unroll
+    )
     return carry, outputs
 
 
-@jax.jit
-def filter_scan(operator: Operator, coefficients: Array, x: Array) -> Array:
-    """Compute f(Δ)x without rules of its own; see `filtered`."""
-
-    def add(total: Array, t: Array, _: Array, c_k: Array) -> tuple[Array, None]:
-        return total + c_k * t, None
-
-    x = operator.enter(x)
-    return operator.leave(_scan_terms(operator, x, coefficients, add, coefficients[0] * x)[0])
+def _factors(terms: int, x: Array) -> Array:
+    """The factors of the recurrence from T_1 on: T_1 = Δ̃T_0 is that with factor 1 and T_{-1} = 0."""
+    return jnp.full(terms - 1, 2, x.dtype).at[:1].set(1)
 
 
-_filter_on_processors = where_installed(filter_rows, filter_scan)
+@dataclass(frozen=True)
+class Family:
+    """Filters of one kind, Σ_k mix(T_k(Δ̃)x, w_k), by the bilinear maps that they and their derivatives are made of."""
+
+    mix: Callable[[Array, Array], Array]  # of rows and the weights of one term
+    pair: Callable[[Array, Array], Array]  # ⟨w, pair(t, y)⟩ = ⟨mix(t, w), y⟩
+    turn: Callable[[Array], Array]  # ⟨t, mix(y, turn(w))⟩ = ⟨mix(t, w), y⟩, also for the weights of all terms at once
+    filter_kernel: Computation | None = None  # of rows, weights and signal
+    project_kernel: Computation | None = None  # of the number of terms, rows and two signals
 
 
 @partial(jax.jit, static_argnums=0)
-def _projection_scan(terms: int, operator: Operator, x: Array, u: Array) -> Array:
-    """Compute Σ_v u_v (T_k(Δ̃)x)_v for so many k, column by column."""
-    u, x = operator.enter(u), operator.enter(x)
+def _filter_scan(family: Family, operator: Operator, w: Array, x: Array) -> Array:
+    """Filter a signal without rules of its own; see `_filtered`."""
+
+    def add(total: Array, t: Array, _: Array, w_k: Array) -> tuple[Array, None]:
+        return total + family.mix(t, w_k), None
+
+    x = operator.enter(x)
+    return operator.leave(_scan_terms(operator, x, w, add, family.mix(x, w[0]))[0])
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _projection_scan(family: Family, terms: int, operator: Operator, x: Array, y: Array) -> Array:
+    """Pair T_k(Δ̃)x with y, for each of so many k."""
+    x, y = operator.enter(x), operator.enter(y)
 
     def project(_: None, t: Array, __: Array, ___: Array) -> tuple[None, Array]:
-        return None, _sums(u * t)
+        return None, family.pair(t, y)
 
     _, rest = _scan_terms(operator, x, jnp.zeros(terms, x.dtype), project, None)
-    return jnp.concatenate([_sums(u * x)[None], rest])
+    return jnp.concatenate([family.pair(x, y)[None], rest])
 
 
-def _transposed_filter(operator: Operator, c: Array, y: Array) -> Array:
-    mass = inner_mass(operator, y)
-    return mass * filtered(operator, c, y / mass)
+def _pulled_back(family: Family, operator: Operator, w: Array, x: Array, y: Array) -> list[Array]:
+    """The gradient of Σ_k ⟨mix(T_k(Δ̃)x, w_k), y⟩ with respect to the floating leaves of the operator, in O(N) memory.
 
-
-def _pulled_back(
-    operator: Operator, c: Array, x: Array, y: Array, weigh: Callable[[Array, Array], Array] = jnp.multiply
-) -> list[Array]:
-    """The gradient of Σ_k ⟨c_k y, T_k(Δ̃)x⟩ with respect to the floating leaves of the operator, in O(N) memory.
-
-    The product c_k y is what `weigh` makes of the two. With b_k = c_k y + 2Δ̃ᵀb_{k+1} - b_{k+2}, it is the sum of the
-    gradients of ⟨b_{k+1}, 2Δ T_k x⟩ over k, where b and T are held fixed, and the factor 2 is 1 at k = 0. Both
-    recurrences run downwards, that of T from its last two terms.
+    With z_k = mix(y, turn(w_k)) and b_k = z_k + 2Δ̃ᵀb_{k+1} - b_{k+2}, it is the sum of the gradients of
+    ⟨b_{k+1}, 2Δ T_k x⟩ over k, where b and T are held fixed, and the factor 2 is 1 at k = 0. Both recurrences run
+    downwards, that of T from its last two terms.
     """
     mass = inner_mass(operator, x)
     x, y, mass = (operator.enter(rows) for rows in (x, y, mass))
     product = operator.product(x)
-
-    def up(state: tuple[Array, Array], factor: Array) -> tuple[tuple[Array, Array], None]:
-        before, t = state
-        return (t, factor * (product(t) - t) - before), None
-
-    factors = jnp.full(len(c) - 1, 2, x.dtype).at[:1].set(1)
-    (before, last), _ = jax.lax.scan(up, (jnp.zeros_like(x), x), factors)
+    (last, before), _ = _scan_terms(
+        operator, x, w, lambda _, t, before, __: ((t, before), None), (x, jnp.zeros_like(x))
+    )
+    factors = _factors(len(w), x)
 
     # Sums over edges have derivatives that only read rows; those of tables would add to them.
     edgewise = operator.by_segments
@@ -116,26 +121,21 @@ def _pulled_back(
 
     def down(state: Any, inputs: tuple[Array, Array]) -> tuple[Any, None]:
         t, following, b, b_after, total = state
-        factor, c_k = inputs
+        factor, w_k = inputs
         rows = operator.leave(t)
         _, pull = jax.vjp(lambda parts: edgewise_product(parts, rows), parts)
         total = jax.tree.map(jnp.add, total, pull(operator.leave(factor * b))[0])
         scaled = b / mass
-        b_before = weigh(c_k, y) + factor * mass * (product(scaled) - scaled) - b_after
+        b_before = family.mix(y, family.turn(w_k)) + factor * mass * (product(scaled) - scaled) - b_after
         return (factor * (product(t) - t) - following, t, b_before, b, total), None
 
-    start = (before, last, weigh(c[-1], y), jnp.zeros_like(x), jax.tree.map(jnp.zeros_like, parts))
-    (*_, total), _ = jax.lax.scan(down, start, (factors, c[:-1]), reverse=True)
+    start = (before, last, family.mix(y, family.turn(w[-1])), jnp.zeros_like(x), jax.tree.map(jnp.zeros_like, parts))
+    (*_, total), _ = jax.lax.scan(down, start, (factors, w[:-1]), reverse=True)
     return total
 
 
-def along(function: Callable[[Operator], Array], operator: Operator, change: PyTree) -> Array:
-    """The derivative of a function in the direction of a change of the operator's floating leaves."""
-    return jax.jvp(lambda part: function(combine(part, operator)), (floats(operator),), (change,))[1]
-
-
 def changes_of(operator: Operator, tangents: Any) -> PyTree | None:
-    """What a rule of `jax.custom_jvp` is given as tangents of an operator, for `along`; None if it does not change."""
+    """Convert the tangents of an operator in a rule of `jax.custom_jvp` for `along`; None if it does not change."""
     leaves: list[Any] = jax.tree.leaves(tangents, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
     if all(isinstance(leaf, SymbolicZero) for leaf in leaves):
         return None
@@ -148,57 +148,102 @@ def changes_of(operator: Operator, tangents: Any) -> PyTree | None:
     return jax.tree.unflatten(jax.tree.structure(operator), part)
 
 
-_change = Linear(
-    lambda operator, c, x, change: along(lambda changed: filter_scan(changed, c, x), operator, change), _pulled_back
-)
-
-#: f(Δ)x as a function of x: `(operator, c, x)`.
-filtered = Linear(
-    filter_scan,
-    _transposed_filter,
-    (_change, lambda operator, c, x, change: of_coefficients(len(c))(operator, x, change)),
-    _filter_on_processors,
-)
-
-
 @cache
-def of_coefficients(terms: int) -> Linear:
-    """f(Δ)x as a function of its coefficients: `(operator, x, c)`."""
+def _changed(family: Family) -> Linear:
+    """The derivative of a filter in the direction of a change of the operator's floating leaves."""
     return Linear(
-        lambda operator, x, c: filter_scan(operator, c, x),
-        projection(terms),
-        (
-            lambda operator, x, c, change: _change(operator, c, x, change),
-            lambda operator, x, c, change: filtered(operator, c, change),
-        ),
-        lambda operator, x, c: _filter_on_processors(operator, c, x),
+        lambda operator, w, x, change: along(lambda changed: _filter_scan(family, changed, w, x), operator, change),
+        partial(_pulled_back, family),
     )
 
 
 @cache
-def projection(terms: int) -> Linear:
-    """Σ_v u_v (T_k(Δ̃)x)_v for so many k as a function of u: `(operator, x, u)`."""
+def _filtered(family: Family) -> Linear:
+    """A filter as a function of the signal: `(operator, w, x)`."""
+    scan = partial(_filter_scan, family)
 
-    def by_signal(operator: Operator, x: Array, u: Array, change: Array) -> Array:
-        mass = inner_mass(operator, u)
-        return projection(terms)(operator, u / mass, mass * change)
+    def transposed(operator: Operator, w: Array, y: Array) -> Array:
+        mass = inner_mass(operator, y)
+        return mass * _filtered(family)(operator, family.turn(w), y / mass)
 
-    scan = partial(_projection_scan, terms)
     return Linear(
         scan,
-        lambda operator, x, m: of_coefficients(terms)(operator, x, m),
-        (_changed_projection(terms), by_signal),
-        where_installed(partial(project_rows, terms), scan),
+        transposed,
+        (_changed(family), lambda operator, w, x, change: _of_weights(family, len(w))(operator, x, change)),
+        where_installed(family.filter_kernel, scan),
     )
 
 
 @cache
-def _changed_projection(terms: int) -> Linear:
-    """The derivative of a projection in the direction of a change of the operator's floating leaves."""
+def _of_weights(family: Family, terms: int) -> Linear:
+    """A filter as a function of its weights: `(operator, x, w)`."""
+    scan = partial(_filter_scan, family)
+    on_processors = where_installed(family.filter_kernel, scan)
     return Linear(
-        lambda operator, x, u, change: along(lambda changed: _projection_scan(terms, changed, x, u), operator, change),
-        lambda operator, x, u, m: _pulled_back(operator, m, x, u),
+        lambda operator, x, w: scan(operator, w, x),
+        lambda operator, x, y: projection(terms, family)(operator, x, y),
+        (
+            lambda operator, x, w, change: _changed(family)(operator, w, x, change),
+            lambda operator, x, w, change: _filtered(family)(operator, w, change),
+        ),
+        lambda operator, x, w: on_processors(operator, w, x),
     )
+
+
+@cache
+def _changed_projection(family: Family, terms: int) -> Linear:
+    """The derivative of a projection in the direction of a change of the operator's floating leaves."""
+    scan = partial(_projection_scan, family, terms)
+    return Linear(
+        lambda operator, x, y, change: along(lambda changed: scan(changed, x, y), operator, change),
+        lambda operator, x, y, w: _pulled_back(family, operator, w, x, y),
+    )
+
+
+#: Filters with a series for each column, Σ_k c_k T_k(Δ̃)x, with projections Σ_v u_v (T_k(Δ̃)x)_v.
+COLUMNS = Family(lambda t, c: c * t, lambda t, u: _sums(u * t), lambda c: c, filter_rows, project_rows)
+
+
+@cache
+def projection(terms: int, family: Family = COLUMNS) -> Linear:
+    """The pairs of T_k(Δ̃)x and y, for each of so many k, as a function of y: `(operator, x, y)`."""
+    scan = partial(_projection_scan, family, terms)
+
+    def by_signal(operator: Operator, x: Array, y: Array, change: Array) -> Array:
+        mass = inner_mass(operator, y)
+        return family.turn(projection(terms, family)(operator, y / mass, mass * change))
+
+    return Linear(
+        scan,
+        lambda operator, x, w: _of_weights(family, terms)(operator, x, w),
+        (_changed_projection(family, terms), by_signal),
+        where_installed(family.project_kernel and partial(family.project_kernel, terms), scan),
+    )
+
+
+def _mix(x: Array, weight: Array) -> Array:
+    """The product xW; by sums over columns where these are few, as processors are slow at such narrow matrices."""
+    if x.shape[1] > _MAX_SUMMED_COLUMNS:
+        return matmul(x, weight)
+    return sum((x[:, i, None] * weight[i] for i in range(1, x.shape[1])), x[:, :1] * weight[0])
+
+
+filter_scan = partial(_filter_scan, COLUMNS)
+
+#: f(Δ)x as a function of x: `(operator, c, x)`.
+filtered = _filtered(COLUMNS)
+
+#: Σ_k T_k(Δ̃)x W_k as a function of x `[N, inputs]`: `(operator, W, x)` with W `[terms, inputs, outputs]`.
+convolution = _filtered(Family(_mix, lambda t, y: matmul(t.T, y), lambda w: w.mT))
+
+
+def solve(
+    apply: Callable[[Array], Array], right: Array, mass: Array, iterations: int, tolerance: float | None = None
+) -> Array:
+    """Solve f(Δ)x = `right` by conjugate gradients, for the map x → f(Δ)x of a positive f; see `filter_rational`."""
+    root, tolerance = jnp.sqrt(mass), 10 * float(jnp.finfo(right.dtype).eps) if tolerance is None else tolerance
+    z, _ = cg(lambda z: root * apply(z / root), root * right, tol=tolerance, maxiter=iterations)
+    return z / root
 
 
 def inner_mass(operator: Operator, x: Array) -> Array:
@@ -248,8 +293,10 @@ components = Linear(
     _components_scan,
     lambda operator, c, y: inner_mass(operator, y[0]) * synthesis(operator, c, y / inner_mass(operator, y[0])),
     (
-        lambda operator, c, x, change: jax.vmap(_change, (None, 0, None, None))(operator, _per_column(c, x), x, change),
-        lambda operator, c, x, change: jax.vmap(of_coefficients(c.shape[1]), (None, None, 0))(
+        lambda operator, c, x, change: jax.vmap(_changed(COLUMNS), (None, 0, None, None))(
+            operator, _per_column(c, x), x, change
+        ),
+        lambda operator, c, x, change: jax.vmap(_of_weights(COLUMNS, c.shape[1]), (None, None, 0))(
             operator, x, _per_column(change, x)
         ),
     ),
@@ -261,87 +308,14 @@ synthesis = Linear(
     _synthesis_scan,
     lambda operator, c, x: inner_mass(operator, x) * components(operator, c, x / inner_mass(operator, x)),
     (
-        lambda operator, c, y, change: jax.vmap(_change, (None, 0, 0, None))(
+        lambda operator, c, y, change: jax.vmap(_changed(COLUMNS), (None, 0, 0, None))(
             operator, _per_column(c, y[0]), y, change
         ).sum(axis=0),
-        lambda operator, c, y, change: jax.vmap(of_coefficients(c.shape[1]), (None, 0, 0))(
+        lambda operator, c, y, change: jax.vmap(_of_weights(COLUMNS, c.shape[1]), (None, 0, 0))(
             operator, y, _per_column(change, y[0])
         ).sum(axis=0),
     ),
 )
-
-
-@jax.jit
-def _convolution_scan(operator: Operator, weight: Array, x: Array) -> Array:
-    def add(total: Array, t: Array, _: Array, w_k: Array) -> tuple[Array, None]:
-        return total + _mix(t, w_k), None
-
-    x = operator.enter(x)
-    return operator.leave(_scan_terms(operator, x, weight, add, _mix(x, weight[0]))[0])
-
-
-@partial(jax.jit, static_argnums=0)
-def _correlation_scan(terms: int, operator: Operator, x: Array, y: Array) -> Array:
-    """(T_k(Δ̃)x)ᵀy for so many k: `[terms, inputs, outputs]`."""
-    x, y = operator.enter(x), operator.enter(y)
-
-    def project(_: None, t: Array, __: Array, ___: Array) -> tuple[None, Array]:
-        return None, matmul(t.T, y)
-
-    _, rest = _scan_terms(operator, x, jnp.zeros(terms, x.dtype), project, None)
-    return jnp.concatenate([matmul(x.T, y)[None], rest])
-
-
-def _mix(x: Array, weight: Array) -> Array:
-    """The product xW; by sums over columns where these are few, as processors are slow at such narrow matrices."""
-    if x.shape[1] > _MAX_SUMMED_COLUMNS:
-        return matmul(x, weight)
-    return sum((x[:, i, None] * weight[i] for i in range(1, x.shape[1])), x[:, :1] * weight[0])
-
-
-_convolution_change = Linear(
-    lambda operator, w, x, change: along(lambda changed: _convolution_scan(changed, w, x), operator, change),
-    lambda operator, w, x, y: _pulled_back(operator, w, x, y, lambda w_k, y: _mix(y, w_k.T)),
-)
-
-#: Σ_k T_k(Δ̃)x W_k as a function of x `[N, inputs]`: `(operator, W, x)` with W `[terms, inputs, outputs]`.
-convolution = Linear(
-    _convolution_scan,
-    lambda operator, w, y: inner_mass(operator, y) * convolution(operator, w.mT, y / inner_mass(operator, y)),
-    (_convolution_change, lambda operator, w, x, change: _of_weights(len(w))(operator, x, change)),
-)
-
-
-@cache
-def _of_weights(terms: int) -> Linear:
-    """Σ_k T_k(Δ̃)x W_k as a function of W: `(operator, x, W)`."""
-    return Linear(
-        lambda operator, x, w: _convolution_scan(operator, w, x),
-        lambda operator, x, y: _correlation(terms)(operator, x, y),
-        (
-            lambda operator, x, w, change: _convolution_change(operator, w, x, change),
-            lambda operator, x, w, change: convolution(operator, w, change),
-        ),
-    )
-
-
-@cache
-def _correlation(terms: int) -> Linear:
-    """(T_k(Δ̃)x)ᵀy for so many k as a function of y: `(operator, x, y)`."""
-
-    def by_signal(operator: Operator, x: Array, y: Array, change: Array) -> Array:
-        mass = inner_mass(operator, x)
-        return _correlation(terms)(operator, y / mass, mass * change).mT
-
-    change_of_operator = Linear(
-        lambda operator, x, y, change: along(lambda changed: _correlation_scan(terms, changed, x, y), operator, change),
-        lambda operator, x, y, w: _pulled_back(operator, w, x, y, lambda w_k, y: _mix(y, w_k.T)),
-    )
-    return Linear(
-        partial(_correlation_scan, terms),
-        lambda operator, x, w: convolution(operator, w, x),
-        (change_of_operator, by_signal),
-    )
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Bool, Float, Int, Int64, Shaped
+from jaxtyping import Array, Float, Int, Int64, Shaped
 from numpy.typing import ArrayLike
 
 from jaxmark.errors import JaxmarkError
@@ -57,8 +57,8 @@ class Shard(NamedTuple):
         """The diagonal of M for the block's rows; 0 past the last vertex."""
         return self.interior.mass
 
-    def linked(self, like: Shaped[Array, " rows *columns"]) -> Bool[Array, " rows *ones"]:
-        """Which of the block's vertices have edges; see `Operator`."""
+    def linked(self, like: Array) -> Array:
+        """A mask of the block's vertices that have edges; see `Operator`."""
         return self.interior.linked(like)
 
     @property
@@ -66,29 +66,23 @@ class Shard(NamedTuple):
         """The same operator by sums over edges; see `Operator`."""
         return self._replace(interior=self.interior.by_segments)
 
-    def product(
-        self, like: Shaped[Array, " rows *columns"]
-    ) -> Callable[[Float[Array, " rows *columns"]], Float[Array, " rows *columns"]]:
-        """The map x → Δx on the block's rows, for use within `shard_map`; see `Operator`.
-
-        Raises:
-            JaxmarkError: if the signal is not floating.
-        """
+    def product(self, like: Array) -> Callable[[Array], Array]:
+        """Return the map x → Δx on the block's rows, for use within `shard_map`; see `Operator`."""
         inside = self.interior.product(like)
         row, place = jnp.asarray(self.cut).T
         factor = per_row(self.weights, like) * self.interior.inverse_mass(like)[row]
         # The received rows are used last, so that the block's own edges are computed while rows are on their way.
         return lambda x: inside(x).at[row].add(-factor * self._received(x)[place])
 
-    def rows(self, like: Shaped[Array, " rows *columns"]) -> None:
-        """See `Operator`: some are on other devices."""
+    def rows(self, like: Array) -> None:
+        """Return None, as some rows are on other devices; see `Operator`."""
 
-    def enter(self, x: Shaped[Array, " rows *columns"]) -> Shaped[Array, " rows *columns"]:
-        """The same rows, as the partition has put them in a good order."""
+    def enter(self, x: Array) -> Array:
+        """Return the rows as they are: the partition has put them in a good order."""
         return x
 
-    def leave(self, x: Shaped[Array, " rows *columns"]) -> Shaped[Array, " rows *columns"]:
-        """The same rows."""
+    def leave(self, x: Array) -> Array:
+        """Return the rows as they are."""
         return x
 
     def _received(self, x: Array) -> Array:
@@ -113,13 +107,10 @@ class ShardedLaplacian(NamedTuple):
         return self.shards.plan
 
     def scatter(self, x: Shaped[np.ndarray, " vertices *columns"]) -> Shaped[Array, "devices rows *columns"]:
-        """Put values per vertex from the host onto the devices; a process reads only those that its devices hold.
+        """Put values per vertex, `[N]` or `[N, C]` in the order of the mesh, from the host onto the devices.
 
-        Args:
-            x: `[N]` or `[N, C]`, in the order of the mesh.
-
-        Returns:
-            `[devices, rows]` or `[devices, rows, C]`, 0 past the last vertex.
+        A process reads only the values that its devices hold. The result is `[devices, rows]` or `[devices, rows, C]`,
+        with 0 past the last vertex.
 
         Raises:
             JaxmarkError: if there is not one row for each vertex, or the operator is not on devices.
@@ -137,13 +128,7 @@ class ShardedLaplacian(NamedTuple):
         return _on_devices(mesh, rows)
 
     def gather(self, y: Shaped[Array, "devices rows *columns"]) -> Shaped[np.ndarray, " vertices *columns"]:
-        """Collect values per vertex, in the order of the mesh, on the host of every process.
-
-        Args:
-            y: `[devices, rows]` or `[devices, rows, C]`.
-
-        Returns:
-            `[N]` or `[N, C]`.
+        """Collect values `[devices, rows]` or `[devices, rows, C]` on the host of every process, as `[N]` or `[N, C]`.
 
         Raises:
             JaxmarkError: if the values are not of this operator's vertices.
@@ -169,12 +154,9 @@ class Traffic(NamedTuple):
 
 
 def shard(operator: Laplacian, devices: Devices, positions: ArrayLike | None = None) -> ShardedLaplacian:
-    """Partition an operator and place its parts on devices, as `place(partition(...))` with their arguments does.
+    """Partition an operator and place its parts on devices: `place(partition(...))`, with their arguments and errors.
 
     With several processes, all call this with the same arguments.
-
-    Raises:
-        JaxmarkError: see `partition` and `place`.
     """
     return place(partition(operator, len(devices), positions), devices)
 
@@ -198,7 +180,7 @@ def partition(operator: Laplacian, count: int, positions: ArrayLike | None = Non
     if not 1 <= count <= size:
         raise JaxmarkError(f"{size} vertices can be shared by 1 to {size} devices, not by {count}.")
     pairs, weights = host_edges(operator)
-    order = cuthill_mckee(pairs, size) if positions is None else _along_curve(_checked(positions, size))
+    order = cuthill_mckee(pairs, size) if positions is None else _along_curve(positions, size)
     rows = -(-size // count)
     # Blocks differ by at most one vertex, so that every device has some.
     start = np.arange(count + 1) * size // count
@@ -244,18 +226,16 @@ def place(parts: ShardedLaplacian, devices: Devices) -> ShardedLaplacian:
 @jax.jit
 def filter_sharded(
     operator: ShardedLaplacian,
-    coefficients: Float[Array | np.ndarray, " terms *filters"],
+    coefficients: Float[Array | np.ndarray, "*filters terms"],
     x: Float[Array, "devices rows *columns"],
 ) -> Float[Array, "devices rows *columns"]:
     """Filter a signal over several devices: f(Δ)x in O(N / devices) memory on each, derivatives included.
 
     Args:
         operator: the Laplacian, placed on its devices by `shard`.
-        coefficients: `[degree + 1]`, or `[degree + 1, C]` for one filter per column; the same on all devices.
-        x: `[devices, rows]` or `[devices, rows, C]`, from `ShardedLaplacian.scatter`.
-
-    Returns:
-        f(Δ)x, in the shape, dtype and placement of `x`; 0 past the last vertex if `x` is 0 there.
+        coefficients: `[degree + 1]`, or `[C, degree + 1]` for one filter per column; the same on all devices.
+        x: `[devices, rows]` or `[devices, rows, C]`, from `ShardedLaplacian.scatter`. The result keeps its shape, dtype
+            and placement, and is 0 past the last vertex if `x` is.
 
     Raises:
         JaxmarkError: if shapes do not fit, or the operator is not on devices.
@@ -281,8 +261,11 @@ def traffic(operator: ShardedLaplacian) -> Traffic:
     return Traffic(sent, plan.boundary, plan.cut)
 
 
-def _along_curve(positions: np.ndarray) -> Int64[np.ndarray, " vertices"]:
+def _along_curve(positions: ArrayLike, size: int) -> Int64[np.ndarray, " vertices"]:
     """Order the vertices along a Hilbert curve (Skilling, *Programming the Hilbert curve*, 2004)."""
+    positions = np.asarray(positions, np.float64)
+    if positions.shape != (size, 3) or not np.isfinite(positions).all():
+        raise JaxmarkError(f"positions must be [{size}, 3] and finite, got {positions.shape}.")
     low = positions.min(axis=0)
     extent = max(float((positions - low).max()), np.finfo(float).tiny)
     axes = ((positions - low) / extent * (2**_BITS_PER_AXIS - 1)).astype(np.int64).T
@@ -342,7 +325,7 @@ def _with_cut(
 ) -> Shard:
     """Complete the stacked parts by the edges between them, and by the rows to be sent in each round."""
     count, rows = interior.degree.shape
-    to, source = np.concatenate([pairs, pairs[:, ::-1]]).T  # each edge at both ends: who needs a row, and which row
+    to, source = np.concatenate([pairs, pairs[:, ::-1]]).T  # each edge at both ends: the row that needs, the row needed
     # A vertex goes to a device once, however many edges lead there. Sorted by (from, to), then vertex:
     pair = source // rows * count + to // rows
     needed, where = np.unique(np.stack([pair, source]), axis=1, return_inverse=True)
@@ -362,15 +345,14 @@ def _with_cut(
     flow = np.searchsorted(flows, needed_pair)
     received = (begins[flow] + np.arange(len(flow)) - first[flow])[where.ravel()]
     device = to // rows
-    order = np.argsort(device, kind="stable")
-    cut = _grouped(np.stack([to % rows, received], axis=1)[order], device[order], count, 0).astype(np.int32)
+    cut = _grouped(np.stack([to % rows, received], axis=1), device, count, 0).astype(np.int32)
     plan = Plan(
         vertices=size,
         cut=len(pairs),
         boundary=len(needed_vertex),
         rounds=tuple(tuple((int(f) // count, int(f) % count) for f in flows[members]) for members in rounds),
     )
-    return Shard(interior, tuple(sends), cut, _grouped(np.tile(weights, 2)[order], device[order], count, 0), plan)
+    return Shard(interior, tuple(sends), cut, _grouped(np.tile(weights, 2), device, count, 0), plan)
 
 
 def _rounds(
@@ -400,10 +382,12 @@ def _rounds(
 def _grouped(
     values: Shaped[np.ndarray, " items *rest"], group: Int[np.ndarray, " items"], count: int, fill: ArrayLike
 ) -> Shaped[np.ndarray, " groups width *rest"]:
-    """Arrange items, sorted by group, in one row for each group, padded with `fill` to the longest."""
+    """Arrange items in one row for each group, in their order, padded with `fill` to the longest."""
+    order = np.argsort(group, kind="stable")
+    group = group[order]
     sizes = np.bincount(group, minlength=count)
     stacked = np.full((count, sizes.max(initial=0), *values.shape[1:]), fill, values.dtype)
-    stacked[group, np.arange(len(group)) - np.searchsorted(group, group)] = values
+    stacked[group, np.arange(len(group)) - np.searchsorted(group, group)] = values[order]
     return stacked
 
 
@@ -419,13 +403,6 @@ def _placed(operator: ShardedLaplacian) -> Mesh:
     if operator.plan.mesh is None:
         raise JaxmarkError("A partition must be put on devices by jaxmark.spectral.sharding.place before it is used.")
     return operator.plan.mesh
-
-
-def _checked(positions: ArrayLike, size: int) -> np.ndarray:
-    positions = np.asarray(positions, np.float64)
-    if positions.shape != (size, 3) or not np.isfinite(positions).all():
-        raise JaxmarkError(f"positions must be [{size}, 3] and finite, got {positions.shape}.")
-    return positions
 
 
 def _check_values(name: str, operator: ShardedLaplacian, values: Array) -> None:

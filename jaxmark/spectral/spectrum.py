@@ -1,19 +1,20 @@
 """The spectrum of the Laplacian: eigenpairs, and the spectral measure of a signal, on the host in float64.
 
-Filters never need it; it is the reference for tests and reports, and what the eigenvector scheme is made of.
+Filters never need it; it is the reference for tests and reports, and the basis of the eigenvector scheme.
 """
 
 from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float64, Int64, PRNGKeyArray
+from jaxtyping import Float64, Int64
 from scipy import linalg, sparse
 from scipy.sparse import csgraph
 from scipy.sparse import linalg as sparse_linalg
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.laplacian import Laplacian, centre, sparse_matrices
+from jaxmark.seeds import Seed, random_key
+from jaxmark.spectral.laplacian import Laplacian, centre, symmetric_matrix
 
 # Up to this number of vertices, a dense decomposition is faster than an iterative one, and finds every eigenvalue.
 _DENSE_LIMIT = 2500
@@ -55,8 +56,8 @@ def eigenpairs(operator: Laplacian, count: int | None = None, *, tolerance: floa
     """
     if count is not None and count < 1:
         raise JaxmarkError(f"eigenpairs(count=...) must be at least 1, got {count}.")
-    linked, root, scaled = _symmetric(operator)
-    size = len(linked)
+    linked, root, matrix = symmetric_matrix(operator)
+    size, scaled = len(linked), sparse.csc_array(matrix)
     null, component = csgraph.connected_components(scaled, directed=False)
     # One pair more than asked for tells whether the last eigenspace is complete.
     wanted = size - null if count is None else min(count + 1, size - null)
@@ -85,15 +86,13 @@ def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: 
     Reference: Golub, Meurant, "Matrices, Moments and Quadrature with Applications", 2010, ch. 6.
 
     Args:
-        operator: the Laplacian, of N vertices.
+        operator: the Laplacian.
         x: one signal `[N]`, preferably centred.
-        steps: number of nodes; the result has fewer if the signal lies in a smaller invariant subspace.
-
-    Returns:
-        Nodes in [0, 2], and non-negative weights that sum to ⟨x, x⟩_M.
+        steps: number of nodes; the result has fewer if the signal lies in a smaller invariant subspace. Nodes are in
+            [0, 2]; weights are not negative, and sum to ⟨x, x⟩_M.
     """
-    linked, root, scaled = _symmetric(operator)
-    vector = root * x[linked]
+    linked, root, matrix = symmetric_matrix(operator)
+    scaled, vector = sparse.csc_array(matrix), root * x[linked]
     norm = float(np.linalg.norm(vector))
     if norm == 0:
         return Quadrature(np.zeros(0), np.zeros(0))
@@ -115,7 +114,7 @@ def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: 
     return Quadrature(nodes, norm**2 * vectors[0] ** 2)
 
 
-def white_probes(operator: Laplacian, key: PRNGKeyArray, probes: int) -> Float64[np.ndarray, "vertices probes"]:
+def white_probes(operator: Laplacian, seed: Seed, probes: int) -> Float64[np.ndarray, "vertices probes"]:
     """Random signals whose spectral measures sum, in expectation, to the counting measure of the eigenvalues.
 
     The signals are random signs over √M, as in Hutchinson's estimator: Σ_p ⟨u_p, f(Δ)u_p⟩_M estimates Σ_i f(λ_i), over
@@ -124,25 +123,13 @@ def white_probes(operator: Laplacian, key: PRNGKeyArray, probes: int) -> Float64
 
     Args:
         operator: the Laplacian, of N vertices.
-        key: any random key but a mark's, because bands must not depend on that one.
-        probes: number of signals.
-
-    Returns:
-        `[N, probes]`, centred, 0 at isolated vertices.
+        seed: a number or a JAX random key; nothing secret, because bands must not depend on a mark's key.
+        probes: number of signals, which are centred, and 0 at isolated vertices.
     """
     mass = np.where(np.asarray(operator.degree) > 0, np.asarray(operator.mass, np.float64), 0)
-    signs = np.asarray(jax.random.rademacher(key, (len(mass), probes)), np.float64)
+    signs = np.asarray(jax.random.rademacher(random_key(seed), (len(mass), probes)), np.float64)
     scale = np.where(mass > 0, 1 / np.sqrt(np.where(mass > 0, probes * mass, 1)), 0)
     return centre(operator, scale[:, None] * signs)
-
-
-def _symmetric(operator: Laplacian) -> tuple[Int64[np.ndarray, " linked"], np.ndarray, sparse.csc_array]:
-    """The vertices that have edges, √M on them, and the symmetric form M^1/2 Δ M^-1/2 of Δ on them."""
-    stiffness, mass = sparse_matrices(operator)
-    linked = np.flatnonzero(np.asarray(operator.degree) > 0)
-    root = np.sqrt(mass.diagonal()[linked])
-    inverse = sparse.diags_array(1 / root)
-    return linked, root, sparse.csc_array(inverse @ stiffness[linked][:, linked] @ inverse)
 
 
 def _lowest(

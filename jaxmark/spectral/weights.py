@@ -8,18 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 
-from jaxmark.geometry.mesh import edges, sides
+from jaxmark.geometry.mesh import Faces, edges, sides
 
 _MIN_COTANGENT = 1e-6  # over the largest weight
 
 Positions = Float[Array | np.ndarray, "points 3"]
-Faces = Int[Array | np.ndarray, "faces 3"]
 
 
 def inverse_length_weights(
     positions: Float[Array | np.ndarray, "points axes"], pairs: Int[np.ndarray, "edges 2"]
 ) -> Float[Array | np.ndarray, " edges"]:
-    """1 over the length of each edge, in the inverse of the positions' unit; infinite for edges of length zero."""
+    """Compute 1 over the length of each edge, in the inverse of the positions' unit; infinite for length zero."""
     xp = positions.__array_namespace__()
     lengths = xp.sqrt(xp.sum((positions[pairs[:, 0]] - positions[pairs[:, 1]]) ** 2, axis=1))
     with np.errstate(divide="ignore"):
@@ -27,7 +26,7 @@ def inverse_length_weights(
 
 
 def cotangent_weights(vertices: Positions, faces: Faces) -> Float[Array | np.ndarray, " edges"]:
-    """Half the sum of the cotangents of the angles opposite each edge, clipped below at 1e-6 of the largest.
+    """Compute half the sum of the cotangents of the angles opposite each edge, clipped below at 1e-6 of the largest.
 
     Pinkall, Polthier, "Computing discrete minimal surfaces and their conjugates", 1993. Obtuse angles make weights
     negative, whence the clipping. A degenerate face has no angles, and adds nothing.
@@ -54,14 +53,9 @@ def cotangent_weights(vertices: Positions, faces: Faces) -> Float[Array | np.nda
 
 
 def vertex_areas(vertices: Positions, faces: Faces) -> Float[Array | np.ndarray, " vertices"]:
-    """A third of the area of the faces around each vertex: the lumped mass of linear finite elements.
+    """Compute a third of the area of the faces around each vertex: the lumped mass `[V]` of linear finite elements.
 
-    Args:
-        vertices: `[V, 3]`.
-        faces: `[F, 3]`, concrete.
-
-    Returns:
-        `[V]`, in the square of the positions' unit; they sum to the area of the mesh.
+    Masses are in the square of the positions' unit, and sum to the area of the mesh. Faces are concrete.
     """
     xp = vertices.__array_namespace__()
     faces = np.asarray(faces)

@@ -21,7 +21,7 @@ from jaxmark.bench.fitting import SHARE, fit
 from jaxmark.bench.methods import METHODS, get_method
 from jaxmark.bench.plugins import digest_of, load_method
 from jaxmark.bench.tables import tables
-from jaxmark.geometry.hashing import geometry_hash
+from jaxmark.geometry.canonical import geometry_hash
 from jaxmark.geometry.mesh import Mesh, diagonal
 from tests import ROOT
 from tests.samples import bumpy_sphere

@@ -33,7 +33,7 @@ def test_filter_and_gradients_are_those_of_one_device(sphere: Mesh, along, lower
     sharded = sharding.shard(operator, jax.devices()[:count], positions)
     random = np.random.default_rng(0)
     x = random.normal(size=(642, *columns)).astype(dtype)
-    c = random.normal(size=(12, *columns)).astype(dtype)
+    c = random.normal(size=(*columns, 12)).astype(dtype)
     there = sharded.scatter(x)
     assert [shard.data.shape for shard in there.addressable_shards] == [(1, -(-642 // count), *columns)] * count
     np.testing.assert_array_equal(sharded.gather(there), x)
@@ -87,7 +87,7 @@ def test_what_is_refused(sphere: Mesh, unchecked):
         lambda: sharded.scatter(x[1:]),
         lambda: sharded.gather(jnp.zeros((3, 4))),
         lambda: sharding.filter_sharded(sharded, np.ones(3), jnp.zeros((3, 4))),
-        lambda: sharding.filter_sharded(sharded, np.ones((3, 2)), sharded.scatter(x)),
+        lambda: sharding.filter_sharded(sharded, np.ones((2, 3)), sharded.scatter(x)),
     ):
         with pytest.raises(JaxmarkError):
             refused()

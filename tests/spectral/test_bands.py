@@ -1,6 +1,5 @@
 from itertools import pairwise
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -175,7 +174,7 @@ def test_intervals_are_damped_projections_of_indicators():
 def test_bands_by_density_hold_equal_counts_of_eigenvalues(sphere: Mesh, x64):
     """Exactly so of the damped estimate; of the eigenvalues themselves within its error: the probes' and the blur's."""
     operator, probes, bands = from_mesh(sphere), 16, 8
-    signals = jnp.asarray(white_probes(operator, jax.random.key(0), probes))
+    signals = jnp.asarray(white_probes(operator, 0, probes))
     found = np.asarray(moments(operator, signals, degree=100)).sum(axis=1)
     edges = equal_edges(found, bands)
     family = intervals(edges, len(found))

@@ -9,7 +9,7 @@ from scipy.spatial import distance
 
 import jaxmark as jm
 from jaxmark import spectral
-from jaxmark.spectral.shapes import pad_edges
+from jaxmark.spectral.padding import pad_edges
 from tests.dense import tolerance
 from tests.samples import bumpy_sphere, ordered_laplacian
 

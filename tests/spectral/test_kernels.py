@@ -11,7 +11,7 @@ import pytest
 from jaxmark.spectral import kernels, recurrence
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.laplacian import Laplacian, graph_laplacian, sparse_matrices
-from jaxmark.spectral.shapes import common_laplacian, pad_edges
+from jaxmark.spectral.padding import common_laplacian, pad_edges
 from tests.dense import tolerance
 from tests.samples import bumpy_sphere
 
@@ -94,7 +94,7 @@ def test_results_are_those_of_the_scans(name, double):
                 "constant": (recurrence.filtered(operator, c[:1], x), c[0] * x),
                 "projection": (
                     recurrence.projection(TERMS)(operator, x, u),
-                    recurrence._projection_scan(TERMS, operator, x, u),
+                    recurrence._projection_scan(recurrence.COLUMNS, TERMS, operator, x, u),
                 ),
             }
             for what, (found, expected) in pairs.items():

@@ -29,8 +29,8 @@ from jaxmark.bench.methods.draws import gather, scatter, uniform
 from jaxmark.bench.methods.surface import per_point, skin
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces, cross_product, face_areas, vertex_normals
-from jaxmark.geometry.moments import volume_moments
 from jaxmark.geometry.pose import Points
+from jaxmark.geometry.surfaces import volume_moments
 
 ANCHOR = (
     "bit error rates of SMI 2010 at its perceptual limits, within 0.1 in the mean, where the reader knows the step; not"

@@ -1,10 +1,11 @@
-"""Best uniform approximation by polynomials with Remez's exchange algorithm, also of functions with kinks."""
+"""Best uniform approximations by polynomials: Remez's exchange algorithm, and hat functions, which are made of them."""
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float, Float64, Int64
 from numpy.polynomial import chebyshev
 
 from jaxmark.errors import JaxmarkError
@@ -74,3 +75,26 @@ def _exchange(error: Float64[np.ndarray, " points"], size: int) -> Int64[np.ndar
         for place in sorted(drop, reverse=True):
             del places[place], heights[place]
     return np.array(places)
+
+
+def hat(knots: Float[np.ndarray, " bands"], degree: int) -> Float64[np.ndarray, "bands terms"]:
+    """Chebyshev coefficients of polynomials close to piecewise linear hats, one knot a row: a partition of unity.
+
+    Hat j is 1 at its knot and 0 from the neighbouring knots on; the first and the last stay 1 to the ends of [0, 2].
+    Such local bands are further work of Sohn et al. (Fig. 15-16). Best approximations of the hats themselves would not
+    sum to 1. Instead the sums of hats from j on, ramps from 0 to 1, have best approximations p_j, and band j is
+    f_j = p_j - p_{j+1}, which deviates by no more than both together. Deviations fall as 1/degree: about
+    0.28/(degree · width) for hats of a width (in λ, from knot to knot) in the middle of [0, 2]. They are ripples of
+    equal height all over [0, 2].
+
+    Args:
+        knots: λ `[bands]`, two or more, ascending in [0, 2].
+        degree: degree of the polynomials.
+    """
+    if len(knots) < 2 or knots[0] < 0 or knots[-1] > 2 or not (np.diff(knots) > 0).all():
+        raise JaxmarkError(f"hat needs two knots or more that ascend within [0, 2], got {knots}.")
+    ramps = np.zeros((len(knots) + 1, degree + 1))
+    ramps[0, 0] = 1
+    for j, ends in enumerate(pairwise(knots), 1):
+        ramps[j] = minimax(lambda x, ends=ends: np.interp(x, ends, (0, 1)), degree, kinks=ends).coefficients
+    return -np.diff(ramps, axis=0)

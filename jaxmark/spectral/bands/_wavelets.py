@@ -1,6 +1,7 @@
 """Banks of graph wavelets: one low-pass and band-passes of growing frequency, as interpolated kernels.
 
 The kernels are those of PyGSP 0.6 for a largest eigenvalue of 2, so that a bank here is its filter of the same name.
+The low-pass is the first row.
 """
 
 import math
@@ -10,7 +11,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.spectral.bands._scaling import nodes, scaling
+from jaxmark.spectral.bands._partitions import nodes, scaling
+
+Kernel = Callable[[np.ndarray], np.ndarray]
 
 
 def mexican_hat(bands: int, degree: int | None = None, *, span: float = 20.0) -> Float64[np.ndarray, "bands terms"]:
@@ -25,50 +28,31 @@ def mexican_hat(bands: int, degree: int | None = None, *, span: float = 20.0) ->
         degree: degree of the polynomials; by default 30√span, where they are within 3e-5 of the kernels. At half of it
             they are off by 2e-3.
         span: largest λ over the smallest that a wavelet resolves, PyGSP's `lpfactor`; at least 1.
-
-    Returns:
-        `[bands, degree + 1]`, the low-pass first, then by increasing frequency.
-
-    Raises:
-        JaxmarkError: if `bands` is below 2 or `span` below 1.
     """
-    scales = _scales("mexican_hat", bands, span)
 
-    def kernels(values: np.ndarray) -> np.ndarray:
-        low = 1.2 / math.e * np.exp(-((values * span / 0.8) ** 4))
-        return np.vstack([low, scales * values * np.exp(-scales * values)])
+    def low(x: np.ndarray) -> np.ndarray:
+        return 1.2 / math.e * np.exp(-((x / 0.8) ** 4))
 
-    return _interpolate(kernels, math.ceil(30 * math.sqrt(span)) if degree is None else degree)
+    return _scaled("mexican_hat", bands, degree, span, low, lambda x: x * np.exp(-x))
 
 
 def abspline(bands: int, degree: int | None = None, *, span: float = 20.0) -> Float64[np.ndarray, "bands terms"]:
     """Chebyshev coefficients of spline wavelets g(sλ), of a scale s a row, and of a low-pass below them.
 
-    g(x) is x² up to 1, 4/x² from 2 on, and between them the cubic -5 + 11x - 6x² + x³ that joins them smoothly
-    (Hammond, Vandergheynst, Gribonval, "Wavelets on graphs via spectral graph theory", 2011). The scales fall
-    from `span` to 1/2 in equal ratios. The low-pass is γ exp(-(λ span/1.2)⁴) with γ = max g.
-
-    Args:
-        bands: number of filters, at least 2: the low-pass, and bands - 1 wavelets.
-        degree: degree of the polynomials; by default 30√span, where they are within 4e-3 of the kernels, of 1.38 at the
-            peak. At half of it they are off by 2e-2; the error falls slowly, for g has kinks in its second derivative.
-        span: largest λ over the smallest that a wavelet resolves, PyGSP's `lpfactor`; at least 1.
-
-    Returns:
-        `[bands, degree + 1]`, the low-pass first, then by increasing frequency.
-
-    Raises:
-        JaxmarkError: if `bands` is below 2 or `span` below 1.
+    g(x) is x² up to 1, 4/x² from 2 on, and between them the cubic -5 + 11x - 6x² + x³ that joins them smoothly. The
+    low-pass is γ exp(-(λ span/1.2)⁴) with γ = max g. Scales, reference and arguments are those of `mexican_hat`. With
+    the default degree the polynomials are within 4e-3 of the kernels, of 1.38 at the peak. At half of it they are off
+    by 2e-2; the error falls slowly, for g has kinks in its second derivative.
     """
-    scales = _scales("abspline", bands, span)
 
-    def kernels(values: np.ndarray) -> np.ndarray:
-        low = (1 + 2 / math.sqrt(27)) * np.exp(-((values * span / 1.2) ** 4))
-        x = scales * values
+    def low(x: np.ndarray) -> np.ndarray:
+        return (1 + 2 / math.sqrt(27)) * np.exp(-((x / 1.2) ** 4))
+
+    def wavelet(x: np.ndarray) -> np.ndarray:
         cubic = -5 + 11 * x - 6 * x**2 + x**3
-        return np.vstack([low, np.select([x <= 1, x < 2], [x**2, cubic], 4 / np.maximum(x, 2) ** 2)])
+        return np.select([x <= 1, x < 2], [x**2, cubic], 4 / np.maximum(x, 2) ** 2)
 
-    return _interpolate(kernels, math.ceil(30 * math.sqrt(span)) if degree is None else degree)
+    return _scaled("abspline", bands, degree, span, low, wavelet)
 
 
 def meyer(bands: int, degree: int | None = None) -> Float64[np.ndarray, "bands terms"]:
@@ -82,14 +66,7 @@ def meyer(bands: int, degree: int | None = None) -> Float64[np.ndarray, "bands t
         bands: number of filters, at least 2: the low-pass, and bands - 1 wavelets.
         degree: degree of the polynomials; by default 16 · 2^(bands/2), where they are within 2e-3 of the kernels, and
             the squares within 4e-3 of 1. At half of it both are off by a tenth.
-
-    Returns:
-        `[bands, degree + 1]`, the low-pass first, then by increasing frequency.
-
-    Raises:
-        JaxmarkError: if `bands` is below 2.
     """
-    _check("meyer", bands)
     scales = 2 / 3 * 2.0 ** np.arange(bands - 2, -1, -1)[:, None]
 
     def kernels(values: np.ndarray) -> np.ndarray:
@@ -98,7 +75,7 @@ def meyer(bands: int, degree: int | None = None) -> Float64[np.ndarray, "bands t
         rise[0], fall[0] = 1, np.cos(np.pi / 2 * _step(1.5 * x[0] - 1))
         return rise * fall
 
-    return _interpolate(kernels, math.ceil(16 * 2 ** (bands / 2)) if degree is None else degree)
+    return _interpolate("meyer", bands, kernels, math.ceil(16 * 2 ** (bands / 2)) if degree is None else degree)
 
 
 def itersine(bands: int, degree: int | None = None) -> Float64[np.ndarray, "bands terms"]:
@@ -112,20 +89,13 @@ def itersine(bands: int, degree: int | None = None) -> Float64[np.ndarray, "band
         degree: degree of the polynomials; by default 16 · bands, where they are within 3e-3 of the kernels, and the
             squares within 1e-3 of 1. The error falls as the square of the degree, for the kernels have kinks in their
             second derivative.
-
-    Returns:
-        `[bands, degree + 1]`, by increasing frequency.
-
-    Raises:
-        JaxmarkError: if `bands` is below 2.
     """
-    _check("itersine", bands)
 
     def kernels(values: np.ndarray) -> np.ndarray:
         x = (bands - 1) / 4 * values - np.arange(bands)[:, None] / 2
         return np.where(np.abs(x) <= 0.5, np.sin(np.pi / 2 * np.cos(np.pi * x) ** 2), 0)
 
-    return _interpolate(kernels, 16 * bands if degree is None else degree)
+    return _interpolate("itersine", bands, kernels, 16 * bands if degree is None else degree)
 
 
 def _step(x: np.ndarray) -> np.ndarray:
@@ -134,17 +104,21 @@ def _step(x: np.ndarray) -> np.ndarray:
     return x**4 * (35 - 84 * x + 70 * x**2 - 20 * x**3)
 
 
-def _scales(name: str, bands: int, span: float) -> Float64[np.ndarray, "wavelets 1"]:
-    _check(name, bands)
+def _scaled(
+    name: str, bands: int, degree: int | None, span: float, low: Kernel, wavelet: Kernel
+) -> Float64[np.ndarray, "bands terms"]:
+    """A low-pass, and a wavelet at scales from `span` to 1/2."""
     if not span >= 1:
         raise JaxmarkError(f"{name}(span=...) must be at least 1, got {span}.")
-    return np.geomspace(span, 0.5, bands - 1)[:, None]
+
+    def kernels(values: np.ndarray) -> np.ndarray:
+        scales = np.geomspace(span, 0.5, bands - 1)[:, None]
+        return np.vstack([low(span * values), wavelet(scales * values)])
+
+    return _interpolate(name, bands, kernels, math.ceil(30 * math.sqrt(span)) if degree is None else degree)
 
 
-def _check(name: str, bands: int) -> None:
+def _interpolate(name: str, bands: int, kernels: Kernel, degree: int) -> Float64[np.ndarray, "bands terms"]:
     if bands < 2:
         raise JaxmarkError(f"{name} needs at least two bands, got {bands}.")
-
-
-def _interpolate(kernels: Callable[[np.ndarray], np.ndarray], degree: int) -> Float64[np.ndarray, "bands terms"]:
     return kernels(nodes(degree + 1)) @ scaling(degree + 1)

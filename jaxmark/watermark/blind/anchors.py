@@ -16,9 +16,9 @@ from scipy.spatial import KDTree
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces, compact, diagonal, open_sides, weld, weld_mesh
-from jaxmark.geometry.moments import Moments, surface_moments, volume_moments
 from jaxmark.geometry.pose import Pose
-from jaxmark.spectral.shapes import common_size
+from jaxmark.geometry.surfaces import Moments, surface_moments, volume_moments
+from jaxmark.spectral.padding import common_size
 
 SPACING = 3.4  # of the lattice, in widths of the narrow Gaussian
 _WIDER = 2.0  # width of the wide Gaussian over the narrow one

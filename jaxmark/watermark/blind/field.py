@@ -17,11 +17,11 @@ from jaxtyping import Array, Float, Float64, Int
 from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, edges
-from jaxmark.geometry.moments import Moments, surface_moments, volume_moments
+from jaxmark.geometry.surfaces import Moments, surface_moments, volume_moments
 from jaxmark.spectral.bands import heat
 from jaxmark.spectral.chebyshev import filter
+from jaxmark.spectral.padding import common_laplacian, pad_rows
 from jaxmark.spectral.precision import matmul
-from jaxmark.spectral.shapes import common_laplacian, pad_rows
 from jaxmark.watermark.blind.anchors import Anchors, Pieces, changes, encloses, look, place, see, turned
 from jaxmark.watermark.blind.scheme import AnchoredHost, Look, measure
 from jaxmark.watermark.coding.keys import Choices

@@ -22,7 +22,7 @@ from jaxmark.geometry.mesh import Mesh, diagonal, open_sides
 from jaxmark.geometry.pose import Pose
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.laplacian import Laplacian
-from jaxmark.spectral.shapes import common_laplacian, common_size, pad_rows
+from jaxmark.spectral.padding import common_laplacian, common_size, pad_rows
 from jaxmark.watermark.blind.dither import make_words
 from jaxmark.watermark.blind.scheme import AnchoredHost, Look, measure
 from jaxmark.watermark.coding.keys import Choices

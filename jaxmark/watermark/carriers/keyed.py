@@ -134,7 +134,7 @@ class KeyedCarrier(NamedTuple):
 
     def coefficients(
         self, beta: Strength, weight: Float[Array, " bands"] | None = None
-    ) -> Float[Array, " terms *channels"]:
+    ) -> Float[Array, "*channels terms"]:
         """Chebyshev coefficients of Σ_j weight_j β_j f_j, including the profile."""
         strength = check_strength(jnp.asarray(beta), len(self.host.coefficients)).astype(self._signs.dtype)
         if strength.ndim == 0:
@@ -142,28 +142,26 @@ class KeyedCarrier(NamedTuple):
         for factor in (weight, self.profile):
             if factor is not None:
                 strength = per_row(jnp.asarray(factor), strength) * strength
-        return matmul(self.host.coefficients.T, strength)
+        return matmul(self.host.coefficients.T, strength).T
 
-    def modulate(self, bits: Float[Array, " bits"], coefficients: Float[Array, " terms *channels"]) -> Displacement:
+    def modulate(self, bits: Float[Array, " bits"], coefficients: Float[Array, "*channels terms"]) -> Displacement:
         """Spread the bits over their chips, and filter these into a displacement."""
         return self.filter_chips(self.spread(bits), coefficients)
 
-    def correlate(
-        self, residual: Displacement, coefficients: Float[Array, " terms *channels"]
-    ) -> Float[Array, " bits"]:
+    def correlate(self, residual: Displacement, coefficients: Float[Array, "*channels terms"]) -> Float[Array, " bits"]:
         """Apply the plain adjoint of `modulate`: Σ_v ⟨modulate(a)_v, r_v⟩ is the dot product of a and this."""
         products = self._signs * self.match_chips(residual, coefficients)
         return jax.ops.segment_sum(products.ravel(), self.chips.slots.ravel(), self.code_bits)
 
     def filter_chips(
-        self, chips: Float[Array, "vertices channels"], coefficients: Float[Array, " terms *channels"]
+        self, chips: Float[Array, "vertices channels"], coefficients: Float[Array, "*channels terms"]
     ) -> Displacement:
         """Filter any chips into a displacement."""
         along = filter(self.host.operator, coefficients, chips)
         return apply_mask(self.masking, along if self.normals is None else self.normals * along)
 
     def match_chips(
-        self, residual: Displacement, coefficients: Float[Array, " terms *channels"]
+        self, residual: Displacement, coefficients: Float[Array, "*channels terms"]
     ) -> Float[Array, "vertices channels"]:
         """Apply the plain adjoint of `filter_chips`, which is a matched filter."""
         hidden = apply_mask(self.masking, residual)
@@ -261,7 +259,7 @@ class KeyedReader(NamedTuple):
         """See `Reader`."""
         return self._replace(carrier=carrier)
 
-    def _matched_coefficients(self, received: Reception) -> Float[Array, " terms *channels"]:
+    def _matched_coefficients(self, received: Reception) -> Float[Array, "*channels terms"]:
         """Chebyshev coefficients of the filter matched to gain and power."""
         return self.carrier.coefficients(1.0, received.gain / received.power)
 

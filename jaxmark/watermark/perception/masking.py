@@ -20,8 +20,8 @@ from jaxmark.geometry.clouds import spacings
 from jaxmark.geometry.mesh import Mesh, area, edges, face_normals, open_sides, unit
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import filter
+from jaxmark.spectral.padding import pad_rows
 from jaxmark.spectral.precision import matmul
-from jaxmark.spectral.shapes import pad_rows
 
 Found = TypeVar("Found")
 _BAND = 2  # of `Hiding`: waves six edges long, of which marks mostly consist

@@ -29,8 +29,7 @@ from scipy.spatial import KDTree
 from jaxmark import distortion
 from jaxmark.alignment.heights import Numbers, Unknowns, VertexHeights, measure_heights
 from jaxmark.alignment.original import Original
-from jaxmark.geometry.mesh import Mesh
-from jaxmark.geometry.simplified import simplify
+from jaxmark.geometry.mesh import Mesh, simplify
 from jaxmark.geometry.surfaces import Surface
 from jaxmark.watermark.interfaces import ChipCarrier, Displacement
 from jaxmark.watermark.perception.budget import first_rms

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import jaxmark as jm
 from jaxmark.alignment.original import make_original
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.geometry.moments import surface_moments, volume_moments
+from jaxmark.geometry.surfaces import surface_moments, volume_moments
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.watermark import EmbedInfo, FieldScheme
 from jaxmark.watermark.blind import reading

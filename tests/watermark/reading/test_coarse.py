@@ -10,8 +10,7 @@ import jaxmark as jm
 from jaxmark.alignment.alignment import Alignment
 from jaxmark.alignment.attempts import align
 from jaxmark.alignment.heights import measure_heights
-from jaxmark.geometry.mesh import Mesh, face_normals
-from jaxmark.geometry.simplified import simplify
+from jaxmark.geometry.mesh import Mesh, face_normals, simplify
 from jaxmark.geometry.surfaces import Surface
 from jaxmark.watermark.carriers.keyed import KeyedCarrier
 from jaxmark.watermark.evidence import ledger

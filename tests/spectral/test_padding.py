@@ -8,7 +8,7 @@ from jaxmark.alignment.original import make_original
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.graphs import from_mesh
-from jaxmark.spectral.shapes import common_laplacian, common_size, pad_rows
+from jaxmark.spectral.padding import common_laplacian, common_size, pad_rows
 from tests.dense import tolerance
 from tests.samples import bumpy_sphere
 
