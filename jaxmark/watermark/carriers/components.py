@@ -55,8 +55,8 @@ class HostBands(NamedTuple):
     gram: Float[Array, "3 bands bands"]  # D inner products of the scaled components, per coordinate
 
     def synthesise(self, amplitudes: Float[Array, "bands 3"]) -> Float[Array, "vertices 3"]:
-        """See `Components`; all bands together are one filter per coordinate, with coefficients Cᵀ·amplitudes."""
-        return filter(self.operator, matmul(self.coefficients.T, self.scale * amplitudes), self.signal)
+        """See `Components`; all bands together are one filter per coordinate, with coefficients amplitudesᵀ·C."""
+        return filter(self.operator, matmul(self.coefficients.T, self.scale * amplitudes).T, self.signal)
 
     def analyse(self, residual: Float[Array, "vertices 3"]) -> Float[Array, "bands 3"]:
         """See `Components`; all bands need only the moments ⟨residual, T_k(Δ̃)x⟩_D."""
