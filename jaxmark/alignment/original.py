@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int64, Shaped
 
-from jaxmark.geometry.canonical import exact, grid_spacing, order_hash, rounded
+from jaxmark.geometry.canonical import grid_spacing, rounded
 from jaxmark.geometry.mesh import Mesh, Weld, diagonal, displacement, host_mesh, used_vertices
 from jaxmark.spectral.laplacian import Laplacian, centre
 from jaxmark.spectral.padding import common_laplacian, pad_rows
@@ -22,13 +22,13 @@ class Original:
     """
 
     mesh: Mesh  # as in its file; what is displaced
-    grid: float  # spacing of the grid that points are rounded to, in the file's units; 0 if they are exact
+    grid: float  # spacing of the grid that points are rounded to, in the file's units
     weld: Weld  # which vertices stand at which point
     points: Mesh  # the canonical geometry, in the file's units: what suspects are compared with
     used: Bool[np.ndarray, " points"]  # mask of the points that faces use
     diagonal: float  # of the points, in the file's units
     geometry: bytes  # hash of the canonical geometry
-    order: bytes  # hash of the file's order of points and faces, see `jaxmark.geometry.canonical.order_hash`
+    order: bytes  # hash of the file's order of points and faces, see `jaxmark.geometry.canonical.rounded`
     places: Int64[np.ndarray, " points"]  # number of each point among those that faces use in this geometry, or -1
     count: int  # number of points that faces use in this geometry
     in_order: bool  # whether the file has the order that was marked, so that suspects are compared vertex by vertex
@@ -72,40 +72,37 @@ def make_original(mesh: Mesh, grid: float | None = None) -> Original:
 
     Args:
         mesh: any mesh.
-        grid: spacing of the grid that points are rounded to, in the mesh's units; by default that of new marks, see
-            `jaxmark.geometry.canonical`; 0 for the exact points of version 1.
+        grid: spacing of the grid that points are rounded to, in the mesh's units, a power of two; by default that of
+            new marks, see `jaxmark.geometry.canonical`.
 
     Raises:
         JaxmarkError: see `make_mesh` and `diagonal`.
     """
     mesh = host_mesh(mesh)
-    spacing = grid_spacing(mesh) if grid is None else grid
-    points, welded, geometry = rounded(mesh, spacing) if spacing else exact(mesh)
-    length = diagonal(points)
+    spacing = grid_spacing(diagonal(mesh)) if grid is None else grid
+    points, welded, geometry, order = rounded(mesh, spacing)
+    length, used = diagonal(points), used_vertices(points)
     operator = common_laplacian(points)
     dtype = jax.dtypes.canonicalize_dtype(np.float64)
-    used = used_vertices(points)
     positions = np.asarray(points.vertices, np.float64)
     positions = (positions - positions[used].mean(axis=0)) / length
     positions[~used] = 0
     signal = jnp.asarray(centre(operator, pad_rows(positions, len(operator.degree))), dtype)
-    traced = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype if leaf.dtype == np.float64 else None), operator)
-    places = np.where(used, np.cumsum(used) - 1, -1)
     return Original(
-        mesh,
-        spacing,
-        welded,
-        points,
-        used,
-        length,
-        geometry,
-        order_hash(mesh, welded),
-        places,
-        int(used.sum()),
-        True,
-        traced,
-        positions,
-        signal,
+        mesh=mesh,
+        grid=spacing,
+        weld=welded,
+        points=points,
+        used=used,
+        diagonal=length,
+        geometry=geometry,
+        order=order,
+        places=np.where(used, np.cumsum(used) - 1, -1),
+        count=int(used.sum()),
+        in_order=True,
+        operator=jax.tree.map(lambda x: jnp.asarray(x, dtype if x.dtype == np.float64 else None), operator),
+        positions=positions,
+        signal=signal,
     )
 
 

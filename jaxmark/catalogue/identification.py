@@ -23,7 +23,7 @@ from jaxmark.catalogue.partial_registration import Part, fit_whole
 from jaxmark.catalogue.retrieval import Index, Near, state_of
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import file_hash
-from jaxmark.geometry.canonical import exact
+from jaxmark.geometry.canonical import geometry_hash
 from jaxmark.geometry.mesh import Mesh, area, compact, components, weld, weld_mesh
 from jaxmark.geometry.pose import Points, Pose
 from jaxmark.watermark.coding.keys import Key, commitment
@@ -390,7 +390,7 @@ def split(meshes: Mapping[str, Mesh]) -> list[Piece]:
     """Split a suspect: each distinct mesh, then the components of those that have several large ones."""
     distinct: dict[bytes, Piece] = {}
     for name, mesh in meshes.items():
-        distinct.setdefault(exact(mesh).hash, Piece(name, mesh, ""))
+        distinct.setdefault(geometry_hash(mesh), Piece(name, mesh, ""))
     wholes = sorted(distinct.values(), key=lambda piece: -len(piece.mesh.faces))[:_MOST_PIECES]
     found = [*wholes]
     for piece in wholes:

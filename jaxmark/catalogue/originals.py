@@ -16,7 +16,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import Scene, load_mesh, load_scene
 from jaxmark.files.atomic import file_hash
 from jaxmark.geometry.canonical import geometry_hash, grid_spacing, rounded
-from jaxmark.geometry.mesh import Mesh, unit, used_vertices
+from jaxmark.geometry.mesh import Mesh, diagonal, unit, used_vertices
 from jaxmark.geometry.pose import Points
 
 WHOLE = ""  # name of the mesh of a file that has only one, or of all meshes of a file together
@@ -95,7 +95,7 @@ def _describe(name: str, mesh: Mesh) -> dict[str, Any] | None:
     known["place"] = (known["place"] - centre) / size
     return {
         "name": name,
-        "geometry": rounded(mesh, grid_spacing(mesh)).hash.hex(),
+        "geometry": rounded(mesh, grid_spacing(diagonal(mesh))).hash.hex(),
         "exact": geometry_hash(mesh).hex(),
         "vertices": int(used_vertices(mesh).sum()),
         "faces": len(mesh.faces),

@@ -1,8 +1,7 @@
 """Canonical geometry: the points that a mark is written in, and a hash of them that distinguishes originals.
 
-Version 1 takes a mesh as its file has it, to the last bit and in its order. Version 2 rounds positions to a grid and
-orders points and faces by position, so that the geometry survives what rounds, reorders or splits vertices; see
-`jaxmark.geometry.imprint` for how rounding is repeated exactly.
+Positions are rounded to a grid, and points and faces ordered by position, so that the geometry survives what rounds,
+reorders or splits vertices; see `jaxmark.geometry.imprint` for how rounding is repeated exactly.
 """
 
 import hashlib
@@ -14,7 +13,7 @@ from jaxtyping import UInt64
 from numpy.typing import ArrayLike
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, Weld, diagonal, weld, weld_mesh
+from jaxmark.geometry.mesh import Mesh, Weld, weld, weld_mesh
 
 # Six significant digits are off by up to 5e-6 of the largest coordinate, float32 by 6e-8. Both stay below a quarter of
 # the grid's spacing, 1.5e-5 to 3e-5 of the diagonal, where coordinates are no larger than three quarters of the latter.
@@ -27,33 +26,27 @@ class Canonical(NamedTuple):
     points: Mesh  # the distinct points, and the mesh's faces as indices of these
     weld: Weld  # which vertices of the mesh stand at which point
     hash: bytes  # SHA-256 that identifies this geometry
-
-
-def exact(mesh: Mesh) -> Canonical:
-    """The geometry of version 1: points at exactly the same position are one, in order of first occurrence."""
-    welded = weld(mesh.vertices)
-    points = weld_mesh(mesh, welded)
-    vertices = np.asarray(points.vertices, np.float64) + 0.0  # turns -0.0 into 0.0
-    found = _digest(b"jaxmark/1/geometry", len(vertices), len(points.faces), vertices, points.faces)
-    return Canonical(points, welded, found)
+    order: bytes  # SHA-256 of the order in which the mesh's file has the canonical points, and of its faces
 
 
 def geometry_hash(mesh: Mesh) -> bytes:
-    """Return the hash of version 1 (SHA-256), the same for every file that stores the geometry exactly.
+    """Return a SHA-256 that is the same for every file that stores the geometry exactly and in the same order.
 
     It covers the welded points in order of first occurrence, as little-endian float64 with -0.0 as 0.0, and the
     triangles that refer to them, as little-endian int64.
     """
-    return exact(mesh).hash
+    points = weld_mesh(mesh, weld(mesh.vertices))
+    vertices = np.asarray(points.vertices, np.float64) + 0.0  # turns -0.0 into 0.0
+    return _digest(b"jaxmark/1/geometry", len(vertices), len(points.faces), vertices, points.faces)
 
 
-def grid_spacing(mesh: Mesh) -> float:
-    """The spacing of the grid for a mesh, in its units: a power of two, so that rounding is exact; see `diagonal`."""
-    return 2.0 ** math.floor(math.log2(diagonal(mesh) / _CELLS))
+def grid_spacing(diagonal: float) -> float:
+    """The spacing of the grid for a bounding-box diagonal, in its units: a power of two, so that rounding is exact."""
+    return 2.0 ** math.floor(math.log2(diagonal / _CELLS))
 
 
 def rounded(mesh: Mesh, spacing: float) -> Canonical:
-    """The geometry of version 2: points on a grid, in the order of their coordinates; those that no face uses are last.
+    """Round points to a grid, and order them by their coordinates; those that no face uses are last.
 
     Faces begin at their lowest corner and are sorted, and those without three different corners are left out, so that
     the result depends neither on the order in a file nor on what a format leaves out. The hash covers the spacing, the
@@ -92,16 +85,8 @@ def rounded(mesh: Mesh, spacing: float) -> Canonical:
     faces = faces[np.lexsort(faces.T[::-1])]
     points, count = cells[first], int(used.sum())
     found = _digest(b"jaxmark/2/geometry", count, len(faces), spacing, points[:count], faces)
-    return Canonical(Mesh(points, faces), Weld(point, first), found)
-
-
-def order_hash(mesh: Mesh, welded: Weld) -> bytes:
-    """SHA-256 of the order in which a file has the canonical points, and of its faces.
-
-    A suspect may be compared vertex by vertex only with an original of this very order: whoever could choose the order
-    when the suspect is known could choose what is compared with what.
-    """
-    return _digest(b"jaxmark/2/order", len(welded.point), len(mesh.faces), welded.point, mesh.faces)
+    ordered = _digest(b"jaxmark/2/order", len(point), len(mesh.faces), point, mesh.faces)
+    return Canonical(Mesh(points, faces), Weld(point, first), found, ordered)
 
 
 def mix(values: UInt64[np.ndarray, "*values"]) -> UInt64[np.ndarray, "*values"]:

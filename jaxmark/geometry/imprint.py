@@ -31,7 +31,7 @@ class Imprint(NamedTuple):
     centre: Float64[np.ndarray, " 3"]  # of the surface
     covariance: Float64[np.ndarray, "3 3"]  # of the surface, about its centre
     tags: UInt32[np.ndarray, " points"]  # hash of each point that faces use, in their canonical order
-    order: bytes  # `order_hash` of the original's file
+    order: bytes  # `Canonical.order` of the original's file
 
 
 class Restored(NamedTuple):
@@ -44,10 +44,10 @@ class Restored(NamedTuple):
     distance: float  # between the two shapes by their moments, over the original's size; says how unlike they are
 
 
-def make_imprint(canonical: Canonical, grid: float, order: bytes = b"") -> Imprint:
-    """Make the imprint of a canonical geometry with this grid, from a file of this order."""
+def make_imprint(canonical: Canonical, grid: float) -> Imprint:
+    """Make the imprint of a canonical geometry with this grid."""
     points = np.asarray(canonical.points.vertices, np.float64)[used_vertices(canonical.points)]
-    return Imprint(canonical.hash, grid, *_moments(canonical.points), _tags(points / grid), order)
+    return Imprint(canonical.hash, grid, *_moments(canonical.points), _tags(points / grid), canonical.order)
 
 
 def restore(copy: Mesh, imprint: Imprint) -> Restored:

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -45,10 +45,7 @@ class EmbedInfo(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Mark:
-    """A mark: its original, key, payload and scheme, prepared once for writing and for reading any number of suspects.
-
-    Make one with `make_mark`.
-    """
+    """A mark: its original, key, payload and scheme, prepared once for writing it and for reading suspects."""
 
     original: Original
     choices: Choices  # what derives from the key
@@ -60,6 +57,34 @@ class Mark:
     content: Content = "message"  # what the code bits say
     record: Record | None = None  # the record of the mark that is read
     caveats: tuple[str, ...] = ()  # why what is read is no proof
+
+    @classmethod
+    def make(
+        cls: "type[_AnyMark]",
+        original: Original,
+        key: bytes,
+        scheme: Scheme,
+        bits: int,
+        *,
+        record: Record | None = None,
+        detector: Detector | None = None,
+        caveats: tuple[str, ...] = (),
+    ) -> "_AnyMark":
+        """Make a mark that carries a message, or without a payload nothing but its presence.
+
+        Raises:
+            JaxmarkError: if the payload does not fit.
+        """
+        code_bits = scheme.code_length(original, bits) if bits else 1
+        content: Content = "message" if bits else "presence"
+        choices = bind_mark(key, original, scheme, bits, content, record)
+        carrier = scheme.carrier(original, choices, bits, code_bits)
+        if not isinstance(scheme, tuple(SCHEMES.values())):
+            caveats += (f"the scheme {scheme.name!r} is not one of this library",)
+        if detector not in (None, scheme.detector):
+            caveats += ("the detector is not the scheme's own",)
+        used = detector or scheme.detector
+        return cls(original, choices, bits, scheme, carrier, code_bits, used, content, record, caveats)
 
     @property
     def key(self) -> Key:
@@ -110,7 +135,7 @@ class Mark:
                 f"The {len(unit)} points of this mesh leave the scheme {self.scheme.name!r} nothing to write in."
             )
         written = displace_within(original, unit, bounds, self.capacity.reference if bounds.limits else None)
-        canonical = Canonical(original.points, original.weld, original.geometry)
+        canonical = Canonical(original.points, original.weld, original.geometry, original.order)
         record = Record(
             scheme=self.scheme.name,
             bits=self.bits,
@@ -120,7 +145,7 @@ class Mark:
             parameters=parameters_of(self.scheme),
             content=self.content,
             told=commit(told, self.choices) if told else "",
-            imprint=seal_imprint(make_imprint(canonical, original.grid, original.order), self.key),
+            imprint=seal_imprint(make_imprint(canonical, original.grid), self.key),
         ).sealed(self.key)
         return written.mesh, EmbedInfo(written.moved.rms, written.moved.max, written.scale, record)
 
@@ -167,7 +192,7 @@ class Mark:
         if (scheme, bits) == (self.scheme, self.bits):
             return self
         detector = None if self.uses_own_detector else self.detector
-        return type(self)(**fields_of(self.original, self.key, scheme, bits, detector=detector))
+        return self.make(self.original, self.key, scheme, bits, detector=detector)
 
     def _per_point(self, weights: ArrayLike) -> Float64[np.ndarray, " points"]:
         """Convert weights of vertices to weights of points, each the mean over the vertices at the point."""
@@ -188,42 +213,6 @@ def bind_mark(
     fixed = {"content": content, "scheme": scheme.name, "parameters": parameters, "bits": bits}
     fixed["order"] = original.order.hex()
     return bind(key, original.geometry, fixed)
-
-
-def fields_of(
-    original: Original,
-    key: bytes,
-    scheme: Scheme,
-    bits: int,
-    *,
-    record: Record | None = None,
-    detector: Detector | None = None,
-    caveats: tuple[str, ...] = (),
-) -> dict[str, Any]:
-    """Return the fields of a `Mark` that carries a message, or without a payload nothing but its presence.
-
-    Raises:
-        JaxmarkError: if the payload does not fit.
-    """
-    code_bits = scheme.code_length(original, bits) if bits else 1
-    content: Content = "message" if bits else "presence"
-    choices = bind_mark(key, original, scheme, bits, content, record)
-    if not isinstance(scheme, tuple(SCHEMES.values())):
-        caveats += (f"the scheme {scheme.name!r} is not one of this library",)
-    if detector not in (None, scheme.detector):
-        caveats += ("the detector is not the scheme's own",)
-    return {
-        "original": original,
-        "choices": choices,
-        "bits": bits,
-        "scheme": scheme,
-        "carrier": scheme.carrier(original, choices, bits, code_bits),
-        "code_bits": code_bits,
-        "detector": detector or scheme.detector,
-        "content": content,
-        "record": record,
-        "caveats": caveats,
-    }
 
 
 def recall(original: Mesh, key: bytes, record: Record | None) -> tuple[Original, tuple[str, ...]]:

@@ -27,7 +27,7 @@ from jaxmark.watermark.coding.keys import Key, commitment
 from jaxmark.watermark.coding.message import DEFAULT_BITS, TAG_BITS, check_size
 from jaxmark.watermark.evidence.detection import Detection, Evidence
 from jaxmark.watermark.interfaces import Detector, Scheme
-from jaxmark.watermark.mark import EmbedInfo, Mark, fields_of, recall
+from jaxmark.watermark.mark import EmbedInfo, Mark, recall
 from jaxmark.watermark.nonblind import Alternatives, read
 from jaxmark.watermark.perception.budget import Bounds, Budget, BudgetLike
 from jaxmark.watermark.perception.capacity import COVERAGE, NOISE, Conditions, Survival
@@ -37,7 +37,6 @@ from jaxmark.watermark.schemes.registry import (
     DEFAULT_SCHEME,
     SCHEMES,
     AnyScheme,
-    find_blind,
     get_nonblind,
     make_blind_scheme,
     make_scheme,
@@ -257,6 +256,14 @@ class BlindMarker:
     scheme: BlindScheme
     writer: Writer
 
+    @classmethod
+    def make(cls, original: Original, key: Key, bits: int, scheme: BlindScheme) -> "BlindMarker":
+        """Prepare an original; see `make_blind_marker`."""
+        blind_reading.code_length(bits)  # refuses a payload that is not a multiple of 8 bits
+        check_faces("A mark that is read without the original", original.mesh)
+        choices = blind_reading.context(key, bits, scheme.name)
+        return cls(original, key, bits, scheme, Writer(original, scheme, choices))
+
     def embed(self, message: bytes, budget: BudgetLike = None, *, read_back: bool = True) -> tuple[Mesh, EmbedInfo]:
         """See `Marker`."""
         budget = Budget.of(budget)
@@ -378,7 +385,8 @@ class CombinedMarker:
         limits = {**bounds.limits, **({} if bounds.rms is None else {"rms": bounds.rms})}
         for place, scheme in enumerate(self.schemes, 1):
             own = None if place == len(self.schemes) else shares[place] * sizes[place]
-            marked, other = self._make_blind(marked, scheme).write(message, Budget(rms=own, limits=limits), reference)
+            marker = self._make_blind(make_original(marked), scheme)
+            marked, other = marker.write(message, Budget(rms=own, limits=limits), reference)
             survives.append(other.survives)
         if read_back:
             self.check(marked, message)
@@ -424,15 +432,15 @@ class CombinedMarker:
 
     @cached_property
     def _blind(self) -> list[BlindMarker]:
-        return [self._make_blind(self.original.mesh, scheme) for scheme in self.schemes]
+        return [self._make_blind(self.original, scheme) for scheme in self.schemes]
 
     @property
     def _all(self) -> Iterator[Marker]:
         yield self.nonblind
         yield from self._blind
 
-    def _make_blind(self, mesh: Mesh, scheme: BlindScheme) -> BlindMarker:
-        return make_blind_marker(mesh, self.nonblind.key, bits=self.nonblind.bits, scheme=scheme)
+    def _make_blind(self, original: Original, scheme: BlindScheme) -> BlindMarker:
+        return BlindMarker.make(original, self.nonblind.key, self.nonblind.bits, scheme)
 
 
 def make_marker(
@@ -477,8 +485,9 @@ def make_marker(
             )
     ready, caveats = recall(original, key, record)
     payload = DEFAULT_BITS if bits is None else bits
-    fields = fields_of(ready, key, get_nonblind(scheme), payload, record=record, detector=detector, caveats=caveats)
-    return NonBlindMarker(**fields)
+    return NonBlindMarker.make(
+        ready, key, get_nonblind(scheme), payload, record=record, detector=detector, caveats=caveats
+    )
 
 
 def make_blind_marker(original: Mesh, key: bytes, *, bits: int = DEFAULT_BITS, scheme: BlindScheme) -> BlindMarker:
@@ -487,10 +496,7 @@ def make_blind_marker(original: Mesh, key: bytes, *, bits: int = DEFAULT_BITS, s
     Raises:
         JaxmarkError: if the mesh or the key is unusable, or the payload is not a multiple of 8 bits.
     """
-    blind_reading.code_length(bits)
-    check_faces("A mark that is read without the original", original)
-    ready, choices = make_original(original), blind_reading.context(Key(key), bits, scheme.name)
-    return BlindMarker(ready, Key(key), bits, scheme, Writer(ready, scheme, choices))
+    return BlindMarker.make(make_original(original), Key(key), bits, scheme)
 
 
 def prepare(mesh: Mesh, key: bytes, bits: int, scheme: AnyScheme, *, adapt_to: Budget | None = None) -> Marker:
@@ -507,14 +513,14 @@ def prepare(mesh: Mesh, key: bytes, bits: int, scheme: AnyScheme, *, adapt_to: B
     Raises:
         JaxmarkError: see `make_marker` and `split`.
     """
-    if isinstance(scheme, tuple):
-        name, blind = split(scheme)
-        marker = make_marker(mesh, key, bits=bits, scheme=name)
-        return CombinedMarker(marker if adapt_to is None else marker.adapted(adapt_to), blind)
-    if (blind := find_blind(scheme)) is not None:
-        return make_blind_marker(mesh, key, bits=bits, scheme=blind)
-    marker = make_marker(mesh, key, bits=bits, scheme=get_nonblind(scheme))
-    return marker if adapt_to is None or not isinstance(scheme, str) else marker.adapted(adapt_to)
+    nonblind, blind = split(scheme)
+    original, secret = make_original(mesh), Key(key)
+    if nonblind is None:
+        return BlindMarker.make(original, secret, bits, *blind)
+    marker = NonBlindMarker.make(original, secret, get_nonblind(nonblind), bits)
+    if adapt_to is not None and isinstance(nonblind, str):
+        marker = marker.adapted(adapt_to)
+    return CombinedMarker(marker, blind) if blind else marker
 
 
 def unite(nonblind: Detection, blind: Sequence[Detection]) -> Detection:

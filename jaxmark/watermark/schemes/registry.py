@@ -114,20 +114,24 @@ def parameters_of(scheme: Named) -> dict[str, Any]:
     return {**_RETIRED_FIELDS.get(scheme.name, {}), **asdict(scheme)}
 
 
-def split(schemes: tuple[str, ...]) -> tuple[str, tuple[BlindScheme, ...]]:
-    """Split the names of schemes that mark one mesh together: the one read with the original, and the blind ones.
+def split(scheme: AnyScheme) -> tuple[str | Scheme | None, tuple[BlindScheme, ...]]:
+    """Split what marks one mesh: the scheme that is read with the original, or its name, if any; and the blind ones.
 
     Raises:
-        JaxmarkError: unless the first is read with the original and the others are blind, each once.
+        JaxmarkError: unless of several names the first is read with the original and the others are blind, each once.
     """
-    if len(schemes) < 2 or schemes[0] not in SCHEMES or any(name not in BLIND_SCHEMES for name in schemes[1:]):
+    if not isinstance(scheme, tuple):
+        if (blind := find_blind(scheme)) is not None:
+            return None, (blind,)
+        return scheme if isinstance(scheme, str) else get_nonblind(scheme), ()
+    if len(scheme) < 2 or scheme[0] not in SCHEMES or any(name not in BLIND_SCHEMES for name in scheme[1:]):
         raise JaxmarkError(
             f"Several marks in one mesh are one that is read with the original ({', '.join(SCHEMES)}) and then blind"
-            f" ones ({', '.join(BLIND_SCHEMES)}), not {', '.join(schemes)}."
+            f" ones ({', '.join(BLIND_SCHEMES)}), not {', '.join(scheme)}."
         )
-    if len(set(schemes)) < len(schemes):
-        raise JaxmarkError(f"Each scheme marks a mesh once, but one is twice among {', '.join(schemes)}.")
-    return schemes[0], tuple(BLIND_SCHEMES[name] for name in schemes[1:])
+    if len(set(scheme)) < len(scheme):
+        raise JaxmarkError(f"Each scheme marks a mesh once, but one is twice among {', '.join(scheme)}.")
+    return scheme[0], tuple(BLIND_SCHEMES[name] for name in scheme[1:])
 
 
 def name_of(scheme: AnyScheme) -> str:
