@@ -1,11 +1,15 @@
-"""The rooms of the package and what they import of each other, read from the code; run it to draw the figure again."""
+"""The rooms of the package, their modules and imports, read from the code; run it to write table and figures again."""
 
 import ast
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 from tests import ROOT
+from tests.project import data_flow
 
 PACKAGE = ROOT / "jaxmark"
+MAP = ROOT / "CONTRIBUTING.md"
+BEGIN, END = "<!-- modules: written by `python -m tests.project.architecture` -->\n", "<!-- end of modules -->\n"
 FIGURE = ROOT / "docs" / "architecture.svg"
 WIDE, HIGH, ACROSS, DOWN = 120, 30, 150, 66  # of a box, and from one to the next
 
@@ -38,27 +42,58 @@ def imports(source: str) -> Iterator[str]:
         yield from (name.split(".")[1] for name in dotted if name.startswith("jaxmark."))
 
 
+def floors(found: Mapping[str, set[str]]) -> list[list[str]]:
+    """The rooms, floor by floor: each above all that it imports."""
+    floor: dict[str, int] = {}
+    for room in sorted(found, key=lambda room: len(below(found, room))):
+        floor[room] = max((floor[other] + 1 for other in below(found, room)), default=0)
+    return [sorted(room for room in found if floor[room] == number) for number in range(max(floor.values()) + 1)]
+
+
+def below(found: Mapping[str, set[str]], room: str) -> set[str]:
+    """All rooms that a room rests on."""
+    return set().union(*({other} | below(found, other) for other in found[room]))
+
+
+def table(found: Mapping[str, set[str]]) -> str:
+    """Rooms and their modules with the first lines of their docstrings, as Markdown; a room imports from those above."""
+    rows = ["| room or module | what it is |", "|---|---|"]
+    for room in (room for floor in floors(found) for room in floor):
+        folder = PACKAGE / room
+        if not folder.is_dir():
+            rows.append(f"| `{room}` | {_first_line(folder.with_suffix('.py'))} |")
+            continue
+        rows.append(f"| `{room}/` | **{_first_line(folder / '__init__.py')}** |")
+        for path in sorted(folder.rglob("*.py"), key=lambda path: path.relative_to(folder).parts):
+            name = path.relative_to(folder).with_suffix("").as_posix().removesuffix("__init__")
+            if name and (line := _first_line(path)):
+                rows.append(f"| · `{name}` | {line} |")
+    return "\n".join([*rows, ""])
+
+
+def written(text: str, rows: str) -> str:
+    """A page with its table of modules written again."""
+    before, rest = text.split(BEGIN)
+    return before + BEGIN + rows + END + rest.split(END)[1]
+
+
+def _first_line(path: Path) -> str:
+    """First line of a module's docstring, without the full stop; empty if it has none."""
+    said = ast.get_docstring(ast.parse(path.read_text())) or ""
+    return said.partition("\n")[0].removesuffix(".").replace("|", "\\|")
+
+
 def draw(found: Mapping[str, set[str]]) -> str:
     """An SVG of the rooms, each above all that it imports; an import that others imply has no arrow."""
-    below: dict[str, set[str]] = {}  # all that a room rests on
-
-    def rest(room: str) -> set[str]:
-        if room not in below:
-            below[room] = set().union(*({other} | rest(other) for other in found[room]))
-        return below[room]
-
-    floor: dict[str, int] = {}
-    for room in sorted(found, key=lambda room: len(rest(room))):
-        floor[room] = max((floor[other] + 1 for other in rest(room)), default=0)
-    floors = [sorted(room for room in found if floor[room] == number) for number in range(max(floor.values()) + 1)]
-    widest = max(map(len, floors))
+    rows = floors(found)
+    widest = max(map(len, rows))
     place = {
-        room: (ACROSS * (column + (widest - len(row) + 1) / 2), DOWN * (len(floors) - number - 0.5))
-        for number, row in enumerate(floors)
+        room: (ACROSS * (column + (widest - len(row) + 1) / 2), DOWN * (len(rows) - number - 0.5))
+        for number, row in enumerate(rows)
         for column, room in enumerate(row)
     }
     lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {ACROSS * widest} {DOWN * len(floors)}"'
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {ACROSS * widest} {DOWN * len(rows)}"'
         ' font-family="monospace" font-size="13" text-anchor="middle">',
         '<defs><marker id="head" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
         '<path d="M0 0 L8 4 L0 8 z" fill="#4a6fa5"/></marker></defs>',
@@ -66,7 +101,7 @@ def draw(found: Mapping[str, set[str]]) -> str:
     ]
     for room, others in sorted(found.items()):
         x, y = place[room]
-        for other in sorted(others - set().union(*(rest(one) for one in others))):
+        for other in sorted(others - set().union(*(below(found, one) for one in others))):
             to, down = place[other]
             lines.append(
                 f'<line x1="{x:g}" y1="{y + HIGH / 2:g}" x2="{to:g}" y2="{down - HIGH / 2:g}" stroke="#4a6fa5"'
@@ -82,3 +117,5 @@ def draw(found: Mapping[str, set[str]]) -> str:
 
 if __name__ == "__main__":
     FIGURE.write_text(draw(rooms()))
+    data_flow.FIGURE.write_text(data_flow.draw())
+    MAP.write_text(written(MAP.read_text(), table(rooms())))

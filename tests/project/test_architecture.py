@@ -6,13 +6,17 @@ import sys
 import xml.etree.ElementTree as ElementTree
 
 import jaxmark as jm
-from tests.project.architecture import FIGURE, PACKAGE, ROOT, draw, imports, modules, rooms
+from tests.project import data_flow
+from tests.project.architecture import FIGURE, MAP, PACKAGE, draw, imports, modules, rooms, table, written
 
 MOST_ROOMS = 16  # at the top of the package
 FILTERING = {"errors", "extras", "seeds", "geometry", "spectral"}  # what a filter needs
 
 
-def table(text: str) -> list[str]:
+AGAIN = "write it again: python -m tests.project.architecture"
+
+
+def named_rooms(text: str) -> list[str]:
     """The rooms in the first column of the table, row by row."""
     rows = re.findall(r"^\| (`[^|]*`) \|", text, re.MULTILINE)
     return [name for row in rows for name in re.findall(r"`(\w+)/?`", row)]
@@ -30,7 +34,7 @@ def backward(order: list[str], found: dict[str, set[str]]) -> list[str]:
 
 
 def test_the_table_names_every_room_once():
-    named = table((ROOT / "CONTRIBUTING.md").read_text())
+    named = named_rooms(MAP.read_text())
     assert sorted(named) == sorted(rooms())
     assert len(named) <= MOST_ROOMS
 
@@ -38,7 +42,7 @@ def test_the_table_names_every_room_once():
 def test_imports_flow_down_the_table():
     found = rooms()
     assert found["evaluation"] >= {"attacks", "watermark", "plot"}
-    assert not backward(table((ROOT / "CONTRIBUTING.md").read_text()), found)
+    assert not backward(named_rooms(MAP.read_text()), found)
 
 
 def test_filtering_knows_nothing_of_the_watermark():
@@ -67,11 +71,19 @@ def test_the_package_shows_its_rooms_and_what_is_used_every_day():
 
 
 def test_the_figure_is_drawn_from_the_imports():
-    assert FIGURE.read_text() == draw(rooms()), "draw it again: python -m tests.project.architecture"
+    assert FIGURE.read_text() == draw(rooms()), AGAIN
+
+
+def test_the_table_has_all_modules_with_their_first_lines():
+    text = MAP.read_text()
+    assert text == written(text, table(rooms())), AGAIN
+    private = {path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if path.name != "__init__.py"}
+    assert len(re.findall(r"^\| (· )?`", text, re.MULTILINE)) >= len(private)
 
 
 def test_modules_in_the_picture_of_the_data_exist():
-    picture = ElementTree.parse(ROOT / "docs" / "data_flow.svg")
+    assert data_flow.FIGURE.read_text() == data_flow.draw(), AGAIN
+    picture = ElementTree.parse(data_flow.FIGURE)
     texts = [text for text in picture.iter("{http://www.w3.org/2000/svg}text") if text.get("class") == "modules"]
     named = {name for text in texts for name in (text.text or "").split()}
     assert len(named) >= 30
