@@ -121,17 +121,10 @@ def register_part(
 ) -> Pose | None:
     """Find the similarity that brings a suspect onto the part of the original that it shows, at least a fifth.
 
-    Args:
-        original: the surface of the welded points, about 1 in size.
-        suspect: in any pose and scale, with an area.
-        reflections: whether the pose may be one that does not mirror (False), one that mirrors (True), or either.
-        settings: see `RegistrationSettings`.
+    Args and raises: see `register_whole`.
 
     Returns:
         The pose; None if local shape suggests none.
-
-    Raises:
-        JaxmarkError: if libigl is missing, or a surface has no area.
     """
     points, normals, _ = suspect.sample(settings.samples)
     fine, rounds = slice(settings.fine_points), settings.comparison_rounds

@@ -35,7 +35,7 @@ _MIGRATIONS = (
         original INTEGER NOT NULL REFERENCES originals ON DELETE CASCADE,
         name TEXT NOT NULL,
         geometry TEXT NOT NULL,  -- hash of the canonical geometry, as in records of version 2
-        exact TEXT NOT NULL,  -- the same of version 1
+        exact TEXT NOT NULL,  -- `geometry_hash`
         vertices INTEGER NOT NULL,
         faces INTEGER NOT NULL,
         described INTEGER NOT NULL,  -- version of the descriptors

@@ -304,7 +304,7 @@ class Scheme(Protocol):
         return 0
 
     def tunable(self) -> Any:
-        """Return the scheme in the form that `tune` needs: a `jaxmark.watermark.schemes.keyed.TunableScheme`.
+        """Return the scheme in the form that `tune` needs: a `jaxmark.watermark.schemes.keyed.KeyedScheme`.
 
         Raises:
             JaxmarkError: if the scheme has no bands whose strengths could be tuned.

@@ -146,11 +146,8 @@ class NonBlindMarker(Mark):
     def check(self, marked: Mesh, message: bytes) -> None:
         """See `Marker`."""
         if not self.reads(marked, message):
-            raise JaxmarkError(
-                f"This mesh ({int(self.original.used.sum())} points) cannot carry {_payload(self.bits)} with the scheme"
-                f" {self.scheme.name!r}: it does not read back, even unattacked. Use a larger budget,"
-                f"{' a shorter message or a presence mark,' if self.bits else ''} or a finer or less regular mesh."
-            )
+            shorter = " a shorter message or a presence mark," if self.bits else ""
+            raise _does_not_read(self, f"a larger budget,{shorter} or a finer or less regular mesh")
 
     def reads(self, marked: Mesh, message: bytes) -> bool:
         """Whether a message can be read from a mesh that has the original's vertex order.
@@ -303,11 +300,7 @@ class BlindMarker:
     def check(self, marked: Mesh, message: bytes) -> None:
         """See `Marker`."""
         if not self.reads(marked, message):
-            raise JaxmarkError(
-                f"This mesh ({int(self.original.used.sum())} points) cannot carry {_payload(self.bits)} with the scheme"
-                f" {self.scheme.name!r}: it does not read back, even unattacked. Use a larger budget, a shorter message"
-                f" or the scheme {DEFAULT_SCHEME!r}."
-            )
+            raise _does_not_read(self, f"a larger budget, a shorter message or the scheme {DEFAULT_SCHEME!r}")
 
     def reads(self, marked: Mesh, message: bytes) -> bool:
         """Whether a message is read, or without one a presence proven."""
@@ -535,8 +528,13 @@ def unite(nonblind: Detection, blind: Sequence[Detection]) -> Detection:
     )
 
 
-def _payload(bits: int) -> str:
-    return f"a message of {bits} bits" if bits else "a presence mark"
+def _does_not_read(marker: NonBlindMarker | BlindMarker, mend: str) -> JaxmarkError:
+    """The error for a mark that does not read, and what to use."""
+    payload = f"a message of {marker.bits} bits" if marker.bits else "a presence mark"
+    return JaxmarkError(
+        f"This mesh ({int(marker.original.used.sum())} points) cannot carry {payload} with the scheme"
+        f" {marker.scheme.name!r}: it does not read back, even unattacked. Use {mend}."
+    )
 
 
 def _matches_record(scheme: Scheme, record: Record) -> bool:

@@ -6,7 +6,7 @@ there already. The pose that it shows is nearly the one that was marked, up to t
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import jax
@@ -23,7 +23,7 @@ from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.padding import common_laplacian, pad_rows
 from jaxmark.spectral.precision import matmul
 from jaxmark.watermark.blind.anchors import Anchors, Pieces, changes, encloses, look, place, see, turned
-from jaxmark.watermark.blind.scheme import AnchoredHost, Look, measure
+from jaxmark.watermark.blind.scheme import AnchoredHost, BlindScheme, Look, measure
 from jaxmark.watermark.coding.keys import Choices
 
 _LEAST_AREA = 0.2  # of the mean: what vertices of smaller area count as
@@ -46,7 +46,7 @@ TURNS = np.array(
 
 
 @dataclass(frozen=True)
-class FieldScheme:
+class FieldScheme(BlindScheme):
     """Writes values at anchors in the shape's own pose; read without the original, and after any remeshing.
 
     Widths and steps are public ladders: of the steps, the largest that keeps the limits is written, and of the widths
@@ -54,23 +54,11 @@ class FieldScheme:
     """
 
     name: ClassVar[str] = "field"
+    in_parts: ClassVar[bool] = False
+    looks: ClassVar[int] = (len(_UNDONE_STEPS) - 1 + len(_BLURS)) * len(TURNS)
     widths: tuple[float, ...] = (0.018, 0.0125, 0.025)  # of the narrow Gaussian, about in diagonals
     steps: tuple[float, ...] = tuple(1e-4 * 2 ** (rung / 2) for rung in range(11))  # of the lattice, in the same unit
     hiding: bool = False  # whether points move where and as it is hidden; see `jaxmark.watermark.perception.masking`
-
-    @property
-    def in_parts(self) -> bool:
-        """See `BlindScheme`."""
-        return False
-
-    @property
-    def looks(self) -> int:
-        """See `BlindScheme`."""
-        return (len(_UNDONE_STEPS) - 1 + len(_BLURS)) * len(TURNS)
-
-    def fixed(self, width: float, step: float) -> "FieldScheme":
-        """See `BlindScheme`."""
-        return replace(self, widths=(width,), steps=(step,))
 
     def hosts(self, original: Original, choices: Choices) -> dict[float, AnchoredHost]:
         """See `BlindScheme`.

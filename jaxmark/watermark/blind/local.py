@@ -8,7 +8,7 @@ smoothed. Another meshing has other colours, and shows nothing.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -24,7 +24,7 @@ from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.laplacian import Laplacian
 from jaxmark.spectral.padding import common_laplacian, common_size, pad_rows
 from jaxmark.watermark.blind.dither import make_words
-from jaxmark.watermark.blind.scheme import AnchoredHost, Look, measure
+from jaxmark.watermark.blind.scheme import AnchoredHost, BlindScheme, Look, measure
 from jaxmark.watermark.coding.keys import Choices
 
 _RINGS = 5  # of neighbours that a colour depends on
@@ -41,30 +41,18 @@ _SPREAD = (0.15,)  # of the usual size, as it is that of another part of the sha
 
 
 @dataclass(frozen=True)
-class LocalScheme:
+class LocalScheme(BlindScheme):
     """Writes values at vertices that connectivity tells; read without the original, and from any part of it.
 
     Widths and steps are public ladders, see `FieldScheme`.
     """
 
     name: ClassVar[str] = "local"
+    in_parts: ClassVar[bool] = True
+    looks: ClassVar[int] = len(_SHORTER)
     widths: tuple[float, ...] = (32.0,)  # power k of the narrow average (I - Δ/2)^k
     steps: tuple[float, ...] = tuple(0.0625 * 2 ** (rung / 2) for rung in range(11))  # of the lattice, over local sizes
     hiding: bool = False  # whether points move where and as it is hidden; see `jaxmark.watermark.perception.masking`
-
-    @property
-    def in_parts(self) -> bool:
-        """See `BlindScheme`."""
-        return True
-
-    @property
-    def looks(self) -> int:
-        """See `BlindScheme`."""
-        return len(_SHORTER)
-
-    def fixed(self, width: float, step: float) -> "LocalScheme":
-        """See `BlindScheme`."""
-        return replace(self, widths=(width,), steps=(step,))
 
     def hosts(self, original: Original, choices: Choices) -> dict[float, AnchoredHost]:
         """See `BlindScheme`."""

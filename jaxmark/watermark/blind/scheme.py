@@ -1,6 +1,7 @@
 """What a blind scheme is: what it shows of an original to write in, and of a suspect to read."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -64,39 +65,22 @@ class Look(NamedTuple):
 
 @runtime_checkable
 class BlindScheme(Protocol):
-    """A frozen dataclass of public ladders: whoever reads without a record tries all of them."""
+    """A frozen dataclass of public ladders: whoever reads without a record tries all of them.
+
+    A scheme inherits from this class.
+    """
 
     name: ClassVar[str]  # in records and on the command line
+    in_parts: ClassVar[bool]  # whether a part of the shape is read as the whole is
+    looks: ClassVar[int]  # number of ways of looking at a suspect with one width, and of its lying there
     __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    @property
-    def widths(self) -> tuple[float, ...]:
-        """Of the averages that values are differences of."""
-        ...
-
-    @property
-    def steps(self) -> tuple[float, ...]:
-        """Of the lattice that values are written to."""
-        ...
-
-    @property
-    def hiding(self) -> bool:
-        """Whether points move where and as it is hidden; see `jaxmark.watermark.perception.masking`."""
-        ...
-
-    @property
-    def in_parts(self) -> bool:
-        """Whether a part of the shape is read as the whole is."""
-        ...
-
-    @property
-    def looks(self) -> int:
-        """Number of ways of looking at a suspect with one width, and of its lying there."""
-        ...
+    widths: tuple[float, ...]  # of the averages that values are differences of
+    steps: tuple[float, ...]  # of the lattice that values are written to
+    hiding: bool  # whether points move where and as it is hidden; see `jaxmark.watermark.perception.masking`
 
     def fixed(self, width: float, step: float) -> "BlindScheme":
-        """The scheme with one width and step."""
-        ...
+        """Return the scheme with one width and step."""
+        return replace(self, widths=(width,), steps=(step,))
 
     def hosts(self, original: Original, choices: Choices) -> dict[float, AnchoredHost]:
         """Look at an original by anchors of each width; all have arrays of the same shapes."""

@@ -53,7 +53,7 @@ def claims(
 ) -> tuple[Float[Array, " ways"], Float[Array, " ways"]]:
     """Score S and norm ‖a‖ of a claimed codeword for each way of weighting a suspect; see `Reader.ways`.
 
-    Each way is a proof of its own; to take the best of them, pay for all (`evidence.any_of`).
+    Each way is a proof of its own; to take the best of them is charged (`jaxmark.watermark.evidence.ledger`).
     """
     scores, norms = zip(*(reader.claim(way, codeword) for way in reader.ways(received)), strict=True)
     return jnp.stack(scores), jnp.stack(norms)

@@ -17,8 +17,37 @@ from jaxmark.watermark.interfaces import Carrier, Detector, Scheme
 from jaxmark.watermark.reading.detectors import decorrelate
 
 
+class ModulatedScheme(Scheme):
+    """A scheme that writes on components of the host, one keyed sign for each of them, coordinate and code bit."""
+
+    @property
+    def count(self) -> int:
+        """Number of components that the scheme asks for; a small mesh may have fewer."""
+        raise NotImplementedError
+
+    def components(self, original: Original) -> Components:
+        """Split an original into its components."""
+        raise NotImplementedError
+
+    @property
+    def detector(self) -> Detector:
+        """See `Scheme`."""
+        return decorrelate
+
+    def code_length(self, original: Original, bits: int) -> int:
+        """See `Scheme`; the more code bits share the components, the more they interfere with each other."""
+        return code_length(bits, 3 * self.count, 2)
+
+    def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> Carrier:
+        """See `Scheme`; one keyed sequence per bit runs over all pairs of a component and a coordinate."""
+        components = self.components(original)
+        sequences = orthogonal_sequences(choices, code_bits, 3 * self.count, label=self.name)
+        sequences = sequences.reshape(code_bits, self.count, 3)
+        return ModulatedCarrier(components, np.ascontiguousarray(sequences[:, : components.gram.shape[-1]]))
+
+
 @dataclass(frozen=True)
-class HostScheme(Scheme):
+class HostScheme(ModulatedScheme):
     """The paper's scheme: it writes on polynomial bands of the host, with a keyed sign for each band and coordinate.
 
     The defaults are the form of it that works: Jackson-damped bands at unit norm. `kernel="printed", damping="none",
@@ -34,23 +63,18 @@ class HostScheme(Scheme):
     unit_norm: bool = True  # whether components are scaled to unit norm
 
     @property
-    def detector(self) -> Detector:
-        """See `Scheme`."""
-        return decorrelate
+    def count(self) -> int:
+        """See `ModulatedScheme`."""
+        return self.bands
 
-    def code_length(self, original: Original, bits: int) -> int:
-        """See `Scheme`; the more code bits share the components, the more they interfere with each other."""
-        return code_length(bits, 3 * self.bands, 2)
-
-    def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> Carrier:
-        """See `Scheme`."""
+    def components(self, original: Original) -> Components:
+        """See `ModulatedScheme`."""
         family = scaling(self.bands, kernel=self.kernel, damping=self.damping)
-        components = host_bands(original.operator, original.signal, family, unit_norm=self.unit_norm)
-        return _make_modulated(self.name, components, self.bands, original, choices, code_bits)
+        return host_bands(original.operator, original.signal, family, unit_norm=self.unit_norm)
 
 
 @dataclass(frozen=True)
-class EigenScheme(Scheme):
+class EigenScheme(ModulatedScheme):
     """Ohbuchi's scheme: it writes on the lowest eigenpairs of the Laplacian, with a keyed sign for each and coordinate.
 
     The numbers that `pairs` may be are those of `HostScheme.bands`.
@@ -60,26 +84,10 @@ class EigenScheme(Scheme):
     pairs: int = 64  # number of eigenpairs
 
     @property
-    def detector(self) -> Detector:
-        """See `Scheme`."""
-        return decorrelate
+    def count(self) -> int:
+        """See `ModulatedScheme`."""
+        return self.pairs
 
-    def code_length(self, original: Original, bits: int) -> int:
-        """See `Scheme`; the more code bits share the components, the more they interfere with each other."""
-        return code_length(bits, 3 * self.pairs, 2)
-
-    def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> Carrier:
-        """See `Scheme`."""
-        pairs = eigenpairs(original.operator, self.pairs)
-        components = eigenspaces(original.operator, original.signal, pairs)
-        return _make_modulated(self.name, components, self.pairs, original, choices, code_bits)
-
-
-def _make_modulated(
-    name: str, components: Components, bands: int, original: Original, choices: Choices, code_bits: int
-) -> ModulatedCarrier:
-    """Modulate components by one keyed sequence per bit, which runs over all pairs of a band and a coordinate."""
-    slots = 3 * bands
-    sequences = orthogonal_sequences(choices, code_bits, slots, label=name).reshape(code_bits, bands, 3)
-    used = components.gram.shape[-1]  # a small mesh has fewer eigenvectors than the layout has places for
-    return ModulatedCarrier(components, np.ascontiguousarray(sequences[:, :used]))
+    def components(self, original: Original) -> Components:
+        """See `ModulatedScheme`."""
+        return eigenspaces(original.operator, original.signal, eigenpairs(original.operator, self.pairs))
