@@ -39,8 +39,8 @@ def margins(channels: Channels, power: Float[Array, " bands"], margin: Margin = 
         power: β_j², `[bands]`.
         margin: the measure. `"rate"`, in bits: Σ_j (n_j/2) log₂(1 + SNR_j), the capacity of parallel Gaussian channels
             (Cover, Thomas, "Elements of Information Theory", 9.4). `"evidence"`, in nats: Σ_j (n_j/2) SNR_j/(1 +
-            SNR_j), the value of S²/2‖a‖² for a claimed message (`evidence.bounds.log10_p_score`), as ‖a‖ contains the mark
-            as well as the noise. `"snr"`: Σ_j (n_j/2) SNR_j, the limit of both for weak marks, up to the unit; it is
+            SNR_j), the value of S²/2‖a‖² for a claimed message (`bounds.log10_p_score`), as ‖a‖ contains the mark as
+            well as the noise. `"snr"`: Σ_j (n_j/2) SNR_j, the limit of both for weak marks, up to the unit; it is
             brittle, because its optimum lies in as many bands as there are attacks.
 
     Returns:
