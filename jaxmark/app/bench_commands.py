@@ -25,7 +25,7 @@ from jaxmark.bench.calibration import RATE
 from jaxmark.bench.corpus import make_corpus
 from jaxmark.bench.equal import SHARES, equal_visibility
 from jaxmark.bench.leagues import LEAGUES
-from jaxmark.bench.methods import METHODS
+from jaxmark.bench.method import METHODS
 from jaxmark.bench.repeat import hold_against, load_published, save_readings
 from jaxmark.bench.results import BenchResults
 from jaxmark.bench.summary import entries, save_entries

@@ -11,9 +11,9 @@ from jaxmark.bench.fitting import fit as fit
 from jaxmark.bench.leagues import LEAGUES as LEAGUES
 from jaxmark.bench.leagues import League as League
 from jaxmark.bench.leagues import Line as Line
+from jaxmark.bench.method import METHODS as METHODS
 from jaxmark.bench.method import Method as Method
 from jaxmark.bench.method import Reading as Reading
-from jaxmark.bench.methods import METHODS as METHODS
 from jaxmark.bench.page import markdown as markdown
 from jaxmark.bench.page import save_page as save_page
 from jaxmark.bench.paired import Paired as Paired

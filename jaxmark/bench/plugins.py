@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmark.bench.method import Bits, Method, Reading
-from jaxmark.bench.methods import METHODS, get_method
+from jaxmark.bench.method import METHODS, Bits, Method, Reading, get_method
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
 from jaxmark.files.atomic import read_file

@@ -18,7 +18,7 @@ from jaxmark.app.bench_commands import ManyValues
 from jaxmark.bench import Method, Reading, calibration, compositions, leagues, paired, quality
 from jaxmark.bench.corpus import corpus, known_hashes, make_member
 from jaxmark.bench.fitting import SHARE, fit
-from jaxmark.bench.methods import METHODS, get_method
+from jaxmark.bench.method import METHODS, get_method
 from jaxmark.bench.plugins import digest_of, load_method
 from jaxmark.bench.tables import tables
 from jaxmark.geometry.canonical import geometry_hash
