@@ -12,11 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxmark.adversaries.registry import attack
-from jaxmark.bench.compositions import last_within
-from jaxmark.bench.fitting import fit
+from jaxmark.bench.composed_attacks import last_within
 from jaxmark.bench.leagues import get_league
-from jaxmark.bench.method import Method
-from jaxmark.bench.plugins import Given, load_method
+from jaxmark.bench.method import Given, load_method
+from jaxmark.bench.strength_search import fit
 from jaxmark.bench.tables import Table
 from jaxmark.bench.tasks import Bench, Meshes, draw, draw_mark, load, make_bench, moved
 from jaxmark.errors import JaxmarkError
@@ -87,25 +86,25 @@ def _work(bench: Bench, cell: Cell) -> dict[str, Any]:
     except Exception as error:  # a foreign method may raise anything
         return {"note": f"{type(error).__name__}: {error}"}
 
+    known = None if method.blind else mesh
+
+    def is_read(suspect: Mesh) -> bool:
+        reading = method.read(suspect, key, known)
+        if method.bits:
+            return reading.message is not None and bool(np.array_equal(np.asarray(reading.message, bool), message))
+        others = (draw(32, f"other/{number}", *setting) for number in range(_OTHER_KEYS))
+        return all(reading.score > method.read(suspect, other, known).score for other in others)
+
     def survives(place: int) -> bool:
         suspect = attack(found.mesh, "noise", NOISE[place], seed=setting.seed)
         try:
-            return _is_there(method, suspect, mesh, setting, key, message)
-        except Exception:
+            return is_read(suspect)
+        except Exception:  # see above
             return False
 
     last = last_within(len(NOISE), survives)
     noise = NOISE[last] if last >= 0 else 0.0
     return {"strength": found.strength, "reached": found.reached, "moved": moved(mesh, found), "noise": noise}
-
-
-def _is_there(method: Method, suspect: Mesh, original: Mesh, setting: Setting, key: bytes, message: np.ndarray) -> bool:
-    known = None if method.blind else original
-    found = method.read(suspect, key, known)
-    if method.bits:
-        return found.message is not None and bool(np.array_equal(np.asarray(found.message, bool), message))
-    others = (draw(32, f"other/{number}", *setting) for number in range(_OTHER_KEYS))
-    return all(found.score > method.read(suspect, other, known).score for other in others)
 
 
 def _table(rows: Sequence[tuple[Setting, Mapping[str, Any]]], shares: Sequence[float]) -> Table:

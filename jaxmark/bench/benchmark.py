@@ -4,16 +4,15 @@ from __future__ import annotations  # so that `help` shows names of types instea
 
 import importlib
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
 
 from jaxmark.bench.calibration import RATE
-from jaxmark.bench.leagues import get_league
-from jaxmark.bench.plugins import Given, load_method
+from jaxmark.bench.leagues import League, get_league
+from jaxmark.bench.method import Given, load_method
 from jaxmark.bench.readings import BenchResults
 from jaxmark.bench.tasks import MARK, UNMARKED, Meshes, Task, make_bench, run_task
 from jaxmark.errors import JaxmarkError
@@ -83,62 +82,51 @@ def run(
     marked, named = bench.meshes, bench.methods
     bench = replace(bench, meshes={**unrelated, **marked})
     made = {name: load_method(given, payloads[0]) for name, given in named.items()}
-    _check_names("attack", attacks, [name for league in leagues for name in get_league(league).lines])
-    _check_names("set of limits", limits, [name for league in leagues for name in get_league(league).limits])
-    plans = {league: _plan(league, attacks, limits) for league in leagues}
-    skipped = {f"{league}, {name}": why for league, plan in plans.items() for name, why in plan.skipped.items()}
+    every = [get_league(league) for league in leagues]
+    _check_names("attack", attacks, [name for league in every for name in league.lines])
+    _check_names("set of limits", limits, [name for league in every for name in league.limits])
+    parts, skipped = {}, {}
+    for league in leagues:
+        lines = {name: one for name, one in get_league(league).lines.items() if _is_wanted(name, attacks)}
+        missing = {name: why for name, one in lines.items() if (why := one.missing())}
+        bounds = {name: one for name, one in get_league(league).limits.items() if not limits or name in limits}
+        parts[league] = League(bounds, {name: one for name, one in lines.items() if name not in missing})
+        skipped |= {f"{league}, {name}": why for name, why in missing.items()}
     for name, why in skipped.items():
         say(f"skipped: {name}: {why}")
     if workers == 1:
         # First imported in another thread, pymeshlab destroys the heap when Python ends.
-        for name in sorted({need for plan in plans.values() for need in plan.needs}):
+        for name in sorted({need for part in parts.values() for one in part.lines.values() for need in one.needs}):
             importlib.import_module(name)
     # Sample by sample, so that a run that is ended has some of every mesh.
     whole = [
         Task(name, payload, league, "", mesh, seed, name, MARK)
         for seed, payload, league, mesh, name in product(range(samples), payloads, leagues, marked, named)
     ]
-    marks = [task._replace(limits=one) for task in whole for one in plans[task.league].limits]
-    suspects = [one for task in whole for one in _suspects(task, plans[task.league], list(named), keys)]
+    marks = [task._replace(limits=one) for task in whole for one in parts[task.league].limits]
+    suspects = [one for task in whole for one in _suspects(task, parts[task.league], list(named), keys)]
     suspects += [
         task._replace(source=other, attack="none", number=number)
         for task, other, number in product(whole, unrelated, range(keys))
         if task.league == leagues[0] and task.mesh != other
     ]
     rows = []
-    for part in (marks, suspects):
-        rows += cells.run(part, partial(run_task, bench), workers, Path(output) / "cells.jsonl", say, _title)
+    for some in (marks, suspects):
+        rows += cells.run(some, partial(run_task, bench), workers, Path(output) / "cells.jsonl", say, _title)
     return BenchResults(made, tuple(rows), skipped, rate)
 
 
-class _Plan(NamedTuple):
-    """The attacks and limits of a league that are run."""
-
-    attacks: Sequence[str]
-    limits: Sequence[str]
-    needs: frozenset[str]  # packages
-    skipped: Mapping[str, str]  # attacks that need what is not installed, and why
-
-
-def _plan(league: str, attacks: Sequence[str], limits: Sequence[str]) -> _Plan:
-    lines, bounds = get_league(league).lines, get_league(league).limits
-    wanted = [name for name in lines if not attacks or any(_fits(name, one) for one in attacks)]
-    skipped = {name: why for name in wanted if (why := lines[name].missing())}
-    there = [name for name in wanted if name not in skipped]
-    needs = frozenset(need for name in there for need in lines[name].needs)
-    return _Plan(there, [one for one in bounds if not limits or one in limits], needs, skipped)
-
-
-def _suspects(task: Task, plan: _Plan, methods: Sequence[str], keys: int) -> Iterator[Task]:
+def _suspects(task: Task, league: League, methods: Sequence[str], keys: int) -> Iterator[Task]:
     """Yield the suspects of one method, mesh and sample: unmarked and marked, and in the first sample others' marks."""
-    for attack, number in product(plan.attacks, range(keys)):
+    for attack, number in product(league.lines, range(keys)):
         yield task._replace(source=UNMARKED, attack=attack, number=number)
-    for limits in plan.limits[:1]:  # and with the key that is used to mark it
+    first = list(league.limits)[:1]
+    for limits in first:  # and with the key that is used to mark it
         yield task._replace(limits=limits, source=UNMARKED, attack="none")
-    for limits, attack in product(plan.limits, plan.attacks):
+    for limits, attack in product(league.limits, league.lines):
         yield task._replace(limits=limits, attack=attack)
     if task.seed == 0:
-        for limits, other in product(plan.limits[:1], methods):
+        for limits, other in product(first, methods):
             if other != task.method:
                 yield task._replace(limits=limits, source=other, attack="none")
 
@@ -148,11 +136,11 @@ def _title(cell: cells.Cell) -> str:
     return f"{task.method}, {task.mesh}, {task.limits or task.source}, {task.attack}"
 
 
-def _fits(name: str, given: str) -> bool:
-    """Whether a name is the one that is given, or begins with its words."""
-    return name == given or name.startswith((f"{given} ", f"{given},"))
+def _is_wanted(name: str, given: Sequence[str]) -> bool:
+    """Whether a name is one of those that are given, or begins with the words of one; all are if none is given."""
+    return not given or any(name == one or name.startswith((f"{one} ", f"{one},")) for one in given)
 
 
 def _check_names(what: str, given: Sequence[str], every: Sequence[str]) -> None:
-    if unknown := [one for one in given if not any(_fits(name, one) for name in every)]:
+    if unknown := [one for one in given if not any(_is_wanted(name, [one]) for name in every)]:
         raise JaxmarkError(f"There is no {what} {unknown[0]!r}; there are {', '.join(dict.fromkeys(every))}.")

@@ -126,14 +126,7 @@ class Calibration(NamedTuple):
 def calibrate(
     method: Method, nulls: Mapping[str, Sequence[tuple[float, float | None]]], marks: Scores, rate: float = RATE
 ) -> Calibration:
-    """Calibrate a reader.
-
-    Args:
-        method: the method, for its threshold and the rate that it states.
-        nulls: by kind, pairs of a score and of log10 p; at least one.
-        marks: scores of its own marks.
-        rate: the false-positive rate of the threshold.
-    """
+    """Calibrate a reader by nulls, which are pairs of a score and log10 p by kind, and by scores of its own marks."""
     scores = {kind: np.array([score for score, _ in some], float) for kind, some in nulls.items()}
     every = np.concatenate(list(scores.values()))
     # A reader that proves something returns None, or refuses, where it proves nothing.

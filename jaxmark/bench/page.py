@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from itertools import cycle
 from typing import Any
 
-from jaxmark.bench.quality import RANGES, curve
 from jaxmark.bench.readings import BenchResults
+from jaxmark.bench.robustness_curves import RANGES, curve
 from jaxmark.bench.summary import points
 from jaxmark.bench.tables import tables
 from jaxmark.extras import require

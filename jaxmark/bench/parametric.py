@@ -19,16 +19,7 @@ _SIDES = np.array([0.5, 0.35, 0.2])  # half the sides of the boxes
 
 
 def grid(rows: int, columns: int, closed: tuple[bool, bool] = (False, False)) -> tuple[Indices, Indices, Faces]:
-    """Triangulate a grid.
-
-    Args:
-        rows: number of rows.
-        columns: number of columns.
-        closed: whether the last row is followed by the first, and the last column by the first.
-
-    Returns:
-        The row and the column of each point, and the triangles.
-    """
+    """Return the row and column of each point of a grid, and its triangles; rows and columns may each be closed."""
     i, j = np.divmod(np.arange(rows * columns), columns)
     inside = (closed[0] | (i < rows - 1)) & (closed[1] | (j < columns - 1))
     a, b = i[inside], j[inside]
@@ -146,14 +137,7 @@ SHAPES: Mapping[str, Callable[[int], Mesh]] = {
 
 
 def tube(points: int, path: Callable[[Values], Points], radius: float, *, ends: bool = False) -> Mesh:
-    """A tube around a path of one parameter from 0 to 2π, closed, or with two open ends.
-
-    Args:
-        points: about how many.
-        path: the path.
-        radius: of the tube.
-        ends: whether the path ends elsewhere than it begins.
-    """
+    """A tube around a path of one parameter from 0 to 2π, closed, or with two open ends."""
     dense = path(np.linspace(0, 2 * np.pi, 4001))
     length = np.linalg.norm(np.diff(dense, axis=0), axis=1).sum()
     across = max(round(np.sqrt(points * 2 * np.pi * radius / length)), 6)

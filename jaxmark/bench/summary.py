@@ -13,8 +13,8 @@ import numpy as np
 from jaxmark.bench.calibration import Calibration, count
 from jaxmark.bench.leagues import get_league
 from jaxmark.bench.method import Method
-from jaxmark.bench.quality import Point, score
 from jaxmark.bench.readings import BenchResults, Suspect
+from jaxmark.bench.robustness_curves import Point, score
 from jaxmark.bench.tasks import COSTS, MARK, Task
 from jaxmark.files.atomic import write_atomically
 

@@ -15,10 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxmark.bench.fitting import Fitted, fit
 from jaxmark.bench.leagues import OVERWRITTEN, Line, get_league
-from jaxmark.bench.method import Bits, Method, Reading
-from jaxmark.bench.plugins import Given, digest_of, load_method
+from jaxmark.bench.method import Bits, Given, Method, Reading, digest_of, load_method
+from jaxmark.bench.strength_search import Fitted, fit
 from jaxmark.distortion import Reference
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.cells import Cell
@@ -49,6 +48,11 @@ class Task(NamedTuple):
     number: int = 0  # of the key, where several that wrote nothing are tried
 
     @property
+    def sample(self) -> tuple[str, int, str, int]:
+        """The fields from which the key and the message derive."""
+        return self.method, self.payload, self.mesh, self.seed
+
+    @property
     def mark(self) -> "Task":
         """The task that makes the mark of the suspect."""
         return self._replace(method=self.source, attack=MARK)
@@ -71,11 +75,7 @@ class Bench:
 def make_bench(
     output: str | os.PathLike[str], meshes: Meshes, methods: Sequence[Given], after: Callable[[], object] | None = None
 ) -> Bench:
-    """Name meshes and methods by their contents; meshes that have no file are written to the folder.
-
-    Raises:
-        JaxmarkError: if a mesh or the file of a method cannot be read.
-    """
+    """Name meshes and methods by their contents; meshes that have no file are written to the folder."""
     folder, files = Path(output) / "meshes", {}
     folder.mkdir(parents=True, exist_ok=True)
     if isinstance(meshes, Mapping):
@@ -121,10 +121,6 @@ def draw_mark(bits: int, *place: object) -> tuple[bytes, Bits]:
     return draw(32, "key", *place), message.astype(bool)
 
 
-def _draw_mark(task: Task, bits: int, name: str) -> tuple[bytes, Bits]:
-    return draw_mark(bits, name, task.method, task.payload, task.mesh, task.seed)
-
-
 def _mark(bench: Bench, task: Task) -> dict[str, Any]:
     """Make the mark of a task, and save the mesh."""
     start = time.perf_counter()
@@ -141,7 +137,7 @@ def _mark(bench: Bench, task: Task) -> dict[str, Any]:
 def _fit(bench: Bench, task: Task, mesh: Mesh, name: str) -> Fitted:
     """Mark a mesh as strongly as the limits of a task allow, or the first limits of its league."""
     method, league = load_method(bench.methods[task.method], task.payload), get_league(task.league)
-    key, message = _draw_mark(task, method.bits, name)
+    key, message = draw_mark(method.bits, name, *task.sample)
     return fit(method, mesh, message, key, league.bounds(task.limits or next(iter(league.limits)), mesh))
 
 
@@ -190,43 +186,35 @@ def _read(bench: Bench, task: Task, original: Mesh, suspect: Mesh, copy: int) ->
     own = task.source == task.method
     names = [_OWN] if task.limits and task.source == UNMARKED else [_OWN, fresh] if own else [fresh]
     method, suspect = load_method(bench.methods[task.method], task.payload), _read_only(suspect)
-    message = _draw_mark(task, method.bits, _OWN)[1]
+    message = draw_mark(method.bits, _OWN, *task.sample)[1]
     for name in names:
-        start, note = time.perf_counter(), {}
+        start = time.perf_counter()
+        row = {"copy": copy, "own": own and name == _OWN}
         try:
-            found = method.read(suspect, _draw_mark(task, 0, name)[0], None if method.blind else original)
-            errors = _bit_errors(found.message, message)
-            score, log10_p = _finite(found)
+            found = method.read(suspect, draw_mark(0, name, *task.sample)[0], None if method.blind else original)
+            row |= _compare(found, message)
         except (Exception, SystemExit) as error:  # see `_mark`
-            errors, score, log10_p, note = 0.5, -math.inf, None, {"note": _sentence(error)}
-        yield {
-            "copy": copy,
-            "own": own and name == _OWN,
-            "read": bool(method.bits) and errors == 0,
-            "bit_errors": errors,
-            "score": score if math.isfinite(score) else None,
-            "log10_p": log10_p,
-            "seconds": time.perf_counter() - start,
-            **note,
-        }
+            row |= {"read": False, "bit_errors": 0.5, "score": None, "log10_p": None, "note": _sentence(error)}
+        yield {**row, "seconds": time.perf_counter() - start}
 
 
-def _finite(found: Reading) -> tuple[float, float | None]:
-    """Return score and log10 p of a reading as JSON can hold them; a probability of 0 becomes the least float."""
-    score, log10_p = float(found.score), None if found.log10_p is None else float(found.log10_p)
+def _compare(found: Reading, message: Bits) -> dict[str, Any]:
+    """Compare a reading with the message, as JSON can hold it: a probability of 0 becomes the least float."""
+    guess, errors = found.message, 0.5  # half of the bits are wrong where nothing is guessed
+    if guess is not None and len(message):
+        if np.shape(guess) != message.shape:
+            raise JaxmarkError(f"A reading has {np.size(guess)} bits, but the message {len(message)}.")
+        errors = float(np.mean(np.asarray(guess, bool) != message))
+    most, score = sys.float_info.max, float(found.score)
+    log10_p = None if found.log10_p is None else float(found.log10_p)
     if math.isnan(score) or (log10_p is not None and math.isnan(log10_p)):
         raise JaxmarkError("The reader's score, or its log10_p, is not a number.")
-    most = sys.float_info.max
-    return min(score, most), None if log10_p is None else min(max(log10_p, -most), 0.0)
-
-
-def _bit_errors(guess: Bits | None, message: Bits) -> float:
-    """Compute the share of wrong bits; 1/2 where nothing is guessed."""
-    if guess is None or not len(message):
-        return 0.5
-    if np.shape(guess) != message.shape:
-        raise JaxmarkError(f"A reading has {np.size(guess)} bits, but the message {len(message)}.")
-    return float(np.mean(np.asarray(guess, bool) != message))
+    return {
+        "read": bool(len(message)) and errors == 0,
+        "bit_errors": errors,
+        "score": min(score, most) if score > -math.inf else None,
+        "log10_p": None if log10_p is None else min(max(log10_p, -most), 0.0),
+    }
 
 
 def _sentence(error: BaseException) -> str:

@@ -83,12 +83,9 @@ def influence(bits: int) -> Method:
 
 
 def basis(mesh: Mesh, count: int) -> Basis:
-    """Compute the displacements by basis functions of height 1 on the spheres of influence of a surface.
+    """Compute the displacements by basis functions of height 1 on spheres of influence; refuse a mesh of fewer points.
 
     The first centre is the farthest point from the first vertex; no part of the mesh is left without one.
-
-    Raises:
-        JaxmarkError: if there are fewer points than spheres.
     """
     points, pairs = np.asarray(mesh.vertices), edges(mesh.faces)
     if len(points) < count:

@@ -111,11 +111,7 @@ def moments(bits: int, steps: Sequence[float] = STEPS) -> Method:
 
 
 def _posed(mesh: Mesh, slabs: int) -> Posed:
-    """Bring a surface into the pose of its volume moments.
-
-    Raises:
-        JaxmarkError: if it has no faces, or encloses nothing.
-    """
+    """Bring a surface into the pose of its volume moments; refuse one that has no faces or encloses nothing."""
     check_faces("The method moments", mesh)
     points, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     length = float(np.ptp(points, axis=0).max())
@@ -175,11 +171,7 @@ def _largest(volumes: Cells, bits: int) -> Int64[np.ndarray, " bits"]:
 
 
 def _target(volumes: Cells, written: Bits, key: bytes, step: float) -> Cells:
-    """Compute target logarithms of volumes; NaN where any will do.
-
-    Raises:
-        JaxmarkError: if there are fewer patches than bits.
-    """
+    """Compute target logarithms of volumes, NaN where any will do; refuse a surface of too few patches."""
     chosen = _largest(volumes, len(written))
     if not volumes[chosen].min() > 0:
         raise JaxmarkError(

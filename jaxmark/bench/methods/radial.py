@@ -75,11 +75,7 @@ def radial(bits: int) -> Method:
 
 
 def _radii(mesh: Mesh, bits: int) -> Radii:
-    """Measure the distances of a surface's points to its centre of area, and sort them into bins.
-
-    Raises:
-        JaxmarkError: if it has no faces, or is a sphere.
-    """
+    """Sort the distances of points to the centre of area into bins; refuse a surface without faces, and a sphere."""
     check_faces("The method radial", mesh)
     points = np.asarray(mesh.vertices)
     weight = per_point(mesh, face_areas(mesh))

@@ -104,11 +104,7 @@ def _method(statistic: Statistic, bits: int) -> Method:
 
 
 def _bins(distance: Values, count: int) -> Bins:
-    """Sort distances into bins (eq. 3-5).
-
-    Raises:
-        JaxmarkError: if all points are equally far from their centre.
-    """
+    """Sort distances into bins (eq. 3-5); refuse points that are equally far from their centre."""
     least, most = distance.min(), distance.max()
     if not most > least:
         raise JaxmarkError("All points are equally far from their centre, so that nothing can be written there.")

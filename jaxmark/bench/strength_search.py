@@ -77,11 +77,7 @@ def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[s
 
 
 def _in_pose_of(mesh: Mesh, marked: Mesh, welded: Weld) -> Mesh:
-    """Register a marked mesh to its original.
-
-    Raises:
-        JaxmarkError: if copies of a vertex are no longer at one place, which metrics of the surface do not measure.
-    """
+    """Register a marked mesh to its original; refuse one whose copies of a vertex are no longer at one place."""
     if len(marked.vertices) != len(mesh.vertices):
         return marked  # metrics refuse it
     before, after = (np.asarray(one.vertices, np.float64) for one in (mesh, marked))
