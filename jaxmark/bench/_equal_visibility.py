@@ -3,11 +3,11 @@
 from __future__ import annotations  # so that `help` shows names of types instead of what they stand for
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,22 +20,12 @@ from jaxmark.bench.tables import Table
 from jaxmark.bench.tasks import Bench, Meshes, draw, draw_mark, load, make_bench, moved
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation import cells
-from jaxmark.evaluation.cells import Cell, Pool
+from jaxmark.evaluation.cells import Pool
 from jaxmark.geometry.mesh import Mesh
 
 SHARES = (0.5, 1.0, 2.0)  # of the limits
 NOISE = tuple(float(f"{x:.2g}") for x in np.geomspace(1e-5, 0.05, 48))  # half widths over the mean radius
 _OTHER_KEYS = 20  # whose scores a mark without a message must exceed
-
-
-class Setting(NamedTuple):
-    """A method at one payload and one visibility."""
-
-    method: str
-    payload: int
-    share: float  # of the limits
-    mesh: str
-    seed: int
 
 
 def equal_visibility(
@@ -70,48 +60,12 @@ def equal_visibility(
     if not shares or any(not share > 0 for share in shares):
         raise JaxmarkError(f"Shares of the limits are above 0, got {', '.join(map(str, shares))}.")
     bench = make_bench(output, meshes, methods)
-    grid: list[Cell] = [Setting(*one) for one in product(bench.methods, payloads, shares, bench.meshes, range(samples))]
-    rows = cells.run(grid, partial(_work, bench), workers, Path(output) / "equal.jsonl", say)
-    return _table([(Setting(*row["cell"]), row) for row in rows], shares)
-
-
-def _work(bench: Bench, cell: Cell) -> dict[str, Any]:
-    """Mark a mesh, and find what the mark survives; at the top level, so that processes can import it."""
-    setting = Setting(*cell)  # pyright: ignore[reportArgumentType] (a cell's values are those of its fields)
-    method, mesh = load_method(bench.methods[setting.method], setting.payload), load(bench.meshes[setting.mesh])
-    key, message = draw_mark(method.bits, *setting)
-    limits = {name: setting.share * limit for name, limit in get_league("2026").bounds("hidden", mesh).items()}
-    try:
-        found = fit(method, mesh, message, key, limits)
-    except Exception as error:  # a foreign method may raise anything
-        return {"note": f"{type(error).__name__}: {error}"}
-
-    known = None if method.blind else mesh
-
-    def is_read(suspect: Mesh) -> bool:
-        reading = method.read(suspect, key, known)
-        if method.bits:
-            return reading.message is not None and bool(np.array_equal(np.asarray(reading.message, bool), message))
-        others = (draw(32, f"other/{number}", *setting) for number in range(_OTHER_KEYS))
-        return all(reading.score > method.read(suspect, other, known).score for other in others)
-
-    def survives(place: int) -> bool:
-        suspect = attack(found.mesh, "noise", NOISE[place], seed=setting.seed)
-        try:
-            return is_read(suspect)
-        except Exception:  # see above
-            return False
-
-    last = last_within(len(NOISE), survives)
-    noise = NOISE[last] if last >= 0 else 0.0
-    return {"strength": found.strength, "reached": found.reached, "moved": moved(mesh, found), "noise": noise}
-
-
-def _table(rows: Sequence[tuple[Setting, Mapping[str, Any]]], shares: Sequence[float]) -> Table:
-    """Tabulate the median noise that is survived, for each method, payload and share."""
+    settings = list(product(bench.methods, payloads, shares, bench.meshes, range(samples)))
+    rows = cells.run(settings, partial(_work, bench), workers, Path(output) / "equal.jsonl", say)
 
     def cell(method: str, payload: int, share: float) -> str:
-        some = [row for setting, row in rows if setting[:3] == (method, payload, share)]
+        """Tabulate the median noise that is survived."""
+        some = [row for row in rows if tuple(row["cell"][:3]) == (method, payload, share)]
         made = [row for row in some if "noise" in row]
         if not made:
             return "not marked"
@@ -124,8 +78,39 @@ def _table(rows: Sequence[tuple[Setting, Mapping[str, Any]]], shares: Sequence[f
         ["method", "bits", *(f"{share:g} × hidden" for share in shares)],
         [
             [method, str(payload), *(cell(method, payload, share) for share in shares)]
-            for method, payload in dict.fromkeys((setting.method, setting.payload) for setting, _ in rows)
+            for method, payload in dict.fromkeys((row["cell"][0], row["cell"][1]) for row in rows)
         ],
         "The strongest noise that a mark survives, half width over the mean radius, the median over meshes and seeds;"
         " all methods are as strong as the same share of the limits of what is hidden allows.",
     )
+
+
+def _work(bench: Bench, cell: Any) -> dict[str, Any]:
+    """Mark a mesh, and find what the mark survives; at the top level, so that processes can import it."""
+    name, payload, share, file, seed = cell
+    method, mesh = load_method(bench.methods[name], payload), load(bench.meshes[file])
+    key, message = draw_mark(method.bits, *cell)
+    limits = {metric: share * limit for metric, limit in get_league("2026").bounds("hidden", mesh).items()}
+    try:
+        found = fit(method, mesh, message, key, limits)
+    except Exception as error:  # a foreign method may raise anything
+        return {"note": f"{type(error).__name__}: {error}"}
+    known = None if method.blind else mesh
+
+    def is_read(suspect: Mesh) -> bool:
+        reading = method.read(suspect, key, known)
+        if method.bits:
+            return reading.message is not None and bool(np.array_equal(np.asarray(reading.message, bool), message))
+        others = (draw(32, f"other/{number}", *cell) for number in range(_OTHER_KEYS))
+        return all(reading.score > method.read(suspect, other, known).score for other in others)
+
+    def survives(place: int) -> bool:
+        suspect = attack(found.mesh, "noise", NOISE[place], seed=seed)
+        try:
+            return is_read(suspect)
+        except Exception:  # see above
+            return False
+
+    last = last_within(len(NOISE), survives)
+    noise = NOISE[last] if last >= 0 else 0.0
+    return {"strength": found.strength, "reached": found.reached, "moved": moved(mesh, found), "noise": noise}

@@ -7,7 +7,7 @@ from functools import partial
 from importlib import resources
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,6 +35,9 @@ def _by_formula() -> Iterator[tuple[str, Member]]:
     def member(name: str, kind: str, make: Callable[..., Mesh], size: int, *options: float) -> tuple[str, Member]:
         return name, Member(kind, size, partial(make, size, *options))
 
+    def attacked(make: Callable[[], Mesh], *how: Any, seed: int) -> Callable[[], Mesh]:
+        return lambda: attack(make(), *how, seed=seed)
+
     for name, size in zip(SHAPES, (1_000, 3_000, 5_000, 10_000, 8_000, 6_000, 20_000), strict=True):
         yield member(name.replace("_", "-"), "CAD", SHAPES[name], size)
     for size in (1_000, 3_000, 10_000, 30_000, 100_000):
@@ -53,19 +56,13 @@ def _by_formula() -> Iterator[tuple[str, Member]]:
     yield member("gem", "CAD", shapes.gem, 2_500, 5)
     yield member("vase", "symmetric", shapes.vase, 6_400)
     yield member("terrain", "scan", shapes.terrain, 25_000, 7)
-    yield "scan-with-holes", Member("scan", 14_000, lambda: attack(asteroid(16_000, seed=11), "holes", 0.1, seed=3))
-    for name, size, make, noise, seed in (
-        ("noisy-asteroid", 8_000, partial(asteroid, seed=21), 0.004, 1),
-        ("noisy-box", 6_000, shapes.rounded_box, 0.003, 2),
-    ):
-        yield name, Member("noisy", size, partial(_noisy, make, size, noise, seed))
+    scan, rock, box = partial(asteroid, 16_000, seed=11), partial(asteroid, 8_000, seed=21), shapes.rounded_box
+    yield "scan-with-holes", Member("scan", 14_000, attacked(scan, "holes", 0.1, seed=3))
+    yield "noisy-asteroid", Member("noisy", 8_000, attacked(rock, "gaussian-noise", 0.004, seed=1))
+    yield "noisy-box", Member("noisy", 6_000, attacked(partial(box, 6_000), "gaussian-noise", 0.003, seed=2))
     yield member("chain-12", "components", shapes.chain, 12_000, 12)
     yield member("rubble-18", "components", shapes.rubble, 18_000, 18)
     yield member("torus-1m", "symmetric", shapes.torus, 1_000_000)
-
-
-def _noisy(make: Callable[[int], Mesh], size: int, noise: float, seed: int) -> Mesh:
-    return attack(make(size), "gaussian-noise", noise, seed=seed)
 
 
 #: Files in the wheel of pymeshlab, of the extra `attacks`.

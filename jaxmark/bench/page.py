@@ -8,7 +8,7 @@ from itertools import cycle
 from typing import Any
 
 from jaxmark.bench.readings import BenchResults
-from jaxmark.bench.robustness_curves import RANGES, curve
+from jaxmark.bench.robustness_curves import RANGES, axis, curve
 from jaxmark.bench.summary import points
 from jaxmark.bench.tables import tables
 from jaxmark.extras import require
@@ -48,7 +48,7 @@ def _survival(results: BenchResults, league: str) -> Picture:
         for name, style in _styles(results):
             some = [one for one in results.suspects if (one.task.method, one.task.league) == (name, league)]
             if (found := curve(points(results, some), metric)) is not None:
-                panel.plot(found.cost, found.success, label=results.methods[name].name, **style)
+                panel.plot(axis(metric), found, label=results.methods[name].name, **style)
         panel.set(xscale="log", xlabel=metric.upper(), ylim=(-0.03, 1.03))
         panel.tick_params(axis="x", which="minor", labelbottom=False)
     axes[0].set_ylabel("share detected")

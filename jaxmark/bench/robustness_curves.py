@@ -15,6 +15,7 @@ from scipy.optimize import isotonic_regression
 RANGES: Mapping[str, tuple[float, float]] = {"mrms": (1e-4, 1e-2), "dame": (5e-3, 0.5), "msdm2": (0.05, 0.8)}
 _PLACES, _RESAMPLES = 64, 500
 Weights = Float64[np.ndarray, " points"]
+Values = Float64[np.ndarray, " places"]
 
 
 class Point(NamedTuple):
@@ -38,15 +39,13 @@ class Score(NamedTuple):
     points: int
 
 
-class Curve(NamedTuple):
-    """The share of marks that survive at a cost."""
-
-    cost: Float64[np.ndarray, " places"]
-    success: Float64[np.ndarray, " places"]
+def axis(metric: str) -> Values:
+    """Return the costs at which curves are evaluated."""
+    return np.geomspace(*RANGES[metric], _PLACES)
 
 
-def curve(points: Sequence[Point], metric: str, weights: Weights | None = None) -> Curve | None:
-    """Fit a falling curve by isotonic regression, every attack counting alike; None if no cost is known.
+def curve(points: Sequence[Point], metric: str, weights: Weights | None = None) -> Values | None:
+    """Fit a falling curve over `axis(metric)` by isotonic regression, every attack counting alike.
 
     It is constant beyond the least and the largest cost. Where no mark could be made for some suspects, the curve of
     the others is lowered to their share: a method gains nothing by refusing.
@@ -55,6 +54,9 @@ def curve(points: Sequence[Point], metric: str, weights: Weights | None = None) 
         points: suspects.
         metric: of `RANGES`.
         weights: how often each point counts.
+
+    Returns:
+        The share of marks that survive, at each cost; None if no cost is known.
     """
     times = np.ones(len(points)) if weights is None else weights
     known = np.array([one.costs.get(metric) is not None for one in points], bool) & (times > 0)
@@ -69,9 +71,8 @@ def curve(points: Sequence[Point], metric: str, weights: Weights | None = None) 
     total = np.bincount(group, share)
     mean = np.bincount(group, share * [one.success for one in some]) / total
     fitted = isotonic_regression(mean, weights=total, increasing=False).x
-    axis = np.geomspace(low, high, _PLACES)
     marked = float(times @ [one.marked for one in points] / times.sum())
-    return Curve(axis, marked * np.interp(np.log(axis), np.log(distinct), fitted))
+    return marked * np.interp(np.log(axis(metric)), np.log(distinct), fitted)
 
 
 def score(points: Sequence[Point]) -> Score | None:
@@ -99,4 +100,4 @@ def score(points: Sequence[Point]) -> Score | None:
 
 def _areas(points: Sequence[Point], weights: Weights | None) -> dict[str, float]:
     curves = {metric: curve(points, metric, weights) for metric in RANGES}
-    return {metric: float(np.mean(one.success)) for metric, one in curves.items() if one is not None}
+    return {metric: float(np.mean(one)) for metric, one in curves.items() if one is not None}

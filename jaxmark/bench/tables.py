@@ -4,7 +4,8 @@ from __future__ import annotations  # so that `help` shows names of types instea
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import product
 from typing import Any, NamedTuple
 
 from jaxmark.bench.readings import BenchResults
@@ -31,24 +32,52 @@ class Table(NamedTuple):
         return "\n".join([f"## {self.title}", *remark, "", *text])
 
 
-def _table(title: str, rows: Sequence[Mapping[str, str]], remark: str = "") -> Table:
-    """Make a table of rows that map its heads to cells."""
-    return Table(title, list(rows[0]) if rows else [], [list(row.values()) for row in rows], remark)
-
-
 def tables(results: BenchResults) -> list[Table]:
     """Make all tables of a benchmark."""
     every = entries(results)
     groups = _groups(every)
     several = len({payload for payload, _, _ in groups}) > 1
-    found = [_scores(every), _calibrations(every, results.rate)]
+    found = [
+        _table(
+            "Scores",
+            _scores(every),
+            "Area under the share of marks that survive, over what the attack itself costs the shape (0 to 1), with"
+            " 95 % intervals over meshes and seeds; the columns of metrics are its parts, of `detected`.",
+        ),
+        _table(
+            "Calibration",
+            _calibrations(every),
+            "Suspects without the key's mark, read by each reader. A mark counts as detected above the threshold whose"
+            f" expected false-positive rate is at most {results.rate:g}; the interval is exact for nulls of one"
+            " distribution.",
+        ),
+    ]
     for (payload, league, limits), parts in groups.items():
         title = f"{league}, {limits} limits{f', {payload} bits' if several else ''}"
-        found += [_marks(title, parts, every), _attacks(title, parts, every), _costs(title, parts)]
-    found += [*_refused(groups, every), *_paired(results, every)]
-    if results.skipped:
-        found.append(Table("Skipped", ["attack", "why"], list(results.skipped.items())))
-    return found
+        found += [
+            _table(f"{title}: the marks", _marks(parts, every)),
+            _attacks(f"{title}: what survives", parts, every),
+            _table(f"{title}: what attacks do to the shape", _costs(parts)),
+        ]
+    paired_remark = (
+        "Detected, on the same meshes, seeds, limits and attacks. Interval and p describe these suspects: many attacks"
+        " of one mark are not independent of each other."
+    )
+    skipped = ({"attack": name, "why": why} for name, why in results.skipped.items())
+    rest = [
+        _table("Refused", _refused(groups, every)),
+        _table("Pairs", _paired(results, every), paired_remark),
+        _table("Skipped", skipped),
+    ]
+    return found + [table for table in rest if table.lines]
+
+
+Row = Mapping[str, str]  # cells by the heads of their columns
+
+
+def _table(title: str, rows: Iterable[Row], remark: str = "") -> Table:
+    listed = list(rows)
+    return Table(title, list(listed[0]) if listed else [], [list(row.values()) for row in listed], remark)
 
 
 def _groups(entries: Entries) -> dict[tuple[str, str, str], dict[str, Any]]:
@@ -75,16 +104,19 @@ def _payloads(entries: Entries) -> Iterator[tuple[str, str, Mapping[str, Any], M
             yield _label(name, entry), bits if entry["bits"] else "-", entry, part
 
 
-def _number(value: float | None, digits: int = 3) -> str:
-    return "-" if value is None else f"{value:.{digits}g}"
+def _number(value: float | None, form: str = ".3g") -> str:
+    return "-" if value is None else f"{value:{form}}"
 
 
 def _interval(value: float, low: float, high: float, form: str) -> str:
     return f"{value:{form}} ({low:{form}} - {high:{form}})"
 
 
-def _scores(entries: Entries) -> Table:
-    rows = []
+def _share(found: Mapping[str, Any], of: str = "hits") -> str:
+    return f"{found[of]}/{found['trials']}"
+
+
+def _scores(entries: Entries) -> Iterator[Row]:
     for label, bits, entry, part in _payloads(entries):
         for league, found in part["leagues"].items():
             row = {"method": label, "reader": "blind" if entry["blind"] else "informed", "bits": bits, "league": league}
@@ -92,61 +124,35 @@ def _scores(entries: Entries) -> Table:
                 known = one is not None and (rule == "detected" or entry["bits"])
                 row[rule] = _interval(one["value"], one["low"], one["high"], ".2f") if known else "-"
             areas = (found["scores"]["detected"] or {"areas": {}})["areas"]
-            row |= {metric.upper(): _number(areas.get(metric), 2) for metric in COSTS}
-            rows.append({**row, "validated by": entry["validated"]})
-    return _table(
-        "Scores",
-        rows,
-        "Area under the share of marks that survive, over what the attack itself costs the shape (0 to 1), with 95 %"
-        " intervals over meshes and seeds; the columns of metrics are its parts, of `detected`.",
-    )
+            row |= {metric.upper(): _number(areas.get(metric), ".2g") for metric in COSTS}
+            yield {**row, "validated by": entry["validated"]}
 
 
-def _calibrations(entries: Entries, rate: float) -> Table:
-    rows = []
+def _calibrations(entries: Entries) -> Iterator[Row]:
     for label, bits, _, part in _payloads(entries):
         if (found := part["calibration"]) is None:
             continue
-        own, bound = (
-            found["own_threshold"],
-            [f"10^{one['log10_p']:g}: {_share(one)}" for one in found["bound"] if one["hits"]],
-        )
-        passed = ", ".join(bound) or f"never passed in {found['bound'][0]['trials']}" if found["bound"] else "-"
-        rows.append(
-            {
-                "method": label,
-                "bits": bits,
-                "nulls above the threshold": ", ".join(
-                    f"{kind}: {_share(one)}" for kind, one in found["nulls"].items()
-                ),
-                "threshold": _number(found["threshold"]),
-                "rate (95 %)": _interval(found["rate"], found["rate_low"], found["rate_high"], ".2g"),
-                "nulls at its own threshold": f"{_share(own)}, stated {own['stated']:g}" if own else "-",
-                "nulls that pass its bound": passed,
-                "ROC": f"{found['roc_area']:.3f}",
-                "verdict": " ".join(found["verdicts"]) or "holds",
-            }
-        )
-    return _table(
-        "Calibration",
-        rows,
-        f"Suspects without the key's mark, read by each reader. A mark counts as detected above the threshold whose"
-        f" expected false-positive rate is at most {rate:g}; the interval is exact for nulls of one distribution.",
-    )
+        own, bound = found["own_threshold"], found["bound"]
+        passed = ", ".join(f"10^{one['log10_p']:g}: {_share(one)}" for one in bound if one["hits"])
+        yield {
+            "method": label,
+            "bits": bits,
+            "nulls above the threshold": ", ".join(f"{kind}: {_share(one)}" for kind, one in found["nulls"].items()),
+            "threshold": _number(found["threshold"]),
+            "rate (95 %)": _interval(found["rate"], found["rate_low"], found["rate_high"], ".2g"),
+            "nulls at its own threshold": f"{_share(own)}, stated {own['stated']:g}" if own else "-",
+            "nulls that pass its bound": (passed or f"never passed in {bound[0]['trials']}") if bound else "-",
+            "ROC": f"{found['roc_area']:.3f}",
+            "verdict": " ".join(found["verdicts"]) or "holds",
+        }
 
 
-def _share(found: Mapping[str, Any], of: str = "hits") -> str:
-    return f"{found[of]}/{found['trials']}"
-
-
-def _marks(title: str, parts: Mapping[str, Any], entries: Entries) -> Table:
-    rows = []
+def _marks(parts: Mapping[str, Any], entries: Entries) -> Iterator[Row]:
     for name, part in parts.items():
         marks = part["marks"]
         row = {"method": _label(name, entries[name]), "made": f"{marks['made']}/{marks['tried']}"}
         row |= {metric.upper(): _number(marks.get(metric)) for metric in ("rms", *COSTS)}
-        rows.append({**row, "s": _number(marks["seconds"], 2), "remarks": "; ".join(marks["notes"]) or "-"})
-    return _table(f"{title}: the marks", rows)
+        yield {**row, "s": _number(marks["seconds"], ".2g"), "remarks": "; ".join(marks["notes"]) or "-"}
 
 
 def _attacks(title: str, parts: Mapping[str, Any], entries: Entries) -> Table:
@@ -161,10 +167,8 @@ def _attacks(title: str, parts: Mapping[str, Any], entries: Entries) -> Table:
     for attack in dict.fromkeys(attack for part in parts.values() for attack in part["attacks"]):
         found = {name: part["attacks"].get(attack) for name, part in parts.items()}
         published = next((p for one in found.values() if one and (p := one.get("published_bit_errors"))), {})
-        cells = [cell(name, one) for name, one in found.items()]
-        lines.append(
-            [attack, *cells, *(f"{published[name]:.2f}" if name in published else "-" for name in ("cho", "wang"))]
-        )
+        line = [attack, *(cell(name, one) for name, one in found.items())]
+        lines.append([*line, *(_number(published.get(name), ".2f") for name in ("cho", "wang"))])
     heads = ["attack", *(_label(name, entries[name]) for name in parts), "Cho, published", "Wang, published"]
     if all(line[-2:] == ["-", "-"] for line in lines):  # this league is younger than they are
         heads, lines = heads[:-2], [line[:-2] for line in lines]
@@ -172,20 +176,16 @@ def _attacks(title: str, parts: Mapping[str, Any], entries: Entries) -> Table:
         "How often the exact message is read; wrong bits of the best guess (BER), the mean; false-positive probability"
         " (p), the median, of methods that bound it."
     )
-    return Table(f"{title}: what survives", heads, lines, remark)
+    return Table(title, heads, lines, remark)
 
 
-def _costs(title: str, parts: Mapping[str, Any]) -> Table:
+def _costs(parts: Mapping[str, Any]) -> Iterator[Row]:
     """Tabulate the distortion of the mesh that the first method marked, the mean over meshes and samples."""
-    attacks = next(iter(parts.values()))["attacks"]
-    rows = [
-        {"attack": attack, **{name.upper(): _number(one["costs"][name]) for name in COSTS}}
-        for attack, one in attacks.items()
-    ]
-    return _table(f"{title}: what attacks do to the shape", rows)
+    for attack, one in next(iter(parts.values()))["attacks"].items():
+        yield {"attack": attack, **{name.upper(): _number(one["costs"][name]) for name in COSTS}}
 
 
-def _refused(groups: Mapping[tuple[str, str, str], Mapping[str, Any]], entries: Entries) -> Iterator[Table]:
+def _refused(groups: Mapping[tuple[str, str, str], Mapping[str, Any]], entries: Entries) -> Iterator[Row]:
     """Tabulate refusals by methods and attacks, and their number."""
     places: dict[tuple[str, str], list[str]] = defaultdict(list)
     for name, entry in entries.items():
@@ -193,31 +193,19 @@ def _refused(groups: Mapping[tuple[str, str, str], Mapping[str, Any]], entries: 
             for attack, one in parts.get(name, {"attacks": {}})["attacks"].items():
                 for note in one["notes"]:
                     places[_label(name, entry), note].append(f"{league}, {limits}: {attack}")
-    if places:
-        lines = [[name, note, str(len(where)), where[0]] for (name, note), where in places.items()]
-        yield Table("Refused", ["method", "what was said", "after attacks", "the first"], lines)
+    for (label, note), where in places.items():
+        yield {"method": label, "what was said": note, "after attacks": str(len(where)), "the first": where[0]}
 
 
-def _paired(results: BenchResults, entries: Entries) -> Iterator[Table]:
+def _paired(results: BenchResults, entries: Entries) -> Iterator[Row]:
     """Compare the first method with each other one, on the same suspects."""
     (first, label), *others = zip(results.methods, (_label(*entry) for entry in entries.items()), strict=True)
-    rows = []
-    for league in dict.fromkeys(task.league for task, _ in results.tasks):
-        for other, other_label in others:
-            found = results.paired(first, other, league)
-            rows.append(
-                {
-                    "league": league,
-                    "methods": f"{label} - {other_label}",
-                    "difference (95 %)": _interval(found.difference, found.low, found.high, "+.3f"),
-                    "only one of them": f"{found.first} : {found.second}",
-                    "McNemar's p": f"{found.p:.2g}",
-                }
-            )
-    if rows:
-        yield _table(
-            "Pairs",
-            rows,
-            "Detected, on the same meshes, seeds, limits and attacks. Interval and p describe these suspects: many"
-            " attacks of one mark are not independent of each other.",
-        )
+    for league, (other, other_label) in product(dict.fromkeys(task.league for task, _ in results.tasks), others):
+        found = results.paired(first, other, league)
+        yield {
+            "league": league,
+            "methods": f"{label} - {other_label}",
+            "difference (95 %)": _interval(found.difference, found.low, found.high, "+.3f"),
+            "only one of them": f"{found.first} : {found.second}",
+            "McNemar's p": f"{found.p:.2g}",
+        }
