@@ -171,7 +171,7 @@ def _split(path: Path, command: str, *known: str) -> list[str]:
         named, words = {name for _, name, _, _ in string.Formatter().parse(command)}, shlex.split(command)
     except ValueError as error:
         raise JaxmarkError(f"{path}: {command!r}: {error}.") from None
-    if unknown := sorted(named - {None, *known}):
+    if unknown := sorted(name for name in named if name is not None and name not in known):
         raise JaxmarkError(f"{path}: {command!r} has {{{unknown[0]}}}; here there are {', '.join(known)}.")
     return words
 

@@ -43,16 +43,16 @@ def save_page(results: BenchResults, path: str | os.PathLike[str], title: str, a
 
 def _survival(results: BenchResults, league: str) -> Picture:
     """Draw a panel for each metric of cost, with a line for each method."""
-    figure, axes = panels(len(RANGES), 4.2, 3.8)
-    for panel, metric in zip(axes, RANGES, strict=True):
+    figure, (first, *others) = panels(len(RANGES), 4.2, 3.8)
+    for panel, metric in zip((first, *others), RANGES, strict=True):
         for name, style in _styles(results):
             some = [one for one in results.suspects if (one.task.method, one.task.league) == (name, league)]
             if (found := curve(points(results, some), metric)) is not None:
                 panel.plot(axis(metric), found, label=results.methods[name].name, **style)
         panel.set(xscale="log", xlabel=metric.upper(), ylim=(-0.03, 1.03))
         panel.tick_params(axis="x", which="minor", labelbottom=False)
-    axes[0].set_ylabel("share detected")
-    return _with_legend(figure, axes[0])
+    first.set_ylabel("share detected")
+    return _with_legend(figure, first)
 
 
 def _rocs(results: BenchResults) -> Picture:

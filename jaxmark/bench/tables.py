@@ -121,8 +121,9 @@ def _scores(entries: Entries) -> Iterator[Row]:
         for league, found in part["leagues"].items():
             row = {"method": label, "reader": "blind" if entry["blind"] else "informed", "bits": bits, "league": league}
             for rule, one in found["scores"].items():
-                known = one is not None and (rule == "detected" or entry["bits"])
-                row[rule] = _interval(one["value"], one["low"], one["high"], ".2f") if known else "-"
+                row[rule] = "-"
+                if one is not None and (rule == "detected" or entry["bits"]):
+                    row[rule] = _interval(one["value"], one["low"], one["high"], ".2f")
             areas = (found["scores"]["detected"] or {"areas": {}})["areas"]
             row |= {metric.upper(): _number(areas.get(metric), ".2g") for metric in COSTS}
             yield {**row, "validated by": entry["validated"]}
