@@ -66,7 +66,7 @@ OWN = click.option(
     "--method", "own", multiple=True, type=_PATH, help="A Python or TOML file that declares a method of your own."
 )
 SAMPLES = click.option(
-    "--samples", type=click.IntRange(1), default=1, show_default=True, help="Keys, messages, attacks."
+    "--samples", type=click.IntRange(1), default=1, show_default=True, help="Number of keys, messages and attacks."
 )
 WORKERS = click.option(
     "--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processes.  [default: all cores]"

@@ -51,8 +51,8 @@ class Level(NamedTuple):
 def threshold(nulls: Scores, rate: float = RATE) -> Threshold:
     """Choose the threshold whose expected false-positive rate is at most `rate`, from nulls alone.
 
-    Of n nulls and one more, all exchangeable, the share above the k-th largest null has the distribution
-    Beta(k, n + 1 - k), whatever that of the scores (Wilks, "Determination of sample sizes for setting tolerance
+    The share of further scores above the k-th largest of n nulls, all exchangeable, has the distribution
+    Beta(k, n + 1 - k), for any distribution of the scores (Wilks, "Determination of sample sizes for setting tolerance
     limits", 1941). Its mean is k/(n + 1). Ties make the rate smaller.
     """
     ordered, count = np.sort(nulls)[::-1], len(nulls)

@@ -2,9 +2,9 @@
 
 import hashlib
 import importlib
-import importlib.util
 import json
 import os
+import runpy
 import shlex
 import string
 import subprocess
@@ -28,13 +28,7 @@ Bits = Bool[np.ndarray, " bits"]
 
 #: The factory of each method, from the size of its message: a module of `jaxmark.bench.methods`, and a function in it.
 METHODS: Mapping[str, str] = {
-    "keyed": "builtin_schemes:keyed",
-    "eigen": "builtin_schemes:eigen",
-    "host": "builtin_schemes:host",
-    "paper": "builtin_schemes:paper",
-    "field": "builtin_schemes:field",
-    "local": "builtin_schemes:local",
-    "harmonics": "builtin_schemes:harmonics",
+    **{name: f"builtin_schemes:{name}" for name in ("keyed", "eigen", "host", "paper", "field", "local", "harmonics")},
     "cho": "vertex_norms:cho",
     "cho-variance": "vertex_norms:cho_variance",
     "radial": "radial:radial",
@@ -109,7 +103,7 @@ def load_method(given: Given, bits: int) -> Method:
 
 
 def digest_of(path: Path) -> str:
-    """Hash a file that declares a method, and the files that its commands name, so that an edited one is run anew."""
+    """Hash a file that declares a method, and the files that its commands name, so that an edited one runs again."""
     try:
         content = read_file(path, _MAX_FILE_BYTES)
         digests = [hashlib.sha256(content).digest()]
@@ -133,13 +127,9 @@ def _load(path: Path, digest: str, bits: int) -> Method:
 
 
 def _from_python(path: Path, digest: str, bits: int) -> Any:
-    spec = importlib.util.spec_from_file_location(f"jaxmark_method_{digest}", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
     try:
-        spec.loader.exec_module(module)
-        return module.method(bits) if hasattr(module, "method") else getattr(module, "METHOD", None)
+        found = runpy.run_path(str(path), run_name=f"jaxmark_method_{digest}")
+        return found["method"](bits) if "method" in found else found.get("METHOD")
     except Exception as error:
         raise JaxmarkError(f"{path} does not run: {type(error).__name__}: {error}.") from error
 

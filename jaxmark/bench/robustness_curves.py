@@ -47,8 +47,8 @@ def axis(metric: str) -> Values:
 def curve(points: Sequence[Point], metric: str, weights: Weights | None = None) -> Values | None:
     """Fit a falling curve over `axis(metric)` by isotonic regression, every attack counting alike.
 
-    It is constant beyond the least and the largest cost. Where no mark could be made for some suspects, the curve of
-    the others is lowered to their share: a method gains nothing by refusing.
+    It is constant beyond the least and the largest cost. The curve is lowered to the share of
+    suspects for which a mark could be made: a method gains nothing by refusing.
 
     Args:
         points: suspects.

@@ -131,7 +131,7 @@ def _attacks(results: BenchResults, some: Sequence[Suspect]) -> dict[str, dict[s
         if line.family:
             families[line.family] += here
     for family, many in families.items():
-        # Of each mark, an attacker who sees the reader's answer takes the suspect of the lowest score.
+        # An attacker who sees the reader's answer takes the suspect of the lowest score of each mark.
         of_marks = [group for of_mesh in _by("mesh", many).values() for group in _by("seed", of_mesh).values()]
         worst = [min(group, key=lambda one: (one.reading["read"], one.score)) for group in of_marks]
         found[f"{family}: the best of all"] = _rates(results, worst)

@@ -72,7 +72,7 @@ class SharedField(FieldScheme):
 
 
 def _views(scheme: FieldScheme, suspect: Mesh) -> Iterator[Look]:
-    """Look at a suspect lazily; copies of the result start anew, and a refusal is raised at once, so never cached."""
+    """Look at a suspect lazily; copies start from the beginning, and a refusal is raised at once, never cached."""
     looks = FieldScheme.views(scheme, suspect, Choices(Key(bytes(32)), b""))
     return tee(chain([next(looks)], looks), 1)[0]
 

@@ -2,7 +2,7 @@
 
 A keyed pattern in the lowest eigenvectors of the cotangent Laplacian is added as displacement along normals. The reader
 registers the original to the suspect by principal axes and closest vertices, and confirms the mark where the
-coefficients of the differences between nearest vertices correlate with the pattern by 0.15 or more. Written anew here
+coefficients of the differences between nearest vertices correlate with the pattern by 0.15 or more. Reimplemented
 as a carrier and a detector of jaxmark; there is no message. The tool is by archtecgr.
 """
 

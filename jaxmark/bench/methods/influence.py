@@ -95,12 +95,12 @@ def basis(mesh: Mesh, count: int) -> Basis:
     graph = (graph + graph.T).tocsr()
     normals = vertex_normals(mesh)
     nearest = np.full(len(points), np.inf)
-    centre = int(np.argmax(_finite(csgraph.dijkstra(graph, indices=0))))
+    centre = int(np.argmax(np.nan_to_num(csgraph.dijkstra(graph, indices=0), posinf=0)))
     rows, columns, values = [], [], []
     for number in range(count):
         reach = nearest[centre]
         distance = csgraph.dijkstra(graph, indices=centre, limit=reach)
-        radius = max(reach if np.isfinite(reach) else _finite(distance).max(), 1e-300)
+        radius = max(reach if np.isfinite(reach) else np.nan_to_num(distance, posinf=0).max(), 1e-300)
         inside = np.flatnonzero(distance < radius)
         bump = (1 + np.cos(np.pi * distance[inside] / radius)) / 2
         rows.append((3 * inside[:, None] + np.arange(3)).ravel())
@@ -127,7 +127,3 @@ def _fit(
     matrix = sparse.csr_array(bumps.T @ sparse.diags_array(weights) @ bumps).toarray()
     matrix += _RIDGE * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
     return np.linalg.solve(matrix, bumps.T @ (weights * residual.ravel()))
-
-
-def _finite(distance: Float64[np.ndarray, " points"]) -> Float64[np.ndarray, " points"]:
-    return np.where(np.isfinite(distance), distance, 0)

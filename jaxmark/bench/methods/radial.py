@@ -97,8 +97,8 @@ def _radii(mesh: Mesh, bits: int) -> Radii:
 def _least(radii: Radii, wanted: PerBin, active: Bool[np.ndarray, " bits"]) -> Values:
     """Compute the least radial displacements, by weighted squares, that shift bins' sums, and not the centre.
 
-    Of all displacements δ within their bounds, with Σ w δ over a bin as wanted and Σ w δ ray = 0, the one of least
-    Σ w δ² is δ = clip(a + ray · m), with a number `a` for each bin and one vector `m` (the dual of the programme).
+    Minimising Σ w δ² over displacements δ within their bounds, with Σ w δ over a bin as wanted and Σ w δ ray = 0,
+    gives δ = clip(a + ray · m), with a number `a` for each bin and one vector `m` (the dual of the programme).
     """
     bits, weight, ray = len(wanted), radii.weight, radii.ray
     width = np.where(radii.place < bits, radii.width, 0)

@@ -12,6 +12,7 @@ depend on the key.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -72,16 +73,6 @@ MEAN = Statistic("cho", ANCHOR, 1 / 2, np.power, Bins.mean)
 VARIANCE = Statistic("cho-variance", "", 1 / 3, _raise_about_middle, _variance)
 
 
-def cho(bits: int) -> Method:
-    """Method I, by means; strengths are shifts of a bin's mean, over its width."""
-    return _method(MEAN, bits)
-
-
-def cho_variance(bits: int) -> Method:
-    """Method II, by variances; strengths are shifts of the variance of a bin that reaches from -1 to 1."""
-    return _method(VARIANCE, bits)
-
-
 def _method(statistic: Statistic, bits: int) -> Method:
     def embed(mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
         surface, written = make_surface(mesh), scatter(message, key, statistic.name)
@@ -101,6 +92,11 @@ def _method(statistic: Statistic, bits: int) -> Method:
         return decode_margins(np.where(bins.high > bins.low, margin, 0), key, statistic.name)
 
     return Method(statistic.name, embed, read, True, bits, (1e-4, 0.3), SOURCE, statistic.anchor)
+
+
+# Method I, by means, and II, by variances; strengths are shifts of a bin's mean over its width, and shifts of the
+# variance of a bin that reaches from -1 to 1.
+cho, cho_variance = partial(_method, MEAN), partial(_method, VARIANCE)
 
 
 def _bins(distance: Values, count: int) -> Bins:
