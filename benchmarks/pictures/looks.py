@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 import jaxmark as jm
-from jaxmark.bench.shapes import SHAPES
+from jaxmark.bench.parametric import SHAPES
 from jaxmark.geometry.mesh import Mesh, compact, host_mesh, weld, weld_mesh
 from jaxmark.geometry.raster import Frame
 from jaxmark.plot import Rendering, exaggerate, render

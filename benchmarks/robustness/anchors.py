@@ -17,8 +17,8 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark.bench import LEAGUES, Method, fit
-from jaxmark.bench.methods.cho import cho
 from jaxmark.bench.methods.moments import moments
+from jaxmark.bench.methods.vertex_norms import cho
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, load, make_parser

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxmark as jm
-from jaxmark.bench.shapes import SHAPES
+from jaxmark.bench.parametric import SHAPES
 from jaxmark.distortion import shading
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, host_mesh, weld, weld_mesh
 from jaxmark.watermark.perception.budget import Budget

@@ -29,7 +29,7 @@ import jaxmark as jm
 from jaxmark import adversaries as enemies
 from jaxmark.adversaries.chains import decode
 from jaxmark.adversaries.learned import init_network
-from jaxmark.bench.forms import creature
+from jaxmark.bench.parametric import creature
 from jaxmark.evaluation import cells
 from jaxmark.geometry import asteroid
 from jaxmark.geometry.mesh import Mesh

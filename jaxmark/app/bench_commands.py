@@ -20,14 +20,13 @@ from jaxmark.app.output import answer, say
 from jaxmark.app.process import keep_programs, release_programs
 from jaxmark.app.progress import current
 from jaxmark.bench import page
+from jaxmark.bench._equal_visibility import SHARES, equal_visibility
 from jaxmark.bench.benchmark import KEYS, run
 from jaxmark.bench.calibration import RATE
 from jaxmark.bench.corpus import make_corpus
-from jaxmark.bench.equal import SHARES, equal_visibility
 from jaxmark.bench.leagues import LEAGUES
-from jaxmark.bench.methods import METHODS
-from jaxmark.bench.repeat import hold_against, load_published, save_readings
-from jaxmark.bench.results import BenchResults
+from jaxmark.bench.method import METHODS
+from jaxmark.bench.readings import BenchResults, hold_against, load_published, save_readings
 from jaxmark.bench.summary import entries, save_entries
 from jaxmark.bench.tables import tables
 from jaxmark.errors import JaxmarkError
@@ -66,7 +65,9 @@ METHODS_OPTION = click.option(
 OWN = click.option(
     "--method", "own", multiple=True, type=_PATH, help="A Python or TOML file that declares a method of your own."
 )
-SEEDS = click.option("--seeds", type=click.IntRange(1), default=1, show_default=True, help="Keys, messages, attacks.")
+SAMPLES = click.option(
+    "--samples", type=click.IntRange(1), default=1, show_default=True, help="Number of keys, messages and attacks."
+)
 WORKERS = click.option(
     "--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processes.  [default: all cores]"
 )
@@ -87,7 +88,7 @@ OUTPUT = click.option("--output", type=_PATH, required=True, help="Folder for th
 @click.option("--attacks", multiple=True, help="Attacks of the league, or the first words of some.  [default: all]")
 @click.option("--limits", multiple=True, help="Sets of limits of the league.  [default: all]")
 @click.option("--payloads", multiple=True, type=click.IntRange(1), help="Bits of a message.  [default: 64]")
-@SEEDS
+@SAMPLES
 @click.option("--others", multiple=True, type=_PATH, help="Further meshes, read unmarked in place of each MESH.")
 @click.option(
     "--keys", type=click.IntRange(1), default=KEYS, show_default=True, help="Keys for each suspect without a mark."
@@ -108,7 +109,7 @@ def bench_command(
     attacks: tuple[str, ...],
     limits: tuple[str, ...],
     payloads: tuple[int, ...],
-    seeds: int,
+    samples: int,
     others: tuple[Path, ...],
     keys: int,
     rate: float,
@@ -136,7 +137,7 @@ def bench_command(
         attacks=attacks,
         limits=limits,
         payloads=payloads or (64,),
-        seeds=seeds,
+        samples=samples,
         others=others,
         keys=keys,
         rate=rate,
@@ -170,7 +171,7 @@ def bench_command(
 @OWN
 @click.option("--payloads", multiple=True, type=click.IntRange(1), help="Bits of a message.  [default: 16 64]")
 @click.option("--shares", multiple=True, type=float, help="Of the limits of what is hidden.  [default: 0.5 1 2]")
-@SEEDS
+@SAMPLES
 @WORKERS
 @OUTPUT
 @QUIET
@@ -181,7 +182,7 @@ def bench_equal_command(
     own: tuple[Path, ...],
     payloads: tuple[int, ...],
     shares: tuple[float, ...],
-    seeds: int,
+    samples: int,
     workers: int,
     output: Path,
     as_json: bool,
@@ -196,7 +197,7 @@ def bench_equal_command(
         methods=[*methods, *own] or ["keyed"],
         payloads=payloads or (16, 64),
         shares=shares or SHARES,
-        seeds=seeds,
+        samples=samples,
         workers=processes(workers, keep_programs),
         say=current().doing,
     )

@@ -1,4 +1,4 @@
-"""The corpus: meshes by formula, and some that other packages ship; made by one command, and known by their hashes."""
+"""The corpus: meshes by formula, and some that other packages ship; made by one command, and verified by hashes."""
 
 import json
 import os
@@ -7,20 +7,20 @@ from functools import partial
 from importlib import resources
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxmark.adversaries.registry import attack
-from jaxmark.bench import forms
-from jaxmark.bench.shapes import SHAPES, torus
+from jaxmark.bench import parametric as shapes
+from jaxmark.bench.parametric import SHAPES
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
 from jaxmark.geometry import asteroid
 from jaxmark.geometry.canonical import geometry_hash
 from jaxmark.geometry.mesh import Mesh, make_mesh
 
-_DIGITS = 6  # after the point, of coordinates: what processors compute differently is cut off
+_DIGITS = 6  # decimals of coordinates: what processors compute differently is cut off
 
 
 class Member(NamedTuple):
@@ -32,34 +32,37 @@ class Member(NamedTuple):
 
 
 def _by_formula() -> Iterator[tuple[str, Member]]:
+    def member(name: str, kind: str, make: Callable[..., Mesh], size: int, *options: float) -> tuple[str, Member]:
+        return name, Member(kind, size, partial(make, size, *options))
+
+    def attacked(make: Callable[[], Mesh], *how: Any, seed: int) -> Callable[[], Mesh]:
+        return lambda: attack(make(), *how, seed=seed)
+
     for name, size in zip(SHAPES, (1_000, 3_000, 5_000, 10_000, 8_000, 6_000, 20_000), strict=True):
-        yield name.replace("_", "-"), Member("CAD", size, partial(SHAPES[name], size))
-    for name, size in (("1k", 1_000), ("3k", 3_000), ("10k", 10_000), ("30k", 30_000), ("100k", 100_000)):
-        yield f"asteroid-{name}", Member("scan", size, partial(asteroid, size, seed=size % 97))
+        yield member(name.replace("_", "-"), "CAD", SHAPES[name], size)
+    for size in (1_000, 3_000, 10_000, 30_000, 100_000):
+        yield f"asteroid-{size // 1000}k", Member("scan", size, partial(asteroid, size, seed=size % 97))
     for seed, size in ((1, 2_000), (2, 6_000), (3, 15_000), (4, 40_000)):
-        yield f"creature-{seed}", Member("organic", size, partial(forms.creature, size, seed))
+        yield member(f"creature-{seed}", "organic", shapes.creature, size, seed)
     for power, size in ((0.8, 5_000), (1.5, 3_000), (6.0, 8_000)):
-        yield f"superquadric-{power:g}", Member("symmetric", size, partial(forms.superquadric, size, power))
+        yield member(f"superquadric-{power:g}", "symmetric", shapes.superquadric, size, power)
     for fold, sharp, size in ((3, 4.0, 5_000), (5, 2.5, 9_000), (8, 1.5, 12_000)):
-        yield f"supershape-{fold}", Member("symmetric", size, partial(forms.supershape, size, fold, sharp))
-    yield "trefoil", Member("organic", 6_000, partial(forms.knot, 6_000, 2, 3))
-    yield "knot-5-2", Member("organic", 20_000, partial(forms.knot, 20_000, 5, 2))
-    yield "seashell", Member("organic", 10_000, partial(forms.seashell, 10_000))
-    yield "spring", Member("CAD", 7_000, partial(forms.spring, 7_000))
-    yield "gear-20", Member("CAD", 9_600, partial(forms.gear, 9_600, 20))
-    yield "gem", Member("CAD", 2_500, partial(forms.gem, 2_500, 5))
-    yield "vase", Member("symmetric", 6_400, partial(forms.vase, 6_400))
-    yield "terrain", Member("scan", 25_000, partial(forms.terrain, 25_000, 7))
-    yield "scan-with-holes", Member("scan", 14_000, _scan_with_holes)
-    yield "noisy-asteroid", Member("noisy", 8_000, lambda: forms.noisy(asteroid(8_000, seed=21), 0.004, 1))
-    yield "noisy-box", Member("noisy", 6_000, lambda: forms.noisy(SHAPES["rounded_box"](6_000), 0.003, 2))
-    yield "chain-12", Member("components", 12_000, partial(forms.chain, 12_000, 12))
-    yield "rubble-18", Member("components", 18_000, partial(forms.rubble, 18_000, 18))
-    yield "torus-1m", Member("symmetric", 1_000_000, partial(torus, 1_000_000))
-
-
-def _scan_with_holes() -> Mesh:
-    return attack(asteroid(16_000, seed=11), "holes", 0.1, seed=3)
+        yield member(f"supershape-{fold}", "symmetric", shapes.supershape, size, fold, sharp)
+    yield member("trefoil", "organic", shapes.knot, 6_000, 2, 3)
+    yield member("knot-5-2", "organic", shapes.knot, 20_000, 5, 2)
+    yield member("seashell", "organic", shapes.seashell, 10_000)
+    yield member("spring", "CAD", shapes.spring, 7_000)
+    yield member("gear-20", "CAD", shapes.gear, 9_600, 20)
+    yield member("gem", "CAD", shapes.gem, 2_500, 5)
+    yield member("vase", "symmetric", shapes.vase, 6_400)
+    yield member("terrain", "scan", shapes.terrain, 25_000, 7)
+    scan, rock, box = partial(asteroid, 16_000, seed=11), partial(asteroid, 8_000, seed=21), shapes.rounded_box
+    yield "scan-with-holes", Member("scan", 14_000, attacked(scan, "holes", 0.1, seed=3))
+    yield "noisy-asteroid", Member("noisy", 8_000, attacked(rock, "gaussian-noise", 0.004, seed=1))
+    yield "noisy-box", Member("noisy", 6_000, attacked(partial(box, 6_000), "gaussian-noise", 0.003, seed=2))
+    yield member("chain-12", "components", shapes.chain, 12_000, 12)
+    yield member("rubble-18", "components", shapes.rubble, 18_000, 18)
+    yield member("torus-1m", "symmetric", shapes.torus, 1_000_000)
 
 
 #: Files in the wheel of pymeshlab, of the extra `attacks`.
@@ -72,29 +75,29 @@ _SHIPPED = {
 }
 
 
-def _shipped() -> Iterator[tuple[str, Member]]:
-    spec = find_spec("pymeshlab")
-    if spec is None or spec.origin is None:
-        return
-    folder = Path(spec.origin).parent / "tests" / "sample_meshes"
-    for name, (kind, size, file) in _SHIPPED.items():
-        if (folder / file).is_file():
-            yield name, Member(kind, size, partial(load_mesh, folder / file))
-
-
 def corpus() -> dict[str, Member]:
-    """The meshes of the corpus by their names: those by formula, and those whose packages are installed."""
-    return {**dict(_by_formula()), **dict(_shipped())}
+    """Return the meshes of the corpus by their names: those by formula, and those whose packages are installed."""
+    members, spec = dict(_by_formula()), find_spec("pymeshlab")
+    if spec is not None and spec.origin is not None:
+        for name, (kind, size, file) in _SHIPPED.items():
+            path = Path(spec.origin).parent / "tests" / "sample_meshes" / file
+            if path.is_file():
+                members[name] = Member(kind, size, partial(load_mesh, path))
+    return members
 
 
 def make_member(member: Member) -> Mesh:
-    """Make a mesh of the corpus, the same on every machine but for the last digit."""
+    """Make a mesh of the corpus, the same on every machine: rounded, and with its faces in a canonical order."""
     mesh = member.make()
-    return make_mesh(np.round(np.asarray(mesh.vertices, np.float64), _DIGITS) + 0.0, forms.sorted_faces(mesh))
+    faces = np.asarray(mesh.faces, np.int64)
+    least = np.argmin(faces, axis=1)  # each face begins with its least vertex
+    faces = np.take_along_axis(faces, (least[:, None] + np.arange(3)) % 3, axis=1)
+    vertices = np.round(np.asarray(mesh.vertices, np.float64), _DIGITS) + 0.0
+    return make_mesh(vertices, faces[np.lexsort(faces.T[::-1])])
 
 
 def known_hashes() -> Mapping[str, str]:
-    """The hash of each mesh as it was made for this version, see `jaxmark.geometry.canonical.geometry_hash`."""
+    """Return the hash of each mesh as this version makes it, see `jaxmark.geometry.canonical.geometry_hash`."""
     return json.loads(resources.files("jaxmark.bench").joinpath("corpus.json").read_text())
 
 

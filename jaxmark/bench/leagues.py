@@ -1,28 +1,27 @@
-"""What marks have to stand: leagues of attacks, and the limits that every method keeps.
+"""Leagues: attacks that marks must survive, and the limits of distortion that every method keeps.
 
-`smi2010` is the field's protocol as it was: Wang, Lavoué, Denis, Baskurt, He, "A benchmark for 3D mesh watermarking",
-SMI 2010. `2026` has what it lacks: other meshings, other forms, other machines, and attackers who choose.
+`smi2010` is the field's protocol: Wang, Lavoué, Denis, Baskurt, He, "A benchmark for 3D mesh watermarking", SMI 2010.
+`2026` adds remeshing, deformation, file formats, and attackers who choose.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxmark.adversaries.registry import attack
 from jaxmark.attacks import Attack
-from jaxmark.bench import compositions as made
+from jaxmark.bench import composed_attacks as composed
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.perception.budget import visibility_of
 
 CROPS = 3  # of one mesh, whose readings are averaged
 OVERWRITTEN = "overwritten"  # by a second mark of the same method, with another key, as strong as the limits
-_FARTHEST = 0.02  # diagonals that a hidden mark moves any vertex: single ones may move far unseen by means
-_EXTRAS = {"pymeshlab": "attacks", "fast_simplification": "attacks", "skimage": "attacks", "igl": "align"}
-_EXTRAS |= {"DracoPy": "files"}
+_MAX_DISPLACEMENT = 0.02  # of the diagonal, of any vertex by a hidden mark: metrics are means, and overlook single ones
+_EXTRAS = {"igl": "align", "DracoPy": "files"}  # of packages; else `attacks`
 
 
 class Line(NamedTuple):
@@ -33,60 +32,53 @@ class Line(NamedTuple):
     cho: tuple[float, float] | None = None  # Cho, Prost, Jung 2007, on Venus, blind
     wang: tuple[float, float] | None = None  # Wang, Lavoué, Denis, Baskurt 2011 (volume moments), on Venus, blind
     copies: int = 1  # suspects that are made, each by another seed
-    in_place: bool = True  # whether what it costs the shape can be measured: it leaves the pose and the whole
+    in_place: bool = True  # whether its distortion can be measured: it leaves the pose and the whole
     needs: tuple[str, ...] = ()  # packages that are optional
     family: str = ""  # of an attacker with one budget, who takes the best for each mark
 
     def suspects(self, mesh: Mesh, seed: int) -> list[Mesh]:
-        """What the attack makes of a mesh, unless it is `OVERWRITTEN`, which only the method itself can do.
-
-        Raises:
-            JaxmarkError: if it is not possible on this mesh.
-        """
+        """Attack a mesh, or refuse it; `OVERWRITTEN` needs the method itself and is not made here."""
         return [attack(mesh, self.kind, self.strength, seed=self.copies * seed + copy) for copy in range(self.copies)]
 
     def missing(self) -> str:
-        """A sentence that names what is not installed; empty if nothing."""
+        """Name a package that is not installed in a sentence, which is empty if none is missing."""
         gone = [name for name in self.needs if find_spec(name) is None]
-        return f"{gone[0]} is missing: pip install 'jaxmark[{_EXTRAS[gone[0]]}]'" if gone else ""
+        return f"{gone[0]} is missing: pip install 'jaxmark[{_EXTRAS.get(gone[0], 'attacks')}]'" if gone else ""
 
 
 class League(NamedTuple):
-    """Attacks, and sets of limits on what a mark may do to the mesh."""
+    """Attacks, and sets of limits on the distortion by a mark."""
 
-    limits: Mapping[str, Mapping[str, float]]  # by metric; an empty one is what is hidden on this mesh
+    limits: Mapping[str, Mapping[str, float]]  # by metric; an empty one is that of hidden marks on each mesh
     lines: Mapping[str, Line]
 
     def bounds(self, limits: str, mesh: Mesh) -> Mapping[str, float]:
         """The limits of one name for a mesh."""
-        return self.limits[limits] or {**visibility_of(mesh)["hidden"], "max": _FARTHEST}
+        return self.limits[limits] or {**visibility_of(mesh)["hidden"], "max": _MAX_DISPLACEMENT}
 
 
 def posed(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """The protocol's similarity: shifts of up to 5 mean radii along each axis, any turn, scales from 0.1 to 10."""
+    """Apply the protocol's similarity: shifts of up to 5 mean radii along each axis, any turn, scales of 0.1 to 10."""
     vertices = np.asarray(mesh.vertices)
     radius = np.linalg.norm(vertices - vertices.mean(axis=0), axis=1).mean()
     axis = random.normal(size=3)
     turn = Rotation.from_rotvec(random.uniform(0, 2 * np.pi) * axis / np.linalg.norm(axis))
-    moved = turn.apply(random.uniform(0.1, 10) * vertices) + radius * random.uniform(-5, 5, 3)
-    return Mesh(moved, mesh.faces)
+    return Mesh(turn.apply(random.uniform(0.1, 10) * vertices) + radius * random.uniform(-5, 5, 3), mesh.faces)
 
 
-def _lines(kind: str, strengths: Iterable[float], *published: str) -> dict[str, Line]:
-    """Lines of one kind; rates published for a method are lists of numbers, perceptual / geometric."""
-    columns = [[[float(x) for x in part.split()] for part in one.split("/")] for one in published]
+def _lines(kind: str, strengths: Sequence[float], *published: str, **options: Any) -> dict[str, Line]:
+    """Make lines of one kind; rates published for a method are lists of numbers, perceptual / geometric."""
+    columns = [
+        [tuple(map(float, pair)) for pair in zip(*map(str.split, one.split("/")), strict=True)] for one in published
+    ]
+    rates = zip(*columns, strict=True) if columns else [()] * len(strengths)
     return {
-        f"{kind} {strength:g}": Line(
-            kind,
-            strength,
-            *((one[0][place], one[1][place]) for one in columns),
-            copies=CROPS if kind == "cropping" else 1,
-            in_place=kind != "cropping",
-            needs=("fast_simplification",) if kind == "simplification" else (),
-        )
-        for place, strength in enumerate(strengths)
+        f"{kind} {strength:g}": Line(kind, strength, *pairs, **options)
+        for strength, pairs in zip(strengths, rates, strict=True)
     }
 
+
+_MESHLAB, _ISO, _EDGES = ("pymeshlab",), ("skimage", "igl"), ("fast_simplification",)
 
 # Published rates: the protocol's result page, for the model Venus.
 PROTOCOL: Mapping[str, Line] = {
@@ -109,42 +101,40 @@ PROTOCOL: Mapping[str, Line] = {
     **_lines("midpoint", (1,), ".04 / .02", "0 / 0"),
     **_lines("sqrt3", (1,), ".14 / .09", "0 / .01"),
     **_lines("loop", (1,), ".16 / .09", "0 / .01"),
-    **_lines("simplification", (0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.975)),
-    **_lines("cropping", (0.1, 0.3, 0.5)),
+    **_lines("simplification", (0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.975), needs=_EDGES),
+    **_lines("cropping", (0.1, 0.3, 0.5), copies=CROPS, in_place=False),
 }
-
-_MESHLAB, _ISO, _EDGES = ("pymeshlab",), ("skimage", "igl"), ("fast_simplification",)
 
 LINES_2026: Mapping[str, Line] = {
     "none": Line("noise", 0),
-    **{f"iso-surface {cells}": Line("iso-surface", cells, needs=_ISO) for cells in (150, 70)},
-    **{f"isotropic {length:g}": Line("isotropic", length, needs=_MESHLAB) for length in (0.7, 1, 1.4)},
-    **{f"poisson {depth}": Line("poisson", depth, needs=_MESHLAB) for depth in (7, 6)},
-    **{f"warp {size:g}": Line("warp", size) for size in (0.005, 0.02)},
-    "bending 10": Line("bending", 10),
-    "twisting 10": Line("twisting", 10),
-    "arap 0.1": Line("arap", 0.1, needs=("igl",)),
-    "remesh-smooth-remesh": Line(made.REMESH_SMOOTH_REMESH, 10, needs=_MESHLAB),
-    "mirror": Line(made.MIRROR, 0, in_place=False),
-    "mirror, retriangulated": Line(made.MIRROR, 0.3, in_place=False),
-    "mirror, remeshed": Line(made.MIRROR_REMESHED, 1, in_place=False, needs=_MESHLAB),
-    "decimated to 4 %, 2 Loop": Line(made.DECIMATE_LOOP, 0.96, needs=_EDGES),
-    "decimated to 20 %, 1 Loop": Line(made.DECIMATE_LOOP, 0.8, needs=_EDGES),
-    "print and scan 0.1 mm": Line(made.PRINT_SCAN, 0.1, in_place=False, needs=(*_ISO, *_MESHLAB)),
-    "slicer": Line(made.SLICER, 5, in_place=False),
-    "Draco 14": Line(made.DRACO, 14, needs=("DracoPy",)),
-    "Draco 11": Line(made.DRACO, 11, needs=("DracoPy",)),
-    "glTF quantised 16": Line(made.GLTF, 16),
-    "glTF quantised 12": Line(made.GLTF, 12),
-    "grafted 0.5": Line(made.GRAFT, 0.5, copies=CROPS, in_place=False),
-    "mosaic 0.1": Line("mosaic", 0.1, in_place=False),
+    **_lines("iso-surface", (150, 70), needs=_ISO),
+    **_lines("isotropic", (0.7, 1, 1.4), needs=_MESHLAB),
+    **_lines("poisson", (7, 6), needs=_MESHLAB),
+    **_lines("warp", (0.005, 0.02)),
+    **_lines("bending", (10,)),
+    **_lines("twisting", (10,)),
+    **_lines("arap", (0.1,), needs=("igl",)),
+    "remesh-smooth-remesh": Line(composed.REMESH_SMOOTH_REMESH, 10, needs=_MESHLAB),
+    "mirror": Line(composed.MIRROR, 0, in_place=False),
+    "mirror, retriangulated": Line(composed.MIRROR, 0.3, in_place=False),
+    "mirror, remeshed": Line(composed.MIRROR_REMESHED, 1, in_place=False, needs=_MESHLAB),
+    "decimated to 4 %, 2 Loop": Line(composed.DECIMATE_LOOP, 0.96, needs=_EDGES),
+    "decimated to 20 %, 1 Loop": Line(composed.DECIMATE_LOOP, 0.8, needs=_EDGES),
+    "print and scan 0.1 mm": Line(composed.PRINT_SCAN, 0.1, in_place=False, needs=(*_ISO, *_MESHLAB)),
+    "slicer": Line(composed.SLICER, 5, in_place=False),
+    "Draco 14": Line(composed.DRACO, 14, needs=("DracoPy",)),
+    "Draco 11": Line(composed.DRACO, 11, needs=("DracoPy",)),
+    "glTF quantised 16": Line(composed.GLTF, 16),
+    "glTF quantised 12": Line(composed.GLTF, 12),
+    "grafted 0.5": Line(composed.GRAFT, 0.5, copies=CROPS, in_place=False),
+    **_lines("mosaic", (0.1,), in_place=False),
     OVERWRITTEN: Line(OVERWRITTEN, 1),
     **{
         f"attacker, MSDM2 {budget:g}: {kind}": Line(
-            made.to_budget(kind), budget, needs=("igl",), family=f"attacker, MSDM2 {budget:g}"
+            composed.to_budget(kind), budget, needs=("igl",), family=f"attacker, MSDM2 {budget:g}"
         )
         for budget in (0.3, 0.5)
-        for kind in made.CHOICES
+        for kind in composed.CHOICES
     },
 }
 
@@ -158,11 +148,7 @@ LEAGUES: Mapping[str, League] = {
 
 
 def get_league(name: str) -> League:
-    """A league by its name.
-
-    Raises:
-        JaxmarkError: if there is none of that name.
-    """
+    """Return a league by its name, or raise `JaxmarkError`."""
     if name not in LEAGUES:
         raise JaxmarkError(f"There is no league {name!r}; there are {', '.join(LEAGUES)}.")
     return LEAGUES[name]

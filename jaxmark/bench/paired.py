@@ -1,19 +1,20 @@
-"""Two methods on the same suspects: McNemar's test, and the interval of the difference of their rates."""
+"""Paired comparison of two methods on the same suspects: McNemar's test, and Newcombe's interval."""
 
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 from scipy.special import bdtr, ndtri
 
 from jaxmark.errors import JaxmarkError
 
 
 class Paired(NamedTuple):
-    """How two methods differ on the same meshes, seeds and attacks."""
+    """The difference of two methods on the same meshes, samples and attacks."""
 
     both: int
-    first: int  # where only the first succeeds
+    first: int  # pairs where only the first succeeds
     second: int
     neither: int
     p: float  # two-sided, that the discordant pairs fall so unequally if both are as good
@@ -39,36 +40,24 @@ def compare_paired(first: Sequence[bool], second: Sequence[bool], confidence: fl
     """
     if len(first) != len(second) or not len(first):
         raise JaxmarkError(f"A paired comparison needs pairs, got {len(first)} and {len(second)} successes.")
-    pairs = [(bool(a), bool(b)) for a, b in zip(first, second, strict=True)]
-    both, one, other, neither = (
-        pairs.count(pair) for pair in ((True, True), (True, False), (False, True), (False, False))
-    )
-    discordant, count = one + other, len(pairs)
-    p = min(2 * float(bdtr(min(one, other), discordant, 0.5)), 1.0) if discordant else 1.0
-    low, high = _newcombe(both, one, other, neither, confidence)
-    return Paired(both, one, other, neither, p, (one - other) / count, low, high)
-
-
-def _newcombe(both: int, one: int, other: int, neither: int, confidence: float) -> tuple[float, float]:
-    count, z = both + one + other + neither, float(ndtri((1 + confidence) / 2))
-    rates = (both + one) / count, (both + other) / count
-    (low1, high1), (low2, high2) = (_wilson(rate, count, z) for rate in rates)
-    products = (both + one) * (other + neither) * (both + other) * (one + neither)
-    excess = both * neither - one * other
+    one, other = np.asarray(first, bool), np.asarray(second, bool)
+    a, b, c, d = (int(np.sum(cell)) for cell in (one & other, one & ~other, ~one & other, ~one & ~other))
+    p = min(2 * float(bdtr(min(b, c), b + c, 0.5)), 1.0) if b + c else 1.0
+    count, z = len(one), float(ndtri((1 + confidence) / 2))
+    rate1, rate2, difference = (a + b) / count, (a + c) / count, (b - c) / count
+    (low1, high1), (low2, high2) = _wilson(rate1, count, z), _wilson(rate2, count, z)
+    products, excess = (a + b) * (c + d) * (a + c) * (b + d), a * d - b * c
     # The correlation is corrected for continuity where it is positive.
-    phi = 0.0 if not products else (max(excess - count / 2, 0) if excess > 0 else excess) / math.sqrt(products)
-    difference = rates[0] - rates[1]
+    phi = (max(excess - count / 2, 0) if excess > 0 else excess) / math.sqrt(products) if products else 0.0
 
-    def reach(a: float, b: float) -> float:
-        return math.sqrt(max(a * a - 2 * phi * a * b + b * b, 0.0))
+    def joined(x: float, y: float) -> float:
+        return math.sqrt(max(x * x - 2 * phi * x * y + y * y, 0.0))
 
-    return (
-        difference - reach(rates[0] - low1, high2 - rates[1]),
-        difference + reach(high1 - rates[0], rates[1] - low2),
-    )
+    low = difference - joined(rate1 - low1, high2 - rate2)
+    return Paired(a, b, c, d, p, difference, low, difference + joined(high1 - rate1, rate2 - low2))
 
 
 def _wilson(rate: float, count: int, z: float) -> tuple[float, float]:
-    """Wilson's score interval of a rate, 1927."""
+    """Compute Wilson's score interval of a rate, 1927."""
     middle, reach = rate + z * z / (2 * count), z * math.sqrt(rate * (1 - rate) / count + z * z / (4 * count * count))
     return (middle - reach) / (1 + z * z / count), (middle + reach) / (1 + z * z / count)

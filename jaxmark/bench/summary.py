@@ -1,10 +1,10 @@
-"""What a benchmark found, summed up: for each method its calibration, its rates after every attack, and its scores."""
+"""Summary of a benchmark: for each method its calibration, its rates after every attack, and its scores."""
 
 import json
 import math
 import os
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -13,9 +13,9 @@ import numpy as np
 from jaxmark.bench.calibration import Calibration, count
 from jaxmark.bench.leagues import get_league
 from jaxmark.bench.method import Method
-from jaxmark.bench.quality import Point, score
-from jaxmark.bench.results import BenchResults, Suspect
-from jaxmark.bench.work import COSTS, MARK, Task
+from jaxmark.bench.readings import BenchResults, Suspect
+from jaxmark.bench.robustness_curves import Point, score
+from jaxmark.bench.tasks import COSTS, MARK, Task
 from jaxmark.files.atomic import write_atomically
 
 NOT_VALIDATED = "not validated"
@@ -24,7 +24,7 @@ _ROC_POINTS = 50
 
 @lru_cache(maxsize=1)  # tables, page and JSON are of the same entries, whose intervals take minutes on large runs
 def entries(results: BenchResults) -> dict[str, dict[str, Any]]:
-    """One entry a method, under its name, that JSON can hold; where two have one name, by their names in cells."""
+    """Return an entry for each method that JSON can hold, by its name, or where two have one by its name in cells."""
     names = [method.name for method in results.methods.values()]
     return {
         method.name if names.count(method.name) == 1 else label: _entry(results, label, method)
@@ -42,17 +42,11 @@ def save_entries(results: BenchResults, path: str | os.PathLike[str]) -> None:
 
 
 def points(results: BenchResults, some: Iterable[Suspect], rule: str = "detected") -> list[Point]:
-    """Suspects as points of a curve, by the rule `"detected"` or `"read"`."""
+    """Convert suspects to points of a curve, by the rule `"detected"` or `"read"`."""
     return [
-        Point(
-            one.task.mesh,
-            one.task.seed,
-            one.task.attack,
-            one.costs,
-            results.succeeds(one, rule),
-            one.task.mark in results.marks,
-        )
+        Point(task.mesh, task.seed, task.attack, one.costs, results.succeeds(one, rule), task.mark in results.marks)
         for one in some
+        for task in [one.task]
     ]
 
 
@@ -67,17 +61,27 @@ def _entry(results: BenchResults, label: str, method: Method) -> dict[str, Any]:
         "payloads": {
             str(payload): {
                 "calibration": _calibration(results.calibrations.get((label, payload))),
-                "leagues": dict(_leagues(results, [one for one in mine if one.task.payload == payload])),
+                "leagues": {
+                    league: _league(results, of_league) for league, of_league in _by("league", of_payload).items()
+                },
             }
-            for payload in sorted({one.task.payload for one in mine})
+            for payload, of_payload in sorted(_by("payload", mine).items())
         },
     }
+
+
+def _by(field: str, suspects: Sequence[Suspect]) -> dict[Any, list[Suspect]]:
+    """Group suspects by a field of their tasks."""
+    groups = defaultdict(list)
+    for one in suspects:
+        groups[getattr(one.task, field)].append(one)
+    return groups
 
 
 def _calibration(found: Calibration | None) -> dict[str, Any] | None:
     if found is None:
         return None
-    every = max(len(found.points) // _ROC_POINTS, 1)
+    step = max(len(found.points) // _ROC_POINTS, 1)
     return {
         "threshold": _finite(found.threshold.value),
         "rate": found.threshold.rate,
@@ -85,40 +89,27 @@ def _calibration(found: Calibration | None) -> dict[str, Any] | None:
         "rate_high": found.threshold.high,
         "nulls": {kind: one._asdict() for kind, one in found.kinds.items()},
         "roc_area": found.area,
-        "roc": [list(point) for point in [*found.points[:-1:every], found.points[-1]]],
+        "roc": [list(point) for point in [*found.points[:-1:step], found.points[-1]]],
         "own_threshold": None if found.own is None else {**found.own._asdict(), "stated": found.stated},
         "bound": [level._asdict() for level in found.bound],
         "verdicts": found.verdicts,
     }
 
 
-def _leagues(results: BenchResults, mine: Sequence[Suspect]) -> Iterator[tuple[str, dict[str, Any]]]:
-    for league in dict.fromkeys(one.task.league for one in mine):
-        some = [one for one in mine if one.task.league == league]
-        scores = {rule: score(points(results, some, rule)) for rule in ("detected", "read")}
-        limits = {
-            name: {
-                "marks": _marks(results, some[0].task._replace(limits=name)),
-                "attacks": dict(_attacks(results, [one for one in some if one.task.limits == name])),
-            }
-            for name in dict.fromkeys(one.task.limits for one in some)
-        }
-        yield (
-            league,
-            {
-                "scores": {rule: None if one is None else one._asdict() for rule, one in scores.items()},
-                "limits": limits,
-            },
-        )
+def _league(results: BenchResults, some: Sequence[Suspect]) -> dict[str, Any]:
+    scores = {rule: score(points(results, some, rule)) for rule in ("detected", "read")}
+    return {
+        "scores": {rule: None if one is None else one._asdict() for rule, one in scores.items()},
+        "limits": {
+            name: {"marks": _marks(results, under[0].task), "attacks": _attacks(results, under)}
+            for name, under in _by("limits", some).items()
+        },
+    }
 
 
 def _marks(results: BenchResults, like: Task) -> dict[str, Any]:
-    """What the marks themselves do under the same limits, the mean over meshes and seeds."""
-    rows = [
-        row
-        for task, row in results.tasks
-        if task.attack == MARK and task[:4] == like[:4] and task.source == like.method
-    ]
+    """Summarise the marks under the same limits: means over meshes and samples."""
+    rows = [row for task, row in results.tasks if task.attack == MARK and task[:4] == like[:4]]
     made = [row for row in rows if "strength" in row]
     return {
         "made": len(made),
@@ -129,47 +120,41 @@ def _marks(results: BenchResults, like: Task) -> dict[str, Any]:
     }
 
 
-def _attacks(results: BenchResults, some: Sequence[Suspect]) -> Iterator[tuple[str, dict[str, Any]]]:
-    families: dict[str, list[Suspect]] = defaultdict(list)
-    for attack in dict.fromkeys(one.task.attack for one in some):
-        here = [one for one in some if one.task.attack == attack]
-        league = get_league(here[0].task.league)
-        line, place = league.lines[attack], list(league.limits).index(here[0].task.limits)
+def _attacks(results: BenchResults, some: Sequence[Suspect]) -> dict[str, dict[str, Any]]:
+    found: dict[str, dict[str, Any]] = {}
+    league, families = get_league(some[0].task.league), defaultdict(list)
+    place = list(league.limits).index(some[0].task.limits)
+    for attack, here in _by("attack", some).items():
+        line = league.lines[attack]
         published = {name: rates[place] for name in ("cho", "wang") if (rates := getattr(line, name)) is not None}
-        yield attack, {**_rates(results, here), "published_bit_errors": published}
+        found[attack] = {**_rates(results, here), "published_bit_errors": published}
         if line.family:
             families[line.family] += here
     for family, many in families.items():
-        yield f"{family}: the best of all", _rates(results, _worst(many))
-
-
-def _worst(many: Iterable[Suspect]) -> list[Suspect]:
-    """Of each mark, the suspect that an attacker would take who sees what the reader says."""
-    found: dict[tuple[str, int], Suspect] = {}
-    for one in many:
-        key = one.task.mesh, one.task.seed
-        if key not in found or (one.reading["read"], one.score) < (found[key].reading["read"], found[key].score):
-            found[key] = one
-    return list(found.values())
+        # An attacker who sees the reader's answer takes the suspect of the lowest score of each mark.
+        of_marks = [group for of_mesh in _by("mesh", many).values() for group in _by("seed", of_mesh).values()]
+        worst = [min(group, key=lambda one: (one.reading["read"], one.score)) for group in of_marks]
+        found[f"{family}: the best of all"] = _rates(results, worst)
+    return found
 
 
 def _rates(results: BenchResults, here: Sequence[Suspect]) -> dict[str, Any]:
-    read = count([one.reading["read"] for one in here])
-    detected = count([results.succeeds(one) for one in here])
-    p = [one.reading["log10_p"] for one in here if one.reading["log10_p"] is not None]
-    seconds = [one.reading["seconds"] for one in here if "seconds" in one.reading]
+    def counted(rule: str) -> dict[str, Any]:
+        found = count([results.succeeds(one, rule) for one in here])
+        return {rule: found.hits, f"{rule}_low": found.low, f"{rule}_high": found.high}
+
+    def median(name: str) -> float | None:
+        known = [one.reading[name] for one in here if one.reading.get(name) is not None]
+        return float(np.median(known)) if known else None
+
     return {
         "trials": len(here),
-        "read": read.hits,
-        "read_low": read.low,
-        "read_high": read.high,
-        "detected": detected.hits,
-        "detected_low": detected.low,
-        "detected_high": detected.high,
+        **counted("read"),
+        **counted("detected"),
         "bit_errors": float(np.mean([one.reading["bit_errors"] for one in here])),
         "score": _finite(float(np.median([one.score for one in here]))),
-        "log10_p": float(np.median(p)) if p else None,
-        "seconds": float(np.median(seconds)) if seconds else None,
+        "log10_p": median("log10_p"),
+        "seconds": median("seconds"),
         "costs": {name: _mean(one.costs.get(name) for one in here) for name in COSTS},
         "notes": sorted({one.reading["note"] for one in here if one.reading.get("note")}),
     }

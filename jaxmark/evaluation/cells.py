@@ -9,8 +9,9 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ def _begin(begin: Callable[[], object] | None) -> None:
 def run(
     cells: Sequence[Cell],
     work: Callable[[Cell], Row],
-    pool: Pool,
+    pool: int | Pool,
     output: str | os.PathLike[str],
     say: Callable[[str], None] = lambda line: None,
     name: Callable[[Cell], str] = lambda cell: "",
@@ -55,7 +56,8 @@ def run(
         cells: the cells, each once; they identify their rows.
         work: function from a cell to its results, which JSON can hold; at the top level of a module if the workers are
             processes.
-        pool: function that makes an executor; called again when one breaks, as a pool does when a process is killed.
+        pool: number of processes, where 1 is this one; or a function that makes an executor, called again when one
+            breaks, as a pool does when a process is killed.
         output: file of JSON lines, `{"cell": [...], ...}`, each written to disk at once. It may hold other cells, too.
         say: function that is called with a line about the progress after each cell.
         name: what to call a cell in such a line.
@@ -68,6 +70,8 @@ def run(
         Exception: whatever `work` raises; cells that were finished before are kept.
     """
     target, broken, start, count = Path(output), 0, time.monotonic(), None
+    if isinstance(pool, int):
+        pool = processes(pool) if pool > 1 else partial(ThreadPoolExecutor, 1)
     while left := _unfinished(cells, target):
         count = len(left) if count is None else count
         missing = len(left)

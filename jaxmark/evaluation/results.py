@@ -1,12 +1,10 @@
 """Results of a study: rows, rates with their intervals, tables, files and pictures of them."""
 
-import base64
 import csv
 import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any
 
 from jaxmark.evaluation import _rates as rates
@@ -15,6 +13,7 @@ from jaxmark.evaluation.pictures.studies import Measure, curves
 from jaxmark.extras import require
 from jaxmark.files.atomic import write_atomically
 from jaxmark.plot import Picture
+from jaxmark.plot.pages import write_page
 
 _LABELS: dict[Control, str] = {"unmarked": "unmarked, detected", "wrong-key": "another key, detected"}
 _SHOWN: dict[Measure, str] = {"read": "What was read", "log10_p_unfloored": "Evidence"}
@@ -92,19 +91,18 @@ class Results:
         Raises:
             JaxmarkError: if matplotlib or Jinja2 is missing, or the page cannot be written.
         """
-        jinja2 = require("jinja2", "plot")
-        template = resources.files("jaxmark.evaluation").joinpath("study.html").read_text(encoding="utf-8")
+        require("jinja2", "plot")
         heads, lines = self._table()
-        page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(template)
-        text = page.render(
-            title=title,
-            pictures={name: base64.b64encode(self.plot(of).png()).decode() for of, name in _SHOWN.items()},
-            heads=heads,
-            lines=lines,
-            controls=self._controls(),
+        write_page(
+            path,
+            title,
+            {name: self.plot(of) for of, name in _SHOWN.items()},
+            alt=", over the strength of each attack",
+            tables=[{"title": "All points", "heads": heads, "lines": lines}],
+            notes=self._controls(),
             refusals=self._refusals(),
+            nowrap=True,
         )
-        write_atomically(path, text.encode())
 
     def save_csv(self, path: str | os.PathLike[str]) -> None:
         """Write all rows as comma-separated values, the file whole or not at all.

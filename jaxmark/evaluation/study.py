@@ -9,7 +9,6 @@ import os
 import pickle
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from itertools import product
@@ -21,7 +20,7 @@ from jaxmark.attacks import Attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation._rates import LOG10_LEVEL, Control, Row
 from jaxmark.evaluation._robustness import NOTHING, Outcome, compare_with
-from jaxmark.evaluation.cells import Cell, Pool, processes, run
+from jaxmark.evaluation.cells import Cell, Pool, run
 from jaxmark.evaluation.results import Results
 from jaxmark.files import load_mesh
 from jaxmark.files.atomic import read_file
@@ -134,7 +133,6 @@ class Study:
                 raise JaxmarkError(f"A study needs at least one worker, got {workers}.")
             if workers > 1:
                 self._check_picklable()
-            workers = processes(workers) if workers > 1 else partial(ThreadPoolExecutor, 1)
         try:
             done = run(cells, partial(work, self), workers, output, say, self._name)
         finally:

@@ -15,11 +15,12 @@ from scipy import stats
 
 import jaxmark as jm
 from jaxmark.app.bench_commands import ManyValues
-from jaxmark.bench import Method, Reading, calibration, compositions, leagues, paired, quality
+from jaxmark.bench import Method, Reading, calibration, leagues, paired
+from jaxmark.bench import composed_attacks as compositions
+from jaxmark.bench import robustness_curves as quality
 from jaxmark.bench.corpus import corpus, known_hashes, make_member
-from jaxmark.bench.fitting import SHARE, fit
-from jaxmark.bench.methods import METHODS, get_method
-from jaxmark.bench.plugins import digest_of, load_method
+from jaxmark.bench.method import METHODS, digest_of, get_method, load_method
+from jaxmark.bench.strength_search import SHARE, fit
 from jaxmark.bench.tables import tables
 from jaxmark.geometry.canonical import geometry_hash
 from jaxmark.geometry.mesh import Mesh, diagonal

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
 from jaxmark.bench.method import Method
-from jaxmark.bench.methods import cho as norms
+from jaxmark.bench.methods import builtin_schemes as here
 from jaxmark.bench.methods import influence as spheres
-from jaxmark.bench.methods import library as here
 from jaxmark.bench.methods import moments as patches
 from jaxmark.bench.methods import radial as programme
-from jaxmark.bench.methods.draws import gather, normal, scatter
+from jaxmark.bench.methods import vertex_norms as norms
+from jaxmark.bench.methods.primitives import gather, normal, scatter
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.field import FieldScheme
 from jaxmark.watermark.blind.reading import context
@@ -105,14 +105,13 @@ def test_powers_shift_the_statistic_of_each_bin_to_its_target(factory, uniform, 
 def test_the_programme_moves_as_little_as_another_solver_finds():
     """On the primal, with all its constraints, beside Newton's method on the dual."""
     small = jm.geometry.asteroid(162)
-    seen = programme._seen(small, 4)
+    seen = programme._radii(small, 4)
     mass = seen.mean(4)[1]
     wanted = np.array([0.02, -0.03, 0.02, -0.02]) * mass * seen.width
     shift = programme._least(seen, wanted, np.ones(4, bool))
-    inside = np.where(seen.place < 4, (seen.distance - seen.low) / seen.width - seen.place, 0)
     free = seen.place < 4
-    low = np.where(free, np.minimum(programme._EDGE - inside, 0), 0) * seen.width
-    high = np.where(free, np.maximum(1 - programme._EDGE - inside, 0), 0) * seen.width
+    low = np.where(free, np.minimum(programme._EDGE - seen.inside, 0), 0) * seen.width
+    high = np.where(free, np.maximum(1 - programme._EDGE - seen.inside, 0), 0) * seen.width
     rows = np.stack([seen.weight * (seen.place == place) for place in range(4)] + list(seen.weight * seen.ray.T))
     # SciPy's bounded least squares; constraints are rows of great weight.
     matrix = np.concatenate([np.diag(np.sqrt(seen.weight)), 1e4 * rows])
@@ -131,8 +130,7 @@ def test_volumes_of_patches_are_those_of_points_thrown_into_a_box():
     assert found.sum() == pytest.approx(1, abs=1e-12)
     assert np.abs(seen.mesh.vertices).max(axis=0) * seen.size == pytest.approx([1.5, 1, 0.5])
     points = np.random.default_rng(0).uniform(-1, 1, (200_000, 3)) * np.array([1.5, 1, 0.5]) / seen.size
-    cells = patches._cell(*patches._places(points, seen.ends, 5), 5)
-    assert np.bincount(cells, minlength=len(found)) / len(points) == pytest.approx(found, abs=2e-3)
+    assert np.bincount(seen.cells(points)[0], minlength=len(found)) / len(points) == pytest.approx(found, abs=2e-3)
 
 
 def test_volumes_know_nothing_of_the_meshing_and_the_pose_is_kept(mesh, message, key):

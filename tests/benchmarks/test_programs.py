@@ -14,7 +14,7 @@ import pytest
 import trimesh
 
 import jaxmark as jm
-from jaxmark.bench.shapes import SHAPES
+from jaxmark.bench.parametric import SHAPES
 from tests import ROOT
 from tests.samples import bumpy_sphere
 

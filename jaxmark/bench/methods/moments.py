@@ -5,15 +5,14 @@ a cylinder about its longest axis. The largest patches carry a bit each: the vol
 of order zero) is quantised by a keyed scalar Costa scheme, by a smooth deformation of the patch that leaves the pose as
 it is. All moments are integrals over triangles, cut where patches meet, and do not depend on how the surface is meshed.
 
-Chosen here, where the publication is silent or was not at hand. What is quantised is the logarithm of the volume, in
+Chosen here, where the publication is silent or was not at hand. The quantised value is the logarithm of the volume, in
 units of the whole. The grid divides the axis evenly between the surface's ends, and the circle about it. The two axes
 of the most skewness point where that is positive, the third one is right-handed. Points move along their normals, under
 a mask that falls to zero at the patch's rim and two odd ones that compensate the pose; of all deformations with the
-wanted moments that is the least, by squares over the surface, found by Newton's method about what the reader would see.
+wanted moments that is the least, by squares over the surface, found by Newton's method for the surface that results.
 Patches that are nearly large enough to carry a bit are kept smaller. The strength is the quantisation step. As in the
-publication, the reader may know it; where it does not, it tries all that the writer may choose from. The score is the
-agreement of the moments with the quantiser's cells, whose places the key draws at random, in standard deviations of
-what another key finds.
+publication, the reader may know it; otherwise it tries all that the writer may choose from. The score is the agreement
+of the moments with the quantiser's cells, whose places the key draws at random, in standard deviations over other keys.
 """
 
 import math
@@ -25,8 +24,7 @@ from jaxtyping import Float64, Int64
 from scipy.special import ive
 
 from jaxmark.bench.method import Bits, Method, Reading
-from jaxmark.bench.methods.draws import gather, scatter, uniform
-from jaxmark.bench.methods.surface import per_point, skin
+from jaxmark.bench.methods.primitives import gather, make_surface, per_point, scatter, uniform
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces, cross_product, face_areas, vertex_normals
 from jaxmark.geometry.pose import Points
@@ -39,15 +37,16 @@ ANCHOR = (
 SOURCE = "Wang, Lavoué, Denis, Baskurt, Computers & Graphics 35 (1), 2011"
 STEPS = tuple(0.128 * 2 ** (-place / 4) for place in range(25))  # of the quantiser, in logarithms of volume
 _SECTORS = 8  # around the axis; even, so that planes through the axis cut them
-_SPARE = 1.4  # patches for each bit
-_GAP = 0.01  # least difference, in logarithms, of the volumes that carry a bit from the others
-_NEARLY = 0.8  # of the smallest volume that carries a bit: patches from here on keep theirs
+_PATCHES_PER_BIT = 1.4
+_MIN_GAP = 0.01  # between the logarithms of the volumes that carry a bit and the others
+_NEARLY_LARGE = 0.8  # of the smallest volume that carries a bit: patches from here on keep theirs
 _COSTA = 0.8  # share of the way to the quantiser's value
 _RIM = 0.35  # share of a patch's width, on either side, where the mask rises
 _AXIS = 0.1  # distance from the axis, in units of the volume's cube root, where the mask is a half
-_ROUNDS, _NEAR = 15, 1e-3  # of Newton's method; the share of a step that ends it
+_MAX_ROUNDS, _TOLERANCE = 15, 1e-3  # of Newton's method; a share of the quantisation step
 
 Cells = Float64[np.ndarray, " cells"]
+Values = Float64[np.ndarray, " points"]
 
 
 class Posed(NamedTuple):
@@ -59,10 +58,13 @@ class Posed(NamedTuple):
     ends: tuple[float, float]  # of the surface along the axis
     slabs: int
 
-    @property
-    def places(self) -> tuple[Float64[np.ndarray, " points"], Float64[np.ndarray, " points"]]:
-        """Where points are along and around the axis, counted in cells."""
-        return _places(np.asarray(self.mesh.vertices), self.ends, self.slabs)
+    def cells(self, points: Points) -> tuple[Int64[np.ndarray, " points"], Values, Values]:
+        """The patch of each point, and its place there along and around the axis, both from 0 to 1."""
+        along = (points[:, 0] - self.ends[0]) * self.slabs / (self.ends[1] - self.ends[0])
+        around = (np.arctan2(points[:, 2], points[:, 1]) / (2 * np.pi) + 0.5) * _SECTORS
+        slab = np.clip(np.floor(along), 0, self.slabs - 1).astype(np.int64)
+        sector = np.minimum(around.astype(np.int64), _SECTORS - 1)
+        return slab * _SECTORS + sector, along - np.floor(along), around - np.floor(around)
 
 
 def moments(bits: int, steps: Sequence[float] = STEPS) -> Method:
@@ -72,28 +74,28 @@ def moments(bits: int, steps: Sequence[float] = STEPS) -> Method:
         bits: of a message.
         steps: what the writer may choose from and the reader tries, descending; one alone where they agree on it.
     """
-    slabs, tried = math.ceil(_SPARE * bits / _SECTORS), np.asarray(steps, float)
+    slabs, tried = math.ceil(_PATCHES_PER_BIT * bits / _SECTORS), np.asarray(steps, float)
 
     def embed(mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
-        body = skin(mesh)
-        points = np.asarray(body.mesh.vertices)
-        width = float(np.append(tried[tried <= strength * (1 + 1e-9)], tried[-1])[0])
+        surface = make_surface(mesh)
+        points = np.asarray(surface.mesh.vertices)
+        step = float(np.append(tried[tried <= strength * (1 + 1e-9)], tried[-1])[0])
         target: Cells | None = None
-        for _ in range(_ROUNDS):
-            seen = _posed(body.mesh._replace(vertices=points), slabs)
-            volumes = _volumes(seen)
+        for _ in range(_MAX_ROUNDS):
+            posed = _posed(surface.mesh._replace(vertices=points), slabs)
+            volumes = _volumes(posed)
             if target is None:
-                target = _target(volumes, scatter(np.asarray(message, bool), key, "moments"), key, width)
+                target = _target(volumes, scatter(message, key, "moments"), key, step)
             with np.errstate(divide="ignore", invalid="ignore"):
-                off = np.where(np.isnan(target), 0, np.log(np.maximum(volumes, 0)) - target)
-            if np.abs(off).max() <= _NEAR * width:
+                error = np.where(np.isnan(target), 0, np.log(np.maximum(volumes, 0)) - target)
+            if np.abs(error).max() <= _TOLERANCE * step:
                 break
-            height = _deformation(seen, volumes, -off, ~np.isnan(target))
-            points = points + seen.size * height[:, None] * vertex_normals(seen.mesh) @ seen.frame.T
-        return body.moved(points)
+            height = _deformation(posed, volumes, -error, ~np.isnan(target))
+            points = points + posed.size * height[:, None] * vertex_normals(posed.mesh) @ posed.frame.T
+        return surface.moved(points)
 
     def read(suspect: Mesh, key: bytes, original: Mesh | None = None) -> Reading:
-        volumes = _volumes(_posed(skin(suspect).mesh, slabs))
+        volumes = _volumes(_posed(make_surface(suspect).mesh, slabs))
         chosen = _largest(volumes, bits)
         known = volumes[chosen] > 0
         value = np.log(np.where(known, volumes[chosen], 1))
@@ -109,15 +111,11 @@ def moments(bits: int, steps: Sequence[float] = STEPS) -> Method:
 
 
 def _posed(mesh: Mesh, slabs: int) -> Posed:
-    """Bring a surface into the pose of its volume moments.
-
-    Raises:
-        JaxmarkError: if it has no faces, or encloses nothing.
-    """
+    """Bring a surface into the pose of its volume moments; refuse one that has no faces or encloses nothing."""
     check_faces("The method moments", mesh)
     points, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    middle, length = points.mean(axis=0), float(np.ptp(points, axis=0).max())
-    points = (points - middle) / length
+    length = float(np.ptp(points, axis=0).max())
+    points = (points - points.mean(axis=0)) / length
     found = volume_moments(points[faces])
     if not abs(found.mass) > 1e-9 or not np.linalg.eigvalsh(found.covariance).min() > 0:
         raise JaxmarkError("This surface encloses no volume, and moments of volume are what the method writes in.")
@@ -129,68 +127,51 @@ def _posed(mesh: Mesh, slabs: int) -> Posed:
     one, two, three = (np.sum(corners**power, axis=1) for power in (1, 2, 3))
     skewness = volume @ ((one**3 + 3 * one * two + 2 * three) / 120) / found.mass / variance[::-1] ** 1.5
     sign = np.where(skewness < 0, -1.0, 1.0)
-    least = int(np.argmin(np.abs(skewness)))
-    sign[least] *= np.sign(np.linalg.det(axes * sign))
+    sign[np.argmin(np.abs(skewness))] *= np.sign(np.linalg.det(axes * sign))
     size, frame = abs(found.mass) ** (1 / 3), axes * sign
-    turned = Mesh(points @ frame / size, faces if found.mass > 0 else faces[:, ::-1])
-    return Posed(
-        turned, size * length, frame, (float(turned.vertices[:, 0].min()), float(turned.vertices[:, 0].max())), slabs
-    )
+    turned = points @ frame / size
+    ends = float(turned[:, 0].min()), float(turned[:, 0].max())
+    return Posed(Mesh(turned, faces if found.mass > 0 else faces[:, ::-1]), size * length, frame, ends, slabs)
 
 
-def _places(points: Points, ends: tuple[float, float], slabs: int) -> tuple[np.ndarray, np.ndarray]:
-    along = (points[:, 0] - ends[0]) * slabs / (ends[1] - ends[0])
-    return along, (np.arctan2(points[:, 2], points[:, 1]) / (2 * np.pi) + 0.5) * _SECTORS
-
-
-def _cell(along: np.ndarray, around: np.ndarray, slabs: int) -> Int64[np.ndarray, " places"]:
-    slab = np.clip(np.floor(along), 0, slabs - 1).astype(np.int64)
-    return slab * _SECTORS + np.minimum(around.astype(np.int64), _SECTORS - 1)
-
-
-def _volumes(seen: Posed) -> Cells:
-    """The volume between each patch and the axis: the flux of (0, y, z)/2, which no cut between patches has."""
-    triangles = np.asarray(seen.mesh.vertices)[np.asarray(seen.mesh.faces)]
+def _volumes(posed: Posed) -> Cells:
+    """Compute the volume between each patch and the axis: the flux of (0, y, z)/2, which no cut between patches has."""
+    triangles = np.asarray(posed.mesh.vertices)[np.asarray(posed.mesh.faces)]
     for turn in np.pi * 2 * np.arange(_SECTORS // 2) / _SECTORS:
         triangles = _cut(triangles, np.array([0, -np.sin(turn), np.cos(turn)]), 0.0)
-    for height in np.linspace(*seen.ends, seen.slabs + 1)[1:-1]:
+    for height in np.linspace(*posed.ends, posed.slabs + 1)[1:-1]:
         triangles = _cut(triangles, np.array([1.0, 0, 0]), height)
-    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    a, b, c = triangles.swapaxes(0, 1)
     middle = (a + b + c) / 3
     flux = (cross_product(b - a, c - a)[:, 1:] * middle[:, 1:]).sum(axis=1) / 4
-    return np.bincount(_cell(*_places(middle, seen.ends, seen.slabs), seen.slabs), flux, seen.slabs * _SECTORS)
+    return np.bincount(posed.cells(middle)[0], flux, posed.slabs * _SECTORS)
 
 
 def _cut(
     triangles: Float64[np.ndarray, "faces 3 3"], normal: Float64[np.ndarray, " 3"], height: float
 ) -> Float64[np.ndarray, "more 3 3"]:
-    """Triangles on one side of a plane each: those that it crosses are cut into three."""
+    """Cut the triangles that a plane crosses into three, so that each lies on one side."""
     side = triangles @ normal - height
     crossed = (side > 0).any(axis=1) & (side < 0).any(axis=1)
     part, side = triangles[crossed], side[crossed]
     positive = side > 0
     alone = np.argmax(positive ^ (positive.sum(axis=1) == 2)[:, None], axis=1)  # the corner alone on its side
     order = (alone[:, None] + np.arange(3)) % 3
-    part = np.take_along_axis(part, order[:, :, None], axis=1)
-    side = np.take_along_axis(side, order, axis=1)
+    part, side = np.take_along_axis(part, order[:, :, None], axis=1), np.take_along_axis(side, order, axis=1)
     share = side[:, :1] / (side[:, :1] - side[:, 1:])
-    a, b, c = part[:, 0], part[:, 1], part[:, 2]
+    a, b, c = part.swapaxes(0, 1)
     on_b, on_c = a + share[:, :1] * (b - a), a + share[:, 1:] * (c - a)
     made = [np.stack(corners, axis=1) for corners in ((a, on_b, on_c), (on_b, b, c), (on_b, c, on_c))]
     return np.concatenate([triangles[~crossed], *made])
 
 
 def _largest(volumes: Cells, bits: int) -> Int64[np.ndarray, " bits"]:
-    """The patches that carry bits, in the order of their places."""
+    """Return the patches that carry bits, in the order of their places."""
     return np.sort(np.argsort(-volumes, kind="stable")[:bits])
 
 
 def _target(volumes: Cells, written: Bits, key: bytes, step: float) -> Cells:
-    """The logarithms that volumes should have; NaN where any will do.
-
-    Raises:
-        JaxmarkError: if there are fewer patches than bits.
-    """
+    """Compute target logarithms of volumes, NaN where any will do; refuse a surface of too few patches."""
     chosen = _largest(volumes, len(written))
     if not volumes[chosen].min() > 0:
         raise JaxmarkError(
@@ -201,31 +182,30 @@ def _target(volumes: Cells, written: Bits, key: bytes, step: float) -> Cells:
     offset = uniform(key, "moments", "dither", len(volumes))[chosen] + written / 2
     nearest = step * (np.round(value / step - offset) + offset)
     target[chosen] = value + _COSTA * (nearest - value)
-    # What is not chosen stays below, so that the reader chooses the same; what is small may do as it likes.
-    most = target[chosen].min() - max(step / 2, _GAP)
-    rest = np.isnan(target) & (volumes > _NEARLY * math.exp(most))
+    # Patches that are not chosen stay below, so that the reader chooses the same; small ones are free.
+    most = target[chosen].min() - max(step / 2, _MIN_GAP)
+    rest = np.isnan(target) & (volumes > _NEARLY_LARGE * math.exp(most))
     target[rest] = np.minimum(np.log(volumes[rest]), most)
     return target
 
 
-def _deformation(seen: Posed, volumes: Cells, change: Cells, fixed: np.ndarray) -> Float64[np.ndarray, " points"]:
-    """The least motion along normals that changes logarithms of volumes, and not the pose."""
-    points, (along, around) = np.asarray(seen.mesh.vertices), seen.places
-    area = per_point(seen.mesh, face_areas(seen.mesh))
-    cell = _cell(along, around, seen.slabs)
-    along, around = along - np.floor(along), around - np.floor(around)
+def _deformation(posed: Posed, volumes: Cells, change: Cells, fixed: np.ndarray) -> Values:
+    """Compute the least motion along normals that changes logarithms of volumes, and not the pose."""
+    points, area = np.asarray(posed.mesh.vertices), per_point(posed.mesh, face_areas(posed.mesh))
+    cell, along, around = posed.cells(points)
     radius = np.hypot(points[:, 1], points[:, 2]) ** 2
     mask = _rise(along) * _rise(around) * radius / (radius + _AXIS**2)
     modes = mask[:, None] * np.stack([np.ones(len(mask)), np.sin(2 * np.pi * along), np.sin(2 * np.pi * around)], 1)
     x, y, z = points.T
     pose = np.stack([x, y, z, x * y, y * z, z * x])
 
-    def sums(weight: np.ndarray) -> Float64[np.ndarray, " unknowns"]:
-        return np.concatenate([np.bincount(cell, area * weight * mode, len(volumes)) for mode in modes.T])
+    def sums(weight: np.ndarray) -> Float64[np.ndarray, "3 cells"]:
+        return np.stack([np.bincount(cell, area * weight * mode, len(volumes)) for mode in modes.T])
 
-    own = np.concatenate([np.diag(part) for part in np.split(sums(np.ones(len(x))), 3)], axis=1)[fixed]
-    relative = own / np.maximum(volumes[fixed], 1e-9)[:, None] - sums(np.ones(len(x)))  # to the whole, which is 1
-    rows = np.concatenate([relative, [sums(row) for row in pose]])
+    whole = sums(np.ones(len(x)))
+    own = np.concatenate([np.diag(part) for part in whole], axis=1)[fixed]
+    relative = own / np.maximum(volumes[fixed], 1e-9)[:, None] - whole.ravel()  # to the whole, which is 1
+    rows = np.concatenate([relative, [sums(row).ravel() for row in pose]])
     cost = np.concatenate([np.bincount(cell, area * mode**2, len(volumes)) for mode in modes.T])
     inverse = np.where(cost > 0, 1 / np.maximum(cost, 1e-300), 0)
     wanted = np.append(change[fixed], np.zeros(len(pose)))
@@ -233,12 +213,12 @@ def _deformation(seen: Posed, volumes: Cells, change: Cells, fixed: np.ndarray) 
     return (modes * amplitude.reshape(3, -1).T[cell]).sum(axis=1)
 
 
-def _rise(place: Float64[np.ndarray, " points"]) -> Float64[np.ndarray, " points"]:
-    """The mask across a patch: from 0 at its rims smoothly to 1."""
+def _rise(place: Values) -> Values:
+    """Compute the mask across a patch: from 0 at its rims smoothly to 1."""
     return (1 - np.cos(np.pi * np.minimum(np.minimum(place, 1 - place) / _RIM, 1))) / 2
 
 
 def _log10_tail(agreement: float, count: int) -> float:
-    """Chernoff's bound on the probability that as many cosines of random angles add up to this: E exp(λ cos) is I₀."""
+    """Bound the probability that cosines of random angles add up to this, by Chernoff: E exp(λ cos) is I₀."""
     rate = np.append(0.0, np.geomspace(1e-3, 1e4, 200))
     return float(np.min(count * (np.log(ive(0, rate)) + rate) - rate * agreement)) / math.log(10)

@@ -1,4 +1,4 @@
-"""How strong a mark may be: the strength of any method that keeps limits of distortion, found by trying."""
+"""The strength of a mark under limits of distortion, the same search for every method."""
 
 import math
 from collections.abc import Mapping
@@ -13,9 +13,9 @@ from jaxmark.geometry.mesh import Mesh, Weld, diagonal, weld
 from jaxmark.geometry.pose import similarity
 from jaxmark.watermark.perception.budget import largest_within
 
-_REFUSED = 2.0  # what a refused strength counts as, over the limits
+_REFUSED = 2.0  # the distortion over the limits that a refused strength counts as
 _TORN = 1e-9  # of the diagonal: rounding
-SHARE = 0.95  # of the limits, as good as all of them: every try is one embedding
+SHARE = 0.95  # of the limits that a mark must reach: each further trial is an embedding
 
 
 class Fitted(NamedTuple):
@@ -28,10 +28,9 @@ class Fitted(NamedTuple):
 
 
 def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[str, float]) -> Fitted:
-    """Embed with the largest strength that keeps limits, the same search for every method.
+    """Embed with the largest strength that keeps limits.
 
-    What a mark does to the pose is undone by the similarity that fits best: a message in the pose would cost nothing
-    that a metric sees.
+    The similarity that fits best is undone: a message in the pose would cost nothing that a metric measures.
 
     Args:
         method: the method; its `strengths` bound the search.
@@ -45,7 +44,7 @@ def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[s
             needs, tears copies of a vertex apart, or refuses the mesh.
     """
     reference, welded, (weakest, strongest) = Reference(mesh), weld(mesh.vertices), method.strengths
-    best: list[Fitted] = []
+    fitted: list[Fitted] = []
     tries, refusal = 0, ""
 
     def ratio(strength: float) -> float:
@@ -58,35 +57,31 @@ def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[s
         except JaxmarkError as error:  # too strong for this mesh, or else the weakest is refused, too
             refusal = str(error)
             return _REFUSED
-        reached = {str(name): value for name, value in reference.measure(marked, limits.keys()).items()}
-        if gone := [name for name, value in reached.items() if value is None]:
-            raise JaxmarkError(f"The metric {gone[0]!r} needs the original's connectivity, which the mark changes.")
-        found = {name: value or 0.0 for name, value in reached.items()}
-        worst = max(found[name] / limit for name, limit in limits.items())
+        reached = {}
+        for name, value in reference.measure(marked, limits.keys()).items():
+            if value is None:
+                raise JaxmarkError(f"The metric {name!r} needs the original's connectivity, which the mark changes.")
+            reached[str(name)] = value
+        worst = max(reached[name] / limit for name, limit in limits.items())
         if worst <= 1:
-            best.append(Fitted(marked, strength, found, tries))
+            fitted.append(Fitted(marked, strength, reached, tries))
         return worst
 
     try:
         largest_within(ratio, strongest, math.sqrt(weakest * strongest), SHARE)
     except JaxmarkError:
         # The search stops above a strength that is not within the limits, but the weakest may be.
-        if not best and ratio(weakest) > 1:
+        if not fitted and ratio(weakest) > 1:
             raise
-    return max(best, key=lambda one: one.strength)._replace(tries=tries)
+    return max(fitted, key=lambda one: one.strength)._replace(tries=tries)
 
 
 def _in_pose_of(mesh: Mesh, marked: Mesh, welded: Weld) -> Mesh:
-    """A marked mesh brought back onto its original.
-
-    Raises:
-        JaxmarkError: if copies of a vertex are no longer at one place, which metrics of the surface do not see.
-    """
+    """Register a marked mesh to its original; refuse one whose copies of a vertex are no longer at one place."""
     if len(marked.vertices) != len(mesh.vertices):
         return marked  # metrics refuse it
     before, after = (np.asarray(one.vertices, np.float64) for one in (mesh, marked))
     points = after[welded.first]
     if np.abs(points[welded.point] - after).max() > _TORN * diagonal(mesh):
         raise JaxmarkError("The mark tears vertices apart that are copies of one point.")
-    pose = similarity(after, before)
-    return Mesh(pose(points)[welded.point], marked.faces)
+    return Mesh(similarity(after, before)(points)[welded.point], marked.faces)

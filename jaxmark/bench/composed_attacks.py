@@ -1,4 +1,4 @@
-"""What happens to objects outside of a modelling tool, composed of the library's attacks; host side."""
+"""Attacks of the league `2026` that are composed of several of the library's; on the host."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -17,10 +17,10 @@ from jaxmark.geometry import asteroid
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, face_normals
 
 _SIZE = 100.0  # mm, the longest side of an object that is printed
-_SCAN_NOISE, _SCAN_LENGTH = 0.05, 2.0  # mm: its standard deviation, and how far it is correlated
+_SCAN_NOISE, _SCAN_LENGTH = 0.05, 2.0  # mm: its standard deviation, and its correlation length
 _SCAN_COVERAGE, _SCAN_POINTS, _SCAN_DEPTH = 0.8, 200_000, 8
-_SCAN_REACH = 1.5  # mm from a scanned point up to which a surface is believed
-_WAVES = 256  # of which correlated noise is the sum
+_SCAN_REACH = 1.5  # mm from a scanned point up to which a surface is kept
+_WAVES = 256  # in the sum that approximates correlated noise
 
 Points = Float64[np.ndarray, "points 3"]
 
@@ -34,7 +34,7 @@ def _remesh_smooth_remesh(mesh: Mesh, strength: float, random: np.random.Generat
 
 
 def _mirror(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """The mirror image in any pose, with a share of its edges flipped."""
+    """Reflect and rotate, and flip a share of the edges."""
     vertices = Rotation.random(rng=random).apply(np.asarray(mesh.vertices) * [-1, 1, 1])
     mirrored = Mesh(vertices, np.asarray(mesh.faces)[:, ::-1].copy())
     return attack(mirrored, "edge-flips", strength, seed=_seed(random)) if strength else mirrored
@@ -45,13 +45,13 @@ def _mirror_remeshed(mesh: Mesh, strength: float, random: np.random.Generator) -
 
 
 def _decimate_loop(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """Simplified, and subdivided until there are nearly as many vertices again."""
+    """Simplify, and subdivide until there are nearly as many vertices again."""
     steps = max(round(-np.log(1 - strength) / np.log(4)), 1)
     return chain(mesh, [("simplification", strength), ("loop", steps)], seed=_seed(random))
 
 
 def _print_scan(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """Printed in layers of so many mm at 10 cm, and scanned: noise, a fifth unseen, and a surface of the points."""
+    """Print in layers of `strength` mm at 10 cm, and scan: noise, a fifth unseen, and a surface of the points."""
     import trimesh  # takes long to import
 
     mesh = compact(mesh)
@@ -73,7 +73,7 @@ def _print_scan(mesh: Mesh, strength: float, random: np.random.Generator) -> Mes
 
 
 def _correlated(points: Points, length: float, random: np.random.Generator) -> Float64[np.ndarray, " points"]:
-    """Noise of unit variance at points, of Gaussian covariance exp(-d²/2 length²): a sum of random waves."""
+    """Draw noise of unit variance at points, of Gaussian covariance exp(-d²/2 length²): a sum of random waves."""
     waves, phases = random.normal(size=(3, _WAVES)) / length, random.uniform(0, 2 * np.pi, _WAVES)
     total = np.zeros(len(points))
     for wave, phase in zip(waves.T, phases, strict=True):
@@ -82,29 +82,27 @@ def _correlated(points: Points, length: float, random: np.random.Generator) -> F
 
 
 def _slicer(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """Through a slicer: turned, set down in mm, as STL, and out again as text with so many digits, in another order."""
+    """Export from a slicer: rotated, in mm, as STL, then as text with `strength` digits, in another order."""
     vertices = Rotation.random(rng=random).apply(np.asarray(mesh.vertices, np.float64))
     vertices *= _SIZE / np.ptp(vertices, axis=0).max()
-    laid = Mesh(vertices - [*vertices.mean(axis=0)[:2], vertices[:, 2].min()], mesh.faces)
-    return chain(laid, [("soup", 1), ("digits", strength), ("reordering", 1)], seed=_seed(random))
+    placed = Mesh(vertices - [*vertices.mean(axis=0)[:2], vertices[:, 2].min()], mesh.faces)
+    return chain(placed, [("soup", 1), ("digits", strength), ("reordering", 1)], seed=_seed(random))
 
 
 def _draco(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """Through Draco, with so many bits for a coordinate."""
     draco = require("DracoPy", "files")
-    points, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
-    coded = draco.encode(points.astype(np.float32), faces.astype(np.uint32), quantization_bits=int(strength))
-    found = draco.decode(coded)
+    points, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32)
+    found = draco.decode(draco.encode(points, faces, quantization_bits=int(strength)))
     return Mesh(np.asarray(found.points, np.float64).reshape(-1, 3), np.asarray(found.faces, np.int64).reshape(-1, 3))
 
 
 def _gltf(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """As `KHR_mesh_quantization` and its tools leave a mesh: whole numbers, single precision, another order."""
+    """Quantise coordinates in single precision and reorder, as tools for `KHR_mesh_quantization` do."""
     return chain(mesh, [("quantisation", strength), ("float-bits", 32), ("reordering", 1)], seed=_seed(random))
 
 
 def _graft(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """What is left beyond a plane, grown into another model that takes the place of what is lost."""
+    """Cut off a part by a plane, and put another model in its place."""
     kept = attack(mesh, "cropping", strength, seed=_seed(random))
     whole, left = np.asarray(mesh.vertices), np.asarray(kept.vertices)
     lost = (whole.sum(axis=0) - left.sum(axis=0)) / max(len(whole) - len(left), 1)
@@ -114,7 +112,7 @@ def _graft(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
     return Mesh(np.concatenate([left, placed]), np.concatenate([kept.faces, len(left) + np.asarray(other.faces)]))
 
 
-#: What an attacker chooses from, each with strengths of rising severity.
+#: The attacks of an attacker with a budget, each with strengths of rising severity.
 CHOICES: Mapping[str, Sequence[float]] = {
     "noise": tuple(np.geomspace(1e-5, 0.1, 64)),
     "smoothing": tuple(np.unique(np.geomspace(1, 1000, 48).astype(int))),
@@ -124,24 +122,36 @@ CHOICES: Mapping[str, Sequence[float]] = {
 }
 
 
-def _attacked_to(kind: str, mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """As strongly as a difference of structure (MSDM2) allows, found by bisection of the strengths in `CHOICES`."""
-    reference, seed, found = Reference(mesh), _seed(random), None
-    held, broken = -1, len(CHOICES[kind])
-    while broken - held > 1:
-        middle = (held + broken) // 2
-        tried = attack(mesh, kind, float(CHOICES[kind][middle]), seed=seed)
-        if (reference.measure(tried, ["msdm2"])["msdm2"] or 0.0) <= strength:
-            held, found = middle, tried
-        else:
-            broken = middle
-    if found is None:
-        raise JaxmarkError(f"Even the weakest {kind} exceeds an MSDM2 of {strength:g} on this mesh.")
-    return found
+def last_within(count: int, within: Callable[[int], bool]) -> int:
+    """Bisect for the last of `count` places of rising severity that is within a limit; -1 if none is."""
+    low, high = -1, count
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if within(middle) else (low, middle)
+    return low
 
 
 def _host(apply: Callable[[Mesh, float, np.random.Generator], Mesh], unit: str, *strengths: float) -> Attack:
     return Attack(apply, unit, strengths, host=True, faces=True)
+
+
+def to_budget(kind: str) -> Attack:
+    """Make an attack as strong as its MSDM2 allows, found by bisection of the strengths in `CHOICES`."""
+
+    def attacked(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
+        reference, seed = Reference(mesh), _seed(random)
+
+        def at(place: int) -> Mesh:
+            return attack(mesh, kind, float(CHOICES[kind][place]), seed=seed)
+
+        def within(place: int) -> bool:
+            return (reference.measure(at(place), ["msdm2"])["msdm2"] or 0.0) <= strength
+
+        if (last := last_within(len(CHOICES[kind]), within)) < 0:
+            raise JaxmarkError(f"Even the weakest {kind} exceeds an MSDM2 of {strength:g} on this mesh.")
+        return at(last)
+
+    return _host(attacked, "MSDM2", 0.3, 0.5)
 
 
 REMESH_SMOOTH_REMESH = _host(_remesh_smooth_remesh, "pairs of steps between two remeshings", 10)
@@ -153,12 +163,3 @@ SLICER = _host(_slicer, "significant digits", 5)
 DRACO = _host(_draco, "bits per coordinate", 14, 11)
 GLTF = _host(_gltf, "bits per coordinate", 16, 12)
 GRAFT = _host(_graft, "share of the vertices that another model replaces", 0.5)
-
-
-def to_budget(kind: str) -> Attack:
-    """An attack that is as strong as its own difference of structure allows."""
-
-    def attacked(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-        return _attacked_to(kind, mesh, strength, random)
-
-    return _host(attacked, "MSDM2", 0.3, 0.5)

@@ -1,35 +1,34 @@
 """Cho, Prost, Jung, "An oblivious watermarking for 3-D polygonal meshes using distribution of vertex norms", 2007.
 
 IEEE Transactions on Signal Processing 55 (1), 142-155. The distances of vertices to their centre are sorted into as
-many bins of equal width as there are bits. In each, distances are brought to the unit interval by the smallest and the
-largest one there, and raised to a power of which their mean (method I) or their variance (method II) lies above or
-below that of a uniform distribution by the strength. The reader compares it with that of the uniform distribution.
+many bins of equal width as there are bits. In each bin, distances are mapped to the unit interval and raised to a
+power, such that their mean (method I) or their variance (method II) differs from that of a uniform distribution by the
+strength, above or below. The reader compares it with that of the uniform distribution.
 
 Chosen here, where the publication is silent. Powers are found by bisection, instead of in steps of 0.001. The centre
-is the one that the reader will find, by a few rounds, as a mark moves it. Copies of a point count once. Bits are
-scattered by a key. There is no detector: the score is the margin that three bits in four exceed, which does not depend
-on the key.
+is the one that the reader will find, by fixed-point iteration, as a mark moves it. Copies of a point count once. Bits
+are scattered by a key. There is no detector: the score is the margin that three bits in four exceed, which does not
+depend on the key.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from jaxmark.bench.method import Bits, Method, Reading
-from jaxmark.bench.methods.draws import gather, scatter
-from jaxmark.bench.methods.surface import skin
+from jaxmark.bench.methods.primitives import decode_margins, make_surface, scatter
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.pose import Points
 
 ANCHOR = "bit error rates of SMI 2010 at both of its limits, within 0.1 in the mean (benchmarks/robustness/anchors.py)"
 SOURCE = "Cho, Prost, Jung, IEEE Transactions on Signal Processing 55 (1), 2007"
-_ROUNDS, _STILL = 30, 1e-12  # of finding the centre; its motion, over the largest distance, that ends them
-_HALVINGS = 50  # of the interval of a power
-_POWERS = (1 / 64, 64.0)  # between which one is sought
-_SURE = 0.25  # quantile of the margins
+_MAX_ROUNDS, _TOLERANCE = 30, 1e-12  # of the centre's iteration; its last step over the largest distance
+_BISECTIONS = 50  # of the interval of a power
+_POWERS = (1 / 64, 64.0)  # range of powers
 
 Values = Float64[np.ndarray, " points"]
 PerBin = Float64[np.ndarray, " bins"]
@@ -44,70 +43,64 @@ class Bins(NamedTuple):
     high: PerBin
 
     def mean(self, values: Values) -> PerBin:
-        """The mean of some values in each bin; 0 in an empty one."""
+        """The mean of values in each bin; 0 in an empty one."""
         count = np.bincount(self.place, minlength=len(self.low))
         return np.bincount(self.place, values, len(self.low)) / np.maximum(count, 1)
 
 
 class Statistic(NamedTuple):
-    """What carries a bit: the mean of a bin, or its variance."""
+    """The statistic of a bin that carries a bit: its mean, or its variance."""
 
     name: str
-    uniform: float  # of the uniform distribution
+    anchor: str
+    uniform: float  # its value for the uniform distribution
     raised: Callable[[Values, Values], Values]  # values in the unit interval, by powers
     of: Callable[[Bins, Values], PerBin]
 
 
-def _both_ways(inside: Values, power: Values) -> Values:
-    """Values about the middle of their interval, raised by their distance from it (eq. 13)."""
+def _raise_about_middle(inside: Values, power: Values) -> Values:
+    """Raise the distance of values from the middle of their interval to a power (eq. 13)."""
     about = 2 * inside - 1
     return (1 + np.sign(about) * np.abs(about) ** power) / 2
 
 
+def _variance(bins: Bins, inside: Values) -> PerBin:
+    return bins.mean((2 * inside - 1) ** 2)
+
+
 # The mean of a uniform variable's power k is 1/(k + 1) (eq. 7), the variance of one about 0 is 1/(2k + 1) (eq. 14).
-MEAN = Statistic("cho", 1 / 2, lambda inside, power: inside**power, lambda bins, inside: bins.mean(inside))
-VARIANCE = Statistic("cho-variance", 1 / 3, _both_ways, lambda bins, inside: bins.mean((2 * inside - 1) ** 2))
+MEAN = Statistic("cho", ANCHOR, 1 / 2, np.power, Bins.mean)
+VARIANCE = Statistic("cho-variance", "", 1 / 3, _raise_about_middle, _variance)
 
 
-def cho(bits: int) -> Method:
-    """Method I, by means; strengths are shifts of a bin's mean, over its width."""
-    return _method(MEAN, bits, ANCHOR)
-
-
-def cho_variance(bits: int) -> Method:
-    """Method II, by variances; strengths are shifts of the variance of a bin that reaches from -1 to 1."""
-    return _method(VARIANCE, bits, "")
-
-
-def _method(statistic: Statistic, bits: int, anchor: str) -> Method:
+def _method(statistic: Statistic, bits: int) -> Method:
     def embed(mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
-        body = skin(mesh)
-        points = np.asarray(body.mesh.vertices)
-        written = scatter(np.asarray(message, bool), key, statistic.name)
-        centre, marked = points.mean(axis=0), points
-        for _ in range(_ROUNDS):
+        surface, written = make_surface(mesh), scatter(message, key, statistic.name)
+        points = marked = np.asarray(surface.mesh.vertices)
+        centre = points.mean(axis=0)
+        for _ in range(_MAX_ROUNDS):
             marked = _mapped(points, centre, statistic, written, strength)
             before, centre = centre, marked.mean(axis=0)
-            if np.linalg.norm(centre - before) <= _STILL * np.abs(points - centre).max():
+            if np.linalg.norm(centre - before) <= _TOLERANCE * np.abs(points - centre).max():
                 break
-        return body.moved(marked)
+        return surface.moved(marked)
 
     def read(suspect: Mesh, key: bytes, original: Mesh | None = None) -> Reading:
-        points = np.asarray(skin(suspect).mesh.vertices)
+        points = np.asarray(make_surface(suspect).mesh.vertices)
         bins = _bins(np.linalg.norm(points - points.mean(axis=0), axis=1), bits)
         margin = statistic.of(bins, bins.inside) - statistic.uniform
-        margin[bins.high == bins.low] = 0
-        return Reading(gather(margin > 0, key, statistic.name), float(np.quantile(np.abs(margin), _SURE)))
+        return decode_margins(np.where(bins.high > bins.low, margin, 0), key, statistic.name)
 
-    return Method(statistic.name, embed, read, True, bits, (1e-4, 0.3), SOURCE, anchor)
+    return Method(statistic.name, embed, read, True, bits, (1e-4, 0.3), SOURCE, statistic.anchor)
+
+
+# Method I, by means, and II, by variances; strengths are shifts of a bin's mean over its width, and shifts of the
+# variance of a bin that reaches from -1 to 1.
+cho, cho_variance = partial(_method, MEAN), partial(_method, VARIANCE)
 
 
 def _bins(distance: Values, count: int) -> Bins:
-    """Sort distances into bins (eq. 3-5).
-
-    Raises:
-        JaxmarkError: if all points are equally far from their centre.
-    """
+    """Sort distances into bins (eq. 3-5); refuse points that are equally far from their centre."""
     least, most = distance.min(), distance.max()
     if not most > least:
         raise JaxmarkError("All points are equally far from their centre, so that nothing can be written there.")
@@ -115,15 +108,14 @@ def _bins(distance: Values, count: int) -> Bins:
     low, high = np.full(count, np.inf), np.full(count, -np.inf)
     np.minimum.at(low, place, distance)
     np.maximum.at(high, place, distance)
-    low, high = np.where(np.isfinite(low), low, 0), np.where(np.isfinite(high), high, 0)
-    width = np.where(high > low, high - low, 1)
-    return Bins(place, (distance - low[place]) / width[place], low, high)
+    low[np.isinf(low)] = high[np.isinf(high)] = 0
+    return Bins(place, (distance - low[place]) / np.where(high > low, high - low, 1)[place], low, high)
 
 
 def _mapped(
     points: Points, centre: Float64[np.ndarray, " 3"], statistic: Statistic, written: Bits, strength: float
 ) -> Points:
-    """Points whose distances to a centre have been mapped, in each bin by its power."""
+    """Map the distances of points to a centre, in each bin by its power."""
     arm = points - centre
     distance = np.linalg.norm(arm, axis=1)
     bins = _bins(distance, len(written))
@@ -132,7 +124,7 @@ def _mapped(
     up, down = statistic.uniform + strength, statistic.uniform - strength
     target = np.where(written, np.maximum(now, up), np.minimum(now, down))
     low, high = np.log(np.full((2, len(written)), np.array(_POWERS)[:, None]))
-    for _ in range(_HALVINGS):
+    for _ in range(_BISECTIONS):
         middle = (low + high) / 2
         above = statistic.of(bins, statistic.raised(bins.inside, np.exp(middle)[bins.place])) > target
         low, high = np.where(above, middle, low), np.where(above, high, middle)
