@@ -4,7 +4,6 @@ Those of `jaxmark.attacks` happen to any mesh; these are made against a watermar
 which can stand wherever a name in `ATTACKS` can; `ambiguity` attacks what a detection proves.
 """
 
-from jaxmark.adversaries._jamming import jamming as jamming
 from jaxmark.adversaries.ambiguity import Search as Search
 from jaxmark.adversaries.ambiguity import forge_original as forge_original
 from jaxmark.adversaries.ambiguity import search_key as search_key
@@ -22,8 +21,6 @@ from jaxmark.adversaries.expected import evidence as evidence
 from jaxmark.adversaries.expected import make_surrogate as make_surrogate
 from jaxmark.adversaries.expected import random_mark as random_mark
 from jaxmark.adversaries.expected import rescale as rescale
-from jaxmark.adversaries.filtering import band_stop as band_stop
-from jaxmark.adversaries.filtering import low_pass as low_pass
 from jaxmark.adversaries.key_holder import erasure as erasure
 from jaxmark.adversaries.key_holder import erasure_by_descent as erasure_by_descent
 from jaxmark.adversaries.keyless import Family as Family
@@ -48,5 +45,8 @@ from jaxmark.adversaries.oracle import score_oracle as score_oracle
 from jaxmark.adversaries.registry import ATTACKS as ATTACKS
 from jaxmark.adversaries.registry import attack as attack
 from jaxmark.adversaries.registry import attack_each as attack_each
+from jaxmark.adversaries.registry import band_stop as band_stop
 from jaxmark.adversaries.registry import chain as chain
 from jaxmark.adversaries.registry import get_attack as get_attack
+from jaxmark.adversaries.registry import jamming as jamming
+from jaxmark.adversaries.registry import low_pass as low_pass

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmark.adversaries.registry import ATTACKS, attack
-from jaxmark.attacks.registry import Attack
+from jaxmark.attacks.attack import Attack
 from jaxmark.distortion import METRICS, Reference
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxmark.adversaries.registry import attack
-from jaxmark.attacks.registry import Attack
+from jaxmark.attacks.attack import Attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, host_mesh, same_connectivity, weld, weld_mesh
 from jaxmark.seeds import Randomness, generator

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Float64
 from jaxmark.adversaries.expected import strongest_evidence
 from jaxmark.alignment.attempts import align
 from jaxmark.alignment.observation import Observation
-from jaxmark.attacks.registry import Attack
+from jaxmark.attacks.attack import Attack
 from jaxmark.distortion import rms
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, weld

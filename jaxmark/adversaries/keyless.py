@@ -30,7 +30,7 @@ from jaxmark.adversaries.expected import (
     rescale,
 )
 from jaxmark.alignment.original import displace
-from jaxmark.attacks.registry import Attack
+from jaxmark.attacks.attack import Attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.seeds import Randomness, random_key

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Float64, PRNGKeyArray
 
 from jaxmark.adversaries.expected import Surrogate, evidence, make_surrogate, random_mark, rescale, rms
 from jaxmark.adversaries.keyless import MARK, make_attack
-from jaxmark.attacks.registry import Attack
+from jaxmark.attacks.attack import Attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.bands import intervals

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from jaxmark.adversaries._jamming import through_bands
-from jaxmark.attacks.registry import Attack
+from jaxmark.adversaries.registry import through_bands
+from jaxmark.attacks.attack import Attack
 from jaxmark.distortion import rms
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.canonical import geometry_hash

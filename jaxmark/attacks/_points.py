@@ -1,10 +1,13 @@
-"""What happens to point clouds: points are lost, added, thrown off, merged with another scan, or sampled anew."""
+"""Attacks on point clouds, on the host: points are lost, added, displaced, merged with another scan, or sampled again.
+
+All raise `JaxmarkError` if the mesh has faces.
+"""
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import KDTree
 
-from jaxmark.attacks.host import on_host
+from jaxmark.attacks.support import check_share, on_host
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, diagonal
 from jaxmark.seeds import Randomness, generator
@@ -14,84 +17,63 @@ _CORNERS = 6  # nearest points among which two span a triangle with a point
 
 
 @on_host
-def subsampling(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
+def subsampling(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     """Lose points at random; the others stay where they are, in their order.
 
-    Args:
-        mesh: a point cloud, concrete.
-        strength: share of the points that are lost, in [0, 1).
-        key: a JAX random key or a NumPy generator.
+    The strength is the share of the points that are lost, in [0, 1).
 
     Raises:
-        JaxmarkError: if the mesh has faces, the share is out of range, or no point would be left.
+        JaxmarkError: if the mesh has faces, or no point would be left.
     """
-    points, count = _points("Subsampling", mesh), _share(strength, mesh)
+    points = _points("Subsampling", mesh)
+    check_share(strength, "points")
+    count = round(strength * len(points))
     if count == len(points):
         raise JaxmarkError(f"Of {len(points)} points none would be left; take fewer away.")
-    return _cloud(points[np.sort(generator(key).permutation(len(points))[count:])])
+    return _cloud(points[np.sort(generator(seed).permutation(len(points))[count:])])
 
 
 @on_host
-def outliers(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
+def outliers(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     """Throw points off to random places in and around the cloud's box.
 
-    Args:
-        mesh: a point cloud, concrete.
-        strength: share of the points that are thrown off, in [0, 1).
-        key: a JAX random key or a NumPy generator.
-
-    Raises:
-        JaxmarkError: if the mesh has faces, or the share is out of range.
+    The strength is the share of the points that are thrown off, in [0, 1).
     """
-    points, random = np.array(_points("Throwing points off", mesh)), generator(key)
-    chosen = random.permutation(len(points))[: _share(strength, mesh)]
+    points, random = np.array(_points("Throwing points off", mesh)), generator(seed)
+    check_share(strength, "points")
+    chosen = random.permutation(len(points))[: round(strength * len(points))]
     points[chosen] = _anywhere(mesh, len(chosen), random)
     return _cloud(points)
 
 
 @on_host
-def floaters(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
+def floaters(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     """Add points at random places in and around the cloud's box, in random order among the others.
 
-    Args:
-        mesh: a point cloud, concrete.
-        strength: number of points that are added, over those that are there.
-        key: a JAX random key or a NumPy generator.
-
-    Raises:
-        JaxmarkError: if the mesh has faces.
+    The strength is the number of points that are added, over those that are there.
     """
-    points, random = _points("Adding points", mesh), generator(key)
+    points, random = _points("Adding points", mesh), generator(seed)
     more = _anywhere(mesh, round(strength * len(points)), random)
     return _cloud(random.permutation(np.concatenate([points, more])))
 
 
 @on_host
-def merging(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
+def merging(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     """Merge the cloud with a second scan of as many points on the same surface, in random order.
 
-    Args:
-        mesh: a point cloud, concrete.
-        strength: half width of the uniform noise on each coordinate of the second scan, over the diagonal.
-        key: a JAX random key or a NumPy generator.
-
-    Raises:
-        JaxmarkError: if the mesh has faces.
+    The strength is the half width of the uniform noise on each coordinate of the second scan, over the diagonal.
     """
-    points, random = _points("Merging scans", mesh), generator(key)
+    points, random = _points("Merging scans", mesh), generator(seed)
     second = _between(points, len(points), random)
     second += strength * diagonal(mesh) * random.uniform(-1, 1, second.shape)
     return _cloud(random.permutation(np.concatenate([points, second])))
 
 
 @on_host
-def resampling(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
-    """Sample the surface anew: random places between points that are near each other take the place of all points.
+def resampling(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
+    """Sample the surface again: random places between points that are near each other take the place of all points.
 
-    Args:
-        mesh: a point cloud, concrete.
-        strength: number of new points, over those that were there.
-        key: a JAX random key or a NumPy generator.
+    The strength is the number of new points, over those that were there.
 
     Raises:
         JaxmarkError: if the mesh has faces, or no point would be left.
@@ -99,7 +81,7 @@ def resampling(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
     points = _points("Resampling", mesh)
     if not round(strength * len(points)):
         raise JaxmarkError(f"{strength:g} times {len(points)} points are none; take more.")
-    return _cloud(_between(points, round(strength * len(points)), generator(key)))
+    return _cloud(_between(points, round(strength * len(points)), generator(seed)))
 
 
 def _points(name: str, mesh: Mesh) -> Float64[np.ndarray, "points 3"]:
@@ -107,12 +89,6 @@ def _points(name: str, mesh: Mesh) -> Float64[np.ndarray, "points 3"]:
     if len(mesh.faces):
         raise JaxmarkError(f"{name} takes a point cloud, and this mesh has {len(mesh.faces)} faces; leave them out.")
     return np.asarray(mesh.vertices, np.float64)
-
-
-def _share(share: float, mesh: Mesh) -> int:
-    if not 0 <= share < 1:
-        raise JaxmarkError(f"A share of points is at least 0 and below 1, got {share:g}.")
-    return round(share * len(mesh.vertices))
 
 
 def _cloud(points: Float64[np.ndarray, "points 3"]) -> Mesh:

@@ -1,13 +1,13 @@
-"""Edge flips: remeshing that keeps the number of edges and the positions of vertices (Sohn et al.)."""
+"""Other faces on the same points: edge flips (Sohn et al.), and reordering; on the host."""
 
 import math
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from jaxmark.attacks.host import on_host
+from jaxmark.attacks.support import check_share, on_host
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, edges, sides, unit
+from jaxmark.geometry.mesh import Mesh, edges, sides, unit, used_vertices
 from jaxmark.seeds import Randomness, generator
 
 _MIN_HEIGHT_RATIO = 0.01  # height of a new face over its longest side
@@ -16,30 +16,22 @@ Codes = Int64[np.ndarray, " edges"]
 
 
 @on_host
-def edge_flips(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
-    """Replace edges between two faces by the other diagonals of their quadrilaterals; on the host, in NumPy.
+def edge_flips(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
+    """Replace edges between two faces by the other diagonals of their quadrilaterals.
 
     An edge is flipped only if exactly two faces of consistent orientation share it, and if neither new face is thin
     (height below 1 % of the longest side) nor turned by 90 degrees or more from the mean of the old faces' unit
     normals. No flip makes an edge that exists or existed before, and no new edge is flipped again. So the numbers of
     vertices, edges and faces stay, no edge gets a third face, and exactly the share of the edges that was asked for is
-    replaced.
-
-    Args:
-        mesh: any mesh, concrete. Vertices are not welded: an edge between two copies of a point has no second face.
-        strength: share of the edges to flip, in [0, 1]; which ones is random.
-        key: a JAX random key or a NumPy generator.
-
-    Returns:
-        The mesh with as many faces as before; unchanged faces keep their places.
+    replaced. Unchanged faces keep their places. Vertices are not welded: an edge between two copies of a point has no
+    second face. The strength is the share of the edges to flip, in [0, 1]; which ones is random.
 
     Raises:
-        JaxmarkError: if the share is outside [0, 1], or fewer edges than that can be flipped.
+        JaxmarkError: if fewer edges than that can be flipped.
     """
-    if not 0 <= strength <= 1:
-        raise JaxmarkError(f"A share of edges to flip is in [0, 1], got {strength:g}.")
+    check_share(strength, "edges to flip", closed=True)
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
-    random = generator(key)
+    random = generator(seed)
     present = _codes(edges(faces), len(vertices))
     total, made = len(present), np.zeros(0, np.int64)
     wanted = round(strength * total)
@@ -114,3 +106,30 @@ def _choose_independent(
     chosen = np.flatnonzero((least[beside] == rank[:, None]).all(axis=1))
     chosen = chosen[np.argsort(rank[chosen])]
     return chosen[np.sort(np.unique(new[chosen], return_index=True)[1])]
+
+
+@on_host
+def reordering(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
+    """Permute random vertices among themselves, and random faces among themselves; the surface stays.
+
+    Each of these faces also starts at a random corner; its orientation stays. A vertex that no face uses keeps its
+    place. The strength is the share of the vertices and of the faces that change places, in [0, 1]; 1 for all of them.
+    """
+    check_share(strength, "vertices and faces to reorder", closed=True)
+    random, faces = generator(seed), np.asarray(mesh.faces, np.int64)
+    here, there = _cycle(np.flatnonzero(used_vertices(mesh)), strength, random)
+    vertices, place = np.array(mesh.vertices), np.arange(len(mesh.vertices))
+    vertices[there], place[here] = vertices[here], there
+    faces = place[faces]
+    here, there = _cycle(np.arange(len(faces)), strength, random)
+    corner = (random.integers(3, size=(len(here), 1)) + np.arange(3)) % 3
+    faces[there] = np.take_along_axis(faces[here], corner, axis=1)
+    return Mesh(vertices, faces)
+
+
+def _cycle(
+    indices: Int64[np.ndarray, " indices"], share: float, random: np.random.Generator
+) -> tuple[Int64[np.ndarray, " chosen"], Int64[np.ndarray, " chosen"]]:
+    """A random share of some indices, and for each the index that it moves to: a cyclic permutation."""
+    chosen = random.permutation(indices)[: round(share * len(indices))]
+    return chosen, np.roll(chosen, 1)
