@@ -1,15 +1,15 @@
 """Attacks on point clouds, on the host: points are lost, added, displaced, merged with another scan, or sampled again.
 
-All raise `JaxmarkError` if the mesh has faces.
+All raise `JaxmarkError` if the mesh has faces, or if no point would be left.
 """
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.spatial import KDTree
 
 from jaxmark.attacks.support import check_share, on_host
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, diagonal
+from jaxmark.geometry.pose import Points
 from jaxmark.seeds import Randomness, generator
 
 _AROUND = 0.25  # width of what lies around a cloud's box on each side, over its diagonal
@@ -21,16 +21,13 @@ def subsampling(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     """Lose points at random; the others stay where they are, in their order.
 
     The strength is the share of the points that are lost, in [0, 1).
-
-    Raises:
-        JaxmarkError: if the mesh has faces, or no point would be left.
     """
     points = _points("Subsampling", mesh)
     check_share(strength, "points")
     count = round(strength * len(points))
     if count == len(points):
         raise JaxmarkError(f"Of {len(points)} points none would be left; take fewer away.")
-    return _cloud(points[np.sort(generator(seed).permutation(len(points))[count:])])
+    return mesh._replace(vertices=points[np.sort(generator(seed).permutation(len(points))[count:])])
 
 
 @on_host
@@ -43,7 +40,7 @@ def outliers(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     check_share(strength, "points")
     chosen = random.permutation(len(points))[: round(strength * len(points))]
     points[chosen] = _anywhere(mesh, len(chosen), random)
-    return _cloud(points)
+    return mesh._replace(vertices=points)
 
 
 @on_host
@@ -54,7 +51,7 @@ def floaters(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     """
     points, random = _points("Adding points", mesh), generator(seed)
     more = _anywhere(mesh, round(strength * len(points)), random)
-    return _cloud(random.permutation(np.concatenate([points, more])))
+    return mesh._replace(vertices=random.permutation(np.concatenate([points, more])))
 
 
 @on_host
@@ -66,7 +63,7 @@ def merging(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     points, random = _points("Merging scans", mesh), generator(seed)
     second = _between(points, len(points), random)
     second += strength * diagonal(mesh) * random.uniform(-1, 1, second.shape)
-    return _cloud(random.permutation(np.concatenate([points, second])))
+    return mesh._replace(vertices=random.permutation(np.concatenate([points, second])))
 
 
 @on_host
@@ -74,44 +71,33 @@ def resampling(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     """Sample the surface again: random places between points that are near each other take the place of all points.
 
     The strength is the number of new points, over those that were there.
-
-    Raises:
-        JaxmarkError: if the mesh has faces, or no point would be left.
     """
     points = _points("Resampling", mesh)
-    if not round(strength * len(points)):
+    if not (count := round(strength * len(points))):
         raise JaxmarkError(f"{strength:g} times {len(points)} points are none; take more.")
-    return _cloud(_between(points, round(strength * len(points)), generator(seed)))
+    return mesh._replace(vertices=_between(points, count, generator(seed)))
 
 
-def _points(name: str, mesh: Mesh) -> Float64[np.ndarray, "points 3"]:
-    """The points of a cloud; a mesh is refused, as its faces would have to go."""
+def _points(name: str, mesh: Mesh) -> Points:
+    """Return the points of a cloud; refuse a mesh, whose faces would be lost."""
     if len(mesh.faces):
         raise JaxmarkError(f"{name} takes a point cloud, and this mesh has {len(mesh.faces)} faces; leave them out.")
     return np.asarray(mesh.vertices, np.float64)
 
 
-def _cloud(points: Float64[np.ndarray, "points 3"]) -> Mesh:
-    return Mesh(points, np.zeros((0, 3), np.int64))
-
-
-def _anywhere(mesh: Mesh, count: int, random: np.random.Generator) -> Float64[np.ndarray, "places 3"]:
-    """Random places in the box of a cloud, and around it."""
+def _anywhere(mesh: Mesh, count: int, random: np.random.Generator) -> Points:
+    """Draw random places in the box of a cloud, and around it."""
     points, wide = np.asarray(mesh.vertices, np.float64), _AROUND * diagonal(mesh)
     return random.uniform(points.min(axis=0) - wide, points.max(axis=0) + wide, (count, 3))
 
 
-def _between(
-    points: Float64[np.ndarray, "points 3"], count: int, random: np.random.Generator
-) -> Float64[np.ndarray, "places 3"]:
-    """Random places in triangles, each of a random point and two of those nearest to it."""
+def _between(points: Points, count: int, random: np.random.Generator) -> Points:
+    """Draw random places in triangles, each of a random point and two of those nearest to it."""
     around = min(_CORNERS, len(points) - 1)
     if around < 1:
         return np.repeat(points, count, axis=0)[:count]
     start = random.integers(len(points), size=count)
     nearest = np.asarray(KDTree(points).query(points[start], around + 1)[1])
     corners = [nearest[np.arange(count), random.integers(around + 1, size=count)] for _ in range(2)]
-    share = random.dirichlet(np.ones(3), count)
-    return share[:, :1] * points[start] + sum(
-        share[:, [place + 1]] * points[corner] for place, corner in enumerate(corners)
-    )
+    share, *shares = random.dirichlet(np.ones(3), count).T[..., None]
+    return share * points[start] + sum(part * points[corner] for part, corner in zip(shares, corners, strict=True))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float64, Key, PRNGKeyArray
+from jaxtyping import Array, Key, PRNGKeyArray
 
 from jaxmark.attacks._points import floaters, merging, outliers, resampling, subsampling
 from jaxmark.attacks.deformation import as_rigid_as_possible
@@ -59,7 +59,7 @@ class Attack(NamedTuple):
 
 
 # Attacks that need faces, that run on the host, and both.
-_surface, _host = partial(Attack, faces=True), partial(Attack, host=True)
+surface_attack, _host = partial(Attack, faces=True), partial(Attack, host=True)
 _host_surface = partial(Attack, host=True, faces=True)
 
 #: What happens to meshes, by accident or by a tool; `jaxmark.adversaries.ATTACKS` has all attacks.
@@ -73,11 +73,11 @@ ATTACKS: Mapping[str, Attack] = {
         "standard deviation of a coordinate over the mean distance to the centre",
         (0.0003, 0.0006, 0.002, 0.003, 0.006),
     ),
-    "smoothing": _surface(laplacian_smoothing, "steps of 0.1", (5, 10, 30, 50, 100)),
-    "taubin": _surface(taubin_smoothing, "pairs of steps 0.5, -0.53", (5, 10, 20, 50, 100)),
-    "cotangent-smoothing": _surface(cotangent_smoothing, "time of diffusion by cotangents", (0.5, 1, 3, 5, 10)),
-    "bilateral": _surface(bilateral_smoothing, "iterations", (1, 2, 5, 10, 20)),
-    "shrinkage": _surface(
+    "smoothing": surface_attack(laplacian_smoothing, "steps of 0.1", (5, 10, 30, 50, 100)),
+    "taubin": surface_attack(taubin_smoothing, "pairs of steps 0.5, -0.53", (5, 10, 20, 50, 100)),
+    "cotangent-smoothing": surface_attack(cotangent_smoothing, "time of diffusion by cotangents", (0.5, 1, 3, 5, 10)),
+    "bilateral": surface_attack(bilateral_smoothing, "iterations", (1, 2, 5, 10, 20)),
+    "shrinkage": surface_attack(
         shrinkage, "length over the diagonal that wavelets are shrunk by", (0.0001, 0.0003, 0.001, 0.003, 0.01)
     ),
     "non-local-means": _host_surface(
@@ -92,9 +92,9 @@ ATTACKS: Mapping[str, Attack] = {
     "bending": Attack(bending, "degrees", (2, 5, 10, 20, 45)),
     "twisting": Attack(twisting, "degrees over the whole length", (2, 5, 10, 20, 45)),
     "edge-flips": _host_surface(edge_flips, "share of the edges", (0.01, 0.03, 0.1, 0.2, 0.3)),
-    "midpoint": _surface(midpoint, "steps", (1, 2, 3)),
-    "sqrt3": _surface(sqrt3, "steps", (1, 2, 3)),
-    "loop": _surface(loop, "steps", (1, 2, 3)),
+    "midpoint": surface_attack(midpoint, "steps", (1, 2, 3)),
+    "sqrt3": surface_attack(sqrt3, "steps", (1, 2, 3)),
+    "loop": surface_attack(loop, "steps", (1, 2, 3)),
     "simplification": _host_surface(
         simplification, "share of the edges that goes", (0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.975)
     ),
@@ -162,18 +162,11 @@ class Registry(NamedTuple):
         return self.chain(mesh, [(kind, strength)], seed=seed)
 
     def chain(self, mesh: Mesh, steps: Sequence[Step], *, seed: Seed) -> Mesh:
-        """Apply several attacks one after the other; with one step this is `attack`.
-
-        Args:
-            mesh: any mesh.
-            steps: the attacks and their strengths, in order.
-            seed: seed of all random choices; each step makes its own.
-        """
+        """Apply attacks one after the other, each as `attack` does and with random choices of its own."""
         entries = [(self.get(kind), strength) for kind, strength in steps]
         for place, (entry, strength) in enumerate(entries):
             _check_strength(strength)
-            key = random_key(seed)
-            mesh = host_mesh(mesh)
+            key, mesh = random_key(seed), host_mesh(mesh)
             self._check_faces(entry, mesh)
             mesh = _apply(mesh, entry, strength, jax.random.fold_in(key, place) if place else key)
         return mesh
@@ -184,14 +177,7 @@ class Registry(NamedTuple):
         A traced attack on meshes with the same faces, such as differently marked copies, is one `jax.vmap`: its random
         numbers are those of `attack`, and its positions differ by rounding at most.
 
-        Args:
-            meshes: at least one mesh.
-            kind: see `attack`.
-            strength: see `attack`.
-            seeds: the seed of the attack's random choices for each mesh.
-
-        Raises:
-            JaxmarkError: see `attack`; if one mesh is refused, all are.
+        If one mesh is refused, all are.
         """
         entry, meshes = self.get(kind), [host_mesh(mesh) for mesh in meshes]
         _check_strength(strength)
@@ -205,11 +191,7 @@ class Registry(NamedTuple):
         return _apply_to_all(meshes, welded, entry, strength, jnp.stack([random_key(seed) for seed in seeds]))
 
     def get(self, kind: Kind) -> Attack:
-        """Look up an attack by its name; an `Attack` is returned as it is.
-
-        Raises:
-            JaxmarkError: if there is no attack of that name.
-        """
+        """Look up an attack by its name, or raise `JaxmarkError`; an `Attack` is returned as it is."""
         if isinstance(kind, Attack):
             return kind
         if not isinstance(kind, str):
@@ -233,34 +215,35 @@ def _check_strength(strength: float) -> None:
         raise JaxmarkError(f"The strength of an attack must be a number, not negative, got {strength!r}.")
 
 
-def _apply(mesh: Mesh, entry: Attack, strength: float, key: PRNGKeyArray) -> Mesh:
+def _apply(mesh: Mesh, entry: Attack, strength: float, seed: PRNGKeyArray) -> Mesh:
     """Apply an attack to the welded points of a mesh."""
     welded = weld(mesh.vertices)
     points = weld_mesh(mesh, welded)
     if entry.host:
-        found = entry.apply(points, strength, generator(key))
+        found = entry.apply(points, strength, generator(seed))
     else:
-        small = _normalise(points)
-        found = small.back(entry.apply(small.mesh, strength, key))
+        small, restore = _normalise(points)
+        found = restore(entry.apply(small, strength, seed))
     return _restore_copies(mesh, welded, points, found)
 
 
 def _apply_to_all(
-    meshes: Sequence[Mesh], welded: Weld, entry: Attack, strength: float, keys: Key[Array, " meshes"]
+    meshes: Sequence[Mesh], welded: Weld, entry: Attack, strength: float, seeds: Key[Array, " meshes"]
 ) -> list[Mesh]:
     """Apply a traced attack to meshes with the same faces and welding, all at once."""
-    small = [_normalise(weld_mesh(mesh, welded)) for mesh in meshes]
-    faces = small[0].mesh.faces
+    points = [weld_mesh(mesh, welded) for mesh in meshes]
+    small, restore = zip(*map(_normalise, points), strict=True)
+    faces = small[0].faces
 
-    def apply(vertices: Array, key: PRNGKeyArray) -> tuple[Array, Array]:
-        moved = entry.apply(Mesh(vertices, faces), strength, key)
+    def apply(vertices: Array, seed: PRNGKeyArray) -> tuple[Array, Array]:
+        moved = entry.apply(Mesh(vertices, faces), strength, seed)
         return jnp.asarray(moved.vertices), jnp.asarray(moved.faces)
 
-    starts = np.stack([one.mesh.vertices for one in small])
-    vertices, faces = jax.vmap(apply, out_axes=(0, None))(jnp.asarray(starts), keys)
+    starts = jnp.asarray(np.stack([one.vertices for one in small]))
+    vertices, faces = jax.vmap(apply, out_axes=(0, None))(starts, seeds)
     return [
-        _restore_copies(mesh, welded, one.points, one.back(Mesh(moved, faces)))
-        for mesh, one, moved in zip(meshes, small, np.asarray(vertices), strict=True)
+        _restore_copies(mesh, welded, start, back(Mesh(moved, faces)))
+        for mesh, start, back, moved in zip(meshes, points, restore, np.asarray(vertices), strict=True)
     ]
 
 
@@ -277,25 +260,18 @@ def _restore_copies(mesh: Mesh, welded: Weld, points: Mesh, found: Mesh) -> Mesh
     return Mesh(found.vertices[welded.point], faces)
 
 
-class _Normalised(NamedTuple):
-    """A mesh centred and scaled to unit diagonal, where float32 keeps its digits."""
+def _normalise(points: Mesh) -> tuple[Mesh, Callable[[Mesh], Mesh]]:
+    """Centre a mesh and scale it to unit diagonal, where float32 keeps its digits; also return the map back."""
+    centre, length = np.asarray(points.vertices)[used_vertices(points)].mean(axis=0), diagonal(points)
+    start = (points.vertices - centre) / length
 
-    points: Mesh  # in its own place and size
-    mesh: Mesh  # centred and scaled
-    centre: Float64[np.ndarray, "3"]
-    length: float
-
-    def back(self, moved: Mesh) -> Mesh:
-        """Bring the attacked mesh back to the place and size of `points`."""
-        found, start = np.asarray(moved.vertices), np.asarray(self.mesh.vertices)
-        there = self.centre + self.length * found.astype(np.float64)
+    def restore(moved: Mesh) -> Mesh:
+        found = np.asarray(moved.vertices)
+        there = centre + length * found.astype(np.float64)
         # Coordinates that the attack left alone stay exactly as they were.
         count = min(len(start), len(found))
         still = found[:count] == start[:count].astype(found.dtype)
-        there[:count] = np.where(still, self.points.vertices[:count], there[:count])
+        there[:count] = np.where(still, points.vertices[:count], there[:count])
         return Mesh(there, np.asarray(moved.faces))
 
-
-def _normalise(points: Mesh) -> _Normalised:
-    centre, length = np.asarray(points.vertices)[used_vertices(points)].mean(axis=0), diagonal(points)
-    return _Normalised(points, Mesh((points.vertices - centre) / length, points.faces), centre, length)
+    return Mesh(start, points.faces), restore

@@ -7,6 +7,7 @@ from jaxmark.attacks.support import on_host
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, compact, component_of, diagonal, face_normals, used_vertices
+from jaxmark.geometry.pose import Points
 from jaxmark.seeds import Randomness, generator
 
 _HANDLE_SHARE = 0.05  # of the vertices, at either end
@@ -46,7 +47,7 @@ def as_rigid_as_possible(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
 
 
 def _ends(
-    points: Float64[np.ndarray, "points 3"], random: np.random.Generator
+    points: Points, random: np.random.Generator
 ) -> tuple[Float64[np.ndarray, " points"], Float64[np.ndarray, "3"]]:
     """Return the place of each point between the held end, 0, and the dragged end, 1; and the axis between them."""
     spread = points - points.mean(axis=0)
@@ -59,9 +60,7 @@ def _ends(
     return share, axis
 
 
-def _relax(
-    mesh: Mesh, start: Float64[np.ndarray, "vertices 3"], share: Float64[np.ndarray, " vertices"]
-) -> Float64[np.ndarray, "vertices 3"]:
+def _relax(mesh: Mesh, start: Points, share: Float64[np.ndarray, " points"]) -> Points:
     """Relax a deformation from initial positions; vertices whose share is 0 or 1 are fixed to theirs."""
     igl = require("igl", "attacks")
     handles, data = np.flatnonzero((share == 0) | (share == 1)), igl.ARAPData()

@@ -4,7 +4,6 @@ from functools import lru_cache
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float64
 from scipy.spatial import KDTree
 
 from jaxmark.attacks.support import Strength, centred, diagonal, displace, on_host, surface
@@ -20,6 +19,7 @@ from jaxmark.spectral.padding import common_laplacian, pad_rows
 _OCTAVES = 7  # of wavelets, and a low-pass below λ = 0.03, which is the shape and stays
 _COARSER = 4  # times of diffusion, each twice the one before, by which places are compared
 _ALIKE = 64  # places that are averaged
+_frame = lru_cache(maxsize=1)(meyer)
 
 
 def shrinkage(mesh: Mesh, strength: Strength, seed: Seed | None = None) -> Mesh:
@@ -32,17 +32,12 @@ def shrinkage(mesh: Mesh, strength: Strength, seed: Seed | None = None) -> Mesh:
     Differentiable with respect to vertices and strength, in reverse mode.
     """
     start, operator = centred(mesh), from_mesh(mesh)
-    frame = _frame().astype(start.dtype)
+    frame = _frame(_OCTAVES + 1).astype(start.dtype)
     parts = band_components(operator, frame, start)
     length = root(jnp.sum(parts**2, axis=-1, keepdims=True))
     most = jnp.asarray(strength).astype(start.dtype) * diagonal(surface(mesh))
     removed = parts * jnp.where(length > most, most / jnp.where(length > most, length, 1), 1)
     return displace(mesh, -synthesise(operator, frame, removed.at[0].set(0)))
-
-
-@lru_cache(maxsize=1)
-def _frame() -> Float64[np.ndarray, "bands terms"]:
-    return meyer(_OCTAVES + 1)
 
 
 @on_host

@@ -6,9 +6,9 @@ All of it is differentiable with respect to vertices and strength.
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from jaxmark.attacks.support import Strength, diagonal, inner_vertices, surface
+from jaxmark.attacks.support import Positions, Strength, diagonal, inner_vertices, surface
 from jaxmark.distortion import rms
 from jaxmark.geometry.mesh import Mesh, used_vertices
 from jaxmark.seeds import Seed, random_key
@@ -47,13 +47,8 @@ def mark_noise(marked: Mesh, original: Mesh, strength: Strength, seed: Seed) -> 
     """Add uniform noise to each coordinate of all vertices, as a multiple of the watermark's size (Sohn et al.).
 
     It needs the original, which an attacker does not have, and so it is not in `ATTACKS`.
-
-    Args:
-        marked: any mesh, its faces concrete.
-        original: the unmarked mesh, with the same vertices in the same order.
-        strength: expected RMS displacement by the noise, relative to that by the mark, both over the vertices that
-            faces use.
-        seed: a whole number or a JAX random key.
+    The original has the same vertices in the same order. The strength is the expected RMS displacement by the noise,
+    relative to that by the mark, both over the vertices that faces use.
     """
     used = used_vertices(marked)
     mark = jnp.asarray(marked.vertices) - jnp.asarray(original.vertices)
@@ -66,18 +61,14 @@ def _radius(mesh: Mesh) -> Float[Array, ""]:
     return jnp.linalg.norm(points - points.mean(axis=0), axis=1).mean()
 
 
-def _uniform(mesh: Mesh, seed: Seed) -> Float[Array, "vertices 3"]:
+def _uniform(mesh: Mesh, seed: Seed) -> Positions:
     """Draw uniform noise in [-1, 1]; the RMS displacement of a vertex is 1, since 3 · 1/3 = 1."""
     vertices = jnp.asarray(mesh.vertices)
     return jax.random.uniform(random_key(seed), vertices.shape, vertices.dtype, -1, 1)
 
 
 def _add_noise(
-    mesh: Mesh,
-    moving: Bool[np.ndarray, "vertices 1"],
-    strength: Strength,
-    unit: Float[Array | np.ndarray, ""],
-    noise: Float[Array, "vertices 3"],
+    mesh: Mesh, moving: np.ndarray, strength: Strength, unit: Float[Array | np.ndarray, ""], noise: Positions
 ) -> Mesh:
     """Move the vertices in `moving` by the noise times `strength` units."""
     size = jnp.asarray(strength).astype(noise.dtype) * unit

@@ -1,7 +1,8 @@
 """Parts of a mesh: lost by cropping, moved apart, or added beside it; on the host.
 
 Where parts are lost, the result has the faces whose vertices are all left, and the vertices that they use, exactly
-where they were.
+where they were. `JaxmarkError` is raised if no face would be left, or if a shift or size is relative to a mesh whose
+vertices are all at one point.
 """
 
 import numpy as np
@@ -24,9 +25,6 @@ def cropping(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     """Cut off the part of the mesh beyond a plane of random direction.
 
     The strength is the share of the vertices that the plane cuts off, in [0, 1).
-
-    Raises:
-        JaxmarkError: if no face would be left.
     """
     used, count = _resolve_share(mesh, strength)
     along = np.asarray(mesh.vertices)[used] @ generator(seed).normal(size=3)
@@ -39,9 +37,6 @@ def region_cropping(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
 
     The strength is the share of the vertices in the region, in [0, 1). Once a connected part is used up, the region
     goes on with the vertices nearest in space.
-
-    Raises:
-        JaxmarkError: if no face would be left.
     """
     used, count = _resolve_share(mesh, strength)
     return _remove(mesh, _nearest(mesh, used, int(generator(seed).choice(used)), count))
@@ -53,9 +48,6 @@ def holes(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
 
     The strength is the share of the vertices in all regions together, in [0, 1). The centre of each region is drawn
     from the vertices that are still there.
-
-    Raises:
-        JaxmarkError: if no face would be left.
     """
     used, count = _resolve_share(mesh, strength)
     random, gone = generator(seed), np.zeros(len(mesh.vertices), bool)
@@ -73,17 +65,13 @@ def mosaic(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     A face belongs to the piece that contains its centroid, and none is cut; vertices that pieces share are duplicated.
     The strength is the length of each shift, relative to the diagonal of the bounding box. Faces keep their order;
     vertices are sorted by piece, and keep their order within a piece.
-
-    Raises:
-        JaxmarkError: if all vertices of the mesh are at one point.
     """
     random, faces = generator(seed), np.asarray(mesh.faces, np.int64)
     piece = _octants(mesh, random)
     shift = random.normal(size=(_OCTANT_COUNT, 3))
     shift *= strength * diagonal(mesh) / np.linalg.norm(shift, axis=1, keepdims=True)
-    size = len(mesh.vertices)
-    copies, place = np.unique(piece[:, None] * size + faces, return_inverse=True)
-    owner, vertex = np.divmod(copies, size)
+    copies, place = np.unique(piece[:, None] * len(mesh.vertices) + faces, return_inverse=True)
+    owner, vertex = np.divmod(copies, len(mesh.vertices))
     return Mesh(np.asarray(mesh.vertices)[vertex] + shift[owner], place.reshape(-1, 3))
 
 
@@ -93,9 +81,6 @@ def missing_pieces(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
 
     The strength is the share of the pieces to remove, in [0, 1), rounded to whole pieces. Only pieces with a face
     count, mostly eight.
-
-    Raises:
-        JaxmarkError: if no piece would be left.
     """
     check_share(strength, "pieces to lose")
     random = generator(seed)
@@ -117,9 +102,6 @@ def adding_geometry(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
 
     The strength is the bounding-box diagonal of each object before it is rotated, relative to that of the mesh;
     positive. The result has the mesh, unchanged, then the ring of 1,024 vertices and the box of 386; none touch.
-
-    Raises:
-        JaxmarkError: if all vertices of the mesh are at one point.
     """
     import trimesh  # takes long to import
 

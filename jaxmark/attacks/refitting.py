@@ -45,6 +45,7 @@ class Region(NamedTuple):
 
 
 Fit = Callable[[Region], Shape | None]  # None for a region that it does not apply to
+Kinds = Sequence[tuple[float, Sequence[Fit]]]
 
 
 @on_host
@@ -88,14 +89,8 @@ def primitive_fitting(mesh: Mesh, strength: float, seed: Randomness | None = Non
     return _refit(mesh, strength, kinds)
 
 
-def _refit(mesh: Mesh, strength: float, kinds: Sequence[tuple[float, Sequence[Fit]]]) -> Mesh:
-    """Project vertices onto the shapes that are found.
-
-    Args:
-        mesh: any mesh.
-        strength: the angle in degrees.
-        kinds: pairs of the turn from face to face that a region may have, in angles, and the fits to try on it.
-    """
+def _refit(mesh: Mesh, strength: float, kinds: Kinds) -> Mesh:
+    """Project vertices onto shapes; `kinds` are pairs of the turn between a region's faces, in angles, and its fits."""
     if not 0 <= strength <= _MAX_DEGREES:
         raise JaxmarkError(f"An angle between normals is from 0 to {_MAX_DEGREES:g} degrees, got {strength:g}.")
     size = diagonal(mesh)
@@ -109,7 +104,7 @@ def _refit(mesh: Mesh, strength: float, kinds: Sequence[tuple[float, Sequence[Fi
     return Mesh(vertices + _displacement(start, found), mesh.faces) if found else mesh
 
 
-def _find_shapes(mesh: Mesh, angle: float, most: float, kinds: Sequence[tuple[float, Sequence[Fit]]]) -> list[Found]:
+def _find_shapes(mesh: Mesh, angle: float, most: float, kinds: Kinds) -> list[Found]:
     """Find the shapes in a mesh; no two share a face."""
     import trimesh  # takes long to import
 
@@ -177,22 +172,18 @@ def _broad_plane(region: Region) -> Shape | None:
     return _plane(region) if len(region.points) - region.rim >= _MIN_INNER_SHARE * len(region.points) else None
 
 
-def _sphere(region: Region) -> Shape:
-    return _round(region.points, np.eye(3))
-
-
 def _cylinder(region: Region) -> Shape:
     """Fit a circular cylinder about the direction in which the faces' normals have the smallest components."""
     axis = _smallest_direction(region.normals * np.sqrt(region.areas)[:, None])
-    return _round(region.points, np.eye(3) - np.outer(axis, axis))
+    return _sphere(region, np.eye(3) - np.outer(axis, axis))
 
 
-def _round(points: Points, flat: Float64[np.ndarray, "3 3"]) -> Shape:
-    """Fit a sphere or cylinder: points at one distance from a centre, after projection onto the plane across the axis.
+def _sphere(region: Region, flat: Float64[np.ndarray, "3 3"] | None = None) -> Shape:
+    """Fit a sphere, or a cylinder if `flat` projects points onto the plane across its axis.
 
-    It is a linear least-squares fit of |x|² = 2 c · x + (r² - |c|²) (Kåsa, IEEE Trans. Instrum. Meas. 25, 1976). The
-    projection is the identity for a sphere.
+    It is a linear least-squares fit of |x|² = 2 c · x + (r² - |c|²) (Kåsa, IEEE Trans. Instrum. Meas. 25, 1976).
     """
+    points, flat = region.points, np.eye(3) if flat is None else flat
     middle = points.mean(axis=0)
     across = (points - middle) @ flat
     squares = np.sum(across**2, axis=1)

@@ -1,13 +1,18 @@
-"""Remeshing: nearly the same surface with other vertices and faces; on the host, by other programs."""
+"""Remeshing: nearly the same surface with other vertices and faces; on the host, by other programs.
+
+All raise `JaxmarkError` if the program fails or would leave no face, or if the mesh has no extent.
+"""
+
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from jaxmark.attacks.meshlab import apply_filter, apply_filter_to_points
 from jaxmark.attacks.support import check_share, on_host, whole_number
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, area, compact, edges, simplify
+from jaxmark.geometry.pose import Points
 from jaxmark.seeds import Randomness, generator
 
 _SAMPLES_PER_VERTEX = 30
@@ -22,9 +27,6 @@ def simplification(mesh: Mesh, strength: float, seed: Randomness | None = None) 
     the same strengths, but uses the simplifier of CGAL, that of Lindstrom and Turk, "Fast and memory efficient
     polygonal simplification", 1998. The strength is the share of the edges to collapse, in [0, 1). The same share of
     the faces goes with them, rounded to a whole number of faces.
-
-    Raises:
-        JaxmarkError: if no face would be left, or all vertices are at one point.
     """
     check_share(strength, "edges to collapse")
     count = len(mesh.faces)
@@ -39,9 +41,6 @@ def isotropic(mesh: Mesh, strength: float, seed: Randomness | None = None) -> Me
     """Remesh with edges of about one length and vertices on the surface, by MeshLab.
 
     The strength is the target length, relative to the mean length of the mesh's edges, in [0.1, 100].
-
-    Raises:
-        JaxmarkError: if MeshLab fails.
     """
     if not 0.1 <= strength <= 100:
         raise JaxmarkError(f"Remeshing takes an edge length of 0.1 to 100 mean ones, got {strength:g}.")
@@ -57,10 +56,7 @@ def iso_surface(mesh: Mesh, strength: float, seed: Randomness | None = None) -> 
     """Extract the surface again from a grid of signed distances, by libigl and the marching cubes of scikit-image.
 
     Where holes leave open what is inside, the winding number decides. The strength is the number of cells along the
-    longest side of the bounding box, a whole number from 4 to 512.
-
-    Raises:
-        JaxmarkError: if the mesh has no inside.
+    longest side of the bounding box, a whole number from 4 to 512. The mesh must have an inside.
     """
     whole_number(strength, 4, 512, "A grid takes a whole number of 4 to 512 cells a side")
     measure, mesh = require("skimage.measure", "attacks"), compact(mesh)
@@ -91,9 +87,6 @@ def poisson(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
 
     This is the screened Poisson reconstruction of Kazhdan and Hoppe, ACM Transactions on Graphics 32(3), 2013, which
     closes holes. The strength is the depth of the octree, a whole number from 1 to 12.
-
-    Raises:
-        JaxmarkError: if the mesh has no area, or MeshLab fails.
     """
     import trimesh  # takes long to import
 
@@ -107,7 +100,7 @@ def poisson(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     normals = np.asarray(surface.face_normals)[face]
     name = "generate_surface_reconstruction_screened_poisson"
     # One thread, because several would add up in no fixed order.
-    return apply_filter_to_points(name, np.asarray(points), normals, depth=depth, threads=1)
+    return apply_filter(name, Mesh(np.asarray(points), mesh.faces), normals, depth=depth, threads=1)
 
 
 def _signed_distance(mesh: Mesh, points: Int64[np.ndarray, "points 3"]) -> Float64[np.ndarray, " points"]:
@@ -115,3 +108,22 @@ def _signed_distance(mesh: Mesh, points: Int64[np.ndarray, "points 3"]) -> Float
     igl = require("igl", "attacks")
     sign = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
     return igl.signed_distance(points.astype(np.float64), np.asarray(mesh.vertices), np.asarray(mesh.faces), sign)[0]
+
+
+def apply_filter(name: str, mesh: Mesh, normals: Points | None = None, **options: Any) -> Mesh:
+    """Apply a filter of MeshLab, by its name and options in pymeshlab, to a mesh, or to its vertices with normals."""
+    rest = {"face_matrix": np.asarray(mesh.faces)} if normals is None else {"v_normals_matrix": normals}
+    meshlab = require("pymeshlab", "attacks")
+    filters = meshlab.MeshSet()
+    filters.add_mesh(meshlab.Mesh(vertex_matrix=np.asarray(mesh.vertices), **rest))
+    try:
+        filters.apply_filter(name, **options)
+        made = filters.current_mesh()
+        points, faces = made.vertex_matrix(), made.face_matrix()
+    except Exception as error:  # whatever type pymeshlab raises
+        raise JaxmarkError(
+            f"MeshLab could not do this to the mesh ({name}): {' '.join(str(error).split())}."
+        ) from error
+    if len(faces) == 0:
+        raise JaxmarkError(f"MeshLab left no face of this mesh ({name}).")
+    return Mesh(points, faces.astype(np.int64))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxmark.attacks.support import Strength, centred, displace, inner_vertices, whole_number
+from jaxmark.attacks.support import Positions, Strength, centred, displace, inner_vertices, whole_number
 from jaxmark.distortion.roots import root
 from jaxmark.geometry.mesh import Mesh, edges
 from jaxmark.seeds import Seed
@@ -21,7 +21,7 @@ from jaxmark.spectral.weights import cotangent_weights
 
 _STEP_SIZE = 0.1  # of the SMI 2010 benchmark
 _TAUBIN_STEP_SIZES = (0.5, -0.53)  # Taubin's λ and μ: frequencies up to 1/λ + 1/μ = 0.11 are passed, not damped
-_MAX_STEPS = 100_000
+Indices = Int[Array | np.ndarray, "_ _"]  # of vertices: one row per face or edge
 
 
 def laplacian_smoothing(mesh: Mesh, strength: float, seed: Seed | None = None) -> Mesh:
@@ -77,7 +77,7 @@ def bilateral_smoothing(mesh: Mesh, strength: float, seed: Seed | None = None) -
 
 
 def _step_count(strength: float) -> int:
-    return whole_number(strength, 0, _MAX_STEPS, f"Smoothing takes a whole number of steps from 0 to {_MAX_STEPS}")
+    return whole_number(strength, 0, 100_000, "Smoothing takes a whole number of steps from 0 to 100000")
 
 
 def _smooth_by_steps(mesh: Mesh, factors: Float[np.ndarray, " steps"]) -> Mesh:
@@ -88,9 +88,7 @@ def _smooth_by_steps(mesh: Mesh, factors: Float[np.ndarray, " steps"]) -> Mesh:
 
 
 @jax.jit
-def _smooth(
-    operator: Laplacian, moving: Array, vertices: Float[Array, "vertices 3"], factors: Float[Array, " steps"]
-) -> Float[Array, "vertices 3"]:
+def _smooth(operator: Laplacian, moving: Array, vertices: Positions, factors: Float[Array, " steps"]) -> Positions:
     def step(v: Array, factor: Array) -> tuple[Array, None]:
         return v - jnp.where(moving, factor * operator.apply(v), 0), None
 
@@ -98,19 +96,15 @@ def _smooth(
 
 
 @jax.jit
-def _diffuse(operator: Laplacian, x: Float[Array, "vertices 3"], time: Float[Array, ""]) -> Float[Array, "vertices 3"]:
+def _diffuse(operator: Laplacian, x: Positions, time: Float[Array, ""]) -> Positions:
     one, nothing = jnp.ones_like(time), jnp.zeros_like(time)
     return rational.filter_rational(operator, jnp.stack([one, nothing, nothing, one, time, nothing])[None], x)
 
 
 @partial(jax.jit, static_argnums=4)
 def _smooth_bilaterally(
-    vertices: Float[Array, "vertices 3"],
-    faces: Int[Array | np.ndarray, "faces 3"],
-    pairs: Int[Array | np.ndarray, "pairs 2"],
-    moving: Array | np.ndarray,
-    steps: int,
-) -> Float[Array, "vertices 3"]:
+    vertices: Positions, faces: Indices, pairs: Indices, moving: Array | np.ndarray, steps: int
+) -> Positions:
     tail, head = pairs[:, 0], pairs[:, 1]
 
     def offsets(v: Array) -> tuple[Array, Array, Array]:
@@ -132,9 +126,7 @@ def _smooth_bilaterally(
     return jax.lax.scan(step, vertices, None, length=steps)[0]
 
 
-def _vertex_normals(
-    v: Float[Array, "vertices 3"], faces: Int[Array | np.ndarray, "faces 3"]
-) -> Float[Array, "vertices 3"]:
+def _vertex_normals(v: Positions, faces: Indices) -> Positions:
     """Return unit normals weighted by area, as `jaxmark.geometry.mesh.vertex_normals`, but traceable."""
     a, b, c = (v[faces[:, corner]] for corner in range(3))
     total = jax.ops.segment_sum(jnp.repeat(jnp.cross(b - a, c - a), 3, axis=0), faces.ravel(), len(v))

@@ -115,11 +115,8 @@ def _edges(faces: Faces) -> _Edges:
 def _move_old(edges: _Edges, size: int, pull: Callable[[np.ndarray], np.ndarray], along: float) -> list[Entries]:
     """Return the entries for old vertices.
 
-    Args:
-        edges: the edges of the mesh.
-        size: number of old vertices.
-        pull: from the number of a vertex's neighbours to the share of the way that it moves to their mean.
-        along: share of either neighbour along the crease, for a vertex on just two crease edges.
+    A vertex with n neighbours moves `pull(n)` of the way to their mean; one on just two crease edges takes `along` of
+    either neighbour along them.
     """
     place, neighbour = np.concatenate([edges.ends, edges.ends[:, ::-1]]).T
     crease = np.tile(edges.crease, 2)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import wraps
 from typing import ParamSpec
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -13,6 +14,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, boundary_vertices, check_concrete, used_vertices
 
 Strength = float | Float[Array, ""]
+Positions = Float[Array, "vertices 3"]
 Arguments = ParamSpec("Arguments")
 
 
@@ -21,9 +23,7 @@ def on_host(attack: Callable[Arguments, Mesh]) -> Callable[Arguments, Mesh]:
 
     @wraps(attack)
     def checked(*arguments: Arguments.args, **options: Arguments.kwargs) -> Mesh:
-        values = [*arguments, *options.values()]
-        meshes = [value for value in values if isinstance(value, Mesh)]
-        check_concrete(attack.__name__, *values, *(leaf for mesh in meshes for leaf in mesh))
+        check_concrete(attack.__name__, *jax.tree.leaves((arguments, options)))
         return attack(*arguments, **options)
 
     return checked
@@ -31,10 +31,9 @@ def on_host(attack: Callable[Arguments, Mesh]) -> Callable[Arguments, Mesh]:
 
 def check_share(share: float, what: str, *, closed: bool = False) -> None:
     """Raise `JaxmarkError` if a share is outside [0, 1), or with `closed` outside [0, 1]."""
+    allowed = "in [0, 1]" if closed else "at least 0 and below 1"
     if not (0 <= share < 1 or (closed and share == 1)):
-        raise JaxmarkError(
-            f"A share of {what} is {'in [0, 1]' if closed else 'at least 0 and below 1'}, got {share:g}."
-        )
+        raise JaxmarkError(f"A share of {what} is {allowed}, got {share:g}.")
 
 
 def whole_number(strength: float, least: int, most: int, rule: str) -> int:
@@ -56,7 +55,7 @@ def inner_vertices(mesh: Mesh) -> Bool[np.ndarray, "vertices 1"]:
     return inner
 
 
-def centred(mesh: Mesh) -> Float[Array, "vertices 3"]:
+def centred(mesh: Mesh) -> Positions:
     """Return positions relative to their mean, so that filters of a distant mesh lose no digits; unused ones are 0."""
     return jnp.where(used_vertices(mesh)[:, None], jnp.asarray(mesh.vertices) - surface(mesh).mean(axis=0), 0)
 
@@ -66,12 +65,12 @@ def diagonal(points: Float[Array, "points 3"]) -> Float[Array, ""]:
     return jnp.linalg.norm(jnp.ptp(points, axis=0))
 
 
-def displace(mesh: Mesh, shift: Float[Array, "vertices 3"]) -> Mesh:
+def displace(mesh: Mesh, shift: Positions) -> Mesh:
     """Move the vertices that faces use by a shift; leave the others alone."""
     return Mesh(jnp.asarray(mesh.vertices) + jnp.where(used_vertices(mesh)[:, None], shift, 0), mesh.faces)
 
 
-def displace_by(mesh: Mesh, shift: Float[Array, "vertices 3"], size: Strength) -> Mesh:
+def displace_by(mesh: Mesh, shift: Positions, size: Strength) -> Mesh:
     """Move as `displace` does, with the shift rescaled to an RMS of `size` diagonals; a shift of zero stays zero."""
     found = rms(shift[np.flatnonzero(used_vertices(mesh))])
     wanted = jnp.asarray(size).astype(shift.dtype) * diagonal(surface(mesh))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxmark.attacks.support import Strength, diagonal, displace, displace_by, surface
+from jaxmark.attacks.support import Positions, Strength, diagonal, displace, displace_by, surface
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, used_vertices
 from jaxmark.seeds import Seed, random_key
@@ -18,7 +18,6 @@ from jaxmark.spectral.precision import matmul
 
 _WAVE_COUNT = 4
 _WAVELENGTH_RANGE = (0.5, 2.0)  # in diagonals
-_FULL_TURN_DEGREES = 360.0
 
 
 def similarity(mesh: Mesh, strength: Strength, seed: Seed) -> Mesh:
@@ -95,8 +94,8 @@ def bending(mesh: Mesh, strength: Strength, seed: Seed | None = None) -> Mesh:
     Planes perpendicular to the axis move rigidly. Where they meet within the mesh, it is folded. The strength is the
     angle of the arc in degrees, in [0, 360]; traced angles are not checked.
     """
-    if isinstance(strength, float | int) and not 0 <= strength <= _FULL_TURN_DEGREES:
-        raise JaxmarkError(f"A mesh is bent by 0 to {_FULL_TURN_DEGREES:g} degrees, got {strength:g}.")
+    if isinstance(strength, float | int) and not 0 <= strength <= 360:
+        raise JaxmarkError(f"A mesh is bent by 0 to 360 degrees, got {strength:g}.")
 
     def bend(x: Array, size: Array, angle: Array) -> Array:
         towards = jnp.where(size[1] <= size[2], jnp.array([0, 1, 0]), jnp.array([0, 0, 1])).astype(x.dtype)
@@ -136,9 +135,7 @@ def _deform(mesh: Mesh, degrees: Strength, shift: Callable[[Array, Array, Array]
     return displace(mesh, jnp.roll(shift(x, jnp.roll(size, -longest), angle), longest, axis=1))
 
 
-def _remove_affine_part(
-    x: Float[Array, "vertices 3"], shift: Float[Array, "vertices 3"], used: Bool[np.ndarray, " vertices"]
-) -> Float[Array, "vertices 3"]:
+def _remove_affine_part(x: Positions, shift: Positions, used: Bool[np.ndarray, " vertices"]) -> Positions:
     """Subtract from a field the affine function of position that is closest to it at the vertices in use."""
     maps, places = jnp.concatenate([jnp.ones_like(x[:, :1]), x], axis=1), np.flatnonzero(used)
     fitted = maps[places]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxmark.adversaries.registry import attack
+from jaxmark.adversaries.by_name import attack
 from jaxmark.bench import forms
 from jaxmark.bench.shapes import SHAPES, torus
 from jaxmark.errors import JaxmarkError

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxmark.adversaries.registry import attack
+from jaxmark.adversaries.by_name import attack
 from jaxmark.bench.benchmark import name_of, named_files
 from jaxmark.bench.fitting import fit
 from jaxmark.bench.leagues import get_league

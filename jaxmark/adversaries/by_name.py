@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64
 
 from jaxmark.attacks import attack as application
-from jaxmark.attacks.attack import Attack, Registry
+from jaxmark.attacks.attack import Attack, Registry, surface_attack
 from jaxmark.attacks.support import Strength, centred, displace, displace_by
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
@@ -92,13 +92,11 @@ def _removal_coefficients(low: float, high: float) -> Float64[np.ndarray, " term
 _REGISTRY = Registry(
     {
         **application.ATTACKS,
-        "low-pass": Attack(
-            low_pass, "share of the spectrum, removed from the top", (0.3, 0.5, 0.7, 0.8, 0.9), faces=True
+        "low-pass": surface_attack(low_pass, "share of the spectrum, removed from the top", (0.3, 0.5, 0.7, 0.8, 0.9)),
+        "band-stop": surface_attack(
+            band_stop, "width in λ of the band that is removed, from 0.02 up", (0.02, 0.05, 0.1, 0.2, 0.4)
         ),
-        "band-stop": Attack(
-            band_stop, "width in λ of the band that is removed, from 0.02 up", (0.02, 0.05, 0.1, 0.2, 0.4), faces=True
-        ),
-        "jamming": Attack(jamming, "RMS over the diagonal", (0.0001, 0.0002, 0.0005, 0.001, 0.002), faces=True),
+        "jamming": surface_attack(jamming, "RMS over the diagonal", (0.0001, 0.0002, 0.0005, 0.001, 0.002)),
     }
 )
 #: All attacks of the library, by the names that the command line uses.
