@@ -67,8 +67,8 @@ def search_chain(
 ) -> Chain:
     """Search for the chain of tools that costs least, by evolution: the best third lives on and has changed copies.
 
-    The first generation has every tool by itself. A changed copy has one strength moved, one step replaced, added,
-    left out or put elsewhere, or the head of one parent and the tail of another.
+    The first generation has one chain of a single step for each tool. A changed copy has one strength moved, one step
+    replaced, added, left out or put elsewhere, or the head of one parent and the tail of another.
 
     Args:
         judge: function that returns the cost of a chain, such as `projected_cost`; a chain that is refused by a
@@ -131,7 +131,7 @@ def projected_cost(
 ) -> Judge:
     """Judge chains by the cost of bringing marks below detection with them: the mean over meshes.
 
-    The cost of a chain is the distortion of the marked mesh over that of the mark. Where the claim of the message is
+    The cost of a chain is the distortion of the marked mesh over that of the mark. If the claim of the message is
     still proven, it grows as noise would have to: noise of n times the mark's size leaves E = E₀/(1 + n²/c) of the
     evidence E₀ = -log10 p, so that n must be √((E₀/E₁ - 1)/(E₀/E - 1)) times as large to leave E₁ = -log10 α.
 

@@ -1,6 +1,6 @@
 """Parts of a mesh: lost by cropping, moved apart, or added beside it; on the host.
 
-Where parts are lost, the result has the faces whose vertices are all left, and the vertices that they use, exactly
+If parts are lost, the result has the faces whose vertices are all left, and the vertices that they use, exactly
 where they were. `JaxmarkError` is raised if no face would be left, or if a shift or size is relative to a mesh whose
 vertices are all at one point.
 """

@@ -55,8 +55,8 @@ def isotropic(mesh: Mesh, strength: float, seed: Randomness | None = None) -> Me
 def iso_surface(mesh: Mesh, strength: float, seed: Randomness | None = None) -> Mesh:
     """Extract the surface again from a grid of signed distances, by libigl and the marching cubes of scikit-image.
 
-    Where holes leave open what is inside, the winding number decides. The strength is the number of cells along the
-    longest side of the bounding box, a whole number from 4 to 512. The mesh must have an inside.
+    At holes the winding number decides what is inside. The strength is the number of cells along the longest side of
+    the bounding box, a whole number from 4 to 512. The mesh must have an inside.
     """
     whole_number(strength, 4, 512, "A grid takes a whole number of 4 to 512 cells a side")
     measure, mesh = require("skimage.measure", "attacks"), compact(mesh)

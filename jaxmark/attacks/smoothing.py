@@ -66,7 +66,7 @@ def bilateral_smoothing(mesh: Mesh, strength: float, seed: Seed | None = None) -
     Fleishman, Drori, Cohen-Or, "Bilateral mesh denoising", SIGGRAPH 2003. With n the normal at v, h = n · (q - v) the
     offset of a neighbour q and r = |q - v|, v moves by n Σ w h / Σ w with w = exp(-r²/2σ_c²) exp(-h²/2σ_s²). Neighbours
     are joined by an edge. σ_c is the mean edge length and σ_s the root mean square of the offsets, both of the given
-    mesh; normals are weighted by area and computed anew in each iteration. The strength is the number of iterations.
+    mesh; normals are weighted by area and computed again in each iteration. The strength is the number of iterations.
     Boundary vertices stay.
     """
     faces = np.asarray(mesh.faces)

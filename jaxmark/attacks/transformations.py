@@ -90,8 +90,8 @@ def warp(mesh: Mesh, strength: Strength, seed: Seed) -> Mesh:
 def bending(mesh: Mesh, strength: Strength, seed: Seed | None = None) -> Mesh:
     """Bend the longest axis of the bounding box into a circular arc of the same length; differentiable.
 
-    The axis goes through the centre of the box, which stays, and bends towards the shorter of the other two sides.
-    Planes perpendicular to the axis move rigidly. Where they meet within the mesh, it is folded. The strength is the
+    The axis goes through the centre of the box, which stays, and turns towards the shorter of the other two sides.
+    Planes perpendicular to the axis move rigidly. The mesh folds if they meet within it. The strength is the
     angle of the arc in degrees, in [0, 360]; traced angles are not checked.
     """
     if isinstance(strength, float | int) and not 0 <= strength <= 360:
