@@ -55,8 +55,8 @@ def band_stop(mesh: Mesh, strength: float, seed: Seed | None = None) -> Mesh:
 def jamming(mesh: Mesh, strength: Strength, seed: Seed) -> Mesh:
     """Add noise that looks like a mark of the default scheme under a key of the attacker's own.
 
-    White normal noise is filtered by the bands of the scheme, each with its strength. No other noise of its size hides a
-    mark better from a reader who knows no more than the attacker does. The strength is the RMS displacement of the
+    White normal noise is filtered by the bands of the scheme, each with its strength. No other noise of its size hides
+    a mark better from a reader who knows no more than the attacker does. The strength is the RMS displacement of the
     vertices, relative to the diagonal of the bounding box, and is met exactly; differentiable in it, too.
     """
     vertices = jnp.asarray(mesh.vertices)
