@@ -29,8 +29,9 @@ from jaxmark.watermark.markers import NonBlindMarker
 _STRENGTHS = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
 
 _Way = Float64[np.ndarray, "points 3"]
-# A function that returns the evidence S/‖a‖ of a claim, and a displacement along which it rises.
-Rise = tuple[Float[Array, ""], Float[Array, "vertices 3"]]
+Rise = tuple[
+    Float[Array, ""], Float[Array, "vertices 3"]
+]  # evidence S/‖a‖ of a claim, and a displacement that raises it
 Slope = Callable[[Reader, Observation, Float[Array, " code"]], Rise]
 
 

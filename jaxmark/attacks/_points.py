@@ -91,7 +91,7 @@ def _anywhere(mesh: Mesh, count: int, random: np.random.Generator) -> Points:
     return random.uniform(points.min(axis=0) - wide, points.max(axis=0) + wide, (count, 3))
 
 
-def _between(points: Points, count: int, random: np.random.Generator) -> Points:
+def _between(points: Points, count: int, random: np.random.Generator) -> np.ndarray:
     """Draw random places in triangles, each of a random point and two of those nearest to it."""
     around = min(_CORNERS, len(points) - 1)
     if around < 1:

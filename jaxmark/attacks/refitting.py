@@ -31,7 +31,7 @@ _GAUSS_NEWTON_STEPS = 5  # the tangent planes of curved shapes turn a little as 
 # A surface onto which vertices are projected: a function of points that returns the unit normals at the surface's
 # points nearest to them, and signed distances along these normals to the surface.
 Shape = Callable[[Points], tuple[Points, Float64[np.ndarray, " points"]]]
-Found = tuple[Shape, Int64[np.ndarray, " vertices"]]  # a shape, and the vertices that belong to it
+Found = tuple[Shape, Int64[np.ndarray, " _"]]  # a shape, and the vertices that belong to it
 
 
 class Region(NamedTuple):

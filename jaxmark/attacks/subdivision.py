@@ -19,7 +19,7 @@ from jaxmark.seeds import Seed
 
 Faces = Int64[np.ndarray, "faces 3"]
 # Entries of a sparse matrix that maps old vertices to new ones: row, column and weight; entries at one place add up.
-Entries = tuple[Int64[np.ndarray, " entries"], Int64[np.ndarray, " entries"], Float64[np.ndarray, " entries"]]
+Entries = tuple[Int64[np.ndarray, " _"], Int64[np.ndarray, " _"], Float64[np.ndarray, " _"]]
 
 
 class _Edges(NamedTuple):
