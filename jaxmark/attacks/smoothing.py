@@ -83,8 +83,7 @@ def _step_count(strength: float) -> int:
 def _smooth_by_steps(mesh: Mesh, factors: Float[np.ndarray, " steps"]) -> Mesh:
     """Smooth a mesh by one explicit step of the graph Laplacian for each factor; boundary vertices stay."""
     vertices = jnp.asarray(mesh.vertices)
-    moved = _smooth(from_mesh(mesh), inner_vertices(mesh), vertices, factors.astype(vertices.dtype))
-    return Mesh(moved, mesh.faces)
+    return Mesh(_smooth(from_mesh(mesh), inner_vertices(mesh), vertices, factors.astype(vertices.dtype)), mesh.faces)
 
 
 @jax.jit
