@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.adversaries.registry import ATTACKS
+from jaxmark.adversaries.by_name import ATTACKS
 from jaxmark.alignment.original import make_original
 from jaxmark.distortion import METRICS
 from jaxmark.geometry.mesh import Mesh, make_mesh

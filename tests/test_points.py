@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
-from jaxmark.adversaries.registry import ATTACKS
+from jaxmark.adversaries.by_name import ATTACKS
 from jaxmark.alignment.attempts import align
 from jaxmark.alignment.nearest import find_heights, find_partners
 from jaxmark.alignment.original import make_original

@@ -37,7 +37,7 @@ import jaxmark as jm
 from jaxmark.alignment.attempts import align
 from jaxmark.alignment.original import make_original
 from jaxmark.attacks import Attack
-from jaxmark.attacks.meshlab import apply_filter
+from jaxmark.attacks.remeshing import apply_filter
 from jaxmark.confidence import clopper_pearson
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, used_vertices, weld, weld_mesh

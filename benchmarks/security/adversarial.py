@@ -24,7 +24,7 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark import adversaries as enemies
-from jaxmark.adversaries.filtering import low_pass
+from jaxmark.adversaries.by_name import low_pass
 from jaxmark.evaluation import cells
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))

@@ -28,7 +28,7 @@ from jax.flatten_util import ravel_pytree
 import jaxmark as jm
 from jaxmark import adversaries as enemies
 from jaxmark.adversaries.chains import decode
-from jaxmark.adversaries.learned import init_network
+from jaxmark.adversaries.networks import init_network
 from jaxmark.bench.parametric import creature
 from jaxmark.evaluation import cells
 from jaxmark.geometry import asteroid
@@ -57,7 +57,7 @@ def learn(folder: Path, goal: enemies.Goal, steps: int, size: int) -> enemies.Ne
         meshes, others = (
             meshes_by_formula(*part, size) for part in ((100, LEARNED_FROM), (100 + LEARNED_FROM, HELD_OUT))
         )
-        found = enemies.learn(meshes, others, key=jax.random.key(0), goal=goal, bits=BITS, steps=steps, say=say)
+        found = enemies.learn(meshes, others, seed=0, goal=goal, bits=BITS, steps=steps, say=say)
         say(f"{goal}: held-out loss {found.before:.4f} of the Wiener estimate, {found.after:.4f} of the network")
         numbers = np.asarray(ravel_pytree(found.network)[0])
         np.savez(file, before=found.before, after=found.after, losses=found.losses, network=numbers)

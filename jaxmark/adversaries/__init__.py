@@ -4,11 +4,18 @@ Those of `jaxmark.attacks` happen to any mesh; these are made against a watermar
 which can stand wherever a name in `ATTACKS` can; `ambiguity` attacks what a detection proves.
 """
 
-from jaxmark.adversaries._jamming import jamming as jamming
 from jaxmark.adversaries.ambiguity import Search as Search
 from jaxmark.adversaries.ambiguity import forge_original as forge_original
 from jaxmark.adversaries.ambiguity import search_key as search_key
 from jaxmark.adversaries.ambiguity import transplant as transplant
+from jaxmark.adversaries.by_name import ATTACKS as ATTACKS
+from jaxmark.adversaries.by_name import attack as attack
+from jaxmark.adversaries.by_name import attack_each as attack_each
+from jaxmark.adversaries.by_name import band_stop as band_stop
+from jaxmark.adversaries.by_name import chain as chain
+from jaxmark.adversaries.by_name import get_attack as get_attack
+from jaxmark.adversaries.by_name import jamming as jamming
+from jaxmark.adversaries.by_name import low_pass as low_pass
 from jaxmark.adversaries.chains import Chain as Chain
 from jaxmark.adversaries.chains import Gene as Gene
 from jaxmark.adversaries.chains import chain_attack as chain_attack
@@ -22,8 +29,6 @@ from jaxmark.adversaries.expected import evidence as evidence
 from jaxmark.adversaries.expected import make_surrogate as make_surrogate
 from jaxmark.adversaries.expected import random_mark as random_mark
 from jaxmark.adversaries.expected import rescale as rescale
-from jaxmark.adversaries.filtering import band_stop as band_stop
-from jaxmark.adversaries.filtering import low_pass as low_pass
 from jaxmark.adversaries.key_holder import erasure as erasure
 from jaxmark.adversaries.key_holder import erasure_by_descent as erasure_by_descent
 from jaxmark.adversaries.keyless import Family as Family
@@ -31,11 +36,11 @@ from jaxmark.adversaries.keyless import descent as descent
 from jaxmark.adversaries.keyless import evolution as evolution
 from jaxmark.adversaries.keyless import remarking as remarking
 from jaxmark.adversaries.keyless import subtraction as subtraction
-from jaxmark.adversaries.learned import Goal as Goal
-from jaxmark.adversaries.learned import Learned as Learned
-from jaxmark.adversaries.learned import Network as Network
-from jaxmark.adversaries.learned import learn as learn
-from jaxmark.adversaries.learned import learned_attack as learned_attack
+from jaxmark.adversaries.networks import Goal as Goal
+from jaxmark.adversaries.networks import Learned as Learned
+from jaxmark.adversaries.networks import Network as Network
+from jaxmark.adversaries.networks import learn as learn
+from jaxmark.adversaries.networks import learned_attack as learned_attack
 from jaxmark.adversaries.oracle import Counted as Counted
 from jaxmark.adversaries.oracle import boundary as boundary
 from jaxmark.adversaries.oracle import decide_by_score as decide_by_score
@@ -45,8 +50,3 @@ from jaxmark.adversaries.oracle import quantise_scores as quantise_scores
 from jaxmark.adversaries.oracle import random_search as random_search
 from jaxmark.adversaries.oracle import randomise_scores as randomise_scores
 from jaxmark.adversaries.oracle import score_oracle as score_oracle
-from jaxmark.adversaries.registry import ATTACKS as ATTACKS
-from jaxmark.adversaries.registry import attack as attack
-from jaxmark.adversaries.registry import attack_each as attack_each
-from jaxmark.adversaries.registry import chain as chain
-from jaxmark.adversaries.registry import get_attack as get_attack

@@ -1,4 +1,4 @@
-"""Attacks on what a detection proves: claims on a mesh by somebody who did not mark it, and marks copied elsewhere."""
+"""Attacks on the proof: claims on a mesh by an adversary who did not mark it, and marks copied to other meshes."""
 
 from typing import NamedTuple
 
@@ -35,20 +35,8 @@ def forge_original(
 
     This is the inversion attack of Craver, Memon, Yeo and Yeung, IEEE Journal on Selected Areas in Communications 16
     (1998). Here the mark must be made before the forged original exists, but its chips derive from that original's
-    geometry.
-
-    Args:
-        given: a published mesh, marked by somebody else or not.
-        key: the forger's key, 32 bytes.
-        message: the forger's message.
-        budget: see `embed`.
-        scheme: see `make_marker`.
-
-    Returns:
-        The forged original, of which the given mesh would be the marked copy.
-
-    Raises:
-        JaxmarkError: see `embed`.
+    geometry. The given mesh would be the marked copy of the forged original that is returned. Key and message are the
+    forger's; they, `budget`, `scheme` and errors are those of `embed`.
     """
     marker = make_marker(given, key, bits=8 * len(message), scheme=scheme)
     marked = marker.embed(message, budget, read_back=False)[0]
@@ -61,15 +49,8 @@ def search_key(
     """Search random keys for the strongest claim on a mesh, with an original of the forger's choice.
 
     The mesh is aligned and received only once, because neither depends on the key. The claims of different keys are
-    independent: at most keys · 10^-x of them are expected to reach a log10 p of -x.
-
-    Args:
-        given: a published mesh.
-        original: the mesh that the forger presents as original; not the given mesh, or there is nothing to claim.
-        message: the message that the forger claims to be in it.
-        keys: number of keys to try, at least 1.
-        seed: seed of the random keys.
-        scheme: see `make_marker`.
+    independent: at most keys · 10^-x of them are expected to reach a log10 p of -x. The original must differ from the
+    given mesh, or there is nothing to claim.
 
     Raises:
         JaxmarkError: if `keys` is below 1, the original is unusable, or the given mesh cannot be aligned.
@@ -77,14 +58,13 @@ def search_key(
     if keys < 1:
         raise JaxmarkError(f"A search takes at least 1 key, got {keys}.")
     maker, ready, random = get_nonblind(scheme), make_original(original), np.random.default_rng(seed)
-    bits = 8 * len(message)
-    code_bits, tried = maker.code_length(ready, bits), [Key(random.bytes(KEY_BYTES)) for _ in range(keys)]
-    seen = align(ready, given).observation(ready)
+    bits, tried = 8 * len(message), [Key(random.bytes(KEY_BYTES)) for _ in range(keys)]
+    code_bits, seen = maker.code_length(ready, bits), align(ready, given).observation(ready)
 
     def choices(key: Key) -> Choices:
         return bind_mark(key, ready, maker, bits, "message")
 
-    # What a reader forms and receives is free of the key.
+    # Reader and reception are independent of the key.
     reader = maker.carrier(ready, choices(tried[0]), bits, code_bits).reader()
     received = reader.receive(seen)
 
@@ -99,19 +79,14 @@ def search_key(
 
 
 def transplant(marked: Mesh, estimate: Mesh, target: Mesh) -> Mesh:
-    """Copy a mark to another mesh: add what a marked mesh has beyond an estimate of its original.
+    """Copy a mark to another mesh: add the difference of a marked mesh and an estimate of its original.
 
     This is the copy attack of Kutter, Voloshynovskiy and Herrigel, Security and Watermarking of Multimedia Contents II
-    (2000).
-
-    Args:
-        marked: a marked mesh.
-        estimate: an estimate of its original: the marked mesh smoothed by one of `ATTACKS`, or the original itself,
-            which gives the whole mark.
-        target: the mesh that the mark is copied to; any mesh of the same connectivity.
+    (2000). The estimate is the marked mesh smoothed by one of `ATTACKS`, or the original itself, which gives the whole
+    mark.
 
     Raises:
-        JaxmarkError: if the three do not share their connectivity.
+        JaxmarkError: if the three meshes do not share their connectivity.
     """
     marked, estimate, target = map(host_mesh, (marked, estimate, target))
     if not all(same_connectivity(one, target) for one in (marked, estimate)):

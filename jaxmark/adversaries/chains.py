@@ -1,4 +1,7 @@
-"""Chains of tools, found by evolution on marks of the attacker's own: no gradient, and any program may be a step."""
+"""Chains of tools, found by evolution on marks of the attacker's own: no gradient, and any program may be a step.
+
+Chains are judged on marks that the attacker makes. A step is a name in `ATTACKS` and a strength.
+"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -6,15 +9,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxmark.adversaries.registry import ATTACKS, attack
-from jaxmark.attacks.registry import Attack
+from jaxmark.adversaries.by_name import attack, get_attack
+from jaxmark.attacks.attack import Attack
 from jaxmark.distortion import METRICS, Reference
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.seeds import Randomness, generator
 from jaxmark.watermark.markers import NonBlindMarker
 
-#: What a step may be by default, and its weakest and strongest strength; whole numbers stay whole.
-TOOLS: Mapping[str, tuple[float, float]] = {
+Tools = Mapping[str, tuple[float, float]]  # kinds of steps, with the weakest and the strongest strength of each
+Steps = Sequence[tuple[str, float]]
+Judge = Callable[[Steps], float]  # the cost of a chain
+
+#: The kinds of steps by default; whole numbers stay whole.
+TOOLS: Tools = {
     "noise": (0.0003, 0.05),
     "jamming": (0.0001, 0.01),
     "smoothing": (1, 300),
@@ -47,13 +55,10 @@ class Chain(NamedTuple):
     cost: float  # by the judge
 
 
-Judge = Callable[[Sequence[tuple[str, float]]], float]
-
-
 def search_chain(
     judge: Judge,
     *,
-    tools: Mapping[str, tuple[float, float]] = TOOLS,
+    tools: Tools = TOOLS,
     steps: int = 4,
     population: int = 12,
     generations: int = 8,
@@ -62,25 +67,25 @@ def search_chain(
 ) -> Chain:
     """Search for the chain of tools that costs least, by evolution: the best third lives on and has changed copies.
 
-    The first generation has every tool by itself. A changed copy has one strength moved, one step replaced, added,
-    left out or put elsewhere, or the head of one parent and the tail of another.
+    The first generation has one chain of a single step for each tool. A changed copy has one strength moved, one step
+    replaced, added, left out or put elsewhere, or the head of one parent and the tail of another.
 
     Args:
-        judge: function of a chain, pairs of a name in `ATTACKS` and a strength, that returns what it costs, such as
-            `projected_cost`; a chain that is refused by a `JaxmarkError` costs most.
-        tools: what a step may be, with its weakest and strongest strength.
-        steps: the longest chain.
-        population: chains of a generation after the first.
-        generations: how many generations are judged.
-        seed: of all random choices.
+        judge: function that returns the cost of a chain, such as `projected_cost`; a chain that is refused by a
+            `JaxmarkError` costs most.
+        tools: the kinds of steps.
+        steps: length of the longest chain.
+        population: number of chains in a generation after the first.
+        generations: number of generations that are judged.
+        seed: seed of all random choices.
         say: function that is called with a line after each generation.
 
     Raises:
         JaxmarkError: if there is no tool, an attack is unknown, a strength is not positive, or a number is below 1; or
-            if the judge says of a chain that it costs no number.
+            if the judge returns NaN.
     """
-    if unknown := [kind for kind in tools if kind not in ATTACKS]:
-        raise JaxmarkError(f"There is no attack {unknown[0]!r}; there are {', '.join(ATTACKS)}.")
+    for kind in tools:
+        get_attack(kind)
     if none := [kind for kind, strengths in tools.items() if not min(strengths) > 0]:
         raise JaxmarkError(f"The strengths of a tool must be positive, got {tools[none[0]]} for {none[0]!r}.")
     if not tools or min(steps, population, generations) < 1:
@@ -93,17 +98,21 @@ def search_chain(
     some = [(Gene(kind, float(random.random())),) for kind in kinds]
     for generation in range(generations):
         for one in some:
-            decoded = decode(one, tools)
-            if decoded not in known:
-                known[decoded] = Chain(one, _judged(judge, decoded))
+            if (decoded := decode(one, tools)) not in known:
+                try:
+                    known[decoded] = Chain(one, judge(decoded))
+                except JaxmarkError:
+                    known[decoded] = Chain(one, _REFUSED)
+                if math.isnan(known[decoded].cost):
+                    raise JaxmarkError(f"The judge says that the chain {decoded} costs no number.")
         best = sorted(known.values(), key=lambda one: one.cost)[: max(population // 3, 1)]
         say(f"generation {generation + 1}: {best[0].cost:.4g} by {decode(best[0].genes, tools)}")
         some = [_changed([one.genes for one in best], kinds, steps, random) for _ in range(population)]
     return min(known.values(), key=lambda one: one.cost)
 
 
-def decode(genes: Sequence[Gene], tools: Mapping[str, tuple[float, float]] = TOOLS) -> tuple[tuple[str, float], ...]:
-    """The steps of a chain with their strengths, which grow geometrically from the weakest to the strongest."""
+def decode(genes: Sequence[Gene], tools: Tools = TOOLS) -> tuple[tuple[str, float], ...]:
+    """Return the steps of a chain with their strengths, which grow geometrically from the weakest to the strongest."""
     steps = []
     for kind, place in genes:
         weakest, strongest = tools[kind]
@@ -120,17 +129,17 @@ def projected_cost(
     log10_alpha: float = -6.0,
     seed: int = 0,
 ) -> Judge:
-    """Judge chains by what it would cost to bring marks below detection: the mean over meshes.
+    """Judge chains by the cost of bringing marks below detection with them: the mean over meshes.
 
-    The cost of a chain is the distortion of the marked mesh over that of the mark. Where the claim of the message is
+    The cost of a chain is the distortion of the marked mesh over that of the mark. If the claim of the message is
     still proven, it grows as noise would have to: noise of n times the mark's size leaves E = E₀/(1 + n²/c) of the
     evidence E₀ = -log10 p, so that n must be √((E₀/E₁ - 1)/(E₀/E - 1)) times as large to leave E₁ = -log10 α.
 
     Args:
         pairs: markers of the attacker's own meshes, with meshes that they marked and the messages.
-        metric: of `distortion.METRICS`; one that needs the connectivity makes remeshing cost most.
+        metric: a metric of `distortion.METRICS`; one that needs the connectivity makes remeshing cost most.
         log10_alpha: log10 of the false-positive probability of detection.
-        seed: of the attacks.
+        seed: seed of the attacks.
 
     Raises:
         JaxmarkError: if there is no such metric, no mark, or one that is not proven before any attack.
@@ -145,15 +154,13 @@ def projected_cost(
         raise JaxmarkError("A mark that is not proven before any attack says nothing about attacks; make it stronger.")
     own = [Reference(marker.original.mesh).measure(marked, [metric])[metric] for marker, marked, _ in pairs]
 
-    def judge(steps: Sequence[tuple[str, float]]) -> float:
+    def judge(steps: Steps) -> float:
         costs = []
         for (marker, marked, message), reference, mark, first in zip(pairs, references, own, proven, strict=True):
             suspect = run_chain(marked, steps, seed=seed)
             paid = reference.measure(suspect, [metric])[metric]
-            if paid is None or not mark:
-                return _REFUSED
             left = max(-_log10_p(marker, suspect, message), -log10_alpha)
-            if left >= first:  # it takes nothing, however often
+            if paid is None or not mark or left >= first:  # the chain removes no evidence, however often it is applied
                 return _REFUSED
             costs.append(paid / mark * math.sqrt((first / -log10_alpha - 1) / (first / left - 1)))
         return float(np.mean(costs))
@@ -161,12 +168,8 @@ def projected_cost(
     return judge
 
 
-def run_chain(mesh: Mesh, steps: Sequence[tuple[str, float]], *, seed: int) -> Mesh:
-    """Apply the steps of a chain one after the other.
-
-    Raises:
-        JaxmarkError: if a step is refused, or the mesh has more than four times as many vertices as at first.
-    """
+def run_chain(mesh: Mesh, steps: Steps, *, seed: int) -> Mesh:
+    """Apply the steps of a chain; refuse one that makes more than four times as many vertices."""
     most = _MOST_GROWTH * len(mesh.vertices)
     for place, (kind, strength) in enumerate(steps):
         mesh = attack(mesh, kind, strength, seed=seed + place)
@@ -175,18 +178,13 @@ def run_chain(mesh: Mesh, steps: Sequence[tuple[str, float]], *, seed: int) -> M
     return mesh
 
 
-def chain_attack(genes: Sequence[Gene], tools: Mapping[str, tuple[float, float]] = TOOLS) -> Attack:
-    """A chain as an attack: all its strengths grow together by a factor of 16 on the way from weakest to strongest.
+def chain_attack(genes: Sequence[Gene], tools: Tools = TOOLS) -> Attack:
+    """Make a chain an attack: all strengths grow together by a factor of 16 from the weakest to the strongest."""
 
-    Args:
-        genes: the chain.
-        tools: of its search.
-    """
-
-    def apply(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
+    def apply(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
         shift = math.log(max(strength, 1e-300)) / math.log(_FACTOR)
         moved = [gene._replace(place=gene.place + shift) for gene in genes]
-        return run_chain(mesh, decode(moved, tools), seed=int(random.integers(2**31)))
+        return run_chain(mesh, decode(moved, tools), seed=int(generator(seed).integers(2**31)))
 
     return Attack(apply, "strengths over those that were found", (1 / _FACTOR, 1, _FACTOR), host=True, faces=True)
 
@@ -198,20 +196,10 @@ def _log10_p(marker: NonBlindMarker, suspect: Mesh, message: bytes) -> float:
         return 0.0
 
 
-def _judged(judge: Judge, steps: Sequence[tuple[str, float]]) -> float:
-    try:
-        cost = judge(steps)
-    except JaxmarkError:
-        return _REFUSED
-    if math.isnan(cost):
-        raise JaxmarkError(f"The judge says that the chain {tuple(steps)} costs no number.")
-    return cost
-
-
 def _changed(
     parents: Sequence[tuple[Gene, ...]], kinds: Sequence[str], longest: int, random: np.random.Generator
 ) -> tuple[Gene, ...]:
-    """A changed copy of one of the parents, or a child of two."""
+    """Make a changed copy of one of the parents, or a child of two."""
 
     def below(count: int) -> int:
         return int(random.integers(count))

@@ -1,7 +1,7 @@
-"""What an attacker without the key knows about a detector: its average behaviour over keys.
+"""The average behaviour of a detector over keys, which an attacker without the key can compute.
 
 The attacker uses the marked mesh in place of the original, writes marks of random keys into it, and measures what a
-displacement leaves of them. All of this is differentiable with respect to the displacement, given the JAX random key.
+displacement leaves of them. All of this is differentiable with respect to the displacement, in diagonals, given a seed.
 """
 
 from typing import NamedTuple
@@ -9,11 +9,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from jaxmark.alignment.observation import observe
 from jaxmark.alignment.original import Original
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.seeds import Seed, random_key
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import band_energies, filter
 from jaxmark.spectral.laplacian import Laplacian
@@ -44,17 +45,7 @@ class Surrogate(NamedTuple):
 def make_surrogate(
     mesh: Mesh, scheme: str | Scheme, bits: int, mark: float, metric: str = "rms"
 ) -> tuple[Surrogate, Original]:
-    """Prepare a marked mesh as the attacker sees it.
-
-    Args:
-        mesh: the marked mesh.
-        scheme: the scheme that it was marked with, see `make_marker`.
-        bits: size of the payload in bits.
-        mark: RMS displacement that the mark is assumed to have, relative to the diagonal.
-        metric: the metric of `distortion.METRICS` by which displacements are measured, see `size`.
-
-    Returns:
-        The surrogate, and the marked mesh prepared as an original.
+    """Prepare a marked mesh as the attacker sees it, under `keyless.Assumptions`, and as an original.
 
     Raises:
         JaxmarkError: see `make_marker` and `distortion.compare`.
@@ -62,12 +53,15 @@ def make_surrogate(
     marker = make_marker(mesh, new_key(), bits=bits, scheme=scheme)
     original, family = marker.original, scaling(_ATTACKER_BANDS, damping="jackson")
     dtype = original.signal.dtype
+    functions = np.c_[np.ones(len(original.used)), original.positions] * original.used[:, None]
+    vectors, values, _ = np.linalg.svd(functions, full_matrices=False)
+    basis = vectors * (values > 1e-9 * values[0])  # flat meshes have fewer affine functions
     seen = np.ones(_ATTACKER_BANDS) if metric == "rms" else band_visibility(original, family, [metric])[0]
     surrogate = Surrogate(
         operator=original.operator,
         signal=original.signal,
         moving=original.to_traced(original.used)[:, None],
-        pose=original.to_traced(_affine_basis(original)),
+        pose=original.to_traced(basis),
         bands=jnp.asarray(family, dtype),
         seen=jnp.asarray(seen, dtype),
         reader=marker.reader,
@@ -76,20 +70,13 @@ def make_surrogate(
     return surrogate, original
 
 
-def _affine_basis(original: Original) -> Float64[np.ndarray, "points columns"]:
-    """Orthonormal basis of the affine functions of the position, on the points that faces use."""
-    functions = np.c_[np.ones(len(original.used)), original.positions] * original.used[:, None]
-    vectors, values, _ = np.linalg.svd(functions, full_matrices=False)
-    return vectors * (values > 1e-9 * values[0])  # flat meshes have fewer such functions
-
-
 def rms(surrogate: Surrogate, displacement: Displacement) -> Float[Array, ""]:
-    """Root mean square length of a displacement over the points that faces use."""
+    """Return the root mean square length of a displacement over the points that faces use."""
     return jnp.sqrt(jnp.sum((surrogate.moving * displacement) ** 2) / surrogate.moving.sum())
 
 
 def size(surrogate: Surrogate, displacement: Displacement) -> Float[Array, ""]:
-    """The metric in its approximation for small displacements: RMS after each band is weighted by its visibility."""
+    """Return the metric as it is for small displacements: the RMS after each band is weighted by its visibility."""
     return rms(surrogate, band_filter(surrogate, surrogate.seen, displacement))
 
 
@@ -105,26 +92,21 @@ def band_filter(surrogate: Surrogate, strengths: Float[Array, " bands"], x: Disp
     return filter(surrogate.operator, matmul(surrogate.bands.T, strengths), x)
 
 
-def random_mark(surrogate: Surrogate, key: PRNGKeyArray) -> tuple[Reader, Displacement]:
+def random_mark(surrogate: Surrogate, seed: Seed) -> tuple[Reader, Displacement]:
     """Make a mark under a random key, and its reader; all its bits are 1, because the key's signs are random."""
-    reader = surrogate.reader.with_carrier(surrogate.reader.carrier.redraw(key))
-    written = reader.carrier.displacement(_ones(surrogate))
+    reader = surrogate.reader.with_carrier(surrogate.reader.carrier.redraw(random_key(seed)))
+    written = reader.carrier.displacement(jnp.ones(reader.carrier.code_bits, surrogate.signal.dtype))
     return reader, surrogate.mark / rms(surrogate, written) * written
 
 
-def evidence(surrogate: Surrogate, displacement: Displacement, key: PRNGKeyArray) -> Float[Array, ""]:
-    """Evidence S/‖a‖ of a random mark's claim after a displacement, averaged over the mark and its negative.
+def evidence(surrogate: Surrogate, displacement: Displacement, seed: Seed) -> Float[Array, ""]:
+    """Compute the evidence S/‖a‖ of a random mark's claim after a displacement, averaged over the mark and minus it.
 
     The average cancels what mark and displacement happen to have in common, which would be most of the noise. The
     affine part of the displacement does not count, because the owner undoes affine maps.
-
-    Args:
-        surrogate: the marked mesh as the attacker's original.
-        displacement: the displacement, in diagonals.
-        key: JAX random key, from which the mark is drawn.
     """
-    reader, written = random_mark(surrogate, key)
-    bits, pose = _ones(surrogate), surrogate.pose
+    reader, written = random_mark(surrogate, seed)
+    bits, pose = jnp.ones(reader.carrier.code_bits, surrogate.signal.dtype), surrogate.pose
     moved = displacement - matmul(pose, matmul(pose.T, displacement))
     suspects = {sign: reader.receive(observe(sign * written + moved)) for sign in (1, -1)}
     both = [strongest_evidence(reader, received, sign * bits) for sign, received in suspects.items()]
@@ -132,7 +114,7 @@ def evidence(surrogate: Surrogate, displacement: Displacement, key: PRNGKeyArray
 
 
 def strongest_evidence(reader: Reader, received: Received, codeword: Float[Array, " code"]) -> Float[Array, ""]:
-    """Smooth maximum of S/‖a‖ over all ways of weighting a suspect, so that an attack lowers all that are near it.
+    """Compute a smooth maximum of S/‖a‖ over all ways of weighting a suspect; an attack lowers all that are near it.
 
     It exceeds the largest S/‖a‖ by at most a quarter of the logarithm of the number of ways.
     """
@@ -141,10 +123,5 @@ def strongest_evidence(reader: Reader, received: Received, codeword: Float[Array
 
 
 def energies(surrogate: Surrogate, x: Displacement) -> Float[Array, " bands"]:
-    """Energy of `x` per band."""
+    """Compute the energy of `x` per band."""
     return jnp.maximum(band_energies(surrogate.operator, surrogate.bands, x, x), 0)
-
-
-def _ones(surrogate: Surrogate) -> Float[Array, " bits"]:
-    """The bits of random marks, which are all 1."""
-    return jnp.ones(surrogate.reader.carrier.code_bits, surrogate.signal.dtype)

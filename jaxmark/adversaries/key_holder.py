@@ -1,8 +1,10 @@
-"""Attacks by somebody who holds original, key and message: the least displacement that defeats a claim of the message.
+"""Attacks by the key holder, with original and message: the least displacement that defeats a claim of the message.
 
-They bound from below what any attacker must pay, and show whether attackers who know less fail for lack of knowledge or
-of skill. Pose and correspondence are found on the host; given them, the claim is a differentiable function of the
-displacement.
+They bound from below the distortion that any attack needs, and show whether attackers who know less fail for lack of
+knowledge or of skill. Pose and correspondence are computed on the host; given them, the claim is a differentiable
+function of the displacement. Strengths are RMS displacements of the vertices that faces use, relative to the diagonal
+of the original's bounding box. The attacked mesh has the original's connectivity, and its payload and scheme are those
+of the marker.
 """
 
 from collections.abc import Callable
@@ -15,7 +17,7 @@ from jaxtyping import Array, Float, Float64
 from jaxmark.adversaries.expected import strongest_evidence
 from jaxmark.alignment.attempts import align
 from jaxmark.alignment.observation import Observation
-from jaxmark.attacks.registry import Attack
+from jaxmark.attacks.attack import Attack
 from jaxmark.distortion import rms
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, weld
@@ -24,12 +26,13 @@ from jaxmark.watermark.coding.message import check_size
 from jaxmark.watermark.interfaces import Reader
 from jaxmark.watermark.markers import NonBlindMarker
 
-_UNIT = "RMS over the diagonal"
 _STRENGTHS = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
 
 _Way = Float64[np.ndarray, "points 3"]
-# A function that returns the evidence S/‖a‖ of a claim, and a displacement along which it rises.
-Slope = Callable[[Reader, Observation, Float[Array, " code"]], tuple[Float[Array, ""], Float[Array, "vertices 3"]]]
+Rise = tuple[
+    Float[Array, ""], Float[Array, "vertices 3"]
+]  # evidence S/‖a‖ of a claim, and a displacement that raises it
+Slope = Callable[[Reader, Observation, Float[Array, " code"]], Rise]
 
 
 def erasure(marker: NonBlindMarker, message: bytes) -> Attack:
@@ -40,14 +43,6 @@ def erasure(marker: NonBlindMarker, message: bytes) -> Attack:
     If subtracting the mark itself leaves less evidence, the attack does that instead: as far as its size allows, and
     beyond that it reverses the mark.
 
-    Args:
-        marker: original, key, payload and scheme of the mark.
-        message: the message that was written.
-
-    Returns:
-        An attack on meshes of the original's connectivity; its strength is the RMS displacement of the vertices that
-        faces use, relative to the diagonal of the original's bounding box.
-
     Raises:
         JaxmarkError: if the message is of another size than the payload.
     """
@@ -55,19 +50,11 @@ def erasure(marker: NonBlindMarker, message: bytes) -> Attack:
 
 
 def erasure_by_descent(marker: NonBlindMarker, message: bytes, *, steps: int = 20) -> Attack:
-    """Make the attack of `erasure` stronger by optimisation through all that the receiver does.
+    """Make the attack of `erasure` stronger by optimisation through the whole receiver, including its weights.
 
-    It so attacks what weights the evidence, too. It starts from the closed form. Each step moves towards the
-    displacement of the same size that lies against the gradient of S/‖a‖, by a share of 2/(k + 2) in step k (Frank,
-    Wolfe, Naval Research Logistics Quarterly 3, 1956); the suspect is aligned anew in each step.
-
-    Args:
-        marker: original, key, payload and scheme of the mark.
-        message: the message that was written.
-        steps: number of gradients; the best of as many displacements is returned.
-
-    Returns:
-        An attack like that of `erasure`.
+    It starts from the closed form. Each step moves towards the displacement of the same size that lies against the
+    gradient of S/‖a‖, by a share of 2/(k + 2) in step k (Frank, Wolfe, Naval Research Logistics Quarterly 3, 1956); the
+    suspect is aligned again in each step. The best displacement of as many as `steps` is returned.
 
     Raises:
         JaxmarkError: see `erasure`; or if `steps` is below 1.
@@ -84,7 +71,7 @@ def _attack(marker: NonBlindMarker, message: bytes, slopes: Slope, steps: int) -
     copies = weld(original.mesh.vertices)
     codeword = jnp.asarray(marker.codeword(message), original.signal.dtype)
 
-    def apply(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
+    def apply(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
         if len(mesh.vertices) != len(copies.first):
             raise JaxmarkError(
                 f"The mesh has {len(mesh.vertices)} points, the original {len(copies.first)}; only marks in the"
@@ -122,24 +109,20 @@ def _attack(marker: NonBlindMarker, message: bytes, slopes: Slope, steps: int) -
         # A step may raise the evidence, so the best of all displacements of this size is returned.
         return mesh._replace(vertices=displace(min(trials, key=lambda one: one[0])[2]).vertices[copies.first])
 
-    return Attack(apply, _UNIT, _STRENGTHS, host=True)
+    return Attack(apply, "RMS over the diagonal", _STRENGTHS, host=True)
 
 
 @jax.jit
-def _linear_slope(
-    reader: Reader, seen: Observation, codeword: Float[Array, " code"]
-) -> tuple[Float[Array, ""], Float[Array, "vertices 3"]]:
-    """Evidence of a claim, and slope of its score if all that the receiver learns is held fixed."""
+def _linear_slope(reader: Reader, seen: Observation, codeword: Float[Array, " code"]) -> Rise:
+    """Return the evidence of a claim, and the slope of its score if all that the receiver learns is held fixed."""
     received = reader.receive(seen)
     slope = jax.grad(lambda residual: reader.linear_score(received, residual, codeword))(seen.residual)
     return strongest_evidence(reader, received, codeword), slope
 
 
 @jax.jit
-def _slope(
-    reader: Reader, seen: Observation, codeword: Float[Array, " code"]
-) -> tuple[Float[Array, ""], Float[Array, "vertices 3"]]:
-    """Evidence of a claim, and its slope through all that the receiver does."""
+def _slope(reader: Reader, seen: Observation, codeword: Float[Array, " code"]) -> Rise:
+    """Return the evidence of a claim, and its slope through all that the receiver does."""
 
     def evidence(residual: Array) -> Array:
         return strongest_evidence(reader, reader.receive(seen._replace(residual=residual)), codeword)

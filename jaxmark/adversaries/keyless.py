@@ -1,9 +1,9 @@
-"""Attacks by somebody who has the marked mesh and the program, but neither key nor original.
+"""Attacks by an adversary who has the marked mesh and the program, but neither key nor original.
 
-In closed form, the attacker estimates the mark and subtracts it, or writes another mark. By optimisation, he searches
-for the displacement that lowers the *expected* score of the detector most: among all displacements, among band filters
-with band-limited noise, or among smooth warps; by gradients, or by evolution, which uninformative gradients cannot
-mislead.
+In closed form, the attacker estimates the mark and subtracts it, or writes another mark. By optimisation, the attacker
+searches for the displacement that lowers the *expected* score of the detector most: among all displacements, among band
+filters with band-limited noise, or among smooth warps; by gradients, or by evolution, which uninformative gradients
+cannot mislead.
 
 Strengths are sizes of the displacement: its RMS relative to the diagonal; or, with another metric, the value that the
 metric would have if it grew in proportion to the displacement, each band weighted by how visible it is.
@@ -11,14 +11,14 @@ metric would have if it grew in proportion to the displacement, each band weight
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypedDict, Unpack, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.example_libraries import optimizers
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray
 
 from jaxmark.adversaries.expected import (
     Surrogate,
@@ -30,15 +30,19 @@ from jaxmark.adversaries.expected import (
     rescale,
 )
 from jaxmark.alignment.original import displace
-from jaxmark.attacks.registry import Attack
+from jaxmark.attacks.attack import Attack
+from jaxmark.attacks.support import Strength
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.seeds import Randomness, random_key
+from jaxmark.seeds import Randomness, Seed, random_key
 from jaxmark.spectral.precision import matmul
 from jaxmark.watermark.interfaces import Displacement
 from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, Scheme
 
 Parameters = Any  # a pytree of arrays
+Loss = Callable[[Parameters, PRNGKeyArray], Array]
+# Parameters to start from, and the function that makes a displacement of parameters.
+Start = tuple[Parameters, Callable[[Parameters], Displacement]]
 Family = Literal["vertices", "bands", "warps"]
 MARK = 8e-4  # RMS displacement, in diagonals, that the attacker assumes of marks by default
 
@@ -48,73 +52,53 @@ _POPULATION_SIZE, _PARENT_COUNT = 16, 4  # candidates in a generation, and the b
 _WAVE_COUNT, _MIN_WAVELENGTH = 24, 0.2  # of a warp; wavelengths in diagonals
 
 
-def subtraction(*, scheme: str | Scheme = DEFAULT_SCHEME, bits: int = 64, mark: float = MARK) -> Attack:
+class Assumptions(TypedDict, total=False):
+    """The attacker's assumptions about the mark; defaults are those of `make_attack`."""
+
+    scheme: str | Scheme  # the scheme that the mesh was marked with
+    bits: int  # size of the payload in bits
+    mark: float  # RMS displacement of the mark, relative to the diagonal
+    metric: str  # the metric of `distortion.METRICS` in which strengths are measured
+
+
+def subtraction(**assumptions: Unpack[Assumptions]) -> Attack:
     """Subtract the best linear estimate of the mark: each band of the mesh times the mark's share of its energy.
 
     This is the Wiener filter for a mark and a host that are independent (Su, Girod, "Power-spectrum condition for
     energy-efficient watermarking", IEEE Transactions on Multimedia 4(4), 2002).
-
-    Args:
-        scheme: the scheme that the mesh was marked with.
-        bits: size of the payload in bits.
-        mark: RMS displacement that the mark is assumed to have, relative to the diagonal.
     """
 
-    def way(surrogate: Surrogate, strength: Array, key: PRNGKeyArray) -> Displacement:
-        written, whole = energies(surrogate, random_mark(surrogate, key)[1]), energies(surrogate, surrogate.signal)
+    def way(surrogate: Surrogate, strength: Array, seed: PRNGKeyArray) -> Displacement:
+        written, whole = energies(surrogate, random_mark(surrogate, seed)[1]), energies(surrogate, surrogate.signal)
         share = jnp.clip(written / jnp.maximum(whole, jnp.finfo(whole.dtype).tiny), 0, 1)
         return -band_filter(surrogate, share, surrogate.signal)
 
-    return make_attack(way, scheme, bits, mark)
+    return make_attack(way, **assumptions)
 
 
-def remarking(*, scheme: str | Scheme = DEFAULT_SCHEME, bits: int = 64) -> Attack:
-    """Write another mark over the first, with a key of the attacker's own.
-
-    Args:
-        scheme: see `subtraction`.
-        bits: see `subtraction`.
-    """
-    return make_attack(lambda surrogate, strength, key: random_mark(surrogate, key)[1], scheme, bits, MARK)
+def remarking(**assumptions: Unpack[Assumptions]) -> Attack:
+    """Write another mark over the first, with a key of the attacker's own."""
+    return make_attack(lambda surrogate, strength, seed: random_mark(surrogate, seed)[1], **assumptions)
 
 
-def descent(
-    family: Family = "vertices",
-    *,
-    scheme: str | Scheme = DEFAULT_SCHEME,
-    bits: int = 64,
-    mark: float = MARK,
-    metric: str = "rms",
-    steps: int = 30,
-) -> Attack:
+def descent(family: Family = "vertices", *, steps: int = 30, **assumptions: Unpack[Assumptions]) -> Attack:
     """Lower the expected evidence by its gradient, with new random keys at each step (Adam; Kingma, Ba, ICLR 2015).
 
     Args:
         family: the displacements to search: `"vertices"`, all of them; `"bands"`, lower gains of the mesh's own bands,
             and another mark with any strength in each band; `"warps"`, smooth fields of wavelengths from 0.2 to 2
             diagonals.
-        scheme: see `subtraction`.
-        bits: see `subtraction`.
-        mark: see `subtraction`.
-        metric: the metric of `distortion.METRICS` in which strengths are measured.
         steps: number of gradient steps.
+        assumptions: see `Assumptions`.
 
     Raises:
         JaxmarkError: if there is no such family, or `steps` is below 1.
     """
     _check(family, steps)
-    return make_attack(jax.jit(partial(descend, family=family, steps=steps)), scheme, bits, mark, metric)
+    return make_attack(jax.jit(partial(descend, family=family, steps=steps)), **assumptions)
 
 
-def evolution(
-    family: Family = "bands",
-    *,
-    scheme: str | Scheme = DEFAULT_SCHEME,
-    bits: int = 64,
-    mark: float = MARK,
-    metric: str = "rms",
-    generations: int = 10,
-) -> Attack:
+def evolution(family: Family = "bands", *, generations: int = 10, **assumptions: Unpack[Assumptions]) -> Attack:
     """Lower the expected evidence without gradients, by the cross-entropy method (Rubinstein 1999).
 
     Each generation draws the parameters 16 times from a normal distribution; the best four draws give the mean and the
@@ -122,11 +106,8 @@ def evolution(
 
     Args:
         family: see `descent`; `"vertices"` has too many parameters.
-        scheme: see `subtraction`.
-        bits: see `subtraction`.
-        mark: see `subtraction`.
-        metric: see `descent`.
         generations: number of generations.
+        assumptions: see `Assumptions`.
 
     Raises:
         JaxmarkError: if there is no such family, it is `"vertices"`, or `generations` is below 1.
@@ -134,41 +115,33 @@ def evolution(
     if family == "vertices":
         raise JaxmarkError("All vertices are too many parameters for an evolution; choose 'bands' or 'warps'.")
     _check(family, generations)
-    return make_attack(jax.jit(partial(evolve, family=family, generations=generations)), scheme, bits, mark, metric)
+    return make_attack(jax.jit(partial(evolve, family=family, generations=generations)), **assumptions)
 
 
-def descend(
-    surrogate: Surrogate, strength: Float[Array, ""], key: PRNGKeyArray, *, family: Family, steps: int
-) -> Displacement:
-    """The displacement that `descent` finds, in diagonals; a pure function, so that `vmap` over keys gives restarts.
+def descend(surrogate: Surrogate, strength: Strength, seed: Seed, *, family: Family, steps: int) -> Displacement:
+    """Find the displacement of `descent`, in diagonals; a pure function, so that `vmap` over seeds gives restarts.
 
-    Args:
-        surrogate: the marked mesh, from `expected.make_surrogate`.
-        strength: size of the displacement.
-        key: a JAX random key.
-        family: see `descent`.
-        steps: see `descent`.
+    The surrogate is the marked mesh, from `expected.make_surrogate`; the strength is the size of the displacement.
     """
-    return _search(surrogate, strength, key, family, partial(_descend, steps=steps))
+    return _search(surrogate, strength, seed, family, partial(_descend, steps=steps))
 
 
-def evolve(
-    surrogate: Surrogate, strength: Float[Array, ""], key: PRNGKeyArray, *, family: Family, generations: int
-) -> Displacement:
-    """The displacement that `evolution` finds; see `descend`."""
-    return _search(surrogate, strength, key, family, partial(_evolve, generations=generations))
+def evolve(surrogate: Surrogate, strength: Strength, seed: Seed, *, family: Family, generations: int) -> Displacement:
+    """Find the displacement of `evolution`, as `descend` does."""
+    return _search(surrogate, strength, seed, family, partial(_evolve, generations=generations))
 
 
 def _search(
-    surrogate: Surrogate, strength: Array, key: PRNGKeyArray, family: Family, seek: Callable[..., Parameters]
+    surrogate: Surrogate, strength: Strength, seed: Seed, family: Family, seek: Callable[..., Parameters]
 ) -> Displacement:
     """Search a family for the displacement of a given size that lowers the expected evidence most."""
+    key, wanted = random_key(seed), jnp.asarray(strength, surrogate.signal.dtype)
     start, make = _FAMILIES[family](surrogate, jax.random.fold_in(key, 0))
 
-    def loss(parameters: Parameters, key: PRNGKeyArray) -> Array:
-        return evidence(surrogate, rescale(surrogate, make(parameters), strength), key)
+    def loss(parameters: Parameters, seed: PRNGKeyArray) -> Array:
+        return evidence(surrogate, rescale(surrogate, make(parameters), wanted), seed)
 
-    return rescale(surrogate, make(seek(loss, start, jax.random.fold_in(key, 1))), strength)
+    return rescale(surrogate, make(seek(loss, start, jax.random.fold_in(key, 1))), wanted)
 
 
 def _check(family: Family, steps: int) -> None:
@@ -180,54 +153,43 @@ def _check(family: Family, steps: int) -> None:
 
 def make_attack(
     way: Callable[[Surrogate, Array, PRNGKeyArray], Displacement],
-    scheme: str | Scheme,
-    bits: int,
-    mark: float,
+    *,
+    scheme: str | Scheme = DEFAULT_SCHEME,
+    bits: int = 64,
+    mark: float = MARK,
     metric: str = "rms",
 ) -> Attack:
-    """Attack by a displacement in the direction that `way` finds for a surrogate, a size and a random key.
+    """Attack by a displacement in the direction of `way(surrogate, size, seed)`; for the rest see `Assumptions`."""
 
-    Args:
-        way: function (surrogate, size, key) → displacement, which is scaled to the size.
-        scheme: see `subtraction`.
-        bits: see `subtraction`.
-        mark: see `subtraction`.
-        metric: see `descent`.
-    """
-
-    def apply(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
+    def apply(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
         surrogate, original = make_surrogate(mesh, scheme, bits, mark, metric)
         wanted = jnp.asarray(strength, surrogate.signal.dtype)
-        moved = rescale(surrogate, way(surrogate, wanted, random_key(key)), wanted)
+        moved = rescale(surrogate, way(surrogate, wanted, random_key(seed)), wanted)
         return displace(original, original.to_host(moved))
 
     unit = "RMS over the diagonal" if metric == "rms" else f"{metric}, as small displacements make it"
     return Attack(apply, unit, _STRENGTHS, host=True)
 
 
-def _descend(
-    loss: Callable[[Parameters, PRNGKeyArray], Array], start: Parameters, key: PRNGKeyArray, *, steps: int
-) -> Parameters:
-    """Adam, with a step proportional to 1/√iteration."""
+def _descend(loss: Loss, start: Parameters, seed: PRNGKeyArray, *, steps: int) -> Parameters:
+    """Minimise a loss by Adam, with a step proportional to 1/√iteration."""
     init, update, get = optimizers.adam(lambda step: _LEARNING_RATE / jnp.sqrt(step + 1.0))
 
     def step(state: Any, count: Array) -> tuple[Any, None]:
-        slope = jax.grad(loss)(get(state), jax.random.fold_in(key, count))
+        slope = jax.grad(loss)(get(state), jax.random.fold_in(seed, count))
         # The count takes the parameters' own dtype, because dtypes must not be mixed.
         return update(count.astype(jax.tree.leaves(slope)[0].dtype), slope, state), None  # pyright: ignore
 
     return get(jax.lax.scan(step, init(start), jnp.arange(steps))[0])
 
 
-def _evolve(
-    loss: Callable[[Parameters, PRNGKeyArray], Array], start: Parameters, key: PRNGKeyArray, *, generations: int
-) -> Parameters:
-    """The cross-entropy method; returns the mean of the last generation."""
+def _evolve(loss: Loss, start: Parameters, seed: PRNGKeyArray, *, generations: int) -> Parameters:
+    """Minimise a loss by the cross-entropy method; return the mean of the last generation."""
     mean, unravel = ravel_pytree(start)
 
-    def generation(state: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple[Array, Array], None]:
+    def generation(state: tuple[Array, Array], seed: PRNGKeyArray) -> tuple[tuple[Array, Array], None]:
         mean, spread = state
-        draw, same = jax.random.split(key)
+        draw, same = jax.random.split(seed)
         drawn = mean + spread * jax.random.normal(draw, (_POPULATION_SIZE, len(mean)), mean.dtype)
         # All candidates meet the same random key; one after the other, to save memory.
         worth = jax.lax.map(lambda one: loss(unravel(one), same), drawn)
@@ -235,22 +197,19 @@ def _evolve(
         # Few parents make the spread too small by chance, so half of the old one is kept.
         return (best.mean(axis=0), 0.5 * spread + 0.5 * best.std(axis=0)), None
 
-    keys = jax.random.split(key, generations)
-    return unravel(jax.lax.scan(generation, (mean, jnp.ones_like(mean)), keys)[0][0])
+    seeds = jax.random.split(seed, generations)
+    return unravel(jax.lax.scan(generation, (mean, jnp.ones_like(mean)), seeds)[0][0])
 
 
-def _vertices(surrogate: Surrogate, key: PRNGKeyArray) -> tuple[Parameters, Callable[[Parameters], Displacement]]:
-    """All displacements, with larger steps in bands that are harder to see; the start is a random mark."""
+def _vertices(surrogate: Surrogate, seed: PRNGKeyArray) -> Start:
+    """Search all displacements, with larger steps in bands that are harder to see; the start is a random mark."""
     hidden = surrogate.seen.min() / surrogate.seen
-    return (
-        random_mark(surrogate, key)[1] / surrogate.mark,
-        lambda z: band_filter(surrogate, hidden, z),
-    )
+    return random_mark(surrogate, seed)[1] / surrogate.mark, lambda z: band_filter(surrogate, hidden, z)
 
 
-def _bands(surrogate: Surrogate, key: PRNGKeyArray) -> tuple[Parameters, Callable[[Parameters], Displacement]]:
-    """A loss from 0 to 1 in each of the mesh's own bands, and another mark with any strength in each band."""
-    other = random_mark(surrogate, key)[1]
+def _bands(surrogate: Surrogate, seed: PRNGKeyArray) -> Start:
+    """Search losses from 0 to 1 in each of the mesh's own bands, and another mark with any strength in each band."""
+    other = random_mark(surrogate, seed)[1]
     start = jnp.full_like(surrogate.seen, -4), jnp.zeros_like(surrogate.seen)
 
     def make(parameters: tuple[Array, Array]) -> Displacement:
@@ -260,9 +219,9 @@ def _bands(surrogate: Surrogate, key: PRNGKeyArray) -> tuple[Parameters, Callabl
     return start, make
 
 
-def _warps(surrogate: Surrogate, key: PRNGKeyArray) -> tuple[Parameters, Callable[[Parameters], Displacement]]:
-    """Sums of plane waves in random directions; the parameters are their amplitudes."""
-    direct, length, begin = jax.random.split(key, 3)
+def _warps(surrogate: Surrogate, seed: PRNGKeyArray) -> Start:
+    """Search sums of plane waves in random directions; the parameters are their amplitudes."""
+    direct, length, begin = jax.random.split(seed, 3)
     dtype = surrogate.signal.dtype
     waves = jax.random.normal(direct, (_WAVE_COUNT, 3), dtype)
     per_diagonal = jax.random.uniform(length, (_WAVE_COUNT, 1), dtype, 0.5, 1 / _MIN_WAVELENGTH)

@@ -1,7 +1,7 @@
-"""Attacks by somebody who may query a detector with meshes of his own making: for its score, or only its decision.
+"""Attacks by an adversary who may query a detector with any meshes: for its score, or only its decision.
 
-He knows the algorithm, but neither key nor original. Directions are drawn with the spectrum of marks, by the public
-filter, because a detector reveals little along others.
+The adversary knows the algorithm, but neither key nor original. Directions are drawn with the spectrum of marks, by the
+public filter, because a detector reveals little along others.
 """
 
 import math
@@ -11,17 +11,16 @@ from typing import Generic, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
-from jaxmark.adversaries._jamming import through_bands
-from jaxmark.attacks.registry import Attack
+from jaxmark.adversaries.by_name import through_bands
+from jaxmark.attacks.attack import Attack
 from jaxmark.distortion import rms
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.canonical import geometry_hash
 from jaxmark.geometry.mesh import Mesh, diagonal, host_mesh, used_vertices
 from jaxmark.seeds import Randomness, generator
 from jaxmark.spectral.graphs import from_mesh
-from jaxmark.spectral.laplacian import Laplacian
 from jaxmark.watermark.coding.keys import Choices, Key
 from jaxmark.watermark.coding.message import check_size
 from jaxmark.watermark.markers import NonBlindMarker
@@ -38,8 +37,8 @@ _BISECTION_TOLERANCE = 0.01  # over the whole way
 _FIRST_NORMAL_DIRECTIONS = 30  # for the first estimate of the boundary's normal
 _DIRECTIONS_PER_BATCH = 32  # filtered together
 
-Score = Callable[[Mesh], float]
-Decision = Callable[[Mesh], bool]
+Score = Callable[[Mesh], float]  # the evidence √(-2 ln p) of a claim
+Decision = Callable[[Mesh], bool]  # whether the claim is proven
 _Shift = Float64[np.ndarray, "vertices 3"]
 Answer = TypeVar("Answer", bool, float)
 
@@ -61,11 +60,8 @@ def score_oracle(marker: NonBlindMarker, message: bytes) -> Score:
     """Make an oracle for the evidence √(-2 ln p) of a claim, with no floor on p; 0 for a suspect that is refused.
 
     The evidence is S/‖a‖ if the detector tries one way of weighting the suspect, and a little less if it takes the
-    better of two (`detectors.claims`). What is read once more, of few vertices or without bends, is left out.
-
-    Args:
-        marker: the reader: original, key, payload and scheme.
-        message: the message that was written.
+    better of two (`detectors.claims`). The second readings of suspects with few vertices or non-rigid deformations are
+    left out.
 
     Raises:
         JaxmarkError: if message and payload differ in size.
@@ -87,12 +83,9 @@ def score_oracle(marker: NonBlindMarker, message: bytes) -> Score:
 
 
 def decision_oracle(marker: NonBlindMarker, message: bytes, alpha: float = 1e-6) -> Decision:
-    """Make an oracle for the decision whether a claim is proven; a suspect that is refused is not detected.
+    """Make an oracle for the decision whether a claim is proven, with a false-positive probability of at most alpha.
 
-    Args:
-        marker: see `score_oracle`.
-        message: see `score_oracle`.
-        alpha: largest false-positive probability of a proof, in (0, 1).
+    A suspect that is refused is not detected.
 
     Raises:
         JaxmarkError: if message and payload differ in size, or `alpha` is out of range.
@@ -112,12 +105,8 @@ def decision_oracle(marker: NonBlindMarker, message: bytes, alpha: float = 1e-6)
 def decide_by_score(oracle: Score, alpha: float = 1e-6) -> Decision:
     """Make a decision from a score: with `randomise_scores`, one whose threshold nobody can predict.
 
-    Args:
-        oracle: an oracle for √(-2 ln p), see `score_oracle`.
-        alpha: see `decision_oracle`.
-
     Raises:
-        JaxmarkError: if `alpha` is out of range.
+        JaxmarkError: if `alpha`, as in `decision_oracle`, is out of range.
     """
     least = math.sqrt(-2 * math.log(10) * _log10(alpha))
     return lambda mesh: bool(oracle(mesh) >= least)
@@ -125,10 +114,6 @@ def decide_by_score(oracle: Score, alpha: float = 1e-6) -> Decision:
 
 def quantise_scores(oracle: Score, step: float) -> Score:
     """Round scores to multiples of a step, which hides small changes of a mesh.
-
-    Args:
-        oracle: an oracle for scores.
-        step: the step, positive.
 
     Raises:
         JaxmarkError: if the step is not positive.
@@ -139,12 +124,9 @@ def quantise_scores(oracle: Score, step: float) -> Score:
 
 
 def randomise_scores(oracle: Score, spread: float, key: bytes) -> Score:
-    """Add normal noise to scores, which a key determines for each mesh, so that repeated queries average nothing out.
+    """Add normal noise to scores, so that repeated queries average nothing out.
 
-    Args:
-        oracle: an oracle for scores.
-        spread: standard deviation of the noise.
-        key: a key of the detector's, 32 bytes.
+    A key of the detector's, 32 bytes, determines the noise for each mesh; `spread` is its standard deviation.
     """
 
     def score(mesh: Mesh) -> float:
@@ -161,14 +143,8 @@ def estimated_gradient(oracle: Score, *, queries: int = 300) -> Attack:
     little, and moves in four rounds on the sphere of displacements of one size. The gradient of a round is the one of
     least norm that explains the score differences of its pairs. Nesterov and Spokoiny, Foundations of Computational
     Mathematics 17, 2017, draw such pairs and average; least squares make up for directions that are not orthogonal. The
-    attack follows the mean of all gradients so far.
-
-    Args:
-        oracle: an oracle for scores.
-        queries: number of queries allowed for one mesh, at least 2.
-
-    Returns:
-        An attack; its strength is the RMS displacement over the diagonal of the mesh.
+    attack follows the mean of all gradients so far. It takes at most `queries` queries for one mesh. Its strength is
+    the RMS displacement over the diagonal.
 
     Raises:
         JaxmarkError: if `queries` is below 2.
@@ -177,8 +153,8 @@ def estimated_gradient(oracle: Score, *, queries: int = 300) -> Attack:
         raise JaxmarkError(f"A gradient takes at least 2 queries, got {queries}.")
     rounds = min(_GRADIENT_ROUNDS, queries // 2)
 
-    def apply(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
-        space, random = _space(mesh), generator(key)
+    def apply(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
+        space, random = _Space(mesh), generator(seed)
         here, total = space.rescale(space.draw(1, random)[0], strength), np.zeros_like(mesh.vertices, float)
         for _ in range(rounds if strength > 0 else 0):
             ways = space.draw(queries // rounds // 2, random)
@@ -199,14 +175,7 @@ def random_search(oracle: Score, *, queries: int = 300) -> Attack:
     """Lower a score by random moves of the displacement, each kept if the score falls; no gradient is estimated.
 
     Moves grow by a half when one is kept and shrink when it is not, so that about a fifth of them is kept (Rechenberg,
-    Evolutionsstrategie, 1973).
-
-    Args:
-        oracle: an oracle for scores.
-        queries: number of queries allowed for one mesh, at least 1.
-
-    Returns:
-        See `estimated_gradient`.
+    Evolutionsstrategie, 1973). The attack has the queries and strength of `estimated_gradient`.
 
     Raises:
         JaxmarkError: if `queries` is below 1.
@@ -214,8 +183,8 @@ def random_search(oracle: Score, *, queries: int = 300) -> Attack:
     if queries < 1:
         raise JaxmarkError(f"A search takes at least 1 query, got {queries}.")
 
-    def apply(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
-        space, random = _space(mesh), generator(key)
+    def apply(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
+        space, random = _Space(mesh), generator(seed)
         here, step = space.rescale(space.draw(1, random)[0], strength), strength / 2
         lowest = oracle(space.mesh(here))
         for _ in range(queries - 1):
@@ -235,18 +204,13 @@ def boundary(oracle: Decision) -> Attack:
     The search follows HopSkipJump (Chen, Jordan, Wainwright, IEEE Symposium on Security and Privacy 2020): a mesh that
     is jammed until it is not detected moves back towards the marked one as far as it can. There the normal of the
     decision boundary is estimated from decisions nearby; the mesh moves along it, with the step halved until it is not
-    detected, and back again.
-
-    Args:
-        oracle: an oracle for decisions, which always answers alike for the same mesh.
-
-    Returns:
-        An attack; its strength is the number of queries, which is never exceeded. It returns the mesh unchanged if
-        these do not suffice to find a displacement that is not detected.
+    detected, and back again. The oracle must give the same answer whenever it is asked about the same mesh.
+    The strength of the attack is the number of queries, which is never exceeded. It returns the mesh unchanged if these
+    do not suffice to find a displacement that is not detected.
     """
 
-    def apply(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
-        space, random, asked = _space(mesh), generator(key), Counted(oracle)
+    def apply(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
+        space, random, asked = _Space(mesh), generator(seed), Counted(oracle)
 
         def left() -> int:
             return int(strength) - asked.queries
@@ -287,14 +251,12 @@ def boundary(oracle: Decision) -> Attack:
     return Attack(apply, "queries", _QUERY_COUNTS, host=True)
 
 
-@dataclass(frozen=True)
 class _Space:
     """Displacements of the vertices that faces use, in diagonals of the mesh."""
 
-    start: Mesh  # the marked mesh, not displaced
-    operator: Laplacian
-    used: Bool[np.ndarray, " vertices"]
-    length: float  # the diagonal
+    def __init__(self, mesh: Mesh) -> None:
+        self.start = host_mesh(mesh)  # the marked mesh, not displaced
+        self.operator, self.used, self.length = from_mesh(mesh), used_vertices(mesh), diagonal(mesh)
 
     def draw(self, count: int, random: np.random.Generator) -> Float64[np.ndarray, "count vertices 3"]:
         """Draw `count` directions that look like marks, each of RMS 1."""
@@ -316,13 +278,8 @@ class _Space:
         return Mesh(self.start.vertices + self.length * shift, self.start.faces)
 
 
-def _space(mesh: Mesh) -> _Space:
-    mesh = host_mesh(mesh)
-    return _Space(mesh, from_mesh(mesh), used_vertices(mesh), diagonal(mesh))
-
-
 def _log10(alpha: float) -> float:
-    """log10 of a probability; refuse what is not in (0, 1)."""
+    """Return log10 of a probability; refuse one that is not in (0, 1)."""
     if not 0 < alpha < 1:
         raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
     return math.log10(alpha)

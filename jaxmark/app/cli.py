@@ -18,7 +18,7 @@ from typing import NoReturn, get_args
 import click
 
 from jaxmark import distortion
-from jaxmark.adversaries.registry import ATTACKS, chain, get_attack
+from jaxmark.adversaries.by_name import ATTACKS, chain, get_attack
 from jaxmark.alignment.alignment import Align
 from jaxmark.app.bench_commands import bench_command, bench_corpus_command, bench_equal_command
 from jaxmark.app.catalogue_commands import catalogue_group, mark_for_command

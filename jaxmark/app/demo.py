@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmark import distortion
-from jaxmark.adversaries.registry import attack
+from jaxmark.adversaries.by_name import attack
 from jaxmark.alignment.original import Original
 from jaxmark.app.output import power
 from jaxmark.app.progress import Doing, quietly

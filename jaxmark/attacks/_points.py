@@ -1,12 +1,15 @@
-"""What happens to point clouds: points are lost, added, thrown off, merged with another scan, or sampled anew."""
+"""Attacks on point clouds, on the host: points are lost, added, displaced, merged with another scan, or sampled again.
+
+All raise `JaxmarkError` if the mesh has faces, or if no point would be left.
+"""
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.spatial import KDTree
 
-from jaxmark.attacks.host import on_host
+from jaxmark.attacks.support import check_share, on_host
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, diagonal
+from jaxmark.geometry.pose import Points
 from jaxmark.seeds import Randomness, generator
 
 _AROUND = 0.25  # width of what lies around a cloud's box on each side, over its diagonal
@@ -14,128 +17,87 @@ _CORNERS = 6  # nearest points among which two span a triangle with a point
 
 
 @on_host
-def subsampling(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
+def subsampling(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     """Lose points at random; the others stay where they are, in their order.
 
-    Args:
-        mesh: a point cloud, concrete.
-        strength: share of the points that are lost, in [0, 1).
-        key: a JAX random key or a NumPy generator.
-
-    Raises:
-        JaxmarkError: if the mesh has faces, the share is out of range, or no point would be left.
+    The strength is the share of the points that are lost, in [0, 1).
     """
-    points, count = _points("Subsampling", mesh), _share(strength, mesh)
+    points = _points("Subsampling", mesh)
+    check_share(strength, "points")
+    count = round(strength * len(points))
     if count == len(points):
         raise JaxmarkError(f"Of {len(points)} points none would be left; take fewer away.")
-    return _cloud(points[np.sort(generator(key).permutation(len(points))[count:])])
+    return mesh._replace(vertices=points[np.sort(generator(seed).permutation(len(points))[count:])])
 
 
 @on_host
-def outliers(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
+def outliers(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     """Throw points off to random places in and around the cloud's box.
 
-    Args:
-        mesh: a point cloud, concrete.
-        strength: share of the points that are thrown off, in [0, 1).
-        key: a JAX random key or a NumPy generator.
-
-    Raises:
-        JaxmarkError: if the mesh has faces, or the share is out of range.
+    The strength is the share of the points that are thrown off, in [0, 1).
     """
-    points, random = np.array(_points("Throwing points off", mesh)), generator(key)
-    chosen = random.permutation(len(points))[: _share(strength, mesh)]
+    points, random = np.array(_points("Throwing points off", mesh)), generator(seed)
+    check_share(strength, "points")
+    chosen = random.permutation(len(points))[: round(strength * len(points))]
     points[chosen] = _anywhere(mesh, len(chosen), random)
-    return _cloud(points)
+    return mesh._replace(vertices=points)
 
 
 @on_host
-def floaters(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
+def floaters(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     """Add points at random places in and around the cloud's box, in random order among the others.
 
-    Args:
-        mesh: a point cloud, concrete.
-        strength: number of points that are added, over those that are there.
-        key: a JAX random key or a NumPy generator.
-
-    Raises:
-        JaxmarkError: if the mesh has faces.
+    The strength is the number of points that are added, over those that are there.
     """
-    points, random = _points("Adding points", mesh), generator(key)
+    points, random = _points("Adding points", mesh), generator(seed)
     more = _anywhere(mesh, round(strength * len(points)), random)
-    return _cloud(random.permutation(np.concatenate([points, more])))
+    return mesh._replace(vertices=random.permutation(np.concatenate([points, more])))
 
 
 @on_host
-def merging(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
+def merging(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     """Merge the cloud with a second scan of as many points on the same surface, in random order.
 
-    Args:
-        mesh: a point cloud, concrete.
-        strength: half width of the uniform noise on each coordinate of the second scan, over the diagonal.
-        key: a JAX random key or a NumPy generator.
-
-    Raises:
-        JaxmarkError: if the mesh has faces.
+    The strength is the half width of the uniform noise on each coordinate of the second scan, over the diagonal.
     """
-    points, random = _points("Merging scans", mesh), generator(key)
+    points, random = _points("Merging scans", mesh), generator(seed)
     second = _between(points, len(points), random)
     second += strength * diagonal(mesh) * random.uniform(-1, 1, second.shape)
-    return _cloud(random.permutation(np.concatenate([points, second])))
+    return mesh._replace(vertices=random.permutation(np.concatenate([points, second])))
 
 
 @on_host
-def resampling(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
-    """Sample the surface anew: random places between points that are near each other take the place of all points.
+def resampling(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
+    """Sample the surface again: random places between points that are near each other take the place of all points.
 
-    Args:
-        mesh: a point cloud, concrete.
-        strength: number of new points, over those that were there.
-        key: a JAX random key or a NumPy generator.
-
-    Raises:
-        JaxmarkError: if the mesh has faces, or no point would be left.
+    The strength is the number of new points, over those that were there.
     """
     points = _points("Resampling", mesh)
-    if not round(strength * len(points)):
+    if not (count := round(strength * len(points))):
         raise JaxmarkError(f"{strength:g} times {len(points)} points are none; take more.")
-    return _cloud(_between(points, round(strength * len(points)), generator(key)))
+    return mesh._replace(vertices=_between(points, count, generator(seed)))
 
 
-def _points(name: str, mesh: Mesh) -> Float64[np.ndarray, "points 3"]:
-    """The points of a cloud; a mesh is refused, as its faces would have to go."""
+def _points(name: str, mesh: Mesh) -> Points:
+    """Return the points of a cloud; refuse a mesh, whose faces would be lost."""
     if len(mesh.faces):
         raise JaxmarkError(f"{name} takes a point cloud, and this mesh has {len(mesh.faces)} faces; leave them out.")
     return np.asarray(mesh.vertices, np.float64)
 
 
-def _share(share: float, mesh: Mesh) -> int:
-    if not 0 <= share < 1:
-        raise JaxmarkError(f"A share of points is at least 0 and below 1, got {share:g}.")
-    return round(share * len(mesh.vertices))
-
-
-def _cloud(points: Float64[np.ndarray, "points 3"]) -> Mesh:
-    return Mesh(points, np.zeros((0, 3), np.int64))
-
-
-def _anywhere(mesh: Mesh, count: int, random: np.random.Generator) -> Float64[np.ndarray, "places 3"]:
-    """Random places in the box of a cloud, and around it."""
+def _anywhere(mesh: Mesh, count: int, random: np.random.Generator) -> Points:
+    """Draw random places in the box of a cloud, and around it."""
     points, wide = np.asarray(mesh.vertices, np.float64), _AROUND * diagonal(mesh)
     return random.uniform(points.min(axis=0) - wide, points.max(axis=0) + wide, (count, 3))
 
 
-def _between(
-    points: Float64[np.ndarray, "points 3"], count: int, random: np.random.Generator
-) -> Float64[np.ndarray, "places 3"]:
-    """Random places in triangles, each of a random point and two of those nearest to it."""
+def _between(points: Points, count: int, random: np.random.Generator) -> np.ndarray:
+    """Draw random places in triangles, each of a random point and two of those nearest to it."""
     around = min(_CORNERS, len(points) - 1)
     if around < 1:
         return np.repeat(points, count, axis=0)[:count]
     start = random.integers(len(points), size=count)
     nearest = np.asarray(KDTree(points).query(points[start], around + 1)[1])
     corners = [nearest[np.arange(count), random.integers(around + 1, size=count)] for _ in range(2)]
-    share = random.dirichlet(np.ones(3), count)
-    return share[:, :1] * points[start] + sum(
-        share[:, [place + 1]] * points[corner] for place, corner in enumerate(corners)
-    )
+    share, *shares = random.dirichlet(np.ones(3), count).T[..., None]
+    return share * points[start] + sum(part * points[corner] for part, corner in zip(shares, corners, strict=True))

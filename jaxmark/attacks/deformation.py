@@ -1,12 +1,13 @@
-"""Deformation by dragged handles, as in a modelling tool; host side."""
+"""Deformation by dragged handles, as in a modelling tool; on the host."""
 
 import numpy as np
 from jaxtyping import Float64
 
-from jaxmark.attacks.host import on_host
+from jaxmark.attacks.support import on_host
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, compact, component_of, diagonal, face_normals, used_vertices
+from jaxmark.geometry.pose import Points
 from jaxmark.seeds import Randomness, generator
 
 _HANDLE_SHARE = 0.05  # of the vertices, at either end
@@ -14,33 +15,25 @@ _ARAP_STEPS = 50
 
 
 @on_host
-def as_rigid_as_possible(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
+def as_rigid_as_possible(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     """Drag one end of the mesh sideways while the other is held; the rest follows as rigidly as possible.
 
     libigl takes 50 steps of Sorkine and Alexa, "As-rigid-as-possible surface modeling", SGP 2007 (with spokes and
     rims), starting from a shear. It fits rotations in single precision, so that some 1e-5 of the diagonal is rounding.
     The ends are the 5 % of the vertices that lie farthest out on either side along the axis of largest spread; which
     end is dragged is random. Connected parts without a vertex at either end stay where they are, and so do vertices
-    that only faces without area use.
-
-    Args:
-        mesh: any mesh, concrete.
-        strength: length of the drag, in a random direction perpendicular to that axis, relative to the diagonal of the
-            bounding box.
-        key: a JAX random key or a NumPy generator.
-
-    Returns:
-        The deformed mesh.
+    that only faces without area use. The strength is the length of the drag, in a random direction perpendicular to
+    that axis, relative to the diagonal of the bounding box.
 
     Raises:
-        JaxmarkError: if no face has an area, libigl finds no deformation, or libigl is missing.
+        JaxmarkError: if no face has an area, or libigl finds no deformation.
     """
     faces = np.asarray(mesh.faces, np.int64)[face_normals(mesh).any(axis=1)]
     if len(faces) == 0:
         raise JaxmarkError("No face of the mesh has an area; there is no surface to deform.")
     if strength == 0:
         return mesh
-    random, vertices = generator(key), np.array(mesh.vertices, np.float64)
+    random, vertices = generator(seed), np.array(mesh.vertices, np.float64)
     used = np.flatnonzero(used_vertices(Mesh(vertices, faces)))
     share, axis = _ends(vertices[used], random)
     direction = np.cross(axis, random.normal(size=3))
@@ -54,9 +47,9 @@ def as_rigid_as_possible(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
 
 
 def _ends(
-    points: Float64[np.ndarray, "points 3"], random: np.random.Generator
+    points: Points, random: np.random.Generator
 ) -> tuple[Float64[np.ndarray, " points"], Float64[np.ndarray, "3"]]:
-    """Place of each point between the held end, 0, and the dragged end, 1; and the axis from the one to the other."""
+    """Return the place of each point between the held end, 0, and the dragged end, 1; and the axis between them."""
     spread = points - points.mean(axis=0)
     axis = np.linalg.eigh(spread.T @ spread)[1][:, 2] * random.choice([-1.0, 1.0])
     along = spread @ axis
@@ -67,9 +60,7 @@ def _ends(
     return share, axis
 
 
-def _relax(
-    mesh: Mesh, start: Float64[np.ndarray, "vertices 3"], share: Float64[np.ndarray, " vertices"]
-) -> Float64[np.ndarray, "vertices 3"]:
+def _relax(mesh: Mesh, start: Points, share: Float64[np.ndarray, " points"]) -> Points:
     """Relax a deformation from initial positions; vertices whose share is 0 or 1 are fixed to theirs."""
     igl = require("igl", "attacks")
     handles, data = np.flatnonzero((share == 0) | (share == 1)), igl.ARAPData()

@@ -4,15 +4,13 @@ from functools import lru_cache
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, PRNGKeyArray
 from scipy.spatial import KDTree
 
-from jaxmark.attacks.extent import diagonal, displace, surface
-from jaxmark.attacks.host import on_host
+from jaxmark.attacks.support import Strength, centred, diagonal, displace, on_host, surface
 from jaxmark.distortion.roots import root
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, used_vertices, vertex_normals
-from jaxmark.seeds import Randomness
+from jaxmark.seeds import Randomness, Seed
 from jaxmark.spectral.bands import heat, meyer
 from jaxmark.spectral.chebyshev import band_components, synthesise
 from jaxmark.spectral.graphs import from_mesh
@@ -21,58 +19,37 @@ from jaxmark.spectral.padding import common_laplacian, pad_rows
 _OCTAVES = 7  # of wavelets, and a low-pass below λ = 0.03, which is the shape and stays
 _COARSER = 4  # times of diffusion, each twice the one before, by which places are compared
 _ALIKE = 64  # places that are averaged
+_frame = lru_cache(maxsize=1)(meyer)
 
 
-def shrinkage(mesh: Mesh, strength: float | Float[Array, ""], key: PRNGKeyArray | None = None) -> Mesh:
+def shrinkage(mesh: Mesh, strength: Strength, seed: Seed | None = None) -> Mesh:
     """Shrink the coefficients of spectral wavelets towards zero, each vector of three by the same length at most.
 
     Donoho, "De-noising by soft-thresholding", IEEE Transactions on Information Theory 41(3), 1995, with the tight
     frame of Meyer wavelets of the graph Laplacian, `jaxmark.spectral.bands.meyer`: what is small at its place and in
     its octave is removed, what is large keeps its direction. All vertices that faces use move, those on a boundary too.
-
-    Args:
-        mesh: any mesh, its faces concrete.
-        strength: the length that is taken from each coefficient, relative to the diagonal of the bounding box.
-        key: not used; attacks share one signature.
-
-    Returns:
-        The denoised mesh. Differentiable with respect to vertices and strength, in reverse mode.
+    The strength is the length that is taken from each coefficient, relative to the diagonal of the bounding box.
+    Differentiable with respect to vertices and strength, in reverse mode.
     """
-    vertices, operator = jnp.asarray(mesh.vertices), from_mesh(mesh)
-    used, points = used_vertices(mesh)[:, None], surface(mesh)
-    frame = _frame().astype(vertices.dtype)
-    parts = band_components(operator, frame, jnp.where(used, vertices - points.mean(axis=0), 0))
+    start, operator = centred(mesh), from_mesh(mesh)
+    frame = _frame(_OCTAVES + 1).astype(start.dtype)
+    parts = band_components(operator, frame, start)
     length = root(jnp.sum(parts**2, axis=-1, keepdims=True))
-    most = jnp.asarray(strength).astype(vertices.dtype) * diagonal(points)
+    most = jnp.asarray(strength).astype(start.dtype) * diagonal(surface(mesh))
     removed = parts * jnp.where(length > most, most / jnp.where(length > most, length, 1), 1)
     return displace(mesh, -synthesise(operator, frame, removed.at[0].set(0)))
 
 
-@lru_cache(maxsize=1)
-def _frame() -> Float64[np.ndarray, "bands terms"]:
-    return meyer(_OCTAVES + 1)
-
-
 @on_host
-def nonlocal_means(mesh: Mesh, strength: float, random: Randomness | None = None) -> Mesh:
-    """Give each place the detail that places like it have on average, wherever on the surface they are.
+def nonlocal_means(mesh: Mesh, strength: float, seed: Randomness | None = None) -> Mesh:
+    """Give each place the detail that places like it have on average, wherever on the surface they are; on the host.
 
     Non-local means (Buades, Coll, Morel, "A non-local algorithm for image denoising", CVPR 2005; on meshes Yoshizawa,
     Belyaev, Seidel, "Smoothing by example", SMI 2006). Detail is the offset along the normal between a vertex and the
     surface after diffusion of a time t. Places are alike if the differences of the diffusions t, 2t, … 16t along their
     normals are: the 64 that are most alike are averaged, with weights exp(-d²/h²) where h is the median distance of the
-    farthest.
-
-    Args:
-        mesh: any mesh.
-        strength: the time t, in units of the graph Laplacian: exp(-tΔ) is about t steps of smoothing.
-        random: not used; attacks share one signature.
-
-    Returns:
-        The denoised mesh.
-
-    Raises:
-        JaxmarkError: if the time is above 1,000.
+    farthest. The strength is the time t, at most 1,000, in units of the graph Laplacian: exp(-tΔ) is about t steps of
+    smoothing.
     """
     if strength > 1000:
         raise JaxmarkError(f"The time of diffusion of non-local means is 1,000 at most, got {strength:g}.")

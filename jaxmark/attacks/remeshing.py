@@ -1,35 +1,46 @@
-"""Remeshing: nearly the same surface with other vertices and faces; host side, by other programs."""
+"""Remeshing: nearly the same surface with other vertices and faces; on the host, by other programs.
+
+All raise `JaxmarkError` if the program fails or would leave no face, or if the mesh has no extent.
+"""
+
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from jaxmark.attacks.host import on_host
-from jaxmark.attacks.meshlab import apply_filter, apply_filter_to_points
+from jaxmark.attacks.support import check_share, on_host, whole_number
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
-from jaxmark.geometry.mesh import Mesh, area, compact, edges
+from jaxmark.geometry.mesh import Mesh, area, compact, edges, simplify
+from jaxmark.geometry.pose import Points
 from jaxmark.seeds import Randomness, generator
 
-_CELL_RANGE = 4, 512  # along the longest side
-_DEPTH_RANGE = 1, 12  # of the octree
 _SAMPLES_PER_VERTEX = 30
 _CELLS_PER_BLOCK = 4  # along each side of a block; a coarse grid of blocks tells where the surface may be
 
 
 @on_host
-def isotropic(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
+def simplification(mesh: Mesh, strength: float, seed: Randomness | None = None) -> Mesh:
+    """Collapse edges, those of least quadric error first, until only a share of the faces is left.
+
+    The program is fast-simplification (`jaxmark.geometry.mesh.simplify`). The protocol of SMI 2010 (Wang et al.) has
+    the same strengths, but uses the simplifier of CGAL, that of Lindstrom and Turk, "Fast and memory efficient
+    polygonal simplification", 1998. The strength is the share of the edges to collapse, in [0, 1). The same share of
+    the faces goes with them, rounded to a whole number of faces.
+    """
+    check_share(strength, "edges to collapse")
+    count = len(mesh.faces)
+    left = round((1 - strength) * count)
+    if left == 0:
+        raise JaxmarkError(f"Of {count} faces none would be left; ask for a share of at most {1 - 1 / count:g}.")
+    return simplify(mesh, left)
+
+
+@on_host
+def isotropic(mesh: Mesh, strength: float, seed: Randomness | None = None) -> Mesh:
     """Remesh with edges of about one length and vertices on the surface, by MeshLab.
 
-    Args:
-        mesh: any mesh, concrete.
-        strength: the target length, relative to the mean length of the mesh's edges, in [0.1, 100].
-        key: not used; attacks share one signature.
-
-    Returns:
-        A mesh with other vertices and faces.
-
-    Raises:
-        JaxmarkError: if the length is out of range, MeshLab fails, or pymeshlab is missing.
+    The strength is the target length, relative to the mean length of the mesh's edges, in [0.1, 100].
     """
     if not 0.1 <= strength <= 100:
         raise JaxmarkError(f"Remeshing takes an edge length of 0.1 to 100 mean ones, got {strength:g}.")
@@ -41,26 +52,13 @@ def isotropic(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mes
 
 
 @on_host
-def iso_surface(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
+def iso_surface(mesh: Mesh, strength: float, seed: Randomness | None = None) -> Mesh:
     """Extract the surface again from a grid of signed distances, by libigl and the marching cubes of scikit-image.
 
-    Where holes leave open what is inside, the winding number decides.
-
-    Args:
-        mesh: any mesh, concrete.
-        strength: cells along the longest side of the bounding box, a whole number from 4 to 512.
-        key: not used; attacks share one signature.
-
-    Returns:
-        A mesh with other vertices and faces.
-
-    Raises:
-        JaxmarkError: if the number of cells is out of range, the mesh has no inside, or libigl or scikit-image is
-            missing.
+    At holes the winding number decides what is inside. The strength is the number of cells along the longest side of
+    the bounding box, a whole number from 4 to 512. The mesh must have an inside.
     """
-    least, most = _CELL_RANGE
-    if not least <= strength <= most or strength != int(strength):
-        raise JaxmarkError(f"A grid takes a whole number of {least} to {most} cells a side, got {strength:g}.")
+    whole_number(strength, 4, 512, "A grid takes a whole number of 4 to 512 cells a side")
     measure, mesh = require("skimage.measure", "attacks"), compact(mesh)
     low, extent = np.asarray(mesh.vertices).min(axis=0), np.ptp(mesh.vertices, axis=0)
     cell = float(extent.max()) / strength
@@ -84,43 +82,48 @@ def iso_surface(mesh: Mesh, strength: float, key: Randomness | None = None) -> M
 
 
 @on_host
-def poisson(mesh: Mesh, strength: float, key: Randomness) -> Mesh:
+def poisson(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
     """Reconstruct the surface from random points with normals, 30 for each vertex, by MeshLab.
 
     This is the screened Poisson reconstruction of Kazhdan and Hoppe, ACM Transactions on Graphics 32(3), 2013, which
-    closes holes.
-
-    Args:
-        mesh: any mesh, concrete.
-        strength: depth of the octree, a whole number from 1 to 12.
-        key: a JAX random key or a NumPy generator, which determines the points.
-
-    Returns:
-        A mesh with other vertices and faces.
-
-    Raises:
-        JaxmarkError: if the depth is out of range, the mesh has no area, MeshLab fails, or pymeshlab is missing.
+    closes holes. The strength is the depth of the octree, a whole number from 1 to 12.
     """
     import trimesh  # takes long to import
 
-    least, most = _DEPTH_RANGE
-    if not least <= strength <= most or strength != int(strength):
-        raise JaxmarkError(f"An octree has a whole depth from {least} to {most}, got {strength:g}.")
+    depth = whole_number(strength, 1, 12, "An octree has a whole depth from 1 to 12")
     mesh = compact(mesh)
     if not area(mesh) > 0:
         raise JaxmarkError("The mesh has no area; there is no surface to reconstruct.")
     surface = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), process=False)
-    points, face = trimesh.sample.sample_surface(
-        surface, _SAMPLES_PER_VERTEX * len(mesh.vertices), seed=generator(key)
-    )[:2]
+    count = _SAMPLES_PER_VERTEX * len(mesh.vertices)
+    points, face = trimesh.sample.sample_surface(surface, count, seed=generator(seed))[:2]
     normals = np.asarray(surface.face_normals)[face]
     name = "generate_surface_reconstruction_screened_poisson"
     # One thread, because several would add up in no fixed order.
-    return apply_filter_to_points(name, np.asarray(points), normals, depth=int(strength), threads=1)
+    return apply_filter(name, Mesh(np.asarray(points), mesh.faces), normals, depth=depth, threads=1)
 
 
 def _signed_distance(mesh: Mesh, points: Int64[np.ndarray, "points 3"]) -> Float64[np.ndarray, " points"]:
-    """Signed distance from points to a mesh, negative inside by the winding number."""
+    """Return the signed distance from points to a mesh, negative inside by the winding number."""
     igl = require("igl", "attacks")
     sign = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
     return igl.signed_distance(points.astype(np.float64), np.asarray(mesh.vertices), np.asarray(mesh.faces), sign)[0]
+
+
+def apply_filter(name: str, mesh: Mesh, normals: Points | None = None, **options: Any) -> Mesh:
+    """Apply a filter of MeshLab, by its name and options in pymeshlab, to a mesh, or to its vertices with normals."""
+    rest = {"face_matrix": np.asarray(mesh.faces)} if normals is None else {"v_normals_matrix": normals}
+    meshlab = require("pymeshlab", "attacks")
+    filters = meshlab.MeshSet()
+    filters.add_mesh(meshlab.Mesh(vertex_matrix=np.asarray(mesh.vertices), **rest))
+    try:
+        filters.apply_filter(name, **options)
+        made = filters.current_mesh()
+        points, faces = made.vertex_matrix(), made.face_matrix()
+    except Exception as error:  # whatever type pymeshlab raises
+        raise JaxmarkError(
+            f"MeshLab could not do this to the mesh ({name}): {' '.join(str(error).split())}."
+        ) from error
+    if len(faces) == 0:
+        raise JaxmarkError(f"MeshLab left no face of this mesh ({name}).")
+    return Mesh(points, faces.astype(np.int64))

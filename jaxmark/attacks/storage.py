@@ -1,57 +1,59 @@
-"""Storage: what file formats lose of a mesh; host side."""
+"""Storage: rounding and loss of connectivity, as in file formats."""
 
 import tempfile
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
 
-from jaxmark.attacks.host import on_host
+from jaxmark.attacks.support import on_host, surface, whole_number
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
 from jaxmark.geometry.mesh import Mesh, used_vertices
-from jaxmark.seeds import Randomness
+from jaxmark.seeds import Randomness, Seed
 
-_MAX_DIGITS = 17  # enough to tell any two float64 apart
 _FLOAT_TYPES = {64: np.float64, 32: np.float32, 16: np.float16}  # by their bits
-_MAX_ROUND_TRIPS = 10
 
 
-@on_host
-def digits(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
-    """Round coordinates to a number of significant decimal digits, as text files do.
+def quantisation(mesh: Mesh, strength: float, seed: Seed | None = None) -> Mesh:
+    """Round coordinates to a uniform grid whose step along each axis is (max - min)/2^R.
 
-    Args:
-        mesh: any mesh, concrete.
-        strength: number of digits, a whole number from 1 to 17; at 17 nothing changes.
-        key: not used; attacks share one signature.
-
-    Returns:
-        The mesh with rounded coordinates.
-
-    Raises:
-        JaxmarkError: if the number of digits is not whole, or outside [1, 17].
+    The strength is R, the bits per coordinate, a number in [1, 32]; static. Gradients pass straight through the
+    rounding.
     """
-    if not 1 <= strength <= _MAX_DIGITS or strength != int(strength):
-        raise JaxmarkError(f"A decimal has a whole number of 1 to {_MAX_DIGITS} significant digits, got {strength:g}.")
-    vertices = np.asarray(mesh.vertices, np.float64)
-    return _replace_used(mesh, np.char.mod(f"%.{int(strength) - 1}e", vertices).astype(np.float64))
+    if not 1 <= strength <= 32:
+        raise JaxmarkError(f"Quantisation takes 1 to 32 bits per coordinate, got {strength}.")
+    vertices, points = jnp.asarray(mesh.vertices), surface(mesh)
+    low = points.min(axis=0)
+    step = (points.max(axis=0) - low) / float(2**strength)
+    # Along an axis of zero extent there is nothing to round.
+    rounds = used_vertices(mesh)[:, None] & (step > 0)
+    rounded = jnp.where(rounds, low + step * jnp.round((vertices - low) / jnp.where(step > 0, step, 1)), vertices)
+    return Mesh(vertices + jax.lax.stop_gradient(rounded - vertices), mesh.faces)
 
 
 @on_host
-def float_bits(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
-    """Round coordinates to IEEE 754 binary floats of a number of bits.
+def digits(mesh: Mesh, strength: float, seed: Randomness | None = None) -> Mesh:
+    """Round coordinates to a number of significant decimal digits, as text files do; on the host.
 
-    Args:
-        mesh: any mesh, concrete.
-        strength: bits per coordinate: 64, at which nothing changes, 32 or 16.
-        key: not used; attacks share one signature.
+    The strength is the number of digits, a whole number from 1 to 17; at 17, which tells any two float64 apart, nothing
+    changes.
+    """
+    count = whole_number(strength, 1, 17, "A decimal has a whole number of 1 to 17 significant digits")
+    rounded = np.char.mod(f"%.{count - 1}e", np.asarray(mesh.vertices, np.float64)).astype(np.float64)
+    return _replace_used(mesh, rounded)
 
-    Returns:
-        The mesh with rounded coordinates.
+
+@on_host
+def float_bits(mesh: Mesh, strength: float, seed: Randomness | None = None) -> Mesh:
+    """Round coordinates to IEEE 754 binary floats of a number of bits; on the host.
+
+    The strength is the number of bits per coordinate: 64, at which nothing changes, 32 or 16.
 
     Raises:
-        JaxmarkError: if there is no float of that many bits, or a coordinate is too large for it.
+        JaxmarkError: if a coordinate is too large for such a float.
     """
     if strength not in _FLOAT_TYPES:
         raise JaxmarkError(f"A coordinate is stored as a float of 64, 32 or 16 bits, got {strength:g}.")
@@ -67,28 +69,19 @@ def float_bits(mesh: Mesh, strength: float, key: Randomness | None = None) -> Me
 
 
 @on_host
-def soup(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
+def soup(mesh: Mesh, strength: float, seed: Randomness | None = None) -> Mesh:
     """Write the mesh to a binary STL file and read it again: single precision, and no vertices shared by faces.
 
-    Args:
-        mesh: any mesh, concrete.
-        strength: number of times, a whole number from 1 to 10; the first loses all that can be lost.
-        key: not used; attacks share one signature.
-
-    Returns:
-        Three vertices for each face, in the order of the faces.
+    The result has three vertices for each face, in the order of the faces. The strength is the number of times, a whole
+    number from 1 to 10; the first loses all that can be lost. On the host.
 
     Raises:
-        JaxmarkError: if the number of times is not whole, or outside [1, 10], or single precision cannot hold the mesh
-            (see `jaxmark.files.save_mesh`).
+        JaxmarkError: if single precision cannot hold the mesh (see `jaxmark.files.save_mesh`).
     """
-    if not 1 <= strength <= _MAX_ROUND_TRIPS or strength != int(strength):
-        raise JaxmarkError(
-            f"A mesh is written and read a whole number of 1 to {_MAX_ROUND_TRIPS} times, got {strength:g}."
-        )
+    times = whole_number(strength, 1, 10, "A mesh is written and read a whole number of 1 to 10 times")
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "soup.stl"
-        for _ in range(int(strength)):
+        for _ in range(times):
             save_mesh(mesh, file)
             mesh = load_mesh(file)
     return mesh

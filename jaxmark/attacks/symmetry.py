@@ -1,4 +1,4 @@
-"""Averaging over what a shape repeats, such as mirrored halves or equal parts; host side.
+"""Averaging over what a shape repeats, such as mirrored halves or equal parts; on the host.
 
 A mark that differs from one repetition to the next is averaged out.
 """
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from jaxmark.alignment.registration import refine
-from jaxmark.attacks.host import on_host
+from jaxmark.attacks.support import check_share, on_host
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, component_of, diagonal, used_vertices
 from jaxmark.geometry.pose import IDENTITY, Points, PointSets, Pose, similarity
@@ -27,26 +27,19 @@ _PROCRUSTES_ROUNDS = 3
 
 
 @on_host
-def mirror_averaging(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
+def mirror_averaging(mesh: Mesh, strength: float, seed: Randomness | None = None) -> Mesh:
     """Average the mesh with its mirror image.
 
     The mirror plane is the best of three through the centroid and perpendicular to the principal axes, each refined by
     closest points between the surface and its image. Vertices move towards the closest point of the image; those
-    farther from it than 2 % of the diagonal have no counterpart and stay.
-
-    Args:
-        mesh: any mesh, concrete.
-        strength: share of the way to the mean of mesh and image, in [0, 1]; 1 is half of the way to the image.
-        key: not used; attacks share one signature.
-
-    Returns:
-        The mesh with moved vertices.
+    farther from it than 2 % of the diagonal have no counterpart and stay. The strength is the share of the way to the
+    mean of mesh and image, in [0, 1]; 1 is half of the way to the image.
 
     Raises:
-        JaxmarkError: if the share is outside [0, 1]; if half of the surface is farther from the best mirror image than
-            2 % of the diagonal, or has no area; if libigl is missing.
+        JaxmarkError: if half of the surface is farther from the best mirror image than 2 % of the diagonal, or has no
+            area.
     """
-    _check(strength)
+    check_share(strength, "the way to the mean", closed=True)
     if strength == 0:
         return mesh
     vertices, used = np.array(mesh.vertices, np.float64), used_vertices(mesh)
@@ -66,25 +59,18 @@ def mirror_averaging(mesh: Mesh, strength: float, key: Randomness | None = None)
 
 
 @on_host
-def instance_averaging(mesh: Mesh, strength: float, key: Randomness | None = None) -> Mesh:
+def instance_averaging(mesh: Mesh, strength: float, seed: Randomness | None = None) -> Mesh:
     """Average parts of the mesh that repeat each other, such as screws, leaves or wheels.
 
     Connected parts repeat each other if their faces are the same once their vertices are numbered in the order in which
     faces use them, and if a similarity brings one to an RMS distance of at most 1 % of its diagonal from the other.
-    Their mean shape (by generalised Procrustes analysis; Gower, Psychometrika 40, 1975) is put in the pose of each.
-
-    Args:
-        mesh: any mesh, concrete.
-        strength: share of the way to the mean, in [0, 1].
-        key: not used; attacks share one signature.
-
-    Returns:
-        The mesh with moved vertices.
+    Their mean shape (by generalised Procrustes analysis; Gower, Psychometrika 40, 1975) is put in the pose of each. The
+    strength is the share of the way to the mean, in [0, 1].
 
     Raises:
-        JaxmarkError: if the share is outside [0, 1], or no part of at least four vertices is repeated.
+        JaxmarkError: if no part of at least four vertices is repeated.
     """
-    _check(strength)
+    check_share(strength, "the way to the mean", closed=True)
     if strength == 0:
         return mesh
     vertices, alone = np.array(mesh.vertices, np.float64), True
@@ -97,22 +83,14 @@ def instance_averaging(mesh: Mesh, strength: float, key: Randomness | None = Non
     return Mesh(vertices, mesh.faces)
 
 
-def _check(strength: float) -> None:
-    if not 0 <= strength <= 1:
-        raise JaxmarkError(f"A share of the way to the mean is in [0, 1], got {strength:g}.")
-
-
 def _mirror(surface: Surface) -> tuple[Pose, float]:
-    """The reflection that changes a surface least, and the median distance of reflected points from the surface."""
+    """Find the reflection that changes a surface least, and the median distance of reflected points from it."""
     points, normals, _ = sample(surface.mesh, _SAMPLE_POINTS)
     middle = points.mean(axis=0)
     axes = np.linalg.eigh((points - middle).T @ (points - middle))[1].T
-    starts = [_reflection(axis, float(axis @ middle)) for axis in axes]
-    ends = [
-        _refine_mirror(surface, points[:_FIRST_SAMPLE_POINTS], normals[:_FIRST_SAMPLE_POINTS], start)
-        for start in starts
-    ]
-    best = min(ends, key=lambda end: _distance(surface, points[:_FIRST_SAMPLE_POINTS], end))
+    few, some = points[:_FIRST_SAMPLE_POINTS], normals[:_FIRST_SAMPLE_POINTS]
+    ends = [_refine_mirror(surface, few, some, _reflection(axis, float(axis @ middle))) for axis in axes]
+    best = min(ends, key=lambda end: _distance(surface, few, end))
     mirror = _refine_mirror(surface, points, normals, best)
     return mirror, _distance(surface, points, mirror)
 
@@ -127,18 +105,18 @@ def _refine_mirror(surface: Surface, points: Points, normals: Points, mirror: Po
 
 
 def _distance(surface: Surface, points: Points, mirror: Pose) -> float:
-    """Median distance of reflected points from the surface."""
+    """Return the median distance of reflected points from the surface."""
     image = mirror(points)
     return float(np.median(np.linalg.norm(surface.closest(image)[0] - image, axis=1)))
 
 
 def _reflection(normal: Float64[np.ndarray, "3"], offset: float) -> Pose:
-    """Reflection across the plane normal · x = offset."""
+    """Return the reflection across the plane normal · x = offset."""
     return Pose(np.eye(3) - 2 * np.outer(normal, normal), 2 * offset * normal)
 
 
 def _fit_reflection(points: Points, images: Points) -> Pose:
-    """The reflection that brings points closest to their images, in the least-squares sense.
+    """Return the reflection that brings points closest to their images, in the least-squares sense.
 
     The sum of squares that remains is 4 nᵀ Σ x yᵀ n - count · (n · Δ)² plus a constant, for centred points x and images
     y whose means are Δ apart.
@@ -150,7 +128,7 @@ def _fit_reflection(points: Points, images: Points) -> Pose:
 
 
 def _repetitions(mesh: Mesh) -> Iterator[Int64[np.ndarray, "parts vertices"]]:
-    """Vertices of parts that repeat each other, one part per row, in corresponding order."""
+    """Yield the vertices of parts that repeat each other, one part per row, in corresponding order."""
     vertices = np.asarray(mesh.vertices, np.float64)
     for parts in _same_faces(mesh):
         left = parts
@@ -166,7 +144,7 @@ def _repetitions(mesh: Mesh) -> Iterator[Int64[np.ndarray, "parts vertices"]]:
 
 
 def _same_faces(mesh: Mesh) -> Iterator[Int64[np.ndarray, "parts vertices"]]:
-    """Vertices of parts with the same connectivity, one part per row, in the order in which faces use them."""
+    """Yield the vertices of parts of the same connectivity, one part per row, in the order in which faces use them."""
     faces = np.asarray(mesh.faces, np.int64)
     label = component_of(mesh)[faces[:, 0]]
     order = np.argsort(label, kind="stable")
@@ -182,7 +160,7 @@ def _same_faces(mesh: Mesh) -> Iterator[Int64[np.ndarray, "parts vertices"]]:
 
 
 def _mean(points: PointSets) -> PointSets:
-    """The mean shape of several sets of points, put in the pose of each."""
+    """Return the mean shape of several sets of points, put in the pose of each."""
     mean = points[0]
     for _ in range(_PROCRUSTES_ROUNDS):
         mean = similarity(points, mean)(points).mean(axis=0)

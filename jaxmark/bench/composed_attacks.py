@@ -7,9 +7,9 @@ from jaxtyping import Float64
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from jaxmark.adversaries.registry import attack, chain
+from jaxmark.adversaries.by_name import attack, chain
 from jaxmark.attacks import Attack
-from jaxmark.attacks.meshlab import apply_filter_to_points
+from jaxmark.attacks.remeshing import apply_filter
 from jaxmark.distortion import Reference
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
@@ -66,7 +66,7 @@ def _print_scan(mesh: Mesh, strength: float, random: np.random.Generator) -> Mes
     away = np.linalg.norm(points - points[random.integers(len(points))], axis=1)
     seen = away >= np.quantile(away, 1 - _SCAN_COVERAGE)
     name = "generate_surface_reconstruction_screened_poisson"
-    scanned = apply_filter_to_points(name, points[seen], normals[seen], depth=_SCAN_DEPTH, threads=1)
+    scanned = apply_filter(name, Mesh(points[seen], mesh.faces), normals[seen], depth=_SCAN_DEPTH, threads=1)
     near = KDTree(points[seen]).query(np.asarray(scanned.vertices))[0] <= _SCAN_REACH
     faces = np.asarray(scanned.faces)
     return compact(Mesh(np.asarray(scanned.vertices), faces[near[faces].all(axis=1)]))

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxmark.adversaries.registry import attack
+from jaxmark.adversaries.by_name import attack
 from jaxmark.bench import parametric as shapes
 from jaxmark.bench.parametric import SHAPES
 from jaxmark.errors import JaxmarkError

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxmark.adversaries.registry import attack
+from jaxmark.adversaries.by_name import attack
 from jaxmark.attacks import Attack
 from jaxmark.bench import composed_attacks as composed
 from jaxmark.errors import JaxmarkError

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from jaxmark.adversaries.registry import attack, get_attack
+from jaxmark.adversaries.by_name import attack, get_attack
 from jaxmark.attacks import Kind
 from jaxmark.distortion import Comparison, compare
 from jaxmark.errors import JaxmarkError

@@ -15,7 +15,7 @@ from itertools import product
 from numbers import Integral, Real
 from typing import Any
 
-from jaxmark.adversaries.registry import attack_each, get_attack
+from jaxmark.adversaries.by_name import attack_each, get_attack
 from jaxmark.attacks import Attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation._rates import LOG10_LEVEL, Control, Row

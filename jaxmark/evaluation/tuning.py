@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int64
 
-from jaxmark.adversaries.registry import attack, get_attack
+from jaxmark.adversaries.by_name import attack, get_attack
 from jaxmark.alignment.attempts import align
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.attacks import Kind

@@ -7,8 +7,8 @@ import pytest
 
 import jaxmark as jm
 from jaxmark.adversaries import chain_attack, projected_cost, search_chain
+from jaxmark.adversaries.by_name import ATTACKS
 from jaxmark.adversaries.chains import Gene, decode, run_chain
-from jaxmark.adversaries.registry import ATTACKS
 from jaxmark.geometry.mesh import Mesh
 
 TOOLS = {"noise": (1e-3, 1e-1), "smoothing": (1, 100), "quantisation": (12, 4)}

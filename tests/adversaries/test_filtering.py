@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 import jaxmark as jm
-from jaxmark.adversaries.filtering import band_stop, low_pass
+from jaxmark.adversaries.by_name import band_stop, low_pass
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral.graphs import from_mesh
 from tests.dense import laplacian_matrix

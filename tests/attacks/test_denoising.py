@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
-from jaxmark.adversaries.filtering import low_pass
+from jaxmark.adversaries.by_name import low_pass
 from jaxmark.attacks.denoising import shrinkage
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral import band_components, bands, from_mesh

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 from scipy.stats import kstest
 
 import jaxmark as jm
-from jaxmark.adversaries.registry import ATTACKS, attack_each
+from jaxmark.adversaries.by_name import ATTACKS, attack_each
 from jaxmark.attacks import (
     affine,
     diagonal_noise,

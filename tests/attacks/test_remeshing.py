@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 import jaxmark as jm
 from jaxmark.attacks import iso_surface, isotropic, poisson, simplification
-from jaxmark.attacks.meshlab import apply_filter
+from jaxmark.attacks.remeshing import apply_filter
 from jaxmark.geometry.mesh import Mesh, diagonal, edges, make_mesh
 from tests.samples import exact_sheet
 

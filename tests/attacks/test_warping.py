@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 import jaxmark as jm
-from jaxmark.adversaries._jamming import jamming
+from jaxmark.adversaries.by_name import jamming
 from jaxmark.attacks import bending, twisting, warp
 from jaxmark.geometry.mesh import Mesh, diagonal, make_mesh
 from jaxmark.spectral.graphs import from_mesh

@@ -1,34 +1,28 @@
-"""The list of attacks by accident or by a tool, and how one or several of a list are applied to a mesh."""
+"""Attacks by their names, and how one or several of them are applied to a mesh."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from numbers import Real
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float64, Key, PRNGKeyArray
+from jaxtyping import Array, Key, PRNGKeyArray
 
-from jaxmark.attacks._affine import affine, similarity
-from jaxmark.attacks._cropping import cropping, holes, region_cropping
 from jaxmark.attacks._points import floaters, merging, outliers, resampling, subsampling
-from jaxmark.attacks._quantisation import quantisation
-from jaxmark.attacks._simplification import simplification
-from jaxmark.attacks.bilateral import bilateral_smoothing
 from jaxmark.attacks.deformation import as_rigid_as_possible
 from jaxmark.attacks.denoising import nonlocal_means, shrinkage
-from jaxmark.attacks.flips import edge_flips
+from jaxmark.attacks.flips import edge_flips, reordering
 from jaxmark.attacks.noise import diagonal_noise, gaussian_noise, uniform_noise
-from jaxmark.attacks.ordering import reordering
-from jaxmark.attacks.pieces import missing_pieces, mosaic
+from jaxmark.attacks.parts import adding_geometry, cropping, holes, missing_pieces, mosaic, region_cropping
 from jaxmark.attacks.refitting import plane_fitting, primitive_fitting
-from jaxmark.attacks.remeshing import iso_surface, isotropic, poisson
-from jaxmark.attacks.scene import adding_geometry
-from jaxmark.attacks.smoothing import cotangent_smoothing, laplacian_smoothing, taubin_smoothing
-from jaxmark.attacks.storage import digits, float_bits, soup
+from jaxmark.attacks.remeshing import iso_surface, isotropic, poisson, simplification
+from jaxmark.attacks.smoothing import bilateral_smoothing, cotangent_smoothing, laplacian_smoothing, taubin_smoothing
+from jaxmark.attacks.storage import digits, float_bits, quantisation, soup
 from jaxmark.attacks.subdivision import loop, midpoint, sqrt3
 from jaxmark.attacks.symmetry import instance_averaging, mirror_averaging
-from jaxmark.attacks.warping import bending, twisting, warp
+from jaxmark.attacks.transformations import affine, bending, similarity, twisting, warp
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import (
     Mesh,
@@ -49,8 +43,8 @@ class Attack(NamedTuple):
     """An attack: one of the library's, or your own.
 
     Attributes:
-        apply: function (mesh, strength, randomness) → mesh. On the host, randomness is a `numpy.random.Generator`, and
-            the mesh is as it is; else a JAX random key, and the mesh is centred and at unit diagonal.
+        apply: function (mesh, strength, seed) → mesh. On the host, the seed is a `numpy.random.Generator`, and the mesh
+            is as it is; else a JAX random key, and the mesh is centred and at unit diagonal.
         unit: what its strength is, in words.
         strengths: usual strengths, weak ones first.
         host: whether it is NumPy or another program; else it is traced.
@@ -64,7 +58,11 @@ class Attack(NamedTuple):
     faces: bool = False
 
 
-#: What happens to meshes, by accident or by a tool; `jaxmark.adversaries.registry` has all attacks.
+# Attacks that need faces, that run on the host, and both.
+surface_attack, _host = partial(Attack, faces=True), partial(Attack, host=True)
+_host_surface = partial(Attack, host=True, faces=True)
+
+#: Attacks by accident or by a tool; `jaxmark.adversaries.ATTACKS` has all attacks.
 ATTACKS: Mapping[str, Attack] = {
     "noise": Attack(
         uniform_noise, "half width over the mean distance to the centre", (0.0005, 0.001, 0.003, 0.005, 0.01)
@@ -75,20 +73,15 @@ ATTACKS: Mapping[str, Attack] = {
         "standard deviation of a coordinate over the mean distance to the centre",
         (0.0003, 0.0006, 0.002, 0.003, 0.006),
     ),
-    "smoothing": Attack(laplacian_smoothing, "steps of 0.1", (5, 10, 30, 50, 100), faces=True),
-    "taubin": Attack(taubin_smoothing, "pairs of steps 0.5, -0.53", (5, 10, 20, 50, 100), faces=True),
-    "cotangent-smoothing": Attack(
-        cotangent_smoothing, "time of diffusion by cotangents", (0.5, 1, 3, 5, 10), faces=True
+    "smoothing": surface_attack(laplacian_smoothing, "steps of 0.1", (5, 10, 30, 50, 100)),
+    "taubin": surface_attack(taubin_smoothing, "pairs of steps 0.5, -0.53", (5, 10, 20, 50, 100)),
+    "cotangent-smoothing": surface_attack(cotangent_smoothing, "time of diffusion by cotangents", (0.5, 1, 3, 5, 10)),
+    "bilateral": surface_attack(bilateral_smoothing, "iterations", (1, 2, 5, 10, 20)),
+    "shrinkage": surface_attack(
+        shrinkage, "length over the diagonal that wavelets are shrunk by", (0.0001, 0.0003, 0.001, 0.003, 0.01)
     ),
-    "bilateral": Attack(bilateral_smoothing, "iterations", (1, 2, 5, 10, 20), faces=True),
-    "shrinkage": Attack(
-        shrinkage,
-        "length over the diagonal that wavelets are shrunk by",
-        (0.0001, 0.0003, 0.001, 0.003, 0.01),
-        faces=True,
-    ),
-    "non-local-means": Attack(
-        nonlocal_means, "time of diffusion, whose detail is averaged", (1, 3, 10, 30, 100), host=True, faces=True
+    "non-local-means": _host_surface(
+        nonlocal_means, "time of diffusion, whose detail is averaged", (1, 3, 10, 30, 100)
     ),
     "quantisation": Attack(quantisation, "bits per coordinate", (11, 10, 9, 8, 7)),
     "similarity": Attack(
@@ -98,65 +91,45 @@ ATTACKS: Mapping[str, Attack] = {
     "warp": Attack(warp, "RMS over the diagonal", (0.002, 0.005, 0.01, 0.02, 0.04)),
     "bending": Attack(bending, "degrees", (2, 5, 10, 20, 45)),
     "twisting": Attack(twisting, "degrees over the whole length", (2, 5, 10, 20, 45)),
-    "edge-flips": Attack(edge_flips, "share of the edges", (0.01, 0.03, 0.1, 0.2, 0.3), host=True, faces=True),
-    "midpoint": Attack(midpoint, "steps", (1, 2, 3), faces=True),
-    "sqrt3": Attack(sqrt3, "steps", (1, 2, 3), faces=True),
-    "loop": Attack(loop, "steps", (1, 2, 3), faces=True),
-    "simplification": Attack(
-        simplification, "share of the edges that goes", (0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.975), host=True, faces=True
+    "edge-flips": _host_surface(edge_flips, "share of the edges", (0.01, 0.03, 0.1, 0.2, 0.3)),
+    "midpoint": surface_attack(midpoint, "steps", (1, 2, 3)),
+    "sqrt3": surface_attack(sqrt3, "steps", (1, 2, 3)),
+    "loop": surface_attack(loop, "steps", (1, 2, 3)),
+    "simplification": _host_surface(
+        simplification, "share of the edges that goes", (0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.975)
     ),
-    "isotropic": Attack(isotropic, "edge length over the mean one", (0.5, 0.7, 1, 1.4, 2), host=True, faces=True),
-    "iso-surface": Attack(iso_surface, "cells along the longest side", (200, 150, 100, 70, 50), host=True, faces=True),
-    "poisson": Attack(poisson, "depth of the octree", (8, 7, 6, 5), host=True, faces=True),
-    "cropping": Attack(cropping, "share of the vertices, beyond a plane", (0.1, 0.3, 0.5, 0.7, 0.8), host=True),
-    "region-cropping": Attack(
-        region_cropping, "share of the vertices, in one region", (0.1, 0.3, 0.5, 0.7, 0.8), host=True
+    "isotropic": _host_surface(isotropic, "edge length over the mean one", (0.5, 0.7, 1, 1.4, 2)),
+    "iso-surface": _host_surface(iso_surface, "cells along the longest side", (200, 150, 100, 70, 50)),
+    "poisson": _host_surface(poisson, "depth of the octree", (8, 7, 6, 5)),
+    "cropping": _host(cropping, "share of the vertices, beyond a plane", (0.1, 0.3, 0.5, 0.7, 0.8)),
+    "region-cropping": _host(region_cropping, "share of the vertices, in one region", (0.1, 0.3, 0.5, 0.7, 0.8)),
+    "holes": _host(holes, "share of the vertices, in ten regions", (0.02, 0.05, 0.1, 0.2, 0.3)),
+    "reordering": _host(reordering, "share of the vertices and of the faces", (0.01, 0.1, 0.3, 1)),
+    "added-geometry": _host_surface(
+        adding_geometry, "size of a ring and of a box over the diagonal", (0.25, 0.5, 1, 2)
     ),
-    "holes": Attack(holes, "share of the vertices, in ten regions", (0.02, 0.05, 0.1, 0.2, 0.3), host=True),
-    "reordering": Attack(reordering, "share of the vertices and of the faces", (0.01, 0.1, 0.3, 1), host=True),
-    "added-geometry": Attack(
-        adding_geometry, "size of a ring and of a box over the diagonal", (0.25, 0.5, 1, 2), host=True, faces=True
+    "mosaic": _host_surface(mosaic, "shift of eight pieces over the diagonal", (0.01, 0.03, 0.1, 0.3, 1)),
+    "missing-pieces": _host_surface(missing_pieces, "share of eight pieces", (0.125, 0.25, 0.5, 0.75)),
+    "digits": _host(digits, "significant decimal digits of a coordinate", (7, 6, 5, 4, 3)),
+    "float-bits": _host(float_bits, "bits of a coordinate, 64, 32 or 16", (32, 16)),
+    "soup": _host_surface(soup, "times through a binary STL file", (1, 2)),
+    "arap": _host_surface(
+        as_rigid_as_possible, "drag of one end sideways over the diagonal", (0.02, 0.05, 0.1, 0.2, 0.4)
     ),
-    "mosaic": Attack(
-        mosaic, "shift of eight pieces over the diagonal", (0.01, 0.03, 0.1, 0.3, 1), host=True, faces=True
+    "plane-fitting": _host_surface(plane_fitting, "degrees between normals of a flat region", (1, 2, 5, 10)),
+    "primitive-fitting": _host_surface(primitive_fitting, "degrees between normals of a flat region", (1, 2, 5, 10)),
+    "mirror-averaging": _host_surface(
+        mirror_averaging, "share of the way to the mean with the mirror image", (0.25, 0.5, 0.75, 1)
     ),
-    "missing-pieces": Attack(missing_pieces, "share of eight pieces", (0.125, 0.25, 0.5, 0.75), host=True, faces=True),
-    "digits": Attack(digits, "significant decimal digits of a coordinate", (7, 6, 5, 4, 3), host=True),
-    "float-bits": Attack(float_bits, "bits of a coordinate, 64, 32 or 16", (32, 16), host=True),
-    "soup": Attack(soup, "times through a binary STL file", (1, 2), host=True, faces=True),
-    "arap": Attack(
-        as_rigid_as_possible,
-        "drag of one end sideways over the diagonal",
-        (0.02, 0.05, 0.1, 0.2, 0.4),
-        host=True,
-        faces=True,
+    "instance-averaging": _host_surface(
+        instance_averaging, "share of the way to the mean of all instances", (0.25, 0.5, 0.75, 1)
     ),
-    "plane-fitting": Attack(
-        plane_fitting, "degrees between normals of a flat region", (1, 2, 5, 10), host=True, faces=True
-    ),
-    "primitive-fitting": Attack(
-        primitive_fitting, "degrees between normals of a flat region", (1, 2, 5, 10), host=True, faces=True
-    ),
-    "mirror-averaging": Attack(
-        mirror_averaging,
-        "share of the way to the mean with the mirror image",
-        (0.25, 0.5, 0.75, 1),
-        host=True,
-        faces=True,
-    ),
-    "instance-averaging": Attack(
-        instance_averaging, "share of the way to the mean of all instances", (0.25, 0.5, 0.75, 1), host=True, faces=True
-    ),
-    "subsampling": Attack(subsampling, "share of a cloud's points, at random", (0.1, 0.3, 0.5, 0.7, 0.9), host=True),
-    "outliers": Attack(outliers, "share of a cloud's points, thrown off", (0.01, 0.03, 0.1, 0.3), host=True),
-    "floaters": Attack(floaters, "points added anywhere over a cloud's own", (0.01, 0.03, 0.1, 0.3), host=True),
-    "merging": Attack(
-        merging, "half width of a second scan's noise over the diagonal", (0, 0.0005, 0.001, 0.002), host=True
-    ),
-    "resampling": Attack(resampling, "points sampled anew over a cloud's own", (2, 1, 0.5, 0.25), host=True),
+    "subsampling": _host(subsampling, "share of a cloud's points, at random", (0.1, 0.3, 0.5, 0.7, 0.9)),
+    "outliers": _host(outliers, "share of a cloud's points, thrown off", (0.01, 0.03, 0.1, 0.3)),
+    "floaters": _host(floaters, "points added anywhere over a cloud's own", (0.01, 0.03, 0.1, 0.3)),
+    "merging": _host(merging, "half width of a second scan's noise over the diagonal", (0, 0.0005, 0.001, 0.002)),
+    "resampling": _host(resampling, "points sampled anew over a cloud's own", (2, 1, 0.5, 0.25)),
 }
-
-
 Kind = str | Attack  # a name in `ATTACKS`, or an attack of your own
 Step = tuple[Kind, float]  # an attack and its strength
 
@@ -189,18 +162,11 @@ class Registry(NamedTuple):
         return self.chain(mesh, [(kind, strength)], seed=seed)
 
     def chain(self, mesh: Mesh, steps: Sequence[Step], *, seed: Seed) -> Mesh:
-        """Apply several attacks one after the other; with one step this is `attack`.
-
-        Args:
-            mesh: any mesh.
-            steps: the attacks and their strengths, in order.
-            seed: seed of all random choices; each step makes its own.
-        """
+        """Apply attacks one after the other, each as `attack` does and with random choices of its own."""
         entries = [(self.get(kind), strength) for kind, strength in steps]
         for place, (entry, strength) in enumerate(entries):
             _check_strength(strength)
-            key = random_key(seed)
-            mesh = host_mesh(mesh)
+            key, mesh = random_key(seed), host_mesh(mesh)
             self._check_faces(entry, mesh)
             mesh = _apply(mesh, entry, strength, jax.random.fold_in(key, place) if place else key)
         return mesh
@@ -211,14 +177,7 @@ class Registry(NamedTuple):
         A traced attack on meshes with the same faces, such as differently marked copies, is one `jax.vmap`: its random
         numbers are those of `attack`, and its positions differ by rounding at most.
 
-        Args:
-            meshes: at least one mesh.
-            kind: see `attack`.
-            strength: see `attack`.
-            seeds: the seed of the attack's random choices for each mesh.
-
-        Raises:
-            JaxmarkError: see `attack`; if one mesh is refused, all are.
+        If one mesh is refused, all are.
         """
         entry, meshes = self.get(kind), [host_mesh(mesh) for mesh in meshes]
         _check_strength(strength)
@@ -232,11 +191,7 @@ class Registry(NamedTuple):
         return _apply_to_all(meshes, welded, entry, strength, jnp.stack([random_key(seed) for seed in seeds]))
 
     def get(self, kind: Kind) -> Attack:
-        """Look up an attack by its name; an `Attack` is returned as it is.
-
-        Raises:
-            JaxmarkError: if there is no attack of that name.
-        """
+        """Look up an attack by its name, or raise `JaxmarkError`; an `Attack` is returned as it is."""
         if isinstance(kind, Attack):
             return kind
         if not isinstance(kind, str):
@@ -260,34 +215,35 @@ def _check_strength(strength: float) -> None:
         raise JaxmarkError(f"The strength of an attack must be a number, not negative, got {strength!r}.")
 
 
-def _apply(mesh: Mesh, entry: Attack, strength: float, key: PRNGKeyArray) -> Mesh:
+def _apply(mesh: Mesh, entry: Attack, strength: float, seed: PRNGKeyArray) -> Mesh:
     """Apply an attack to the welded points of a mesh."""
     welded = weld(mesh.vertices)
     points = weld_mesh(mesh, welded)
     if entry.host:
-        found = entry.apply(points, strength, generator(key))
+        found = entry.apply(points, strength, generator(seed))
     else:
-        small = _normalise(points)
-        found = small.back(entry.apply(small.mesh, strength, key))
+        small, restore = _normalise(points)
+        found = restore(entry.apply(small, strength, seed))
     return _restore_copies(mesh, welded, points, found)
 
 
 def _apply_to_all(
-    meshes: Sequence[Mesh], welded: Weld, entry: Attack, strength: float, keys: Key[Array, " meshes"]
+    meshes: Sequence[Mesh], welded: Weld, entry: Attack, strength: float, seeds: Key[Array, " meshes"]
 ) -> list[Mesh]:
     """Apply a traced attack to meshes with the same faces and welding, all at once."""
-    small = [_normalise(weld_mesh(mesh, welded)) for mesh in meshes]
-    faces = small[0].mesh.faces
+    points = [weld_mesh(mesh, welded) for mesh in meshes]
+    small, restore = zip(*map(_normalise, points), strict=True)
+    faces = small[0].faces
 
-    def apply(vertices: Array, key: PRNGKeyArray) -> tuple[Array, Array]:
-        moved = entry.apply(Mesh(vertices, faces), strength, key)
+    def apply(vertices: Array, seed: PRNGKeyArray) -> tuple[Array, Array]:
+        moved = entry.apply(Mesh(vertices, faces), strength, seed)
         return jnp.asarray(moved.vertices), jnp.asarray(moved.faces)
 
-    starts = np.stack([one.mesh.vertices for one in small])
-    vertices, faces = jax.vmap(apply, out_axes=(0, None))(jnp.asarray(starts), keys)
+    starts = jnp.asarray(np.stack([one.vertices for one in small]))
+    vertices, faces = jax.vmap(apply, out_axes=(0, None))(starts, seeds)
     return [
-        _restore_copies(mesh, welded, one.points, one.back(Mesh(moved, faces)))
-        for mesh, one, moved in zip(meshes, small, np.asarray(vertices), strict=True)
+        _restore_copies(mesh, welded, start, back(Mesh(moved, faces)))
+        for mesh, start, back, moved in zip(meshes, points, restore, np.asarray(vertices), strict=True)
     ]
 
 
@@ -304,25 +260,18 @@ def _restore_copies(mesh: Mesh, welded: Weld, points: Mesh, found: Mesh) -> Mesh
     return Mesh(found.vertices[welded.point], faces)
 
 
-class _Normalised(NamedTuple):
-    """A mesh centred and scaled to unit diagonal, where float32 keeps its digits."""
+def _normalise(points: Mesh) -> tuple[Mesh, Callable[[Mesh], Mesh]]:
+    """Centre a mesh and scale it to unit diagonal, where float32 keeps its digits; also return the map back."""
+    centre, length = np.asarray(points.vertices)[used_vertices(points)].mean(axis=0), diagonal(points)
+    start = (points.vertices - centre) / length
 
-    points: Mesh  # in its own place and size
-    mesh: Mesh  # centred and scaled
-    centre: Float64[np.ndarray, "3"]
-    length: float
-
-    def back(self, moved: Mesh) -> Mesh:
-        """Bring the attacked mesh back to the place and size of `points`."""
-        found, start = np.asarray(moved.vertices), np.asarray(self.mesh.vertices)
-        there = self.centre + self.length * found.astype(np.float64)
+    def restore(moved: Mesh) -> Mesh:
+        found = np.asarray(moved.vertices)
+        there = centre + length * found.astype(np.float64)
         # Coordinates that the attack left alone stay exactly as they were.
         count = min(len(start), len(found))
         still = found[:count] == start[:count].astype(found.dtype)
-        there[:count] = np.where(still, self.points.vertices[:count], there[:count])
+        there[:count] = np.where(still, points.vertices[:count], there[:count])
         return Mesh(there, np.asarray(moved.faces))
 
-
-def _normalise(points: Mesh) -> _Normalised:
-    centre, length = np.asarray(points.vertices)[used_vertices(points)].mean(axis=0), diagonal(points)
-    return _Normalised(points, Mesh((points.vertices - centre) / length, points.faces), centre, length)
+    return Mesh(start, points.faces), restore

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import jaxmark as jm
 from jaxmark import adversaries
 from jaxmark.adversaries.expected import make_surrogate, random_mark, rms
-from jaxmark.adversaries.learned import Goal, Learned, estimate, init_network, learn, learned_attack, removal
+from jaxmark.adversaries.networks import Goal, Learned, estimate, init_network, learn, learned_attack, removal
 from jaxmark.geometry import asteroid
 from jaxmark.geometry.mesh import Mesh
 
@@ -69,25 +69,25 @@ def test_networks_turn_with_the_mesh(work, mesh, x64):
 def test_what_is_learned_holds_on_other_meshes_and_is_an_attack(goal: Goal, mark, steps, mesh):
     lines, key = [], jax.random.key(0)
     meshes = [asteroid(500, seed=seed) for seed in (2, 3, 4)]
-    found = learn(meshes, [mesh], key=key, goal=goal, bits=8, mark=mark, steps=steps, say=lines.append)
+    found = learn(meshes, [mesh], seed=key, goal=goal, bits=8, mark=mark, steps=steps, say=lines.append)
     assert found.after < 0.99 * found.before
     assert len(found.losses) == steps
     assert len(lines) == steps // 100
     attack = learned_attack(found.network, goal, bits=8, mark=mark)
     suspect = jm.attack(mesh, attack, 5e-3, seed=0)
     assert jm.compare(mesh, suspect, ["rms"]).rms == pytest.approx(5e-3, rel=0.05)
-    again = learn(meshes, [mesh], key=key, goal=goal, bits=8, mark=mark, steps=2)
+    again = learn(meshes, [mesh], seed=key, goal=goal, bits=8, mark=mark, steps=2)
     np.testing.assert_allclose(again.losses, found.losses[:2], rtol=1e-4)
 
 
 def test_refusals(mesh, unchecked):
     with pytest.raises(jm.JaxmarkError, match="There is no goal 'x'; there are estimate, removal"):
-        adversaries.learn([mesh], [mesh], key=jax.random.key(0), goal="x")  # type: ignore[arg-type]
+        adversaries.learn([mesh], [mesh], seed=0, goal="x")  # type: ignore[arg-type]
     with pytest.raises(jm.JaxmarkError, match="There is no goal 'x'"):
         learned_attack(init_network(jax.random.key(0)), "x")  # type: ignore[arg-type]
     with pytest.raises(jm.JaxmarkError, match="pass its `network`, and its `goal`"):
         learned_attack(Learned((), "estimate", np.zeros(0), 0.0, 0.0), "estimate")  # type: ignore[arg-type]
     with pytest.raises(jm.JaxmarkError, match="of a mark is positive, got -1"):
-        adversaries.learn([mesh], [mesh], key=jax.random.key(0), mark=-1.0)
+        adversaries.learn([mesh], [mesh], seed=0, mark=-1.0)
     with pytest.raises(jm.JaxmarkError, match="got 1, 0, 400"):
-        adversaries.learn([mesh], [], key=jax.random.key(0))
+        adversaries.learn([mesh], [], seed=0)

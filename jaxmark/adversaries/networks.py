@@ -6,7 +6,7 @@ displacement turns with the mesh. Before it has learned anything, the network su
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, Unpack, get_args
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +15,11 @@ from jax.example_libraries import optimizers
 from jaxtyping import Array, Float, Float64, PRNGKeyArray
 
 from jaxmark.adversaries.expected import Surrogate, evidence, make_surrogate, random_mark, rescale, rms
-from jaxmark.adversaries.keyless import MARK, make_attack
-from jaxmark.attacks.registry import Attack
+from jaxmark.adversaries.keyless import MARK, Assumptions, make_attack
+from jaxmark.attacks.attack import Attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.seeds import Seed, random_key
 from jaxmark.spectral.bands import intervals
 from jaxmark.spectral.chebyshev import band_components
 from jaxmark.spectral.learned import cheb_conv, init_cheb_conv
@@ -27,6 +28,8 @@ from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, Scheme
 
 Goal = Literal["estimate", "removal"]
 Network = tuple[dict[str, Float[Array, "..."]], ...]  # parameters of convolutions, one after the other
+Parts = Float[Array, "bands rows 3"]
+Weights = Float[Array, "bands rows 1"]
 
 _EDGES = (0.0, 0.02, 0.05, 0.1, 0.17, 0.26, 0.36, 0.46, 2.0)  # of the bands in λ; marks are below 0.46
 _TERMS = 129
@@ -47,11 +50,11 @@ class Learned(NamedTuple):
     after: float  # on the same, of the network
 
 
-def init_network(key: PRNGKeyArray) -> Network:
+def init_network(seed: Seed) -> Network:
     """Draw the parameters of a network whose last layer is zero, so that it gives the Wiener estimate."""
     bands = len(_EDGES) - 1
     sizes = ((2 * bands, _HIDDEN), (_HIDDEN, _HIDDEN), (_HIDDEN, 2 * bands))
-    keys = jax.random.split(key, len(sizes))
+    keys = jax.random.split(random_key(seed), len(sizes))
     *layers, last = (init_cheb_conv(one, *size, degree=_DEGREE) for one, size in zip(keys, sizes, strict=True))
     return (*layers, jax.tree.map(jnp.zeros_like, last))
 
@@ -59,27 +62,17 @@ def init_network(key: PRNGKeyArray) -> Network:
 def estimate(network: Network, surrogate: Surrogate, signal: Displacement) -> Displacement:
     """Estimate the mark in a signal: Σ_j share_j f_j(Δ)x, with a share of each band at each vertex.
 
-    Args:
-        network: see `init_network`.
-        surrogate: the mesh, from `expected.make_surrogate`.
-        signal: its coordinates, marked, `[rows, 3]`, in diagonals.
+    The signal is the coordinates of the marked mesh of `expected.make_surrogate`, `[rows, 3]`, in diagonals.
     """
     parts = _parts(surrogate, signal)
     return surrogate.moving * jnp.sum(_decide(network, surrogate, parts)[0] * parts, axis=0)
 
 
-def removal(network: Network, surrogate: Surrogate, signal: Displacement, key: PRNGKeyArray) -> Displacement:
-    """The displacement by which a network removes a mark: less its estimate, and noise of the bands in its place.
-
-    Args:
-        network: see `init_network`.
-        surrogate: see `estimate`.
-        signal: see `estimate`.
-        key: JAX random key, of the noise.
-    """
+def removal(network: Network, surrogate: Surrogate, signal: Displacement, seed: Seed) -> Displacement:
+    """Compute the displacement that removes a mark from a signal: less its estimate, and random noise in its place."""
     parts = _parts(surrogate, signal)
     shares, strengths = _decide(network, surrogate, parts)
-    noise = _parts(surrogate, jax.random.normal(key, signal.shape, signal.dtype))
+    noise = _parts(surrogate, jax.random.normal(random_key(seed), signal.shape, signal.dtype))
     return surrogate.moving * jnp.sum(surrogate.mark * strengths * noise - shares * parts, axis=0)
 
 
@@ -87,7 +80,7 @@ def learn(
     meshes: Sequence[Mesh],
     held_out: Sequence[Mesh],
     *,
-    key: PRNGKeyArray,
+    seed: Seed,
     goal: Goal = "estimate",
     scheme: str | Scheme = DEFAULT_SCHEME,
     bits: int = 64,
@@ -95,12 +88,12 @@ def learn(
     steps: int = 400,
     say: Callable[[str], None] = lambda line: None,
 ) -> Learned:
-    """Let a network learn on meshes, each marked with another random key in every step (Adam).
+    """Train a network on meshes, each marked with another random key in every step (Adam).
 
     Args:
         meshes: meshes to learn from; nothing of what is attacked later.
         held_out: meshes by which is measured what was learned.
-        key: JAX random key.
+        seed: a whole number or a JAX random key.
         goal: `"estimate"`, the loss is the energy of mark less estimate, over that of the mark; `"removal"`, the
             expected evidence S/‖a‖ after a displacement four times as large as the mark.
         scheme: the scheme that meshes are marked with, see `make_marker`.
@@ -108,10 +101,6 @@ def learn(
         mark: RMS displacement of marks, relative to the diagonal.
         steps: number of gradient steps, each on one mesh, in turn.
         say: function that is called with a line after every hundredth step.
-
-    Returns:
-        The network, its losses on the way, and what it reaches on meshes that were held out; `learned_attack` attacks
-        by it.
 
     Raises:
         JaxmarkError: if there is no such goal, no mesh, no mark or no step, or a mesh cannot be marked.
@@ -125,17 +114,17 @@ def learn(
         )
     surrogates = [make_surrogate(mesh, scheme, bits, mark)[0] for mesh in meshes]
     others = [make_surrogate(mesh, scheme, bits, mark)[0] for mesh in held_out]
-    loss, begin, drawn, judged = _LOSSES[goal], *jax.random.split(key, 3)
+    loss, begin, drawn, judged = _LOSSES[goal], *jax.random.split(random_key(seed), 3)
     init, update, get = optimizers.adam(_RATE)
 
     @jax.jit
-    def step(count: Any, state: Any, surrogate: Surrogate, key: PRNGKeyArray) -> tuple[Any, Array]:
-        found, slope = jax.value_and_grad(loss)(get(state), surrogate, key)
+    def step(count: Any, state: Any, surrogate: Surrogate, seed: PRNGKeyArray) -> tuple[Any, Array]:
+        found, slope = jax.value_and_grad(loss)(get(state), surrogate, seed)
         return update(count, slope, state), found
 
     def judge(network: Network) -> float:
-        keys = jax.random.split(judged, _CHECKS)
-        return float(np.mean([[one(network, surrogate, key) for key in keys] for surrogate in others]))
+        seeds = jax.random.split(judged, _CHECKS)
+        return float(np.mean([[one(network, surrogate, seed) for seed in seeds] for surrogate in others]))
 
     one = jax.jit(loss)
     network = init_network(begin)
@@ -150,22 +139,8 @@ def learn(
     return Learned(get(state), goal, np.array(losses), before, judge(get(state)))
 
 
-def learned_attack(
-    network: Network,
-    goal: Goal,
-    *,
-    scheme: str | Scheme = DEFAULT_SCHEME,
-    bits: int = 64,
-    mark: float = MARK,
-) -> Attack:
-    """Attack by a network: subtract what it takes for the mark, or what it has learned to do.
-
-    Args:
-        network: `Learned.network`, from `learn`.
-        goal: what it has learned, `Learned.goal`.
-        scheme: the scheme that meshes are marked with.
-        bits: size of the payload in bits.
-        mark: RMS displacement that the mark is assumed to have, relative to the diagonal.
+def learned_attack(network: Network, goal: Goal, **assumptions: Unpack[Assumptions]) -> Attack:
+    """Attack by the `network` of a `Learned`: subtract its estimate of the mark, or do what it has learned to do.
 
     Raises:
         JaxmarkError: if there is no such goal, or the network is none.
@@ -174,12 +149,12 @@ def learned_attack(
     if isinstance(network, Learned):
         raise JaxmarkError("An attack is made of the network that has learned: pass its `network`, and its `goal`.")
 
-    def way(surrogate: Surrogate, strength: Array, key: PRNGKeyArray) -> Displacement:
+    def way(surrogate: Surrogate, strength: Array, seed: PRNGKeyArray) -> Displacement:
         if goal == "estimate":
             return -estimate(network, surrogate, surrogate.signal)
-        return removal(network, surrogate, surrogate.signal, key)
+        return removal(network, surrogate, surrogate.signal, seed)
 
-    return make_attack(way, scheme, bits, mark)
+    return make_attack(way, **assumptions)
 
 
 def _check_goal(goal: Goal) -> None:
@@ -187,18 +162,16 @@ def _check_goal(goal: Goal) -> None:
         raise JaxmarkError(f"There is no goal {goal!r}; there are {', '.join(get_args(Goal))}.")
 
 
-def _parts(surrogate: Surrogate, signal: Displacement) -> Float[Array, "bands rows 3"]:
-    """The parts of a signal in the network's bands, which sum to it."""
+def _parts(surrogate: Surrogate, signal: Displacement) -> Parts:
+    """Return the parts of a signal in the network's bands, which sum to it."""
     return band_components(surrogate.operator, intervals(np.array(_EDGES), _TERMS), signal)
 
 
-def _decide(
-    network: Network, surrogate: Surrogate, parts: Float[Array, "bands rows 3"]
-) -> tuple[Float[Array, "bands rows 1"], Float[Array, "bands rows 1"]]:
-    """The share of each part that is taken away at each vertex, and the strength of noise in its band.
+def _decide(network: Network, surrogate: Surrogate, parts: Parts) -> tuple[Weights, Weights]:
+    """Return the share of each part that is taken away at each vertex, and the strength of noise in its band.
 
-    What is seen of the parts is how their energies compare with that of the mark, and what they have in common with
-    the next band: neither changes when the mesh is turned.
+    The network sees the energies of the parts over that of the mark, and their correlations with the next band: neither
+    changes when the mesh is rotated.
     """
     mark, bands = surrogate.mark**2, len(parts)
     square = jnp.sum(parts**2, axis=-1)
@@ -216,22 +189,22 @@ def _decide(
 
 
 def _profile(surrogate: Surrogate) -> Float[Array, " bands"]:
-    """Share of a mark's energy in each band, the same for every key."""
+    """Return the share of a mark's energy in each band, the same for every key."""
     written = random_mark(surrogate, jax.random.key(0))[1]
     square = jnp.sum(jnp.sum(_parts(surrogate, written) ** 2, axis=-1), axis=1)
     return square / jnp.maximum(jnp.sum(written**2), jnp.finfo(square.dtype).tiny)
 
 
-def _distance(network: Network, surrogate: Surrogate, key: PRNGKeyArray) -> Float[Array, ""]:
-    """Energy of a mark less its estimate, over its own; averaged over the mark and its negative, as in `evidence`."""
-    written = random_mark(surrogate, key)[1]
+def _distance(network: Network, surrogate: Surrogate, seed: PRNGKeyArray) -> Float[Array, ""]:
+    """Compute the energy of a mark less its estimate, over its own; averaged as in `evidence`."""
+    written = random_mark(surrogate, seed)[1]
     both = [rms(surrogate, one - estimate(network, surrogate, surrogate.signal + one)) for one in (written, -written)]
     return jnp.mean(jnp.stack(both) ** 2) / rms(surrogate, written) ** 2
 
 
-def _evidence(network: Network, surrogate: Surrogate, key: PRNGKeyArray) -> Float[Array, ""]:
-    """Expected evidence of a mark after removal by a displacement of a fixed size."""
-    noise, mark = jax.random.split(key)
+def _evidence(network: Network, surrogate: Surrogate, seed: PRNGKeyArray) -> Float[Array, ""]:
+    """Compute the expected evidence of a mark after removal by a displacement of a fixed size."""
+    noise, mark = jax.random.split(seed)
     moved = removal(network, surrogate, surrogate.signal, noise)
     return evidence(surrogate, rescale(surrogate, moved, _SIZE * surrogate.mark), mark)
 
