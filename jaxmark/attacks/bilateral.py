@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxmark.attacks.smoothing import inner_vertices, whole_steps
-from jaxmark.distortion.roots import root
+from jaxmark.distortion.norms import root
 from jaxmark.geometry.mesh import Mesh, edges
 
 

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from jaxmark.attacks.extent import diagonal, displace, surface
 from jaxmark.attacks.host import on_host
-from jaxmark.distortion.roots import root
+from jaxmark.distortion.norms import root
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, used_vertices, vertex_normals
 from jaxmark.seeds import Randomness

@@ -40,8 +40,7 @@ from jaxtyping import Array, Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from jaxmark.distortion.percentiles import percentile
-from jaxmark.distortion.roots import root
+from jaxmark.distortion.norms import percentile, ratio, root
 from jaxmark.geometry.mesh import cross_product, face_pairs
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import band_components, filter
@@ -174,8 +173,7 @@ def vertex_means(values: Float[Array, " faces"], hiding: Hiding, count: int) -> 
     """Means of faces' values around each of `count` vertices, weighted by area, for heat maps; 0 where no face is."""
     area = jnp.asarray(hiding.area).astype(values.dtype)[:, None]
     zeros, corners = jnp.zeros(count, values.dtype), hiding.faces
-    total, around = zeros.at[corners].add(area), zeros.at[corners].add(area * values[:, None])
-    return jnp.where(total > 0, around / jnp.where(total > 0, total, 1), 0)
+    return ratio(zeros.at[corners].add(area * values[:, None]), zeros.at[corners].add(area))
 
 
 def _areas_and_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxmark.distortion.roots import root
+from jaxmark.distortion.norms import lengths, ratio
 from jaxmark.geometry.mesh import edges
 
 _FOLDED_WEIGHT = 0.01  # weight of an angle of π, where the surface is folded back onto itself; an angle of 0 has 1
@@ -55,14 +55,12 @@ def dihedral_sine_cosine(
     """
     tail, head = x[hinges.edges[:, 0]], x[hinges.edges[:, 1]]
     along = head - tail
-    length = _norm(along)
+    length = lengths(along)
     first, second = jnp.cross(along, x[hinges.left] - tail), jnp.cross(x[hinges.right] - tail, along)
-    size = _norm(first) * _norm(second) * length
-    sound = size > 0
-    sine = jnp.sum(jnp.cross(first, second) * along, axis=1)
-    cosine = jnp.sum(first * second, axis=1) * length
-    scale = jnp.where(sound, size, 1)
-    return jnp.where(sound, sine / scale, 0), jnp.where(sound, cosine / scale, 1)
+    size = lengths(first) * lengths(second) * length
+    sine = ratio(jnp.sum(jnp.cross(first, second) * along, axis=1), size)
+    cosine = ratio(jnp.sum(first * second, axis=1) * length, size)
+    return sine, jnp.where(size > 0, cosine, 1)
 
 
 @jax.jit
@@ -92,7 +90,3 @@ def dame(
     masking = jnp.exp(math.log(_FOLDED_WEIGHT) * (before / np.pi) ** 2)
     inner = jnp.asarray(hinges.inner).astype(before.dtype)
     return jnp.sum(inner * masking * jnp.abs(after - before)) / jnp.maximum(inner.sum(), 1)
-
-
-def _norm(x: Float[Array, "rows 3"]) -> Float[Array, " rows"]:
-    return root(jnp.sum(x**2, axis=1))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxmark.distortion.roots import root
+from jaxmark.distortion.norms import lengths, ratio
 from jaxmark.geometry.mesh import boundary_vertices
 
 POWER = 0.15  # exponent by which roughness is modulated
@@ -53,7 +53,7 @@ def _local_roughness(
     corners = x[faces]
     u, v = jnp.roll(corners, -1, axis=1) - corners, jnp.roll(corners, -2, axis=1) - corners
     cosine, cross = jnp.sum(u * v, axis=2), jnp.cross(u[:, 0], v[:, 0])
-    sine = root(jnp.sum(cross**2, axis=1))[:, None]  # each corner's sine, up to the same factor as its cosine
+    sine = lengths(cross)[:, None]  # each corner's sine, up to the same factor as its cosine
     sound = (sine > 0) | (cosine != 0)
     angle = jnp.arctan2(jnp.where(sound, sine, 0), jnp.where(sound, cosine, 1))
     half = jnp.clip(cosine / jnp.where(sine > 0, sine, 1) / 2, *_HALF_COTANGENTS)
@@ -64,8 +64,7 @@ def _local_roughness(
     start, end = jnp.roll(faces, -1, axis=1), jnp.roll(faces, -2, axis=1)
     total = zeros.at[start].add(half).at[end].add(half)
     around = zeros.at[start].add(half * defect[end]).at[end].add(half * defect[start])
-    used = total > 0
-    rough = jnp.abs(jnp.where(used, defect - around / jnp.where(used, total, 1), 0))
+    rough = jnp.abs(jnp.where(total > 0, defect - ratio(around, total), 0))
     return Rough(rough, zeros.at[faces].add(jnp.broadcast_to(sine / 6, angle.shape)))
 
 
@@ -84,16 +83,14 @@ def fmpd(first: Rough, second: Rough) -> Float[Array, ""]:
     floor = MIN_ROUGHNESS**POWER
     turn = jnp.maximum(means, MIN_ROUGHNESS) ** POWER - floor
 
+    most = jnp.maximum(MAX_ROUGHNESS, _MAX_OVER_MEAN * means)
+
     def overall(rough: Rough) -> Array:
-        value = (
-            jnp.clip(rough.roughness, MIN_ROUGHNESS, jnp.maximum(MAX_ROUGHNESS, _MAX_OVER_MEAN * means)) ** POWER
-            - floor
-        )
+        value = jnp.clip(rough.roughness, MIN_ROUGHNESS, most) ** POWER - floor
         return _mean(jnp.where(value > turn, turn + _SLOPE_ABOVE_MEAN * (value - turn), value), rough.area)
 
     return jnp.minimum(_SCALE * jnp.abs(overall(first) - overall(second)), 1)
 
 
 def _mean(values: Array, weights: Array) -> Array:
-    total = weights.sum()
-    return jnp.sum(values * weights) / jnp.where(total > 0, total, 1)
+    return ratio(jnp.sum(values * weights), weights.sum())

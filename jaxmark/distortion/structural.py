@@ -1,8 +1,9 @@
-"""MSDM and MSDM2, the mesh structural distortion measures.
+"""MSDM and MSDM2, the mesh structural distortion measures, and the curvature tensors that they compare.
 
 References: Lavoué, Gelasca, Dupont, Baskurt, Ebrahimi, "Perceptually driven 3D distance metrics with application to
 watermarking", SPIE 6312, 2006; Lavoué, "A multiscale metric for 3D mesh visual quality assessment", Computer Graphics
-Forum 30(5), 2011, with the constants of its implementation in MEPP2.
+Forum 30(5), 2011, with the constants of its implementation in MEPP2. Tensors: Cohen-Steiner, Morvan, "Restricted
+Delaunay triangulations and normal cycle", SoCG 2003.
 """
 
 from typing import NamedTuple
@@ -12,10 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxmark.distortion._curvature import curvature, curvature_tensor
-from jaxmark.distortion.dihedral import Hinges, make_hinges
-from jaxmark.distortion.neighbourhoods import Neighbourhoods, filled, make_neighbourhoods
-from jaxmark.distortion.structure import contributions, cubic_mean, window_statistics
+from jaxmark.distortion.dihedral import Hinges, dihedral_sine_cosine, make_hinges
+from jaxmark.distortion.neighbourhoods import Neighbourhoods, filled, make_neighbourhoods, share_inside
+from jaxmark.distortion.norms import cube_root, cubic_mean, inverse_root, ratio, root, with_dtype
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.surfaces import Surface, barycentric
 from jaxmark.spectral.precision import einsum
@@ -26,6 +26,73 @@ _MSDM2_BALLS = (0.002, 0.003, 0.004)  # radius of the balls at each scale
 _MSDM2_WINDOW_BALLS, _MSDM2_SIGMA_BALLS = 5.0, 2.5  # radius of windows, width of the Gaussian, in radii of the ball
 _MSDM2_OFFSET = 1.0  # added to the denominators of the contributions
 _MAX_WINDOWS = 20_000  # in larger meshes, windows are around this number of random vertices
+
+
+@jax.jit
+def curvature_tensor(
+    x: Float[Array, "vertices 3"], hinges: Hinges, balls: Neighbourhoods
+) -> Float[Array, "vertices 3 3"]:
+    """The tensor T = 1/(πr²) Σ β_e/|e| e eᵀ over the pieces e of edges in the ball around each vertex.
+
+    β_e is the dihedral angle. As in MEPP2, whose values are published, it is computed by the inverse sine, and so at
+    most π/2 however sharp the edge is, and edges across the direction of the search from the centre do not count.
+
+    Args:
+        x: positions.
+        hinges: from `make_hinges`.
+        balls: edges in balls of radius r, from `make_neighbourhoods`.
+    """
+    sine, cosine = dihedral_sine_cosine(x, hinges)
+    angle = jnp.arctan2(sine, jnp.abs(cosine))
+    along = share_inside(x, balls)[:, None] * (x[balls.head] - x[balls.tail])
+    weight = angle[balls.edge] * inverse_root(jnp.sum(along**2, axis=1))
+    products = weight[:, None, None] * along[:, :, None] * along[:, None, :]
+    total = jax.ops.segment_sum(products, balls.centre, len(x), indices_are_sorted=True)
+    return total / (np.pi * jnp.asarray(balls.radius).astype(x.dtype) ** 2)
+
+
+@jax.jit
+def curvature(tensor: Float[Array, "vertices 3 3"]) -> Float[Array, " vertices"]:
+    """(|K_max| + |K_min|)/2, the mean size of the two largest eigenvalues of the tensor by size."""
+    sizes = jnp.sort(jnp.abs(_eigenvalues(tensor)), axis=1)
+    return (sizes[:, 1] + sizes[:, 2]) / 2
+
+
+def _eigenvalues(matrix: Float[Array, "matrices 3 3"]) -> Float[Array, "matrices 3"]:
+    """Eigenvalues of symmetric matrices, in closed form (Smith, Communications of the ACM 4, 1961).
+
+    LAPACK is avoided, for the determinant, too: on processors, several of its batched calls at once can deadlock.
+    """
+    mean = jnp.trace(matrix, axis1=1, axis2=2) / 3
+    rest = matrix - mean[:, None, None] * jnp.eye(3, dtype=matrix.dtype)
+    square = jnp.sum(rest**2, axis=(1, 2)) / 6
+    round_ = square <= 0
+    size = jnp.sqrt(jnp.where(round_, 1, square))
+    first, second, third = jnp.moveaxis(rest / size[:, None, None], 1, 0)
+    half = jnp.where(round_, 0, jnp.sum(first * jnp.cross(second, third), axis=1) / 2)
+    # The arc cosine's slope at ±1, where two eigenvalues meet, is infinite: stop just before it.
+    limit = 1 - 4 * jnp.finfo(matrix.dtype).eps
+    angle = jnp.arccos(jnp.clip(half, -limit, limit)) / 3
+    turns = angle[:, None] + 2 * np.pi / 3 * jnp.arange(3, dtype=matrix.dtype)
+    return mean[:, None] + jnp.where(round_, 0, 2 * size)[:, None] * jnp.cos(turns).astype(matrix.dtype)
+
+
+@jax.jit
+def tensor_distance(
+    original: Float[Array, "vertices 3 3"], distorted: Float[Array, "vertices 3 3"]
+) -> Float[Array, ""]:
+    """Change of curvature in size and direction, 0 to 1: the cubic mean of ‖T - T'‖/(‖T‖ + ‖T'‖ + ε) over vertices.
+
+    This follows TPDM (Torkhani, Wang, Chassery, "A curvature-tensor-based perceptual quality metric for 3D triangular
+    meshes", Machine Graphics & Vision 2014) in comparing tensors relative to their size, but has none of its visibility
+    weights. ε is 5 % of the mean of the original's ‖T‖.
+    """
+
+    def norm(tensor: Array) -> Array:
+        return root(jnp.sum(tensor**2, axis=(1, 2)))
+
+    before, after = norm(original), norm(distorted)
+    return cubic_mean(ratio(norm(distorted - original), before + after + 0.05 * before.mean()))
 
 
 class Scale(NamedTuple):
@@ -131,7 +198,7 @@ def msdm(original: Float[Array, "vertices 3"], distorted: Float[Array, "vertices
         views: from `msdm_views`, for these positions or others near them.
     """
     curved, contrast, structure = (values[0] for values in _compared(original, distorted, views, 0.0))
-    return cubic_mean(_cubic_root((curved**3 + contrast**3 + structure**3 / 2) / 2.5))
+    return cubic_mean(cube_root((curved**3 + contrast**3 + structure**3 / 2) / 2.5))
 
 
 def _compared(original: Array, distorted: Array, views: Views, offset: float) -> tuple[Array, Array, Array]:
@@ -139,19 +206,54 @@ def _compared(original: Array, distorted: Array, views: Views, offset: float) ->
     share = jnp.asarray(views.share).astype(distorted.dtype)
     closest = einsum("vk,vkc->vc", share, original[views.corners])
 
-    def at_scale(scale: Scale) -> tuple[Array, Array, Array]:
+    def at_scale(scale: Scale) -> tuple[Array, ...]:
         first = curvature(curvature_tensor(original, views.hinges[0], scale.original)) * views.unit
         second = curvature(curvature_tensor(distorted, views.hinges[1], scale.distorted)) * views.unit
         matched = einsum("vk,vk->v", share, first[jnp.asarray(views.corners)])
-        found = window_statistics((matched, second), (closest, distorted), scale.windows, scale.sigma)
-        return contributions(jax.tree.map(lambda value: value[jnp.asarray(views.centres)], found), offset)
-
-    def cast(leaf: Array | np.ndarray) -> Array:
-        return jnp.asarray(leaf, distorted.dtype if jnp.issubdtype(leaf.dtype, jnp.floating) else None)
+        found = _contributions((matched, second), (closest, distorted), scale.windows, scale.sigma, offset)
+        return tuple(values[jnp.asarray(views.centres)] for values in found)
 
     # Scales are computed one after the other, because balls have many pieces.
-    return jax.lax.map(at_scale, jax.tree.map(cast, views.scales))
+    return jax.lax.map(at_scale, with_dtype(views.scales, distorted.dtype))
 
 
-def _cubic_root(values: Array) -> Array:
-    return jnp.where(values > 0, jnp.cbrt(jnp.where(values > 0, values, 1)), 0)
+def _contributions(
+    curvatures: tuple[Float[Array, " vertices"], Float[Array, " vertices"]],
+    positions: tuple[Float[Array, "vertices 3"], Float[Array, "vertices 3"]],
+    windows: Neighbourhoods,
+    sigma: float | np.ndarray | Float[Array, ""],
+    offset: float,
+) -> tuple[Float[Array, " vertices"], ...]:
+    """Differences of curvature, contrast and structure in the window of each vertex, as SSIM has them of images.
+
+    Each is relative to its size plus an offset. Points are weighted by a Gaussian of the distance from the centre.
+
+    Args:
+        curvatures: of the original and of the distorted mesh, both at the distorted mesh's vertices.
+        positions: of both meshes, likewise.
+        windows: points of the distorted mesh, from `make_neighbourhoods`.
+        sigma: width of the Gaussian, in the units of the positions.
+        offset: number that is added to the sizes.
+    """
+    share = share_inside(positions[1], windows)
+
+    def at_points(values: Array) -> Array:
+        part = share if values.ndim == 1 else share[:, None]
+        return (1 - part) * values[windows.tail] + part * values[windows.head]
+
+    def total(values: Array) -> Array:
+        return jax.ops.segment_sum(values, windows.centre, len(curvatures[0]), indices_are_sorted=True)
+
+    def relative(difference: Array, size: Array) -> Array:
+        return ratio(jnp.abs(difference), size + offset)
+
+    values = [at_points(curvature) for curvature in curvatures]
+    weights = [jnp.exp(-jnp.sum((at_points(x) - x[windows.centre]) ** 2, axis=1) / (2 * sigma**2)) for x in positions]
+    sums = [jnp.where(whole > 0, whole, 1) for whole in map(total, weights)]
+    m1, m2 = means = [total(w * v) / s for w, v, s in zip(weights, values, sums, strict=True)]
+    off = [v - m[windows.centre] for v, m in zip(values, means, strict=True)]
+    s1, s2 = (root(total(w * d**2) / s) for w, d, s in zip(weights, off, sums, strict=True))
+    # As in MEPP, weights are those of the original, but their sum is that of the distorted mesh.
+    covariance = total(weights[0] * off[0] * off[1]) / sums[1]
+    curved, contrast = relative(m1 - m2, jnp.maximum(m1, m2)), relative(s1 - s2, jnp.maximum(s1, s2))
+    return curved, contrast, relative(s1 * s2 - covariance, s1 * s2)
