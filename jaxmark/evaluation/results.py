@@ -6,15 +6,14 @@ import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any
 
 from jaxmark.evaluation import _rates as rates
 from jaxmark.evaluation._rates import POINT, Control, Row
-from jaxmark.evaluation.pictures.studies import Measure, curves
+from jaxmark.evaluation.pictures import Measure, curves
 from jaxmark.extras import require
 from jaxmark.files.atomic import write_atomically
-from jaxmark.plot import Picture
+from jaxmark.plot.figures import Picture, fill_template
 
 _LABELS: dict[Control, str] = {"unmarked": "unmarked, detected", "wrong-key": "another key, detected"}
 _SHOWN: dict[Measure, str] = {"read": "What was read", "log10_p_unfloored": "Evidence"}
@@ -92,11 +91,10 @@ class Results:
         Raises:
             JaxmarkError: if matplotlib or Jinja2 is missing, or the page cannot be written.
         """
-        jinja2 = require("jinja2", "plot")
-        template = resources.files("jaxmark.evaluation").joinpath("study.html").read_text(encoding="utf-8")
         heads, lines = self._table()
-        page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(template)
-        text = page.render(
+        text = fill_template(
+            "jaxmark.evaluation",
+            "study.html",
             title=title,
             pictures={name: base64.b64encode(self.plot(of).png()).decode() for of, name in _SHOWN.items()},
             heads=heads,

@@ -2,7 +2,6 @@
 
 import html
 import os
-from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +11,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.files.atomic import write_atomically
 from jaxmark.geometry.mesh import Mesh, diagonal, host_mesh
-from jaxmark.plot.figures import FIELD
+from jaxmark.plot.figures import FIELD, fill_template
 from jaxmark.plot.meshes import View
 
 _PLAIN = (205, 205, 200, 255)  # the colour of a mesh without values
@@ -51,7 +50,7 @@ def show(*views: View | Mesh) -> Viewer:
             vertex, or the first mesh has no extent (see `jaxmark.geometry.mesh.diagonal`).
     """
     require("matplotlib", "plot")
-    jinja2 = require("jinja2", "plot")
+    require("jinja2", "plot")
     import trimesh  # takes long to import
     from trimesh.scene import Camera, Scene
     from trimesh.viewer.notebook import scene_to_html
@@ -69,10 +68,9 @@ def show(*views: View | Mesh) -> Viewer:
         solid = trimesh.Trimesh(points, mesh.faces, vertex_colors=_colours(view, len(points)), process=False)
         scene.add_geometry(solid, node_name=f"view{place}", geom_name=f"view{place}")
     scene.set_camera()
-    template = resources.files("jaxmark.plot").joinpath("viewer.html").read_text(encoding="utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     title = " / ".join(view.title for view in named if view.title) or "jaxmark"
-    controls = environment.from_string(template).render(title=title, views=[_legend(view) for view in named])
+    legends = [_legend(view) for view in named]
+    controls = fill_template("jaxmark.plot", "viewer.html", title=title, views=legends)
     before, end, after = scene_to_html(scene).rpartition("</body>")
     return Viewer(before + controls + end + after)
 
