@@ -90,14 +90,7 @@ class Reference:
     """An original that any number of meshes are compared with; intermediates that depend on it are computed once."""
 
     def __init__(self, original: Mesh) -> None:
-        """Prepare an original.
-
-        Args:
-            original: any mesh with an area, or a point cloud.
-
-        Raises:
-            JaxmarkError: see `compare`.
-        """
+        """Prepare a mesh with an area, or a point cloud; others are refused, see `compare`."""
         self.given = host_mesh(original)
         self.length, self.welded = diagonal(self.given), weld(self.given.vertices)
         self.centre = np.asarray(self.given.vertices, np.float64)[used_vertices(self.given)].mean(axis=0)
@@ -132,7 +125,6 @@ class Reference:
         for metric in metrics:
             if isinstance(metric, str) and metric not in _METRICS:
                 raise JaxmarkError(f"There is no metric {metric!r}; there are {', '.join(_METRICS)}.")
-        for metric in metrics:
             if isinstance(metric, str) and metric not in OF_POINTS:
                 check_faces(f"The metric {metric!r}", self.given)
         pair = _Pair(self, distorted)
@@ -174,10 +166,9 @@ class _Pair:
     def moved(self) -> DisplacementSize:
         return displacement_size(*self.given)
 
-    @property
-    def shift(self) -> Float[np.ndarray, "points 3"]:
+    def point_to_plane(self) -> float:
         first, second = (np.asarray(mesh.vertices, np.float64) for mesh in self.meshes)
-        return second - first
+        return point_to_plane(second - first, self.reference.around)
 
     @cached_property
     def surfaces(self) -> SurfaceDistance:
@@ -206,7 +197,7 @@ _METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
     "curvature": _Pair.tensor_distance,
     "stretch": lambda pair: stretch(*pair.common, pair.reference.hinges.edges),
     "shading": lambda pair: shading(*pair.common, pair.reference.hiding),
-    "point_to_plane": lambda pair: point_to_plane(pair.shift, pair.reference.around),
+    "point_to_plane": _Pair.point_to_plane,
     "flip": lambda pair: flip(*pair.meshes).high,
     "ssim": lambda pair: ssim(*pair.meshes).high,
 }
@@ -223,8 +214,8 @@ _ANY_CONNECTIVITY = {"mrms", "hausdorff", "fmpd", "msdm2", *RENDERED}
 
 def metrics_of(original: Mesh, distorted: Mesh) -> tuple[str, ...]:
     """The names in `METRICS` that two meshes can be compared by: if one is a point cloud, those in `OF_POINTS`."""
-    check_mesh(original)
-    check_mesh(distorted)
+    for mesh in (original, distorted):
+        check_mesh(mesh)
     return METRICS if len(original.faces) and len(distorted.faces) else OF_POINTS
 
 
@@ -279,13 +270,9 @@ def compare(original: Mesh, distorted: Mesh, metrics: Collection[str] | None = N
 
 
 def shading_at_vertices(original: Mesh, distorted: Mesh) -> Float[np.ndarray, " vertices"]:
-    """How visible the turn of normals is around each vertex, in just noticeable differences, for heat maps.
+    """Compute how visible the turn of normals is around each vertex, in just noticeable differences, for heat maps.
 
-    Means of `visible_turn` over the faces around, weighted by area; 0 at vertices without faces.
-
-    Args:
-        original: any mesh with an area.
-        distorted: a mesh of the same connectivity.
+    Values are means of `visible_turn` over the faces around, weighted by area; 0 at vertices without faces.
 
     Raises:
         JaxmarkError: if the connectivity differs, or see `compare`.

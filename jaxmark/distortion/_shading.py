@@ -40,7 +40,7 @@ from jaxtyping import Array, Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from jaxmark.distortion.norms import percentile, ratio, root
+from jaxmark.distortion.norms import Positions, Scalar, percentile, ratio, root
 from jaxmark.geometry.mesh import cross_product, face_pairs
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import band_components, filter
@@ -90,12 +90,9 @@ class Hiding(NamedTuple):
 def make_hiding(
     vertices: Float[Array | np.ndarray, "vertices 3"], faces: Int[Array | np.ndarray, "faces 3"], bands: int = BANDS
 ) -> Hiding:
-    """Compute what an original hides, on the host. Edges of one face, or of three or more, link nothing.
+    """Compute what an original masks, on the host, in `bands` bands from the shortest waves on.
 
-    Args:
-        vertices: positions.
-        faces: the triangles.
-        bands: number of bands that are looked at, from the shortest waves on.
+    Edges of one face, or of three or more, link nothing.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     pairs, against = face_pairs(faces)
@@ -120,16 +117,8 @@ def make_hiding(
 
 
 @jax.jit
-def visible_turn(
-    original: Float[Array, "vertices 3"], distorted: Float[Array, "vertices 3"], hiding: Hiding
-) -> Float[Array, " faces"]:
-    """How visible the turn of each face's normal is, in just noticeable differences.
-
-    Args:
-        original: positions.
-        distorted: positions of the same vertices.
-        hiding: from `make_hiding` of the original.
-    """
+def visible_turn(original: Positions, distorted: Positions, hiding: Hiding) -> Float[Array, " faces"]:
+    """Compute how visible the turn of each face's normal is, in just noticeable differences."""
     change = _normals(distorted, hiding) - _normals(original, hiding)
     # Compiled code may round equal positions to different normals. Only the value is mended: the derivative is sound.
     unmoved = jnp.all((original == distorted)[hiding.faces], axis=(1, 2))[:, None]
@@ -145,28 +134,16 @@ def visible_turn(
 
 
 @jax.jit
-def shading(
-    original: Float[Array, "vertices 3"],
-    distorted: Float[Array, "vertices 3"],
-    hiding: Hiding,
-    share: float | Float[Array, ""] = SHARE,
-) -> Float[Array, ""]:
-    """The visible turn of normals that is exceeded on 1 % of the area, in just noticeable differences.
+def shading(original: Positions, distorted: Positions, hiding: Hiding, share: float | Scalar = SHARE) -> Scalar:
+    """The visible turn of normals that is exceeded on 1 % of the area (1 - `share`), in just noticeable differences.
 
     Normals are split into bands of spatial frequency; a turn in each is taken over the least that is seen there, which
     the original's own contrast in the band raises (masking as by Daly, with the constants of Nader, Wang,
     Hétroy-Wheeler, Dupont, "Just noticeable distortion profile for flat-shaded 3D mesh surfaces", IEEE TVCG 22(11),
-    2016; sensitivity as by Barten, JOSA A 7(10), 1990). On a plane 0.2° are just noticeable, by our calibration.
-
-    Args:
-        original: positions.
-        distorted: positions of the same vertices.
-        hiding: from `make_hiding` of the original.
-        share: share of the area that turns less; the gradient is that of the face at this percentile.
+    2016; sensitivity as by Barten, JOSA A 7(10), 1990). On a plane 0.2° are just noticeable, by our calibration. The
+    gradient is that of the face at the percentile.
     """
-    values = visible_turn(original, distorted, hiding)
-    area = jnp.asarray(hiding.area).astype(values.dtype)
-    return percentile(values, area, share)
+    return percentile(visible_turn(original, distorted, hiding), jnp.asarray(hiding.area), share)
 
 
 def vertex_means(values: Float[Array, " faces"], hiding: Hiding, count: int) -> Float[Array, " vertices"]:
@@ -179,12 +156,10 @@ def vertex_means(values: Float[Array, " faces"], hiding: Hiding, count: int) -> 
 def _areas_and_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Areas of faces and their unit normals, 0 for those that are too flat to have one."""
     sides = [vertices[faces[:, k]] - vertices[faces[:, k - 1]] for k in range(3)]
-    longest = np.max([_squared(side) for side in sides], axis=0)
-    normals = cross_product(sides[1], sides[2])
+    longest, normals = np.max([_squared(side) for side in sides], axis=0), cross_product(sides[1], sides[2])
     double = np.sqrt(_squared(normals))
     area = np.where(double > _MIN_HEIGHT * longest, double / 2, 0)
-    normals /= np.where(area > 0, double, 1)[:, None]
-    return area, normals
+    return area, normals / np.where(area > 0, double, 1)[:, None]
 
 
 def _squared(x: Float[np.ndarray, "rows 3"]) -> Float[np.ndarray, " rows"]:
@@ -250,9 +225,8 @@ def _bands(links: Laplacian, x: Array, count: int) -> Array:
 
 def _by_length(series: Float[np.ndarray, "series terms"]) -> list[Float[np.ndarray, "some fewer"]]:
     """Split series, the shortest first, into those of few terms, which end there, and the others."""
-    few = _FEW_TERMS
-    short = int((~series[:, few:].any(axis=1)).sum())
-    return [some for some in (series[:short, :few], series[short:]) if len(some)]
+    short = int((~series[:, _FEW_TERMS:].any(axis=1)).sum())
+    return [some for some in (series[:short, :_FEW_TERMS], series[short:]) if len(some)]
 
 
 @partial(jax.jit, static_argnames="count")

@@ -8,10 +8,12 @@ import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 from scipy.spatial import KDTree
 
-from jaxmark.distortion.norms import inverse_root, lengths, percentile, ratio, rms
+from jaxmark.distortion.norms import Positions, Scalar, inverse_root, lengths, percentile, ratio, rms
 from jaxmark.geometry.clouds import planes, spacings
 from jaxmark.geometry.mesh import Mesh, used_vertices
 from jaxmark.geometry.surfaces import Surface, sample
+
+Edges = Int[Array | np.ndarray, "edges 2"]  # as by `jaxmark.geometry.mesh.edges`
 
 HIGH_SHARE = 0.99  # share of the edges, or corners of faces, whose change is smaller than the returned one
 _HIGH_SHARE_OF_POINTS = 0.95
@@ -47,9 +49,7 @@ def surface_distance(first: Mesh, second: Mesh) -> SurfaceDistance:
 
 
 @jax.jit
-def geometric_laplacian(
-    x: Float[Array, "vertices 3"], edges: Int[Array | np.ndarray, "edges 2"]
-) -> Float[Array, "vertices 3"]:
+def geometric_laplacian(x: Positions, edges: Edges) -> Positions:
     """The geometric Laplacian v - Σ_j v_j/l_j / Σ_j 1/l_j of each vertex, over neighbours j at distances l_j.
 
     Edges of length 0 do not count; a vertex without other edges gets 0.
@@ -62,42 +62,23 @@ def geometric_laplacian(
 
 
 @jax.jit
-def gl(
-    original: Float[Array, "vertices 3"],
-    distorted: Float[Array, "vertices 3"],
-    edges: Int[Array | np.ndarray, "edges 2"],
-) -> Float[Array, ""]:
+def gl(original: Positions, distorted: Positions, edges: Edges) -> Scalar:
     """The mean of two RMS changes, of positions and of the geometric Laplacian, in the units of the positions.
 
     Reference: Karni, Gotsman, "Spectral compression of mesh geometry", SIGGRAPH 2000, section 5. The paper divides the
     roots of sums of squares by the number of vertices. Here they are root mean squares, so that meshes with different
     numbers of vertices are comparable.
-
-    Args:
-        original: positions.
-        distorted: positions of the same vertices.
-        edges: from `jaxmark.geometry.mesh.edges`.
     """
     change = geometric_laplacian(distorted, edges) - geometric_laplacian(original, edges)
     return jnp.asarray((rms(distorted - original) + rms(change)) / 2)
 
 
 @jax.jit
-def stretch(
-    original: Float[Array, "vertices 3"],
-    distorted: Float[Array, "vertices 3"],
-    edges: Int[Array | np.ndarray, "edges 2"],
-    share: float | Float[Array, ""] = HIGH_SHARE,
-) -> Float[Array, ""]:
-    """The change of length that 1 % of the edges exceed, over the length that each has in the original.
+def stretch(original: Positions, distorted: Positions, edges: Edges, share: float | Scalar = HIGH_SHARE) -> Scalar:
+    """The change of length that 1 % of the edges (1 - `share`) exceed, over the length that each has in the original.
 
-    Displacements along the surface change lengths, and so textures, where shading hardly changes.
-
-    Args:
-        original: positions.
-        distorted: positions of the same vertices.
-        edges: pairs of vertices, as by `jaxmark.geometry.mesh.edges`; those of length 0 do not count.
-        share: share of the edges that change less; the gradient is that of the edge at this percentile.
+    Displacements along the surface change lengths, and so textures, where shading hardly changes. Edges of length 0 do
+    not count. The gradient is that of the edge at this percentile.
     """
     before, after = (lengths(x[edges[:, 0]] - x[edges[:, 1]]) for x in (original, distorted))
     return percentile(ratio(jnp.abs(after - before), before), (before > 0).astype(before.dtype), share)
@@ -119,11 +100,8 @@ def point_to_plane(displacement: Float64[np.ndarray, "points 3"], around: PointP
     """Measure the displacement across the surface that 5 % of the points exceed, over the distance of nearest points.
 
     A cloud is drawn as dots or small discs about as large as the points are apart: a small share of that neither
-    roughens its surface nor opens it. Along the surface, points may stand anywhere.
-
-    Args:
-        displacement: of each point, in the units of the planes.
-        around: the planes of the points before they moved.
+    roughens its surface nor opens it. Along the surface, points may stand anywhere. `around` has the planes of the
+    points before they moved, in the units of the displacement.
     """
     across = np.abs(np.sum(displacement * around.normals, axis=1))
     return float(np.quantile(across, _HIGH_SHARE_OF_POINTS) / (around.spacing or 1.0))

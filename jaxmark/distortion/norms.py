@@ -8,6 +8,9 @@ import numpy as np
 from jaxtyping import Array, DTypeLike, Float
 
 Tree = TypeVar("Tree")
+Positions = Float[Array, "vertices 3"]
+PerVertex = Float[Array, " vertices"]
+Scalar = Float[Array, ""]
 
 
 def root(square: Any, xp: Any = jnp) -> Any:
@@ -48,7 +51,7 @@ def lengths(x: Float[Array, "rows 3"]) -> Float[Array, " rows"]:
     return root(jnp.sum(x**2, axis=1))
 
 
-def rms(displacement: Float[Array | np.ndarray, "vertices 3"]) -> Float[Array | np.ndarray, ""]:
+def rms(displacement: Float[Array | np.ndarray, "vertices 3"]) -> Scalar | np.ndarray:
     """Root mean square √(mean over v of |d_v|²), unweighted, in the units of `displacement`; the gradient at 0 is 0.
 
     A NumPy array gives a NumPy result, so that float64 stays float64 on the host.
@@ -57,20 +60,18 @@ def rms(displacement: Float[Array | np.ndarray, "vertices 3"]) -> Float[Array | 
     return root(xp.mean(xp.sum(displacement**2, axis=-1)), xp)
 
 
-def maximum(displacement: Float[Array | np.ndarray, "vertices 3"]) -> Float[Array | np.ndarray, ""]:
+def maximum(displacement: Float[Array | np.ndarray, "vertices 3"]) -> Scalar | np.ndarray:
     """Largest |d_v| over the vertices, in the units of `displacement`; the gradient at 0 is 0."""
     xp: Any = np if isinstance(displacement, np.ndarray) else jnp
     return root(xp.max(xp.sum(displacement**2, axis=-1)), xp)
 
 
-def cubic_mean(values: Float[Array, " vertices"]) -> Float[Array, ""]:
+def cubic_mean(values: PerVertex) -> Scalar:
     """The cube root of the mean of cubes; the gradient at 0 is 0."""
     return cube_root(jnp.mean(values**3))
 
 
-def percentile(
-    values: Float[Array, " values"], weights: Float[Array, " values"], share: float | Float[Array, ""]
-) -> Float[Array, ""]:
+def percentile(values: PerVertex, weights: PerVertex, share: float | Scalar) -> Scalar:
     """Find the least value at or below which lies `share` (0 to 1) of the weight; the gradient is that of this value.
 
     **Values and weights must not be negative**: such numbers are ordered as the integers that their bits are, and these

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
-from jaxmark.distortion.norms import lengths, ratio
+from jaxmark.distortion.norms import PerVertex, Positions, Scalar, lengths, ratio
 from jaxmark.geometry.mesh import boundary_vertices
 
 POWER = 0.15  # exponent by which roughness is modulated
@@ -25,21 +25,16 @@ _SCALE = 8.0  # brings the distance into [0, 1]
 class Rough(NamedTuple):
     """Roughness of a surface at its vertices."""
 
-    roughness: Float[Array, " vertices"]  # in radians; see `local_roughness`
-    area: Float[Array, " vertices"]  # a third of the area of the faces around
+    roughness: PerVertex  # in radians; see `local_roughness`
+    area: PerVertex  # a third of the area of the faces around
 
 
 def local_roughness(
-    x: Float[Array, "vertices 3"],
-    faces: Int[Array | np.ndarray, "faces 3"],
-    boundary: Bool[np.ndarray, " vertices"] | None = None,
+    x: Positions, faces: Int[Array | np.ndarray, "faces 3"], boundary: Bool[np.ndarray, " vertices"] | None = None
 ) -> Rough:
     """Difference of each vertex's absolute angle defect from the cotangent-weighted mean of its neighbours'.
 
-    Args:
-        x: positions.
-        faces: vertex indices.
-        boundary: mask of the boundary vertices, at which flat angles sum to π; computed unless given.
+    `boundary` is the mask of the boundary vertices, at which flat angles sum to π; it is computed unless given.
     """
     if boundary is None:
         boundary = np.isin(np.arange(len(x)), boundary_vertices(np.asarray(faces)))
@@ -47,9 +42,7 @@ def local_roughness(
 
 
 @jax.jit
-def _local_roughness(
-    x: Float[Array, "vertices 3"], faces: Int[Array, "faces 3"], boundary: Bool[Array, " vertices"]
-) -> Rough:
+def _local_roughness(x: Positions, faces: Int[Array, "faces 3"], boundary: Bool[Array, " vertices"]) -> Rough:
     corners = x[faces]
     u, v = jnp.roll(corners, -1, axis=1) - corners, jnp.roll(corners, -2, axis=1) - corners
     cosine, cross = jnp.sum(u * v, axis=2), jnp.cross(u[:, 0], v[:, 0])
@@ -69,15 +62,11 @@ def _local_roughness(
 
 
 @jax.jit
-def fmpd(first: Rough, second: Rough) -> Float[Array, ""]:
+def fmpd(first: Rough, second: Rough) -> Scalar:
     """Fast mesh perceptual distance, 0 to 1: how much rougher one surface is than another as a whole.
 
     Connectivities may differ. The metric is nearly blind to slow waves, so do not rely on it alone for a mark of low
     frequencies.
-
-    Args:
-        first: from `local_roughness`, of one mesh.
-        second: likewise, of the other mesh.
     """
     means = jnp.minimum(*(_mean(rough.roughness, rough.area) for rough in (first, second)))
     floor = MIN_ROUGHNESS**POWER

@@ -15,10 +15,23 @@ from jaxtyping import Array, Float, Int
 
 from jaxmark.distortion.dihedral import Hinges, dihedral_sine_cosine, make_hinges
 from jaxmark.distortion.neighbourhoods import Neighbourhoods, filled, make_neighbourhoods, share_inside
-from jaxmark.distortion.norms import cube_root, cubic_mean, inverse_root, ratio, root, with_dtype
+from jaxmark.distortion.norms import (
+    PerVertex,
+    Positions,
+    Scalar,
+    cube_root,
+    cubic_mean,
+    inverse_root,
+    ratio,
+    root,
+    with_dtype,
+)
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.surfaces import Surface, barycentric
 from jaxmark.spectral.precision import einsum
+
+Originals = Float[Array, "originals 3"]
+Tensors = Float[Array, "vertices 3 3"]
 
 # Lengths are in units of the longest side of the distorted mesh's bounding box.
 _MSDM_BALL, _MSDM_WINDOW, _MSDM_SIGMA = 0.005, 0.015, 0.008  # radius of balls and windows, width of the Gaussian
@@ -29,18 +42,12 @@ _MAX_WINDOWS = 20_000  # in larger meshes, windows are around this number of ran
 
 
 @jax.jit
-def curvature_tensor(
-    x: Float[Array, "vertices 3"], hinges: Hinges, balls: Neighbourhoods
-) -> Float[Array, "vertices 3 3"]:
+def curvature_tensor(x: Positions, hinges: Hinges, balls: Neighbourhoods) -> Tensors:
     """The tensor T = 1/(πr²) Σ β_e/|e| e eᵀ over the pieces e of edges in the ball around each vertex.
 
     β_e is the dihedral angle. As in MEPP2, whose values are published, it is computed by the inverse sine, and so at
-    most π/2 however sharp the edge is, and edges across the direction of the search from the centre do not count.
-
-    Args:
-        x: positions.
-        hinges: from `make_hinges`.
-        balls: edges in balls of radius r, from `make_neighbourhoods`.
+    most π/2 however sharp the edge is, and edges across the direction of the search from the centre do not count. The
+    balls, of radius r, are the edges that `make_neighbourhoods` returns.
     """
     sine, cosine = dihedral_sine_cosine(x, hinges)
     angle = jnp.arctan2(sine, jnp.abs(cosine))
@@ -52,13 +59,13 @@ def curvature_tensor(
 
 
 @jax.jit
-def curvature(tensor: Float[Array, "vertices 3 3"]) -> Float[Array, " vertices"]:
+def curvature(tensor: Tensors) -> PerVertex:
     """(|K_max| + |K_min|)/2, the mean size of the two largest eigenvalues of the tensor by size."""
     sizes = jnp.sort(jnp.abs(_eigenvalues(tensor)), axis=1)
     return (sizes[:, 1] + sizes[:, 2]) / 2
 
 
-def _eigenvalues(matrix: Float[Array, "matrices 3 3"]) -> Float[Array, "matrices 3"]:
+def _eigenvalues(matrix: Tensors) -> Positions:
     """Eigenvalues of symmetric matrices, in closed form (Smith, Communications of the ACM 4, 1961).
 
     LAPACK is avoided, for the determinant, too: on processors, several of its batched calls at once can deadlock.
@@ -78,9 +85,7 @@ def _eigenvalues(matrix: Float[Array, "matrices 3 3"]) -> Float[Array, "matrices
 
 
 @jax.jit
-def tensor_distance(
-    original: Float[Array, "vertices 3 3"], distorted: Float[Array, "vertices 3 3"]
-) -> Float[Array, ""]:
+def tensor_distance(original: Tensors, distorted: Tensors) -> Scalar:
     """Change of curvature in size and direction, 0 to 1: the cubic mean of ‖T - T'‖/(‖T‖ + ‖T'‖ + ε) over vertices.
 
     This follows TPDM (Torkhani, Wang, Chassery, "A curvature-tensor-based perceptual quality metric for 3D triangular
@@ -144,25 +149,22 @@ def _views(
     meshes = [(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)) for mesh in (original, distorted)]
     unit, count = float(np.ptp(meshes[1][0], axis=0).max()), len(meshes[1][0])
     centres = np.sort(np.random.default_rng(0).permutation(count)[:_MAX_WINDOWS])
-    balls = [[make_neighbourhoods(*mesh, unit * ball)[0] for ball, _, _ in sizes] for mesh in meshes]
+
+    def stack(vertices: np.ndarray, scales: list[Neighbourhoods]) -> Neighbourhoods:
+        """Pad the neighbourhoods of all scales to the largest, so that one compiled program serves all."""
+        most = max(len(one.centre) for one in scales)
+        return jax.tree.map(lambda *rows: np.stack(rows), *(filled(one, most, len(vertices)) for one in scales))
+
+    balls = [stack(mesh[0], [make_neighbourhoods(*mesh, unit * ball)[0] for ball, _, _ in sizes]) for mesh in meshes]
     windows = [make_neighbourhoods(*meshes[1], unit * window, centres)[1] for _, window, _ in sizes]
-    counts = [len(vertices) for vertices, _ in meshes]
-    first, second, third = map(_stacked, (*balls, windows), (*counts, counts[1]))
-    scales = Scale(first, second, third, np.array([unit * sigma for _, _, sigma in sizes]))
+    sigmas = np.array([unit * sigma for _, _, sigma in sizes])
     before, after = (make_hinges(faces) for _, faces in meshes)
+    scales = Scale(*balls, windows=stack(meshes[1][0], windows), sigma=sigmas)
     return Views((before, after), corners, share, scales, centres, unit)
 
 
-def _stacked(scales: list[Neighbourhoods], count: int) -> Neighbourhoods:
-    """Stack the neighbourhoods of several scales, padded to the largest, so that one compiled program serves all."""
-    most = max(len(balls.centre) for balls in scales)
-    return Neighbourhoods(*map(np.stack, zip(*(filled(balls, most, count) for balls in scales), strict=True)))
-
-
 @jax.jit
-def local_msdm2(
-    original: Float[Array, "originals 3"], distorted: Float[Array, "vertices 3"], views: Views
-) -> Float[Array, " centres"]:
+def local_msdm2(original: Originals, distorted: Positions, views: Views) -> Float[Array, " centres"]:
     """Distortion at each centre of the views, from 0 to 1: (L + C + S/2)/2.5, averaged over scales.
 
     L, C and S are the differences of curvature, contrast and structure; arguments are those of `msdm2`.
@@ -172,30 +174,21 @@ def local_msdm2(
 
 
 @jax.jit
-def msdm2(
-    original: Float[Array, "originals 3"], distorted: Float[Array, "vertices 3"], views: Views
-) -> Float[Array, ""]:
+def msdm2(original: Originals, distorted: Positions, views: Views) -> Scalar:
     """Multiscale structural distortion of a mesh, from 0 to 1; not symmetric. Connectivities may differ.
 
-    Args:
-        original: positions.
-        distorted: positions.
-        views: from `msdm2_views`, for these positions or others near them.
+    The views are those that `msdm2_views` prepares, for these positions or others near them.
     """
     return cubic_mean(local_msdm2(original, distorted, views))
 
 
 @jax.jit
-def msdm(original: Float[Array, "vertices 3"], distorted: Float[Array, "vertices 3"], views: Views) -> Float[Array, ""]:
+def msdm(original: Positions, distorted: Positions, views: Views) -> Scalar:
     """Structural distortion of a mesh at one scale, from 0 to 1; connectivities must be the same.
 
     By the paper's equations, the local distortion is ((L³ + C³ + S³/2)/2.5)^(1/3), from the differences of curvature L,
-    contrast C and structure S, and the global one the cubic mean of local ones.
-
-    Args:
-        original: positions.
-        distorted: positions of the same vertices.
-        views: from `msdm_views`, for these positions or others near them.
+    contrast C and structure S, and the global one the cubic mean of local ones. The views are those that `msdm_views`
+    prepares, for these positions or others near them.
     """
     curved, contrast, structure = (values[0] for values in _compared(original, distorted, views, 0.0))
     return cubic_mean(cube_root((curved**3 + contrast**3 + structure**3 / 2) / 2.5))
@@ -218,22 +211,16 @@ def _compared(original: Array, distorted: Array, views: Views, offset: float) ->
 
 
 def _contributions(
-    curvatures: tuple[Float[Array, " vertices"], Float[Array, " vertices"]],
-    positions: tuple[Float[Array, "vertices 3"], Float[Array, "vertices 3"]],
+    curvatures: tuple[PerVertex, PerVertex],
+    positions: tuple[Positions, Positions],
     windows: Neighbourhoods,
-    sigma: float | np.ndarray | Float[Array, ""],
+    sigma: float | np.ndarray | Scalar,
     offset: float,
-) -> tuple[Float[Array, " vertices"], ...]:
+) -> tuple[PerVertex, ...]:
     """Differences of curvature, contrast and structure in the window of each vertex, as SSIM has them of images.
 
-    Each is relative to its size plus an offset. Points are weighted by a Gaussian of the distance from the centre.
-
-    Args:
-        curvatures: of the original and of the distorted mesh, both at the distorted mesh's vertices.
-        positions: of both meshes, likewise.
-        windows: points of the distorted mesh, from `make_neighbourhoods`.
-        sigma: width of the Gaussian, in the units of the positions.
-        offset: number that is added to the sizes.
+    Each is relative to its size plus an offset. Curvatures and positions are those of both meshes at the distorted
+    mesh's vertices; points are weighted by a Gaussian of width `sigma` of their distance from the centre.
     """
     share = share_inside(positions[1], windows)
 

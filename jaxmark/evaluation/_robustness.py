@@ -72,8 +72,10 @@ NOTHING = Outcome(False, False, 0.5, 0.0, 0.0)  # the reading of a refused suspe
 
 def compare_with(message: bytes, marker: Marker, found: Detection) -> Outcome:
     """Compare what a marker read with the message that was written."""
-    said = marker.guess(found)
-    wrong = 0.5 if said is None else float(np.mean(_bits(said) != _bits(message)))
+    guess, wrong = marker.guess(found), 0.5
+    if guess is not None:
+        read, written = (np.unpackbits(np.frombuffer(one, np.uint8)) for one in (guess, message))
+        wrong = float(np.mean(read != written))
     other = found.message not in (None, message)
     return Outcome(found.message == message, other, wrong, found.log10_p, found.evidence.log10_p_unfloored)
 
@@ -118,14 +120,8 @@ def robustness(
         return np.array([[getattr(reading, name) for reading, _ in row] for row in rows])
 
     refusals = tuple(tuple(sentence for _, sentence in row) for row in rows)
-    return Robustness(
-        np.array(strengths, float),
-        column("read"),
-        column("bit_errors"),
-        column("log10_p"),
-        column("log10_p_unfloored"),
-        refusals,
-    )
+    numbers = map(column, ("read", "bit_errors", "log10_p", "log10_p_unfloored"))
+    return Robustness(np.array(strengths, float), *numbers, refusals=refusals)
 
 
 def minimum_distortion(
@@ -185,7 +181,3 @@ def minimum_distortion(
     trials.sort(key=lambda one: one.strength, reverse=strong < weak)
     weakest = next((one for one in trials if one.log10_p > math.log10(alpha)), None)
     return Breaking(compare(marker.original.mesh, marked, metrics), weakest, tuple(trials))
-
-
-def _bits(message: bytes) -> np.ndarray:
-    return np.unpackbits(np.frombuffer(message, np.uint8))

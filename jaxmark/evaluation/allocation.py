@@ -1,12 +1,13 @@
-"""Strengths per band that leave most after the worst of several attacks, for given channels, by jaxopt.
+"""Strengths per band that leave most after the worst of several attacks, for given channels.
 
-This is the only module that imports jaxopt, and only when it is called. The problem is concave: `allocate` solves it
-and is differentiable, `upper_bound` says how much better other strengths could be.
+The problem is concave: `allocate` solves it and is differentiable, `upper_bound` says how much better other strengths
+could be. This is the only module that imports jaxopt, and only when it is called.
 """
 
 import warnings
+from collections.abc import Callable
 from functools import partial
-from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -85,33 +86,49 @@ def _allocate(
     cap: float,
     steps: int,
 ) -> Array:
-    jaxopt = import_jaxopt()
     # A band's share of the budget buys this much β².
     scaled = channels._replace(gain=channels.gain * budget / jnp.sqrt(cost))
     level = 1 / margins(scaled, jnp.full_like(cost, 1 / len(cost)), margin).mean()
 
-    # jaxopt differentiates its solution with respect to arguments, not to what a closure holds.
     def loss(shares: Array, scaled: Channels, level: Array, sharpness: Array) -> Array:
         return jax.nn.logsumexp(-sharpness * level * margins(scaled, shares, margin)) / sharpness
 
-    simplex = jaxopt.ProjectedGradient(
-        fun=loss,
-        projection=lambda x, _: _capped_simplex(x, cap),
-        maxiter=steps,
-        tol=1e-7,
-        acceleration=False,
-    )
-    run = partial(simplex.run, hyperparams_proj=None)
-
     def stage(shares: Array, share: Array) -> tuple[Array, None]:
-        return run(shares, scaled=scaled, level=level, sharpness=share * sharpness).params, None
+        data = {"scaled": scaled, "level": level, "sharpness": share * sharpness}
+        project, options = partial(_capped_simplex, cap=cap), {"maxiter": steps, "tol": 1e-7, "acceleration": False}
+        return minimise(loss, project, shares, data, **options), None
 
-    with jax.numpy_dtype_promotion("standard"):  # jaxopt mixes integers into its floats
-        warm = jax.lax.stop_gradient(jax.lax.scan(stage, first, jnp.asarray(_ANNEALING_SHARES, first.dtype))[0])
-        shares = stage(warm, jnp.ones_like(sharpness))[0]
+    warm = jax.lax.stop_gradient(jax.lax.scan(stage, first, jnp.asarray(_ANNEALING_SHARES, first.dtype))[0])
+    shares = stage(warm, jnp.ones_like(sharpness))[0]
     # The root's slope at an empty band is infinite: select before it. NaN is not empty, and stays.
     empty = shares <= 0
     return jnp.where(empty, 0, budget * jnp.sqrt(jnp.where(empty, 1, shares) / cost))
+
+
+def minimise(
+    loss: Callable[..., Array],
+    project: Callable[[Array], Array],
+    start: Array,
+    data: dict[str, Any] | None = None,
+    **options: Any,
+) -> Array:
+    """Minimise a function over a convex set by projected gradients; call it in compiled code, because jaxopt retraces.
+
+    Args:
+        loss: function of a point and of `data`, by which jaxopt differentiates its solution; a closure's values do not
+            count.
+        project: projection onto the set.
+        start: a point of the set.
+        data: keyword arguments of `loss`.
+        options: options of `jaxopt.ProjectedGradient`.
+    """
+    with warnings.catch_warnings():
+        # It says at import that nobody maintains it; no maintained library solves constrained problems in JAX.
+        warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
+        import jaxopt
+    with jax.numpy_dtype_promotion("standard"):  # jaxopt mixes integers into its floats
+        solver = jaxopt.ProjectedGradient(loss, lambda x, _: project(x), **options)
+        return solver.run(start, hyperparams_proj=None, **(data or {})).params
 
 
 @partial(jax.jit, static_argnames="cap")
@@ -216,12 +233,3 @@ def balance(
         weights = weights / weights.sum()
     assert best is not None
     return best[1], best[2]
-
-
-def import_jaxopt() -> ModuleType:
-    """Import jaxopt, without its warning."""
-    with warnings.catch_warnings():
-        # It says at import that nobody maintains it; no maintained library solves constrained problems in JAX.
-        warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
-        import jaxopt
-    return jaxopt

@@ -21,7 +21,7 @@ from jaxmark.alignment.attempts import align
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, displace
 from jaxmark.errors import JaxmarkError
-from jaxmark.evaluation.allocation import import_jaxopt
+from jaxmark.evaluation.allocation import minimise
 from jaxmark.evaluation.channels import Margin, measure
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.carriers.keyed import KeyedCarrier, KeyedReader
@@ -33,7 +33,7 @@ Attack = Callable[[Mesh, int], Mesh]  # an attack of some strength on a mesh, wi
 
 # Numbers of the signs of marks, each of which is tried beside its opposite. Strengths are fitted to the first ones, the
 # best of several are chosen by others, and the choice is checked by others again: each is good by chance for its own.
-_FITTED, _CHOSEN, _CHECKED = range(3, 6), range(3), range(6, 14)
+FITTED, CHOSEN, CHECKED = range(3, 6), range(3), range(6, 14)
 _SHARPNESS = 50.0  # of the soft minimum over attacks, over the least worth
 _SHAPES = 5  # cosines over the bands that strengths are changed by: more would fit what is chance in each band
 _STEPS, _TRIES = 5, 5  # of the gradient, and of the size of each step, before marks are tried again
@@ -97,31 +97,18 @@ class Trials:
             return False
         return True
 
-    def run(self, scheme: KeyedScheme) -> Trial:
-        """Write, attack and read marks of a scheme, to choose among several.
-
-        Raises:
-            JaxmarkError: if the payload does not fit, a limit cannot be kept, or a suspect cannot be aligned.
-        """
-        return self._run(scheme, _CHOSEN)
-
-    def check(self, scheme: KeyedScheme) -> Trial:
-        """Write, attack and read more marks of a scheme than `run`, by which nothing was chosen before.
-
-        Raises:
-            JaxmarkError: see `run`.
-        """
-        return self._run(scheme, _CHECKED)
-
-    def _run(self, scheme: KeyedScheme, numbers: range) -> Trial:
+    def run(self, scheme: KeyedScheme, numbers: range = CHOSEN) -> Trial:
         """Write, attack and read marks of a scheme.
 
-        Each mark is tried beside its opposite: what attacks have in common with its signs by chance cancels, so that
-        few marks tell two profiles apart.
+        Each mark is tried with its opposite: correlations of the attacks with its signs by chance cancel, so that few
+        marks suffice to distinguish two profiles.
 
         Args:
             scheme: the scheme with its strengths.
-            numbers: of the signs, which are drawn from nobody's key; the first one is added to the attacks' seeds.
+            numbers: numbers of the signs, which depend on no secret key; the first one is added to the attacks' seeds.
+
+        Raises:
+            JaxmarkError: if the payload does not fit, a limit cannot be kept, or a suspect cannot be aligned.
         """
         original = self.original
         code = scheme.code_length(original, self.bits)
@@ -168,7 +155,7 @@ class Trials:
 
     def _improved(self, tried: Trial, cost: Float64[np.ndarray, "limits bands"]) -> KeyedScheme:
         """The scheme with the strengths that are best by what is seen of others, which are not far."""
-        at = self._run(tried.scheme, _FITTED)
+        at = self.run(tried.scheme, FITTED)
         carrier, dtype = at.reader.carrier, at.word.dtype
         base = jnp.asarray(carrier.profile)
         scales = [jnp.asarray(scale, dtype) for scale in at.scales]
@@ -271,7 +258,6 @@ def _climb(
     attacks: int,
 ) -> Float[Array, " passing"]:
     """The strengths that leave most after the worst attack, of those that differ smoothly, and not by much."""
-    jaxopt = import_jaxopt()
     base = jnp.asarray(reader.carrier.profile)
     places = (np.arange(len(base)) + 0.5) / len(base)
     shapes = jnp.asarray(np.cos(np.pi * np.outer(places, np.arange(1, _SHAPES + 1))), base.dtype)
@@ -295,10 +281,6 @@ def _climb(
         nats = jnp.maximum(mean, 0) ** 2 / 2
         return jax.nn.logsumexp(-_SHARPNESS * nats * level) / _SHARPNESS
 
-    with jax.numpy_dtype_promotion("standard"):  # jaxopt mixes integers into its floats
-        solver = jaxopt.ProjectedGradient(
-            loss, jaxopt.projection.projection_box, maxiter=_STEPS, maxls=_TRIES, tol=1e-4
-        )
-        most = jnp.full(_SHAPES, _REACH, base.dtype)
-        change = solver.run(jnp.zeros(_SHAPES, base.dtype), hyperparams_proj=(-most, most)).params
+    start, reach = jnp.zeros(_SHAPES, base.dtype), partial(jnp.clip, min=-_REACH, max=_REACH)
+    change = minimise(loss, reach, start, maxiter=_STEPS, maxls=_TRIES, tol=1e-4)
     return base * jnp.exp(shapes @ change)

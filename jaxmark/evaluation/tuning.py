@@ -1,44 +1,50 @@
-"""Strengths per band that leave most readable after the worst of several attacks, within a budget.
+"""Choose the strengths of bands, or the width and the step of a blind mark, for the worst of several attacks.
 
 `tune` measures what attacks leave of each band of a mesh, solves for the strengths that are best by these channels,
 with a proof of how good they are, and goes on from there, or from the scheme's default strengths, by trials with the
-detector itself.
+detector itself. `tune_blind` compares all widths and steps that a budget allows.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import groupby
 from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int64
+from jaxtyping import Array, Float, Float64
 
 from jaxmark.adversaries.registry import attack, get_attack
 from jaxmark.alignment.attempts import align
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.attacks import Kind
-from jaxmark.distortion import name_of
+from jaxmark.distortion import Reference, name_of
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.allocation import balance, upper_bound
 from jaxmark.evaluation.channels import Channels, Margin, margins, measure
-from jaxmark.evaluation.trials import Trials
+from jaxmark.evaluation.trials import CHECKED, Trials
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.seeds import Seed, probe_signs, random_key
 from jaxmark.spectral.chebyshev import band_energies, filter
+from jaxmark.watermark.blind.prediction import Left, best_margin, compare
+from jaxmark.watermark.blind.reading import codeword, register
+from jaxmark.watermark.blind.scheme import BlindScheme, Look
+from jaxmark.watermark.blind.writing import Plan, carried, sureness
 from jaxmark.watermark.interfaces import Displacement, Scheme
+from jaxmark.watermark.markers import make_blind_marker
 from jaxmark.watermark.perception.budget import Bounds, Budget, BudgetLike, displace_within
 from jaxmark.watermark.perception.capacity import Capacity
 from jaxmark.watermark.perception.masking import apply_mask
 from jaxmark.watermark.perception.visibility import band_visibility
 from jaxmark.watermark.schemes.keyed import KeyedScheme
 from jaxmark.watermark.schemes.passband import choose_pass_band
-from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, find_blind, get_nonblind
+from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, DEFAULT_SCHEME, find_blind, get_nonblind
 
 Attacker = tuple[Kind, float] | Callable[[Mesh, int], Mesh]  # an attack and a strength, or (mesh, seed) → mesh
 
-
 _LOW_PASS = (1 / 8, 1 / 4)  # shares of the spectrum that are tried with equal strengths
+_PUBLIC_KEY = bytes(32)  # of blind marks: predictions hardly depend on the key
 _LEAST_GAIN = 1.2  # of what the worst attack leaves by the scheme's own strengths, for which others are returned
 
 
@@ -114,14 +120,12 @@ def tune(
     Raises:
         JaxmarkError: if the mesh, an attack, the budget or a number is unusable, or the scheme has no bands to tune.
     """
-    if not attacks or samples < 1:
-        raise JaxmarkError(f"tune needs at least one attack and one sample, got {len(attacks)} and {samples}.")
-    check_attackers(attacks)
+    seeds = _draw_seeds("tune", attacks, samples, seed)
     if margin not in get_args(Margin):
         raise JaxmarkError(f"The margin to tune for is one of {', '.join(get_args(Margin))}, got {margin!r}.")
     if find_blind(scheme) is not None:
         raise JaxmarkError(f"The scheme {scheme!r} is read without the original, and has no bands; see tune_blind.")
-    numbers, tunable = seed_numbers(seed, samples), get_nonblind(scheme).tunable()
+    tunable = get_nonblind(scheme).tunable()
     original, family = make_original(mesh), tunable.family()
     bounds = Budget.of(budget).bounds(original.mesh)
     (signs,) = probe_signs("tuning", original.signal.shape, dtype=original.signal.dtype)
@@ -137,7 +141,7 @@ def tune(
     probe = shape_signs(equal)
     written = displace_within(original, probe, bounds)
     mark = original.to_traced(written.scale * probe)
-    suspects = [[apply_attack(one, written.mesh, int(seed)) for seed in numbers] for one in attacks]
+    suspects = [[apply_attack(one, written.mesh, seed) for seed in seeds] for one in attacks]
     seen = [[align(original, suspect).observation(original) for suspect in row] for row in suspects]
 
     def measure_channels(profile: tuple[float, ...]) -> Channels:
@@ -153,22 +157,23 @@ def tune(
     worth = np.asarray(margins(channels, jnp.asarray(beta**2, original.signal.dtype), margin), np.float64)
     bound = upper_bound(channels, weights @ cost, cap=cap, margin=margin)
 
-    trials = Trials(original, bits, bounds, [partial(apply_attack, one) for one in attacks], numbers.tolist(), margin)
+    trials = Trials(original, bits, bounds, [partial(apply_attack, one) for one in attacks], seeds, margin)
     default = trials.run(choose_pass_band(Capacity(original, tunable), bits, bounds).tunable())
     solved = tunable.with_profile(_profile(beta))
     low_pass = [tunable.with_profile((1.0,) * round(share * len(family))) for share in _LOW_PASS]
     others = [trials.run(one) for one in (solved, *low_pass) if trials.fits(one)]
     chosen = trials.ascend(max(default, *others, key=lambda one: one.worst), cost)
     # Which of several is best in few trials is so by chance in part: other marks decide.
-    checked = {one: trials.check(one) for one in {default.scheme, solved, chosen.scheme} if trials.fits(one)}
+    checked = {one: trials.run(one, CHECKED) for one in {default.scheme, solved, chosen.scheme} if trials.fits(one)}
     usual, best = checked[default.scheme], max(checked.values(), key=lambda one: one.worst)
     if not best.surpasses(usual, _LEAST_GAIN):
         best = usual
+    names = [*map(name_of, bounds.limits)] + ["budget"] * (bounds.rms is not None)
     report = Report(
         worth,
         bound,
         1 - float(worth.min()) / bound,
-        dict(zip(_names(bounds), map(float, weights), strict=True)),
+        dict(zip(names, map(float, weights), strict=True)),
         best.worth,
         checked[solved].worth if solved in checked else np.zeros(len(attacks)),
         usual.worth,
@@ -191,14 +196,9 @@ def _costs(
     whole = band_energies(original.operator, jnp.asarray(family, signs.dtype), signs, signs)
     energy = np.maximum(np.asarray(whole, np.float64) / original.used.sum(), 1e-12)
     seen = list(bounds.limits)
-    visible = band_visibility(original, family, seen, mask) if seen else np.empty((0, len(family)))
+    visible = band_visibility(original, family, seen, mask) if seen else []
     rows = [energy * (row / bounds.limits[name]) ** 2 for name, row in zip(seen, visible, strict=True)]
     return np.stack(rows + ([energy / bounds.rms**2] if bounds.rms is not None else []))
-
-
-def _names(bounds: Bounds) -> list[str]:
-    """Names of the limits, in the order of `_costs`."""
-    return [*map(name_of, bounds.limits)] + (["budget"] if bounds.rms is not None else [])
 
 
 def _profile(beta: Float64[np.ndarray, " bands"]) -> tuple[float, ...]:
@@ -212,23 +212,104 @@ def _mean(channels: list[Channels]) -> Channels:
     return jax.tree.map(lambda *values: jnp.mean(jnp.stack(values), axis=0), *channels)
 
 
-def seed_numbers(seed: Seed, count: int) -> Int64[np.ndarray, " samples"]:
-    """Draw seeds of the attacks' random choices."""
-    return np.asarray(jax.random.randint(random_key(seed), (count,), 0, 2**31 - 1), np.int64)
+class TunedBlind(NamedTuple):
+    """A blind scheme of the width and the step that are predicted to leave most after the worst attack."""
+
+    scheme: BlindScheme  # `embed` takes it; whoever reads needs no more than the scheme's name
+    worst: float  # surplus after the worst of the attacks; if it is negative, messages are not expected to read
+    choices: tuple[tuple[float, float], ...]  # all widths and steps that the budget allows
+    surplus: Float64[np.ndarray, "choices attacks"]  # in nats, see `jaxmark.watermark.blind.prediction.margin`
 
 
-def check_attackers(attacks: Sequence[Attacker]) -> None:
-    """Check that attacks to tune for are functions of mesh and seed, or pairs of an attack and a strength.
+def tune_blind(
+    mesh: Mesh,
+    attacks: Sequence[Attacker],
+    budget: BudgetLike = None,
+    *,
+    seed: Seed,
+    bits: int = 64,
+    scheme: str | BlindScheme = "field",
+    samples: int = 1,
+) -> TunedBlind:
+    """Choose width and step of a mark that is read without the original, for the attacks that it must survive.
+
+    The original is attacked, and looked at as a suspect is; how far its values are from what they were tells what would
+    be left of any mark. A wide average survives more smoothing, a narrow one gives more anchors; a large step survives
+    more noise, a small one is met more exactly within the same budget. All that a budget allows are compared, by how
+    much the information that is left exceeds what payload and tag need. If that is negative after the worst of the
+    attacks, the mark is not expected to survive it.
+
+    Args:
+        mesh: the original.
+        attacks: see `jaxmark.evaluation.tuning.tune`.
+        budget: see `jaxmark.watermark.everyday.embed`.
+        seed: see `jaxmark.evaluation.tuning.tune`.
+        bits: size of the payload in bits.
+        scheme: a blind scheme, whose widths and steps are compared.
+        samples: number of times that each attack is tried; predictions are averaged.
 
     Raises:
-        JaxmarkError: if one is neither, or there is no such attack.
+        JaxmarkError: if the mesh, an attack, the budget or a number is unusable, the scheme is no blind one, or the
+            budget leaves nothing to write in.
     """
+    seeds = _draw_seeds("tune_blind", attacks, samples, seed)
+    blind = find_blind(scheme)
+    if blind is None:
+        raise JaxmarkError(
+            f"tune_blind tunes the schemes that are read without the original ({', '.join(BLIND_SCHEMES)}), not"
+            f" {scheme!r}; for the others there is tune."
+        )
+    writer = make_blind_marker(mesh, _PUBLIC_KEY, bits=bits, scheme=blind).writer
+    word = codeword(bytes(bits // 8), writer.choices)
+    allowances = writer.allowances(word, Budget.of(budget).bounds(mesh), Reference(mesh))
+    plans = [one.plan(step) for one in allowances for step in writer.steps(one)]
+    if not plans:
+        raise JaxmarkError(f"This mesh, or the budget for it, leaves the scheme {blind.name!r} nothing to write in.")
+
+    def looks(suspect: Mesh) -> dict[float, list[Look]]:
+        found = sorted(blind.views(register(suspect), writer.choices), key=lambda look: look.width)
+        return {width: list(some) for width, some in groupby(found, key=lambda look: look.width)}
+
+    before = {width: some[0] for width, some in looks(mesh).items()}
+
+    def left(attacker: Attacker, seed: int) -> dict[float, list[Left]]:
+        seen = looks(apply_attack(attacker, mesh, seed))
+        return {width: [way for look in some for way in compare(before[width], look)] for width, some in seen.items()}
+
+    found = [[left(one, seed) for seed in seeds] for one in attacks]
+    size = carried(bits)
+
+    def left_of(plan: Plan, row: list[dict[float, list[Left]]]) -> float:
+        ways = (one[plan.width] for one in row)
+        return float(np.mean([best_margin(some, plan.step, plan.alpha, size).surplus for some in ways]))
+
+    surplus = np.array([[left_of(plan, row) for row in found] for plan in plans])
+    worst = surplus.min(axis=1)
+    chosen = max(range(len(plans)), key=lambda one: (sureness(plans[one], bits), worst[one]))
+    return TunedBlind(
+        blind.fixed(plans[chosen].width, plans[chosen].step),
+        float(worst[chosen]),
+        tuple((plan.width, plan.step) for plan in plans),
+        surplus,
+    )
+
+
+def _draw_seeds(tuner: str, attacks: Sequence[Attacker], samples: int, seed: Seed) -> list[int]:
+    """Draw the seeds of the attacks' samples.
+
+    Raises:
+        JaxmarkError: if there is no attack or no sample, one attack is neither a function of mesh and seed nor a pair
+            of an attack and a strength, or there is no such attack.
+    """
+    if not attacks or samples < 1:
+        raise JaxmarkError(f"{tuner} needs at least one attack and one sample, got {len(attacks)} and {samples}.")
     for attacker in attacks:
         if callable(attacker):
             continue
         if not isinstance(attacker, tuple) or len(attacker) != 2:
             raise JaxmarkError(f"An attack to tune for is a pair such as ('noise', 0.005), got {attacker!r}.")
         get_attack(attacker[0])
+    return jax.random.randint(random_key(seed), (samples,), 0, 2**31 - 1).tolist()
 
 
 def apply_attack(attacker: Attacker, mesh: Mesh, seed: int) -> Mesh:
