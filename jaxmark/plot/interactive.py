@@ -5,7 +5,6 @@ import os
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
@@ -38,12 +37,10 @@ class Viewer(NamedTuple):
 def show(*views: View | Mesh) -> Viewer:
     """Make an interactive view of meshes, which notebooks and browsers show without network.
 
-    One mesh is seen at a time; all are seen from where the mouse has turned the first. So a mark is looked for by
-    `show(View("original", original.mesh), View("marked", marked), exaggerate(original, marked))`.
-
-    Args:
-        views: meshes, with titles by which they are chosen, and perhaps values, shown as colours from 0 to the largest;
-            or meshes alone. They keep their places beside the first one.
+    One mesh is seen at a time; all are seen from where the mouse has turned the first. To look for a mark, call
+    `show(View("original", original.mesh), View("marked", marked), exaggerate(original, marked))`. Titles are those by
+    which meshes are chosen; values are shown as colours from 0 to the largest. Meshes keep their places relative to the
+    first one.
 
     Raises:
         JaxmarkError: if matplotlib or Jinja2 is missing, there is no view, there is not one finite value for each
@@ -75,14 +72,6 @@ def show(*views: View | Mesh) -> Viewer:
     return Viewer(before + controls + end + after)
 
 
-def _shares(view: View, vertices: int) -> Float64[np.ndarray, " vertices"]:
-    """The values as shares of the largest."""
-    values = np.asarray(view.values, np.float64)
-    if values.shape != (vertices,) or not np.isfinite(values).all():
-        raise JaxmarkError(f"A viewer needs {vertices} finite values, one for each vertex.")
-    return np.clip(values / _most(view), 0, 1)
-
-
 def _most(view: View) -> float:
     return max(float(np.max(view.values)), 1e-300) if view.values is not None else 0.0
 
@@ -92,11 +81,14 @@ def _colours(view: View, vertices: int) -> np.ndarray:
         return np.tile(np.array(_PLAIN, np.uint8), (vertices, 1))
     from matplotlib import colormaps
 
-    return colormaps[FIELD](_shares(view, vertices), bytes=True)
+    values = np.asarray(view.values, np.float64)
+    if values.shape != (vertices,) or not np.isfinite(values).all():
+        raise JaxmarkError(f"A viewer needs {vertices} finite values, one for each vertex.")
+    return colormaps[FIELD](np.clip(values / _most(view), 0, 1), bytes=True)
 
 
 def _legend(view: View) -> dict[str, Any]:
-    """What the page says of a view: its title, and the scale of its colours if it has values."""
+    """The title of a view, and the scale of its colours if it has values."""
     if view.values is None:
         return {"title": view.title, "most": "", "unit": "", "colours": []}
     from matplotlib import colormaps
