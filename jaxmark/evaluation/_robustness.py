@@ -54,12 +54,9 @@ class Breaking(NamedTuple):
     curve: tuple[Trial, ...]  # all trials, weak ones first
 
     def cost(self, metric: str) -> float:
-        """The attack's distortion over the mark's own.
+        """The attack's distortion over the mark's own, by a metric (a field of `Comparison`) that was measured.
 
         It is infinite if the attack does not succeed, and NaN if its distortion is unknown or the mark has none.
-
-        Args:
-            metric: a field of `Comparison` that was measured.
         """
         if self.weakest is None:
             return math.inf

@@ -34,17 +34,14 @@ class Channels(NamedTuple):
 def margins(channels: Channels, power: Float[Array, " bands"], margin: Margin = "rate") -> Float[Array, " attacks"]:
     """Compute how much of a mark with powers β_j² remains readable after each attack; concave in the powers.
 
-    Args:
-        channels: the channels of the attacks.
-        power: β_j², `[bands]`.
-        margin: the measure. `"rate"`, in bits: Σ_j (n_j/2) log₂(1 + SNR_j), the capacity of parallel Gaussian channels
-            (Cover, Thomas, "Elements of Information Theory", 9.4). `"evidence"`, in nats: Σ_j (n_j/2) SNR_j/(1 +
-            SNR_j), the value of S²/2‖a‖² for a claimed message (`evidence.log10_p_claimed`), as ‖a‖ contains the mark
-            as well as the noise. `"snr"`: Σ_j (n_j/2) SNR_j, the limit of both for weak marks, up to the unit; it is
-            brittle, because its optimum lies in as many bands as there are attacks.
+    The measure is one of:
 
-    Returns:
-        One number for each attack, `[attacks]`.
+    - `"rate"`, in bits: Σ_j (n_j/2) log₂(1 + SNR_j), the capacity of parallel Gaussian channels (Cover, Thomas,
+      "Elements of Information Theory", 9.4);
+    - `"evidence"`, in nats: Σ_j (n_j/2) SNR_j/(1 + SNR_j), the value of S²/2‖a‖² for a claimed message
+      (`evidence.log10_p_claimed`), as ‖a‖ contains the mark as well as the noise;
+    - `"snr"`: Σ_j (n_j/2) SNR_j, the limit of both for weak marks, up to the unit; it is brittle, because its optimum
+      lies in as many bands as there are attacks.
     """
     ratio = channels.gain**2 * power / channels.noise
     worth = {"rate": lambda: jnp.log2(1 + ratio), "evidence": lambda: ratio / (1 + ratio), "snr": lambda: ratio}

@@ -20,6 +20,7 @@ from jaxmark.spectral.bands import nodes, scaling
 from jaxmark.watermark.evidence.ledger import MIN_LOG10_P
 from jaxmark.watermark.perception.visibility import band_visibility as measure_visibility
 
+Suspects = Float[np.ndarray, " suspects"]
 Measure = Literal["read", "log10_p", "log10_p_unfloored"]
 Series = tuple[str, Control | None, list[dict[str, Any]]]  # name of a line, its control if any, its rates over strength
 
@@ -34,9 +35,7 @@ _ENDS = {"read": ("_low", "_high"), **dict.fromkeys(("log10_p", "log10_p_unfloor
 _MAX_COLUMNS = 3
 
 
-def roc(
-    log10_p: Mapping[str, Float[np.ndarray, " suspects"]], *, lowest: float = -20.0, confidence: float = 0.95
-) -> Picture:
+def roc(log10_p: Mapping[str, Suspects], *, lowest: float = -20.0, confidence: float = 0.95) -> Picture:
     """Plot the share of suspects that are detected at each nominal false-positive probability α.
 
     A suspect is detected at α if its `log10_p` is at most log10 α. Detected suspects are true positives if they are
@@ -57,15 +56,12 @@ def roc(
     return _frequencies(log10_p, lowest, confidence, "α itself", **labels)
 
 
-def p_values(log10_p: Mapping[str, Float[np.ndarray, " suspects"]], *, confidence: float = 0.95) -> Picture:
+def p_values(log10_p: Mapping[str, Suspects], *, confidence: float = 0.95) -> Picture:
     """Plot how often p is at most 10^x for suspects without a mark, beside the bound that p claims.
 
     A proof says that P(log10 p ≤ x) ≤ 10^x for suspects without the mark: the curve of a sound p lies below the dashed
-    line, up to chance, which the shaded intervals show.
-
-    Args:
-        log10_p: `log10_p` of suspects without a mark, or read with a wrong key, by the way in which p was computed.
-        confidence: confidence level of the shaded Clopper-Pearson intervals, at each x separately.
+    line, up to chance, which the shaded Clopper-Pearson intervals show at each x separately. The p-values are those of
+    suspects without a mark, or read with a wrong key, by the way in which p was computed.
 
     Raises:
         JaxmarkError: if matplotlib is missing, there is no suspect of a kind, or the confidence is out of range.
@@ -77,7 +73,7 @@ def p_values(log10_p: Mapping[str, Float[np.ndarray, " suspects"]], *, confidenc
 
 
 def _frequencies(
-    log10_p: Mapping[str, Float[np.ndarray, " suspects"]], lowest: float, confidence: float, bound: str, **labels: Any
+    log10_p: Mapping[str, Suspects], lowest: float, confidence: float, bound: str, **labels: Any
 ) -> Picture:
     """Plot the share of values that are at most x for each x from `lowest` to 0, with the line 10^x as a bound."""
     grid = np.linspace(lowest, 0, _CURVE_POINTS)
@@ -121,14 +117,10 @@ def success(curves: Mapping[str, Robustness], unit: str, *, confidence: float = 
 
 
 def band_visibility(original: Original, metrics: Sequence[Metric], bands: int = 64) -> Picture:
-    """Plot how far metrics rise per unit of displacement in each band.
+    """Plot how far metrics rise per unit of displacement in each of several Jackson-damped scaling functions.
 
-    The values are those of `jaxmark.watermark.perception.visibility.band_visibility`.
-
-    Args:
-        original: the original.
-        metrics: names in `distortion.METRICS`, or functions of your own.
-        bands: number of Jackson-damped scaling functions.
+    The values are those of `jaxmark.watermark.perception.visibility.band_visibility`; metrics are names in
+    `distortion.METRICS`, or functions of your own.
 
     Raises:
         JaxmarkError: if matplotlib is missing, or a metric is refused (see `distortion.measure`).

@@ -4,6 +4,7 @@ import base64
 import csv
 import io
 import os
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -53,14 +54,13 @@ class Results:
         lines = []
         for point, rate in cells.items():
             mark = rate["marked"]
-            said = [f"{one:g}" if isinstance(one, float) else str(one) for one in point]
-            said += [
+            line = [f"{one:g}" if isinstance(one, float) else str(one) for one in point]
+            line += [
                 f"{mark['read']}/{mark['trials']}",
                 f"{100 * mark['read_low']:.0f} - {100 * mark['read_high']:.0f}",
             ]
-            said += [f"{100 * mark['bit_errors']:.1f} %", f"{mark['log10_p']:.1f}", f"{mark['log10_p_unfloored']:.1f}"]
-            said += [f"{rate[name]['detected']}/{rate[name]['trials']}" for name in _LABELS]
-            lines.append(said)
+            line += [f"{100 * mark['bit_errors']:.1f} %", f"{mark['log10_p']:.1f}", f"{mark['log10_p_unfloored']:.1f}"]
+            lines.append(line + [f"{rate[name]['detected']}/{rate[name]['trials']}" for name in _LABELS])
         return heads, lines
 
     def _controls(self) -> list[str]:
@@ -73,36 +73,25 @@ class Results:
         ]
 
     def _refusals(self) -> list[str]:
-        """Every refusal, and how often it was."""
-        counts: dict[tuple[Any, ...], int] = {}
-        for row in self.rows:
-            if row.refusal and row.control != "wrong-key":
-                case = (row.mesh, row.scheme, f"{row.attack} {row.strength:g}", row.control, row.refusal)
-                counts[case] = counts.get(case, 0) + 1
+        """Every refusal, with its count."""
+        counts = Counter(
+            (row.mesh, row.scheme, f"{row.attack} {row.strength:g}", row.control, row.refusal)
+            for row in self.rows
+            if row.refusal and row.control != "wrong-key"
+        )
         return [f"{', '.join(case[:-1])}, {count} ×: {case[-1]}" for case, count in counts.items()]
 
     def save_page(self, path: str | os.PathLike[str], title: str = "What a mark survives") -> None:
         """Write one HTML page with pictures, table, controls and refusals, which loads nothing. Needs the extra `plot`.
 
-        Args:
-            path: file for the page.
-            title: its title.
-
         Raises:
             JaxmarkError: if matplotlib or Jinja2 is missing, or the page cannot be written.
         """
         heads, lines = self._table()
-        text = fill_template(
-            "jaxmark.evaluation",
-            "study.html",
-            title=title,
-            pictures={name: base64.b64encode(self.plot(of).png()).decode() for of, name in _SHOWN.items()},
-            heads=heads,
-            lines=lines,
-            controls=self._controls(),
-            refusals=self._refusals(),
-        )
-        write_atomically(path, text.encode())
+        pictures = {name: base64.b64encode(self.plot(of).png()).decode() for of, name in _SHOWN.items()}
+        facts = {"title": title, "heads": heads, "lines": lines, "pictures": pictures}
+        facts |= {"controls": self._controls(), "refusals": self._refusals()}
+        write_atomically(path, fill_template("jaxmark.evaluation", "study.html", **facts).encode())
 
     def save_csv(self, path: str | os.PathLike[str]) -> None:
         """Write all rows as comma-separated values, the file whole or not at all.

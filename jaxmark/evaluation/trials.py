@@ -67,11 +67,9 @@ class Trial(NamedTuple):
         return np.mean(self.scales) * np.asarray(self.reader.carrier.profile, np.float64)
 
     def surpasses(self, other: "Trial", least: float) -> bool:
-        """Whether the worst attack leaves more than of another trial of the same signs, by a factor and beyond chance.
+        """Whether the worst attack leaves more than of another trial of the same signs, beyond chance.
 
-        Args:
-            other: the other trial.
-            least: the factor.
+        The factor between them must be `least` at least.
         """
         gains = self.by_signs.min(axis=1) - other.by_signs.min(axis=1)
         error = float(np.std(gains, ddof=1)) / len(gains) ** 0.5
@@ -117,20 +115,12 @@ class Trials:
         drawn = [carrier.redraw(number) for number in numbers]
         shifts = [original.to_host(one.displacement(word)) for one in drawn]
         written = [displace_within(original, shift, self.bounds, self._reference) for shift in shifts]
-        marks = [
-            displace(original, sign * one.scale * shift)
-            for one, shift in zip(written, shifts, strict=True)
-            for sign in (1, -1)
-        ]
+        scaled = [one.scale * shift for one, shift in zip(written, shifts, strict=True)]
+        marks = [displace(original, sign * shift) for shift in scaled for sign in (1, -1)]
         signs = tuple(sign * jnp.asarray(one.chips.signs) for one in drawn for sign in (1, -1))
-        seen = tuple(
-            tuple(
-                align(original, one(mark, seed + numbers.start)).observation(original)
-                for seed in self.seeds
-                for mark in marks
-            )
-            for one in self.attacks
-        )
+        tries = [(mark, seed + numbers.start) for seed in self.seeds for mark in marks]
+        suspects = [[one(*some) for some in tries] for one in self.attacks]
+        seen = tuple(tuple(align(original, one).observation(original) for one in some) for some in suspects)
         scales, used = tuple(one.scale for one in written for _ in (1, -1)), self._used(written[0])
         reader = carrier.reader()
         left = [self._left(scheme, reader, word, signs, copies) for copies in seen]
@@ -139,14 +129,10 @@ class Trials:
         return Trial(scheme, reader, word, signs, scales, used, seen, worth, by_signs)
 
     def ascend(self, start: Trial, cost: Float64[np.ndarray, "limits bands"]) -> Trial:
-        """Change strengths as the gradient of what is left after the worst attack says, as long as trials agree.
+        """Change strengths along the gradient of what the worst attack leaves, as long as trials agree.
 
-        Args:
-            start: the strengths to start from.
-            cost: share of each limit, squared, that β_j² = 1 uses up in band j.
-
-        Returns:
-            The best trial, which is the first one if no other is better.
+        `cost` is the share of each limit, squared, that β_j² = 1 uses up in band j. The best trial is returned, which
+        is the first one if no other is better.
         """
         best, found = start, self.run(self._improved(start, cost))
         while found.worst > _LEAST_GAIN * best.worst:
@@ -159,10 +145,8 @@ class Trials:
         carrier, dtype = at.reader.carrier, at.word.dtype
         base = jnp.asarray(carrier.profile)
         scales = [jnp.asarray(scale, dtype) for scale in at.scales]
-        marks = [
-            scale * _with_signs(carrier, signs).displacement(at.word)
-            for scale, signs in zip(scales, at.signs, strict=True)
-        ]
+        drawn = [_with_signs(carrier, signs).displacement(at.word) for signs in at.signs]
+        marks = [scale * shift for scale, shift in zip(scales, drawn, strict=True)]
         most = max((one.nuisance.shape[1] for some in at.seen for one in some if one.nuisance is not None), default=0)
         copies: dict[object, list[_Copy]] = {}
         for number, suspects in enumerate(at.seen):

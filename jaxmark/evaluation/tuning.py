@@ -51,8 +51,8 @@ _LEAST_GAIN = 1.2  # of what the worst attack leaves by the scheme's own strengt
 class Report(NamedTuple):
     """How well the tuned strengths do, and how much better any others could.
 
-    Channels are a model of attacks, limits and reader, in which a solution comes with a proof. What the detector makes
-    of marks, written within the limits and attacked, is tried besides, and decides.
+    Channels are a model of attacks, limits and reader, in which a solution comes with a proof. Trials of the detector
+    on marks, written within the limits and attacked, decide.
     """
 
     margins: Float64[np.ndarray, " attacks"]  # margin of the channels' best strengths after each attack
@@ -93,9 +93,9 @@ def tune(
 
     Each attack's channel is measured from a probe that spends equal shares of the budget in all bands. Limits on other
     metrics than RMS displacement count as quadratic in the strengths, with the measured visibility of each band. The
-    strengths that are best so have a proof, but leave out what limits, attacks and reader really are. So marks of them,
-    of the scheme's own strengths in the pass band that suits the budget, and of low-pass filters are written within the
-    real limits, attacked and read. The best ones are improved by the gradient of what the detector has after the worst
+    strengths that are best by this model have a proof, but the model simplifies limits, attacks and reader. So marks of
+    them, of the scheme's own strengths in the adaptive pass band, and of low-pass filters are written within the real
+    limits, attacked and read. The best ones are improved by the gradient of the detector's margin after the worst
     attack, as long as trials with other signs and seeds agree (`jaxmark.evaluation.trials`). If the scheme's own
     strengths are as good, they are returned.
 
@@ -107,15 +107,12 @@ def tune(
         seed: of the attacks' random choices, a whole number or a JAX random key; not secret.
         bits: size of the payload in bits.
         scheme: the scheme whose bands are tuned; its profile is replaced.
-        samples: number of times that each attack is tried; what is measured is averaged.
+        samples: number of times that each attack is tried; measurements are averaged.
         margin: what the worst attack should leave: `"evidence"`, for a claimed message, or `"rate"`, for a message that
             is to be read; see `jaxmark.evaluation.channels.margins`. Trials have S²/2‖a‖² in nats of the claim, or the
-            bits that the soft values of joint decoding transmit.
+            bits that the soft decisions of joint decoding transmit.
         cap: the largest share of the budget that one band gets, so that losing a band does not lose the mark.
         start: strengths to start from, such as those of an earlier tuning.
-
-    Returns:
-        The strengths, the scheme that has them, and a report.
 
     Raises:
         JaxmarkError: if the mesh, an attack, the budget or a number is unusable, or the scheme has no bands to tune.
@@ -128,7 +125,7 @@ def tune(
     tunable = get_nonblind(scheme).tunable()
     original, family = make_original(mesh), tunable.family()
     bounds = Budget.of(budget).bounds(original.mesh)
-    (signs,) = probe_signs("tuning", original.signal.shape, dtype=original.signal.dtype)
+    signs = probe_signs("tuning", original.signal.shape, dtype=original.signal.dtype)[0]
     signs = signs * original.to_traced(original.used)[:, None]
     mask = tunable.mask(original)
 
@@ -146,10 +143,11 @@ def tune(
 
     def measure_channels(profile: tuple[float, ...]) -> Channels:
         receiver = tunable.with_profile(profile).receiver(original, bits)
-        rows = [_mean([measure(receiver, one, mark) for one in row]) for row in seen]
-        return Channels(*map(jnp.concatenate, zip(*rows, strict=True)))
+        rows = [[measure(receiver, one, mark) for one in row] for row in seen]
+        means = [jax.tree.map(lambda *values: jnp.mean(jnp.stack(values), axis=0), *row) for row in rows]
+        return Channels(*map(jnp.concatenate, zip(*means, strict=True)))
 
-    # What the receiver projects off depends on the profile: once for a first one, and again for what it was tuned to.
+    # The receiver's projection depends on the profile: channels are measured for a first one, and for the tuned one.
     first = measure_channels(_profile(equal if start is None else np.asarray(start, np.float64)))
     start, _ = balance(first, cost, margin, cap, start)
     channels = measure_channels(_profile(start))
@@ -169,18 +167,10 @@ def tune(
     if not best.surpasses(usual, _LEAST_GAIN):
         best = usual
     names = [*map(name_of, bounds.limits)] + ["budget"] * (bounds.rms is not None)
-    report = Report(
-        worth,
-        bound,
-        1 - float(worth.min()) / bound,
-        dict(zip(names, map(float, weights), strict=True)),
-        best.worth,
-        checked[solved].worth if solved in checked else np.zeros(len(attacks)),
-        usual.worth,
-        best is usual,
-    )
-    exact = np.zeros(len(family))
-    exact[: len(best.strengths)] = best.strengths
+    others = checked[solved].worth if solved in checked else np.zeros(len(attacks))
+    binding, gap = dict(zip(names, map(float, weights), strict=True)), 1 - float(worth.min()) / bound
+    report = Report(worth, bound, gap, binding, best.worth, others, usual.worth, best is usual)
+    exact = np.pad(best.strengths, (0, len(family) - len(best.strengths)))
     matched = np.asarray(channels.gain * exact / channels.noise, np.float64)
     return Tuned(best.scheme, exact, channels, cost, matched, report)
 
@@ -207,11 +197,6 @@ def _profile(beta: Float64[np.ndarray, " bands"]) -> tuple[float, ...]:
     return tuple(float(f"{value:.4g}") for value in relative[: 1 + np.flatnonzero(relative)[-1]])
 
 
-def _mean(channels: list[Channels]) -> Channels:
-    """Mean channel of several trials of one attack."""
-    return jax.tree.map(lambda *values: jnp.mean(jnp.stack(values), axis=0), *channels)
-
-
 class TunedBlind(NamedTuple):
     """A blind scheme of the width and the step that are predicted to leave most after the worst attack."""
 
@@ -231,22 +216,13 @@ def tune_blind(
     scheme: str | BlindScheme = "field",
     samples: int = 1,
 ) -> TunedBlind:
-    """Choose width and step of a mark that is read without the original, for the attacks that it must survive.
+    """Choose width and step of a blind mark for the attacks that it must survive; see `tune` for what is not said here.
 
-    The original is attacked, and looked at as a suspect is; how far its values are from what they were tells what would
-    be left of any mark. A wide average survives more smoothing, a narrow one gives more anchors; a large step survives
-    more noise, a small one is met more exactly within the same budget. All that a budget allows are compared, by how
-    much the information that is left exceeds what payload and tag need. If that is negative after the worst of the
-    attacks, the mark is not expected to survive it.
-
-    Args:
-        mesh: the original.
-        attacks: see `jaxmark.evaluation.tuning.tune`.
-        budget: see `jaxmark.watermark.everyday.embed`.
-        seed: see `jaxmark.evaluation.tuning.tune`.
-        bits: size of the payload in bits.
-        scheme: a blind scheme, whose widths and steps are compared.
-        samples: number of times that each attack is tried; predictions are averaged.
+    The original is attacked, and looked at as a suspect is; the change of its values tells how much would be left of
+    any mark. A wide average survives more smoothing, a narrow one gives more anchors; a large step survives more noise,
+    a small one is met more exactly within the same budget. All that a budget allows are compared, by how much the
+    information that is left exceeds the needs of payload and tag. If that is negative after the worst of the attacks,
+    the mark is not expected to survive it. `scheme` is a blind scheme, whose widths and steps are compared.
 
     Raises:
         JaxmarkError: if the mesh, an attack, the budget or a number is unusable, the scheme is no blind one, or the
@@ -276,22 +252,16 @@ def tune_blind(
         seen = looks(apply_attack(attacker, mesh, seed))
         return {width: [way for look in some for way in compare(before[width], look)] for width, some in seen.items()}
 
-    found = [[left(one, seed) for seed in seeds] for one in attacks]
-    size = carried(bits)
+    found, size = [[left(one, seed) for seed in seeds] for one in attacks], carried(bits)
 
-    def left_of(plan: Plan, row: list[dict[float, list[Left]]]) -> float:
-        ways = (one[plan.width] for one in row)
-        return float(np.mean([best_margin(some, plan.step, plan.alpha, size).surplus for some in ways]))
+    def surplus_of(plan: Plan, ways: dict[float, list[Left]]) -> float:
+        return best_margin(ways[plan.width], plan.step, plan.alpha, size).surplus
 
-    surplus = np.array([[left_of(plan, row) for row in found] for plan in plans])
+    surplus = np.array([[np.mean([surplus_of(plan, ways) for ways in row]) for row in found] for plan in plans])
     worst = surplus.min(axis=1)
     chosen = max(range(len(plans)), key=lambda one: (sureness(plans[one], bits), worst[one]))
-    return TunedBlind(
-        blind.fixed(plans[chosen].width, plans[chosen].step),
-        float(worst[chosen]),
-        tuple((plan.width, plan.step) for plan in plans),
-        surplus,
-    )
+    choices = tuple((plan.width, plan.step) for plan in plans)
+    return TunedBlind(blind.fixed(*choices[chosen]), float(worst[chosen]), choices, surplus)
 
 
 def _draw_seeds(tuner: str, attacks: Sequence[Attacker], samples: int, seed: Seed) -> list[int]:

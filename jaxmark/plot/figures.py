@@ -57,14 +57,14 @@ def panels(
     legend: float = 0.0,
     **options: Any,
 ) -> tuple[Any, Any]:
-    """Make a figure of panels side by side, and in several rows if there are more than `columns`.
+    """Make a figure of panels, of which width and height are in inches, side by side.
 
     Args:
         count: number of panels.
-        width: width of each panel, in inches.
-        height: height of each panel, in inches.
+        width: of each panel.
+        height: of each panel.
         columns: the largest number of panels in a row; all of them unless given.
-        legend: height below the panels, in inches.
+        legend: height below the panels.
         options: options of matplotlib's `Figure.subplots`.
 
     Returns:
