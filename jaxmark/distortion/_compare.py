@@ -149,18 +149,16 @@ class _Pair:
     def measure(self, metric: Metric) -> float | None:
         if isinstance(metric, str):
             return float(_METRICS[metric](self)) if self.same or metric in _ANY_CONNECTIVITY else None
-        value = float(metric(*self.given))
+        name, value = name_of(metric), float(metric(*self.given))
         if not 0 <= value < np.inf:
-            said = f"The metric {name_of(metric)!r} must be a finite number, not negative"
-            raise JaxmarkError(f"{said}, got {value:g}.")
+            raise JaxmarkError(f"The metric {name!r} must be a finite number, not negative, got {value:g}.")
         return value
 
     @cached_property
     def common(self) -> tuple[Array, Array]:
         """The positions, padded to a size that many meshes share."""
         count = common_size(len(self.x))
-        x, y = (pad_rows(np.asarray(mesh.vertices, np.float32), count) for mesh in self.meshes)
-        return jnp.asarray(x), jnp.asarray(y)
+        return jnp.asarray(pad_rows(np.asarray(self.x), count)), jnp.asarray(pad_rows(np.asarray(self.y), count))
 
     @cached_property
     def moved(self) -> DisplacementSize:

@@ -1,5 +1,6 @@
 """Roots, ratios, norms and percentiles whose derivatives are finite where those of the plain formulas are not."""
 
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
@@ -15,20 +16,22 @@ Scalar = Float[Array, ""]
 
 def root(square: Any, xp: Any = jnp) -> Any:
     """√square of numbers of any shape, by JAX or by NumPy; 0 with gradient 0 where `square` is not positive."""
-    positive = square > 0
-    return xp.where(positive, xp.sqrt(xp.where(positive, square, 1)), 0)
+    return _where_positive(xp.sqrt, square, xp)
 
 
 def cube_root(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """∛values; 0 with gradient 0 where they are not positive."""
-    positive = values > 0
-    return jnp.where(positive, jnp.cbrt(jnp.where(positive, values, 1)), 0)
+    return _where_positive(jnp.cbrt, values)
 
 
 def inverse_root(square: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """1/√square; 0 with gradient 0 where `square` is not positive."""
-    positive = square > 0
-    return jnp.where(positive, jax.lax.rsqrt(jnp.where(positive, square, 1)), 0)
+    return _where_positive(jax.lax.rsqrt, square)
+
+
+def _where_positive(function: Callable[[Any], Any], x: Any, xp: Any = jnp) -> Any:
+    positive = x > 0
+    return xp.where(positive, function(xp.where(positive, x, 1)), 0)
 
 
 def ratio(numerator: Float[Array, "*shape"], denominator: Float[Array, "*#shape"]) -> Float[Array, "*shape"]:

@@ -137,16 +137,10 @@ def minimum_distortion(
     The attack succeeds if not even a claim of the message is proven, or if the suspect is refused. Success is assumed
     to be monotonic between the weakest and the strongest usual strength, which holds for one seed.
 
-    Args:
-        marker: the reader: original, key, payload and scheme.
-        marked: the mesh with the message in it.
-        message: the message that was written.
-        kind: a name in `ATTACKS`, or an `Attack` of your own; its usual strengths bound the search.
-        alpha: false-positive probability at which the reader detects, in (0, 1).
-        metrics: the metrics of `distortion.METRICS` by which distortion is measured.
-        seed: seed of the attack's random choices.
-        tolerance: ratio of strengths, minus 1, at which the bisection ends; strengths that are whole numbers are
-            bisected to a difference of 1.
+    The reader detects at the false-positive probability `alpha`, in (0, 1). The bisection, between the usual strengths
+    of the attack, ends at a ratio of strengths of 1 + `tolerance`, or at a difference of 1 if they are whole numbers.
+    Metrics are names in `distortion.METRICS`; `seed` is that of the attack's random choices. For the other parameters
+    see `robustness`.
 
     Raises:
         JaxmarkError: if there is no such attack or metric, or a number is out of range.
@@ -170,8 +164,7 @@ def minimum_distortion(
     if not detects(strong) and detects(weak):
         held, broken = weak, strong
         while abs(math.log(broken / held)) > math.log1p(tolerance):
-            middle = math.sqrt(held * broken)
-            middle = float(round(middle)) if whole else middle
+            middle = float(round(math.sqrt(held * broken))) if whole else math.sqrt(held * broken)
             if middle in (held, broken):
                 break
             held, broken = (middle, broken) if detects(middle) else (held, middle)

@@ -24,7 +24,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation._rates import LOG10_LEVEL, Control, Row
 from jaxmark.evaluation._robustness import NOTHING, Outcome, compare_with
 from jaxmark.evaluation.cells import Cell, Pool, processes, run
-from jaxmark.evaluation.results import Results
+from jaxmark.evaluation.study_results import Results
 from jaxmark.files import load_mesh
 from jaxmark.files.atomic import read_file
 from jaxmark.geometry.canonical import geometry_hash
@@ -74,12 +74,12 @@ class Study:
         """
         self._check_forms()
         parts = {"mesh": self.meshes, "attack": self.attacks, "scheme": self._schemes, "budget": self._budgets}
-        parts |= {f"strength of {name!r}": self._strengths(name) for name in self.attacks if self._attack(name)}
+        parts |= {f"strength of {name!r}": strengths for name, (_, strengths) in self._attacks.items()}
         for name, part in {**parts, "payload": self.payloads, "sample": range(self.samples)}.items():
             if not part:
                 raise JaxmarkError(f"A study needs at least one {name}.")
-        for name in self.attacks:
-            for strength in self._strengths(name):
+        for name, (_, strengths) in self._attacks.items():
+            for strength in strengths:
                 if not (isinstance(strength, Real) and math.isfinite(strength) and strength >= 0):
                     raise JaxmarkError(f"The strengths of {name!r} are finite and not negative, got {strength!r}.")
         for bits in self.payloads:
@@ -164,13 +164,12 @@ class Study:
         """Budgets by the names that they have in rows: `0.0008`, `hidden`, or `dame=0.008`."""
         return {str(one): one for one in map(Budget.of, self.budgets)}
 
-    def _attack(self, name: str) -> Attack:
-        given = self.attacks[name]
-        return given if isinstance(given, Attack) else get_attack(name)
-
-    def _strengths(self, name: str) -> Sequence[float]:
-        given = self.attacks[name]
-        return given.strengths if isinstance(given, Attack) else given
+    @property
+    def _attacks(self) -> dict[str, tuple[Attack, Sequence[float]]]:
+        """Attacks with their strengths, by the names that they have in rows."""
+        attacks = {name: one if isinstance(one, Attack) else get_attack(name) for name, one in self.attacks.items()}
+        own = {name: one.strengths if isinstance(one, Attack) else one for name, one in self.attacks.items()}
+        return {name: (attacks[name], own[name]) for name in own}
 
     def _cells(self) -> Iterator[Cell]:
         """All cells; those with the same marked meshes follow each other, so that each mesh is marked once."""
@@ -181,8 +180,8 @@ class Study:
             # What an older file does not say of a reading is read again.
             fields = json.dumps([digests[mesh], schemes[scheme].name, parameters_of(schemes[scheme]), Outcome._fields])
             digest = hashlib.sha256(fields.encode()).hexdigest()[:16]
-            for name in self.attacks:
-                for strength in self._strengths(name):
+            for name, (_, strengths) in self._attacks.items():
+                for strength in strengths:
                     yield mesh, scheme, bits, budget, name, float(strength), *block, digest
 
     def _name(self, cell: Cell) -> str:
@@ -195,7 +194,7 @@ class Study:
 
     def _rows(self, cell: Mapping[str, Any]) -> Iterator[Row]:
         mesh, scheme, bits, budget, attack, strength, *_ = cell["cell"]
-        unit = self._attack(attack).unit
+        unit = self._attacks[attack][0].unit
         for one in cell["readings"]:
             detected = one["log10_p"] <= LOG10_LEVEL
             yield Row(mesh, scheme, bits, budget, attack, strength, unit, detected=detected, **one)
@@ -228,7 +227,7 @@ def work(study: Study, cell: Cell) -> dict[str, Any]:
     seeds = list(range(int(first), int(first) + int(count)))
     marked = [_mark(point, seed) for seed in seeds]
     meshes = [mesh for mesh, _ in marked] + [_original_mesh(point, seeds[0])] * len(seeds)
-    suspects = _attack_meshes(meshes, study._attack(str(name)), float(strength), seeds + seeds)
+    suspects = _attack_meshes(meshes, study._attacks[str(name)][0], float(strength), seeds + seeds)
     readings: list[dict[str, Any]] = []
     for seed, (_, rms), suspect, control in zip(seeds, marked, suspects, suspects[len(seeds) :], strict=False):
         readings += _read(point, suspect, seed, {"marked": seed, "wrong-key": seed + 1}, rms)

@@ -60,39 +60,30 @@ def show(*views: View | Mesh) -> Viewer:
     centre, size = np.mean(meshes[0].vertices, axis=0), diagonal(meshes[0])
     # Without names of our own, trimesh would choose random ones.
     scene = Scene(camera=Camera("camera", fov=(60, 45)))
-    for place, (view, mesh) in enumerate(zip(named, meshes, strict=True)):
+    shown = [_present(view, len(mesh.vertices)) for view, mesh in zip(named, meshes, strict=True)]
+    for place, (mesh, (colours, _)) in enumerate(zip(meshes, shown, strict=True)):
         points = (mesh.vertices - centre) / size
-        solid = trimesh.Trimesh(points, mesh.faces, vertex_colors=_colours(view, len(points)), process=False)
+        solid = trimesh.Trimesh(points, mesh.faces, vertex_colors=colours, process=False)
         scene.add_geometry(solid, node_name=f"view{place}", geom_name=f"view{place}")
     scene.set_camera()
     title = " / ".join(view.title for view in named if view.title) or "jaxmark"
-    legends = [_legend(view) for view in named]
-    controls = fill_template("jaxmark.plot", "viewer.html", title=title, views=legends)
+    controls = fill_template("jaxmark.plot", "viewer.html", title=title, views=[legend for _, legend in shown])
     before, end, after = scene_to_html(scene).rpartition("</body>")
     return Viewer(before + controls + end + after)
 
 
-def _most(view: View) -> float:
-    return max(float(np.max(view.values)), 1e-300) if view.values is not None else 0.0
-
-
-def _colours(view: View, vertices: int) -> np.ndarray:
+def _present(view: View, vertices: int) -> tuple[np.ndarray, dict[str, Any]]:
+    """The colours of the vertices, and the legend of the page: the title, and the scale of the colours of values."""
+    legend: dict[str, Any] = {"title": view.title, "most": "", "unit": "", "colours": []}
     if view.values is None:
-        return np.tile(np.array(_PLAIN, np.uint8), (vertices, 1))
-    from matplotlib import colormaps
-
-    values = np.asarray(view.values, np.float64)
-    if values.shape != (vertices,) or not np.isfinite(values).all():
-        raise JaxmarkError(f"A viewer needs {vertices} finite values, one for each vertex.")
-    return colormaps[FIELD](np.clip(values / _most(view), 0, 1), bytes=True)
-
-
-def _legend(view: View) -> dict[str, Any]:
-    """The title of a view, and the scale of its colours if it has values."""
-    if view.values is None:
-        return {"title": view.title, "most": "", "unit": "", "colours": []}
+        return np.tile(np.array(_PLAIN, np.uint8), (vertices, 1)), legend
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
-    colours = [to_hex(colormaps[FIELD](step)) for step in np.linspace(0, 1, 9)]
-    return {"title": view.title, "most": f"{_most(view):.3g}", "unit": view.unit, "colours": colours}
+    values, colours = np.asarray(view.values, np.float64), colormaps[FIELD]
+    if values.shape != (vertices,) or not np.isfinite(values).all():
+        raise JaxmarkError(f"A viewer needs {vertices} finite values, one for each vertex.")
+    most = max(float(values.max()), 1e-300)
+    scale = [to_hex(colours(step)) for step in np.linspace(0, 1, 9)]
+    legend |= {"most": f"{most:.3g}", "unit": view.unit, "colours": scale}
+    return colours(np.clip(values / most, 0, 1), bytes=True), legend

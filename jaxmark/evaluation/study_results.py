@@ -55,10 +55,8 @@ class Results:
         for point, rate in cells.items():
             mark = rate["marked"]
             line = [f"{one:g}" if isinstance(one, float) else str(one) for one in point]
-            line += [
-                f"{mark['read']}/{mark['trials']}",
-                f"{100 * mark['read_low']:.0f} - {100 * mark['read_high']:.0f}",
-            ]
+            low, high = 100 * mark["read_low"], 100 * mark["read_high"]
+            line += [f"{mark['read']}/{mark['trials']}", f"{low:.0f} - {high:.0f}"]
             line += [f"{100 * mark['bit_errors']:.1f} %", f"{mark['log10_p']:.1f}", f"{mark['log10_p_unfloored']:.1f}"]
             lines.append(line + [f"{rate[name]['detected']}/{rate[name]['trials']}" for name in _LABELS])
         return heads, lines
