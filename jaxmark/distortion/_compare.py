@@ -72,7 +72,7 @@ class Comparison(NamedTuple):
     shading: float | None  # visible turn of normals that 1 % of the area exceed, in just noticeable differences
     point_to_plane: float | None  # displacement across the surface that 5 % of the points exceed, over their spacing
     flip: float | None = None  # difference of pictures by FLIP that 1 % of their pixels exceed, 0 to 1; see `RENDERED`
-    ssim: float | None = None  # likewise by structural similarity, as 1 - SSIM
+    ssim: float | None = None  # the same by structural similarity, as 1 - SSIM
 
 
 def displacement_size(original: Mesh, distorted: Mesh) -> DisplacementSize:

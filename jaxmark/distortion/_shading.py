@@ -1,31 +1,29 @@
-"""Visible change of shading: how far normals turn, over what the original itself hides, point by point.
+"""Visible change of shading: the turn of normals over the turn that the original masks, face by face.
 
-A mean over edges cannot see a wave on a plane: most edges lie where the surface is curved or rough and hides more. Here
-each point is judged by itself, and the result is a percentile of the area, in just noticeable differences.
+A mean over edges cannot see a wave on a plane: most edges lie where the surface is curved or rough and masks more. Here
+each point is judged separately, and the result is a percentile of the area, in just noticeable differences.
 
 1. *Contrast.* Where a normal turns by δ, Lambertian shading changes by up to tan(i)·δ of itself, i being the incidence
-   of the light, which may come from any side. Lights come at 60°: a turn of 0.33° is a contrast of 1 %. None is fixed
-   in space, so that no rotation changes the result.
+   of the light. Lights come at 60°, from any side, so that no rotation changes the result: 0.33° is a contrast of 1 %.
 2. *Frequency.* Normals of faces are split into six bands by diffusion from face to face, from waves as long as 1.5
-   edges to waves of 48. Diffusion stops at creases of the original, on whose two sides light differs anyway: a plane is
-   compared with itself.
+   edges to waves of 48. Diffusion stops at creases of the original, on whose two sides light differs anyway.
 3. *Sensitivity.* How contrast sensitivity falls towards short waves is the formula of Barten, "Evaluation of subjective
    image quality with the square-root integral method", Journal of the Optical Society of America A 7(10), 1990, at
    100 cd/m² and with the diagonal as large as 40° of the field of view.
-4. *Masking.* What the original has of a band around a point raises the threshold there by (1 + (k c)^b)^(1/b), c being
-   that contrast over its own threshold. The formula is that of Daly, "The visible differences predictor" (Digital
+4. *Masking.* The original's contrast in a band around a point raises the threshold there by (1 + (k c)^b)^(1/b), c
+   being that contrast over its own threshold. The formula is that of Daly, "The visible differences predictor" (Digital
    Images and Human Vision, 1993). Nader, Wang, Hétroy-Wheeler and Dupont fitted it to what people saw on meshes ("Just
    noticeable distortion profile for flat-shaded 3D mesh surfaces", IEEE TVCG 22(11), 2016); k = 0.0078 · 88.29 and
-   b = 4.207, with a slope of 1, are what their model has in the program MEPP2.
+   b = 4.207, with a slope of 1, are those of their model in the program MEPP2.
 5. *Pooling.* Bands are summed with the exponent 4, near those of probability summation over channels (Watson, Ahumada,
    "A standard model for foveal detection of spatial contrast", Journal of Vision 5(9), 2005).
 
 Chosen by us: the lights' incidence; the angle at which a crease begins; that sensitivity does not fall towards long
 waves, which gratings do but glossy planes do not; and the least contrast, 0.6 %, which makes 0.2° on a plane just
 noticeable. It lies between what Barten's formula gives for practised people and plain gratings, 0.17 %, and the 2 % of
-Nader et al. at their best frequency for one moved vertex. `benchmarks/robustness/visibility.py` prints what follows.
+Nader et al. at their best frequency for one moved vertex. `benchmarks/robustness/visibility.py` prints the results.
 
-What it does not see: waves much longer than 48 edges, which on a mesh of a million points are short; sides between
+The metric does not see waves much longer than 48 edges, which on a mesh of a million points are short; sides between
 creases that turn as a whole; silhouettes; and displacements along the surface, which only textures show.
 """
 
@@ -67,7 +65,7 @@ _MIN_AREA = 1e-3  # of a face over the mean, in its links
 
 
 class Hiding(NamedTuple):
-    """What an original hides, face by face; make it with `make_hiding`."""
+    """The turns of normals that an original masks, face by face; make it with `make_hiding`."""
 
     faces: Int[Array | np.ndarray, "faces 3"]
     area: Float[Array | np.ndarray, " faces"]  # share of the whole; 0 for faces without a normal

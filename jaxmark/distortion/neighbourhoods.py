@@ -1,7 +1,7 @@
 """Find the edges that lie in balls around vertices and are reached from their centres, on the host.
 
-They are found by a breadth-first search that only goes outward, as in MEPP's metrics. What depends on the positions
-within a given neighbourhood is computed in traced code, by `curvature_tensor` and `window_statistics`.
+They are found by a breadth-first search that only goes outward, as in MEPP's metrics; the search depends on the
+positions, but traced code computes the share of each edge in its ball (`share_inside`).
 """
 
 from typing import NamedTuple
@@ -75,7 +75,7 @@ def _search(graph: _Graph, centres: np.ndarray, radius: float) -> tuple[tuple[np
     row, at = np.arange(len(centres)), centres
     reached = np.zeros(len(centres) * count, bool)
     reached[row * count + at] = True
-    # Of several edges that reach a vertex in one step, the last one that is written here is taken.
+    # If several edges reach a vertex in one step, the last one that is written here is taken.
     last = np.empty(len(reached), np.int32)
     found, points = [], [(centres, centres)]
     while len(row):

@@ -1,7 +1,7 @@
 """How different two meshes look: pictures of both, compared by metrics of images.
 
 Both are seen from six sides under three lights, one of which grazes what faces the eye, with flat and with smooth
-shading. That is slow, and what is seen depends on sides and lights; it is a check on metrics of the surface.
+shading. The result is slow, and depends on sides and lights; it is a check on metrics of the surface.
 """
 
 from collections.abc import Callable, Iterator

@@ -240,7 +240,7 @@ def _contributions(
     m1, m2 = means = [total(w * v) / s for w, v, s in zip(weights, values, sums, strict=True)]
     off = [v - m[windows.centre] for v, m in zip(values, means, strict=True)]
     s1, s2 = (root(total(w * d**2) / s) for w, d, s in zip(weights, off, sums, strict=True))
-    # As in MEPP, weights are those of the original, but their sum is that of the distorted mesh.
+    # As in MEPP, the original's weights are divided by the sum of the distorted mesh's.
     covariance = total(weights[0] * off[0] * off[1]) / sums[1]
     curved, contrast = relative(m1 - m2, jnp.maximum(m1, m2)), relative(s1 - s2, jnp.maximum(s1, s2))
     return curved, contrast, relative(s1 * s2 - covariance, s1 * s2)

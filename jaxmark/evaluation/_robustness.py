@@ -1,4 +1,4 @@
-"""What a mark survives: attacks of rising strength, and what is still read after each."""
+"""Robustness of a mark: readings after attacks of rising strength, and the least distortion that removes it."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -18,7 +18,7 @@ from jaxmark.watermark.markers import Marker
 
 
 class Outcome(NamedTuple):
-    """What is read from one suspect, compared with what was written."""
+    """The reading of one suspect, compared with the message that was written."""
 
     read: bool  # the exact message was read, and its tag fits
     wrong: bool  # another message was read, whose tag fits
@@ -28,7 +28,7 @@ class Outcome(NamedTuple):
 
 
 class Robustness(NamedTuple):
-    """What is read in each sample at each strength; a refused suspect counts as not read."""
+    """The readings of each sample at each strength; a refused suspect counts as not read."""
 
     strengths: Float64[np.ndarray, " strengths"]
     success: Bool[np.ndarray, "strengths samples"]  # whether the exact message was read

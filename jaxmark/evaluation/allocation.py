@@ -191,7 +191,7 @@ def upper_bound(
     even = worth(np.full(len(cost), 1 / len(cost))).sum(axis=1)
     start = np.append(np.zeros(len(gain)), np.log(max(even.min(), 1e-300)))
     best = np.inf
-    # The bound holds at every trial, so the least of all counts; a bend of it can stop a search, so it starts again.
+    # The bound holds at every trial, so the least of all counts; a kink of it can stop a search, so it starts again.
     for _ in range(20):
         found = optimize.minimize(bound, start, jac=True, method="L-BFGS-B", options={"maxiter": 500})
         improved, best, start = found.fun < best * (1 - 1e-6), min(best, float(found.fun)), found.x

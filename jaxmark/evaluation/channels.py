@@ -1,4 +1,4 @@
-"""What attacks leave of a mark in each band: parallel Gaussian channels, and how much they transmit.
+"""The parts of a mark that attacks leave in each band: parallel Gaussian channels, and how much they transmit.
 
 The bands f_j ≥ 0 with Σ_j f_j = 1 share each eigenvector's energy: ⟨u, v⟩ = Σ_j ⟨u, f_j(Δ)v⟩. Everything is computed
 from moments, in O(N) memory for any number of bands.
@@ -24,7 +24,7 @@ _MIN_BAND_DIMENSIONS = 3  # the variance in a band cannot be estimated from fewe
 
 
 class Channels(NamedTuple):
-    """What attacks do to a mark of strength β_j in band j: SNR_aj = gain_aj² β_j² / noise_aj in each dimension."""
+    """The effect of attacks on a mark of strength β_j in band j: SNR_aj = gain_aj² β_j² / noise_aj in each dimension."""
 
     gain: Float[Array, "attacks bands"]  # share of the band's amplitude that the attack leaves
     noise: Float[Array, "attacks bands"]  # variance that it adds to each dimension, in units of β², positive

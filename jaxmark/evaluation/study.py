@@ -177,7 +177,7 @@ class Study:
         schemes, budgets, count = self._schemes, self._budgets, self.samples
         blocks = [(first, min(_SEEDS_PER_CELL, count - first)) for first in range(0, count, _SEEDS_PER_CELL)]
         for mesh, scheme, bits, budget, block in product(self.meshes, schemes, self.payloads, budgets, blocks):
-            # What an older file does not say of a reading is read again.
+            # Cells of older files whose readings lack a field are read again.
             fields = json.dumps([digests[mesh], schemes[scheme].name, parameters_of(schemes[scheme]), Outcome._fields])
             digest = hashlib.sha256(fields.encode()).hexdigest()[:16]
             for name, (_, strengths) in self._attacks.items():
@@ -202,7 +202,7 @@ class Study:
 
 @dataclass(frozen=True)
 class _Point:
-    """What all cells with the same marked meshes share; seeds give keys and messages."""
+    """The data that all cells with the same marked meshes share; seeds give keys and messages."""
 
     cell: Cell  # identifies the point
     mesh: str | os.PathLike[str] | Mesh = field(compare=False)

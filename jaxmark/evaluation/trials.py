@@ -1,8 +1,8 @@
-"""Marks that are written, attacked and read with signs of nobody's key: what strengths are worth to the detector.
+"""Trials of marks, written, attacked and read with public signs: how much strengths are worth to the detector.
 
-Channels (`jaxmark.evaluation.channels`) say which strengths are best for a model of attacks, limits and reader, quickly
-and with a proof. Trials leave nothing out, and `Trials.ascend` differentiates them: from strengths to the mark within
-its limits, to what each attack leaves of it, to the weights that the reader gives the bands, to the claim.
+Channels (`jaxmark.evaluation.channels`) give the best strengths for a model of attacks, limits and reader, quickly and
+with a proof. Trials leave nothing out, and `Trials.ascend` differentiates them: from strengths to the mark within its
+limits, to the part of it that each attack leaves, to the weights that the reader gives the bands, to the claim.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,7 +44,7 @@ _LEAST_WORTH = 1.0  # nats or bits, of which a smaller gain is none: next to not
 
 
 class Trial(NamedTuple):
-    """Marks of one profile of strengths, each attack applied to them, and what the detector makes of that."""
+    """Marks of one profile of strengths, copies of them after each attack, and their worth to the detector."""
 
     scheme: KeyedScheme
     reader: KeyedReader
@@ -78,7 +78,7 @@ class Trial(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """What strengths are worth on one original, by attacks and limits; all profiles are tried alike."""
+    """The worth of strengths on one original, by attacks and limits; all profiles are tried alike."""
 
     original: Original
     bits: int
@@ -170,7 +170,7 @@ class Trials:
         signs: Sequence[Int8[Array, "vertices channels"]],
         copies: Sequence[Observation],
     ) -> Float64[np.ndarray, "seeds marks two values"]:
-        """What is left of each mark and its opposite after an attack: S/‖a‖, or the soft value of each bit."""
+        """The remainder of each mark and its opposite after an attack: S/‖a‖, or the soft decision of each bit."""
         readers = cycle([reader.with_carrier(_with_signs(reader.carrier, one)) for one in signs])
         pairs = [(own, own.receive(one)) for one, own in zip(copies, readers, strict=False)]
         if self.margin == "rate":
@@ -181,7 +181,7 @@ class Trials:
         return np.reshape(values, (len(self.seeds), len(signs) // 2, 2, -1))
 
     def _worth(self, values: Float64[np.ndarray, "*axes"]) -> float:
-        """What values are worth in the unit of the margin."""
+        """The worth of such remainders in the unit of the margin."""
         mean = max(np.mean(values), 0)
         if self.margin == "rate":
             return float(values.shape[-1] / 2 * np.log2(1 + (mean / (np.std(values) or 1)) ** 2))

@@ -1,6 +1,6 @@
 """Choose the strengths of bands, or the width and the step of a blind mark, for the worst of several attacks.
 
-`tune` measures what attacks leave of each band of a mesh, solves for the strengths that are best by these channels,
+`tune` measures what attacks leave of each band of a mesh, solves for the strengths that are best for these channels,
 with a proof of how good they are, and goes on from there, or from the scheme's default strengths, by trials with the
 detector itself. `tune_blind` compares all widths and steps that a budget allows.
 """
@@ -161,7 +161,7 @@ def tune(
     low_pass = [tunable.with_profile((1.0,) * round(share * len(family))) for share in _LOW_PASS]
     others = [trials.run(one) for one in (solved, *low_pass) if trials.fits(one)]
     chosen = trials.ascend(max(default, *others, key=lambda one: one.worst), cost)
-    # Which of several is best in few trials is so by chance in part: other marks decide.
+    # The best of several in few trials is the best partly by chance: other marks decide.
     checked = {one: trials.run(one, CHECKED) for one in {default.scheme, solved, chosen.scheme} if trials.fits(one)}
     usual, best = checked[default.scheme], max(checked.values(), key=lambda one: one.worst)
     if not best.surpasses(usual, _LEAST_GAIN):
@@ -216,10 +216,10 @@ def tune_blind(
     scheme: str | BlindScheme = "field",
     samples: int = 1,
 ) -> TunedBlind:
-    """Choose width and step of a blind mark for the attacks that it must survive; see `tune` for what is not said here.
+    """Choose width and step of a blind mark for the attacks that it must survive; for other parameters see `tune`.
 
-    The original is attacked, and looked at as a suspect is; the change of its values tells how much would be left of
-    any mark. A wide average survives more smoothing, a narrow one gives more anchors; a large step survives more noise,
+    The original is attacked, and looked at as a suspect is; the change of its values predicts how much would be left
+    of any mark. A wide average survives more smoothing, a narrow one gives more anchors; a large step survives more noise,
     a small one is met more exactly within the same budget. All that a budget allows are compared, by how much the
     information that is left exceeds the needs of payload and tag. If that is negative after the worst of the attacks,
     the mark is not expected to survive it. `scheme` is a blind scheme, whose widths and steps are compared.

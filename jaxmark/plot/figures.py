@@ -1,4 +1,4 @@
-"""What all pictures share: figures that need no screen, styles of lines, and PNG files."""
+"""Parts that all pictures share: figures that need no screen, styles of lines, and PNG files."""
 
 import io
 import os

@@ -77,5 +77,5 @@ def _stripes(raster: Raster) -> Float64[np.ndarray, "rows columns"]:
     normals = raster.normals(smooth=True)
     # The eye is far away at +z: its line of sight is reflected to 2 (n·z) n - z.
     height = np.clip(2 * normals[:, :, 2] * normals[:, :, 1], -1, 1)
-    # What faces the eye shows the middle of a stripe, so that a plane is plain.
+    # Surfaces that face the eye show the middle of a stripe, so that a plane is plain.
     return 0.5 + 0.5 * np.tanh(np.cos(_STRIPES * np.arcsin(height)) / _EDGE)
