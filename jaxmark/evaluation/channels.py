@@ -24,7 +24,7 @@ _MIN_BAND_DIMENSIONS = 3  # the variance in a band cannot be estimated from fewe
 
 
 class Channels(NamedTuple):
-    """The effect of attacks on a mark of strength β_j in band j: SNR_aj = gain_aj² β_j² / noise_aj in each dimension."""
+    """The effect of attacks on a mark of strengths β_j in bands j: SNR_aj = gain_aj² β_j² / noise_aj per dimension."""
 
     gain: Float[Array, "attacks bands"]  # share of the band's amplitude that the attack leaves
     noise: Float[Array, "attacks bands"]  # variance that it adds to each dimension, in units of β², positive

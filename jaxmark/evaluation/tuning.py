@@ -218,8 +218,8 @@ def tune_blind(
 ) -> TunedBlind:
     """Choose width and step of a blind mark for the attacks that it must survive; for other parameters see `tune`.
 
-    The original is attacked, and looked at as a suspect is; the change of its values predicts how much would be left
-    of any mark. A wide average survives more smoothing, a narrow one gives more anchors; a large step survives more noise,
+    The original is attacked, and looked at as a suspect is; the change of its values predicts how much would be left of
+    any mark. A wide average survives more smoothing, a narrow one gives more anchors; a large step survives more noise,
     a small one is met more exactly within the same budget. All that a budget allows are compared, by how much the
     information that is left exceeds the needs of payload and tag. If that is negative after the worst of the attacks,
     the mark is not expected to survive it. `scheme` is a blind scheme, whose widths and steps are compared.
