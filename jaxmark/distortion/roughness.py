@@ -29,15 +29,12 @@ class Rough(NamedTuple):
     area: PerVertex  # a third of the area of the faces around
 
 
-def local_roughness(
-    x: Positions, faces: Int[Array | np.ndarray, "faces 3"], boundary: Bool[np.ndarray, " vertices"] | None = None
-) -> Rough:
+def local_roughness(x: Positions, faces: Int[Array | np.ndarray, "faces 3"]) -> Rough:
     """Difference of each vertex's absolute angle defect from the cotangent-weighted mean of its neighbours'.
 
-    `boundary` is the mask of the boundary vertices, at which flat angles sum to π; it is computed unless given.
+    Flat angles sum to π at the vertices of the boundary.
     """
-    if boundary is None:
-        boundary = np.isin(np.arange(len(x)), boundary_vertices(np.asarray(faces)))
+    boundary = np.isin(np.arange(len(x)), boundary_vertices(np.asarray(faces)))
     return _local_roughness(x, jnp.asarray(faces), jnp.asarray(boundary))
 
 
