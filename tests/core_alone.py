@@ -99,7 +99,7 @@ def needing(folder: str) -> Iterator[tuple[str, str, Callable[[], object]]]:
     from jaxmark import plot
     from jaxmark.app.demo import sample_mesh
     from jaxmark.app.serving import Desk, make_app
-    from jaxmark.evaluation.results import Results
+    from jaxmark.evaluation.study_results import Results
     from jaxmark.geometry.surfaces import Surface
     from jaxmark.spectral import learned
 

@@ -42,8 +42,7 @@ def sources(picture: str) -> list[Path]:
         notebooks = (ROOT / "notebooks").glob(f"{picture.removeprefix('gallery_')[:2]}_*.py")
         found = {*notebooks, programs / "front.py"}
     else:
-        rooms = (package / "plot", package / "evaluation" / "pictures")
-        found = {*(path for room in rooms for path in room.glob("*.py")), programs / "front.py"}
+        found = {*(package / "plot").glob("*.py"), package / "evaluation" / "pictures.py", programs / "front.py"}
     return sorted({*found, Path(__file__).resolve()})
 
 

@@ -46,8 +46,8 @@ from jaxmark.app.read_files import FileReader
 from jaxmark.app.serving import serve_command
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.cells import left_over
-from jaxmark.evaluation.pictures.studies import Measure
-from jaxmark.evaluation.study_file import load_study
+from jaxmark.evaluation.pictures import Measure
+from jaxmark.evaluation.study import load_study
 from jaxmark.extras import require
 from jaxmark.files import load_mesh, load_scene, load_skin, save_mesh, save_scene
 from jaxmark.files.atomic import replacing, write_atomically

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from jaxmark.attacks.support import Strength, centred, diagonal, displace, on_host, surface
-from jaxmark.distortion.roots import root
+from jaxmark.distortion.norms import root
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, used_vertices, vertex_normals
 from jaxmark.seeds import Randomness, Seed

@@ -13,8 +13,7 @@ from jaxmark.bench.summary import points
 from jaxmark.bench.tables import tables
 from jaxmark.extras import require
 from jaxmark.plot import Picture
-from jaxmark.plot.figures import COLOURS, panels
-from jaxmark.plot.pages import write_page
+from jaxmark.plot.figures import COLOURS, panels, write_page
 
 
 def markdown(results: BenchResults, title: str, about: str) -> str:

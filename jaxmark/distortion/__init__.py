@@ -1,4 +1,4 @@
-"""Metrics of how far a mesh was moved, and how visible that is; one metric per module.
+"""Metrics of how far a mesh was moved, and how visible that is.
 
 `compare` computes all of them for two meshes on the host; most are also shown as functions of positions that JAX can
 differentiate.
@@ -18,31 +18,31 @@ from jaxmark.distortion._compare import measure as measure
 from jaxmark.distortion._compare import metrics_of as metrics_of
 from jaxmark.distortion._compare import name_of as name_of
 from jaxmark.distortion._compare import shading_at_vertices as shading_at_vertices
-from jaxmark.distortion._curvature import curvature as curvature
-from jaxmark.distortion._curvature import curvature_tensor as curvature_tensor
-from jaxmark.distortion._curvature import tensor_distance as tensor_distance
-from jaxmark.distortion._geometric_laplacian import geometric_laplacian as geometric_laplacian
-from jaxmark.distortion._geometric_laplacian import gl as gl
-from jaxmark.distortion._msdm import local_msdm2 as local_msdm2
-from jaxmark.distortion._msdm import msdm as msdm
-from jaxmark.distortion._msdm import msdm2 as msdm2
-from jaxmark.distortion._msdm import msdm2_views as msdm2_views
-from jaxmark.distortion._msdm import msdm_views as msdm_views
 from jaxmark.distortion._shading import Hiding as Hiding
 from jaxmark.distortion._shading import make_hiding as make_hiding
 from jaxmark.distortion._shading import shading as shading
 from jaxmark.distortion._shading import vertex_means as vertex_means
 from jaxmark.distortion._shading import visible_turn as visible_turn
-from jaxmark.distortion._stretch import stretch as stretch
-from jaxmark.distortion._texture import texture_drift as texture_drift
 from jaxmark.distortion.dihedral import dame as dame
 from jaxmark.distortion.dihedral import dihedral_angles as dihedral_angles
 from jaxmark.distortion.dihedral import make_hinges as make_hinges
-from jaxmark.distortion.displacement import maximum as maximum
-from jaxmark.distortion.displacement import rms as rms
+from jaxmark.distortion.geometric import geometric_laplacian as geometric_laplacian
+from jaxmark.distortion.geometric import gl as gl
+from jaxmark.distortion.geometric import stretch as stretch
+from jaxmark.distortion.geometric import surface_distance as surface_distance
+from jaxmark.distortion.geometric import texture_drift as texture_drift
+from jaxmark.distortion.norms import maximum as maximum
+from jaxmark.distortion.norms import rms as rms
 from jaxmark.distortion.rendered import Difference as Difference
 from jaxmark.distortion.rendered import flip as flip
 from jaxmark.distortion.rendered import ssim as ssim
 from jaxmark.distortion.roughness import fmpd as fmpd
 from jaxmark.distortion.roughness import local_roughness as local_roughness
-from jaxmark.distortion.surface import surface_distance as surface_distance
+from jaxmark.distortion.structural import curvature as curvature
+from jaxmark.distortion.structural import curvature_tensor as curvature_tensor
+from jaxmark.distortion.structural import local_msdm2 as local_msdm2
+from jaxmark.distortion.structural import msdm as msdm
+from jaxmark.distortion.structural import msdm2 as msdm2
+from jaxmark.distortion.structural import msdm2_views as msdm2_views
+from jaxmark.distortion.structural import msdm_views as msdm_views
+from jaxmark.distortion.structural import tensor_distance as tensor_distance

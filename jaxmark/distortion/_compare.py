@@ -2,24 +2,20 @@
 
 from collections.abc import Callable, Collection, Mapping
 from functools import cached_property
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmark.distortion._curvature import curvature_tensor, tensor_distance
-from jaxmark.distortion._geometric_laplacian import gl
-from jaxmark.distortion._msdm import Views, msdm, msdm2, msdm2_views, msdm_views
 from jaxmark.distortion._shading import Hiding, make_hiding, shading, vertex_means, visible_turn
-from jaxmark.distortion._stretch import stretch
 from jaxmark.distortion.dihedral import Hinges, dame, make_hinges
-from jaxmark.distortion.displacement import maximum, rms
-from jaxmark.distortion.point_planes import PointPlanes, make_point_planes, point_to_plane
+from jaxmark.distortion.geometric import PointPlanes, SurfaceDistance, gl, point_to_plane, stretch, surface_distance
+from jaxmark.distortion.norms import maximum, rms, with_dtype
 from jaxmark.distortion.rendered import flip, ssim
 from jaxmark.distortion.roughness import fmpd, local_roughness
-from jaxmark.distortion.surface import SurfaceDistance, surface_distance
+from jaxmark.distortion.structural import Views, curvature_tensor, msdm, msdm2, msdm2_views, msdm_views, tensor_distance
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import (
     Mesh,
@@ -39,7 +35,6 @@ from jaxmark.geometry.mesh import (
 )
 from jaxmark.spectral.padding import SURFACE_VALENCE, common_edges, common_size, pad_rows
 
-Prepared = TypeVar("Prepared")
 Metric = str | Callable[[Mesh, Mesh], float]  # a name in `METRICS` or `RENDERED`, or a function: see `measure`
 
 
@@ -77,7 +72,7 @@ class Comparison(NamedTuple):
     shading: float | None  # visible turn of normals that 1 % of the area exceed, in just noticeable differences
     point_to_plane: float | None  # displacement across the surface that 5 % of the points exceed, over their spacing
     flip: float | None = None  # difference of pictures by FLIP that 1 % of their pixels exceed, 0 to 1; see `RENDERED`
-    ssim: float | None = None  # likewise by structural similarity, as 1 - SSIM
+    ssim: float | None = None  # the same by structural similarity, as 1 - SSIM
 
 
 def displacement_size(original: Mesh, distorted: Mesh) -> DisplacementSize:
@@ -87,45 +82,24 @@ def displacement_size(original: Mesh, distorted: Mesh) -> DisplacementSize:
         JaxmarkError: if the meshes do not share their connectivity, or one is unusable (see `make_mesh`, `diagonal`).
     """
     mesh = host_mesh(original)
-    welded = weld(mesh.vertices)
-    return DisplacementSize.of(
-        displacement(mesh, distorted, welded, diagonal(mesh))[used_vertices(weld_mesh(mesh, welded))]
-    )
+    welded, length = weld(mesh.vertices), diagonal(mesh)
+    return DisplacementSize.of(displacement(mesh, distorted, welded, length)[used_vertices(weld_mesh(mesh, welded))])
 
 
 class Reference:
-    """An original that any number of meshes are compared with; what metrics need of it is computed once."""
+    """An original that any number of meshes are compared with; intermediates that depend on it are computed once."""
 
     def __init__(self, original: Mesh) -> None:
-        """Prepare an original.
-
-        Args:
-            original: any mesh with an area, or a point cloud.
-
-        Raises:
-            JaxmarkError: see `compare`.
-        """
+        """Prepare a mesh with an area, or a point cloud; others are refused, see `compare`."""
         self.given = host_mesh(original)
         self.length, self.welded = diagonal(self.given), weld(self.given.vertices)
         self.centre = np.asarray(self.given.vertices, np.float64)[used_vertices(self.given)].mean(axis=0)
         self.used = used_vertices(weld_mesh(self.given, self.welded))  # mask of the distinct points
-        self.mesh = self._at_unit_size(_plain(self.given, self.welded), "original")
+        self.mesh = self.at_unit_size(_distinct(self.given, self.welded), "original")
         self.faces = np.asarray(self.mesh.faces)
 
-    def plain(self, distorted: Mesh, same: bool) -> Mesh:
-        """The distinct points of a mesh that faces use, moved and scaled as the original is to unit size.
-
-        Args:
-            distorted: a mesh of NumPy arrays.
-            same: whether it has the original's connectivity, and so points that are distinct in the original.
-        """
-        if same:
-            points = Mesh(np.asarray(distorted.vertices)[self.welded.first[self.used]], self.faces)
-        else:
-            points = _plain(distorted, weld(distorted.vertices))
-        return self._at_unit_size(points, "distorted mesh")
-
-    def _at_unit_size(self, mesh: Mesh, name: str) -> Mesh:
+    def at_unit_size(self, mesh: Mesh, name: str) -> Mesh:
+        """Move and scale a mesh as the original is moved and scaled to a diagonal of 1."""
         scaled = mesh._replace(vertices=(np.asarray(mesh.vertices) - self.centre) / self.length)
         if len(scaled.faces) and not 0 < area(scaled) < np.inf:
             raise JaxmarkError(f"The {name} has an area of {area(scaled):g}; its shape cannot be compared.")
@@ -136,37 +110,25 @@ class Reference:
         """Padded with edges of no length, so that programs compiled for one mesh serve others."""
         found = make_hinges(self.faces)
         count = common_edges(len(found.edges), common_size(len(self.mesh.vertices)), SURFACE_VALENCE)
-        return _ready(Hinges(*(pad_rows(np.asarray(rows), count) for rows in found)))
+        return with_dtype(Hinges(*(pad_rows(np.asarray(rows), count) for rows in found)), jnp.float32)
 
     @cached_property
     def around(self) -> PointPlanes:
-        return make_point_planes(np.asarray(self.mesh.vertices))
+        return PointPlanes.of(np.asarray(self.mesh.vertices))
 
     @cached_property
     def hiding(self) -> Hiding:
-        return _ready(make_hiding(np.asarray(self.mesh.vertices), self.faces).padded())
+        return with_dtype(make_hiding(np.asarray(self.mesh.vertices), self.faces).padded(), jnp.float32)
 
     def measure(self, distorted: Mesh, metrics: Collection[Metric]) -> dict[Metric, float | None]:
         """Measure how far a mesh was distorted from this original; see `measure`."""
-        names = [metric for metric in metrics if isinstance(metric, str)]
-        known = {**_METRICS, **_RENDERED}
-        if unknown := [name for name in names if name not in known]:
-            raise JaxmarkError(f"There is no metric {unknown[0]!r}; there are {', '.join(known)}.")
-        for name in names:
-            if name not in OF_POINTS:
-                check_faces(f"The metric {name!r}", self.given)
-        pair = _Pair(self, distorted)
-        wanted = {name for name in names if pair.same or name in _ANY_CONNECTIVITY}
-        found: dict[Metric, float | None] = {}
         for metric in metrics:
-            if isinstance(metric, str):
-                found[metric] = float(known[metric](pair)) if metric in wanted else None
-                continue
-            found[metric] = value = float(metric(*pair.given))
-            if not 0 <= value < np.inf:
-                said = f"The metric {name_of(metric)!r} must be a finite number, not negative"
-                raise JaxmarkError(f"{said}, got {value:g}.")
-        return found
+            if isinstance(metric, str) and metric not in _METRICS:
+                raise JaxmarkError(f"There is no metric {metric!r}; there are {', '.join(_METRICS)}.")
+            if isinstance(metric, str) and metric not in OF_POINTS:
+                check_faces(f"The metric {metric!r}", self.given)
+        pair = _Pair(self, distorted)
+        return {metric: pair.measure(metric) for metric in metrics}
 
 
 class _Pair:
@@ -176,25 +138,35 @@ class _Pair:
         second = host_mesh(distorted)
         self.reference, self.given = reference, (reference.given, second)
         self.same = same_connectivity(*self.given)
-        self.meshes = reference.mesh, reference.plain(second, self.same)
+        if self.same:  # points are those that are distinct in the original
+            points = Mesh(np.asarray(second.vertices)[reference.welded.first[reference.used]], reference.faces)
+        else:
+            points = _distinct(second, weld(second.vertices))
+        self.meshes = reference.mesh, reference.at_unit_size(points, "distorted mesh")
         self.faces = [np.asarray(mesh.faces) for mesh in self.meshes]
         self.x, self.y = (jnp.asarray(mesh.vertices, jnp.float32) for mesh in self.meshes)
+
+    def measure(self, metric: Metric) -> float | None:
+        if isinstance(metric, str):
+            return float(_METRICS[metric](self)) if self.same or metric in _ANY_CONNECTIVITY else None
+        name, value = name_of(metric), float(metric(*self.given))
+        if not 0 <= value < np.inf:
+            raise JaxmarkError(f"The metric {name!r} must be a finite number, not negative, got {value:g}.")
+        return value
 
     @cached_property
     def common(self) -> tuple[Array, Array]:
         """The positions, padded to a size that many meshes share."""
         count = common_size(len(self.x))
-        x, y = (pad_rows(np.asarray(mesh.vertices, np.float32), count) for mesh in self.meshes)
-        return jnp.asarray(x), jnp.asarray(y)
+        return jnp.asarray(pad_rows(np.asarray(self.x), count)), jnp.asarray(pad_rows(np.asarray(self.y), count))
 
     @cached_property
     def moved(self) -> DisplacementSize:
         return displacement_size(*self.given)
 
-    @property
-    def shift(self) -> Float[np.ndarray, "points 3"]:
+    def point_to_plane(self) -> float:
         first, second = (np.asarray(mesh.vertices, np.float64) for mesh in self.meshes)
-        return second - first
+        return point_to_plane(second - first, self.reference.around)
 
     @cached_property
     def surfaces(self) -> SurfaceDistance:
@@ -223,16 +195,14 @@ _METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
     "curvature": _Pair.tensor_distance,
     "stretch": lambda pair: stretch(*pair.common, pair.reference.hinges.edges),
     "shading": lambda pair: shading(*pair.common, pair.reference.hiding),
-    "point_to_plane": lambda pair: point_to_plane(pair.shift, pair.reference.around),
+    "point_to_plane": _Pair.point_to_plane,
+    "flip": lambda pair: flip(*pair.meshes).high,
+    "ssim": lambda pair: ssim(*pair.meshes).high,
 }
-_RENDERED: Mapping[str, Callable[[_Pair], float]] = {
-    "flip": lambda pair: flip(pair.meshes[0], pair.meshes[1]).high,
-    "ssim": lambda pair: ssim(pair.meshes[0], pair.meshes[1]).high,
-}
-#: Names of the metrics of `compare`; limits of distortion are stated in them, too.
-METRICS = tuple(_METRICS)
 #: Names of the metrics of pictures: many seconds each, and so only computed where they are asked for.
-RENDERED = tuple(_RENDERED)
+RENDERED = ("flip", "ssim")
+#: Names of the metrics of `compare`; limits of distortion are stated in them, too.
+METRICS = tuple(name for name in _METRICS if name not in RENDERED)
 #: Names of the metrics that need no faces: those of point clouds.
 OF_POINTS = ("rms", "max", "point_to_plane")
 #: Names of the metrics that look at single vertices and edges, and are quickly computed.
@@ -242,8 +212,8 @@ _ANY_CONNECTIVITY = {"mrms", "hausdorff", "fmpd", "msdm2", *RENDERED}
 
 def metrics_of(original: Mesh, distorted: Mesh) -> tuple[str, ...]:
     """The names in `METRICS` that two meshes can be compared by: if one is a point cloud, those in `OF_POINTS`."""
-    check_mesh(original)
-    check_mesh(distorted)
+    for mesh in (original, distorted):
+        check_mesh(mesh)
     return METRICS if len(original.faces) and len(distorted.faces) else OF_POINTS
 
 
@@ -298,13 +268,9 @@ def compare(original: Mesh, distorted: Mesh, metrics: Collection[str] | None = N
 
 
 def shading_at_vertices(original: Mesh, distorted: Mesh) -> Float[np.ndarray, " vertices"]:
-    """How visible the turn of normals is around each vertex, in just noticeable differences, for heat maps.
+    """Compute how visible the turn of normals is around each vertex, in just noticeable differences, for heat maps.
 
-    Means of `visible_turn` over the faces around, weighted by area; 0 at vertices without faces.
-
-    Args:
-        original: any mesh with an area.
-        distorted: a mesh of the same connectivity.
+    Values are means of `visible_turn` over the faces around, weighted by area; 0 at vertices without faces.
 
     Raises:
         JaxmarkError: if the connectivity differs, or see `compare`.
@@ -319,15 +285,6 @@ def shading_at_vertices(original: Mesh, distorted: Mesh) -> Float[np.ndarray, " 
     return points[reference.welded.point]
 
 
-def _ready(arrays: Prepared) -> Prepared:
-    """Arrays as metrics compute with them, so that no call converts them again; numbers are float32."""
-
-    def one(leaf: np.ndarray) -> Array:
-        return jnp.asarray(leaf, jnp.float32 if np.issubdtype(leaf.dtype, np.floating) else None)
-
-    return jax.tree.map(one, arrays)
-
-
-def _plain(mesh: Mesh, welded: Weld) -> Mesh:
+def _distinct(mesh: Mesh, welded: Weld) -> Mesh:
     """The mesh of the distinct points that faces use."""
     return host_mesh(compact(weld_mesh(mesh, welded)))

@@ -1,31 +1,29 @@
-"""Visible change of shading: how far normals turn, over what the original itself hides, point by point.
+"""Visible change of shading: the turn of normals over the turn that the original masks, face by face.
 
-A mean over edges cannot see a wave on a plane: most edges lie where the surface is curved or rough and hides more. Here
-each point is judged by itself, and the result is a percentile of the area, in just noticeable differences.
+A mean over edges cannot see a wave on a plane: most edges lie where the surface is curved or rough and masks more. Here
+each point is judged separately, and the result is a percentile of the area, in just noticeable differences.
 
 1. *Contrast.* Where a normal turns by δ, Lambertian shading changes by up to tan(i)·δ of itself, i being the incidence
-   of the light, which may come from any side. Lights come at 60°: a turn of 0.33° is a contrast of 1 %. None is fixed
-   in space, so that no rotation changes the result.
+   of the light. Lights come at 60°, from any side, so that no rotation changes the result: 0.33° is a contrast of 1 %.
 2. *Frequency.* Normals of faces are split into six bands by diffusion from face to face, from waves as long as 1.5
-   edges to waves of 48. Diffusion stops at creases of the original, on whose two sides light differs anyway: a plane is
-   compared with itself.
+   edges to waves of 48. Diffusion stops at creases of the original, on whose two sides light differs anyway.
 3. *Sensitivity.* How contrast sensitivity falls towards short waves is the formula of Barten, "Evaluation of subjective
    image quality with the square-root integral method", Journal of the Optical Society of America A 7(10), 1990, at
    100 cd/m² and with the diagonal as large as 40° of the field of view.
-4. *Masking.* What the original has of a band around a point raises the threshold there by (1 + (k c)^b)^(1/b), c being
-   that contrast over its own threshold. The formula is that of Daly, "The visible differences predictor" (Digital
+4. *Masking.* The original's contrast in a band around a point raises the threshold there by (1 + (k c)^b)^(1/b), c
+   being that contrast over its own threshold. The formula is that of Daly, "The visible differences predictor" (Digital
    Images and Human Vision, 1993). Nader, Wang, Hétroy-Wheeler and Dupont fitted it to what people saw on meshes ("Just
    noticeable distortion profile for flat-shaded 3D mesh surfaces", IEEE TVCG 22(11), 2016); k = 0.0078 · 88.29 and
-   b = 4.207, with a slope of 1, are what their model has in the program MEPP2.
+   b = 4.207, with a slope of 1, are those of their model in the program MEPP2.
 5. *Pooling.* Bands are summed with the exponent 4, near those of probability summation over channels (Watson, Ahumada,
    "A standard model for foveal detection of spatial contrast", Journal of Vision 5(9), 2005).
 
 Chosen by us: the lights' incidence; the angle at which a crease begins; that sensitivity does not fall towards long
 waves, which gratings do but glossy planes do not; and the least contrast, 0.6 %, which makes 0.2° on a plane just
 noticeable. It lies between what Barten's formula gives for practised people and plain gratings, 0.17 %, and the 2 % of
-Nader et al. at their best frequency for one moved vertex. `benchmarks/robustness/visibility.py` prints what follows.
+Nader et al. at their best frequency for one moved vertex. `benchmarks/robustness/visibility.py` prints the results.
 
-What it does not see: waves much longer than 48 edges, which on a mesh of a million points are short; sides between
+The metric does not see waves much longer than 48 edges, which on a mesh of a million points are short; sides between
 creases that turn as a whole; silhouettes; and displacements along the surface, which only textures show.
 """
 
@@ -40,8 +38,7 @@ from jaxtyping import Array, Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from jaxmark.distortion.percentiles import percentile
-from jaxmark.distortion.roots import root
+from jaxmark.distortion.norms import Positions, Scalar, percentile, ratio, root
 from jaxmark.geometry.mesh import cross_product, face_pairs
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import band_components, filter
@@ -68,7 +65,7 @@ _MIN_AREA = 1e-3  # of a face over the mean, in its links
 
 
 class Hiding(NamedTuple):
-    """What an original hides, face by face; make it with `make_hiding`."""
+    """The turns of normals that an original masks, face by face; make it with `make_hiding`."""
 
     faces: Int[Array | np.ndarray, "faces 3"]
     area: Float[Array | np.ndarray, " faces"]  # share of the whole; 0 for faces without a normal
@@ -91,12 +88,9 @@ class Hiding(NamedTuple):
 def make_hiding(
     vertices: Float[Array | np.ndarray, "vertices 3"], faces: Int[Array | np.ndarray, "faces 3"], bands: int = BANDS
 ) -> Hiding:
-    """Compute what an original hides, on the host. Edges of one face, or of three or more, link nothing.
+    """Compute what an original masks, on the host, in `bands` bands from the shortest waves on.
 
-    Args:
-        vertices: positions.
-        faces: the triangles.
-        bands: number of bands that are looked at, from the shortest waves on.
+    Edges of one face, or of three or more, link nothing.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     pairs, against = face_pairs(faces)
@@ -121,16 +115,8 @@ def make_hiding(
 
 
 @jax.jit
-def visible_turn(
-    original: Float[Array, "vertices 3"], distorted: Float[Array, "vertices 3"], hiding: Hiding
-) -> Float[Array, " faces"]:
-    """How visible the turn of each face's normal is, in just noticeable differences.
-
-    Args:
-        original: positions.
-        distorted: positions of the same vertices.
-        hiding: from `make_hiding` of the original.
-    """
+def visible_turn(original: Positions, distorted: Positions, hiding: Hiding) -> Float[Array, " faces"]:
+    """Compute how visible the turn of each face's normal is, in just noticeable differences."""
     change = _normals(distorted, hiding) - _normals(original, hiding)
     # Compiled code may round equal positions to different normals. Only the value is mended: the derivative is sound.
     unmoved = jnp.all((original == distorted)[hiding.faces], axis=(1, 2))[:, None]
@@ -146,47 +132,32 @@ def visible_turn(
 
 
 @jax.jit
-def shading(
-    original: Float[Array, "vertices 3"],
-    distorted: Float[Array, "vertices 3"],
-    hiding: Hiding,
-    share: float | Float[Array, ""] = SHARE,
-) -> Float[Array, ""]:
-    """The visible turn of normals that is exceeded on 1 % of the area, in just noticeable differences.
+def shading(original: Positions, distorted: Positions, hiding: Hiding, share: float | Scalar = SHARE) -> Scalar:
+    """The visible turn of normals that is exceeded on 1 % of the area (1 - `share`), in just noticeable differences.
 
     Normals are split into bands of spatial frequency; a turn in each is taken over the least that is seen there, which
     the original's own contrast in the band raises (masking as by Daly, with the constants of Nader, Wang,
     Hétroy-Wheeler, Dupont, "Just noticeable distortion profile for flat-shaded 3D mesh surfaces", IEEE TVCG 22(11),
-    2016; sensitivity as by Barten, JOSA A 7(10), 1990). On a plane 0.2° are just noticeable, by our calibration.
-
-    Args:
-        original: positions.
-        distorted: positions of the same vertices.
-        hiding: from `make_hiding` of the original.
-        share: share of the area that turns less; the gradient is that of the face at this percentile.
+    2016; sensitivity as by Barten, JOSA A 7(10), 1990). On a plane 0.2° are just noticeable, by our calibration. The
+    gradient is that of the face at the percentile.
     """
-    values = visible_turn(original, distorted, hiding)
-    area = jnp.asarray(hiding.area).astype(values.dtype)
-    return percentile(values, area, share)
+    return percentile(visible_turn(original, distorted, hiding), jnp.asarray(hiding.area), share)
 
 
 def vertex_means(values: Float[Array, " faces"], hiding: Hiding, count: int) -> Float[Array, " vertices"]:
     """Means of faces' values around each of `count` vertices, weighted by area, for heat maps; 0 where no face is."""
     area = jnp.asarray(hiding.area).astype(values.dtype)[:, None]
     zeros, corners = jnp.zeros(count, values.dtype), hiding.faces
-    total, around = zeros.at[corners].add(area), zeros.at[corners].add(area * values[:, None])
-    return jnp.where(total > 0, around / jnp.where(total > 0, total, 1), 0)
+    return ratio(zeros.at[corners].add(area * values[:, None]), zeros.at[corners].add(area))
 
 
 def _areas_and_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Areas of faces and their unit normals, 0 for those that are too flat to have one."""
     sides = [vertices[faces[:, k]] - vertices[faces[:, k - 1]] for k in range(3)]
-    longest = np.max([_squared(side) for side in sides], axis=0)
-    normals = cross_product(sides[1], sides[2])
+    longest, normals = np.max([_squared(side) for side in sides], axis=0), cross_product(sides[1], sides[2])
     double = np.sqrt(_squared(normals))
     area = np.where(double > _MIN_HEIGHT * longest, double / 2, 0)
-    normals /= np.where(area > 0, double, 1)[:, None]
-    return area, normals
+    return area, normals / np.where(area > 0, double, 1)[:, None]
 
 
 def _squared(x: Float[np.ndarray, "rows 3"]) -> Float[np.ndarray, " rows"]:
@@ -252,9 +223,8 @@ def _bands(links: Laplacian, x: Array, count: int) -> Array:
 
 def _by_length(series: Float[np.ndarray, "series terms"]) -> list[Float[np.ndarray, "some fewer"]]:
     """Split series, the shortest first, into those of few terms, which end there, and the others."""
-    few = _FEW_TERMS
-    short = int((~series[:, few:].any(axis=1)).sum())
-    return [some for some in (series[:short, :few], series[short:]) if len(some)]
+    short = int((~series[:, _FEW_TERMS:].any(axis=1)).sum())
+    return [some for some in (series[:short, :_FEW_TERMS], series[short:]) if len(some)]
 
 
 @partial(jax.jit, static_argnames="count")

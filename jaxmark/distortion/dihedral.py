@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxmark.distortion.roots import root
+from jaxmark.distortion.norms import Positions, Scalar, lengths, ratio
 from jaxmark.geometry.mesh import edges
 
 _FOLDED_WEIGHT = 0.01  # weight of an angle of π, where the surface is folded back onto itself; an angle of 0 has 1
@@ -30,8 +30,7 @@ class Hinges(NamedTuple):
 def make_hinges(faces: Int[Array | np.ndarray, "faces 3"]) -> Hinges:
     """Find the faces on both sides of each edge, on the host. An edge of one face, or of three or more, is no hinge."""
     faces = np.asarray(faces)
-    pairs = edges(faces)
-    base = int(faces.max(initial=0)) + 1
+    pairs, base = edges(faces), int(faces.max(initial=0)) + 1
     start, end, apex = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel(), np.roll(faces, -2, axis=1).T.ravel()
     # A face whose corners coincide has no sides, only an edge that it runs along twice.
     whole = (start != end) & (end != apex) & (apex != start)
@@ -39,60 +38,41 @@ def make_hinges(faces: Int[Array | np.ndarray, "faces 3"]) -> Hinges:
     which = np.searchsorted(pairs @ [base, 1], np.minimum(start, end) * base + np.maximum(start, end))
     count = np.bincount(which, minlength=len(pairs))
     order = np.lexsort((start > end, which))  # the face that has the edge in its own direction comes first
-    first = np.cumsum(count) - count
-    inner = count == 2
+    first, inner = np.cumsum(count) - count, count == 2
     left, right = pairs[:, 0].copy(), pairs[:, 0].copy()
     left[inner], right[inner] = apex[order][first[inner]], apex[order][first[inner] + 1]
     return Hinges(pairs.astype(np.int32), left.astype(np.int32), right.astype(np.int32), inner.astype(float))
 
 
-def dihedral_sine_cosine(
-    x: Float[Array, "vertices 3"], hinges: Hinges
-) -> tuple[Float[Array, " edges"], Float[Array, " edges"]]:
+def dihedral_sine_cosine(x: Positions, hinges: Hinges) -> tuple[Float[Array, " edges"], Float[Array, " edges"]]:
     """Sine and cosine, up to a common factor, of the angle by which the surface turns at each edge.
 
     The angle is positive where a surface whose faces run counterclockwise is convex, and 0 where it is not defined.
     """
     tail, head = x[hinges.edges[:, 0]], x[hinges.edges[:, 1]]
     along = head - tail
-    length = _norm(along)
+    length = lengths(along)
     first, second = jnp.cross(along, x[hinges.left] - tail), jnp.cross(x[hinges.right] - tail, along)
-    size = _norm(first) * _norm(second) * length
-    sound = size > 0
-    sine = jnp.sum(jnp.cross(first, second) * along, axis=1)
-    cosine = jnp.sum(first * second, axis=1) * length
-    scale = jnp.where(sound, size, 1)
-    return jnp.where(sound, sine / scale, 0), jnp.where(sound, cosine / scale, 1)
+    size = lengths(first) * lengths(second) * length
+    sine = ratio(jnp.sum(jnp.cross(first, second) * along, axis=1), size)
+    cosine = ratio(jnp.sum(first * second, axis=1) * length, size)
+    return sine, jnp.where(size > 0, cosine, 1)
 
 
 @jax.jit
-def dihedral_angles(x: Float[Array, "vertices 3"], hinges: Hinges) -> Float[Array, " edges"]:
+def dihedral_angles(x: Positions, hinges: Hinges) -> Float[Array, " edges"]:
     """Angle by which the surface turns at each edge, in radians from -π to π; 0 if it is flat or there is no hinge."""
     return jnp.arctan2(*dihedral_sine_cosine(x, hinges))
 
 
 @jax.jit
-def dame(
-    original: Float[Array, "vertices 3"], distorted: Float[Array, "vertices 3"], hinges: Hinges
-) -> Float[Array, ""]:
+def dame(original: Positions, distorted: Positions, hinges: Hinges) -> Scalar:
     """Dihedral angle mesh error: mean change of dihedral angles over inner edges, masked where the original is sharp.
 
-    This is the paper's sum with masking m = exp((kα)²), k² = ln(0.01)/π², by the original's angle α. The paper's
-    visibility weights, which need rendered images, are 1 here.
-
-    Args:
-        original: positions.
-        distorted: positions of the same vertices.
-        hinges: from `make_hinges`.
-
-    Returns:
-        The error in radians; 0 for equal shapes, whatever their scale.
+    The error is in radians, and independent of scale. It is the paper's sum with masking m = exp((kα)²), k² =
+    ln(0.01)/π², by the original's angle α. The paper's visibility weights, which need rendered images, are 1 here.
     """
     before, after = dihedral_angles(original, hinges), dihedral_angles(distorted, hinges)
     masking = jnp.exp(math.log(_FOLDED_WEIGHT) * (before / np.pi) ** 2)
     inner = jnp.asarray(hinges.inner).astype(before.dtype)
     return jnp.sum(inner * masking * jnp.abs(after - before)) / jnp.maximum(inner.sum(), 1)
-
-
-def _norm(x: Float[Array, "rows 3"]) -> Float[Array, " rows"]:
-    return root(jnp.sum(x**2, axis=1))

@@ -1,14 +1,14 @@
 """Find the edges that lie in balls around vertices and are reached from their centres, on the host.
 
-They are found by a breadth-first search that only goes outward, as in MEPP's metrics. What depends on the positions
-within a given neighbourhood is computed in traced code, by `curvature_tensor` and `window_statistics`.
+They are found by a breadth-first search that only goes outward, as in MEPP's metrics; the search depends on the
+positions, but traced code computes the share of each edge in its ball (`share_inside`).
 """
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxmark.geometry.mesh import edges
 
@@ -38,14 +38,8 @@ def make_neighbourhoods(
 ) -> tuple[Neighbourhoods, Neighbourhoods]:
     """Find the edges in balls around vertices, and the points in them: vertices inside, and where edges leave.
 
-    Args:
-        vertices: positions.
-        faces: vertex indices.
-        radius: radius of the balls, in the units of the positions.
-        centres: vertices around which the balls lie; all vertices unless given.
-
-    Returns:
-        The edges, and the points. A point is stored as an edge that ends at it; a vertex as an edge from and to itself.
+    The balls lie around all vertices unless `centres` are given; their radius is in the units of the positions. A point
+    is stored as an edge that ends at it; a vertex as an edge from and to itself.
     """
     pairs = edges(faces)
     tail, head = np.concatenate([pairs, pairs[:, ::-1]]).T
@@ -54,18 +48,12 @@ def make_neighbourhoods(
     graph = _Graph(np.asarray(vertices), first, head[order], np.tile(np.arange(len(pairs)), 2)[order])
     centre = np.arange(len(vertices)) if centres is None else np.sort(centres)
     blocks = np.array_split(centre, max(1, len(centre) * len(vertices) // _MAX_PAIRS_AT_ONCE))
-    found, reached = [], []
-    for block in blocks:
-        pieces, points = _search(graph, block, radius)
-        found.append(pieces)
-        reached.append(points)
-    c, p, q, e, inside = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+    found, reached = zip(*(_search(graph, block, radius) for block in blocks), strict=True)
+    *pieces, inside = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
     centre_of, vertex = (np.concatenate(arrays) for arrays in zip(*reached, strict=True))
-    vertices_inside = (centre_of, vertex, vertex, np.full(len(vertex), -1))
-    c0, p0, q0, e0 = (
-        np.concatenate([own, leaving[~inside]]) for own, leaving in zip(vertices_inside, (c, p, q, e), strict=True)
-    )
-    return _sorted(len(vertices), radius, c, p, q, e), _sorted(len(vertices), radius, c0, p0, q0, e0)
+    within = centre_of, vertex, vertex, np.full(len(vertex), -1)
+    points = [np.concatenate([own, leaving[~inside]]) for own, leaving in zip(within, pieces, strict=True)]
+    return _sorted(len(vertices), radius, *pieces), _sorted(len(vertices), radius, *points)
 
 
 class _Graph(NamedTuple):
@@ -87,7 +75,7 @@ def _search(graph: _Graph, centres: np.ndarray, radius: float) -> tuple[tuple[np
     row, at = np.arange(len(centres)), centres
     reached = np.zeros(len(centres) * count, bool)
     reached[row * count + at] = True
-    # Of several edges that reach a vertex in one step, the last one that is written here is taken.
+    # If several edges reach a vertex in one step, the last one that is written here is taken.
     last = np.empty(len(reached), np.int32)
     found, points = [], [(centres, centres)]
     while len(row):
@@ -111,36 +99,26 @@ def _search(graph: _Graph, centres: np.ndarray, radius: float) -> tuple[tuple[np
 
 
 def _sorted(count: int, radius: float, *pieces: np.ndarray) -> Neighbourhoods:
+    """Sort pieces by their centres, and pad them to one of four sizes per octave."""
     order = np.argsort(pieces[0], kind="stable")
-    c, p, q, e = (array[order].astype(np.int32) for array in pieces)
-    return filled(Neighbourhoods(c, p, q, e, radius), _rounded(len(c)), count)
+    step = 1 << max(0, len(order).bit_length() - 3)
+    balls = Neighbourhoods(*(array[order].astype(np.int32) for array in pieces), radius=radius)
+    return filled(balls, -(-len(order) // step) * step, count)
 
 
 def filled(balls: Neighbourhoods, pieces: int, count: int) -> Neighbourhoods:
     """Pad neighbourhoods to `pieces` pieces, on a mesh of `count` vertices."""
-    padding = pieces - len(balls.centre)
-    c, p, q, e = (
-        np.concatenate([array, np.full(padding, value, np.int32)])
-        for array, value in zip(balls[:4], (count, 0, 0, -1), strict=True)
-    )
-    return Neighbourhoods(c, p, q, e, balls.radius)
-
-
-def _rounded(size: int) -> int:
-    """Round up to one of four sizes per octave."""
-    step = 1 << max(0, size.bit_length() - 3)
-    return -(-size // step) * step
+    fill = zip(balls[:4], (count, 0, 0, -1), strict=True)
+    padded = (np.pad(array, (0, pieces - len(array)), constant_values=value) for array, value in fill)
+    return Neighbourhoods(*padded, radius=balls.radius)
 
 
 def share_inside(x: Float[Array, "vertices 3"], pieces: Neighbourhoods) -> Float[Array, " pieces"]:
     """Share of each edge that lies in its ball, 0 to 1, at positions near those that `pieces` was made for."""
     along, out = x[pieces.head] - x[pieces.tail], x[pieces.tail] - x[pieces.centre]
-    a, b, c = (
-        jnp.sum(along**2, axis=1),
-        jnp.sum(along * out, axis=1),
-        jnp.sum(out**2, axis=1) - jnp.asarray(pieces.radius).astype(x.dtype) ** 2,
-    )
+    a, b = jnp.sum(along**2, axis=1), jnp.sum(along * out, axis=1)
+    c = jnp.sum(out**2, axis=1) - jnp.asarray(pieces.radius).astype(x.dtype) ** 2
     discriminant = b**2 - a * c
-    sound: Bool[Array, " pieces"] = (a > 0) & (discriminant > 0)
+    sound = (a > 0) & (discriminant > 0)
     root = jnp.sqrt(jnp.where(sound, discriminant, 1))
     return jnp.where(sound, jnp.clip((root - b) / jnp.where(sound, a, 1), 0, 1), 1)

@@ -1,14 +1,14 @@
 """How different two meshes look: pictures of both, compared by metrics of images.
 
 Both are seen from six sides under three lights, one of which grazes what faces the eye, with flat and with smooth
-shading. That is slow, and what is seen depends on sides and lights; it is a check on metrics of the surface.
+shading. The result is slow, and depends on sides and lights; it is a check on metrics of the surface.
 """
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64
 
 from jaxmark.extras import require
 from jaxmark.geometry.mesh import Mesh, host_mesh
@@ -34,16 +34,11 @@ class Difference(NamedTuple):
 
 
 def flip(original: Mesh, distorted: Mesh, size: int = SIZE) -> Difference:
-    """Compare pictures by FLIP, 0 to 1: the difference that is seen when they are shown in turn.
+    """Compare pictures of two meshes in the same place by FLIP, 0 to 1: the difference seen when they are alternated.
 
     Reference: Andersson, Nilsson, Akenine-Möller, Oskarsson, Åström, Fairchild, "FLIP: a difference evaluator for
     alternating images", Proceedings of the ACM on Computer Graphics and Interactive Techniques 3(2), 2020, by the
-    authors' program, for 67 pixels per degree.
-
-    Args:
-        original: any mesh.
-        distorted: another mesh, in the same place.
-        size: pixels on each side of a picture.
+    authors' program, for 67 pixels per degree. Pictures have `size` pixels on each side.
 
     Raises:
         JaxmarkError: if flip-evaluator or libigl is missing.
@@ -58,15 +53,11 @@ def flip(original: Mesh, distorted: Mesh, size: int = SIZE) -> Difference:
 
 
 def ssim(original: Mesh, distorted: Mesh, size: int = SIZE) -> Difference:
-    """Compare pictures by structural similarity: 1 - SSIM, 0 for equal pictures.
+    """Compare pictures of two meshes in the same place by structural similarity: 1 - SSIM, 0 for equal pictures.
 
     Reference: Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment: from error visibility to structural
-    similarity", IEEE Transactions on Image Processing 13(4), 2004, with its Gaussian windows, by scikit-image.
-
-    Args:
-        original: any mesh.
-        distorted: another mesh, in the same place.
-        size: pixels on each side of a picture.
+    similarity", IEEE Transactions on Image Processing 13(4), 2004, with its Gaussian windows, by scikit-image. Pictures
+    have `size` pixels on each side.
 
     Raises:
         JaxmarkError: if scikit-image or libigl is missing.
@@ -82,13 +73,11 @@ def ssim(original: Mesh, distorted: Mesh, size: int = SIZE) -> Difference:
     return _compare(original, distorted, size, compared)
 
 
-def lambert(raster: Raster, light: Float64[np.ndarray, "3"], *, smooth: bool) -> Float64[np.ndarray, "rows columns"]:
+def lambert(raster: Raster, light: Float64[np.ndarray, "3"], *, smooth: bool) -> Gray:
     """Shade a picture by Lambert's law, as values for a screen (sRGB); black where no light falls, or no object is.
 
-    Args:
-        raster: what the pixels show.
-        light: unit vector to the light, in the camera's directions.
-        smooth: whether normals are interpolated between vertices.
+    `light` is the unit vector to the light, in the camera's directions. Smooth shading interpolates normals between
+    vertices.
     """
     linear = np.clip(raster.normals(smooth=smooth) @ light, 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
@@ -102,10 +91,8 @@ def _compare(original: Mesh, distorted: Mesh, size: int, compared: Callable[[Gra
     return Difference(float(values.mean()), float(np.percentile(values, _PERCENTILE)))
 
 
-def _pictures(
-    original: Mesh, distorted: Mesh, size: int
-) -> Iterator[tuple[Bool[np.ndarray, "rows columns"], Gray, Gray]]:
-    """Which pixels show the object, and pictures of both meshes, from each side.
+def _pictures(original: Mesh, distorted: Mesh, size: int) -> Iterator[tuple[np.ndarray, Gray, Gray]]:
+    """Yield the mask of the pixels that show the object, and pictures of both meshes, for each side.
 
     Those by each light, flat and smooth, lie side by side in one, because programs take long to begin with a picture.
     """
@@ -122,12 +109,7 @@ def _pictures(
         yield np.hstack([shown[part]] * len(ways)), first, second
 
 
-def _around(shown: Bool[np.ndarray, "rows columns"]) -> tuple[slice, slice]:
+def _around(shown: Bool[np.ndarray, "rows columns"]) -> tuple[slice, ...]:
     """The part of a picture that shows something, with a margin for the filters of metrics."""
-    rows, columns = (np.flatnonzero(shown.any(axis=axis)) for axis in (1, 0))
-    return _extent(rows), _extent(columns)
-
-
-def _extent(places: Int64[np.ndarray, " places"]) -> slice:
-    first, last = (places[0], places[-1]) if len(places) else (0, 0)
-    return slice(max(int(first) - _MARGIN, 0), int(last) + _MARGIN + 1)
+    parts = (np.append(np.flatnonzero(shown.any(axis=axis)), [] if shown.any() else [0]) for axis in (1, 0))
+    return tuple(slice(max(int(part[0]) - _MARGIN, 0), int(part[-1]) + _MARGIN + 1) for part in parts)

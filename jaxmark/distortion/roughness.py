@@ -9,13 +9,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
-from jaxmark.distortion.roots import root
+from jaxmark.distortion.norms import PerVertex, Positions, Scalar, lengths, ratio
 from jaxmark.geometry.mesh import boundary_vertices
 
 POWER = 0.15  # exponent by which roughness is modulated
-_SLOPE_ABOVE_MEAN = 0.5  # factor of what of a modulated roughness exceeds that of the mean
+_SLOPE_ABOVE_MEAN = 0.5  # factor on the part of a modulated roughness above the mean's
 MIN_ROUGHNESS, MAX_ROUGHNESS = 5e-4, 0.2  # roughness is clipped to these, in radians
 _MAX_OVER_MEAN = 5.0  # the upper bound is at least this many times the mean
 _HALF_COTANGENTS = (1e-3, 1e3)  # range to which half cotangents are clipped
@@ -25,35 +25,25 @@ _SCALE = 8.0  # brings the distance into [0, 1]
 class Rough(NamedTuple):
     """Roughness of a surface at its vertices."""
 
-    roughness: Float[Array, " vertices"]  # in radians; see `local_roughness`
-    area: Float[Array, " vertices"]  # a third of the area of the faces around
+    roughness: PerVertex  # in radians; see `local_roughness`
+    area: PerVertex  # a third of the area of the faces around
 
 
-def local_roughness(
-    x: Float[Array, "vertices 3"],
-    faces: Int[Array | np.ndarray, "faces 3"],
-    boundary: Bool[np.ndarray, " vertices"] | None = None,
-) -> Rough:
+def local_roughness(x: Positions, faces: Int[Array | np.ndarray, "faces 3"]) -> Rough:
     """Difference of each vertex's absolute angle defect from the cotangent-weighted mean of its neighbours'.
 
-    Args:
-        x: positions.
-        faces: vertex indices.
-        boundary: mask of the boundary vertices, at which flat angles sum to π; computed unless given.
+    Flat angles sum to π at the vertices of the boundary.
     """
-    if boundary is None:
-        boundary = np.isin(np.arange(len(x)), boundary_vertices(np.asarray(faces)))
+    boundary = np.isin(np.arange(len(x)), boundary_vertices(np.asarray(faces)))
     return _local_roughness(x, jnp.asarray(faces), jnp.asarray(boundary))
 
 
 @jax.jit
-def _local_roughness(
-    x: Float[Array, "vertices 3"], faces: Int[Array, "faces 3"], boundary: Bool[Array, " vertices"]
-) -> Rough:
+def _local_roughness(x: Positions, faces: Int[Array, "faces 3"], boundary: Bool[Array, " vertices"]) -> Rough:
     corners = x[faces]
     u, v = jnp.roll(corners, -1, axis=1) - corners, jnp.roll(corners, -2, axis=1) - corners
     cosine, cross = jnp.sum(u * v, axis=2), jnp.cross(u[:, 0], v[:, 0])
-    sine = root(jnp.sum(cross**2, axis=1))[:, None]  # each corner's sine, up to the same factor as its cosine
+    sine = lengths(cross)[:, None]  # each corner's sine, up to the same factor as its cosine
     sound = (sine > 0) | (cosine != 0)
     angle = jnp.arctan2(jnp.where(sound, sine, 0), jnp.where(sound, cosine, 1))
     half = jnp.clip(cosine / jnp.where(sine > 0, sine, 1) / 2, *_HALF_COTANGENTS)
@@ -64,36 +54,29 @@ def _local_roughness(
     start, end = jnp.roll(faces, -1, axis=1), jnp.roll(faces, -2, axis=1)
     total = zeros.at[start].add(half).at[end].add(half)
     around = zeros.at[start].add(half * defect[end]).at[end].add(half * defect[start])
-    used = total > 0
-    rough = jnp.abs(jnp.where(used, defect - around / jnp.where(used, total, 1), 0))
+    rough = jnp.abs(jnp.where(total > 0, defect - ratio(around, total), 0))
     return Rough(rough, zeros.at[faces].add(jnp.broadcast_to(sine / 6, angle.shape)))
 
 
 @jax.jit
-def fmpd(first: Rough, second: Rough) -> Float[Array, ""]:
+def fmpd(first: Rough, second: Rough) -> Scalar:
     """Fast mesh perceptual distance, 0 to 1: how much rougher one surface is than another as a whole.
 
     Connectivities may differ. The metric is nearly blind to slow waves, so do not rely on it alone for a mark of low
     frequencies.
-
-    Args:
-        first: from `local_roughness`, of one mesh.
-        second: likewise, of the other mesh.
     """
     means = jnp.minimum(*(_mean(rough.roughness, rough.area) for rough in (first, second)))
     floor = MIN_ROUGHNESS**POWER
     turn = jnp.maximum(means, MIN_ROUGHNESS) ** POWER - floor
 
+    most = jnp.maximum(MAX_ROUGHNESS, _MAX_OVER_MEAN * means)
+
     def overall(rough: Rough) -> Array:
-        value = (
-            jnp.clip(rough.roughness, MIN_ROUGHNESS, jnp.maximum(MAX_ROUGHNESS, _MAX_OVER_MEAN * means)) ** POWER
-            - floor
-        )
+        value = jnp.clip(rough.roughness, MIN_ROUGHNESS, most) ** POWER - floor
         return _mean(jnp.where(value > turn, turn + _SLOPE_ABOVE_MEAN * (value - turn), value), rough.area)
 
     return jnp.minimum(_SCALE * jnp.abs(overall(first) - overall(second)), 1)
 
 
 def _mean(values: Array, weights: Array) -> Array:
-    total = weights.sum()
-    return jnp.sum(values * weights) / jnp.where(total > 0, total, 1)
+    return ratio(jnp.sum(values * weights), weights.sum())

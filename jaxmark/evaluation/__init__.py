@@ -4,7 +4,6 @@
 must survive, `tune_blind` width and step of a mark that is read without the original.
 """
 
-from jaxmark.evaluation import pictures as pictures
 from jaxmark.evaluation._rates import Control as Control
 from jaxmark.evaluation._rates import Row as Row
 from jaxmark.evaluation._rates import rates as rates
@@ -12,9 +11,9 @@ from jaxmark.evaluation._robustness import Outcome as Outcome
 from jaxmark.evaluation._robustness import Robustness as Robustness
 from jaxmark.evaluation._robustness import minimum_distortion as minimum_distortion
 from jaxmark.evaluation._robustness import robustness as robustness
-from jaxmark.evaluation.blind_tuning import TunedBlind as TunedBlind
-from jaxmark.evaluation.blind_tuning import tune_blind as tune_blind
-from jaxmark.evaluation.results import Results as Results
 from jaxmark.evaluation.study import Study as Study
+from jaxmark.evaluation.study_results import Results as Results
 from jaxmark.evaluation.tuning import Tuned as Tuned
+from jaxmark.evaluation.tuning import TunedBlind as TunedBlind
 from jaxmark.evaluation.tuning import tune as tune
+from jaxmark.evaluation.tuning import tune_blind as tune_blind

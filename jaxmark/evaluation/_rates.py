@@ -57,16 +57,17 @@ def rates(rows: Iterable[Row], by: Sequence[str] = (*POINT, "control"), level: f
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault(tuple(getattr(row, name) for name in by), []).append(row)
-    found = []
-    for values, group in groups.items():
-        rate: dict[str, Any] = {**dict(zip(by, values, strict=True)), "trials": len(group)}
-        for name in ("read", "detected"):
-            rate[name] = sum(getattr(row, name) for row in group)
-            interval = clopper_pearson(rate[name], len(group), level)
-            rate[f"{name}_low"], rate[f"{name}_high"] = float(interval.low), float(interval.high)
-        rate["bit_errors"] = float(np.mean([row.bit_errors for row in group]))
-        for name in ("log10_p", "log10_p_unfloored"):
-            p = [getattr(row, name) for row in group]
-            rate |= {name: float(np.median(p)), f"{name}_least": min(p), f"{name}_largest": max(p)}
-        found.append(rate)
-    return found
+    return [{**dict(zip(by, values, strict=True)), **_rate(group, level)} for values, group in groups.items()]
+
+
+def _rate(rows: list[Row], level: float) -> dict[str, Any]:
+    rate: dict[str, Any] = {"trials": len(rows)}
+    for name in ("read", "detected"):
+        rate[name] = sum(getattr(row, name) for row in rows)
+        interval = clopper_pearson(rate[name], len(rows), level)
+        rate |= {f"{name}_low": float(interval.low), f"{name}_high": float(interval.high)}
+    rate["bit_errors"] = float(np.mean([row.bit_errors for row in rows]))
+    for name in ("log10_p", "log10_p_unfloored"):
+        p = [getattr(row, name) for row in rows]
+        rate |= {name: float(np.median(p)), f"{name}_least": min(p), f"{name}_largest": max(p)}
+    return rate

@@ -1,4 +1,4 @@
-"""What a mark survives: attacks of rising strength, and what is still read after each."""
+"""Robustness of a mark: readings after attacks of rising strength, and the least distortion that removes it."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -18,7 +18,7 @@ from jaxmark.watermark.markers import Marker
 
 
 class Outcome(NamedTuple):
-    """What is read from one suspect, compared with what was written."""
+    """The reading of one suspect, compared with the message that was written."""
 
     read: bool  # the exact message was read, and its tag fits
     wrong: bool  # another message was read, whose tag fits
@@ -28,7 +28,7 @@ class Outcome(NamedTuple):
 
 
 class Robustness(NamedTuple):
-    """What is read in each sample at each strength; a refused suspect counts as not read."""
+    """The readings of each sample at each strength; a refused suspect counts as not read."""
 
     strengths: Float64[np.ndarray, " strengths"]
     success: Bool[np.ndarray, "strengths samples"]  # whether the exact message was read
@@ -54,12 +54,9 @@ class Breaking(NamedTuple):
     curve: tuple[Trial, ...]  # all trials, weak ones first
 
     def cost(self, metric: str) -> float:
-        """The attack's distortion over the mark's own.
+        """The attack's distortion over the mark's own, by a metric (a field of `Comparison`) that was measured.
 
         It is infinite if the attack does not succeed, and NaN if its distortion is unknown or the mark has none.
-
-        Args:
-            metric: a field of `Comparison` that was measured.
         """
         if self.weakest is None:
             return math.inf
@@ -72,8 +69,10 @@ NOTHING = Outcome(False, False, 0.5, 0.0, 0.0)  # the reading of a refused suspe
 
 def compare_with(message: bytes, marker: Marker, found: Detection) -> Outcome:
     """Compare what a marker read with the message that was written."""
-    said = marker.guess(found)
-    wrong = 0.5 if said is None else float(np.mean(_bits(said) != _bits(message)))
+    guess, wrong = marker.guess(found), 0.5
+    if guess is not None:
+        read, written = (np.unpackbits(np.frombuffer(one, np.uint8)) for one in (guess, message))
+        wrong = float(np.mean(read != written))
     other = found.message not in (None, message)
     return Outcome(found.message == message, other, wrong, found.log10_p, found.evidence.log10_p_unfloored)
 
@@ -118,14 +117,8 @@ def robustness(
         return np.array([[getattr(reading, name) for reading, _ in row] for row in rows])
 
     refusals = tuple(tuple(sentence for _, sentence in row) for row in rows)
-    return Robustness(
-        np.array(strengths, float),
-        column("read"),
-        column("bit_errors"),
-        column("log10_p"),
-        column("log10_p_unfloored"),
-        refusals,
-    )
+    numbers = map(column, ("read", "bit_errors", "log10_p", "log10_p_unfloored"))
+    return Robustness(np.array(strengths, float), *numbers, refusals=refusals)
 
 
 def minimum_distortion(
@@ -144,16 +137,10 @@ def minimum_distortion(
     The attack succeeds if not even a claim of the message is proven, or if the suspect is refused. Success is assumed
     to be monotonic between the weakest and the strongest usual strength, which holds for one seed.
 
-    Args:
-        marker: the reader: original, key, payload and scheme.
-        marked: the mesh with the message in it.
-        message: the message that was written.
-        kind: a name in `ATTACKS`, or an `Attack` of your own; its usual strengths bound the search.
-        alpha: false-positive probability at which the reader detects, in (0, 1).
-        metrics: the metrics of `distortion.METRICS` by which distortion is measured.
-        seed: seed of the attack's random choices.
-        tolerance: ratio of strengths, minus 1, at which the bisection ends; strengths that are whole numbers are
-            bisected to a difference of 1.
+    The reader detects at the false-positive probability `alpha`, in (0, 1). The bisection, between the usual strengths
+    of the attack, ends at a ratio of strengths of 1 + `tolerance`, or at a difference of 1 if they are whole numbers.
+    Metrics are names in `distortion.METRICS`; `seed` is that of the attack's random choices. For the other parameters
+    see `robustness`.
 
     Raises:
         JaxmarkError: if there is no such attack or metric, or a number is out of range.
@@ -177,15 +164,10 @@ def minimum_distortion(
     if not detects(strong) and detects(weak):
         held, broken = weak, strong
         while abs(math.log(broken / held)) > math.log1p(tolerance):
-            middle = math.sqrt(held * broken)
-            middle = float(round(middle)) if whole else middle
+            middle = float(round(math.sqrt(held * broken))) if whole else math.sqrt(held * broken)
             if middle in (held, broken):
                 break
             held, broken = (middle, broken) if detects(middle) else (held, middle)
     trials.sort(key=lambda one: one.strength, reverse=strong < weak)
     weakest = next((one for one in trials if one.log10_p > math.log10(alpha)), None)
     return Breaking(compare(marker.original.mesh, marked, metrics), weakest, tuple(trials))
-
-
-def _bits(message: bytes) -> np.ndarray:
-    return np.unpackbits(np.frombuffer(message, np.uint8))

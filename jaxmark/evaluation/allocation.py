@@ -1,12 +1,13 @@
-"""Strengths per band that leave most after the worst of several attacks, for given channels, by jaxopt.
+"""Strengths per band that leave most after the worst of several attacks, for given channels.
 
-This is the only module that imports jaxopt, and only when it is called. The problem is concave: `allocate` solves it
-and is differentiable, `upper_bound` says how much better other strengths could be.
+The problem is concave: `allocate` solves it and is differentiable, `upper_bound` says how much better other strengths
+could be. This is the only module that imports jaxopt, and only when it is called.
 """
 
 import warnings
+from collections.abc import Callable
 from functools import partial
-from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,21 +19,23 @@ from scipy import optimize
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.channels import Channels, Margin, margins
 
+Bands = Float[Array, " bands"]
+
 _ANNEALING_SHARES = (0.01, 0.1)  # of the final sharpness, in the stages before the last
 _BALANCING_ROUNDS = 30  # in which several limits are weighed against each other
 
 
 def allocate(
     channels: Channels,
-    cost: Float[Array, " bands"],
+    cost: Bands,
     budget: float | Float[Array, ""] = 1.0,
     *,
     margin: Margin = "rate",
     cap: float = 1.0,
     sharpness: float = 100.0,
     steps: int = 500,
-    start: Float[Array, " bands"] | None = None,
-) -> Float[Array, " bands"]:
+    start: Bands | None = None,
+) -> Bands:
     """Strengths per band that maximise the worst attack's margin under Σ_j cost_j β_j² = budget²; traceable.
 
     The problem is solved by projected gradients for the bands' shares of the budget, which lie on a simplex cut off at
@@ -44,7 +47,7 @@ def allocate(
         channels: channels of the attacks to survive.
         cost: cost of each band at β = 1, positive; if it is the mean square displacement, the budget is an RMS.
         budget: root of the total cost.
-        margin: see `jaxmark.evaluation.channels.margins`.
+        margin: see `channels.margins`.
         cap: the largest share of the budget that one band gets, at least 1/bands.
         sharpness: sharpness of the soft minimum.
         steps: largest number of iterations.
@@ -71,51 +74,61 @@ def allocate(
     first = jnp.full_like(cost, 1 / bands) if start is None else cost * jnp.asarray(start, cost.dtype) ** 2
     first = _capped_simplex(first / first.sum(), min(cap, 1.0))
     numbers = (jnp.asarray(budget, cost.dtype), jnp.asarray(sharpness, cost.dtype))
-    return _allocate(channels, cost, *numbers, first, margin, min(cap, 1.0), steps)
+    return _allocate(channels, cost, numbers, first, margin, min(cap, 1.0), steps)
 
 
 @partial(jax.jit, static_argnames=("margin", "cap", "steps"))
 def _allocate(
-    channels: Channels,
-    cost: Array,
-    budget: Array,
-    sharpness: Array,
-    first: Array,
-    margin: Margin,
-    cap: float,
-    steps: int,
+    channels: Channels, cost: Array, numbers: tuple[Array, Array], first: Array, margin: Margin, cap: float, steps: int
 ) -> Array:
-    jaxopt = import_jaxopt()
+    budget, sharpness = numbers
     # A band's share of the budget buys this much β².
     scaled = channels._replace(gain=channels.gain * budget / jnp.sqrt(cost))
     level = 1 / margins(scaled, jnp.full_like(cost, 1 / len(cost)), margin).mean()
 
-    # jaxopt differentiates its solution with respect to arguments, not to what a closure holds.
     def loss(shares: Array, scaled: Channels, level: Array, sharpness: Array) -> Array:
         return jax.nn.logsumexp(-sharpness * level * margins(scaled, shares, margin)) / sharpness
 
-    simplex = jaxopt.ProjectedGradient(
-        fun=loss,
-        projection=lambda x, _: _capped_simplex(x, cap),
-        maxiter=steps,
-        tol=1e-7,
-        acceleration=False,
-    )
-    run = partial(simplex.run, hyperparams_proj=None)
-
     def stage(shares: Array, share: Array) -> tuple[Array, None]:
-        return run(shares, scaled=scaled, level=level, sharpness=share * sharpness).params, None
+        data = {"scaled": scaled, "level": level, "sharpness": share * sharpness}
+        project, options = partial(_capped_simplex, cap=cap), {"maxiter": steps, "tol": 1e-7, "acceleration": False}
+        return minimise(loss, project, shares, data, **options), None
 
-    with jax.numpy_dtype_promotion("standard"):  # jaxopt mixes integers into its floats
-        warm = jax.lax.stop_gradient(jax.lax.scan(stage, first, jnp.asarray(_ANNEALING_SHARES, first.dtype))[0])
-        shares = stage(warm, jnp.ones_like(sharpness))[0]
+    warm = jax.lax.stop_gradient(jax.lax.scan(stage, first, jnp.asarray(_ANNEALING_SHARES, first.dtype))[0])
+    shares = stage(warm, jnp.ones_like(sharpness))[0]
     # The root's slope at an empty band is infinite: select before it. NaN is not empty, and stays.
     empty = shares <= 0
     return jnp.where(empty, 0, budget * jnp.sqrt(jnp.where(empty, 1, shares) / cost))
 
 
+def minimise(
+    loss: Callable[..., Array],
+    project: Callable[[Array], Array],
+    start: Array,
+    data: dict[str, Any] | None = None,
+    **options: Any,
+) -> Array:
+    """Minimise a function over a convex set by projected gradients; call it in compiled code, because jaxopt retraces.
+
+    Args:
+        loss: function of a point and of `data`, by which jaxopt differentiates its solution; a closure's values do not
+            count.
+        project: projection onto the set.
+        start: a point of the set.
+        data: keyword arguments of `loss`.
+        options: options of `jaxopt.ProjectedGradient`.
+    """
+    with warnings.catch_warnings():
+        # It says at import that nobody maintains it; no maintained library solves constrained problems in JAX.
+        warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
+        import jaxopt
+    with jax.numpy_dtype_promotion("standard"):  # jaxopt mixes integers into its floats
+        solver = jaxopt.ProjectedGradient(loss, lambda x, _: project(x), **options)
+        return solver.run(start, hyperparams_proj=None, **(data or {})).params
+
+
 @partial(jax.jit, static_argnames="cap")
-def _capped_simplex(x: Float[Array, " bands"], cap: float) -> Float[Array, " bands"]:
+def _capped_simplex(x: Bands, cap: float) -> Bands:
     """Project onto Σ_j s_j = 1, 0 ≤ s_j ≤ cap: subtract one level from all, and clip."""
 
     def halve(_: Array | int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -146,8 +159,13 @@ def upper_bound(
     # In shares s = cost · p of the budget, of which slope · s is the SNR.
     half, slope = dimensions / 2, gain**2 / noise / cost
 
+    def worth(shares: np.ndarray) -> np.ndarray:
+        """Each attack's margin in each band."""
+        snr = slope * shares
+        return half * {"rate": np.log2(1 + snr), "evidence": snr / (1 + snr), "snr": snr}[margin]
+
     def rising(shares: np.ndarray) -> np.ndarray:
-        """Derivative of each attack's margin in each band."""
+        """The derivative of `worth`."""
         snr = slope * shares
         each = {"rate": 1 / (1 + snr) / np.log(2), "evidence": 1 / (1 + snr) ** 2, "snr": np.ones_like(snr)}
         return half * slope * each[margin]
@@ -161,23 +179,19 @@ def upper_bound(
             low, high = np.where(worthwhile, middle, low), np.where(worthwhile, high, middle)
         return low
 
-    def by_attack(shares: np.ndarray) -> np.ndarray:
-        snr = slope * shares
-        return (half * {"rate": np.log2(1 + snr), "evidence": snr / (1 + snr), "snr": snr}[margin]).sum(axis=1)
-
     def bound(variables: np.ndarray) -> tuple[float, np.ndarray]:
         weights = np.exp(variables[:-1] - variables[:-1].max())
         weights /= weights.sum()
         price = float(np.exp(variables[-1]))
         shares = spent(weights, price)
-        values = by_attack(shares)
+        values = worth(shares).sum(axis=1)
         total = float(weights @ values + price * (1 - shares.sum()))
         return total, np.append(weights * (values - weights @ values), price * (1 - shares.sum()))
 
-    even = by_attack(np.full(len(cost), 1 / len(cost)))
+    even = worth(np.full(len(cost), 1 / len(cost))).sum(axis=1)
     start = np.append(np.zeros(len(gain)), np.log(max(even.min(), 1e-300)))
     best = np.inf
-    # The bound holds at every trial, so the least of all counts; a bend of it can stop a search, so it starts again.
+    # The bound holds at every trial, so the least of all counts; a kink of it can stop a search, so it starts again.
     for _ in range(20):
         found = optimize.minimize(bound, start, jac=True, method="L-BFGS-B", options={"maxiter": 500})
         improved, best, start = found.fun < best * (1 - 1e-6), min(best, float(found.fun)), found.x
@@ -199,29 +213,18 @@ def balance(
     keeps all limits are found by raising those of limits that are exceeded.
     """
     weights, dtype = np.full(len(cost), 1 / len(cost)), channels.gain.dtype
-    best: tuple[float, np.ndarray, np.ndarray] | None = None
+    best = -np.inf, np.zeros(len(cost[0])), weights
     for _ in range(_BALANCING_ROUNDS if len(cost) > 1 else 1):
         given = None if start is None else jnp.asarray(start, dtype)
-        mixed = jnp.asarray(weights @ cost, dtype)
-        solved = allocate(channels, mixed, margin=margin, cap=cap, start=given)
+        solved = allocate(channels, jnp.asarray(weights @ cost, dtype), margin=margin, cap=cap, start=given)
         power = np.asarray(solved, np.float64) ** 2
         used = cost @ power
         power /= used.max()
         worst = float(margins(channels, jnp.asarray(power, dtype), margin).min())
-        if best is None or worst > best[0]:
+        if not worst <= best[0]:
             best = worst, np.sqrt(power), weights
         if used.max() < 1.001:
             break
         start, weights = np.sqrt(power), weights * used**0.5
         weights = weights / weights.sum()
-    assert best is not None
     return best[1], best[2]
-
-
-def import_jaxopt() -> ModuleType:
-    """Import jaxopt, without its warning."""
-    with warnings.catch_warnings():
-        # It says at import that nobody maintains it; no maintained library solves constrained problems in JAX.
-        warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
-        import jaxopt
-    return jaxopt

@@ -8,7 +8,7 @@ import multiprocessing
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, suppress
 from functools import partial
@@ -27,9 +27,7 @@ _MAX_BROKEN_POOLS = 3  # in a row, without finishing a cell
 def processes(workers: int, begin: Callable[[], object] | None = None) -> Callable[[], ProcessPoolExecutor]:
     """Return a maker of pools of processes, which are spawned because forks of a started JAX would hang.
 
-    Args:
-        workers: number of processes.
-        begin: what each calls before its first work, a function at the top level of a module.
+    Each process calls `begin`, a function at the top level of a module, before its first work.
     """
     return lambda: ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin, (begin,))
 
@@ -60,7 +58,7 @@ def run(
             breaks, as a pool does when a process is killed.
         output: file of JSON lines, `{"cell": [...], ...}`, each written to disk at once. It may hold other cells, too.
         say: function that is called with a line about the progress after each cell.
-        name: what to call a cell in such a line.
+        name: the name of a cell in such a line.
 
     Returns:
         The rows of the cells in their order, including those of earlier runs.
@@ -72,9 +70,9 @@ def run(
     target, broken, start, count = Path(output), 0, time.monotonic(), None
     if isinstance(pool, int):
         pool = processes(pool) if pool > 1 else partial(ThreadPoolExecutor, 1)
-    while left := _unfinished(cells, target):
-        count = len(left) if count is None else count
-        missing = len(left)
+    rows = _finished_rows(target)
+    while left := [cell for cell in cells if cell not in rows]:
+        count, missing = count or len(left), len(left)
         try:
             with pool() as executor:
                 futures = {executor.submit(work, cell): cell for cell in left}
@@ -96,8 +94,12 @@ def run(
                     f"{broken} pools of workers broke without finishing a cell of {missing}{first}: {error}"
                 ) from None
             say(f"{error} A new pool goes on.")
-    rows = {_cell(row): row for row in load_finished(target)}
+        rows = _finished_rows(target)
     return [rows[cell] for cell in cells]
+
+
+def _finished_rows(output: Path) -> dict[Cell, dict[str, Any]]:
+    return {tuple(row["cell"]): row for row in load_finished(output)}
 
 
 def left_over(seconds: float) -> str:
@@ -125,11 +127,6 @@ def load_finished(output: str | os.PathLike[str]) -> list[dict[str, Any]]:
     return [_row(line, path, number) for number, line in enumerate(whole.splitlines(), 1)]
 
 
-def _unfinished(cells: Iterable[Cell], output: Path) -> list[Cell]:
-    there = {_cell(row) for row in load_finished(output)}
-    return [cell for cell in cells if cell not in there]
-
-
 def _row(line: bytes, path: Path, number: int) -> dict[str, Any]:
     row: Any = None
     with suppress(ValueError, RecursionError):
@@ -138,10 +135,6 @@ def _row(line: bytes, path: Path, number: int) -> dict[str, Any]:
     if not isinstance(cell, list) or not all(isinstance(value, str | int | float) for value in cell):
         raise JaxmarkError(f"Line {number} of {path} is no row of a study; delete that line to have it done again.")
     return row
-
-
-def _cell(row: Row) -> Cell:
-    return tuple(row["cell"])
 
 
 def append(output: Path, row: Row) -> None:

@@ -1,4 +1,4 @@
-"""What attacks leave of a mark in each band: parallel Gaussian channels, and how much they transmit.
+"""The parts of a mark that attacks leave in each band: parallel Gaussian channels, and how much they transmit.
 
 The bands f_j ≥ 0 with Σ_j f_j = 1 share each eigenvector's energy: ⟨u, v⟩ = Σ_j ⟨u, f_j(Δ)v⟩. Everything is computed
 from moments, in O(N) memory for any number of bands.
@@ -24,7 +24,7 @@ _MIN_BAND_DIMENSIONS = 3  # the variance in a band cannot be estimated from fewe
 
 
 class Channels(NamedTuple):
-    """What attacks do to a mark of strength β_j in band j: SNR_aj = gain_aj² β_j² / noise_aj in each dimension."""
+    """The effect of attacks on a mark of strengths β_j in bands j: SNR_aj = gain_aj² β_j² / noise_aj per dimension."""
 
     gain: Float[Array, "attacks bands"]  # share of the band's amplitude that the attack leaves
     noise: Float[Array, "attacks bands"]  # variance that it adds to each dimension, in units of β², positive
@@ -34,17 +34,14 @@ class Channels(NamedTuple):
 def margins(channels: Channels, power: Float[Array, " bands"], margin: Margin = "rate") -> Float[Array, " attacks"]:
     """Compute how much of a mark with powers β_j² remains readable after each attack; concave in the powers.
 
-    Args:
-        channels: the channels of the attacks.
-        power: β_j², `[bands]`.
-        margin: the measure. `"rate"`, in bits: Σ_j (n_j/2) log₂(1 + SNR_j), the capacity of parallel Gaussian channels
-            (Cover, Thomas, "Elements of Information Theory", 9.4). `"evidence"`, in nats: Σ_j (n_j/2) SNR_j/(1 +
-            SNR_j), the value of S²/2‖a‖² for a claimed message (`bounds.log10_p_score`), as ‖a‖ contains the mark as
-            well as the noise. `"snr"`: Σ_j (n_j/2) SNR_j, the limit of both for weak marks, up to the unit; it is
-            brittle, because its optimum lies in as many bands as there are attacks.
+    The measure is one of:
 
-    Returns:
-        One number for each attack, `[attacks]`.
+    - `"rate"`, in bits: Σ_j (n_j/2) log₂(1 + SNR_j), the capacity of parallel Gaussian channels (Cover, Thomas,
+      "Elements of Information Theory", 9.4);
+    - `"evidence"`, in nats: Σ_j (n_j/2) SNR_j/(1 + SNR_j), the value of S²/2‖a‖² for a claimed message
+      (`bounds.log10_p_score`), as ‖a‖ contains the mark as well as the noise;
+    - `"snr"`: Σ_j (n_j/2) SNR_j, the limit of both for weak marks, up to the unit; it is brittle, because its optimum
+      lies in as many bands as there are attacks.
     """
     ratio = channels.gain**2 * power / channels.noise
     worth = {"rate": lambda: jnp.log2(1 + ratio), "evidence": lambda: ratio / (1 + ratio), "snr": lambda: ratio}

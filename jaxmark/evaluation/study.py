@@ -8,11 +8,13 @@ import math
 import os
 import pickle
 import time
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from itertools import product
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any
 
 from jaxmark.adversaries.by_name import attack_each, get_attack
@@ -21,7 +23,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation._rates import LOG10_LEVEL, Control, Row
 from jaxmark.evaluation._robustness import NOTHING, Outcome, compare_with
 from jaxmark.evaluation.cells import Cell, Pool, run
-from jaxmark.evaluation.results import Results
+from jaxmark.evaluation.study_results import Results
 from jaxmark.files import load_mesh
 from jaxmark.files.atomic import read_file
 from jaxmark.geometry.canonical import geometry_hash
@@ -35,6 +37,7 @@ from jaxmark.watermark.perception.budget import Budget, BudgetLike
 from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, find_blind, get_nonblind, parameters_of
 
 _SEEDS_PER_CELL = 5  # attacked by one call
+_MAX_FILE_BYTES = 2**24  # of a TOML file
 
 
 @dataclass(frozen=True)
@@ -70,12 +73,12 @@ class Study:
         """
         self._check_forms()
         parts = {"mesh": self.meshes, "attack": self.attacks, "scheme": self._schemes, "budget": self._budgets}
-        parts |= {f"strength of {name!r}": self._strengths(name) for name in self.attacks if self._attack(name)}
+        parts |= {f"strength of {name!r}": strengths for name, (_, strengths) in self._attacks.items()}
         for name, part in {**parts, "payload": self.payloads, "sample": range(self.samples)}.items():
             if not part:
                 raise JaxmarkError(f"A study needs at least one {name}.")
-        for name in self.attacks:
-            for strength in self._strengths(name):
+        for name, (_, strengths) in self._attacks.items():
+            for strength in strengths:
                 if not (isinstance(strength, Real) and math.isfinite(strength) and strength >= 0):
                     raise JaxmarkError(f"The strengths of {name!r} are finite and not negative, got {strength!r}.")
         for bits in self.payloads:
@@ -132,7 +135,13 @@ class Study:
             if workers < 1:
                 raise JaxmarkError(f"A study needs at least one worker, got {workers}.")
             if workers > 1:
-                self._check_picklable()
+                try:
+                    pickle.dumps(self)
+                except Exception as error:  # pickle raises many types
+                    raise JaxmarkError(
+                        f"This study cannot be sent to other processes ({error}); define its attacks and schemes in a"
+                        " module, or use one worker."
+                    ) from None
         try:
             done = run(cells, partial(work, self), workers, output, say, self._name)
         finally:
@@ -153,13 +162,12 @@ class Study:
         """Budgets by the names that they have in rows: `0.0008`, `hidden`, or `dame=0.008`."""
         return {str(one): one for one in map(Budget.of, self.budgets)}
 
-    def _attack(self, name: str) -> Attack:
-        given = self.attacks[name]
-        return given if isinstance(given, Attack) else get_attack(name)
-
-    def _strengths(self, name: str) -> Sequence[float]:
-        given = self.attacks[name]
-        return given.strengths if isinstance(given, Attack) else given
+    @property
+    def _attacks(self) -> dict[str, tuple[Attack, Sequence[float]]]:
+        """Attacks with their strengths, by the names that they have in rows."""
+        attacks = {name: one if isinstance(one, Attack) else get_attack(name) for name, one in self.attacks.items()}
+        own = {name: one.strengths if isinstance(one, Attack) else one for name, one in self.attacks.items()}
+        return {name: (attacks[name], own[name]) for name in own}
 
     def _cells(self) -> Iterator[Cell]:
         """All cells; those with the same marked meshes follow each other, so that each mesh is marked once."""
@@ -167,44 +175,32 @@ class Study:
         schemes, budgets, count = self._schemes, self._budgets, self.samples
         blocks = [(first, min(_SEEDS_PER_CELL, count - first)) for first in range(0, count, _SEEDS_PER_CELL)]
         for mesh, scheme, bits, budget, block in product(self.meshes, schemes, self.payloads, budgets, blocks):
-            # What an older file does not say of a reading is read again.
+            # Cells of older files whose readings lack a field are read again.
             fields = json.dumps([digests[mesh], schemes[scheme].name, parameters_of(schemes[scheme]), Outcome._fields])
             digest = hashlib.sha256(fields.encode()).hexdigest()[:16]
-            for name in self.attacks:
-                for strength in self._strengths(name):
+            for name, (_, strengths) in self._attacks.items():
+                for strength in strengths:
                     yield mesh, scheme, bits, budget, name, float(strength), *block, digest
 
     def _name(self, cell: Cell) -> str:
         """A cell by what varies in this study, such as `noise 0.02, budget 0.0004`."""
         mesh, scheme, bits, budget, attack, strength, *_ = cell
-        varied = {
-            f"{mesh}": self.meshes,
-            f"{scheme}": self.schemes,
-            f"{bits} bits": self.payloads,
-            f"budget {budget}": self.budgets,
-        }
-        return ", ".join([f"{attack} {strength:g}", *(name for name, all_ in varied.items() if len(all_) > 1)])
+        names = str(mesh), str(scheme), f"{bits} bits", f"budget {budget}"
+        parts = self.meshes, self.schemes, self.payloads, self.budgets
+        varied = [name for name, part in zip(names, parts, strict=True) if len(part) > 1]
+        return ", ".join([f"{attack} {strength:g}", *varied])
 
     def _rows(self, cell: Mapping[str, Any]) -> Iterator[Row]:
         mesh, scheme, bits, budget, attack, strength, *_ = cell["cell"]
-        unit = self._attack(attack).unit
+        unit = self._attacks[attack][0].unit
         for one in cell["readings"]:
             detected = one["log10_p"] <= LOG10_LEVEL
             yield Row(mesh, scheme, bits, budget, attack, strength, unit, detected=detected, **one)
 
-    def _check_picklable(self) -> None:
-        try:
-            pickle.dumps(self)
-        except Exception as error:  # pickle raises many types
-            raise JaxmarkError(
-                f"This study cannot be sent to other processes ({error}); define its attacks and schemes in a module,"
-                " or use one worker."
-            ) from None
-
 
 @dataclass(frozen=True)
 class _Point:
-    """What all cells with the same marked meshes share; seeds give keys and messages."""
+    """The data that all cells with the same marked meshes share; seeds give keys and messages."""
 
     cell: Cell  # identifies the point
     mesh: str | os.PathLike[str] | Mesh = field(compare=False)
@@ -214,7 +210,10 @@ class _Point:
 
 
 def work(study: Study, cell: Cell) -> dict[str, Any]:
-    """Compute a cell: one attack at one strength for a few seeds. At the top level, where workers find it."""
+    """Compute a cell: one attack at one strength for a few seeds. At the top level, where workers find it.
+
+    For each seed, the marked suspect is read with its key and with another one, and the unmarked suspect with the key.
+    """
     mesh, scheme, bits, budget, name, strength, first, count, digest = cell
     point = _Point(
         (mesh, scheme, bits, budget, digest),
@@ -224,33 +223,29 @@ def work(study: Study, cell: Cell) -> dict[str, Any]:
         study._budgets[str(budget)],
     )
     seeds = list(range(int(first), int(first) + int(count)))
-    return {"readings": list(_readings(point, study._attack(str(name)), float(strength), seeds))}
-
-
-def _readings(point: _Point, attack: Attack, strength: float, seeds: list[int]) -> Iterator[dict[str, Any]]:
-    """For each seed, read the marked suspect with its key and with another, and the unmarked suspect."""
     marked = [_mark(point, seed) for seed in seeds]
     meshes = [mesh for mesh, _ in marked] + [_original_mesh(point, seeds[0])] * len(seeds)
-    suspects = _attack_meshes(meshes, attack, strength, seeds + seeds)
+    suspects = _attack_meshes(meshes, study._attacks[str(name)][0], float(strength), seeds + seeds)
+    readings: list[dict[str, Any]] = []
     for seed, (_, rms), suspect, control in zip(seeds, marked, suspects, suspects[len(seeds) :], strict=False):
-        yield from _read(point, suspect, seed, {"marked": seed, "wrong-key": seed + 1}, rms)
-        yield from _read(point, control, seed, {"unmarked": seed}, 0.0)
+        readings += _read(point, suspect, seed, {"marked": seed, "wrong-key": seed + 1}, rms)
+        readings += _read(point, control, seed, {"unmarked": seed}, 0.0)
+    return {"readings": readings}
 
 
 def _attack_meshes(meshes: list[Mesh | str], attack: Attack, strength: float, seeds: list[int]) -> list[Mesh | str]:
     """Attack meshes by one call, or one by one if any is refused; a refused mesh is replaced by the sentence."""
-    there = [(mesh, seed) for mesh, seed in zip(meshes, seeds, strict=True) if isinstance(mesh, Mesh)]
+    there = {place: mesh for place, mesh in enumerate(meshes) if isinstance(mesh, Mesh)}
     if not there:
         return meshes
     try:
-        found: list[Mesh | str] = [*attack_each([m for m, _ in there], attack, strength, seeds=[s for _, s in there])]
+        found = attack_each(list(there.values()), attack, strength, seeds=[seeds[place] for place in there])
     except JaxmarkError as error:
-        if len(there) == 1:
-            found = [f"Not attacked: {error}"]
-        else:
-            found = [_attack_meshes([mesh], attack, strength, [seed])[0] for mesh, seed in there]
-    made = iter(found)
-    return [next(made) if isinstance(mesh, Mesh) else mesh for mesh in meshes]
+        if len(meshes) == 1:
+            return [f"Not attacked: {error}"]
+        found = [_attack_meshes([mesh], attack, strength, [seeds[place]])[0] for place, mesh in there.items()]
+    made = dict(zip(there, found, strict=True))
+    return [made.get(place, mesh) for place, mesh in enumerate(meshes)]
 
 
 def _read(
@@ -264,7 +259,7 @@ def _read(
             try:
                 marker = _marker(point, key)
                 registered = marker.register(suspect) if registered is None else registered
-                outcome = compare_with(_message(seed, point.bits), marker, marker.read(registered))
+                outcome = compare_with(_derive(seed, "message", point.bits // 8), marker, marker.read(registered))
             except JaxmarkError as error:
                 refusal = str(error)
         said = {"refusal": refusal, "seconds": time.perf_counter() - start}
@@ -281,8 +276,9 @@ def _marker(point: _Point, seed: int) -> Marker:
 def _mark(point: _Point, seed: int) -> tuple[Mesh | str, float]:
     """Mark as strongly as the budget allows, readable or not; return the mesh, or why not, and the mark's RMS."""
     budget = replace(point.budget, noise=0.0 if point.budget.noise is None else point.budget.noise)
+    message = _derive(seed, "message", point.bits // 8)
     try:
-        mesh, info = _marker(point, seed).embed(_message(seed, point.bits), budget, read_back=False)
+        mesh, info = _marker(point, seed).embed(message, budget, read_back=False)
     except JaxmarkError as error:
         return f"Not marked: {error}", 0.0
     return mesh, info.rms
@@ -293,10 +289,6 @@ def _original_mesh(point: _Point, seed: int) -> Mesh | str:
         return _marker(point, seed).original.mesh
     except JaxmarkError as error:
         return f"Not marked: {error}"
-
-
-def _message(seed: int, bits: int) -> bytes:
-    return _derive(seed, "message", bits // 8)
 
 
 def _derive(seed: int, label: str, size: int) -> bytes:
@@ -311,3 +303,66 @@ def _digest(mesh: str | os.PathLike[str] | Mesh) -> str:
         return hashlib.sha256(read_file(mesh)).hexdigest()
     except OSError as error:
         raise JaxmarkError(f"Cannot read {os.fspath(mesh)}: {error.strerror}.") from None
+
+
+def load_study(path: str | os.PathLike[str]) -> Study:
+    """Load a study from a TOML file.
+
+    The tables `meshes` (files, relative to the TOML file's folder) and `attacks` (lists of strengths) are by name.
+    `schemes` (names), `payloads`, `budgets` (numbers, names, or tables of limits) and `samples` are as in `Study`, and
+    have its defaults.
+
+    Raises:
+        JaxmarkError: if the file cannot be read, is not TOML, or declares no study.
+    """
+    name = os.fspath(path)
+    try:
+        declared = tomllib.loads(read_file(path, _MAX_FILE_BYTES).decode("utf-8"))
+    except OSError as error:
+        raise JaxmarkError(f"Cannot read {name}: {error.strerror}.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise JaxmarkError(f"{name} is no TOML: {error}.") from None
+    for part in ("meshes", "attacks"):
+        if part not in declared:
+            raise JaxmarkError(f"{name} declares no {part}; give a table [{part}].")
+    for part, value in declared.items():
+        if part not in _FIELDS:
+            raise JaxmarkError(f"{name}: a study has no field {part!r}; there are {', '.join(_FIELDS)}.")
+        shape, fits = _FIELDS[part]
+        if not fits(value):
+            raise JaxmarkError(f"{name}: {part} must be {shape}.")
+    meshes = {label: Path(path).parent / file for label, file in declared["meshes"].items()}
+    try:
+        return Study(**{**declared, "meshes": meshes})
+    except JaxmarkError as error:
+        raise JaxmarkError(f"{name}: {error}") from None
+
+
+Test = Callable[[Any], bool]
+
+
+def _is(*types: type) -> Test:
+    return lambda value: isinstance(value, types) and not isinstance(value, bool)
+
+
+def _list(fits: Test) -> Test:
+    return lambda value: isinstance(value, list) and all(map(fits, value))
+
+
+def _table(fits: Test) -> Test:
+    return lambda value: isinstance(value, dict) and all(map(fits, value.values()))
+
+
+_number, _text = _is(int, float), _is(str)
+# The form of each field in a TOML file, in words and as a test.
+_FIELDS: dict[str, tuple[str, Test]] = {
+    "meshes": ("a table of files", _table(_text)),
+    "attacks": ("a table of lists of numbers", _table(_list(_number))),
+    "schemes": ("a list of names", _list(_text)),
+    "payloads": ("a list of whole numbers of bits", _list(_is(int))),
+    "budgets": (
+        "a list of numbers, names or tables of limits",
+        _list(lambda one: _number(one) or _text(one) or (bool(one) and _table(_number)(one))),
+    ),
+    "samples": ("a whole number", _is(int)),
+}

@@ -1,8 +1,8 @@
-"""Marks that are written, attacked and read with signs of nobody's key: what strengths are worth to the detector.
+"""Trials of marks, written, attacked and read with public signs: how much strengths are worth to the detector.
 
-Channels (`jaxmark.evaluation.channels`) say which strengths are best for a model of attacks, limits and reader, quickly
-and with a proof. Trials leave nothing out, and `Trials.ascend` differentiates them: from strengths to the mark within
-its limits, to what each attack leaves of it, to the weights that the reader gives the bands, to the claim.
+Channels (`jaxmark.evaluation.channels`) give the best strengths for a model of attacks, limits and reader, quickly and
+with a proof. Trials leave nothing out, and `Trials.ascend` differentiates them: from strengths to the mark within its
+limits, to the part of it that each attack leaves, to the weights that the reader gives the bands, to the claim.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ from jaxmark.alignment.attempts import align
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, displace
 from jaxmark.errors import JaxmarkError
-from jaxmark.evaluation.allocation import import_jaxopt
+from jaxmark.evaluation.allocation import minimise
 from jaxmark.evaluation.channels import Margin, measure
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.carriers.keyed import KeyedCarrier, KeyedReader
@@ -33,7 +33,7 @@ Attack = Callable[[Mesh, int], Mesh]  # an attack of some strength on a mesh, wi
 
 # Numbers of the signs of marks, each of which is tried beside its opposite. Strengths are fitted to the first ones, the
 # best of several are chosen by others, and the choice is checked by others again: each is good by chance for its own.
-_FITTED, _CHOSEN, _CHECKED = range(3, 6), range(3), range(6, 14)
+FITTED, CHOSEN, CHECKED = range(3, 6), range(3), range(6, 14)
 _SHARPNESS = 50.0  # of the soft minimum over attacks, over the least worth
 _SHAPES = 5  # cosines over the bands that strengths are changed by: more would fit what is chance in each band
 _STEPS, _TRIES = 5, 5  # of the gradient, and of the size of each step, before marks are tried again
@@ -44,7 +44,7 @@ _LEAST_WORTH = 1.0  # nats or bits, of which a smaller gain is none: next to not
 
 
 class Trial(NamedTuple):
-    """Marks of one profile of strengths, each attack applied to them, and what the detector makes of that."""
+    """Marks of one profile of strengths, copies of them after each attack, and their worth to the detector."""
 
     scheme: KeyedScheme
     reader: KeyedReader
@@ -67,11 +67,9 @@ class Trial(NamedTuple):
         return np.mean(self.scales) * np.asarray(self.reader.carrier.profile, np.float64)
 
     def surpasses(self, other: "Trial", least: float) -> bool:
-        """Whether the worst attack leaves more than of another trial of the same signs, by a factor and beyond chance.
+        """Whether the worst attack leaves more than of another trial of the same signs, beyond chance.
 
-        Args:
-            other: the other trial.
-            least: the factor.
+        The factor between them must be `least` at least.
         """
         gains = self.by_signs.min(axis=1) - other.by_signs.min(axis=1)
         error = float(np.std(gains, ddof=1)) / len(gains) ** 0.5
@@ -80,7 +78,7 @@ class Trial(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """What strengths are worth on one original, by attacks and limits; all profiles are tried alike."""
+    """The worth of strengths on one original, by attacks and limits; all profiles are tried alike."""
 
     original: Original
     bits: int
@@ -97,31 +95,18 @@ class Trials:
             return False
         return True
 
-    def run(self, scheme: KeyedScheme) -> Trial:
-        """Write, attack and read marks of a scheme, to choose among several.
-
-        Raises:
-            JaxmarkError: if the payload does not fit, a limit cannot be kept, or a suspect cannot be aligned.
-        """
-        return self._run(scheme, _CHOSEN)
-
-    def check(self, scheme: KeyedScheme) -> Trial:
-        """Write, attack and read more marks of a scheme than `run`, by which nothing was chosen before.
-
-        Raises:
-            JaxmarkError: see `run`.
-        """
-        return self._run(scheme, _CHECKED)
-
-    def _run(self, scheme: KeyedScheme, numbers: range) -> Trial:
+    def run(self, scheme: KeyedScheme, numbers: range = CHOSEN) -> Trial:
         """Write, attack and read marks of a scheme.
 
-        Each mark is tried beside its opposite: what attacks have in common with its signs by chance cancels, so that
-        few marks tell two profiles apart.
+        Each mark is tried with its opposite: correlations of the attacks with its signs by chance cancel, so that few
+        marks suffice to distinguish two profiles.
 
         Args:
             scheme: the scheme with its strengths.
-            numbers: of the signs, which are drawn from nobody's key; the first one is added to the attacks' seeds.
+            numbers: numbers of the signs, which depend on no secret key; the first one is added to the attacks' seeds.
+
+        Raises:
+            JaxmarkError: if the payload does not fit, a limit cannot be kept, or a suspect cannot be aligned.
         """
         original = self.original
         code = scheme.code_length(original, self.bits)
@@ -130,20 +115,12 @@ class Trials:
         drawn = [carrier.redraw(number) for number in numbers]
         shifts = [original.to_host(one.displacement(word)) for one in drawn]
         written = [displace_within(original, shift, self.bounds, self._reference) for shift in shifts]
-        marks = [
-            displace(original, sign * one.scale * shift)
-            for one, shift in zip(written, shifts, strict=True)
-            for sign in (1, -1)
-        ]
+        scaled = [one.scale * shift for one, shift in zip(written, shifts, strict=True)]
+        marks = [displace(original, sign * shift) for shift in scaled for sign in (1, -1)]
         signs = tuple(sign * jnp.asarray(one.chips.signs) for one in drawn for sign in (1, -1))
-        seen = tuple(
-            tuple(
-                align(original, one(mark, seed + numbers.start)).observation(original)
-                for seed in self.seeds
-                for mark in marks
-            )
-            for one in self.attacks
-        )
+        tries = [(mark, seed + numbers.start) for seed in self.seeds for mark in marks]
+        suspects = [[one(*some) for some in tries] for one in self.attacks]
+        seen = tuple(tuple(align(original, one).observation(original) for one in some) for some in suspects)
         scales, used = tuple(one.scale for one in written for _ in (1, -1)), self._used(written[0])
         reader = carrier.reader()
         left = [self._left(scheme, reader, word, signs, copies) for copies in seen]
@@ -152,14 +129,10 @@ class Trials:
         return Trial(scheme, reader, word, signs, scales, used, seen, worth, by_signs)
 
     def ascend(self, start: Trial, cost: Float64[np.ndarray, "limits bands"]) -> Trial:
-        """Change strengths as the gradient of what is left after the worst attack says, as long as trials agree.
+        """Change strengths along the gradient of what the worst attack leaves, as long as trials agree.
 
-        Args:
-            start: the strengths to start from.
-            cost: share of each limit, squared, that β_j² = 1 uses up in band j.
-
-        Returns:
-            The best trial, which is the first one if no other is better.
+        `cost` is the share of each limit, squared, that β_j² = 1 uses up in band j. The best trial is returned, which
+        is the first one if no other is better.
         """
         best, found = start, self.run(self._improved(start, cost))
         while found.worst > _LEAST_GAIN * best.worst:
@@ -168,14 +141,12 @@ class Trials:
 
     def _improved(self, tried: Trial, cost: Float64[np.ndarray, "limits bands"]) -> KeyedScheme:
         """The scheme with the strengths that are best by what is seen of others, which are not far."""
-        at = self._run(tried.scheme, _FITTED)
+        at = self.run(tried.scheme, FITTED)
         carrier, dtype = at.reader.carrier, at.word.dtype
         base = jnp.asarray(carrier.profile)
         scales = [jnp.asarray(scale, dtype) for scale in at.scales]
-        marks = [
-            scale * _with_signs(carrier, signs).displacement(at.word)
-            for scale, signs in zip(scales, at.signs, strict=True)
-        ]
+        drawn = [_with_signs(carrier, signs).displacement(at.word) for signs in at.signs]
+        marks = [scale * shift for scale, shift in zip(scales, drawn, strict=True)]
         most = max((one.nuisance.shape[1] for some in at.seen for one in some if one.nuisance is not None), default=0)
         copies: dict[object, list[_Copy]] = {}
         for number, suspects in enumerate(at.seen):
@@ -199,7 +170,7 @@ class Trials:
         signs: Sequence[Int8[Array, "vertices channels"]],
         copies: Sequence[Observation],
     ) -> Float64[np.ndarray, "seeds marks two values"]:
-        """What is left of each mark and its opposite after an attack: S/‖a‖, or the soft value of each bit."""
+        """The remainder of each mark and its opposite after an attack: S/‖a‖, or the soft decision of each bit."""
         readers = cycle([reader.with_carrier(_with_signs(reader.carrier, one)) for one in signs])
         pairs = [(own, own.receive(one)) for one, own in zip(copies, readers, strict=False)]
         if self.margin == "rate":
@@ -210,7 +181,7 @@ class Trials:
         return np.reshape(values, (len(self.seeds), len(signs) // 2, 2, -1))
 
     def _worth(self, values: Float64[np.ndarray, "*axes"]) -> float:
-        """What values are worth in the unit of the margin."""
+        """The worth of such remainders in the unit of the margin."""
         mean = max(np.mean(values), 0)
         if self.margin == "rate":
             return float(values.shape[-1] / 2 * np.log2(1 + (mean / (np.std(values) or 1)) ** 2))
@@ -271,7 +242,6 @@ def _climb(
     attacks: int,
 ) -> Float[Array, " passing"]:
     """The strengths that leave most after the worst attack, of those that differ smoothly, and not by much."""
-    jaxopt = import_jaxopt()
     base = jnp.asarray(reader.carrier.profile)
     places = (np.arange(len(base)) + 0.5) / len(base)
     shapes = jnp.asarray(np.cos(np.pi * np.outer(places, np.arange(1, _SHAPES + 1))), base.dtype)
@@ -295,10 +265,6 @@ def _climb(
         nats = jnp.maximum(mean, 0) ** 2 / 2
         return jax.nn.logsumexp(-_SHARPNESS * nats * level) / _SHARPNESS
 
-    with jax.numpy_dtype_promotion("standard"):  # jaxopt mixes integers into its floats
-        solver = jaxopt.ProjectedGradient(
-            loss, jaxopt.projection.projection_box, maxiter=_STEPS, maxls=_TRIES, tol=1e-4
-        )
-        most = jnp.full(_SHAPES, _REACH, base.dtype)
-        change = solver.run(jnp.zeros(_SHAPES, base.dtype), hyperparams_proj=(-most, most)).params
+    start, reach = jnp.zeros(_SHAPES, base.dtype), partial(jnp.clip, min=-_REACH, max=_REACH)
+    change = minimise(loss, reach, start, maxiter=_STEPS, maxls=_TRIES, tol=1e-4)
     return base * jnp.exp(shapes @ change)

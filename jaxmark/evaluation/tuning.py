@@ -1,52 +1,58 @@
-"""Strengths per band that leave most readable after the worst of several attacks, within a budget.
+"""Choose the strengths of bands, or the width and the step of a blind mark, for the worst of several attacks.
 
-`tune` measures what attacks leave of each band of a mesh, solves for the strengths that are best by these channels,
+`tune` measures what attacks leave of each band of a mesh, solves for the strengths that are best for these channels,
 with a proof of how good they are, and goes on from there, or from the scheme's default strengths, by trials with the
-detector itself.
+detector itself. `tune_blind` compares all widths and steps that a budget allows.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import groupby
 from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int64
+from jaxtyping import Array, Float, Float64
 
 from jaxmark.adversaries.by_name import attack, get_attack
 from jaxmark.alignment.attempts import align
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.attacks import Kind
-from jaxmark.distortion import name_of
+from jaxmark.distortion import Reference, name_of
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.allocation import balance, upper_bound
 from jaxmark.evaluation.channels import Channels, Margin, margins, measure
-from jaxmark.evaluation.trials import Trials
+from jaxmark.evaluation.trials import CHECKED, Trials
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.seeds import Seed, probe_signs, random_key
 from jaxmark.spectral.chebyshev import band_energies, filter
+from jaxmark.watermark.blind.prediction import Left, best_margin, compare
+from jaxmark.watermark.blind.reading import codeword, register
+from jaxmark.watermark.blind.scheme import BlindScheme, Look
+from jaxmark.watermark.blind.writing import Plan, carried, sureness
 from jaxmark.watermark.interfaces import Displacement, Scheme
+from jaxmark.watermark.markers import make_blind_marker
 from jaxmark.watermark.perception.budget import Bounds, Budget, BudgetLike, displace_within
 from jaxmark.watermark.perception.capacity import Capacity
 from jaxmark.watermark.perception.masking import apply_mask
 from jaxmark.watermark.perception.visibility import band_visibility
 from jaxmark.watermark.schemes.keyed import KeyedScheme
 from jaxmark.watermark.schemes.passband import choose_pass_band
-from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, find_blind, get_nonblind
+from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, DEFAULT_SCHEME, find_blind, get_nonblind
 
 Attacker = tuple[Kind, float] | Callable[[Mesh, int], Mesh]  # an attack and a strength, or (mesh, seed) → mesh
 
-
 _LOW_PASS = (1 / 8, 1 / 4)  # shares of the spectrum that are tried with equal strengths
+_PUBLIC_KEY = bytes(32)  # of blind marks: predictions hardly depend on the key
 _LEAST_GAIN = 1.2  # of what the worst attack leaves by the scheme's own strengths, for which others are returned
 
 
 class Report(NamedTuple):
     """How well the tuned strengths do, and how much better any others could.
 
-    Channels are a model of attacks, limits and reader, in which a solution comes with a proof. What the detector makes
-    of marks, written within the limits and attacked, is tried besides, and decides.
+    Channels are a model of attacks, limits and reader, in which a solution comes with a proof. Trials of the detector
+    on marks, written within the limits and attacked, decide.
     """
 
     margins: Float64[np.ndarray, " attacks"]  # margin of the channels' best strengths after each attack
@@ -87,9 +93,9 @@ def tune(
 
     Each attack's channel is measured from a probe that spends equal shares of the budget in all bands. Limits on other
     metrics than RMS displacement count as quadratic in the strengths, with the measured visibility of each band. The
-    strengths that are best so have a proof, but leave out what limits, attacks and reader really are. So marks of them,
-    of the scheme's own strengths in the pass band that suits the budget, and of low-pass filters are written within the
-    real limits, attacked and read. The best ones are improved by the gradient of what the detector has after the worst
+    strengths that are best by this model have a proof, but the model simplifies limits, attacks and reader. So marks of
+    them, of the scheme's own strengths in the adaptive pass band, and of low-pass filters are written within the real
+    limits, attacked and read. The best ones are improved by the gradient of the detector's margin after the worst
     attack, as long as trials with other signs and seeds agree (`jaxmark.evaluation.trials`). If the scheme's own
     strengths are as good, they are returned.
 
@@ -101,30 +107,25 @@ def tune(
         seed: of the attacks' random choices, a whole number or a JAX random key; not secret.
         bits: size of the payload in bits.
         scheme: the scheme whose bands are tuned; its profile is replaced.
-        samples: number of times that each attack is tried; what is measured is averaged.
+        samples: number of times that each attack is tried; measurements are averaged.
         margin: what the worst attack should leave: `"evidence"`, for a claimed message, or `"rate"`, for a message that
             is to be read; see `jaxmark.evaluation.channels.margins`. Trials have S²/2‖a‖² in nats of the claim, or the
-            bits that the soft values of joint decoding transmit.
+            bits that the soft decisions of joint decoding transmit.
         cap: the largest share of the budget that one band gets, so that losing a band does not lose the mark.
         start: strengths to start from, such as those of an earlier tuning.
-
-    Returns:
-        The strengths, the scheme that has them, and a report.
 
     Raises:
         JaxmarkError: if the mesh, an attack, the budget or a number is unusable, or the scheme has no bands to tune.
     """
-    if not attacks or samples < 1:
-        raise JaxmarkError(f"tune needs at least one attack and one sample, got {len(attacks)} and {samples}.")
-    check_attackers(attacks)
+    seeds = _draw_seeds("tune", attacks, samples, seed)
     if margin not in get_args(Margin):
         raise JaxmarkError(f"The margin to tune for is one of {', '.join(get_args(Margin))}, got {margin!r}.")
     if find_blind(scheme) is not None:
         raise JaxmarkError(f"The scheme {scheme!r} is read without the original, and has no bands; see tune_blind.")
-    numbers, tunable = seed_numbers(seed, samples), get_nonblind(scheme).tunable()
+    tunable = get_nonblind(scheme).tunable()
     original, family = make_original(mesh), tunable.family()
     bounds = Budget.of(budget).bounds(original.mesh)
-    (signs,) = probe_signs("tuning", original.signal.shape, dtype=original.signal.dtype)
+    signs = probe_signs("tuning", original.signal.shape, dtype=original.signal.dtype)[0]
     signs = signs * original.to_traced(original.used)[:, None]
     mask = tunable.mask(original)
 
@@ -137,15 +138,16 @@ def tune(
     probe = shape_signs(equal)
     written = displace_within(original, probe, bounds)
     mark = original.to_traced(written.scale * probe)
-    suspects = [[apply_attack(one, written.mesh, int(seed)) for seed in numbers] for one in attacks]
+    suspects = [[apply_attack(one, written.mesh, seed) for seed in seeds] for one in attacks]
     seen = [[align(original, suspect).observation(original) for suspect in row] for row in suspects]
 
     def measure_channels(profile: tuple[float, ...]) -> Channels:
         receiver = tunable.with_profile(profile).receiver(original, bits)
-        rows = [_mean([measure(receiver, one, mark) for one in row]) for row in seen]
-        return Channels(*map(jnp.concatenate, zip(*rows, strict=True)))
+        rows = [[measure(receiver, one, mark) for one in row] for row in seen]
+        means = [jax.tree.map(lambda *values: jnp.mean(jnp.stack(values), axis=0), *row) for row in rows]
+        return Channels(*map(jnp.concatenate, zip(*means, strict=True)))
 
-    # What the receiver projects off depends on the profile: once for a first one, and again for what it was tuned to.
+    # The receiver's projection depends on the profile: channels are measured for a first one, and for the tuned one.
     first = measure_channels(_profile(equal if start is None else np.asarray(start, np.float64)))
     start, _ = balance(first, cost, margin, cap, start)
     channels = measure_channels(_profile(start))
@@ -153,29 +155,22 @@ def tune(
     worth = np.asarray(margins(channels, jnp.asarray(beta**2, original.signal.dtype), margin), np.float64)
     bound = upper_bound(channels, weights @ cost, cap=cap, margin=margin)
 
-    trials = Trials(original, bits, bounds, [partial(apply_attack, one) for one in attacks], numbers.tolist(), margin)
+    trials = Trials(original, bits, bounds, [partial(apply_attack, one) for one in attacks], seeds, margin)
     default = trials.run(choose_pass_band(Capacity(original, tunable), bits, bounds).tunable())
     solved = tunable.with_profile(_profile(beta))
     low_pass = [tunable.with_profile((1.0,) * round(share * len(family))) for share in _LOW_PASS]
     others = [trials.run(one) for one in (solved, *low_pass) if trials.fits(one)]
     chosen = trials.ascend(max(default, *others, key=lambda one: one.worst), cost)
-    # Which of several is best in few trials is so by chance in part: other marks decide.
-    checked = {one: trials.check(one) for one in {default.scheme, solved, chosen.scheme} if trials.fits(one)}
+    # The best of several in few trials is the best partly by chance: other marks decide.
+    checked = {one: trials.run(one, CHECKED) for one in {default.scheme, solved, chosen.scheme} if trials.fits(one)}
     usual, best = checked[default.scheme], max(checked.values(), key=lambda one: one.worst)
     if not best.surpasses(usual, _LEAST_GAIN):
         best = usual
-    report = Report(
-        worth,
-        bound,
-        1 - float(worth.min()) / bound,
-        dict(zip(_names(bounds), map(float, weights), strict=True)),
-        best.worth,
-        checked[solved].worth if solved in checked else np.zeros(len(attacks)),
-        usual.worth,
-        best is usual,
-    )
-    exact = np.zeros(len(family))
-    exact[: len(best.strengths)] = best.strengths
+    names = [*map(name_of, bounds.limits)] + ["budget"] * (bounds.rms is not None)
+    others = checked[solved].worth if solved in checked else np.zeros(len(attacks))
+    binding, gap = dict(zip(names, map(float, weights), strict=True)), 1 - float(worth.min()) / bound
+    report = Report(worth, bound, gap, binding, best.worth, others, usual.worth, best is usual)
+    exact = np.pad(best.strengths, (0, len(family) - len(best.strengths)))
     matched = np.asarray(channels.gain * exact / channels.noise, np.float64)
     return Tuned(best.scheme, exact, channels, cost, matched, report)
 
@@ -191,14 +186,9 @@ def _costs(
     whole = band_energies(original.operator, jnp.asarray(family, signs.dtype), signs, signs)
     energy = np.maximum(np.asarray(whole, np.float64) / original.used.sum(), 1e-12)
     seen = list(bounds.limits)
-    visible = band_visibility(original, family, seen, mask) if seen else np.empty((0, len(family)))
+    visible = band_visibility(original, family, seen, mask) if seen else []
     rows = [energy * (row / bounds.limits[name]) ** 2 for name, row in zip(seen, visible, strict=True)]
     return np.stack(rows + ([energy / bounds.rms**2] if bounds.rms is not None else []))
-
-
-def _names(bounds: Bounds) -> list[str]:
-    """Names of the limits, in the order of `_costs`."""
-    return [*map(name_of, bounds.limits)] + (["budget"] if bounds.rms is not None else [])
 
 
 def _profile(beta: Float64[np.ndarray, " bands"]) -> tuple[float, ...]:
@@ -207,28 +197,89 @@ def _profile(beta: Float64[np.ndarray, " bands"]) -> tuple[float, ...]:
     return tuple(float(f"{value:.4g}") for value in relative[: 1 + np.flatnonzero(relative)[-1]])
 
 
-def _mean(channels: list[Channels]) -> Channels:
-    """Mean channel of several trials of one attack."""
-    return jax.tree.map(lambda *values: jnp.mean(jnp.stack(values), axis=0), *channels)
+class TunedBlind(NamedTuple):
+    """A blind scheme of the width and the step that are predicted to leave most after the worst attack."""
+
+    scheme: BlindScheme  # `embed` takes it; whoever reads needs no more than the scheme's name
+    worst: float  # surplus after the worst of the attacks; if it is negative, messages are not expected to read
+    choices: tuple[tuple[float, float], ...]  # all widths and steps that the budget allows
+    surplus: Float64[np.ndarray, "choices attacks"]  # in nats, see `jaxmark.watermark.blind.prediction.margin`
 
 
-def seed_numbers(seed: Seed, count: int) -> Int64[np.ndarray, " samples"]:
-    """Draw seeds of the attacks' random choices."""
-    return np.asarray(jax.random.randint(random_key(seed), (count,), 0, 2**31 - 1), np.int64)
+def tune_blind(
+    mesh: Mesh,
+    attacks: Sequence[Attacker],
+    budget: BudgetLike = None,
+    *,
+    seed: Seed,
+    bits: int = 64,
+    scheme: str | BlindScheme = "field",
+    samples: int = 1,
+) -> TunedBlind:
+    """Choose width and step of a blind mark for the attacks that it must survive; for other parameters see `tune`.
 
-
-def check_attackers(attacks: Sequence[Attacker]) -> None:
-    """Check that attacks to tune for are functions of mesh and seed, or pairs of an attack and a strength.
+    The original is attacked, and looked at as a suspect is; the change of its values predicts how much would be left of
+    any mark. A wide average survives more smoothing, a narrow one gives more anchors; a large step survives more noise,
+    a small one is met more exactly within the same budget. All that a budget allows are compared, by how much the
+    information that is left exceeds the needs of payload and tag. If that is negative after the worst of the attacks,
+    the mark is not expected to survive it. `scheme` is a blind scheme, whose widths and steps are compared.
 
     Raises:
-        JaxmarkError: if one is neither, or there is no such attack.
+        JaxmarkError: if the mesh, an attack, the budget or a number is unusable, the scheme is no blind one, or the
+            budget leaves nothing to write in.
     """
+    seeds = _draw_seeds("tune_blind", attacks, samples, seed)
+    blind = find_blind(scheme)
+    if blind is None:
+        raise JaxmarkError(
+            f"tune_blind tunes the schemes that are read without the original ({', '.join(BLIND_SCHEMES)}), not"
+            f" {scheme!r}; for the others there is tune."
+        )
+    writer = make_blind_marker(mesh, _PUBLIC_KEY, bits=bits, scheme=blind).writer
+    word = codeword(bytes(bits // 8), writer.choices)
+    allowances = writer.allowances(word, Budget.of(budget).bounds(mesh), Reference(mesh))
+    plans = [one.plan(step) for one in allowances for step in writer.steps(one)]
+    if not plans:
+        raise JaxmarkError(f"This mesh, or the budget for it, leaves the scheme {blind.name!r} nothing to write in.")
+
+    def looks(suspect: Mesh) -> dict[float, list[Look]]:
+        found = sorted(blind.views(register(suspect), writer.choices), key=lambda look: look.width)
+        return {width: list(some) for width, some in groupby(found, key=lambda look: look.width)}
+
+    before = {width: some[0] for width, some in looks(mesh).items()}
+
+    def left(attacker: Attacker, seed: int) -> dict[float, list[Left]]:
+        seen = looks(apply_attack(attacker, mesh, seed))
+        return {width: [way for look in some for way in compare(before[width], look)] for width, some in seen.items()}
+
+    found, size = [[left(one, seed) for seed in seeds] for one in attacks], carried(bits)
+
+    def surplus_of(plan: Plan, ways: dict[float, list[Left]]) -> float:
+        return best_margin(ways[plan.width], plan.step, plan.alpha, size).surplus
+
+    surplus = np.array([[np.mean([surplus_of(plan, ways) for ways in row]) for row in found] for plan in plans])
+    worst = surplus.min(axis=1)
+    chosen = max(range(len(plans)), key=lambda one: (sureness(plans[one], bits), worst[one]))
+    choices = tuple((plan.width, plan.step) for plan in plans)
+    return TunedBlind(blind.fixed(*choices[chosen]), float(worst[chosen]), choices, surplus)
+
+
+def _draw_seeds(tuner: str, attacks: Sequence[Attacker], samples: int, seed: Seed) -> list[int]:
+    """Draw the seeds of the attacks' samples.
+
+    Raises:
+        JaxmarkError: if there is no attack or no sample, one attack is neither a function of mesh and seed nor a pair
+            of an attack and a strength, or there is no such attack.
+    """
+    if not attacks or samples < 1:
+        raise JaxmarkError(f"{tuner} needs at least one attack and one sample, got {len(attacks)} and {samples}.")
     for attacker in attacks:
         if callable(attacker):
             continue
         if not isinstance(attacker, tuple) or len(attacker) != 2:
             raise JaxmarkError(f"An attack to tune for is a pair such as ('noise', 0.005), got {attacker!r}.")
         get_attack(attacker[0])
+    return jax.random.randint(random_key(seed), (samples,), 0, 2**31 - 1).tolist()
 
 
 def apply_attack(attacker: Attacker, mesh: Mesh, seed: int) -> Mesh:

@@ -19,9 +19,8 @@ FREQUENCY = "frequency λ, from 0, smooth, to 2"
 def responses(families: Mapping[str, Float[np.ndarray, "bands terms"]], mark: Sequence[float] = ()) -> Picture:
     """Plot the responses of families of bands over λ, one panel each; the lowest bands are dark, the highest bright.
 
-    Args:
-        families: Chebyshev coefficients (see `jaxmark.spectral.bands`), by the title of the panel.
-        mark: values of λ for vertical lines, such as the edges between bands.
+    Families are Chebyshev coefficients (see `jaxmark.spectral.bands`) by the title of the panel; `mark` has values of λ
+    for vertical lines, such as the edges between bands.
 
     Raises:
         JaxmarkError: if matplotlib is missing.
@@ -41,15 +40,12 @@ def responses(families: Mapping[str, Float[np.ndarray, "bands terms"]], mark: Se
 
 
 def strengths(betas: Mapping[str, Float[np.ndarray, " bands"]]) -> Picture:
-    """Plot the strengths of bands over λ, such as those that `jaxmark.evaluation.tuning.tune` finds.
-
-    Args:
-        betas: β of each band in diagonals, such as `Tuned.beta`, by the name of the line.
+    """Plot strengths β of bands, in diagonals, over λ, such as `Tuned.beta`, by the name of the line.
 
     Raises:
         JaxmarkError: if matplotlib is missing.
     """
-    figure, (axes,) = panels(1, 6.5, 4.2)
+    figure, (axes,) = panels()
     for (name, beta), style in zip(betas.items(), styles(64), strict=False):
         axes.plot(nodes(len(beta)), beta, label=name, **style)
     finish(axes, xlabel=FREQUENCY, ylabel="strength β of a band / diagonal", ylim=(0, None))
@@ -73,7 +69,7 @@ def spectra(original: Original, moves: Mapping[str, tuple[Mesh, Mesh]], bands: i
     signals = {"host": original.to_host(original.signal)}
     for name, (before, after) in moves.items():
         signals[name] = shift_of(original, after) - shift_of(original, before)
-    figure, (axes,) = panels(1, 6.5, 4.2)
+    figure, (axes,) = panels()
     for (name, signal), style in zip(signals.items(), styles(bands), strict=False):
         axes.plot(nodes(bands), mean_squares(original, signal, bands), label=name, **style)
     finish(axes, xlabel=FREQUENCY, ylabel="mean square in the band / diagonal²", yscale="log")
@@ -85,7 +81,7 @@ def mean_squares(
 ) -> Float64[np.ndarray, " bands"]:
     """Mean square of a displacement (in diagonals) in each band, over the vertices that faces use.
 
-    Vertices are weighted by valence, as in the inner product of the bands. Values at the level of rounding become NaN.
+    Vertices are weighted by valence, as in the inner product of the bands. Values at the level of rounding are NaN.
     """
     family, x = jnp.asarray(scaling(bands, damping="jackson"), original.signal.dtype), original.to_traced(signal)
     energies = np.asarray(band_energies(original.operator, family, x, x), np.float64)

@@ -1,15 +1,15 @@
-"""What all pictures share: figures that need no screen, styles of lines, and PNG files."""
+"""Parts that all pictures share: figures that need no screen, styles of lines, and PNG files."""
 
+import base64
 import io
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import resources
 from itertools import cycle
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from jaxmark.confidence import Interval
 from jaxmark.extras import require
 from jaxmark.files.atomic import write_atomically
 
@@ -49,17 +49,27 @@ class Picture(NamedTuple):
         return self.png()
 
 
-def panels(count: int, width: float, height: float, **options: Any) -> tuple[Any, Iterable[Any]]:
-    """Make a figure of panels side by side.
+def panels(
+    count: int = 1,
+    width: float = 6.5,
+    height: float = 4.2,
+    *,
+    columns: int | None = None,
+    legend: float = 0.0,
+    **options: Any,
+) -> tuple[Any, Any]:
+    """Make a figure of panels, of which width and height are in inches, side by side.
 
     Args:
         count: number of panels.
-        width: width of each panel, in inches.
-        height: height of each panel, in inches.
+        width: of each panel.
+        height: of each panel.
+        columns: the largest number of panels in a row; all of them unless given.
+        legend: height below the panels.
         options: options of matplotlib's `Figure.subplots`.
 
     Returns:
-        The figure, and the axes of its panels.
+        The figure, and the axes of its panels; the last row may have some more.
 
     Raises:
         JaxmarkError: if matplotlib is missing.
@@ -67,8 +77,10 @@ def panels(count: int, width: float, height: float, **options: Any) -> tuple[Any
     require("matplotlib", "plot")
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width * count, height), layout="constrained")
-    return figure, np.atleast_1d(figure.subplots(1, count, **options))
+    columns = min(count, columns or count)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(width * columns, height * rows + legend), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, **options).ravel()
 
 
 def styles(points: int) -> Iterator[dict[str, Any]]:
@@ -77,26 +89,56 @@ def styles(points: int) -> Iterator[dict[str, Any]]:
         yield {"color": colour, "marker": marker, "markevery": max(1, points // _MARKERS_PER_LINE), "markersize": 5}
 
 
-def band(axes: Any, x: Float[np.ndarray, " points"], interval: Interval, colour: str) -> None:
-    """Shade a confidence interval about a line."""
-    axes.fill_between(x, interval.low, interval.high, color=colour, alpha=0.2, linewidth=0)
-
-
-def move_aside(drawn: Any, place: int, count: int, points: int) -> None:
-    """Move one of several series aside on the page, whatever the scale of its axes, so that all are visible.
+def draw_aside(axes: Any, line: Sequence[Any], place: int, count: int, points: int, **style: Any) -> None:
+    """Draw one of several lines with error bars, moved aside on the page so that all are visible.
 
     Args:
-        drawn: the series, matplotlib's `ErrorbarContainer`; limits of the axes are taken from where it was drawn.
-        place: place of the series among all, from 0.
-        count: number of series.
+        axes: matplotlib's axes, of any scale; their limits are taken from where the line is without being moved.
+        line: x, y, and the lower and upper ends of the bars.
+        place: place of the line among all, from 0.
+        count: number of lines.
         points: number of values of x, which share the width of the axes.
+        style: options of matplotlib's `Axes.errorbar`.
     """
     from matplotlib.transforms import ScaledTranslation
 
-    step = min(_ASIDE, _ASIDE_IN_ALL / (count * points))
+    x, y, low, high = line
+    # Rounding must not make a bar negative.
+    drawn = axes.errorbar(x, y, np.maximum([y - low, high - y], 0), capsize=3, **style)
+    inches, step = axes.figure.dpi_scale_trans, min(_ASIDE, _ASIDE_IN_ALL / (count * points))
     for artist in drawn.get_children():
-        inches = artist.get_figure().dpi_scale_trans
-        artist.set_transform(artist.axes.transData + ScaledTranslation(step * (place - (count - 1) / 2), 0, inches))
+        artist.set_transform(axes.transData + ScaledTranslation(step * (place - (count - 1) / 2), 0, inches))
+
+
+def fill_template(room: str, name: str, **values: Any) -> str:
+    """Fill the HTML template of a room with values, which are escaped.
+
+    Raises:
+        JaxmarkError: if Jinja2 is missing.
+    """
+    jinja2 = require("jinja2", "plot")
+    template = resources.files(room).joinpath(name).read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    return environment.from_string(template).render(values)
+
+
+def write_page(path: str | os.PathLike[str], title: str, pictures: Mapping[str, Picture], **parts: Any) -> None:
+    """Write an HTML page of pictures and tables, which loads nothing. Needs the extra `plot`.
+
+    Args:
+        path: file for the page.
+        title: its title.
+        pictures: pictures by their headings.
+        parts: `tables`, objects with `title`, `remark`, `heads` and `lines`; as needed `about`, a sentence below the
+            title; `alt`, the end of each picture's description; sentences as `notes` and `refusals`; and `nowrap`,
+            whether cells stay on one line.
+
+    Raises:
+        JaxmarkError: if Jinja2 is missing, or the page cannot be written.
+    """
+    shown = {"about": "", "alt": "", "notes": (), "refusals": (), "nowrap": False, "title": title, **parts}
+    shown["pictures"] = {name: base64.b64encode(picture.png()).decode() for name, picture in pictures.items()}
+    write_atomically(path, fill_template("jaxmark.plot", "page.html", **shown).encode())
 
 
 def finish(axes: Any, **labels: Any) -> None:

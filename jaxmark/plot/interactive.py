@@ -2,17 +2,15 @@
 
 import html
 import os
-from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.extras import require
 from jaxmark.files.atomic import write_atomically
 from jaxmark.geometry.mesh import Mesh, diagonal, host_mesh
-from jaxmark.plot.figures import FIELD
+from jaxmark.plot.figures import FIELD, fill_template
 from jaxmark.plot.meshes import View
 
 _PLAIN = (205, 205, 200, 255)  # the colour of a mesh without values
@@ -39,19 +37,17 @@ class Viewer(NamedTuple):
 def show(*views: View | Mesh) -> Viewer:
     """Make an interactive view of meshes, which notebooks and browsers show without network.
 
-    One mesh is seen at a time; all are seen from where the mouse has turned the first. So a mark is looked for by
-    `show(View("original", original.mesh), View("marked", marked), exaggerate(original, marked))`.
-
-    Args:
-        views: meshes, with titles by which they are chosen, and perhaps values, shown as colours from 0 to the largest;
-            or meshes alone. They keep their places beside the first one.
+    One mesh is seen at a time; all are seen from where the mouse has turned the first. To look for a mark, call
+    `show(View("original", original.mesh), View("marked", marked), exaggerate(original, marked))`. Titles are those by
+    which meshes are chosen; values are shown as colours from 0 to the largest. Meshes keep their places relative to the
+    first one.
 
     Raises:
         JaxmarkError: if matplotlib or Jinja2 is missing, there is no view, there is not one finite value for each
             vertex, or the first mesh has no extent (see `jaxmark.geometry.mesh.diagonal`).
     """
     require("matplotlib", "plot")
-    jinja2 = require("jinja2", "plot")
+    require("jinja2", "plot")
     import trimesh  # takes long to import
     from trimesh.scene import Camera, Scene
     from trimesh.viewer.notebook import scene_to_html
@@ -64,45 +60,30 @@ def show(*views: View | Mesh) -> Viewer:
     centre, size = np.mean(meshes[0].vertices, axis=0), diagonal(meshes[0])
     # Without names of our own, trimesh would choose random ones.
     scene = Scene(camera=Camera("camera", fov=(60, 45)))
-    for place, (view, mesh) in enumerate(zip(named, meshes, strict=True)):
+    shown = [_present(view, len(mesh.vertices)) for view, mesh in zip(named, meshes, strict=True)]
+    for place, (mesh, (colours, _)) in enumerate(zip(meshes, shown, strict=True)):
         points = (mesh.vertices - centre) / size
-        solid = trimesh.Trimesh(points, mesh.faces, vertex_colors=_colours(view, len(points)), process=False)
+        solid = trimesh.Trimesh(points, mesh.faces, vertex_colors=colours, process=False)
         scene.add_geometry(solid, node_name=f"view{place}", geom_name=f"view{place}")
     scene.set_camera()
-    template = resources.files("jaxmark.plot").joinpath("viewer.html").read_text(encoding="utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     title = " / ".join(view.title for view in named if view.title) or "jaxmark"
-    controls = environment.from_string(template).render(title=title, views=[_legend(view) for view in named])
+    controls = fill_template("jaxmark.plot", "viewer.html", title=title, views=[legend for _, legend in shown])
     before, end, after = scene_to_html(scene).rpartition("</body>")
     return Viewer(before + controls + end + after)
 
 
-def _shares(view: View, vertices: int) -> Float64[np.ndarray, " vertices"]:
-    """The values as shares of the largest."""
-    values = np.asarray(view.values, np.float64)
-    if values.shape != (vertices,) or not np.isfinite(values).all():
-        raise JaxmarkError(f"A viewer needs {vertices} finite values, one for each vertex.")
-    return np.clip(values / _most(view), 0, 1)
-
-
-def _most(view: View) -> float:
-    return max(float(np.max(view.values)), 1e-300) if view.values is not None else 0.0
-
-
-def _colours(view: View, vertices: int) -> np.ndarray:
+def _present(view: View, vertices: int) -> tuple[np.ndarray, dict[str, Any]]:
+    """The colours of the vertices, and the legend of the page: the title, and the scale of the colours of values."""
+    legend: dict[str, Any] = {"title": view.title, "most": "", "unit": "", "colours": []}
     if view.values is None:
-        return np.tile(np.array(_PLAIN, np.uint8), (vertices, 1))
-    from matplotlib import colormaps
-
-    return colormaps[FIELD](_shares(view, vertices), bytes=True)
-
-
-def _legend(view: View) -> dict[str, Any]:
-    """What the page says of a view: its title, and the scale of its colours if it has values."""
-    if view.values is None:
-        return {"title": view.title, "most": "", "unit": "", "colours": []}
+        return np.tile(np.array(_PLAIN, np.uint8), (vertices, 1)), legend
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
-    colours = [to_hex(colormaps[FIELD](step)) for step in np.linspace(0, 1, 9)]
-    return {"title": view.title, "most": f"{_most(view):.3g}", "unit": view.unit, "colours": colours}
+    values, colours = np.asarray(view.values, np.float64), colormaps[FIELD]
+    if values.shape != (vertices,) or not np.isfinite(values).all():
+        raise JaxmarkError(f"A viewer needs {vertices} finite values, one for each vertex.")
+    most = max(float(values.max()), 1e-300)
+    scale = [to_hex(colours(step)) for step in np.linspace(0, 1, 9)]
+    legend |= {"most": f"{most:.3g}", "unit": view.unit, "colours": scale}
+    return colours(np.clip(values / most, 0, 1), bytes=True), legend

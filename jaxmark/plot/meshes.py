@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxmark.alignment.original import Original, shift_of
 from jaxmark.distortion import local_roughness, shading_at_vertices
 from jaxmark.distortion.roughness import MAX_ROUGHNESS, MIN_ROUGHNESS, POWER
-from jaxmark.geometry.mesh import Mesh, check_faces, host_mesh
+from jaxmark.geometry.mesh import Mesh, check_faces, face_normals, host_mesh
 from jaxmark.plot.figures import FIELD, Picture, panels
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import filter
@@ -29,36 +29,30 @@ class View(NamedTuple):
 
 
 def displacement(original: Original, moved: Mesh, title: str = "displacement") -> View:
-    """Make a heat map of how far each vertex was moved.
-
-    Args:
-        original: the original, not moved.
-        moved: a mesh of the same connectivity.
-        title: title of the panel.
+    """Make a heat map of the displacement of each vertex, in percent of the diagonal.
 
     Raises:
-        JaxmarkError: if the connectivity differs.
+        JaxmarkError: if the connectivity differs from the original's.
     """
-    return View(title, original.mesh, _percent(original, moved)[original.weld.point], "% of diagonal")
+    return _map_percent(original, moved, title, np.ones(len(original.used)))
 
 
 def visibility(
     original: Original, moved: Mesh, title: str = "visibility: displacement over what roughness hides"
 ) -> View:
-    """Make a heat map of displacement over what roughness hides.
+    """Make a heat map of displacement over the displacement that roughness masks; see `roughness_masking`.
 
-    The same displacement shows more where the mesh is smooth; see `roughness_masking`.
-
-    Args:
-        original: the original, not moved.
-        moved: a mesh of the same connectivity.
-        title: title of the panel.
+    The same displacement shows more where the mesh is smooth.
 
     Raises:
-        JaxmarkError: if the connectivity differs.
+        JaxmarkError: if the connectivity differs from the original's.
     """
-    percent, hidden = _percent(original, moved), original.to_host(roughness_masking(original))
-    shown = np.divide(percent, hidden, out=np.zeros_like(percent), where=hidden > 0)
+    return _map_percent(original, moved, title, original.to_host(roughness_masking(original)))
+
+
+def _map_percent(original: Original, moved: Mesh, title: str, masked: Float[np.ndarray, " points"]) -> View:
+    percent = 100 * np.linalg.norm(shift_of(original, moved), axis=1)
+    shown = np.divide(percent, masked, out=np.zeros_like(percent), where=masked > 0)
     return View(title, original.mesh, shown[original.weld.point], "% of diagonal")
 
 
@@ -82,14 +76,7 @@ def roughness_masking(original: Original) -> Float[Array, " rows"]:
 
 
 def shading(original: Mesh, moved: Mesh, title: str = "visible turn of normals") -> View:
-    """Make a heat map of how far normals turn, over what the original hides.
-
-    See `jaxmark.distortion.visible_turn`.
-
-    Args:
-        original: the original, not moved.
-        moved: a mesh of the same connectivity.
-        title: title of the panel.
+    """Make a heat map of the turn of normals over what the original masks; see `jaxmark.distortion.visible_turn`.
 
     Raises:
         JaxmarkError: if the connectivity differs, or a mesh is unusable.
@@ -104,12 +91,12 @@ def exaggerate(original: Original, moved: Mesh, factor: float = 10) -> View:
 
 
 def draw(views: Sequence[View], *, elevation: float = 15.0, azimuth: float = 25.0) -> Picture:
-    """Draw meshes side by side, shaded, all from one direction, each as large as fits.
+    """Draw meshes side by side, left to right, shaded, all from one direction, each as large as fits.
 
     Values are drawn with a colour bar in their unit, from 0.
 
     Args:
-        views: the panels, left to right.
+        views: the panels.
         elevation: elevation of the eye above the horizon, in degrees; +y is up.
         azimuth: azimuth of the eye around the vertical, in degrees; 0 looks along -z.
 
@@ -126,20 +113,13 @@ def draw(views: Sequence[View], *, elevation: float = 15.0, azimuth: float = 25.
     return Picture(figure)
 
 
-def save_views(
-    views: Sequence[View], path: str | os.PathLike[str], *, elevation: float = 15.0, azimuth: float = 25.0
-) -> None:
-    """Write the picture of `draw` to a PNG file, whole or not at all.
+def save_views(views: Sequence[View], path: str | os.PathLike[str], **eye: float) -> None:
+    """Write the picture of `draw`, of which `eye` has the angles, to a PNG file, whole or not at all.
 
     Raises:
         JaxmarkError: see `draw`; also if the file cannot be written.
     """
-    draw(views, elevation=elevation, azimuth=azimuth).save(path)
-
-
-def _percent(original: Original, moved: Mesh) -> np.ndarray:
-    """Displacement of each point, in percent of the diagonal."""
-    return 100 * np.linalg.norm(shift_of(original, moved), axis=1)
+    draw(views, **eye).save(path)
 
 
 def rotation(elevation: float, azimuth: float) -> Float[np.ndarray, "3 3"]:
@@ -155,17 +135,13 @@ def _paint(axes, view: View, turn: np.ndarray):
 
     mesh = host_mesh(view.mesh)
     corners = (np.asarray(mesh.vertices) @ turn.T)[np.asarray(mesh.faces)]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    normals = face_normals(Mesh(mesh.vertices @ turn.T, mesh.faces))
     light = np.array([0.3, 0.5, 0.8]) / np.linalg.norm([0.3, 0.5, 0.8])
     # Soups and open surfaces have no inside: light both sides.
     brightness = (0.35 + 0.65 * np.abs(normals @ light))[:, None]
     order = np.argsort(corners[:, :, 2].mean(axis=1), kind="stable")
-    mappable = None
-    if view.values is None:
-        colours = brightness * np.array([0.80, 0.80, 0.84])
-    else:
+    mappable, colours = None, brightness * np.array([0.80, 0.80, 0.84])
+    if view.values is not None:
         from matplotlib.cm import ScalarMappable
         from matplotlib.colors import Normalize
 

@@ -31,13 +31,11 @@ class Rendering(NamedTuple):
 
 
 def render(rendering: Rendering, size: int = 600) -> Float64[np.ndarray, "rows columns"]:
-    """Render a mesh as gray values, 0 to 1, white beside it.
+    """Render a mesh as gray values, 0 to 1, white beside it, with `size` pixels on each side.
 
-    Args:
-        rendering: what to show. `"flat"` and `"smooth"` are lit from the upper left; `"zebra"` is smooth and glossy and
-            reflects bands of light that run around it, as body shops and designers of surfaces inspect them: where
-            normals turn by an angle, stripes move by twice that angle.
-        size: pixels on each side.
+    `"flat"` and `"smooth"` are lit from the upper left; `"zebra"` is smooth and glossy and reflects bands of light that
+    run around it, as body shops and designers of surfaces inspect them: where normals turn by an angle, stripes move by
+    twice that angle.
 
     Raises:
         JaxmarkError: if libigl is missing, or there is no such style or side.
@@ -53,11 +51,7 @@ def render(rendering: Rendering, size: int = 600) -> Float64[np.ndarray, "rows c
 
 
 def draw_renderings(renderings: Sequence[Rendering], size: int = 600) -> Picture:
-    """Draw renderings side by side.
-
-    Args:
-        renderings: the panels, left to right.
-        size: pixels on each side of a panel.
+    """Draw renderings side by side, left to right, each of `size` pixels on a side.
 
     Raises:
         JaxmarkError: if matplotlib is missing; or see `render`.
@@ -79,9 +73,9 @@ def _camera(side: str | tuple[float, float]) -> Float64[np.ndarray, "3 3"]:
 
 
 def _stripes(raster: Raster) -> Float64[np.ndarray, "rows columns"]:
-    """What a mirror shows of stripes, by the height at which the reflected line of sight ends."""
+    """The stripes that a mirror shows, by the height at which the reflected line of sight ends."""
     normals = raster.normals(smooth=True)
     # The eye is far away at +z: its line of sight is reflected to 2 (n·z) n - z.
     height = np.clip(2 * normals[:, :, 2] * normals[:, :, 1], -1, 1)
-    # What faces the eye shows the middle of a stripe, so that a plane is plain.
+    # Surfaces that face the eye show the middle of a stripe, so that a plane is plain.
     return 0.5 + 0.5 * np.tanh(np.cos(_STRIPES * np.arcsin(height)) / _EDGE)

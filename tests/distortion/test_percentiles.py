@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmark.distortion.percentiles import percentile
+from jaxmark.distortion.norms import percentile
 
 pytestmark = pytest.mark.core
 

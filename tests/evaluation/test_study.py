@@ -17,8 +17,8 @@ from jaxmark.attacks import Attack
 from jaxmark.confidence import clopper_pearson
 from jaxmark.evaluation._rates import Row
 from jaxmark.evaluation.cells import load_finished
-from jaxmark.evaluation.results import Results
-from jaxmark.evaluation.study_file import load_study
+from jaxmark.evaluation.study import load_study
+from jaxmark.evaluation.study_results import Results
 from jaxmark.geometry.mesh import Mesh
 from tests.app.test_cli import Workshop
 from tests.samples import bumpy_sphere

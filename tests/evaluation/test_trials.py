@@ -57,7 +57,7 @@ def test_what_is_tried_is_what_the_detector_has(mesh, trials, trial):
 
 
 def test_strengths_are_fitted_chosen_and_checked_by_different_signs(trials, trial):
-    fitted, checked = trials._run(trial.scheme, module._FITTED), trials.check(trial.scheme)
+    fitted, checked = trials.run(trial.scheme, module.FITTED), trials.run(trial.scheme, module.CHECKED)
     signs = [np.asarray(one).tobytes() for tried in (trial, fitted, checked) for one in tried.signs]
     assert len(set(signs)) == len(signs) == 2 * (3 + 3 + 8)
     again = trials.run(trial.scheme)
@@ -87,7 +87,7 @@ def test_what_is_better_by_chance_does_not_surpass(trial):
 def test_the_gradient_leads_to_more_evidence(trials, monkeypatch):
     """From strengths that fall too fast, judged by the very marks that better ones were fitted to."""
     poor = trials.run(KeyedScheme(profile=tuple(np.geomspace(1, 0.03, 24).tolist())))
-    monkeypatch.setattr(module, "_FITTED", module._CHOSEN)
+    monkeypatch.setattr(module, "FITTED", module.CHOSEN)
     better = trials.run(trials._improved(poor, _rms_cost(trials)))
     assert better.worst > 1.15 * poor.worst
     change = np.log(better.strengths / poor.strengths)
@@ -116,11 +116,11 @@ def test_limits_bind_as_metrics_do():
 @pytest.mark.long
 def test_tuned_strengths_are_not_worse_than_those_given(mesh):
     poor = KeyedScheme(profile=(1.0,) * 8)
-    found = tune(mesh, ATTACKS[:1], RMS, key=jax.random.key(0), bits=16, scheme=poor)
+    found = tune(mesh, ATTACKS[:1], RMS, seed=jax.random.key(0), bits=16, scheme=poor)
     report = found.report
     assert not report.kept
     assert report.tried.min() >= max(1.1 * report.tried_default.min(), report.tried_channels.min())
     # Started from the best, nothing is much better, and so it is kept as it is.
-    kept = tune(mesh, ATTACKS[:1], RMS, key=jax.random.key(0), bits=16, scheme=found.scheme)
+    kept = tune(mesh, ATTACKS[:1], RMS, seed=jax.random.key(0), bits=16, scheme=found.scheme)
     assert kept.report.tried.min() >= report.tried.min()
     assert kept.report.kept == (kept.scheme == found.scheme)

@@ -3,17 +3,17 @@
 import csv
 import io
 import os
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from jaxmark.evaluation import _rates as rates
 from jaxmark.evaluation._rates import POINT, Control, Row
-from jaxmark.evaluation.pictures.studies import Measure, curves
+from jaxmark.evaluation.pictures import Measure, curves
 from jaxmark.extras import require
 from jaxmark.files.atomic import write_atomically
-from jaxmark.plot import Picture
-from jaxmark.plot.pages import write_page
+from jaxmark.plot.figures import Picture, write_page
 
 _LABELS: dict[Control, str] = {"unmarked": "unmarked, detected", "wrong-key": "another key, detected"}
 _SHOWN: dict[Measure, str] = {"read": "What was read", "log10_p_unfloored": "Evidence"}
@@ -53,14 +53,11 @@ class Results:
         lines = []
         for point, rate in cells.items():
             mark = rate["marked"]
-            said = [f"{one:g}" if isinstance(one, float) else str(one) for one in point]
-            said += [
-                f"{mark['read']}/{mark['trials']}",
-                f"{100 * mark['read_low']:.0f} - {100 * mark['read_high']:.0f}",
-            ]
-            said += [f"{100 * mark['bit_errors']:.1f} %", f"{mark['log10_p']:.1f}", f"{mark['log10_p_unfloored']:.1f}"]
-            said += [f"{rate[name]['detected']}/{rate[name]['trials']}" for name in _LABELS]
-            lines.append(said)
+            line = [f"{one:g}" if isinstance(one, float) else str(one) for one in point]
+            low, high = 100 * mark["read_low"], 100 * mark["read_high"]
+            line += [f"{mark['read']}/{mark['trials']}", f"{low:.0f} - {high:.0f}"]
+            line += [f"{100 * mark['bit_errors']:.1f} %", f"{mark['log10_p']:.1f}", f"{mark['log10_p_unfloored']:.1f}"]
+            lines.append(line + [f"{rate[name]['detected']}/{rate[name]['trials']}" for name in _LABELS])
         return heads, lines
 
     def _controls(self) -> list[str]:
@@ -73,20 +70,16 @@ class Results:
         ]
 
     def _refusals(self) -> list[str]:
-        """Every refusal, and how often it was."""
-        counts: dict[tuple[Any, ...], int] = {}
-        for row in self.rows:
-            if row.refusal and row.control != "wrong-key":
-                case = (row.mesh, row.scheme, f"{row.attack} {row.strength:g}", row.control, row.refusal)
-                counts[case] = counts.get(case, 0) + 1
+        """Every refusal, with its count."""
+        counts = Counter(
+            (row.mesh, row.scheme, f"{row.attack} {row.strength:g}", row.control, row.refusal)
+            for row in self.rows
+            if row.refusal and row.control != "wrong-key"
+        )
         return [f"{', '.join(case[:-1])}, {count} ×: {case[-1]}" for case, count in counts.items()]
 
     def save_page(self, path: str | os.PathLike[str], title: str = "What a mark survives") -> None:
         """Write one HTML page with pictures, table, controls and refusals, which loads nothing. Needs the extra `plot`.
-
-        Args:
-            path: file for the page.
-            title: its title.
 
         Raises:
             JaxmarkError: if matplotlib or Jinja2 is missing, or the page cannot be written.
@@ -98,7 +91,7 @@ class Results:
             title,
             {name: self.plot(of) for of, name in _SHOWN.items()},
             alt=", over the strength of each attack",
-            tables=[{"title": "All points", "heads": heads, "lines": lines}],
+            tables=[{"title": "All points", "remark": "", "heads": heads, "lines": lines}],
             notes=self._controls(),
             refusals=self._refusals(),
             nowrap=True,
