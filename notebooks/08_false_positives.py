@@ -77,7 +77,7 @@ def vector(seen):
 
 def scores(suspect: jm.Mesh, claims: list[tuple[jm.Key, bytes]]) -> tuple[np.ndarray, float]:
     """S of each claim of a key and a message, and ‖a‖."""
-    a = np.asarray(vector(owner.observe(suspect)), np.float64)
+    a = np.asarray(vector(owner.observe(owner.register(suspect))), np.float64)
     a[~original.moving] = 0
     found = []
     for key, message in claims:
