@@ -107,8 +107,8 @@ assert by_library < 0.99 * (by_hand + math.log10(2 / 0.97**2))
 #
 # Two thousand keys that had no part in it are tried on an unmarked mesh with noise, and on one that somebody else has
 # marked. The proof says that the curves stay below the dashed line. They stay well below: Hoeffding's bound must hold
-# for every suspect, the worst included. The estimate that takes $S$ to be Gaussian (`log10_p_gaussian`) follows the line
-# closely, here.
+# for every suspect, the worst included. The estimate that takes $S$ to be Gaussian (`log10_p_gaussian`) follows the
+# line closely, here.
 
 # %%
 strangers = [(key_of(1000 + number), MESSAGE) for number in range(2000)]

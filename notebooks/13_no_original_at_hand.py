@@ -112,7 +112,8 @@ for panel, (kind, strengths) in zip(axes, STRENGTHS.items(), strict=True):
         jm.detect(jm.attack(marked, kind, strength, seed=0), key=key, record=info.record) for strength in strengths
     ]
     for strength, found in zip(strengths, readings, strict=True):
-        print(f"{kind} {strength:g}: {found.message!r}, log10 p {found.log10_p:.1f}, agreement {found.registration.agreement:.2f}")
+        agreement = found.registration.agreement
+        print(f"{kind} {strength:g}: {found.message!r}, log10 p {found.log10_p:.1f}, agreement {agreement:.2f}")
     panel.plot(strengths, [found.registration.agreement for found in readings], color=COLOURS[0], marker="o")
     finish(panel, title=kind, xlabel="strength", ylabel="agreement", ylim=(0, 1))
 Picture(figure).save("13_2.png")
