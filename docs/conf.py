@@ -8,6 +8,7 @@ import ast
 import inspect
 import re
 import textwrap
+from pathlib import Path
 from typing import Any
 
 from sphinx.application import Sphinx
@@ -33,6 +34,11 @@ nb_execution_mode = "off"
 nb_merge_streams = True
 nb_output_stderr = "remove"  # what XLA says of itself
 templates_path = ["_templates"]
+_ROOT = Path(__file__).parents[1]
+# Pages of packages describe what they show of their private modules.
+autosummary_context = {
+    "packages": [".".join(path.parent.relative_to(_ROOT).parts) for path in _ROOT.glob("jaxmark/**/__init__.py")]
+}
 html_theme = "furo"
 html_static_path = ["_static"]
 html_css_files = ["pages.css"]

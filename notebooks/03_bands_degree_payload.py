@@ -181,5 +181,5 @@ pictures.success(curves, jm.adversaries.ATTACKS["noise"].unit).save("03_5.png")
 #
 # - Damped scaling functions, 64 bands: the default, for nearly all meshes.
 # - As few bits as serve: 64 name anything in a table. The rest of the energy makes the mark stronger.
-# - As strong as `limits=` on a perceptual metric allows, not as one displacement for all meshes.
+# - As strong as the limits of a budget on a perceptual metric allow, not with one displacement for all meshes.
 # - `jm.capacity` before, and `jm.robustness` after.

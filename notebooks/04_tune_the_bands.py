@@ -26,7 +26,6 @@ if importlib.util.find_spec("jaxmark") is None:  # in the folder of notebooks of
     subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", "..[plot]"], check=True)
 
 # %%
-import jax
 import numpy as np
 
 import jaxmark as jm
@@ -56,7 +55,7 @@ for band in (0, 1, 3, 7, 15, 31):
 # %%
 LIMITS = {"dame": 0.008}
 ATTACKS = [("jamming", 0.002), ("low-pass", 0.9)]
-tuned = jm.tune(mesh, ATTACKS, LIMITS, key=jax.random.key(0), bits=16, margin="evidence")
+tuned = jm.tune(mesh, ATTACKS, LIMITS, seed=0, bits=16, margin="evidence")
 report = tuned.report
 print("kept: the default is as good" if report.kept else "found: better strengths than the default's")
 for (kind, strength), left, before in zip(ATTACKS, report.tried, report.tried_default, strict=True):
@@ -75,8 +74,8 @@ for name, scheme in (("default", "keyed"), ("tuned", tuned.scheme)):
     print(f"{name}: RMS {info.rms:.4%} of the diagonal, DAME {jm.compare(mesh, marked, ['dame']).dame:.4f}")
     claims = [marker.detect(jm.attack(marked, *one, seed=1), message) for one in ATTACKS]
     for (kind, strength), found in zip(ATTACKS, claims, strict=True):
-        print(f"  after {kind} {strength:g}: log10 p of the claim {found.log10_p_unfloored:.1f}")
-    worst[name] = max(found.log10_p_unfloored for found in claims)
+        print(f"  after {kind} {strength:g}: log10 p of the claim {found.evidence.log10_p_unfloored:.1f}")
+    worst[name] = max(found.evidence.log10_p_unfloored for found in claims)
     betas[name] = info.record.beta * np.asarray(marker.reader.carrier.profile)
     shown[name] = marked
 assert worst["tuned"] < -6

@@ -38,7 +38,7 @@ study = jm.Study(
     schemes=["keyed"],
     budgets=[4e-4],  # RMS of the mark over the diagonal: weak, so that there is something to lose
     attacks={"noise": [0.002, 0.005, 0.02], "quantisation": [9, 7]},
-    seeds=3,
+    samples=3,
 )
 results = study.run(FOLDER / "results.jsonl", say=print)
 
@@ -47,7 +47,7 @@ results = study.run(FOLDER / "results.jsonl", say=print)
 # Add a strength, and only that is done. With `workers=2` there are two processes; a script (not Jupyter) then has to
 # start them below `if __name__ == "__main__":`.
 #
-# Every seed stands for a trial of its own: another key, another message, another attack. So the trials are independent,
+# Every sample has a seed of its own: another key, another message, another attack. So the trials are independent,
 # and the share that was read has an exact interval (Clopper and Pearson, 1934), which covers the true rate with at
 # least 95 % probability whatever it is. From three trials that all read, it begins at 29 %: few trials prove little.
 

@@ -62,7 +62,7 @@ word = jnp.asarray(marker.codeword(message), jnp.float32)
 share = 0.3
 weak = enemies.erasure_by_descent(marker, message, steps=8)
 suspect = jm.attack(marked, weak, share * size, seed=0)
-scores, norms = claims(marker.reader, marker.receive(suspect), word)
+scores, norms = claims(marker.reader, marker.receive(marker.register(suspect)), word)
 by_bands, all_alike = np.asarray(scores / norms)
 print(f"displaced by {share:.0%} of the mark's RMS: {by_bands:.1f} weighed by bands, {all_alike:.1f} all alike")
 print(f"claimed: log10 p {marker.detect(suspect, message).log10_p:.1f}")

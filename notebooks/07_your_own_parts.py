@@ -158,7 +158,7 @@ class Waves(NamedTuple):
 # `choices` has all that depends on the key: signs, permutations and bytes, by a label of our own. They are bound to
 # the scheme's name and fields, to payload and original: with another wavelength, all signs are others. Only the signs
 # may depend on the key; the waves must not, or the proof of a detection would not hold. Nobody but you can know that,
-# so that what is read with a scheme of your own is called an estimate, and `doubts` says why.
+# so that a reading with a scheme of your own is an estimate, and `evidence.caveats` says why.
 
 
 # %%

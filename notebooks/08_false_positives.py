@@ -39,7 +39,7 @@ from jaxmark.evaluation import pictures
 from jaxmark.geometry import asteroid
 from jaxmark.watermark.carriers import make_chips
 from jaxmark.watermark.coding.message import encode
-from jaxmark.watermark.evidence.bounds import log10_p_claimed, log10_p_fitted
+from jaxmark.watermark.evidence.bounds import log10_p_gaussian, log10_p_score
 
 mesh = asteroid(1400)
 MESSAGE = b"jaxmark!"
@@ -77,7 +77,7 @@ def vector(seen):
 
 def scores(suspect: jm.Mesh, claims: list[tuple[jm.Key, bytes]]) -> tuple[np.ndarray, float]:
     """S of each claim of a key and a message, and ‖a‖."""
-    a = np.asarray(vector(owner.observe(suspect)), np.float64)
+    a = np.asarray(vector(owner.observe(owner.register(suspect))), np.float64)
     a[~original.moving] = 0
     found = []
     for key, message in claims:
@@ -91,15 +91,15 @@ def scores(suspect: jm.Mesh, claims: list[tuple[jm.Key, bytes]]) -> tuple[np.nda
 def bound(suspect: jm.Mesh, claims: list[tuple[jm.Key, bytes]]) -> np.ndarray:
     """The proven log10 p of each claim."""
     found, norm = scores(suspect, claims)
-    return np.array([log10_p_claimed(score, norm) for score in found])
+    return np.array([log10_p_score(score, norm) for score in found])
 
 
 noisy = jm.attack(marked, "noise", 0.02, seed=0)
 (by_hand,) = bound(noisy, [(key_of(0), MESSAGE)])
 by_library = owner.detect(noisy, MESSAGE).log10_p
 print(f"log10 p by hand {by_hand:.2f}, by the library {by_library:.2f}")
-# The library pays for two ways to weigh the bands, of which this is one and the other may prove more, and by 3 % each
-# for other ways to align and for other messages.
+# The library charges for two ways to weight the bands, of which this is one and the other may prove more, and 3 % each
+# for other alignments and for other messages.
 assert by_library < 0.99 * (by_hand + math.log10(2 / 0.97**2))
 
 # %% [markdown]
@@ -107,8 +107,8 @@ assert by_library < 0.99 * (by_hand + math.log10(2 / 0.97**2))
 #
 # Two thousand keys that had no part in it are tried on an unmarked mesh with noise, and on one that somebody else has
 # marked. The proof says that the curves stay below the dashed line. They stay well below: Hoeffding's bound must hold
-# for every suspect, the worst included. The estimate that takes $S$ to be Gaussian (`log10_p_fitted`) follows the line
-# closely, here.
+# for every suspect, the worst included. The estimate that takes $S$ to be Gaussian (`log10_p_gaussian`) follows the
+# line closely, here.
 
 # %%
 strangers = [(key_of(1000 + number), MESSAGE) for number in range(2000)]
@@ -119,7 +119,7 @@ unmarked = {
 }
 proven = {name: bound(suspect, strangers) for name, suspect in unmarked.items()}
 found, norm = scores(unmarked["unmarked, with noise"], strangers)
-fitted = np.array([log10_p_fitted(score, norm) for score in found])
+fitted = np.array([log10_p_gaussian(score, norm) for score in found])
 for name, values in proven.items():
     for level in (-1, -2):
         hits = int(np.sum(values <= level))
@@ -165,14 +165,15 @@ pictures.roc({"right key": np.array(right), "wrong key": np.array(wrong)}, lowes
 # %% [markdown]
 # ## Searching
 #
-# The bound is for *one* key and *one* message, fixed before the suspect was seen. Who tries fifty and shows the best
-# has made fifty attempts: its probability is not that of one. The remedy is old (Bonferroni): multiply by fifty, or add
-# log10 50.
+# The bound is for *one* key and *one* message, fixed before the suspect was seen. Anybody who tries fifty and shows the
+# best has made fifty attempts: its probability is not that of one. The Bonferroni correction multiplies it by fifty, or
+# adds log10 50.
 #
-# The library pays by itself where it searches: a message that is *read*, not claimed, is the best of all, so that its
-# bound counts all of them, and the keyed tag of 28 bits counts the candidates that tried it before it fitted, 64 at
-# most. What it cannot know is how many suspects, keys or originals *you* went through. For who does not believe you,
-# there is `log10_p_undated`, which takes it that you tried 2^64, each with all messages.
+# The library charges for its own searches: a message that was *decoded*, not claimed, is the best of all, so that its
+# bound counts all of them, and the keyed tag of 28 bits counts the candidates that were tried before it fitted, 64 at
+# most. `evidence.charges` lists all of this. The library cannot know how many suspects, keys or originals *you* tried.
+# A reader who does not trust you takes `evidence.log10_p_uncommitted`, which assumes that you tried 2^64, each with all
+# messages.
 
 # %%
 TRIES = 50
@@ -235,9 +236,9 @@ assert not claim.detected()
 assert owner.detect(marked, MESSAGE).detected()
 
 # %% [markdown]
-# This makes forging a search, and a search has been dealt with above: it must be paid for. Who may choose original, key
-# and message *after* the suspect was seen can go on searching for as long as they like. That is why all three must be
-# fixed before, by a record that is dated: `info.record` commits to key, original and message without showing any, and
+# This makes forging a search, and a search must be charged, as above. An adversary who may choose original, key and
+# message *after* seeing the suspect can go on searching for as long as they like. That is why all three must be fixed
+# before, by a timestamped commitment: `info.record` commits to key, original and message without showing any, and
 # `jaxmark deposit` makes of many records one number to publish.
 #
 # A mesh that is no copy of the original at all is not compared in vain, but refused:
@@ -257,7 +258,7 @@ except jm.JaxmarkError as refusal:
 # | for any suspect made without the key: attacked, or marked by others | for which message a mark under that key has |
 # | for one key, original, message and record, fixed before | for the best of many, unless their number is paid for |
 # | with weights, pose and masks from suspect and original | with weights that were chosen by the score |
-# | whatever the residual looks like | for `log10_p_fitted`, an estimate |
+# | whatever the residual looks like | for `log10_p_gaussian`, an estimate |
 #
 # `python benchmarks/security/false_positives.py` counts a million pairs of key and suspect, with suspects made to be
 # hard.

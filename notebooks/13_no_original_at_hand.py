@@ -62,7 +62,7 @@ suspects = {
 }
 for name, suspect in suspects.items():
     found = jm.detect(suspect, key=key, scheme=SCHEME)
-    print(f"{name:<51} {found.message!r} log10 p {found.log10_p:6.1f}  agreement {found.agreement:.2f}")
+    print(f"{name:<51} {found.message!r} log10 p {found.log10_p:6.1f}  agreement {found.registration.agreement:.2f}")
     assert found.message == MESSAGE
 known = SCHEME.fixed(width, step)  # less to try
 for name, suspect, tried in (("unmarked", mesh, key), ("marked, another key", marked, jm.new_key())):
@@ -112,8 +112,9 @@ for panel, (kind, strengths) in zip(axes, STRENGTHS.items(), strict=True):
         jm.detect(jm.attack(marked, kind, strength, seed=0), key=key, record=info.record) for strength in strengths
     ]
     for strength, found in zip(strengths, readings, strict=True):
-        print(f"{kind} {strength:g}: {found.message!r}, log10 p {found.log10_p:.1f}, agreement {found.agreement:.2f}")
-    panel.plot(strengths, [found.agreement for found in readings], color=COLOURS[0], marker="o")
+        agreement = found.registration.agreement
+        print(f"{kind} {strength:g}: {found.message!r}, log10 p {found.log10_p:.1f}, agreement {agreement:.2f}")
+    panel.plot(strengths, [found.registration.agreement for found in readings], color=COLOURS[0], marker="o")
     finish(panel, title=kind, xlabel="strength", ylabel="agreement", ylim=(0, 1))
 Picture(figure).save("13_2.png")
 

@@ -1,8 +1,8 @@
 """Marks that are read without their originals, after attacks: python benchmarks/robustness/blind.py MESH...
 
-With each of --keys keys, 64 bits are written with --scheme within --limits: the two of the protocol of SMI
-2010 (see smi2010.py), or hidden as by default. Each suspect is read with key and suspect alone. A table for each mesh
-has a line for each attack, written as soon as it is known:
+With each of --keys keys, 64 bits are written with --scheme within --limits: the two of the protocol of SMI 2010 (a
+track of `jaxmark bench`), or hidden as by default. Each suspect is read with key and suspect alone. A table for each
+mesh has a line for each attack, written as soon as it is known:
 
 read        in how many of the copies the exact message was read
 log10 p     of the false-positive probability, the worst and the best of the copies; [...] without its floor at -77

@@ -1,10 +1,10 @@
 """How often a claimed message is "detected" where there is no mark: nominal probabilities against counted ones.
 
-For many keys and hard suspects, through `Marker.observe`, `detectors.claims` and `bounds.log10_p_score`, which
+For many keys and hard suspects, through `NonBlindMarker.observe`, `detectors.claims` and `weigh`, which
 `jaxmark.detect` calls. Every rate must not exceed its level (Clopper-Pearson, one-sided, 99.9 %), for each suspect, and
 the rate over all must be at least a thirtieth of it, at levels where that makes 10 hits or more (down to 1e-3 with the
 default number of keys): a bound that never fires proves nothing. As a control, the same checks of a bound with the
-exponent doubled must fail. The same for a message that was read: the best of all, paid for by the union bound, and
+exponent doubled must fail. The same for a message that was read: the best of all, charged by the union bound, and
 without it as a control. Exit status 1 if a check does not end so. With --surfaces, suspects were meshed anew, so that
 only their surface is known; with --vertices, few vertices are left, by which they are read.
 

@@ -11,8 +11,8 @@ degree     13: the same over the degree; "all bands" forms all n + 1 components 
 attacks    14: bit error rate of 64 bits without a code, RMS 0.08 % of the diagonal, mean of --trials keys, messages
            and seeds. "as printed": printed kernel, components as they are, plain correlation; "working": Jackson-damped
            bands at unit norm, decorrelated; "eigenvectors": decorrelated, too. The attacks are `jaxmark.attacks`'s:
-           diagonal-noise, mark_noise, similarity and edge-flips; the last two are brought back by
-           `jaxmark.alignment.alignment`, the others compared as they stand.
+           diagonal-noise, mark_noise, similarity and edge-flips; the last two are aligned by
+           `jaxmark.alignment.attempts.align`, the others compared as they stand.
 collinear  median |⟨x_i, x_j⟩_D| of unit components that are not empty, over x, y and z, and bit errors of 64 bits
            with no attack, components as they are and plain correlation, for each form of the kernel.
 gibbs      15 and 16: 16 bands of best approximated hats, and of sums of neighbouring scaling functions of the same

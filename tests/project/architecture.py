@@ -56,7 +56,7 @@ def below(found: Mapping[str, set[str]], room: str) -> set[str]:
 
 
 def table(found: Mapping[str, set[str]]) -> str:
-    """Rooms and their modules with the first lines of their docstrings, as Markdown; a room imports from those above."""
+    """The rooms and their modules, with the first lines of their docstrings; a room imports from those above."""
     rows = ["| room or module | what it is |", "|---|---|"]
     for room in (room for floor in floors(found) for room in floor):
         folder = PACKAGE / room
