@@ -18,7 +18,6 @@ from .errors import JaxmarkError as JaxmarkError
 from .evaluation import Study as Study
 from .evaluation import robustness as robustness
 from .evaluation import tune as tune
-from .evaluation import tune_blind as tune_blind
 from .files import load_mesh as load_mesh
 from .files import save_mesh as save_mesh
 from .geometry import Mesh as Mesh

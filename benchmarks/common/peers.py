@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from scipy import sparse
 
-from jaxmark.extras import require
+from jaxmark.errors import require
 
 Run = Callable[[], Any]
 

@@ -39,7 +39,7 @@ from jaxmark.alignment.original import make_original
 from jaxmark.attacks import Attack
 from jaxmark.attacks.remeshing import apply_filter
 from jaxmark.confidence import clopper_pearson
-from jaxmark.extras import require
+from jaxmark.errors import require
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, used_vertices, weld, weld_mesh
 from jaxmark.geometry.pose import Pose
 from jaxmark.watermark.schemes.registry import get_nonblind

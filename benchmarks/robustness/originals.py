@@ -121,7 +121,7 @@ def measured(mesh: Mesh, seed: int) -> tuple[str, dict[str, Row]]:
 def cell(row: Row) -> str:
     if "refused" in row:
         return f"refused: {row['refused']}"
-    return f"{row['log10_p']:.1f}{'*' * row['reads']}{', an estimate' * bool(row['doubts'])}"
+    return f"{row['log10_p']:.1f}{'*' * row['reads']}{', an estimate' * bool(row['caveats'])}"
 
 
 def summary(rows: list[dict[str, Row]]) -> list[Row]:

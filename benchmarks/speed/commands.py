@@ -38,19 +38,21 @@ from common.timing import for_commands
 BORN = time.time()
 # The functions of each stage: module, name, and stage.
 FUNCTIONS = (
+    ("jaxmark.app.mark_files", "load_scene", "read"),
+    ("jaxmark.app.mark_files", "load_mesh", "read"),
+    ("jaxmark.app.mark_files", "load_texture", "read"),
     ("jaxmark.app.read_files", "load_scene", "read"),
     ("jaxmark.app.read_files", "load_mesh", "read"),
-    ("jaxmark.app.read_files", "load_texture", "read"),
-    ("jaxmark.app.read_files", "prepare", "prepare"),
-    ("jaxmark.app.read_files", "make_markers", "prepare"),
+    ("jaxmark.app.mark_files", "prepare", "prepare"),
+    ("jaxmark.app.read_files", "alternatives", "prepare"),
     ("jaxmark.distortion", "Reference.measure", "limits"),
-    ("jaxmark.watermark.marking", "Marker.suited", "write"),
-    ("jaxmark.watermark.marking", "Marker.embed", "write"),
-    ("jaxmark.watermark.marking", "Marker.reads", "back"),
-    ("jaxmark.watermark.marking", "Marker.tried", "back"),
-    ("jaxmark.app.read_files", "save_mesh", "save"),
+    ("jaxmark.watermark.markers", "NonBlindMarker.adapted", "write"),
+    ("jaxmark.watermark.markers", "NonBlindMarker.embed", "write"),
+    ("jaxmark.watermark.markers", "NonBlindMarker.reads", "back"),
+    ("jaxmark.watermark.markers", "NonBlindMarker.measure_survival", "back"),
+    ("jaxmark.app.mark_files", "save_mesh", "save"),
     ("jaxmark.alignment.attempts", "align", "align"),
-    ("jaxmark.watermark.marking", "Markers.detect", "receive"),
+    ("jaxmark.watermark.nonblind", "Alternatives.read", "receive"),
 )
 STAGES = ("start", *dict.fromkeys(stage for *_, stage in FUNCTIONS), "other")
 

@@ -31,7 +31,7 @@ from scipy.sparse import linalg as sparse_linalg
 
 import jaxmark as jm
 from jaxmark.alignment.original import make_original
-from jaxmark.extras import require
+from jaxmark.errors import require
 from jaxmark.spectral.chebyshev import filter, moments
 from jaxmark.spectral.laplacian import Laplacian, host_edges, sparse_matrices
 from jaxmark.spectral.learned import cheb_conv

@@ -39,7 +39,7 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark.alignment.original import Original, make_original
-from jaxmark.extras import require
+from jaxmark.errors import require
 from jaxmark.spectral import kernels
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.chebyshev import band_components, filter, moments

@@ -13,8 +13,7 @@ from jaxmark.alignment.original import Original
 from jaxmark.alignment.registration import refine, register_part, register_whole
 from jaxmark.alignment.replay import replay_smoothing
 from jaxmark.alignment.suspect import Suspect
-from jaxmark.errors import JaxmarkError
-from jaxmark.extras import available
+from jaxmark.errors import JaxmarkError, available
 from jaxmark.geometry.mesh import (
     Mesh,
     area,

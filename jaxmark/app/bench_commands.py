@@ -29,9 +29,8 @@ from jaxmark.bench.method import METHODS
 from jaxmark.bench.readings import BenchResults, hold_against, load_published, save_readings
 from jaxmark.bench.summary import entries, save_entries
 from jaxmark.bench.tables import tables
-from jaxmark.errors import JaxmarkError
+from jaxmark.errors import JaxmarkError, require
 from jaxmark.evaluation.cells import processes
-from jaxmark.extras import require
 from jaxmark.files.atomic import write_atomically
 
 _PATH = click.Path(path_type=Path)

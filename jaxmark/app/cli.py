@@ -44,11 +44,10 @@ from jaxmark.app.process import end_by_exception
 from jaxmark.app.progress import current
 from jaxmark.app.read_files import FileReader
 from jaxmark.app.serving import serve_command
-from jaxmark.errors import JaxmarkError
+from jaxmark.errors import JaxmarkError, require
 from jaxmark.evaluation.cells import left_over
 from jaxmark.evaluation.pictures import Measure
 from jaxmark.evaluation.study import load_study
-from jaxmark.extras import require
 from jaxmark.files import load_mesh, load_scene, load_skin, save_mesh, save_scene
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.geometry import unpose

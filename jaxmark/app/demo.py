@@ -12,9 +12,8 @@ from jaxmark.adversaries.by_name import attack
 from jaxmark.alignment.original import Original
 from jaxmark.app.output import power
 from jaxmark.app.progress import Doing, quietly
-from jaxmark.errors import JaxmarkError
+from jaxmark.errors import JaxmarkError, package_folder, require
 from jaxmark.evaluation._rates import Control
-from jaxmark.extras import package_folder, require
 from jaxmark.files import load_mesh, save_mesh
 from jaxmark.files.atomic import write_atomically
 from jaxmark.geometry.mesh import Mesh

@@ -22,8 +22,7 @@ from jaxtyping import Float64
 from jaxmark.alignment.alignment import Alignment
 from jaxmark.alignment.original import Original
 from jaxmark.app.output import make_folder
-from jaxmark.errors import JaxmarkError
-from jaxmark.extras import require
+from jaxmark.errors import JaxmarkError, require
 from jaxmark.files.atomic import file_hash, write_atomically
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.plot import View, draw, save_views

@@ -17,9 +17,8 @@ from jaxmark.app.output import answer, message_text, power, say
 from jaxmark.app.process import release_programs
 from jaxmark.app.progress import current
 from jaxmark.catalogue import Catalogue, Finder, Match, Plan, Verdict, find_each, mesh_files_below
-from jaxmark.errors import JaxmarkError
+from jaxmark.errors import JaxmarkError, require
 from jaxmark.evaluation.cells import Pool, processes
-from jaxmark.extras import require
 
 
 @catalogue_group.command(name="find")

@@ -24,8 +24,7 @@ from jaxmark.app.output import answer, error_text
 from jaxmark.app.process import release_programs
 from jaxmark.app.read_files import FileReader
 from jaxmark.catalogue import Catalogue, Finder, Match
-from jaxmark.errors import JaxmarkError
-from jaxmark.extras import require
+from jaxmark.errors import JaxmarkError, require
 from jaxmark.files import SUFFIXES
 from jaxmark.files.atomic import write_atomically
 from jaxmark.watermark.coding.keys import Key

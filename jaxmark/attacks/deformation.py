@@ -4,8 +4,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxmark.attacks.support import on_host
-from jaxmark.errors import JaxmarkError
-from jaxmark.extras import require
+from jaxmark.errors import JaxmarkError, require
 from jaxmark.geometry.mesh import Mesh, compact, component_of, diagonal, face_normals, used_vertices
 from jaxmark.geometry.pose import Points
 from jaxmark.seeds import Randomness, generator

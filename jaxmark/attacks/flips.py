@@ -40,7 +40,7 @@ def edge_flips(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
         if len(quads) == 0:
             share = math.floor(1000 * len(made) / total) / 1000
             raise JaxmarkError(
-                f"Only {len(made)} of the mesh's {total} edges can be flipped with this key, not {wanted}; ask for a"
+                f"Only {len(made)} of the mesh's {total} edges can be flipped with this seed, not {wanted}; ask for a"
                 f" share of at most {share:g}."
             )
         a, b, c, d = quads.T

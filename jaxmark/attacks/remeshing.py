@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from jaxmark.attacks.support import check_share, on_host, whole_number
-from jaxmark.errors import JaxmarkError
-from jaxmark.extras import require
+from jaxmark.errors import JaxmarkError, require
 from jaxmark.geometry.mesh import Mesh, area, compact, edges, simplify
 from jaxmark.geometry.pose import Points
 from jaxmark.seeds import Randomness, generator

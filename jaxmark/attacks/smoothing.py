@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmark.attacks.support import Positions, Strength, centred, displace, inner_vertices, whole_number
-from jaxmark.distortion.roots import root
+from jaxmark.distortion.norms import root
 from jaxmark.geometry.mesh import Mesh, edges
 from jaxmark.seeds import Seed
 from jaxmark.spectral import rational

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmark.adversaries.registry import attack
+from jaxmark.adversaries.by_name import attack
 from jaxmark.bench.composed_attacks import last_within
 from jaxmark.bench.leagues import get_league
 from jaxmark.bench.method import Given, load_method

@@ -15,10 +15,9 @@ from jaxmark.bench.leagues import League, get_league
 from jaxmark.bench.method import Given, load_method
 from jaxmark.bench.readings import BenchResults
 from jaxmark.bench.tasks import MARK, UNMARKED, Meshes, Task, make_bench, run_task
-from jaxmark.errors import JaxmarkError
+from jaxmark.errors import JaxmarkError, require
 from jaxmark.evaluation import cells
 from jaxmark.evaluation.cells import Pool
-from jaxmark.extras import require
 
 KEYS = 2  # for each unmarked suspect: a hundred nulls give a rate of 1 %
 

@@ -11,8 +11,7 @@ from jaxmark.adversaries.by_name import attack, chain
 from jaxmark.attacks import Attack
 from jaxmark.attacks.remeshing import apply_filter
 from jaxmark.distortion import Reference
-from jaxmark.errors import JaxmarkError
-from jaxmark.extras import require
+from jaxmark.errors import JaxmarkError, require
 from jaxmark.geometry import asteroid
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, face_normals
 

@@ -11,7 +11,7 @@ from jaxmark.bench.readings import BenchResults
 from jaxmark.bench.robustness_curves import RANGES, axis, curve
 from jaxmark.bench.summary import points
 from jaxmark.bench.tables import tables
-from jaxmark.extras import require
+from jaxmark.errors import require
 from jaxmark.plot import Picture
 from jaxmark.plot.figures import COLOURS, panels, write_page
 

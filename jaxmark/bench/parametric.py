@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial import ConvexHull, Delaunay
 
-from jaxmark.adversaries.registry import attack
+from jaxmark.adversaries.by_name import attack
 from jaxmark.geometry import asteroid
 from jaxmark.geometry.mesh import Mesh, make_mesh, unit
 

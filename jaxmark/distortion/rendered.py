@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from jaxmark.extras import require
+from jaxmark.errors import require
 from jaxmark.geometry.mesh import Mesh, host_mesh
 from jaxmark.geometry.raster import SIDES, Frame, Raster, cast
 

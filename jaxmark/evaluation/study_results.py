@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from jaxmark.errors import require
 from jaxmark.evaluation import _rates as rates
 from jaxmark.evaluation._rates import POINT, Control, Row
 from jaxmark.evaluation.pictures import Measure, curves
-from jaxmark.extras import require
 from jaxmark.files.atomic import write_atomically
 from jaxmark.plot.figures import Picture, write_page
 

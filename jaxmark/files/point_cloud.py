@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxmark.errors import JaxmarkError
-from jaxmark.extras import require
+from jaxmark.errors import JaxmarkError, require
 from jaxmark.files.binary import BinaryNumbers, overlay
 from jaxmark.files.source import Changes, Indices, Patched, Rows, Source, splice
 from jaxmark.files.text import Lines, Text, blank, is_numeral, unix, without_comments

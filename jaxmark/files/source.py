@@ -162,6 +162,10 @@ class Patched(NamedTuple):
     companions: tuple[str, ...] = ()  # paths of files that it refers to and that did not change
 
 
+def read_nothing() -> None:
+    """Return None, as the file has nothing of the kind."""
+
+
 @dataclass
 class Source:
     """One parsed file.
@@ -181,8 +185,8 @@ class Source:
     coordinates: Numbers
     faces: Faces
     normals: Transported | PerFace | None = None
-    texture: Callable[[], Texture] = lambda: None
-    skin: Callable[[], Skinning | None] = lambda: None
+    texture: Callable[[], Texture] = read_nothing
+    skin: Callable[[], Skinning | None] = read_nothing
     parts: Sequence[Part] = ()
     left: Mapping[str, str] = field(default_factory=dict)
 

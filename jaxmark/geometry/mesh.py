@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from jaxmark.errors import JaxmarkError
-from jaxmark.extras import require
+from jaxmark.errors import JaxmarkError, require
 
 # Diagonal to which meshes are scaled for fast-simplification. Its thresholds are absolute: in smaller meshes it
 # collapses many edges in arbitrary order, in much larger ones too few.

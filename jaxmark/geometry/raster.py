@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from jaxmark.extras import require
+from jaxmark.errors import require
 from jaxmark.geometry.mesh import Mesh, diagonal, face_normals, unit, used_vertices, vertex_normals
 
 #: Cameras by the side that they look at: right, up and towards the eye, as rows. +y is up, the front is +z.

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int64
 
-from jaxmark.errors import JaxmarkError
-from jaxmark.extras import require
+from jaxmark.errors import JaxmarkError, require
 from jaxmark.geometry.mesh import Mesh, area, boundary_vertices, unit, used_vertices, vertex_normals
 from jaxmark.geometry.pose import IDENTITY, Points, Pose
 

@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxmark.errors import JaxmarkError
-from jaxmark.extras import require
+from jaxmark.errors import JaxmarkError, require
 from jaxmark.files.atomic import write_atomically
 from jaxmark.geometry.mesh import Mesh, diagonal, host_mesh
 from jaxmark.plot.figures import FIELD, fill_template

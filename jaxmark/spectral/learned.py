@@ -14,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxmark.errors import JaxmarkError
-from jaxmark.extras import available, require
+from jaxmark.errors import JaxmarkError, available, require
 from jaxmark.seeds import Seed, random_key
 from jaxmark.spectral.laplacian import Operator, checked_signal
 from jaxmark.spectral.recurrence import convolution, inner_mass

@@ -1,7 +1,7 @@
 """Embedding, detection and evidence as three pure functions of arrays.
 
 `embed_bits`, `detect_bits` and `log_evidence` take carriers as arguments, and work under every transformation of JAX.
-`jaxmark.watermark.marking` does the same for meshes, messages and keys.
+`jaxmark.watermark.markers` does the same for meshes, messages and keys.
 """
 
 import math

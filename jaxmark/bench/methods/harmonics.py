@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxmark.alignment.observation import observe
 from jaxmark.alignment.original import Original, make_original
-from jaxmark.extras import require
+from jaxmark.errors import require
 from jaxmark.geometry.mesh import Mesh, vertex_normals, weld, weld_mesh
 from jaxmark.spectral.precision import einsum, matmul
 from jaxmark.watermark.carriers import ModulatedCarrier

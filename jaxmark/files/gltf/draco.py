@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from jaxmark.errors import JaxmarkError
-from jaxmark.extras import require
+from jaxmark.errors import JaxmarkError, require
 from jaxmark.files.gltf.document import COMPONENTS, Document, Elements, whole
 from jaxmark.files.source import Faces
 

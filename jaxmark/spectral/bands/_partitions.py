@@ -11,6 +11,7 @@ from scipy import special
 
 from jaxmark.errors import JaxmarkError
 
+#: How the series of a family is damped against ripples.
 Damping = Literal["none", "jackson", "lanczos"]
 
 _MAX_SIZE = 1e8  # largest sum of a polynomial's |coefficients|; a larger one costs over half of float64's digits

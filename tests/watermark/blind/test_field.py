@@ -338,7 +338,7 @@ def test_what_is_too_rough_when_smoothing_is_undone_is_left_out(shape: Mesh):
 def test_tuning_chooses_what_the_worst_attack_leaves_most_of(shape: Mesh):
     ways = (("noise", 0.003), lambda mesh, seed: turned(mesh))
     scheme = dataclasses.replace(SCHEME, widths=(WIDTH, 0.018))
-    tuned = jm.tune_blind(shape, ways, 6e-4, key=jax.random.key(0), bits=32, scheme=scheme)
+    tuned = jm.evaluation.tune_blind(shape, ways, 6e-4, seed=0, bits=32, scheme=scheme)
     assert tuned.surplus.shape == (len(tuned.choices), 2)
     chosen = tuned.choices.index((*tuned.scheme.widths, *tuned.scheme.steps))
     assert tuned.worst == tuned.surplus[chosen].min() > 0
@@ -360,4 +360,4 @@ def test_information_of_few_good_and_of_many_weak_values():
 
 def test_tuning_refuses_informed_schemes(shape: Mesh):
     with pytest.raises(jm.JaxmarkError, match="there is tune"):
-        jm.tune_blind(shape, [("noise", 0.003)], seed=0, scheme="keyed")
+        jm.evaluation.tune_blind(shape, [("noise", 0.003)], seed=0, scheme="keyed")
