@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from jaxmark.alignment.alignment import Align
 from jaxmark.alignment.pairing import pair
+from jaxmark.alignment.result import Align
 from jaxmark.app.diagnosis import diagnose, is_original
 from jaxmark.app.dossier import Case, save_dossier, save_report
 from jaxmark.app.mark_files import pick

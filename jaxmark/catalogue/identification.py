@@ -14,7 +14,7 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar, get_args, runtim
 import numpy as np
 from scipy.spatial import KDTree
 
-from jaxmark.alignment.alignment import Align
+from jaxmark.alignment.result import Align
 from jaxmark.catalogue import descriptors
 from jaxmark.catalogue.database import Database
 from jaxmark.catalogue.landmarks import landmarks

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.alignment.original import make_original
 from jaxmark.alignment.pairing import pair
+from jaxmark.alignment.result import Align, Alignment
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_mesh
 from jaxmark.watermark.blind import reading as blind_reading
