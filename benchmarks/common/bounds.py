@@ -39,7 +39,7 @@ from jaxmark.alignment.original import Original, displace, shift_of
 from jaxmark.distortion import rms
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.surfaces import Surface
-from jaxmark.watermark.carriers.keyed import KeyedCarrier
+from jaxmark.watermark.carriers.chips import KeyedCarrier
 from jaxmark.watermark.markers import NonBlindMarker
 from jaxmark.watermark.reading.coarse import model_errors, orthonormal
 

@@ -13,8 +13,8 @@ from jaxtyping import Int, Int64
 from scipy.sparse import csgraph
 
 from jaxmark.alignment import attempts
-from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.alignment.original import Original, make_original
+from jaxmark.alignment.result import Align, Alignment
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces, edges, host_mesh, used_vertices, weld, weld_mesh
 from jaxmark.spectral.laplacian import adjacency

@@ -27,7 +27,7 @@ from jaxmark.alignment.observation import Observation
 from jaxmark.confidence import clopper_pearson
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.carriers import make_chips
-from jaxmark.watermark.carriers.keyed import KeyedCarrier
+from jaxmark.watermark.carriers.chips import KeyedCarrier
 from jaxmark.watermark.coding.message import encode
 from jaxmark.watermark.evidence.detection import weigh
 from jaxmark.watermark.reading.coarse import receive_coarse

@@ -28,8 +28,8 @@ import numpy as np
 from scipy.optimize import nnls
 
 import jaxmark as jm
-from jaxmark.alignment.alignment import Alignment
 from jaxmark.alignment.attempts import align
+from jaxmark.alignment.result import Alignment
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.chebyshev import band_components
 from jaxmark.spectral.laplacian import per_row

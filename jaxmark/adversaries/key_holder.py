@@ -18,7 +18,7 @@ from jaxmark.adversaries.expected import strongest_evidence
 from jaxmark.alignment.attempts import align
 from jaxmark.alignment.observation import Observation
 from jaxmark.attacks.attack import Attack
-from jaxmark.distortion import rms
+from jaxmark.distortion.norms import rms
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, weld
 from jaxmark.seeds import Randomness

@@ -15,7 +15,7 @@ from jaxtyping import Float64
 
 from jaxmark.adversaries.by_name import through_bands
 from jaxmark.attacks.attack import Attack
-from jaxmark.distortion import rms
+from jaxmark.distortion.norms import rms
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.canonical import geometry_hash
 from jaxmark.geometry.mesh import Mesh, diagonal, host_mesh, used_vertices

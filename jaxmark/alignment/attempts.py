@@ -1,20 +1,20 @@
-"""Align a suspect with the original, to find the displacement of each point; on the host, without the key.
+"""Start here: `align` attempts the ways of `by_vertices`, `by_cloud` and `by_surface` in their order, until one works.
 
-Several ways are attempted in their order, until one works: `align` shows them. An affine attack moves the mark with
-the host, so that its map is inverted first, by least squares on the points that agree with it. Points that lie far off
-were cut away, replaced or lost, and are masked. Every map may mirror, where that fits better.
+They find the displacement of each point of the original; on the host, without the key. An affine attack moves the mark
+with the host, so that its map is inverted first, by least squares on the points that agree with it. Points that lie far
+off were cut away, replaced or lost, and are masked. Every map may mirror, where that fits better.
 """
 
 import time
 from collections.abc import Sequence
 from typing import get_args
 
-from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.alignment.by_cloud import align_cloud, align_cloud_in_order
 from jaxmark.alignment.by_surface import align_surfaces
 from jaxmark.alignment.by_vertices import align_by_connectivity, align_in_order
 from jaxmark.alignment.features import EITHER
 from jaxmark.alignment.original import Original
+from jaxmark.alignment.result import Align, Alignment
 from jaxmark.alignment.suspect import Suspect, make_suspect
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxmark.alignment.alignment import Align, Alignment, file_pose, rms
 from jaxmark.alignment.by_vertices import MIN_COVERAGE, align_in_order, align_points
 from jaxmark.alignment.fitting import FAR_DISTANCE, agreeing
 from jaxmark.alignment.nearest import find_heights, settle
 from jaxmark.alignment.original import Original
 from jaxmark.alignment.registration import SETTINGS, refine, register_part, register_whole
+from jaxmark.alignment.result import Align, Alignment, file_pose, rms
 from jaxmark.alignment.suspect import Suspect
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.clouds import Cloud

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Int64
 
-from jaxmark.alignment.alignment import Alignment, file_pose, rms
 from jaxmark.alignment.by_vertices import MIN_COVERAGE
 from jaxmark.alignment.fitting import FAR_DISTANCE, MIN_PIECE_SHARE, agreeing
 from jaxmark.alignment.heights import measure_heights
 from jaxmark.alignment.original import Original
 from jaxmark.alignment.registration import refine, register_part, register_whole
 from jaxmark.alignment.replay import replay_smoothing
+from jaxmark.alignment.result import Alignment, file_pose, rms
 from jaxmark.alignment.suspect import Suspect
 from jaxmark.errors import JaxmarkError, available
 from jaxmark.geometry.mesh import (

@@ -5,11 +5,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Int64
 
-from jaxmark.alignment.alignment import Alignment, file_pose, rms
 from jaxmark.alignment.fitting import FAR_DISTANCE, fit_pieces, fit_whole, min_piece_points
 from jaxmark.alignment.nonrigid import Bent
 from jaxmark.alignment.original import Original, residual
 from jaxmark.alignment.replay import replay_smoothing_of_points
+from jaxmark.alignment.result import Alignment, file_pose, rms
 from jaxmark.alignment.suspect import Suspect
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.connectivity import matching_vertices

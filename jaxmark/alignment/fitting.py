@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from jaxmark.alignment.alignment import rms
+from jaxmark.alignment.result import rms
 from jaxmark.geometry.pose import Points, Pose, affine, similarity
 
 # A point is masked if it is off by more than the distance (in diagonals), and by more than the multiple of the 40 %

@@ -19,7 +19,7 @@ import click
 
 from jaxmark import distortion
 from jaxmark.adversaries.by_name import ATTACKS, chain, get_attack
-from jaxmark.alignment.alignment import Align
+from jaxmark.alignment.result import Align
 from jaxmark.app.bench_commands import bench_command, bench_corpus_command, bench_equal_command
 from jaxmark.app.catalogue_commands import catalogue_group, mark_for_command
 from jaxmark.app.find_commands import identify_by_catalogue

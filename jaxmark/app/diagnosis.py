@@ -6,8 +6,8 @@ What is tried here uses the key, and is not paid for: it is a hint where to look
 from collections.abc import Iterator
 from itertools import product
 
-from jaxmark.alignment.alignment import Align
 from jaxmark.alignment.attempts import align
+from jaxmark.alignment.result import Align
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.imprint import restore
 from jaxmark.geometry.mesh import Mesh

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from jaxmark.alignment.alignment import Alignment
 from jaxmark.alignment.original import Original
+from jaxmark.alignment.result import Alignment
 from jaxmark.app.output import make_folder
 from jaxmark.errors import JaxmarkError, require
 from jaxmark.files.atomic import file_hash, write_atomically

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 import click
 
-from jaxmark.alignment.alignment import Align
+from jaxmark.alignment.result import Align
 from jaxmark.app.catalogue_commands import CATALOGUE, catalogue_group
 from jaxmark.app.folders import begin_worker
 from jaxmark.app.options import ALIGN, FILE, JSON, KEYS, QUIET, read_key

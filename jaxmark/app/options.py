@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import click
 
-from jaxmark.alignment.alignment import Align
+from jaxmark.alignment.result import Align
 from jaxmark.app.output import say
 from jaxmark.app.progress import Progress
 from jaxmark.errors import JaxmarkError

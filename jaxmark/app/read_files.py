@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from jaxmark.alignment.alignment import Align
 from jaxmark.alignment.pairing import pair
+from jaxmark.alignment.result import Align
 from jaxmark.app.diagnosis import diagnose, is_original
 from jaxmark.app.dossier import Case, save_dossier, save_report
 from jaxmark.app.mark_files import pick
@@ -21,6 +21,7 @@ from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.everyday import alternatives, detect_scene, read_blind, with_blind
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Detection
+from jaxmark.watermark.markers import make_marker
 from jaxmark.watermark.nonblind import Alternatives
 from jaxmark.watermark.record import Record, SceneRecord, TimestampedCommitment, load_record
 from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, DEFAULT_SCHEME
@@ -195,7 +196,7 @@ class FileReader:
                 bits = 8 * len(self.message)
             scheme = self.schemes[0] if self.schemes else DEFAULT_SCHEME
             try:
-                marks = alternatives(mesh, self.key, bits=bits, record=record, scheme=scheme)
+                marks = alternatives(make_marker(mesh, self.key, bits=bits, record=record, scheme=scheme), scheme)
             except JaxmarkError as error:
                 if record is not None and is_original(suspect, record, self.key):
                     raise JaxmarkError(f"{error} The suspect is that mesh: exchange the two files.") from None

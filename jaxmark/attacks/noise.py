@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmark.attacks.support import Positions, Strength, diagonal, inner_vertices, surface
-from jaxmark.distortion import rms
+from jaxmark.distortion.norms import rms
 from jaxmark.geometry.mesh import Mesh, used_vertices
 from jaxmark.seeds import Seed, random_key
 

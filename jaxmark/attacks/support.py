@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxmark.distortion import rms
+from jaxmark.distortion.norms import rms
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, boundary_vertices, check_concrete, used_vertices
 

@@ -14,7 +14,7 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar, get_args, runtim
 import numpy as np
 from scipy.spatial import KDTree
 
-from jaxmark.alignment.alignment import Align
+from jaxmark.alignment.result import Align
 from jaxmark.catalogue import descriptors
 from jaxmark.catalogue.database import Database
 from jaxmark.catalogue.landmarks import landmarks
@@ -29,6 +29,7 @@ from jaxmark.geometry.pose import Points, Pose
 from jaxmark.watermark.coding.keys import Key, commitment
 from jaxmark.watermark.everyday import alternatives
 from jaxmark.watermark.evidence import ledger
+from jaxmark.watermark.markers import make_marker
 from jaxmark.watermark.record import Record, is_recorded
 from jaxmark.watermark.tracing.tracer import make_tracer
 
@@ -326,8 +327,8 @@ class Finder(Generic[_Catalogue]):
                 continue
             for record in records or [None]:
                 bits = self.bits if record is None else None
-                marks = alternatives(pair.original, key, bits=bits, record=record)
-                found, mark = marks.read(pair.suspect, align=self.align)
+                marker = make_marker(pair.original, key, bits=bits, record=record)
+                found, mark = alternatives(marker).read(pair.suspect, align=self.align)
                 evidence = found.evidence.charged(ledger.ORIGINALS.charge("original", pair.tried))
                 found = found._replace(evidence=evidence)
                 match = pair.match._replace(

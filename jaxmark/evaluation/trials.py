@@ -24,7 +24,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.allocation import minimise
 from jaxmark.evaluation.channels import Margin, measure
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.carriers.keyed import KeyedCarrier, KeyedReader
+from jaxmark.watermark.carriers.chips import KeyedCarrier, KeyedReader
 from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key
 from jaxmark.watermark.perception.budget import Bounds, Written, displace_within
 from jaxmark.watermark.schemes.keyed import KeyedScheme

@@ -1,4 +1,4 @@
-"""Parse PLY: text, binary little endian and binary big endian."""
+"""Parse PLY: text, binary little endian and binary big endian; `export` writes new files, `source` patched ones."""
 
 import re
 from dataclasses import dataclass, field

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.alignment.original import make_original
 from jaxmark.alignment.pairing import pair
+from jaxmark.alignment.result import Align, Alignment
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_mesh
 from jaxmark.watermark.blind import reading as blind_reading
@@ -181,28 +181,19 @@ def detect(
         return read_blind(suspect, key, bits=bits, message=message, record=record, schemes=schemes)
     if original is None:
         raise JaxmarkError(f"The scheme {named!r} is read with the original; give it, or mark with 'field'.")
-    marks = alternatives(original, key, bits=bits, record=record, scheme=scheme or DEFAULT_SCHEME, detector=detector)
-    found, mark = marks.read(suspect, message, weights, align)
+    scheme = scheme or DEFAULT_SCHEME
+    usual = make_marker(original, key, bits=bits, record=record, scheme=scheme, detector=detector)
+    found, mark = alternatives(usual, scheme).read(suspect, message, weights, align)
     return with_blind(found, together, suspect, key, mark.bits, message)
 
 
-def alternatives(
-    original: Mesh,
-    key: bytes,
-    *,
-    bits: int | None = None,
-    record: Record | None = None,
-    scheme: str | Scheme | BlindScheme = DEFAULT_SCHEME,
-    detector: Detector | None = None,
-) -> Alternatives:
-    """Prepare an original for reading all marks that may be meant, the likeliest first.
+def alternatives(usual: NonBlindMarker, scheme: str | Scheme | BlindScheme = DEFAULT_SCHEME) -> Alternatives:
+    """List all marks that may be meant, the likeliest first.
 
-    With a record there is one. Without, marks of the default scheme have any pass band that is chosen by a budget.
-
-    Args and raises: see `make_marker`.
+    Without a record, marks of the default scheme, which was asked for by its name, have any pass band that is chosen by
+    a budget. Else there is one.
     """
-    usual = make_marker(original, key, bits=bits, record=record, scheme=scheme, detector=detector)
-    if record is not None or scheme != DEFAULT_SCHEME:
+    if usual.record is not None or scheme != DEFAULT_SCHEME:
         return Alternatives([((), lambda: usual)])
     return Alternatives(
         [

@@ -11,9 +11,9 @@ from jaxtyping import Float64
 from numpy.typing import ArrayLike
 
 from jaxmark import distortion
-from jaxmark.alignment.alignment import Alignment
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, make_original
+from jaxmark.alignment.result import Alignment
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.canonical import Canonical
 from jaxmark.geometry.imprint import Imprint, make_imprint, restore

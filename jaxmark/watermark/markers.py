@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 
 from jaxmark import distortion
 from jaxmark.alignment import attempts
-from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.alignment.original import Original, make_original
+from jaxmark.alignment.result import Align, Alignment
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces
 from jaxmark.watermark.blind import reading as blind_reading

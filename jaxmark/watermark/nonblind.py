@@ -17,10 +17,10 @@ from jaxtyping import Array, Float64
 from numpy.typing import ArrayLike
 
 from jaxmark.alignment import attempts
-from jaxmark.alignment.alignment import Align, Alignment
 from jaxmark.alignment.heights import VertexHeights
 from jaxmark.alignment.nonrigid import Bent
 from jaxmark.alignment.original import Original
+from jaxmark.alignment.result import Align, Alignment
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.coding.message import TAG_BITS, Decoded, check_size

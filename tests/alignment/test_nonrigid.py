@@ -134,7 +134,7 @@ def test_without_a_mark_or_its_key_nothing_is_read(mesh, key: jm.Key):
 def test_a_mark_that_reads_by_one_map_is_not_straightened(mesh, key: jm.Key, monkeypatch):
     marker = jm.make_marker(mesh, key, bits=16)
     marked, _ = marker.embed(b"ok", 8e-4)
-    monkeypatch.setattr("jaxmark.alignment.alignment.straighten", None)
+    monkeypatch.setattr("jaxmark.alignment.result.straighten", None)
     bent = jm.attack(marked, "bending", 45, seed=0)
     assert align(marker.original, bent).bent is not None
     assert marker.detect(bent).message == b"ok"

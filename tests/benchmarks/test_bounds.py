@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxmark.geometry.mesh import Mesh, vertex_normals
-from jaxmark.watermark.carriers.keyed import KeyedCarrier
+from jaxmark.watermark.carriers.chips import KeyedCarrier
 from jaxmark.watermark.markers import make_marker
 from jaxmark.watermark.reading.coarse import expected_errors
 from tests import ROOT

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxmark.alignment.alignment import Alignment
 from jaxmark.alignment.attempts import align
 from jaxmark.alignment.original import make_original
+from jaxmark.alignment.result import Alignment
 from jaxmark.bench.method import Bits, Method, Reading
 from jaxmark.bench.methods.harmonics import THRESHOLD, make_mark
 from jaxmark.geometry.mesh import Mesh

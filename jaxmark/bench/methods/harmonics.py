@@ -38,7 +38,7 @@ Points = Float64[np.ndarray, "points 3"]
 
 
 class Harmonics(NamedTuple):
-    """Eigenvectors along normals as `jaxmark.watermark.carriers.modulated.Components`, with D = 1."""
+    """Eigenvectors along normals as `jaxmark.watermark.carriers.components.Components`, with D = 1."""
 
     vectors: Float[Array, "vertices bands"]
     normals: Float[Array, "vertices 3"]

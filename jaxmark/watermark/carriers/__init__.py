@@ -4,17 +4,17 @@
 `ModulatedCarrier` writes them on components of the host such as `host_bands` and `eigenspaces`.
 """
 
+from jaxmark.watermark.carriers.chips import Chips as Chips
+from jaxmark.watermark.carriers.chips import KeyedCarrier as KeyedCarrier
+from jaxmark.watermark.carriers.chips import KeyedReader as KeyedReader
+from jaxmark.watermark.carriers.chips import make_chips as make_chips
 from jaxmark.watermark.carriers.components import Components as Components
 from jaxmark.watermark.carriers.components import Eigenspaces as Eigenspaces
 from jaxmark.watermark.carriers.components import HostBands as HostBands
 from jaxmark.watermark.carriers.components import eigenspaces as eigenspaces
 from jaxmark.watermark.carriers.components import host_bands as host_bands
-from jaxmark.watermark.carriers.keyed import Chips as Chips
-from jaxmark.watermark.carriers.keyed import KeyedCarrier as KeyedCarrier
-from jaxmark.watermark.carriers.keyed import KeyedReader as KeyedReader
-from jaxmark.watermark.carriers.keyed import make_chips as make_chips
-from jaxmark.watermark.carriers.modulated import ModulatedCarrier as ModulatedCarrier
-from jaxmark.watermark.carriers.modulated import PlainReader as PlainReader
+from jaxmark.watermark.carriers.modulation import ModulatedCarrier as ModulatedCarrier
+from jaxmark.watermark.carriers.modulation import PlainReader as PlainReader
 from jaxmark.watermark.interfaces import Carrier as Carrier
 from jaxmark.watermark.interfaces import Claim as Claim
 from jaxmark.watermark.interfaces import Reader as Reader

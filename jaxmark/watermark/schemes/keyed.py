@@ -12,7 +12,7 @@ from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces, vertex_normals
 from jaxmark.spectral.bands import scaling
-from jaxmark.watermark.carriers.keyed import KeyedCarrier, make_chips
+from jaxmark.watermark.carriers.chips import KeyedCarrier, make_chips
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import TAG_BITS, code_length
 from jaxmark.watermark.interfaces import Detector, Scheme

@@ -9,7 +9,7 @@ from jaxmark.alignment.original import Original
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark.carriers.components import Components, eigenspaces, host_bands
-from jaxmark.watermark.carriers.modulated import ModulatedCarrier
+from jaxmark.watermark.carriers.modulation import ModulatedCarrier
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import code_length
 from jaxmark.watermark.coding.sequences import orthogonal_sequences

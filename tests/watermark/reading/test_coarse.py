@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
-from jaxmark.alignment.alignment import Alignment
 from jaxmark.alignment.attempts import align
 from jaxmark.alignment.heights import measure_heights
+from jaxmark.alignment.result import Alignment
 from jaxmark.geometry.mesh import Mesh, face_normals, simplify
 from jaxmark.geometry.surfaces import Surface
-from jaxmark.watermark.carriers.keyed import KeyedCarrier
+from jaxmark.watermark.carriers.chips import KeyedCarrier
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.markers import NonBlindMarker
 from jaxmark.watermark.nonblind import read

@@ -116,7 +116,9 @@ def test_faint_marks_are_read_with_their_record_and_without():
 def test_all_bands_are_tried_beside_one_alignment(monkeypatch):
     calls, align = [], attempts.align
     monkeypatch.setattr(attempts, "align", lambda *given, **options: (calls.append(1), align(*given, **options))[1])
-    found, mark = alternatives(SHAPE, jm.new_key(), bits=16).read(jm.attack(SHAPE, "noise", 0.001, seed=0))
+    found, mark = alternatives(jm.make_marker(SHAPE, jm.new_key(), bits=16)).read(
+        jm.attack(SHAPE, "noise", 0.001, seed=0)
+    )
     assert len(calls) == 1
     assert not found.detected()
     assert isinstance(mark.scheme, KeyedScheme)
@@ -150,9 +152,10 @@ def test_a_forgotten_payload_size_is_told_whatever_the_band(monkeypatch):
 def test_a_scheme_that_is_given_is_the_only_one_read():
     marked = marker_of("low").embed(b"ab", 4e-4)[0]
     assert jm.detect(marked, original=SHAPE, key=jm.Key(bytes(32)), bits=16).message == b"ab"
-    alone = alternatives(SHAPE, jm.Key(bytes(32)), bits=16, scheme=replace(KeyedScheme(), passband="low"))
+    low = replace(KeyedScheme(), passband="low")
+    alone = alternatives(jm.make_marker(SHAPE, jm.Key(bytes(32)), bits=16, scheme=low), low)
     assert alone.read(marked)[0].message == b"ab"
-    other = alternatives(SHAPE, jm.Key(bytes(32)), bits=16, scheme=KeyedScheme())
+    other = alternatives(jm.make_marker(SHAPE, jm.Key(bytes(32)), bits=16, scheme=KeyedScheme()), KeyedScheme())
     assert other.read(marked)[0].message is None
 
 
