@@ -28,7 +28,7 @@ def marked(key: jm.Key) -> tuple[jm.watermark.NonBlindMarker, Mesh]:
 def owner_sees(marker: jm.watermark.NonBlindMarker, suspect: Mesh) -> float:
     """The largest S/‖a‖ of a claim of the message under the owner's key."""
     code = marker.codeword(MESSAGE)
-    received = marker.receive(suspect)
+    received = marker.receive(marker.register(suspect))
     scores, norms = claims(marker.reader, received, jnp.asarray(code, received.observed.residual.dtype))
     return float(jnp.max(scores / norms))
 

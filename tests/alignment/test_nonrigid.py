@@ -114,7 +114,7 @@ def test_a_message_is_read_in_another_pose_without_a_skeleton(mesh, key: jm.Key)
     suspect = folded(marked, 40)
     aligned = align(marker.original, suspect)
     assert marker.decode(marker.soft_decisions(marker.receive(aligned))) is None  # by a single map
-    found = marker.detect(aligned)
+    found = marker.read(aligned)
     assert found.message == b"ok"
     assert found.detected()
     # Whether bends were undone depends on the key, and what unites several meshes must not.

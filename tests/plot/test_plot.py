@@ -118,7 +118,7 @@ def test_faces_are_painted_from_back_to_front_in_their_colours():
 
 @pytest.mark.usefixtures("x64")
 def test_spectra_are_sums_over_eigenvectors():
-    original = make_original(bumpy_sphere(2), 0.0)
+    original = make_original(bumpy_sphere(2))
     rng = np.random.default_rng(0)
     shifts = 1e-3 * rng.normal(size=(2, *original.positions.shape))
     marked, suspect = displace(original, shifts[0]), displace(original, shifts.sum(axis=0))
