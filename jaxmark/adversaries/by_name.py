@@ -101,4 +101,11 @@ _REGISTRY = Registry(
 )
 #: All attacks of the library, by the names that the command line uses.
 ATTACKS: Mapping[str, Attack] = _REGISTRY.attacks
-attack, attack_each, chain, get_attack = _REGISTRY.attack, _REGISTRY.attack_each, _REGISTRY.chain, _REGISTRY.get
+#: Apply an attack to a mesh; see `jaxmark.attacks.attack.Registry.attack`.
+attack = _REGISTRY.attack
+#: Apply an attack to a mesh once for each seed; see `jaxmark.attacks.attack.Registry.attack_each`.
+attack_each = _REGISTRY.attack_each
+#: Make one attack of several; see `jaxmark.attacks.attack.Registry.chain`.
+chain = _REGISTRY.chain
+#: Find an attack by its name; see `jaxmark.attacks.attack.Registry.get`.
+get_attack = _REGISTRY.get

@@ -15,7 +15,7 @@ from jaxmark.alignment.by_vertices import align_by_connectivity, align_in_order
 from jaxmark.alignment.features import EITHER
 from jaxmark.alignment.original import Original
 from jaxmark.alignment.result import Align, Alignment
-from jaxmark.alignment.suspect import Suspect, make_suspect
+from jaxmark.alignment.suspect import PreparedSuspect, make_suspect
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 
@@ -48,7 +48,7 @@ def align(
     return found._replace(pose=ready.pose.then(found.pose), seconds=time.perf_counter() - start, align=align)
 
 
-def _attempt(original: Original, suspect: Suspect, align: Align, reflections: Sequence[bool]) -> Alignment:
+def _attempt(original: Original, suspect: PreparedSuspect, align: Align, reflections: Sequence[bool]) -> Alignment:
     """Attempt the ways of aligning in their order, until one works."""
     if align == "same":
         return align_in_order(original, suspect.mesh)

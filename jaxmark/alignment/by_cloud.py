@@ -11,7 +11,7 @@ from jaxmark.alignment.nearest import find_heights, settle
 from jaxmark.alignment.original import Original
 from jaxmark.alignment.registration import SETTINGS, refine, register_part, register_whole
 from jaxmark.alignment.result import Align, Alignment, file_pose, rms
-from jaxmark.alignment.suspect import Suspect
+from jaxmark.alignment.suspect import PreparedSuspect
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.clouds import Cloud
 from jaxmark.geometry.mesh import used_vertices
@@ -22,7 +22,7 @@ _MIN_IN_PLACE = 0.5  # share of a cloud's points that must be in order, or near 
 _SAMPLES_PER_POINT = 2  # points sampled from a surface for each of an original cloud, which they are compared with
 
 
-def align_cloud_in_order(original: Original, suspect: Suspect) -> Alignment | None:
+def align_cloud_in_order(original: Original, suspect: PreparedSuspect) -> Alignment | None:
     """Align a cloud by the order of its points; None if they seem to be in another order."""
     if not original.in_order or len(suspect.mesh.vertices) != len(original.mesh.vertices):
         return None
@@ -30,7 +30,7 @@ def align_cloud_in_order(original: Original, suspect: Suspect) -> Alignment | No
     return found if found.residual <= FAR_DISTANCE and found.coverage(original) >= _MIN_IN_PLACE else None
 
 
-def align_cloud(original: Original, suspect: Suspect, align: Align, reflections: Sequence[bool]) -> Alignment:
+def align_cloud(original: Original, suspect: PreparedSuspect, align: Align, reflections: Sequence[bool]) -> Alignment:
     """Align a suspect by its points: the faces of either mesh tell nothing about the other one.
 
     Raises:

@@ -12,7 +12,7 @@ from jaxmark.alignment.original import Original
 from jaxmark.alignment.registration import refine, register_part, register_whole
 from jaxmark.alignment.replay import replay_smoothing
 from jaxmark.alignment.result import Alignment, file_pose, rms
-from jaxmark.alignment.suspect import Suspect
+from jaxmark.alignment.suspect import PreparedSuspect
 from jaxmark.errors import JaxmarkError, available
 from jaxmark.geometry.mesh import (
     Mesh,
@@ -33,7 +33,9 @@ _FULL_COVERAGE = 0.95  # share of the original from which on no further pieces a
 _FEW_VERTICES = 0.5  # of the original's: with so many or less, a surface is right at its vertices, and chords between
 
 
-def align_surfaces(original: Original, suspect: Suspect, reflections: Sequence[bool], *, by_affine: bool) -> Alignment:
+def align_surfaces(
+    original: Original, suspect: PreparedSuspect, reflections: Sequence[bool], *, by_affine: bool
+) -> Alignment:
     """Align a suspect's surface: as the whole of the original, else as a part of it, else one component at a time.
 
     Raises:

@@ -10,7 +10,7 @@ from jaxmark.alignment.nonrigid import Bent
 from jaxmark.alignment.original import Original, residual
 from jaxmark.alignment.replay import replay_smoothing_of_points
 from jaxmark.alignment.result import Alignment, file_pose, rms
-from jaxmark.alignment.suspect import Suspect
+from jaxmark.alignment.suspect import PreparedSuspect
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.connectivity import matching_vertices
 from jaxmark.geometry.mesh import Mesh, component_of
@@ -37,7 +37,7 @@ def align_in_order(original: Original, suspect: Mesh) -> Alignment:
     return align_points(original, y, original.used, np.asarray(original.points.faces), "same", back)
 
 
-def align_by_connectivity(original: Original, suspect: Suspect) -> Alignment | None:
+def align_by_connectivity(original: Original, suspect: PreparedSuspect) -> Alignment | None:
     """Align a suspect by vertices whose surroundings have the original's connectivity; None if there are too few."""
     # If a suspect has no copies of points, the welded mesh is the suspect itself.
     copies = len(suspect.welded.vertices) < len(suspect.mesh.vertices)

@@ -14,7 +14,7 @@ _COPIES_APART = 0.1  # distance of copies of a point, over the size of the suspe
 
 
 @dataclass(frozen=True, eq=False)
-class Suspect:
+class PreparedSuspect:
     """A suspect made ready for alignment with an original; make one with `make_suspect`."""
 
     mesh: Mesh  # of a size whose powers neither overflow nor vanish
@@ -49,7 +49,7 @@ class Suspect:
         return len(copies) == 0 or bool(np.median(apart) <= _COPIES_APART * np.median(size))
 
 
-def make_suspect(original: Original, mesh: Mesh) -> Suspect:
+def make_suspect(original: Original, mesh: Mesh) -> PreparedSuspect:
     """Check a mesh, scale it to a usual size, and give it the original's faces if these differ by corners' order only.
 
     Programs that mirror a mesh reverse its faces, so that normals point outwards again.
@@ -64,10 +64,10 @@ def make_suspect(original: Original, mesh: Mesh) -> Suspect:
         mesh = mesh._replace(faces=own)
     size = float(np.quantile(np.abs(vertices - np.median(vertices, axis=0)).max(axis=1), 0.6))  # of most points
     if not 0 < size < np.inf or _SMALLEST < size < 1 / _SMALLEST:
-        return Suspect(mesh, IDENTITY)
+        return PreparedSuspect(mesh, IDENTITY)
     # In two steps, as a factor may be out of range itself.
     exponent = -int(np.floor(np.log2(size)))
     half = np.ldexp(1.0, exponent // 2)
     scaled = vertices * half * np.ldexp(1.0, exponent - exponent // 2)
     pose = Pose(np.ldexp(1.0, min(exponent, 1000)) * np.eye(3), np.zeros(3))
-    return Suspect(mesh._replace(vertices=scaled), pose)
+    return PreparedSuspect(mesh._replace(vertices=scaled), pose)

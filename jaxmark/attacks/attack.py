@@ -62,7 +62,7 @@ class Attack(NamedTuple):
 surface_attack, _host = partial(Attack, faces=True), partial(Attack, host=True)
 _host_surface = partial(Attack, host=True, faces=True)
 
-#: Attacks by accident or by a tool; `jaxmark.adversaries.ATTACKS` has all attacks.
+#: Attacks by accident or by a tool; `jaxmark.adversaries.by_name.ATTACKS` has all attacks.
 ATTACKS: Mapping[str, Attack] = {
     "noise": Attack(
         uniform_noise, "half width over the mean distance to the centre", (0.0005, 0.001, 0.003, 0.005, 0.01)

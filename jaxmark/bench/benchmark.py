@@ -49,8 +49,8 @@ def run(
         meshes: files, or meshes by their names.
         output: folder, in which finished tasks and marked meshes are kept; the same benchmark resumes where it was
             ended, and a wider one takes over what both have.
-        methods: names in `jaxmark.bench.METHODS`, files that declare a method, or methods.
-        leagues: names in `jaxmark.bench.LEAGUES`.
+        methods: names in `jaxmark.bench.method.METHODS`, files that declare a method, or methods.
+        leagues: names in `jaxmark.bench.leagues.LEAGUES`.
         attacks: those of a league that are named, or begin with a name that is given; by default all.
         limits: names of a league's sets of limits; by default all.
         payloads: bits of a message, for methods that have a choice.

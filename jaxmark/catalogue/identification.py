@@ -137,10 +137,10 @@ class Originals(Protocol):
         ...
 
 
-_Catalogue = TypeVar("_Catalogue", bound=Originals)
+AnyOriginals = TypeVar("AnyOriginals", bound=Originals)
 
 
-class Finder(Generic[_Catalogue]):
+class Finder(Generic[AnyOriginals]):
     """A search for the originals of many suspects in one catalogue, which keeps the descriptors in memory.
 
     Args:
@@ -158,7 +158,7 @@ class Finder(Generic[_Catalogue]):
 
     def __init__(
         self,
-        catalogue: _Catalogue,
+        catalogue: AnyOriginals,
         keys: Sequence[bytes],
         *,
         alpha: float = 1e-6,

@@ -59,7 +59,7 @@ class Marker(Protocol):
         ...
 
     def embed(self, message: bytes, budget: BudgetLike = None, *, read_back: bool = True) -> tuple[Mesh, EmbedInfo]:
-        """Embed a message of exactly the payload's size in the original; see `jaxmark.embed`.
+        """Embed a message of exactly the payload's size in the original; see `jaxmark.watermark.everyday.embed`.
 
         Pass `read_back=False` if you verify the written file yourself.
         """
@@ -101,7 +101,7 @@ class Marker(Protocol):
         ...
 
     def detect(self, suspect: Mesh, message: bytes | None = None) -> Detection:
-        """Read a suspect, with a claimed message or without; see `jaxmark.detect`."""
+        """Read a suspect, with a claimed message or without; see `jaxmark.watermark.everyday.detect`."""
         ...
 
     def guess(self, found: Detection) -> bytes | None:

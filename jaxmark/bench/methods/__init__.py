@@ -1,1 +1,1 @@
-"""Methods of the literature and of this library, one publication a module; `jaxmark.bench.METHODS` names them."""
+"""Methods of the literature and of this library, one publication a module; see `jaxmark.bench.method.METHODS`."""

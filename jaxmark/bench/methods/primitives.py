@@ -56,7 +56,7 @@ def normal(key: bytes, method: str, label: str, count: int) -> Float64[np.ndarra
     return ndtri(uniform(key, method, label, count))
 
 
-class Surface(NamedTuple):
+class DistinctPoints(NamedTuple):
     """The distinct points of a mesh that faces use; all points of a cloud."""
 
     mesh: Mesh  # the points, and faces between them
@@ -71,11 +71,11 @@ class Surface(NamedTuple):
         return Mesh(everywhere[self.welded.point], self.given.faces)
 
 
-def make_surface(mesh: Mesh) -> Surface:
+def make_surface(mesh: Mesh) -> DistinctPoints:
     """Weld a mesh and remove unused vertices; raises as `jaxmark.geometry.mesh.make_mesh` does."""
     given = host_mesh(mesh)
     welded = weld(given.vertices)
-    return Surface(compact(weld_mesh(given, welded)), given, welded)
+    return DistinctPoints(compact(weld_mesh(given, welded)), given, welded)
 
 
 def per_point(mesh: Mesh, values: Float64[np.ndarray, " faces"]) -> Float64[np.ndarray, " points"]:
