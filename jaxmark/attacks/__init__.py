@@ -1,9 +1,10 @@
 """Attacks: what may happen to a marked mesh, by accident or by a tool.
 
 `jaxmark.adversaries.by_name.ATTACKS` lists them by their names, with those of keyless attackers. An attack is a
-function `(mesh, strength, seed)` that returns the attacked mesh; `mark_noise` alone takes the original, too. Its docstring
-defines the strength. The seed is a whole number or a JAX random key, on the host also a NumPy generator; attacks that
-make no random choice ignore it. Vertices that no face uses are not part of the surface: they neither move nor count.
+function `(mesh, strength, seed)` that returns the attacked mesh; `mark_noise` alone takes the original, too. Its
+docstring defines the strength. The seed is a whole number or a JAX random key, on the host also a NumPy generator;
+attacks that make no random choice ignore it. Vertices that no face uses are not part of the surface: they neither move
+nor count.
 
 Attacks are traced functions, unless their docstring or that of their module says that they run on the host. Under
 `jit`, `vmap` and `grad`, close over the faces, because graphs are prepared on the host. Attacks on the host take any

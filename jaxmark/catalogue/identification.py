@@ -137,6 +137,7 @@ class Originals(Protocol):
         ...
 
 
+#: Any kind of `Originals`.
 AnyOriginals = TypeVar("AnyOriginals", bound=Originals)
 
 

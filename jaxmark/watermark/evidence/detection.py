@@ -27,8 +27,8 @@ class Evidence(NamedTuple):
         log10_p_uncommitted: the same if nothing was: for the best message of any of 2^64 keys, originals and records.
         log10_p_gaussian: the probability if the score were Gaussian: an estimate, which decides nothing.
         log10_p_unfloored: log10_p without the floor at -77: orders attacks and schemes, proves and decides nothing.
-        charges: what each choice of the reading cost; `log10_p` includes all of them. Of several marks that were united,
-            what uniting them cost: `Detection.parts` has the charges of each.
+        charges: what each choice of the reading cost; `log10_p` includes all of them. Of several marks that were
+            united, what uniting them cost: `Detection.parts` has the charges of each.
         caveats: why the probabilities are estimates, not proofs; empty if they are proofs.
     """
 
