@@ -52,7 +52,7 @@ _POPULATION_SIZE, _PARENT_COUNT = 16, 4  # candidates in a generation, and the b
 _WAVE_COUNT, _MIN_WAVELENGTH = 24, 0.2  # of a warp; wavelengths in diagonals
 
 
-class Assumptions(TypedDict, total=False):
+class _Assumptions(TypedDict, total=False):
     """The attacker's assumptions about the mark; defaults are those of `make_attack`."""
 
     scheme: str | Scheme  # the scheme that the mesh was marked with
@@ -61,7 +61,7 @@ class Assumptions(TypedDict, total=False):
     metric: str  # the metric of `distortion.METRICS` in which strengths are measured
 
 
-def subtraction(**assumptions: Unpack[Assumptions]) -> Attack:
+def subtraction(**assumptions: Unpack[_Assumptions]) -> Attack:
     """Subtract the best linear estimate of the mark: each band of the mesh times the mark's share of its energy.
 
     This is the Wiener filter for a mark and a host that are independent (Su, Girod, "Power-spectrum condition for
@@ -76,12 +76,12 @@ def subtraction(**assumptions: Unpack[Assumptions]) -> Attack:
     return make_attack(way, **assumptions)
 
 
-def remarking(**assumptions: Unpack[Assumptions]) -> Attack:
+def remarking(**assumptions: Unpack[_Assumptions]) -> Attack:
     """Write another mark over the first, with a key of the attacker's own."""
     return make_attack(lambda surrogate, strength, seed: random_mark(surrogate, seed)[1], **assumptions)
 
 
-def descent(family: Family = "vertices", *, steps: int = 30, **assumptions: Unpack[Assumptions]) -> Attack:
+def descent(family: Family = "vertices", *, steps: int = 30, **assumptions: Unpack[_Assumptions]) -> Attack:
     """Lower the expected evidence by its gradient, with new random keys at each step (Adam; Kingma, Ba, ICLR 2015).
 
     Args:
@@ -89,7 +89,7 @@ def descent(family: Family = "vertices", *, steps: int = 30, **assumptions: Unpa
             and another mark with any strength in each band; `"warps"`, smooth fields of wavelengths from 0.2 to 2
             diagonals.
         steps: number of gradient steps.
-        assumptions: see `Assumptions`.
+        assumptions: see `_Assumptions`.
 
     Raises:
         JaxmarkError: if there is no such family, or `steps` is below 1.
@@ -98,7 +98,7 @@ def descent(family: Family = "vertices", *, steps: int = 30, **assumptions: Unpa
     return make_attack(jax.jit(partial(descend, family=family, steps=steps)), **assumptions)
 
 
-def evolution(family: Family = "bands", *, generations: int = 10, **assumptions: Unpack[Assumptions]) -> Attack:
+def evolution(family: Family = "bands", *, generations: int = 10, **assumptions: Unpack[_Assumptions]) -> Attack:
     """Lower the expected evidence without gradients, by the cross-entropy method (Rubinstein 1999).
 
     Each generation draws the parameters 16 times from a normal distribution; the best four draws give the mean and the
@@ -107,7 +107,7 @@ def evolution(family: Family = "bands", *, generations: int = 10, **assumptions:
     Args:
         family: see `descent`; `"vertices"` has too many parameters.
         generations: number of generations.
-        assumptions: see `Assumptions`.
+        assumptions: see `_Assumptions`.
 
     Raises:
         JaxmarkError: if there is no such family, it is `"vertices"`, or `generations` is below 1.
@@ -159,7 +159,7 @@ def make_attack(
     mark: float = MARK,
     metric: str = "rms",
 ) -> Attack:
-    """Attack by a displacement in the direction of `way(surrogate, size, seed)`; for the rest see `Assumptions`."""
+    """Attack by a displacement in the direction of `way(surrogate, size, seed)`; for the rest see `_Assumptions`."""
 
     def apply(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
         surrogate, original = make_surrogate(mesh, scheme, bits, mark, metric)

@@ -15,7 +15,7 @@ from jax.example_libraries import optimizers
 from jaxtyping import Array, Float, Float64, PRNGKeyArray
 
 from jaxmark.adversaries.expected import Surrogate, evidence, make_surrogate, random_mark, rescale, rms
-from jaxmark.adversaries.keyless import MARK, Assumptions, make_attack
+from jaxmark.adversaries.keyless import MARK, _Assumptions, make_attack
 from jaxmark.attacks.attack import Attack
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
@@ -139,7 +139,7 @@ def learn(
     return Learned(get(state), goal, np.array(losses), before, judge(get(state)))
 
 
-def learned_attack(network: Network, goal: Goal, **assumptions: Unpack[Assumptions]) -> Attack:
+def learned_attack(network: Network, goal: Goal, **assumptions: Unpack[_Assumptions]) -> Attack:
     """Attack by the `network` of a `Learned`: subtract its estimate of the mark, or do what it has learned to do.
 
     Raises:
