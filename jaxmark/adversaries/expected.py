@@ -45,7 +45,7 @@ class Surrogate(NamedTuple):
 def make_surrogate(
     mesh: Mesh, scheme: str | Scheme, bits: int, mark: float, metric: str = "rms"
 ) -> tuple[Surrogate, Original]:
-    """Prepare a marked mesh as the attacker sees it, under the assumptions of `keyless.make_attack`, and as an original.
+    """Prepare a marked mesh as the attacker sees it, by the assumptions of `keyless.make_attack`, and an original.
 
     Raises:
         JaxmarkError: see `make_marker` and `distortion.compare`.
