@@ -106,6 +106,8 @@ def list_face(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: 
     links, data = [], []
     for shown_name, module in shown.items():
         value, place = getattr(obj, shown_name), f"{_home(module)}.{shown_name}"
+        if inspect.ismethod(value):  # of one object that a room shows; described in its class
+            place = f"{value.__module__}.{value.__qualname__}"
         comment = ModuleAnalyzer.for_module(module).find_attr_docs().get(("", shown_name))
         linked = inspect.isclass(value) or inspect.isroutine(value) or inspect.ismodule(value) or comment
         links.append(f"`~{place}`" if linked else f"``{shown_name}``")
