@@ -8,6 +8,8 @@ from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral.graphs import Weighting, from_mesh
 from jaxmark.spectral.laplacian import Laplacian
 
+FINE = 2.0**-44  # spacing of a grid for originals, so fine that rounding to it changes nothing that tests measure
+
 
 def bumpy_sphere(level: int, seed: int = 0) -> Mesh:
     """A `rough_sphere` of 10 · 4^level + 2 vertices, as many as a subdivided icosahedron has."""

@@ -20,7 +20,7 @@ from jaxmark.geometry.mesh import Mesh, diagonal, make_mesh, used_vertices
 from jaxmark.plot.meshes import roughness_masking
 from jaxmark.watermark.perception.budget import CLOUD_VISIBILITY, VISIBILITY
 from jaxmark.watermark.schemes.keyed import KeyedScheme
-from tests.samples import rough_sphere
+from tests.samples import FINE, rough_sphere
 
 NONE = np.zeros((0, 3), int)
 MESSAGE = b"jaxmark!"
@@ -76,7 +76,7 @@ def test_a_cloud_is_the_graph_of_nearest_neighbours(host: Mesh):
     original = make_original(host)
     x = original.positions[:500]
     x = x[np.lexsort(x.T[::-1])]  # in the canonical order
-    small = make_original(cloud(x), 2.0**-44)
+    small = make_original(cloud(x), FINE)
     square = ((x[:, None] - x) ** 2).sum(axis=2)
     np.fill_diagonal(square, np.inf)
     nearest = np.argsort(square, axis=1)[:, :10]

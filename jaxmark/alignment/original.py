@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
@@ -45,6 +46,12 @@ class Original:
         if len(self.points.faces):
             return math.sqrt(3) / (2 * math.pi)
         return 2 / float(np.mean(np.asarray(self.operator.degree)[: len(self.used)]))
+
+    @cached_property
+    def radius(self) -> float:
+        """Mean distance of the points that faces use to their centre, in diagonals."""
+        points = self.positions[self.used]
+        return float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean())
 
     @property
     def moving(self) -> Bool[np.ndarray, " rows"]:

@@ -11,7 +11,6 @@ import platform
 import shlex
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from jaxmark.errors import JaxmarkError, require
 from jaxmark.files.atomic import file_hash, write_atomically
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.plot import View, draw, save_views
+from jaxmark.plot.figures import fill_template
 from jaxmark.watermark.coding.keys import commitment as commitment_to
 from jaxmark.watermark.evidence.detection import Detection
 from jaxmark.watermark.mark import Mark
@@ -91,12 +91,10 @@ def save_dossier(folder: Path, case: Case) -> None:
         raise JaxmarkError(f"There is no dossier of an estimate: {'; '.join(case.found.evidence.caveats)}.")
     if not case.found.detected():
         raise JaxmarkError("Nothing was detected that a dossier could show (at a probability of 10^-6).")
-    jinja2 = require("jinja2", "plot")
+    require("jinja2", "plot")  # before anything is drawn
     facts = _facts(case)
-    template = resources.files("jaxmark.app").joinpath("dossier.html").read_text(encoding="utf-8")
-    page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(template)
     make_folder(folder)
-    text = page.render(**facts, pictures=_draw_sides(case))
+    text = fill_template("jaxmark.app", "dossier.html", **facts, pictures=_draw_sides(case))
     write_atomically(folder / "dossier.json", (json.dumps(facts, indent=2) + "\n").encode())
     write_atomically(folder / "dossier.html", text.encode())
 

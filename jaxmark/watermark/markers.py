@@ -21,7 +21,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces
 from jaxmark.watermark.blind import reading as blind_reading
 from jaxmark.watermark.blind.scheme import BlindScheme
-from jaxmark.watermark.blind.writing import Writer, radius_of
+from jaxmark.watermark.blind.writing import Writer
 from jaxmark.watermark.coding import message as coding
 from jaxmark.watermark.coding.keys import Key, commitment
 from jaxmark.watermark.coding.message import DEFAULT_BITS, TAG_BITS, check_size
@@ -176,8 +176,7 @@ class NonBlindMarker(Mark):
         if not self._reads_in_order(aligned, message):
             return None
         points, used = self.original.positions, self.original.used
-        radius = float(np.linalg.norm(points[used] - points[used].mean(axis=0), axis=1).mean())
-        unit = radius * rng.uniform(-1, 1, points.shape)
+        unit = self.original.radius * rng.uniform(-1, 1, points.shape)
         near = points[:, 0] <= np.median(points[used, 0])  # half of the mesh, as if it was cut
 
         def survives(noise: float, seen: np.ndarray) -> bool:
@@ -312,7 +311,7 @@ class BlindMarker:
         if not self.reads(marked, message):
             return None
         points, rng = np.asarray(marked.vertices, np.float64), np.random.default_rng(0)
-        size = radius_of(self.original) * self.original.diagonal
+        size = self.original.radius * self.original.diagonal
         unit = size * rng.uniform(-1, 1, self.original.positions.shape)[self.original.weld.point]
         faces = np.asarray(marked.faces)
         near = (points[faces, 0] <= np.median(points[faces, 0])).all(axis=1)

@@ -14,9 +14,7 @@ from jaxmark.alignment.original import Original, make_original
 from jaxmark.geometry.canonical import rounded
 from jaxmark.geometry.mesh import Mesh, make_mesh, vertex_normals
 from jaxmark.geometry.pose import Pose
-from tests.samples import bumpy_sphere, exact_sheet, rough_sphere
-
-FINE = 2.0**-44  # spacing of a grid so fine that rounding to it changes nothing that is measured here
+from tests.samples import FINE, bumpy_sphere, exact_sheet, rough_sphere
 
 
 def exact_original(mesh: Mesh) -> Original:

@@ -20,7 +20,7 @@ from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.spectrum import eigenpairs
 from jaxmark.watermark.evidence.bounds import log10_p_score
 from jaxmark.watermark.evidence.ledger import MIN_LOG10_P
-from tests.samples import bumpy_sphere
+from tests.samples import FINE, bumpy_sphere
 
 matplotlib = pytest.importorskip("matplotlib")
 
@@ -30,7 +30,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 @pytest.fixture(scope="module")
 def pair() -> tuple[Original, Mesh]:
     """An original, and a mesh moved from it."""
-    original = make_original(bumpy_sphere(2), 2.0**-44)  # a grid so fine that rounding changes nothing
+    original = make_original(bumpy_sphere(2))
     return original, displace(original, 1e-3 * np.random.default_rng(0).normal(size=original.positions.shape))
 
 
@@ -118,7 +118,7 @@ def test_faces_are_painted_from_back_to_front_in_their_colours():
 
 @pytest.mark.usefixtures("x64")
 def test_spectra_are_sums_over_eigenvectors():
-    original = make_original(bumpy_sphere(2), 2.0**-44)  # a grid so fine that rounding changes nothing
+    original = make_original(bumpy_sphere(2), FINE)
     rng = np.random.default_rng(0)
     shifts = 1e-3 * rng.normal(size=(2, *original.positions.shape))
     marked, suspect = displace(original, shifts[0]), displace(original, shifts.sum(axis=0))

@@ -303,10 +303,4 @@ class Writer:
         """The original with noise of `NOISE`."""
         original, points = self.original, self.original.positions
         noise = np.random.default_rng(0).uniform(-1, 1, points.shape) * original.used[:, None]
-        return original.to_traced(points + NOISE * radius_of(original) * noise)
-
-
-def radius_of(original: Original) -> float:
-    """Mean distance of the points that faces use to their centre, in diagonals."""
-    points = original.positions[original.used]
-    return float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean())
+        return original.to_traced(points + NOISE * original.radius * noise)

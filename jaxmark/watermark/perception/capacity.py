@@ -154,7 +154,7 @@ class Capacity:
             return math.inf
         if conditions.noise == 0:
             return 0.0
-        ratio = left.energy / (2 * (conditions.noise * self._radius()) ** 2 / 3)
+        ratio = left.energy / (2 * (conditions.noise * self.original.radius) ** 2 / 3)
 
         def excess(logarithm: float) -> float:
             return worth(math.exp(2 * logarithm) * ratio, dimensions) - needed
@@ -191,7 +191,7 @@ class Capacity:
         left = self._left(bits)
         if left is None:
             return 0.0
-        ratio = reached**2 * left.energy / ((noise * self._radius()) ** 2 / 3)
+        ratio = reached**2 * left.energy / ((noise * self.original.radius) ** 2 / 3)
         return float(np.sum(left.dimensions * ratio / (1 + ratio))) / 2
 
     def needed(self, bits: int, evidence: float, noise: float) -> float:
@@ -211,11 +211,6 @@ class Capacity:
             make = self._known.get(layout) or self._carrier(bits).reader
             self._rooms[layout] = make().room(self.original.to_traced(self.original.used))
         return self._rooms[layout]
-
-    def _radius(self) -> float:
-        """Mean distance of the points that faces use to their centre, in diagonals."""
-        points = self.original.positions[self.original.used]
-        return float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean())
 
     def reach(self, bits: int, bounds: Bounds) -> float:
         """RMS displacement, in diagonals, that bounds surely allow a mark with a payload of `bits` bits."""
