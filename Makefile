@@ -64,18 +64,18 @@ looks: $(VENV)/.all  ## the pictures of docs/visibility.md, of meshes that are n
 
 benchmark: $(VENV)/.all  ## the published benchmark of methods anew, some hours: docs/benchmark_results.md, benchmark_2026.md, benchmark.csv
 	$(BIN)/jaxmark bench-corpus build/benchmark/meshes --most-vertices 3000
-	$(BIN)/jaxmark bench $(TABLED:%=build/benchmark/meshes/%.ply) --methods $(METHODS) --league smi2010 \
+	$(BIN)/jaxmark bench $(TABLED:%=build/benchmark/meshes/%.ply) --methods $(METHODS) --track smi2010 \
 	  --others $(OTHERS:%=build/benchmark/meshes/%.ply) --keys 1 --output build/benchmark/table
 	cp build/benchmark/table/results.md docs/benchmark_results.md
 	cp build/benchmark/table/readings.csv docs/benchmark.csv
-	$(BIN)/jaxmark bench $(TABLED:%=build/benchmark/meshes/%.ply) --methods $(METHODS) --league 2026 \
+	$(BIN)/jaxmark bench $(TABLED:%=build/benchmark/meshes/%.ply) --methods $(METHODS) --track 2026 \
 	  --others $(OTHERS:%=build/benchmark/meshes/%.ply) --keys 1 --output build/benchmark/table
 	cp build/benchmark/table/results.md docs/benchmark_2026.md
 	tail -n +2 build/benchmark/table/readings.csv >> docs/benchmark.csv
 
 benchmark-quick: $(VENV)/.all  ## a part of the published benchmark of methods again, within ten minutes, and where it disagrees
 	$(BIN)/jaxmark bench-corpus build/benchmark/meshes --most-vertices 3000
-	$(BIN)/jaxmark bench $(QUICK:%=build/benchmark/meshes/%.ply) --methods $(METHODS) --league smi2010 2026 \
+	$(BIN)/jaxmark bench $(QUICK:%=build/benchmark/meshes/%.ply) --methods $(METHODS) --track smi2010 2026 \
 	  --limits perceptual hidden --attacks none $(QUICK_ATTACKS) --keys 1 --output build/benchmark/quick --against docs/benchmark.csv
 
 docs: $(VENV)/.docs $(NOTEBOOKS)  ## all pages, with executed notebooks, in docs/_build/html

@@ -57,10 +57,10 @@ LIMITS = {"dame": 0.008}
 ATTACKS = [("jamming", 0.002), ("low-pass", 0.9)]
 tuned = jm.tune(mesh, ATTACKS, LIMITS, seed=0, bits=16, margin="evidence")
 report = tuned.report
-print("kept: the default is as good" if report.kept else "found: better strengths than the default's")
-for (kind, strength), left, before in zip(ATTACKS, report.tried, report.tried_default, strict=True):
+print("kept: the default is as good" if report.default_kept else "found: better strengths than the default's")
+for (kind, strength), left, before in zip(ATTACKS, report.trials, report.default_trials, strict=True):
     print(f"after {kind} {strength:g}: {left:.0f} nats, by default {before:.0f}")
-print(f"worst {report.tried.min():.0f}, by default {report.tried_default.min():.0f}, bound {report.bound:.0f}")
+print(f"worst {report.trials.min():.0f}, by default {report.default_trials.min():.0f}, bound {report.bound:.0f}")
 
 # %% [markdown]
 # Beside a mark of the default strengths, at the same limit. The claims are of another key than those that were tried.
@@ -79,7 +79,7 @@ for name, scheme in (("default", "keyed"), ("tuned", tuned.scheme)):
     betas[name] = info.record.beta * np.asarray(marker.reader.carrier.profile)
     shown[name] = marked
 assert worst["tuned"] < -6
-assert report.kept or worst["tuned"] < worst["default"]
+assert report.default_kept or worst["tuned"] < worst["default"]
 
 # %% [markdown]
 # The strengths over frequency: β is what is written in a band, in diagonals of the bounding box.

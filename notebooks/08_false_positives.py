@@ -239,7 +239,7 @@ assert owner.detect(marked, MESSAGE).detected()
 # This makes forging a search, and a search must be charged, as above. An adversary who may choose original, key and
 # message *after* seeing the suspect can go on searching for as long as they like. That is why all three must be fixed
 # before, by a timestamped commitment: `info.record` commits to key, original and message without showing any, and
-# `jaxmark deposit` makes of many records one number to publish.
+# `jaxmark commit` makes of many records one number to publish.
 #
 # A mesh that is no copy of the original at all is not compared in vain, but refused:
 

@@ -119,8 +119,8 @@ layers[1] = jax.tree.map(jnp.zeros_like, layers[1])  # which leaves scans as the
 
 
 def denoise(layers, seen):
-    bent = 100 * operator.apply(seen)  # where a vertex lies off the mean of its neighbours
-    hidden = jax.nn.tanh(spectral.cheb_conv(operator, layers[0], bent))
+    deformed = 100 * operator.apply(seen)  # where a vertex lies off the mean of its neighbours
+    hidden = jax.nn.tanh(spectral.cheb_conv(operator, layers[0], deformed))
     return seen - 0.01 * spectral.cheb_conv(operator, layers[1], hidden)
 
 

@@ -177,7 +177,7 @@ def test_half_of_a_cloud_in_any_pose_and_order_shows_its_points(marker: jm.water
 
 
 def test_a_saved_original_will_do(host: Mesh, marked: Mesh, marker: jm.watermark.NonBlindMarker):
-    record = marker.write(marker.codeword(MESSAGE), 4e-4, told=MESSAGE)[1].record
+    record = marker.write(marker.codeword(MESSAGE), 4e-4, content=MESSAGE)[1].record
     again = cloud(np.random.default_rng(3).permutation(host.vertices).astype(np.float32).astype(float))
     found = jm.detect(marked, original=again, key=marker.key, record=record)
     assert found.message == MESSAGE

@@ -178,7 +178,7 @@ def test_products_of_preparing_embedding_and_reading(scheme, original, key: jm.K
         seen, reader = observe(marked - x)._replace(nuisance=x), carrier.reader()
         received = reader.receive(seen)
         probe = KeyedReader._probe(reader, jnp.ones_like(x[:, 0])) if scheme.name == "keyed" else None
-        more = probe, reader.linear_score(received, x, bits), reader.glance(seen)
+        more = probe, reader.linear_score(received, x, bits), reader.read_quickly(seen)
         return (
             carrier.claim(seen, bits),
             carrier.adjoint(x, beta),

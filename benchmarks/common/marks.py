@@ -7,7 +7,7 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark.interfaces import Room, Scheme
+from jaxmark.watermark.interfaces import FreeDimensions, Scheme
 from jaxmark.watermark.perception.budget import BudgetLike
 from jaxmark.watermark.perception.capacity import NOISE
 
@@ -56,10 +56,10 @@ def mark(mesh: Mesh, scheme: Scheme, bits: int, budget: float, noise: float | No
 
 
 def write(marker: jm.watermark.NonBlindMarker, message: bytes, budget: BudgetLike) -> Mesh:
-    """Embed without reading back, whether or not the mesh has room for the message."""
+    """Embed without reading back, whether or not the mesh has capacity for the message."""
     return marker.write(marker.codeword(message), budget)[0]
 
 
-def room(marker: jm.watermark.NonBlindMarker) -> Room | None:
+def free_dimensions(marker: jm.watermark.NonBlindMarker) -> FreeDimensions | None:
     """What the marker's reader leaves of its mark; None if it knows nothing of noise."""
-    return marker.reader.room(marker.original.to_traced(marker.original.used))
+    return marker.reader.free_dimensions(marker.original.to_traced(marker.original.used))

@@ -13,8 +13,8 @@ def planes(mesh: Mesh) -> np.ndarray:
     """Which faces are of a plane."""
     faces, size = np.asarray(mesh.faces), len(mesh.vertices)
     hinges = make_hinges(faces)
-    bent = np.abs(np.degrees(dihedral_angles(jnp.asarray(mesh.vertices, jnp.float32), hinges))) > PLANE
-    pairs = np.sort(np.asarray(hinges.edges)[bent], axis=1) @ [size, 1]
+    deformed = np.abs(np.degrees(dihedral_angles(jnp.asarray(mesh.vertices, jnp.float32), hinges))) > PLANE
+    pairs = np.sort(np.asarray(hinges.edges)[deformed], axis=1) @ [size, 1]
     sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1), axis=-1) @ [size, 1]
     return np.asarray(np.all(~np.isin(sides, pairs), axis=1))
 

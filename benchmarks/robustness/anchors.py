@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 import jaxmark as jm
-from jaxmark.bench import LEAGUES, Method, fit
+from jaxmark.bench import TRACKS, Method, fit
 from jaxmark.bench.methods.moments import moments
 from jaxmark.bench.methods.vertex_norms import cho
 
@@ -28,7 +28,7 @@ BITS = 64
 TOLERANCE = 0.10  # of the mean difference of bit error rates
 STEPS = tuple(np.geomspace(0.2, 0.001, 200))  # that moments are quantised by, so fine that limits are met
 METHODS: Mapping[str, Method] = {"cho": cho(BITS), "wang": moments(BITS, STEPS)}
-LEAGUE = LEAGUES["smi2010"]
+LEAGUE = TRACKS["smi2010"]
 WHERE = {"perceptual": 0, "geometric": 1}
 RATED = {name: row for name, row in LEAGUE.lines.items() if row.cho is not None}
 

@@ -50,15 +50,15 @@ def row(name: str, mesh: Mesh, budget: Budget, attacks: list[str]) -> Row:
     mesh = host_mesh(compact(weld_mesh(mesh, weld(mesh.vertices))))
     reference = jm.distortion.Reference(mesh)
     cells: dict[str, list[str]] = {}
-    for hiding in (False, True):
-        marker = jm.make_marker(mesh, KEY, bits=8 * len(MESSAGE), scheme=KeyedScheme(hiding=hiding))
+    for masking in (False, True):
+        marker = jm.make_marker(mesh, KEY, bits=8 * len(MESSAGE), scheme=KeyedScheme(hiding=masking))
         marked = write(marker, MESSAGE, budget)
         found = reference.measure(marked, ("rms", "dame", "stretch"))
         x, y = (
             jnp.asarray((np.asarray(one.vertices) - reference.centre) / diagonal(mesh), jnp.float32)
             for one in (mesh, marked)
         )
-        seen = [float(shading(x, y, reference.hiding, share)) for share in (0.95, 0.99)]
+        seen = [float(shading(x, y, reference.masking, share)) for share in (0.95, 0.99)]
         told = {
             "rms": f"{1e3 * (found['rms'] or 0):.2f}",
             "shading": " / ".join(f"{value:.2f}" for value in seen),

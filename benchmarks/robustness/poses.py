@@ -84,9 +84,9 @@ def rows_of(path: Path, mesh: Mesh, bits: int, budget: float) -> list[Row]:
         places, before = np.asarray(suspect.vertices, np.float64), np.asarray(mesh.vertices, np.float64)
         off = np.linalg.norm(similarity(places, before)(places) - before, axis=1)
         moved = float(np.sqrt(np.mean(off**2))) / diagonal(mesh)
-        ways = {"one map": aligned._replace(bent=None)}
-        if aligned.bent is not None:
-            ways["own maps"] = aligned.straightened(marker.original, aligned.bent)
+        ways = {"one map": aligned._replace(deformed=None)}
+        if aligned.deformed is not None:
+            ways["own maps"] = aligned.undeformed(marker.original, aligned.deformed)
         if skin is not None:
             ways["skeleton"] = align(marker.original, unpose(mesh, skin, suspect))
         claims = {name: marker.read(way, subject.message).evidence.log10_p_unfloored for name, way in ways.items()}

@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import add_meshes, make_parser
 from common.attacks import attacked
 from common.detection import compilation_cache, detect
-from common.marks import Case, Subject, add_schemes, mark, parse_case, room
+from common.marks import Case, Subject, add_schemes, free_dimensions, mark, parse_case
 from common.strengths import GRIDS, OWN, largest
 from common.tables import Row, head, line, save, say
 
@@ -80,7 +80,7 @@ def measure(mesh: Mesh, source: Path, wanted: Case, options: argparse.Namespace)
     """All rows of one mesh and case."""
     bits, budget, _ = wanted
     probe = jm.make_marker(mesh, bytes(32), bits=bits)
-    left = room(probe)
+    left = free_dimensions(probe)
     assert left is not None
     kept = left.dimensions @ left.energy
     ceiling = f"{budget * math.sqrt(1.5 * kept / (10**0.25 * least_energy(bits))):.5f}"
@@ -97,7 +97,7 @@ def measure(mesh: Mesh, source: Path, wanted: Case, options: argparse.Namespace)
         except jm.JaxmarkError as error:
             yield row | {"cell": "refused", "note": str(error)}
             continue
-        promised = f" for noise {subjects[0].noise:g}" if room(subjects[0].marker) else ""
+        promised = f" for noise {subjects[0].noise:g}" if free_dimensions(subjects[0].marker) else ""
         yield row | {"cell": f"{size:.3g}{promised}"}
         if part == "required":
             yield row | {"attack": "ceiling", "cell": ceiling}

@@ -123,9 +123,9 @@ def main() -> None:
         mesh = load(parser, path)
         whole = jm.capacity(mesh, options.budget)
         for parts in options.parts:
-            rooms = capacities(mesh, parts, options.budget) if parts > 1 else [whole]
+            bits = capacities(mesh, parts, options.budget) if parts > 1 else [whole]
             for way in ways(mesh, parts, options.bits, options.budget)[parts == 1 :]:
-                carried = f"{min(rooms)}, {sum(rooms)}" if way.parts > 1 else f"{whole}"
+                carried = f"{min(bits)}, {sum(bits)}" if way.parts > 1 else f"{whole}"
                 found = measure(way, parts, options.bits, options.seeds)
                 print(line(path.name, way.name, parts * options.bits, carried, *found), flush=True)
 

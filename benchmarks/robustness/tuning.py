@@ -34,7 +34,7 @@ from common.tables import Row, head, line, save_json, say
 from common.timing import timed
 
 ATTACKS = ["noise=0.005", "noise=0.001", "smoothing=10", "smoothing=50", "quantisation=8", "quantisation=9"]
-TRIED_CHANNELS = "tried of the channels' best"
+CHANNEL_TRIALS = "channel trials"
 LOW_PASS = (8, 16, 32)
 LIMITS = ["rms=0.0008", "gl=0.0002", "dame=0.008", "msdm2=0.12"]
 UNSEEN = 1000  # first seed of the attacks reported
@@ -128,10 +128,10 @@ def reported(
     if own is None:
         return rows
     rows[-1] |= {
-        "tried": own.report.tried.tolist(),
-        TRIED_CHANNELS: own.report.tried_channels.tolist(),
-        "tried of the default": own.report.tried_default.tolist(),
-        "kept": own.report.kept,
+        "trials": own.report.trials.tolist(),
+        CHANNEL_TRIALS: own.report.channel_trials.tolist(),
+        "default trials": own.report.default_trials.tolist(),
+        "default_kept": own.report.default_kept,
         "bound": own.report.bound,
         "model": float(own.report.margins.min()),
         "gap": own.report.gap,
@@ -162,12 +162,12 @@ def table(rows: list[Row], attacks: list[tuple[str, float]]) -> str:
             cells += [f"{worst / default:.2f}", f"{row['read']:.0%}"]
             cells += row.get("strengths", [])
         text.append(line(row["profile"], *cells))
-    if "tried" not in last:
+    if "trials" not in last:
         return "\n".join([*text, ""])
     note = (
-        f"Tuned in {last['seconds']:.1f} s: by trials {min(last['tried']):.1f} nats, the default"
-        f" {min(last['tried of the default']):.1f}, the best by channels"
-        f" {min(last[TRIED_CHANNELS]):.1f}; on the channels themselves {last['model']:.0f}, no profile above"
+        f"Tuned in {last['seconds']:.1f} s: by trials {min(last['trials']):.1f} nats, the default"
+        f" {min(last['default trials']):.1f}, the best by channels"
+        f" {min(last[CHANNEL_TRIALS]):.1f}; on the channels themselves {last['model']:.0f}, no profile above"
         f" {last['bound']:.0f} (gap {last['gap']:.2%})."
     )
     return "\n".join([*text, "", note, ""])

@@ -26,7 +26,7 @@ import numpy as np
 
 import jaxmark as jm
 from jaxmark.bench.parametric import SHAPES
-from jaxmark.distortion import RENDERED, make_hiding, shading
+from jaxmark.distortion import RENDERED, make_masking, shading
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, host_mesh, weld, weld_mesh
 from jaxmark.watermark.perception.budget import Budget
 
@@ -52,13 +52,13 @@ def row(name: str, mesh: Mesh, budget: Budget, pictures: bool) -> Row:
     found = jm.distortion.measure(mesh, marked, metrics)
     points = [np.asarray(one.vertices, np.float64) / diagonal(mesh) for one in (mesh, marked)]
     points = [one - points[0].mean(axis=0) for one in points]
-    hiding, prepare = again(lambda: make_hiding(points[0], mesh.faces))
+    masking, prepare = again(lambda: make_masking(points[0], mesh.faces))
     x, y = (jnp.asarray(one, jnp.float32) for one in points)
-    seen = [float(shading(x, y, hiding, share)) for share in (0.5, 0.95, 0.99)]
-    _, measure = again(lambda: shading(x, y, hiding))
+    seen = [float(shading(x, y, masking, share)) for share in (0.5, 0.95, 0.99)]
+    _, measure = again(lambda: shading(x, y, masking))
     slope = jax.jit(jax.grad(shading, argnums=1))
-    _, differentiate = again(lambda: slope(x, y, hiding))
-    least = np.degrees(np.quantile(hiding.threshold, 0.05, axis=1).min())
+    _, differentiate = again(lambda: slope(x, y, masking))
+    least = np.degrees(np.quantile(masking.threshold, 0.05, axis=1).min())
     return {
         "mesh": name,
         "points": len(x),

@@ -92,7 +92,7 @@ ATTACKERS: dict[tuple[str, str], Callable[..., jm.attacks.Attack]] = {
     ("program", "shrinkage of wavelets"): named("shrinkage", 3e-5, 3e-2),
     ("program", "random warp"): named("warp", 0.01, 1),
     ("program", "Wiener estimate subtracted"): sought(enemies.subtraction),
-    ("program", "another mark"): sought(enemies.remarking),
+    ("program", "another mark"): sought(enemies.rewatermarking),
     ("program", "vertices, by gradient"): sought(enemies.descent, family="vertices"),
     ("program", "vertices, by gradient, for DAME"): visible,
     ("program", "bands, by gradient"): sought(enemies.descent, family="bands"),

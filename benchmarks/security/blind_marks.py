@@ -8,7 +8,7 @@ Tables in Markdown, by part; `--only` chooses some:
              of anchors, which a search breaks
   unmarked   the smallest log10 p that is read from unmarked meshes, and expected by chance
   erasure    values of all anchors moved by shares of a step, without the key
-  remarking  a second mark by another key, of the same limits
+  rewatermarking  a second mark by another key, of the same limits
   copying    the phases of one marked work written in another shape, without the key
   averaging  the lattice of values estimated from several works of one key with different messages, and another work
              moved to halfway between
@@ -65,7 +65,7 @@ PARTS = (
     "bound",
     "unmarked",
     "erasure",
-    "remarking",
+    "rewatermarking",
     "copying",
     "averaging",
     "answers",
@@ -279,7 +279,7 @@ def erasure(work: Marked) -> Iterator[Row]:
             yield row | cost(work.marked, erased, work.info.rms) | read(erased)
 
 
-def remarking(work: Marked) -> Iterator[Row]:
+def rewatermarking(work: Marked) -> Iterator[Row]:
     """Mark a marked work again under another key."""
     second = MESSAGE[::-1]
     again, _ = jm.embed(work.marked, second, OTHER, budget=LIMITS, scheme=SCHEME)
@@ -561,8 +561,8 @@ def main() -> None:
     works = [mark(name, mesh) for name, mesh in meshes.items()]
     if "erasure" in parts:
         show("Erasure without the key", (row for work in works for row in erasure(work)))
-    if "remarking" in parts:
-        show("Another mark", (row for work in works for row in remarking(work)))
+    if "rewatermarking" in parts:
+        show("Another mark", (row for work in works for row in rewatermarking(work)))
     if "copying" in parts:
         rows = (row for work in works for row in copying(work, targets(work, meshes)))
         show("Copying without the key", rows)

@@ -10,7 +10,7 @@ strengths are tuned, these; then of the detector's answers, against who may ask 
          median for it
 
 The attackers of marks are `bands` and `vertices`, by gradient, unless others are named: `shrinkage` of wavelets, and
-`remarking`, another mark of the same strengths. What a defence of the mark costs elsewhere stands beside it: the mark's
+`rewatermarking`, another mark of the same strengths. The table also gives the cost of a defence elsewhere: the mark's
 own DAME and MSDM2, and log10 p of a claim after noise of 0.5 % and 50 steps of smoothing, without its floor.
 """
 
@@ -58,7 +58,7 @@ ATTACKERS = {
     "bands": Attacker(partial(descent, "bands"), 4 * BUDGET),
     "vertices": Attacker(partial(descent, "vertices"), 4 * BUDGET),
     "shrinkage": Attacker(lambda known, steps: jm.adversaries.ATTACKS["shrinkage"], None, (3e-5, 3e-2)),
-    "remarking": Attacker(lambda known, steps: enemies.remarking(scheme=known, bits=BITS), None),
+    "rewatermarking": Attacker(lambda known, steps: enemies.rewatermarking(scheme=known, bits=BITS), None),
 }
 ELSEWHERE = (("noise", 0.005), ("smoothing", 50))
 
@@ -83,7 +83,7 @@ def tuned(mesh: Mesh, names: Sequence[str], steps: int, rounds: int) -> Iterator
             attacks.append((ATTACKERS[name].attack(scheme, steps), strength))
         found = jm.tune(mesh, attacks, BUDGET, seed=0, bits=BITS, margin="evidence")
         scheme = found.scheme
-        yield f"tuned, round {count}" + (" (the default)" if found.report.kept else ""), scheme, scheme
+        yield f"tuned, round {count}" + (" (the default)" if found.report.default_kept else ""), scheme, scheme
 
 
 def jittered(mesh: Mesh) -> tuple[str, KeyedScheme, KeyedScheme]:

@@ -94,8 +94,8 @@ def suspects(marker: jm.watermark.NonBlindMarker) -> dict[str, Observation]:
     seen = {name: marker.observe(marker.register(suspect)) for name, suspect in meshes.items()}
     for name, straight in (("bent", mesh), ("marked under another key, bent", marked(204))):
         aligned = marker.register(jm.attack(straight, "twisting", 120, seed=5))
-        assert aligned.bent is not None
-        seen[f"{name}, straightened"] = marker.observe(aligned.straightened(marker.original, aligned.bent))
+        assert aligned.deformed is not None
+        seen[f"{name}, undeformed"] = marker.observe(aligned.undeformed(marker.original, aligned.deformed))
     return stackable(seen)
 
 

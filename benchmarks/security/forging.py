@@ -151,15 +151,15 @@ def claims_of(part: tuple[np.ndarray, np.ndarray], profile: np.ndarray, charge: 
 
 def record_of(marker: NonBlindMarker) -> Record:
     """The record that the owner would have of this mark."""
-    return marker.write(marker.codeword(MESSAGE), BUDGET, told=MESSAGE)[1].record
+    return marker.write(marker.codeword(MESSAGE), BUDGET, content=MESSAGE)[1].record
 
 
 def remade(record: Record, key: jm.Key, mesh: Mesh, profile: Sequence[float]) -> Record:
     """The owner's record with another profile, whole in every other respect."""
     parameters = {**record.parameters, "profile": tuple(profile)}
-    fresh = dataclasses.replace(record, parameters=parameters, told="").sealed(key)
+    fresh = dataclasses.replace(record, parameters=parameters, message_commitment="").sealed(key)
     told = commit(MESSAGE, jm.make_marker(mesh, key, record=fresh).choices)
-    return dataclasses.replace(fresh, told=told).sealed(key)
+    return dataclasses.replace(fresh, message_commitment=told).sealed(key)
 
 
 def strengths(mesh: Mesh, seen: dict[str, Mesh], keys: int, bands: int) -> Row:
@@ -233,7 +233,7 @@ def presented(mesh: Mesh) -> list[Row]:
     """Read with originals that were moved against the mark, from what was never marked."""
     key = key_of(0)
     marker = jm.make_marker(mesh, key)
-    marked, info = marker.write(marker.codeword(MESSAGE), BUDGET, told=MESSAGE)
+    marked, info = marker.write(marker.codeword(MESSAGE), BUDGET, content=MESSAGE)
     shift = np.asarray(marked.vertices) - np.asarray(mesh.vertices)
     shift /= np.sqrt(np.mean(np.sum(shift**2, axis=1)))
     half = (mesh.vertices[:, 0] > np.median(mesh.vertices[:, 0]))[:, None]

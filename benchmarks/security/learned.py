@@ -99,7 +99,7 @@ ATTACKERS: dict[str, Callable[[Path, Target], jm.attacks.Attack]] = {
     "chain": lambda folder, target: enemies.chain_attack(search(folder, 0, 0)),
     "non-local means": named("non-local-means", 0.3, 300),
     "shrinkage of wavelets": named("shrinkage", 3e-5, 3e-2),
-    "another mark": lambda folder, target: around(enemies.remarking(bits=BITS), target.theory),
+    "another mark": lambda folder, target: around(enemies.rewatermarking(bits=BITS), target.theory),
 }
 
 

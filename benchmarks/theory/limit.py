@@ -8,7 +8,7 @@ read if it is on the list, as the tag picks it but with probability 64 · 2^-28.
 MESH, codes are then as long as is of use.
 
 Eb/N0 = η |w|² / (2 k σ²): w is the mark as written, η the share of such marks that survives the projection (`energy` of
-a reader's room, from one probe), k the payload without the tag, σ the noise of a coordinate. Limits:
+a reader's free dimensions, from one probe), k the payload without the tag, σ the noise of a coordinate. Limits:
 Shannon's, the least energy of any code (the converse of Polyanskiy, Poor, Verdú 2011), and a matched filter for each
 bit, uncoded.
 
@@ -37,7 +37,7 @@ from jaxmark.watermark.perception.capacity import least_energy
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import load, make_parser
-from common.marks import BUDGET, room, write
+from common.marks import BUDGET, free_dimensions, write
 
 TARGET = 1e-3
 ENOUGH = 100  # errors
@@ -115,7 +115,7 @@ def prepare(marker: NonBlindMarker, text: bytes, random: np.random.Generator) ->
     """Write a mark; the result says whether one reading of it fails at an Eb/N0."""
     original = marker.original
     mark = shift_of(original, write(marker, text, BUDGET))
-    left = room(marker)
+    left = free_dimensions(marker)
     assert left is not None
     energy = left.dimensions @ left.energy * np.sum(mark**2) / original.used.sum()
 

@@ -34,7 +34,7 @@ from jaxmark.adversaries.key_holder import erasure_by_descent as erasure_by_desc
 from jaxmark.adversaries.keyless import Family as Family
 from jaxmark.adversaries.keyless import descent as descent
 from jaxmark.adversaries.keyless import evolution as evolution
-from jaxmark.adversaries.keyless import remarking as remarking
+from jaxmark.adversaries.keyless import rewatermarking as rewatermarking
 from jaxmark.adversaries.keyless import subtraction as subtraction
 from jaxmark.adversaries.networks import Goal as Goal
 from jaxmark.adversaries.networks import Learned as Learned

@@ -58,15 +58,15 @@ def search_key(
     if keys < 1:
         raise JaxmarkError(f"A search takes at least 1 key, got {keys}.")
     maker, ready, random = get_nonblind(scheme), make_original(original), np.random.default_rng(seed)
-    bits, tried = 8 * len(message), [Key(random.bytes(KEY_BYTES)) for _ in range(keys)]
-    code_bits, seen = maker.code_length(ready, bits), align(ready, given).observation(ready)
+    bits, candidates = 8 * len(message), [Key(random.bytes(KEY_BYTES)) for _ in range(keys)]
+    code_bits, observation = maker.code_length(ready, bits), align(ready, given).observation(ready)
 
     def choices(key: Key) -> Choices:
         return bind_mark(key, ready, maker, bits, "message")
 
     # Reader and reception are independent of the key.
-    reader = maker.carrier(ready, choices(tried[0]), bits, code_bits).reader()
-    received = reader.receive(seen)
+    reader = maker.carrier(ready, choices(candidates[0]), bits, code_bits).reader()
+    received = reader.receive(observation)
 
     def claim_log10_p(key: Key) -> float:
         codeword = jnp.asarray(encode(message, choices(key), code_bits), ready.signal.dtype)
@@ -74,8 +74,8 @@ def search_key(
         ways = list(zip(*claims(other, received, codeword), strict=True))
         return weigh(ways, bits=bits, fixed=True).log10_p
 
-    log10_p = np.array([claim_log10_p(key) for key in tried])
-    return Search(tried[int(log10_p.argmin())], log10_p)
+    log10_p = np.array([claim_log10_p(key) for key in candidates])
+    return Search(candidates[int(log10_p.argmin())], log10_p)
 
 
 def transplant(marked: Mesh, estimate: Mesh, target: Mesh) -> Mesh:

@@ -37,7 +37,7 @@ class Surrogate(NamedTuple):
     moving: Float[Array, "rows 1"]  # 1 if a face uses the point, else 0
     pose: Float[Array, "rows columns"]  # orthonormal basis of the affine functions of the position
     bands: Float[Array, "bands terms"]  # Chebyshev coefficients of the attacker's bands
-    seen: Float[Array, " bands"]  # visibility of each band per unit of RMS displacement; 1 if the metric is RMS
+    visibility: Float[Array, " bands"]  # visibility of each band per unit of RMS displacement; 1 if the metric is RMS
     reader: Reader  # reader for a random key, which does not matter
     mark: Float[Array, ""]  # RMS displacement that marks are assumed to have
 
@@ -56,14 +56,14 @@ def make_surrogate(
     functions = np.c_[np.ones(len(original.used)), original.positions] * original.used[:, None]
     vectors, values, _ = np.linalg.svd(functions, full_matrices=False)
     basis = vectors * (values > 1e-9 * values[0])  # flat meshes have fewer affine functions
-    seen = np.ones(_ATTACKER_BANDS) if metric == "rms" else band_visibility(original, family, [metric])[0]
+    visibility = np.ones(_ATTACKER_BANDS) if metric == "rms" else band_visibility(original, family, [metric])[0]
     surrogate = Surrogate(
         operator=original.operator,
         signal=original.signal,
         moving=original.to_traced(original.used)[:, None],
         pose=original.to_traced(basis),
         bands=jnp.asarray(family, dtype),
-        seen=jnp.asarray(seen, dtype),
+        visibility=jnp.asarray(visibility, dtype),
         reader=marker.reader,
         mark=jnp.asarray(mark, dtype),
     )
@@ -77,7 +77,7 @@ def rms(surrogate: Surrogate, displacement: Displacement) -> Float[Array, ""]:
 
 def size(surrogate: Surrogate, displacement: Displacement) -> Float[Array, ""]:
     """Return the metric as it is for small displacements: the RMS after each band is weighted by its visibility."""
-    return rms(surrogate, band_filter(surrogate, surrogate.seen, displacement))
+    return rms(surrogate, band_filter(surrogate, surrogate.visibility, displacement))
 
 
 def rescale(surrogate: Surrogate, displacement: Displacement, wanted: Float[Array, ""]) -> Displacement:

@@ -83,10 +83,10 @@ def _attack(marker: NonBlindMarker, message: bytes, slopes: Slope, steps: int) -
         start = np.asarray(mesh.vertices, np.float64)[copies.point]
         faces = original.mesh.faces
         given = align(original, Mesh(start, faces), "same")
-        seen, back = marker.observe(given), np.linalg.inv(given.pose.matrix)
+        observation, back = marker.observe(given), np.linalg.inv(given.pose.matrix)
 
-        def evaluate(seen: Observation) -> tuple[float, _Way]:
-            evidence, slope = slopes(reader, seen, codeword)
+        def evaluate(observation: Observation) -> tuple[float, _Way]:
+            evidence, slope = slopes(reader, observation, codeword)
             return float(evidence), -original.to_host(slope)
 
         def resize(way: _Way) -> _Way:
@@ -100,8 +100,8 @@ def _attack(marker: NonBlindMarker, message: bytes, slopes: Slope, steps: int) -
 
         # Two displacements in closed form: the one that lowers the score most, and the mark subtracted. The better of
         # them is the start of the descent.
-        homewards = -original.to_host(seen.residual)
-        trials = [attempt(resize(way)) for way in (evaluate(seen)[1], homewards)]
+        homewards = -original.to_host(observation.residual)
+        trials = [attempt(resize(way)) for way in (evaluate(observation)[1], homewards)]
         _, against, way = min(trials, key=lambda one: one[0])
         for step in range(steps - 1):
             trials.append(attempt(way + (2 / (step + 3)) * (resize(against) - way)))
@@ -113,18 +113,18 @@ def _attack(marker: NonBlindMarker, message: bytes, slopes: Slope, steps: int) -
 
 
 @jax.jit
-def _linear_slope(reader: Reader, seen: Observation, codeword: Float[Array, " code"]) -> Rise:
+def _linear_slope(reader: Reader, observation: Observation, codeword: Float[Array, " code"]) -> Rise:
     """Return the evidence of a claim, and the slope of its score if all that the receiver learns is held fixed."""
-    received = reader.receive(seen)
-    slope = jax.grad(lambda residual: reader.linear_score(received, residual, codeword))(seen.residual)
+    received = reader.receive(observation)
+    slope = jax.grad(lambda residual: reader.linear_score(received, residual, codeword))(observation.residual)
     return strongest_evidence(reader, received, codeword), slope
 
 
 @jax.jit
-def _slope(reader: Reader, seen: Observation, codeword: Float[Array, " code"]) -> Rise:
+def _slope(reader: Reader, observation: Observation, codeword: Float[Array, " code"]) -> Rise:
     """Return the evidence of a claim, and its slope through all that the receiver does."""
 
     def evidence(residual: Array) -> Array:
-        return strongest_evidence(reader, reader.receive(seen._replace(residual=residual)), codeword)
+        return strongest_evidence(reader, reader.receive(observation._replace(residual=residual)), codeword)
 
-    return jax.value_and_grad(evidence)(seen.residual)
+    return jax.value_and_grad(evidence)(observation.residual)

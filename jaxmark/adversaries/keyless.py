@@ -76,7 +76,7 @@ def subtraction(**assumptions: Unpack[_Assumptions]) -> Attack:
     return make_attack(way, **assumptions)
 
 
-def remarking(**assumptions: Unpack[_Assumptions]) -> Attack:
+def rewatermarking(**assumptions: Unpack[_Assumptions]) -> Attack:
     """Write another mark over the first, with a key of the attacker's own."""
     return make_attack(lambda surrogate, strength, seed: random_mark(surrogate, seed)[1], **assumptions)
 
@@ -203,14 +203,14 @@ def _evolve(loss: Loss, start: Parameters, seed: PRNGKeyArray, *, generations: i
 
 def _vertices(surrogate: Surrogate, seed: PRNGKeyArray) -> Start:
     """Search all displacements, with larger steps in bands that are harder to see; the start is a random mark."""
-    hidden = surrogate.seen.min() / surrogate.seen
+    hidden = surrogate.visibility.min() / surrogate.visibility
     return random_mark(surrogate, seed)[1] / surrogate.mark, lambda z: band_filter(surrogate, hidden, z)
 
 
 def _bands(surrogate: Surrogate, seed: PRNGKeyArray) -> Start:
     """Search losses from 0 to 1 in each of the mesh's own bands, and another mark with any strength in each band."""
     other = random_mark(surrogate, seed)[1]
-    start = jnp.full_like(surrogate.seen, -4), jnp.zeros_like(surrogate.seen)
+    start = jnp.full_like(surrogate.visibility, -4), jnp.zeros_like(surrogate.visibility)
 
     def make(parameters: tuple[Array, Array]) -> Displacement:
         lost, strengths = jax.nn.sigmoid(parameters[0]), jnp.exp(parameters[1])

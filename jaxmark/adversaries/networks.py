@@ -177,11 +177,11 @@ def _decide(network: Network, surrogate: Surrogate, parts: Parts) -> tuple[Weigh
     square = jnp.sum(parts**2, axis=-1)
     common = jnp.sum(parts * jnp.roll(parts, -1, axis=0), axis=-1)
     either = jnp.sqrt((square + _FLOOR * mark) * (jnp.roll(square, -1, axis=0) + _FLOOR * mark))
-    seen = jnp.concatenate([jnp.log(square / mark + _FLOOR) / 4, common / either]).T
+    features = jnp.concatenate([jnp.log(square / mark + _FLOOR) / 4, common / either]).T
     *hidden, last = network
     for layer in hidden:
-        seen = jnp.tanh(cheb_conv(surrogate.operator, layer, seen))
-    more, strengths = jnp.split(cheb_conv(surrogate.operator, last, seen).T[..., None], [bands])
+        features = jnp.tanh(cheb_conv(surrogate.operator, layer, features))
+    more, strengths = jnp.split(cheb_conv(surrogate.operator, last, features).T[..., None], [bands])
     energy = jnp.sum(surrogate.moving.T * square, axis=1) / surrogate.moving.sum()
     wiener = jnp.clip(mark * _profile(surrogate) / jnp.maximum(energy, jnp.finfo(energy.dtype).tiny), 1e-6, 0.5)
     start = jnp.log(wiener / (1 - wiener))[:, None, None]

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 from jaxmark.alignment.fitting import FAR_DISTANCE, fit_pieces, fit_whole, min_piece_points
-from jaxmark.alignment.nonrigid import Bent
+from jaxmark.alignment.nonrigid import DeformedPoints
 from jaxmark.alignment.original import Original, residual
 from jaxmark.alignment.replay import replay_smoothing_of_points
 from jaxmark.alignment.result import Alignment, file_pose, rms
@@ -85,7 +85,7 @@ def align_points(
     # Points that do not agree may belong to pieces that moved apart; if the residual is large, so may all points.
     far = rms(error[agreeing]) > FAR_DISTANCE
     has_pieces = far or np.sum(sound & ~agreeing) >= min_piece_points(x)
-    bent = Bent(pose(y), sound) if has_pieces else None
+    deformed = DeformedPoints(pose(y), sound) if has_pieces else None
     label = np.where(sound, component_of(Mesh(y, faces)), -1) if has_pieces else np.full(len(x), -1)
     pieces = fit_pieces(x, y, label) if far else []
     if 2 * sum(len(points) for points, _ in pieces) > known.sum():
@@ -102,4 +102,4 @@ def align_points(
     nuisance = replay_smoothing_of_points(original.operator, mesh, error, agreeing)
     pose = before.then(pose).then(file_pose(original))
     size = rms(error[agreeing])
-    return Alignment(error, agreeing.astype(float), None, nuisance, method, pose, size, bent=bent)
+    return Alignment(error, agreeing.astype(float), None, nuisance, method, pose, size, deformed=deformed)

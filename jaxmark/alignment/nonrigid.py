@@ -21,21 +21,21 @@ _FLAT = 1e-3  # volume of a unit cube after a map that can be undone
 _LEAST_ENERGY = 0.25  # of the median, which is added: no place gains much weight by being quiet
 
 
-class Bent(NamedTuple):
+class DeformedPoints(NamedTuple):
     """Where the points of an original are in a suspect that no single map brings back."""
 
     places: Points  # after a single map, in diagonals
     known: Bool[np.ndarray, " points"]  # mask of the points that were recognised
 
 
-class Straightened(NamedTuple):
+class Undeformed(NamedTuple):
     """A suspect without its bends."""
 
     displacement: Points  # in diagonals; 0 where nothing is known
     weights: Float64[np.ndarray, " points"]  # inverse energy around each point; 0 where nothing is known
 
 
-def straighten(operator: Laplacian, positions: Points, bent: Bent) -> Straightened:
+def undo_deformation(operator: Laplacian, positions: Points, deformed: DeformedPoints) -> Undeformed:
     """Invert an affine map around each point, fitted to its surroundings.
 
     Its surroundings are weighed by diffusion. Moments of first and second order give the best map by least squares,
@@ -45,9 +45,9 @@ def straighten(operator: Laplacian, positions: Points, bent: Bent) -> Straighten
     Args:
         operator: the Laplacian of the original's points; only its edges count.
         positions: positions of these points, in diagonals.
-        bent: where they are in the suspect.
+        deformed: where they are in the suspect.
     """
-    x, y, known = positions, bent.places, bent.known
+    x, y, known = positions, deformed.places, deformed.known
     x, y = (np.where(known[:, None], points, 0) for points in (x, y))
     around = _Surroundings(operator, known)
     first = around.mean(np.concatenate([x, y], axis=1))
@@ -67,7 +67,7 @@ def straighten(operator: Laplacian, positions: Points, bent: Bent) -> Straighten
     displacement = np.where(sound[:, None], back - x, 0)
     energy = around.mean(np.sum(displacement**2, axis=1, keepdims=True))[:, 0]
     middle = np.median(energy[sound]) if sound.any() else 0.0
-    return Straightened(displacement, np.where(sound, 1 / (energy / (middle or 1.0) + _LEAST_ENERGY), 0))
+    return Undeformed(displacement, np.where(sound, 1 / (energy / (middle or 1.0) + _LEAST_ENERGY), 0))
 
 
 class _Surroundings:

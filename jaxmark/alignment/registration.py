@@ -32,11 +32,11 @@ class RegistrationSettings:
     coarse_points: int = 300  # points on each surface by which the 48 first poses are improved and told apart
     rough_points: int = 500  # vertices of the original by which all candidate poses are refined
     fine_points: int = 2000  # points by which likely poses are improved, and the best ones refined and compared
-    kept_share: float = 0.8  # share of the closest pairs that a round of trimmed closest points keeps
+    inlier_share: float = 0.8  # share of the closest pairs that a round of trimmed closest points keeps
     rounds: int = 30  # largest number of rounds of closest points, and of the final refinement
     comparison_rounds: int = 10  # rounds of refinement before poses are compared: enough to tell which one is the best
     reach: float = 0.03  # distances up to this count in the first round of refinement, however small the others are
-    lost_distance: float = 0.005  # points that are further off count as this far off when poses are compared
+    outlier_distance: float = 0.005  # points that are further off count as this far off when poses are compared
     first_ratio: float = 12.0  # of the first poses, those that leave up to this many times the least are improved
     likely_ratio: float = 2.0  # poses that leave up to this many times the least distance are pursued
     mirror_ratio: float = 1.05  # a pose that mirrors must leave so many times less than one that does not
@@ -154,7 +154,7 @@ def _unlikeliness(distance: float, pose: Pose, settings: RegistrationSettings) -
 def _distance(surface: Geometry, points: Points, pose: Pose, settings: RegistrationSettings) -> float:
     """Mean distance of points from a surface, where points that are lost count as a bounded distance."""
     distance = np.linalg.norm(surface.closest(points, pose)[0] - points, axis=1)
-    return float(np.mean(np.minimum(distance, settings.lost_distance)))
+    return float(np.mean(np.minimum(distance, settings.outlier_distance)))
 
 
 def refine(
@@ -309,7 +309,7 @@ def _closest_pairs(
         (source, forward.data[to_target[1]], to_target[0]),
         (backward.data[to_source[1]], target, to_source[0] * scale),
     ]
-    share = settings.kept_share
+    share = settings.inlier_share
     kept = [(s[near], t[near], d[near]) for s, t, d in pairs for near in [d <= np.quantile(d, share)]]
     points, places, distance = (np.concatenate(arrays) for arrays in zip(*kept, strict=True))
     return points, places, float(np.sqrt(np.mean(distance**2)))

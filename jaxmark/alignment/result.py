@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64
 
 from jaxmark.alignment.heights import VertexHeights
-from jaxmark.alignment.nonrigid import Bent, straighten
+from jaxmark.alignment.nonrigid import DeformedPoints, undo_deformation
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original
 from jaxmark.geometry.pose import Points, Pose
@@ -28,7 +28,7 @@ class Alignment(NamedTuple):
     seconds: float = 0.0  # duration of the alignment
     align: Align = "auto"  # how it was asked for
     heights: VertexHeights | None = None  # of the vertices of a surface that has few, above the original
-    bent: Bent | None = None  # recognised points that no single map brings back
+    deformed: DeformedPoints | None = None  # recognised points that no single map brings back
 
     def facts(self) -> dict[str, Any]:
         """Return what a report says of the registration, as values for JSON."""
@@ -47,11 +47,15 @@ class Alignment(NamedTuple):
         known = original.to_traced(self.displacement), original.to_traced(self.weights)
         return Observation(*known, array(self.normals), array(self.nuisance))
 
-    def straightened(self, original: Original, bent: Bent) -> "Alignment":
-        """Align by a map of its own around each point, see `nonrigid.straighten`."""
-        displacement, weights = straighten(original.operator, np.asarray(original.positions, np.float64), bent)
+    def undeformed(self, original: Original, deformed: DeformedPoints) -> "Alignment":
+        """Align by a map of its own around each point, see `nonrigid.undo_deformation`."""
+        displacement, weights = undo_deformation(
+            original.operator, np.asarray(original.positions, np.float64), deformed
+        )
         residual = rms(displacement[weights > 0])
-        return self._replace(displacement=displacement, weights=weights, nuisance=None, residual=residual, bent=None)
+        return self._replace(
+            displacement=displacement, weights=weights, nuisance=None, residual=residual, deformed=None
+        )
 
 
 def rms(x: Points) -> float:

@@ -24,11 +24,11 @@ from jaxmark.bench._equal_visibility import SHARES, equal_visibility
 from jaxmark.bench.benchmark import KEYS, run
 from jaxmark.bench.calibration import RATE
 from jaxmark.bench.corpus import make_corpus
-from jaxmark.bench.leagues import LEAGUES
 from jaxmark.bench.method import METHODS
 from jaxmark.bench.readings import BenchResults, hold_against, load_published, save_readings
 from jaxmark.bench.summary import entries, save_entries
 from jaxmark.bench.tables import tables
+from jaxmark.bench.tracks import TRACKS
 from jaxmark.errors import JaxmarkError, require
 from jaxmark.evaluation.cells import processes
 from jaxmark.files.atomic import write_atomically
@@ -78,14 +78,14 @@ OUTPUT = click.option("--output", type=_PATH, required=True, help="Folder for th
 @METHODS_OPTION
 @OWN
 @click.option(
-    "--league",
-    "leagues",
+    "--track",
+    "tracks",
     multiple=True,
-    type=click.Choice(list(LEAGUES)),
+    type=click.Choice(list(TRACKS)),
     help="Attacks and limits.  [default: smi2010]",
 )
-@click.option("--attacks", multiple=True, help="Attacks of the league, or the first words of some.  [default: all]")
-@click.option("--limits", multiple=True, help="Sets of limits of the league.  [default: all]")
+@click.option("--attacks", multiple=True, help="Attacks of the track, or the first words of some.  [default: all]")
+@click.option("--limits", multiple=True, help="Sets of limits of the track.  [default: all]")
 @click.option("--payloads", multiple=True, type=click.IntRange(1), help="Bits of a message.  [default: 64]")
 @SAMPLES
 @click.option("--others", multiple=True, type=_PATH, help="Further meshes, read unmarked in place of each MESH.")
@@ -104,7 +104,7 @@ def bench_command(
     meshes: tuple[Path, ...],
     methods: tuple[str, ...],
     own: tuple[Path, ...],
-    leagues: tuple[str, ...],
+    tracks: tuple[str, ...],
     attacks: tuple[str, ...],
     limits: tuple[str, ...],
     payloads: tuple[int, ...],
@@ -119,7 +119,7 @@ def bench_command(
 ) -> None:
     """Measure watermarking methods on meshes as papers do: what they survive, and how often they err.
 
-    Every method marks every MESH as strongly as one set of limits allows, and is read after every attack of a league;
+    Every method marks every MESH as strongly as one set of limits allows, and is read after every attack of a track;
     its score is calibrated on suspects that have no mark. Options that may be repeated take all values up to the next
     option. The folder gets results.json, with an entry for each method, results.md, readings.csv (of marks, to
     publish), all_readings.csv (of nulls, too), and with the extra `plot` page.html. The same command goes on where it
@@ -132,7 +132,7 @@ def bench_command(
         meshes,
         output,
         methods=[*methods, *own] or ["keyed"],
-        leagues=leagues or ("smi2010",),
+        tracks=tracks or ("smi2010",),
         attacks=attacks,
         limits=limits,
         payloads=payloads or (64,),
@@ -222,7 +222,7 @@ def bench_corpus_command(folder: Path, most_vertices: int, as_json: bool) -> Non
 
 def _write(found: BenchResults, output: Path, about: str) -> None:
     """All files but the cells."""
-    title = f"What watermarks of meshes survive: {', '.join(dict.fromkeys(task.league for task, _ in found.tasks))}"
+    title = f"What watermarks of meshes survive: {', '.join(dict.fromkeys(task.track for task, _ in found.tasks))}"
     save_entries(found, output / "results.json")
     found.save_csv(output / "all_readings.csv")
     save_readings(found, output / "readings.csv")

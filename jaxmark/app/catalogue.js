@@ -49,12 +49,12 @@ function show(found) {
   if (named.length) {
     box.append(make("p", `Such a naming would come about by chance with a probability of at most ${power(found.log10_p)}, if `
       + "keys, originals and records were fixed before the file existed; "
-      + `${power(found.log10_p_uncommitted)} if nothing dates them. All ${found.tried} readings that could have been made are paid for.`));
+      + `${power(found.log10_p_uncommitted)} if nothing dates them. All ${found.readings} readings that could have been made are paid for.`));
   }
   if (found.dossier) {
     const link = make("a", "Dossier");
     link.href = `dossiers/${found.dossier}`;
-    box.append(make("p", null, link, ` (of this original alone: its figures do not pay for the other ${found.tried - 1} readings)`));
+    box.append(make("p", null, link, ` (of this original alone: its figures do not pay for the other ${found.readings - 1} readings)`));
   }
   const rows = found.matches.map((match) => make("tr", null,
     make("td", null, picture(match.id)), make("td", match.original), make("td", `${match.by}, rank ${match.rank}`),

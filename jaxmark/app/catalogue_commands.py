@@ -65,7 +65,7 @@ def add_command(files: tuple[Path, ...], catalogue_file: Path, records: bool, co
                 _refused(as_json, file, error)
                 continue
             said = f"{file}: {added.status} as {added.id}"
-            said += f", {added.meshes} meshes" * (added.meshes > 1) + _left(added.left)
+            said += f", {added.meshes} meshes" * (added.meshes > 1) + _left(added.skipped)
             answer(as_json, {"file": str(file), **added._asdict()}, said)
         for file in dict.fromkeys(given):
             try:
@@ -152,7 +152,7 @@ def export_command(file: Path, catalogue_file: Path, as_json: bool) -> None:
         raise JaxmarkError(f"FILE and --catalogue are the same file, {file}; give another name.")
     with Catalogue(catalogue_file, read_only=True) as catalogue:
         counted = export_catalogue(catalogue, file)
-    answer(as_json, counted._asdict(), f"{_told(counted)} → {file}")
+    answer(as_json, counted._asdict(), f"{_counts(counted)} → {file}")
 
 
 @catalogue_group.command(name="import")
@@ -165,7 +165,7 @@ def import_command(file: Path, catalogue_file: Path, as_json: bool) -> None:
         raise JaxmarkError(f"{file} is no file that could be imported.")
     with Catalogue(catalogue_file) as catalogue:
         counted = import_catalogue(catalogue, file)
-    answer(as_json, counted._asdict(), f"{_told(counted)}, new in {catalogue_file}")
+    answer(as_json, counted._asdict(), f"{_counts(counted)}, new in {catalogue_file}")
 
 
 @catalogue_group.command(name="check")
@@ -196,7 +196,7 @@ def _existing(catalogue_file: Path) -> Catalogue:
     return Catalogue(catalogue_file)
 
 
-def _told(counted: tuple[int, ...]) -> str:
+def _counts(counted: tuple[int, ...]) -> str:
     originals, records, recipients, verdicts = counted
     return f"{originals} originals, {records} records, {recipients} recipients, {verdicts} verdicts"
 

@@ -197,7 +197,9 @@ def embed_command(
     f"  [default: {DEFAULT_SCHEME}, without --original any blind one]",
 )
 @ALIGN
-@click.option("--deposit", "deposit_file", type=FILE, help="Deposit that dates the record, from `jaxmark deposit`.")
+@click.option(
+    "--commitment", "commitment_file", type=FILE, help="Timestamped commitment to the record, from `jaxmark commit`."
+)
 @click.option("--obtained", default="", help="When and where SUSPECT was got, for the dossier.")
 @click.option("--report", type=FILE, help="Folder for a picture of how SUSPECT was aligned (needs the extra `plot`).")
 @click.option("--dossier", type=FILE, help="Folder for a page that shows a detection to others (extra `plot`).")
@@ -217,7 +219,7 @@ def detect_command(
     meshes: tuple[str, ...],
     schemes: tuple[str, ...] | None,
     align: Align,
-    deposit_file: Path | None,
+    commitment_file: Path | None,
     obtained: str,
     report: Path | None,
     dossier: Path | None,
@@ -242,8 +244,8 @@ def detect_command(
     For a folder, each file gets a line of output, and the exit status is the worst of all. --original and --record may
     then be folders, too, with files of the same names.
     """
-    if deposit_file is not None and record_file is None:
-        raise JaxmarkError("A deposit dates records: give the --record that is in it, too.")
+    if commitment_file is not None and record_file is None:
+        raise JaxmarkError("A commitment applies to a record: give the --record that is in it, too.")
     if presence and (message is not None or bits):
         raise JaxmarkError("A presence mark has no message; leave out --message and --bits, or --presence.")
     named = schemes or ()
@@ -261,7 +263,7 @@ def detect_command(
         named,
         align,
         alpha,
-        None if deposit_file is None else TimestampedCommitment.load(deposit_file),
+        None if commitment_file is None else TimestampedCommitment.load(commitment_file),
         obtained,
         diagnoses=not suspect.is_dir(),
         meshes=meshes,
@@ -343,15 +345,17 @@ def identify_command(
     sys.exit(0 if accused else 1)
 
 
-@cli.command(name="deposit")
+@cli.command(name="commit")
 @click.argument("records", type=FILE, nargs=-1, required=True)
-@click.option("--output", type=FILE, required=True, help="File for the deposit; a request to date it goes beside it.")
+@click.option(
+    "--output", type=FILE, required=True, help="File for the commitment; a timestamp request is written next to it."
+)
 @JSON
-def deposit_command(records: tuple[Path, ...], output: Path, as_json: bool) -> None:
+def commit_command(records: tuple[Path, ...], output: Path, as_json: bool) -> None:
     """Make a deposit of RECORDS, to be dated before anybody claims anything; it shows nothing of what they commit to.
 
     Publish its root, sign a commit with it, print it; or send OUTPUT.tsq to a time-stamping authority (RFC 3161) and
-    keep the answer. `jaxmark detect --deposit OUTPUT` then counts a dated claim in full, less log10 of their number.
+    keep the answer. `jaxmark detect --commitment OUTPUT` then counts a dated claim in full, less log10 of their number.
     """
     check_distinct(output=output, **{f"record {place}": path for place, path in enumerate(records)})
     found = make_commitment(load_record(path).digest() for path in records)
@@ -359,7 +363,7 @@ def deposit_command(records: tuple[Path, ...], output: Path, as_json: bool) -> N
     with replacing(request) as draft:
         write_atomically(draft, found.timestamp_request())
         write_atomically(output, found.to_json().encode())
-    values = {"root": found.root, "records": len(found.digests), "deposit": str(output), "request": str(request)}
+    values = {"root": found.root, "records": len(found.digests), "commitment": str(output), "request": str(request)}
     size = f"{len(found.digests)} record{'s' if len(found.digests) > 1 else ''}"
     answer(as_json, values, f"{size} → {output}, root {found.root}, request → {request}")
 
@@ -393,7 +397,7 @@ def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int
     current().doing(f"attacking {source}: {' '.join(words)}")
     scene = load_scene(source)
     if (
-        len(scene.meshes) + len(scene.left) > 1 and source.suffix.lower() != ".obj"
+        len(scene.meshes) + len(scene.skipped) > 1 and source.suffix.lower() != ".obj"
     ):  # whose objects lie in the same coordinates
         return _attack_scene(source, target, steps, seed, as_json)
     mesh = load_mesh(source)
@@ -422,10 +426,10 @@ def _attack_scene(source: Path, target: Path, steps: list[tuple[str, float]], se
         save_scene(attacked, draft, like=source)
         after = load_scene(draft).meshes
     sizes = {name: distortion.displacement_size(mesh, after[name])._asdict() for name, mesh in meshes.items()}
-    values = {"attacks": steps, "seed": seed, "meshes": sizes, "left": scene.left}
+    values = {"attacks": steps, "seed": seed, "meshes": sizes, "skipped": scene.skipped}
     largest = max(one["rms"] for one in sizes.values())
     lines = [f"{said} → {target}, {len(meshes)} meshes, RMS up to {largest:.3g} of their diagonals"]
-    lines += [f"left alone: {name!r}: {reason}" for name, reason in scene.left.items()]
+    lines += [f"left alone: {name!r}: {reason}" for name, reason in scene.skipped.items()]
     answer(as_json, values, "\n".join(lines))
 
 
@@ -604,8 +608,8 @@ def _each(folder: Path, as_json: bool, work: Work, workers: int) -> NoReturn:
     """Work on the mesh files of a folder, print a line for each, and exit with the worst status."""
     files, status, start = mesh_files(folder), 0, time.monotonic()
     current().doing(f"0/{len(files)} files of {folder}")
-    with closing(each(files, work, workers)) as told:
-        for done, (file, one) in enumerate(told, 1):
+    with closing(each(files, work, workers)) as results:
+        for done, (file, one) in enumerate(results, 1):
             status = max(status, 2 if one.refused else 0 if one.done else 1)
             answer(as_json, {"file": file.name, **one.values}, f"{file.name}: {one.text}")
             pace = (time.monotonic() - start) / done

@@ -165,8 +165,8 @@ def verdict(rows: Sequence[DemoRow]) -> list[str]:
         said.append(f"Each of its readings is a false alarm with a chance of at most {power(weakest)}{floor}.")
     controls = [row for row in rows if row.control != "marked"]
     false = sum(row.detected for row in controls)
-    told = f"{false} were FALSE ALARMS" if false else "nothing was found, as it must be"
-    return [*said, f"In {len(controls)} controls, without a mark or with a wrong key, {told}."]
+    outcome = f"{false} were FALSE ALARMS" if false else "nothing was found, as it must be"
+    return [*said, f"In {len(controls)} controls, without a mark or with a wrong key, {outcome}."]
 
 
 def _attack_and_read(marker: NonBlindMarker, marked: Mesh, message: bytes, doing: Doing) -> Iterator[DemoRow]:

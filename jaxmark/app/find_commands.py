@@ -171,7 +171,7 @@ def describe(verdict: Verdict, alpha: float) -> str:
     if verdict.named:
         return "\n".join(_named(match) for match in verdict.named)
     seen = [match for match in verdict.matches if match.refused is None]
-    said = f"nobody's: none of {verdict.tried} readings is named (--alpha {alpha:g})"
+    said = f"nobody's: none of {verdict.readings} readings is named (--alpha {alpha:g})"
     if seen:
         said += f"; most like {_place(seen[0])}, probability at most {power(seen[0].log10_p)}"
         said += "".join(f". {note}" for note in seen[0].notes)
@@ -181,8 +181,8 @@ def describe(verdict: Verdict, alpha: float) -> str:
 
 
 def _caveats(matches: Sequence[Match]) -> str:
-    told = dict.fromkeys(caveat for match in matches for caveat in match.caveats)
-    return f"; estimates, which name nobody: {'; '.join(told)}" if told else ""
+    caveats = dict.fromkeys(caveat for match in matches for caveat in match.caveats)
+    return f"; estimates, which name nobody: {'; '.join(caveats)}" if caveats else ""
 
 
 def _place(match: Match) -> str:

@@ -35,15 +35,15 @@ def pick(scene: Scene, names: Sequence[str], path: Path) -> Scene:
         JaxmarkError: if the file has no mesh of such a name, or it cannot be used.
     """
     for name in names:
-        if name in scene.left:
-            raise JaxmarkError(f"{path}: the mesh {name!r} cannot be used: {scene.left[name]}.")
+        if name in scene.skipped:
+            raise JaxmarkError(f"{path}: the mesh {name!r} cannot be used: {scene.skipped[name]}.")
         if name not in scene.meshes:
             known = ", ".join(map(repr, list(scene.meshes)[:_MOST_NAMED]))
             raise JaxmarkError(f"{path} has no mesh {name!r}; there are {len(scene.meshes)}, such as {known}.")
     if not names:
         return scene
     others = {name: "it was not picked" for name in scene.meshes if name not in names}
-    return Scene({name: scene.meshes[name] for name in names}, {**scene.left, **others})
+    return Scene({name: scene.meshes[name] for name in names}, {**scene.skipped, **others})
 
 
 def mark_file(
@@ -80,7 +80,7 @@ def mark_file(
         raise JaxmarkError("Give --message, --presence or --recipient, one of them.")
     doing(f"reading {original}")
     scene = pick(load_scene(original), meshes, original)
-    if len(scene.meshes) + len(scene.left) > 1:
+    if len(scene.meshes) + len(scene.skipped) > 1:
         if message is None:
             raise JaxmarkError("Fingerprints are for files of one mesh; save the meshes of this one apart.")
         try:
@@ -197,7 +197,7 @@ def _mark_scene(
         name: {**_moved(markers[name].original, written[name]), "survives": survives[name]._asdict()}
         for name in info.meshes
     }
-    skipped = {**scene.left, **info.skipped}
+    skipped = {**scene.skipped, **info.skipped}
     most = {size: max(one[size] for one in each.values()) for size in ("rms", "max")}
     values = {
         **most,

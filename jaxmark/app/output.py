@@ -95,36 +95,38 @@ def survival_text(survives: Survival) -> str:
     return f"noise of {whole} of the mean distance to the centre, {half} with half of the vertices lost"
 
 
-def detection_text(found: Detection, alpha: float, timestamped: float | None, *, charges: bool = False) -> str:
+def detection_text(detection: Detection, alpha: float, timestamped: float | None, *, charges: bool = False) -> str:
     """What was detected, in words.
 
     Args:
-        found: the detection.
+        detection: the detection.
         alpha: largest false-positive probability of a detection.
         timestamped: log10 of the bound if the commitment is older than the suspect; None without one.
         charges: whether to say what each choice of the reading cost.
     """
-    evidence = found.evidence
-    read = f"message {message_text(found.message)}" if found.message is not None else "no message could be read"
-    said = f"{'detected' if found.detected(alpha, allow_estimate=True) else 'nothing detected'}: {read}; "
+    evidence = detection.evidence
+    read = f"message {message_text(detection.message)}" if detection.message is not None else "no message could be read"
+    said = f"{'detected' if detection.detected(alpha, allow_estimate=True) else 'nothing detected'}: {read}; "
     if evidence.caveats:
-        said += f"false-positive probability about {power(found.log10_p)}, an estimate: {'; '.join(evidence.caveats)}"
+        said += (
+            f"false-positive probability about {power(detection.log10_p)}, an estimate: {'; '.join(evidence.caveats)}"
+        )
     else:
         said += (
-            f"false-positive probability at most {power(found.log10_p)} if {found.premises} were fixed"
+            f"false-positive probability at most {power(detection.log10_p)} if {detection.premises} were fixed"
             f" before the suspect existed, {power(evidence.log10_p_uncommitted)} if nothing dates them"
         )
         if timestamped is not None:
-            said += f", {power(timestamped)} if the deposit is older than the suspect"
-    said = " ".join([f"{said} (--alpha {alpha:g})", *found.notes])
+            said += f", {power(timestamped)} if the commitment is older than the suspect"
+    said = " ".join([f"{said} (--alpha {alpha:g})", *detection.notes])
     if charges:
-        paid = [f"{one.choice}: {one.taken} {one.log10:.2f}" for one in evidence.charges]
-        said += f"\ncharged in log10 p: {', '.join(paid) or 'nothing'}"
+        charged = [f"{one.choice}: {one.taken} {one.log10:.2f}" for one in evidence.charges]
+        said += f"\ncharged in log10 p: {', '.join(charged) or 'nothing'}"
     return said
 
 
 def detection_values(
-    found: Detection,
+    detection: Detection,
     alpha: float,
     suspect: Path,
     obtained: str,
@@ -134,7 +136,7 @@ def detection_values(
     """What was detected, as values for JSON.
 
     Args:
-        found: the detection.
+        detection: the detection.
         alpha: see `detection_text`.
         suspect: its file.
         obtained: when and where it was got.
@@ -142,25 +144,25 @@ def detection_values(
         record_digest: digest of the record that was read with.
     """
     values = {
-        **_figures(found, alpha),
-        "proof": not found.evidence.caveats,
-        "caveats": list(found.evidence.caveats),
-        "charges": [one._asdict() for one in found.evidence.charges],
-        "notes": list(found.notes),
-        "scheme": found.scheme,
-        "version": found.version,
+        **_figures(detection, alpha),
+        "proof": not detection.evidence.caveats,
+        "caveats": list(detection.evidence.caveats),
+        "charges": [one._asdict() for one in detection.evidence.charges],
+        "notes": list(detection.notes),
+        "scheme": detection.scheme,
+        "version": detection.version,
         "suspect_sha256": file_hash(suspect),
         "obtained": obtained or None,
-        "scores": found.scores.tolist(),
-        "coverage": found.coverage,
-        "registration": found.registration.facts(),
+        "scores": detection.scores.tolist(),
+        "coverage": detection.coverage,
+        "registration": detection.registration.facts(),
     }
-    if found.parts:
+    if detection.parts:
         values["parts"] = {
             name: {**_figures(one, alpha), "coverage": one.coverage, "registration": one.registration.facts()}
-            for name, one in found.parts.items()
+            for name, one in detection.parts.items()
         }
-        values["skipped"] = dict(found.skipped)
+        values["skipped"] = dict(detection.skipped)
     if record_digest is not None:
         values["record_digest"] = record_digest
     if timestamped is not None:
@@ -168,11 +170,11 @@ def detection_values(
     return values
 
 
-def _figures(found: Detection, alpha: float) -> dict[str, Any]:
-    evidence = found.evidence
+def _figures(detection: Detection, alpha: float) -> dict[str, Any]:
+    evidence = detection.evidence
     return {
-        "detected": found.detected(alpha, allow_estimate=True),
-        "message": None if found.message is None else found.message.hex(),
+        "detected": detection.detected(alpha, allow_estimate=True),
+        "message": None if detection.message is None else detection.message.hex(),
         "log10_p": evidence.log10_p,
         "log10_p_uncommitted": evidence.log10_p_uncommitted,
         "log10_p_gaussian": evidence.log10_p_gaussian,

@@ -29,7 +29,7 @@ class Progress:
         """
         self._stream, self._what, self._compiled = stream, "", 0
         if stream is not None:
-            jax.monitoring.register_event_listener(self._hear)
+            jax.monitoring.register_event_listener(self._on_event)
 
     def doing(self, what: str) -> None:
         """Say what begins now."""
@@ -41,7 +41,7 @@ class Progress:
         if self._what:
             self.doing("")
 
-    def _hear(self, event: str, **details: str | int) -> None:
+    def _on_event(self, event: str, **details: str | int) -> None:
         """Hear from JAX."""
         if not self._what:
             return

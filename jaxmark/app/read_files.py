@@ -93,7 +93,7 @@ class FileReader:
         if self.diagnoses and record is None and found.message is None and not detected and not notes:
             self.doing("nothing detected, looking for a mistake")
             notes = diagnose(mesh, mark, self.align)
-        if not detected and found.registration.bent is not None and _has_skin(original):
+        if not detected and found.registration.deformed is not None and _has_skin(original):
             notes += ("If it is in another pose of the original's skeleton, `jaxmark unpose` undoes that.",)
         outcome = self._outcome(found._replace(notes=notes), suspect, known)
         if dossier is not None:
@@ -127,7 +127,7 @@ class FileReader:
         self.doing(f"reading {suspect}")
         scene = pick(load_scene(suspect), self.meshes, suspect)
         several = len(scene.meshes) > 1
-        tried = scene.meshes if several else {"": load_mesh(suspect)}
+        candidates = scene.meshes if several else {"": load_mesh(suspect)}
         self.doing(f"looking for a mark in {suspect}, without an original")
         named = [BLIND_SCHEMES[name] for name in self.schemes if name in BLIND_SCHEMES]
         schemes = named if len(named) == 1 and record is None else []
@@ -136,9 +136,9 @@ class FileReader:
             release_programs()
             return read_blind(mesh, self.key, bits=self.bits, message=self.message, record=record, schemes=schemes)
 
-        found = list(try_each(partial(read, mesh, one) for mesh in tried.values() for one in records))
-        best = best_of(found, ledger.PARTS, len(tried) * len(records))
-        return self._count_alone(best, found, len(tried)) if several else best
+        found = list(try_each(partial(read, mesh, one) for mesh in candidates.values() for one in records))
+        best = best_of(found, ledger.PARTS, len(candidates) * len(records))
+        return self._count_alone(best, found, len(candidates)) if several else best
 
     def _pick(
         self, suspect: Path, original: Path, record: Record | SceneRecord | None

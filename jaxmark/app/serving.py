@@ -150,11 +150,11 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
     def reply(content: bytes, kind: str, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
         return Response(content, status, {**_HEADERS, **(headers or {})}, kind)
 
-    def told(values: Any, status: int = 200) -> Response:
+    def respond(values: Any, status: int = 200) -> Response:
         return JSONResponse(values, status, _HEADERS)
 
     def refuse(sentence: str, status: int) -> Response:
-        return told({"refused": sentence}, status)
+        return respond({"refused": sentence}, status)
 
     def read(work: Callable[[Catalogue], Response]) -> Response:
         try:
@@ -172,7 +172,7 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
     async def originals(request: Request) -> Response:
         start = request.query_params.get("start", "0")
         first = int(start) if start.isdecimal() and len(start) < 10 else 0
-        return await run_in_threadpool(read, lambda catalogue: told(_listed(catalogue, first)))
+        return await run_in_threadpool(read, lambda catalogue: respond(_listed(catalogue, first)))
 
     async def thumbnail(request: Request) -> Response:
         number = request.path_params["number"]
@@ -202,7 +202,7 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
                     if len(data) > most_bytes:
                         return refuse(f"The file is larger than {most_bytes // 2**20} megabytes.", 413)
             async with turn:
-                return told(await run_in_threadpool(desk.find, bytes(data), suffix))
+                return respond(await run_in_threadpool(desk.find, bytes(data), suffix))
         except TimeoutError:
             return refuse("The file did not come in time.", 408)
         except ClientDisconnect:

@@ -6,9 +6,6 @@
 from jaxmark.bench._equal_visibility import equal_visibility as equal_visibility
 from jaxmark.bench.benchmark import run as run
 from jaxmark.bench.corpus import make_corpus as make_corpus
-from jaxmark.bench.leagues import LEAGUES as LEAGUES
-from jaxmark.bench.leagues import League as League
-from jaxmark.bench.leagues import Line as Line
 from jaxmark.bench.method import METHODS as METHODS
 from jaxmark.bench.method import Method as Method
 from jaxmark.bench.method import Reading as Reading
@@ -26,3 +23,6 @@ from jaxmark.bench.strength_search import Fitted as Fitted
 from jaxmark.bench.strength_search import fit as fit
 from jaxmark.bench.summary import entries as entries
 from jaxmark.bench.summary import save_entries as save_entries
+from jaxmark.bench.tracks import TRACKS as TRACKS
+from jaxmark.bench.tracks import Line as Line
+from jaxmark.bench.tracks import Track as Track

@@ -13,11 +13,11 @@ import numpy as np
 
 from jaxmark.adversaries.by_name import attack
 from jaxmark.bench.composed_attacks import last_within
-from jaxmark.bench.leagues import get_league
 from jaxmark.bench.method import Given, load_method
 from jaxmark.bench.strength_search import fit
 from jaxmark.bench.tables import Table
 from jaxmark.bench.tasks import Bench, Meshes, draw, draw_mark, load, make_bench, moved
+from jaxmark.bench.tracks import get_track
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation import cells
 from jaxmark.evaluation.cells import Pool
@@ -90,7 +90,7 @@ def _work(bench: Bench, cell: Any) -> dict[str, Any]:
     name, payload, share, file, seed = cell
     method, mesh = load_method(bench.methods[name], payload), load(bench.meshes[file])
     key, message = draw_mark(method.bits, *cell)
-    limits = {metric: share * limit for metric, limit in get_league("2026").bounds("hidden", mesh).items()}
+    limits = {metric: share * limit for metric, limit in get_track("2026").bounds("hidden", mesh).items()}
     try:
         found = fit(method, mesh, message, key, limits)
     except Exception as error:  # a foreign method may raise anything

@@ -11,10 +11,10 @@ from itertools import product
 from pathlib import Path
 
 from jaxmark.bench.calibration import RATE
-from jaxmark.bench.leagues import League, get_league
 from jaxmark.bench.method import Given, load_method
 from jaxmark.bench.readings import BenchResults
 from jaxmark.bench.tasks import MARK, UNMARKED, Meshes, Task, make_bench, run_task
+from jaxmark.bench.tracks import Track, get_track
 from jaxmark.errors import JaxmarkError, require
 from jaxmark.evaluation import cells
 from jaxmark.evaluation.cells import Pool
@@ -27,7 +27,7 @@ def run(
     output: str | os.PathLike[str],
     *,
     methods: Sequence[Given] = ("keyed",),
-    leagues: Sequence[str] = ("smi2010",),
+    tracks: Sequence[str] = ("smi2010",),
     attacks: Sequence[str] = (),
     limits: Sequence[str] = (),
     payloads: Sequence[int] = (64,),
@@ -50,9 +50,9 @@ def run(
         output: folder, in which finished tasks and marked meshes are kept; the same benchmark resumes where it was
             ended, and a wider one takes over what both have.
         methods: names in `jaxmark.bench.method.METHODS`, files that declare a method, or methods.
-        leagues: names in `jaxmark.bench.leagues.LEAGUES`.
-        attacks: those of a league that are named, or begin with a name that is given; by default all.
-        limits: names of a league's sets of limits; by default all.
+        tracks: names in `jaxmark.bench.tracks.TRACKS`.
+        attacks: those of a track that are named, or begin with a name that is given; by default all.
+        limits: names of a track's sets of limits; by default all.
         payloads: bits of a message, for methods that have a choice.
         samples: number of samples.
         others: files of further meshes, which every method reads unmarked, in place of each mesh.
@@ -64,7 +64,7 @@ def run(
         say: function that is called with a line about the progress after each task.
 
     Raises:
-        JaxmarkError: if there is no such method, league or attack, a mesh cannot be read, or libigl is missing. A
+        JaxmarkError: if there is no such method, track or attack, a mesh cannot be read, or libigl is missing. A
             refusal by a method or an attack ends only its task.
     """
     require("igl", "align")
@@ -76,21 +76,21 @@ def run(
         raise JaxmarkError(f"A benchmark needs a worker, got {workers}.")
     if not 0 < rate < 1:
         raise JaxmarkError(f"The rate of false positives is between 0 and 1, got {rate:g}.")
-    leagues, payloads = list(dict.fromkeys(leagues)), list(dict.fromkeys(payloads))
+    tracks, payloads = list(dict.fromkeys(tracks)), list(dict.fromkeys(payloads))
     bench, unrelated = make_bench(output, meshes, methods, after), make_bench(output, others, ()).meshes
     marked, named = bench.meshes, bench.methods
     bench = replace(bench, meshes={**unrelated, **marked})
     made = {name: load_method(given, payloads[0]) for name, given in named.items()}
-    every = [get_league(league) for league in leagues]
-    _check_names("attack", attacks, [name for league in every for name in league.lines])
-    _check_names("set of limits", limits, [name for league in every for name in league.limits])
+    every = [get_track(track) for track in tracks]
+    _check_names("attack", attacks, [name for track in every for name in track.lines])
+    _check_names("set of limits", limits, [name for track in every for name in track.limits])
     parts, skipped = {}, {}
-    for league in leagues:
-        lines = {name: one for name, one in get_league(league).lines.items() if _is_wanted(name, attacks)}
+    for track in tracks:
+        lines = {name: one for name, one in get_track(track).lines.items() if _is_wanted(name, attacks)}
         missing = {name: why for name, one in lines.items() if (why := one.missing())}
-        bounds = {name: one for name, one in get_league(league).limits.items() if not limits or name in limits}
-        parts[league] = League(bounds, {name: one for name, one in lines.items() if name not in missing})
-        skipped |= {f"{league}, {name}": why for name, why in missing.items()}
+        bounds = {name: one for name, one in get_track(track).limits.items() if not limits or name in limits}
+        parts[track] = Track(bounds, {name: one for name, one in lines.items() if name not in missing})
+        skipped |= {f"{track}, {name}": why for name, why in missing.items()}
     for name, why in skipped.items():
         say(f"skipped: {name}: {why}")
     if workers == 1:
@@ -99,15 +99,15 @@ def run(
             importlib.import_module(name)
     # Sample by sample, so that a run that is ended has some of every mesh.
     whole = [
-        Task(name, payload, league, "", mesh, seed, name, MARK)
-        for seed, payload, league, mesh, name in product(range(samples), payloads, leagues, marked, named)
+        Task(name, payload, track, "", mesh, seed, name, MARK)
+        for seed, payload, track, mesh, name in product(range(samples), payloads, tracks, marked, named)
     ]
-    marks = [task._replace(limits=one) for task in whole for one in parts[task.league].limits]
-    suspects = [one for task in whole for one in _suspects(task, parts[task.league], list(named), keys)]
+    marks = [task._replace(limits=one) for task in whole for one in parts[task.track].limits]
+    suspects = [one for task in whole for one in _suspects(task, parts[task.track], list(named), keys)]
     suspects += [
         task._replace(source=other, attack="none", number=number)
         for task, other, number in product(whole, unrelated, range(keys))
-        if task.league == leagues[0] and task.mesh != other
+        if task.track == tracks[0] and task.mesh != other
     ]
     rows = []
     for some in (marks, suspects):
@@ -115,14 +115,14 @@ def run(
     return BenchResults(made, tuple(rows), skipped, rate)
 
 
-def _suspects(task: Task, league: League, methods: Sequence[str], keys: int) -> Iterator[Task]:
+def _suspects(task: Task, track: Track, methods: Sequence[str], keys: int) -> Iterator[Task]:
     """Yield the suspects of one method, mesh and sample: unmarked and marked, and in the first sample others' marks."""
-    for attack, number in product(league.lines, range(keys)):
+    for attack, number in product(track.lines, range(keys)):
         yield task._replace(source=UNMARKED, attack=attack, number=number)
-    first = list(league.limits)[:1]
+    first = list(track.limits)[:1]
     for limits in first:  # and with the key that is used to mark it
         yield task._replace(limits=limits, source=UNMARKED, attack="none")
-    for limits, attack in product(league.limits, league.lines):
+    for limits, attack in product(track.limits, track.lines):
         yield task._replace(limits=limits, attack=attack)
     if task.seed == 0:
         for limits, other in product(first, methods):

@@ -1,4 +1,4 @@
-"""Attacks of the league `2026` that are composed of several of the library's; on the host."""
+"""Attacks of the track `2026` that are composed of several of the library's; on the host."""
 
 from collections.abc import Callable, Mapping, Sequence
 

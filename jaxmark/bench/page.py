@@ -34,18 +34,18 @@ def save_page(results: BenchResults, path: str | os.PathLike[str], title: str, a
         JaxmarkError: if matplotlib or Jinja2 is missing, or the page cannot be written.
     """
     require("jinja2", "plot")
-    leagues = dict.fromkeys(task.league for task, _ in results.tasks)
-    drawn = {f"{league}: detected, over what the attack costs": _survival(results, league) for league in leagues}
+    tracks = dict.fromkeys(task.track for task, _ in results.tasks)
+    drawn = {f"{track}: detected, over what the attack costs": _survival(results, track) for track in tracks}
     drawn["Marks found over false positives, after all attacks"] = _rocs(results)
     write_page(path, title, drawn, about=about, tables=tables(results))
 
 
-def _survival(results: BenchResults, league: str) -> Picture:
+def _survival(results: BenchResults, track: str) -> Picture:
     """Draw a panel for each metric of cost, with a line for each method."""
     figure, (first, *others) = panels(len(RANGES), 4.2, 3.8)
     for panel, metric in zip((first, *others), RANGES, strict=True):
         for name, style in _styles(results):
-            some = [one for one in results.suspects if (one.task.method, one.task.league) == (name, league)]
+            some = [one for one in results.suspects if (one.task.method, one.task.track) == (name, track)]
             if (found := curve(points(results, some), metric)) is not None:
                 panel.plot(axis(metric), found, label=results.methods[name].name, **style)
         panel.set(xscale="log", xlabel=metric.upper(), ylim=(-0.03, 1.03))

@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxmark.bench.calibration import RATE, Calibration, calibrate
-from jaxmark.bench.leagues import get_league
 from jaxmark.bench.method import Method
 from jaxmark.bench.paired import Paired, compare_paired
 from jaxmark.bench.tasks import MARK, UNMARKED, Task
+from jaxmark.bench.tracks import get_track
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import read_file, write_atomically
 
@@ -75,7 +75,7 @@ class BenchResults:
             own = [one for one in row["readings"] if one["own"]]
             if not own:
                 nothing = {"read": False, "bit_errors": 0.5, "score": None, "log10_p": 0.0, "note": row.get("note", "")}
-                own = [{**nothing, "copy": copy} for copy in range(get_league(task.league).lines[task.attack].copies)]
+                own = [{**nothing, "copy": copy} for copy in range(get_track(task.track).lines[task.attack].copies)]
             suspects += [Suspect(task, row.get("costs", {}), one) for one in own]
         return suspects
 
@@ -120,9 +120,9 @@ class BenchResults:
         return found is not None and one.score > found.threshold.value
 
     def paired(
-        self, first: str, second: str, league: str, rule: str = "detected", attacks: Sequence[str] = ()
+        self, first: str, second: str, track: str, rule: str = "detected", attacks: Sequence[str] = ()
     ) -> Paired:
-        """Compare two methods on all meshes, samples, limits and attacks of a league that both have.
+        """Compare two methods on all meshes, samples, limits and attacks of a track that both have.
 
         Interval and p assume independent suspects. After one attack, of many meshes, they are; after many attacks of
         few meshes they describe these suspects only.
@@ -130,7 +130,7 @@ class BenchResults:
         Args:
             first: a method's name, or its name in cells, where two have the same.
             second: another one.
-            league: the league.
+            track: the track.
             rule: `"detected"` at the calibrated threshold, or `"read"`, the exact message.
             attacks: after these; by default after all.
 
@@ -140,13 +140,13 @@ class BenchResults:
         first, second = self._label(first), self._label(second)
         won: dict[str, dict[tuple[Any, ...], bool]] = {first: {}, second: {}}
         for one in self.suspects:
-            wanted = one.task.league == league and (not attacks or one.task.attack in attacks)
+            wanted = one.task.track == track and (not attacks or one.task.attack in attacks)
             if one.task.method in won and wanted:
                 place = (*one.task._replace(method="", source=""), one.reading.get("copy", 0))
                 won[one.task.method][place] = self.succeeds(one, rule)
         shared = sorted(won[first].keys() & won[second].keys())
         if not shared:
-            raise JaxmarkError(f"{first!r} and {second!r} have no suspect in common in the league {league}.")
+            raise JaxmarkError(f"{first!r} and {second!r} have no suspect in common in the track {track}.")
         return compare_paired([won[first][one] for one in shared], [won[second][one] for one in shared])
 
     def _label(self, name: str) -> str:
@@ -241,7 +241,7 @@ def hold_against(results: BenchResults, published: Published) -> Repetition:
         rule = "read" if results.methods[row["method"]].bits else "detected"
         apart = abs(float(row["bit_errors"]) - float(other["bit_errors"]))
         if row[rule] != other[rule] or apart > _MAX_BIT_ERROR_DIFFERENCE:
-            place = ", ".join(row[name] for name in ("method", "payload", "league", "limits", "mesh", "seed", "attack"))
+            place = ", ".join(row[name] for name in ("method", "payload", "track", "limits", "mesh", "seed", "attack"))
             differences.append(
                 f"{place}: {rule} {row[rule]} here, {other[rule]} there; wrong bits {row['bit_errors']} here,"
                 f" {other['bit_errors']} there"

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from jaxmark.bench.calibration import Calibration, count
-from jaxmark.bench.leagues import get_league
 from jaxmark.bench.method import Method
 from jaxmark.bench.readings import BenchResults, Suspect
 from jaxmark.bench.robustness_curves import Point, score
 from jaxmark.bench.tasks import COSTS, MARK, Task
+from jaxmark.bench.tracks import get_track
 from jaxmark.files.atomic import write_atomically
 
 NOT_VALIDATED = "not validated"
@@ -61,9 +61,7 @@ def _entry(results: BenchResults, label: str, method: Method) -> dict[str, Any]:
         "payloads": {
             str(payload): {
                 "calibration": _calibration(results.calibrations.get((label, payload))),
-                "leagues": {
-                    league: _league(results, of_league) for league, of_league in _by("league", of_payload).items()
-                },
+                "tracks": {track: _track(results, of_league) for track, of_league in _by("track", of_payload).items()},
             }
             for payload, of_payload in sorted(_by("payload", mine).items())
         },
@@ -96,7 +94,7 @@ def _calibration(found: Calibration | None) -> dict[str, Any] | None:
     }
 
 
-def _league(results: BenchResults, some: Sequence[Suspect]) -> dict[str, Any]:
+def _track(results: BenchResults, some: Sequence[Suspect]) -> dict[str, Any]:
     scores = {rule: score(points(results, some, rule)) for rule in ("detected", "read")}
     return {
         "scores": {rule: None if one is None else one._asdict() for rule, one in scores.items()},
@@ -122,10 +120,10 @@ def _marks(results: BenchResults, like: Task) -> dict[str, Any]:
 
 def _attacks(results: BenchResults, some: Sequence[Suspect]) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
-    league, families = get_league(some[0].task.league), defaultdict(list)
-    place = list(league.limits).index(some[0].task.limits)
+    track, families = get_track(some[0].task.track), defaultdict(list)
+    place = list(track.limits).index(some[0].task.limits)
     for attack, here in _by("attack", some).items():
-        line = league.lines[attack]
+        line = track.lines[attack]
         published = {name: rates[place] for name in ("cho", "wang") if (rates := getattr(line, name)) is not None}
         found[attack] = {**_rates(results, here), "published_bit_errors": published}
         if line.family:

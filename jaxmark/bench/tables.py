@@ -21,15 +21,15 @@ class Table(NamedTuple):
     title: str
     heads: Sequence[str]
     lines: Sequence[Sequence[str]]
-    remark: str = ""
+    note: str = ""
 
     def markdown(self) -> str:
         """Format the table as Markdown."""
         rows = [[re.sub(r"\s+", " ", cell).replace("|", "\\|") for cell in row] for row in (self.heads, *self.lines)]
         text = [f"| {' | '.join(row)} |" for row in rows]
         text.insert(1, "|---" * len(self.heads) + "|")
-        remark = ["", self.remark] if self.remark else []
-        return "\n".join([f"## {self.title}", *remark, "", *text])
+        note = ["", self.note] if self.note else []
+        return "\n".join([f"## {self.title}", *note, "", *text])
 
 
 def tables(results: BenchResults) -> list[Table]:
@@ -52,8 +52,8 @@ def tables(results: BenchResults) -> list[Table]:
             " distribution.",
         ),
     ]
-    for (payload, league, limits), parts in groups.items():
-        title = f"{league}, {limits} limits{f', {payload} bits' if several else ''}"
+    for (payload, track, limits), parts in groups.items():
+        title = f"{track}, {limits} limits{f', {payload} bits' if several else ''}"
         found += [
             _table(f"{title}: the marks", _marks(parts, every)),
             _attacks(f"{title}: what survives", parts, every),
@@ -75,19 +75,19 @@ def tables(results: BenchResults) -> list[Table]:
 Row = Mapping[str, str]  # cells by the heads of their columns
 
 
-def _table(title: str, rows: Iterable[Row], remark: str = "") -> Table:
+def _table(title: str, rows: Iterable[Row], note: str = "") -> Table:
     listed = list(rows)
-    return Table(title, list(listed[0]) if listed else [], [list(row.values()) for row in listed], remark)
+    return Table(title, list(listed[0]) if listed else [], [list(row.values()) for row in listed], note)
 
 
 def _groups(entries: Entries) -> dict[tuple[str, str, str], dict[str, Any]]:
-    """Group the parts of all methods by payload, league and limits."""
+    """Group the parts of all methods by payload, track and limits."""
     groups: dict[tuple[str, str, str], dict[str, Any]] = defaultdict(dict)
     for payload in sorted({payload for entry in entries.values() for payload in entry["payloads"]}, key=int):
         for name, entry in entries.items():
-            for league, found in entry["payloads"].get(payload, {"leagues": {}})["leagues"].items():
+            for track, found in entry["payloads"].get(payload, {"tracks": {}})["tracks"].items():
                 for limits, part in found["limits"].items():
-                    groups[payload, league, limits][name] = part
+                    groups[payload, track, limits][name] = part
     return groups
 
 
@@ -118,8 +118,8 @@ def _share(found: Mapping[str, Any], of: str = "hits") -> str:
 
 def _scores(entries: Entries) -> Iterator[Row]:
     for label, bits, entry, part in _payloads(entries):
-        for league, found in part["leagues"].items():
-            row = {"method": label, "reader": "blind" if entry["blind"] else "informed", "bits": bits, "league": league}
+        for track, found in part["tracks"].items():
+            row = {"method": label, "reader": "blind" if entry["blind"] else "informed", "bits": bits, "track": track}
             for rule, one in found["scores"].items():
                 row[rule] = "-"
                 if one is not None and (rule == "detected" or entry["bits"]):
@@ -153,7 +153,7 @@ def _marks(parts: Mapping[str, Any], entries: Entries) -> Iterator[Row]:
         marks = part["marks"]
         row = {"method": _label(name, entries[name]), "made": f"{marks['made']}/{marks['tried']}"}
         row |= {metric.upper(): _number(marks.get(metric)) for metric in ("rms", *COSTS)}
-        yield {**row, "s": _number(marks["seconds"], ".2g"), "remarks": "; ".join(marks["notes"]) or "-"}
+        yield {**row, "s": _number(marks["seconds"], ".2g"), "notes": "; ".join(marks["notes"]) or "-"}
 
 
 def _attacks(title: str, parts: Mapping[str, Any], entries: Entries) -> Table:
@@ -171,13 +171,13 @@ def _attacks(title: str, parts: Mapping[str, Any], entries: Entries) -> Table:
         line = [attack, *(cell(name, one) for name, one in found.items())]
         lines.append([*line, *(_number(published.get(name), ".2f") for name in ("cho", "wang"))])
     heads = ["attack", *(_label(name, entries[name]) for name in parts), "Cho, published", "Wang, published"]
-    if all(line[-2:] == ["-", "-"] for line in lines):  # this league is younger than they are
+    if all(line[-2:] == ["-", "-"] for line in lines):  # this track is younger than they are
         heads, lines = heads[:-2], [line[:-2] for line in lines]
-    remark = (
+    note = (
         "How often the exact message is read; wrong bits of the best guess (BER), the mean; false-positive probability"
         " (p), the median, of methods that bound it."
     )
-    return Table(title, heads, lines, remark)
+    return Table(title, heads, lines, note)
 
 
 def _costs(parts: Mapping[str, Any]) -> Iterator[Row]:
@@ -190,10 +190,10 @@ def _refused(groups: Mapping[tuple[str, str, str], Mapping[str, Any]], entries: 
     """Tabulate refusals by methods and attacks, and their number."""
     places: dict[tuple[str, str], list[str]] = defaultdict(list)
     for name, entry in entries.items():
-        for (_, league, limits), parts in groups.items():
+        for (_, track, limits), parts in groups.items():
             for attack, one in parts.get(name, {"attacks": {}})["attacks"].items():
                 for note in one["notes"]:
-                    places[_label(name, entry), note].append(f"{league}, {limits}: {attack}")
+                    places[_label(name, entry), note].append(f"{track}, {limits}: {attack}")
     for (label, note), where in places.items():
         yield {"method": label, "what was said": note, "after attacks": str(len(where)), "the first": where[0]}
 
@@ -201,10 +201,10 @@ def _refused(groups: Mapping[tuple[str, str, str], Mapping[str, Any]], entries: 
 def _paired(results: BenchResults, entries: Entries) -> Iterator[Row]:
     """Compare the first method with each other one, on the same suspects."""
     (first, label), *others = zip(results.methods, (_label(*entry) for entry in entries.items()), strict=True)
-    for league, (other, other_label) in product(dict.fromkeys(task.league for task, _ in results.tasks), others):
-        found = results.paired(first, other, league)
+    for track, (other, other_label) in product(dict.fromkeys(task.track for task, _ in results.tasks), others):
+        found = results.paired(first, other, track)
         yield {
-            "league": league,
+            "track": track,
             "methods": f"{label} - {other_label}",
             "difference (95 %)": _interval(found.difference, found.low, found.high, "+.3f"),
             "only one of them": f"{found.first} : {found.second}",

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxmark.bench.leagues import OVERWRITTEN, Line, get_league
 from jaxmark.bench.method import Bits, Given, Method, Reading, digest_of, load_method
 from jaxmark.bench.strength_search import Fitted, fit
+from jaxmark.bench.tracks import OVERWRITTEN, Line, get_track
 from jaxmark.distortion import Reference
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.cells import Cell
@@ -39,12 +39,12 @@ class Task(NamedTuple):
 
     method: str
     payload: int  # bits of a message that are asked for; a method may have its own number
-    league: str
+    track: str
     limits: str  # empty where nothing is marked
     mesh: str
     seed: int  # number of the sample, from which key, message and attacks derive
     source: str  # the method whose mark the suspect has, or `UNMARKED`, or an unmarked mesh in place of this one
-    attack: str  # of the league, or `MARK`
+    attack: str  # of the track, or `MARK`
     number: int = 0  # of the key, where several that wrote nothing are tried
 
     @property
@@ -135,10 +135,10 @@ def _mark(bench: Bench, task: Task) -> dict[str, Any]:
 
 
 def _fit(bench: Bench, task: Task, mesh: Mesh, name: str) -> Fitted:
-    """Mark a mesh as strongly as the limits of a task allow, or the first limits of its league."""
-    method, league = load_method(bench.methods[task.method], task.payload), get_league(task.league)
+    """Mark a mesh as strongly as the limits of a task allow, or the first limits of its track."""
+    method, track = load_method(bench.methods[task.method], task.payload), get_track(task.track)
     key, message = draw_mark(method.bits, name, *task.sample)
-    return fit(method, mesh, message, key, league.bounds(task.limits or next(iter(league.limits)), mesh))
+    return fit(method, mesh, message, key, track.bounds(task.limits or next(iter(track.limits)), mesh))
 
 
 def moved(mesh: Mesh, found: Fitted) -> Mapping[Any, float | None]:
@@ -152,7 +152,7 @@ def _attack_and_read(bench: Bench, task: Task) -> dict[str, Any]:
     if not file.exists():
         return {"note": "Not marked.", "readings": []}
     original, before = load(bench.meshes[task.mesh]), load(file)
-    line = get_league(task.league).lines[task.attack]
+    line = get_track(task.track).lines[task.attack]
     try:
         suspects = _suspects(bench, task, line, before)
     except (Exception, SystemExit) as error:  # also of a foreign method, which writes over its mark
@@ -182,7 +182,7 @@ def _suspects(bench: Bench, task: Task, line: Line, before: Mesh) -> list[Mesh]:
 def _read(bench: Bench, task: Task, original: Mesh, suspect: Mesh, copy: int) -> Iterator[dict[str, Any]]:
     """Read a suspect with the keys of a task."""
     # Keys that wrote nothing are used once, so that false positives are independent of each other.
-    fresh = "/".join((task.league, task.limits, task.source, task.attack, str(copy), str(task.number)))
+    fresh = "/".join((task.track, task.limits, task.source, task.attack, str(copy), str(task.number)))
     own = task.source == task.method
     names = [_OWN] if task.limits and task.source == UNMARKED else [_OWN, fresh] if own else [fresh]
     method, suspect = load_method(bench.methods[task.method], task.payload), _read_only(suspect)

@@ -43,7 +43,7 @@ class Added(NamedTuple):
     path: str
     status: str  # "added", "known", or "moved" if it was known, but not where it was
     meshes: int
-    left: Mapping[str, str]  # meshes that cannot be used, and why
+    skipped: Mapping[str, str]  # meshes that cannot be used, and why
 
 
 class Kept(NamedTuple):
@@ -104,7 +104,7 @@ class Catalogue:
         with self.database.writing():  # another process may have added the same file meanwhile
             number, new = self.database.insert_original({**prepared.file, "added": _now()}, prepared.shapes)
         status = "added" if new else "known"
-        return Added(number, prepared.file["path"], status, len(prepared.shapes), prepared.left)
+        return Added(number, prepared.file["path"], status, len(prepared.shapes), prepared.skipped)
 
     def _known(self, content: str, path: str | os.PathLike[str]) -> Added | None:
         """Look for a known file, and describe it again if its descriptors are of another jaxmark."""

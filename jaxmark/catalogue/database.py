@@ -99,7 +99,7 @@ class Database:
             raise JaxmarkError(f"There is no catalogue {path}; `jaxmark catalogue add` makes one.")
         if not self.path.parent.is_dir():
             raise JaxmarkError(f"The folder {self.path.parent} of the catalogue does not exist.")
-        with self._telling():
+        with self._clear_errors():
             self._connection = self._connect()
             try:
                 self._prepare()
@@ -122,12 +122,12 @@ class Database:
 
     def each(self, statement: str, *values: object) -> Iterator[sqlite3.Row]:
         """Yield the rows that a query finds, one after the other, for large ones; see `rows`."""
-        with self._telling():
+        with self._clear_errors():
             yield from self._connection.execute(statement, values)
 
     def run(self, statement: str, *values: object) -> int:
         """Change rows, within `writing`, and return how many changed; see `rows`."""
-        with self._telling():
+        with self._clear_errors():
             return self._connection.execute(statement, values).rowcount
 
     def insert(self, table: str, values: Mapping[str, object]) -> bool:
@@ -158,11 +158,11 @@ class Database:
 
     @contextmanager
     def _transaction(self, kind: str) -> Iterator[None]:
-        with self._telling():
+        with self._clear_errors():
             self._connection.execute(f"BEGIN {kind}")
         try:
             yield
-            with self._telling():
+            with self._clear_errors():
                 self._connection.execute("COMMIT")
         except BaseException:
             with suppress(sqlite3.Error):
@@ -242,7 +242,7 @@ class Database:
                 time.sleep(_PAUSE)
 
     @contextmanager
-    def _telling(self) -> Iterator[None]:
+    def _clear_errors(self) -> Iterator[None]:
         """Say in a sentence what SQLite refuses."""
         try:
             yield

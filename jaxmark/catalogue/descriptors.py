@@ -149,10 +149,10 @@ def _scattered(points: Points, far: Float64[np.ndarray, " points"], count: int) 
     """Choose points, each as far as possible from those before it, and from the place that `far` counts from."""
     first = far if np.isfinite(far).all() else np.linalg.norm(points - points.mean(axis=0), axis=1)
     chosen = [int(np.argmax(first))]
-    room = far
+    distance = far
     while len(chosen) < count:
-        room = np.minimum(room, np.linalg.norm(points - points[chosen[-1]], axis=1))
-        chosen.append(int(np.argmax(room)))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        chosen.append(int(np.argmax(distance)))
     return np.array(chosen)
 
 

@@ -81,7 +81,7 @@ class Verdict(NamedTuple):
 
     suspect: str  # SHA-256 of its file, hexadecimal; empty for a mesh that is no file
     matches: tuple[Match, ...]  # all comparisons, the likeliest first
-    tried: int  # readings that could have been made, by whose number all probabilities are corrected
+    readings: int  # readings that could have been made, by whose number all probabilities are corrected
 
     @property
     def named(self) -> tuple[Match, ...]:
@@ -101,7 +101,7 @@ class Verdict(NamedTuple):
             **head,
             "log10_p": min((match.log10_p for match in self.matches), default=0.0),
             "log10_p_uncommitted": min((match.log10_p_uncommitted for match in self.matches), default=0.0),
-            "tried": self.tried,
+            "readings": self.readings,
             "suspect_sha256": self.suspect or None,
             "matches": [match._asdict() for match in self.matches],
         }
@@ -121,7 +121,7 @@ class _Comparison(NamedTuple):
     match: Match  # with the result, once it is read
     original: Mesh
     suspect: Mesh
-    tried: int
+    readings: int
     pose: Pose | None = None  # of the suspect on the original
     agrees: bool = True  # whether the record that was read with commits to the result
 
@@ -209,19 +209,19 @@ class Finder(Generic[AnyOriginals]):
         meshes = {"": suspect} if isinstance(suspect, Mesh) else meshes_of(suspect).meshes
         digest = "" if isinstance(suspect, Mesh) else file_hash(suspect)
         pieces = split(meshes)
-        tried = len(pieces) * self._readings()
+        readings = len(pieces) * self._readings()
         matches: list[Match] = []
         explained: set[str] = set()
         for number, piece in enumerate(pieces):
             if piece.name in explained:
                 continue
-            for found in self._compare(piece, self.depth if number < _DEEP_PIECES else 1, tried):
+            for found in self._compare(piece, self.depth if number < _DEEP_PIECES else 1, readings):
                 matches.append(found.match)
                 if found.match.named and found.pose is not None:
                     inside = [one for one in pieces if one.within == piece.name]
                     explained |= {one.name for one in inside if _is_explained(one.mesh, found.pose, found.original)}
                     break
-        return Verdict(digest, tuple(sorted(matches, key=lambda match: match.order)), tried)
+        return Verdict(digest, tuple(sorted(matches, key=lambda match: match.order)), readings)
 
     def _readings(self) -> int:
         """Count the readings of a piece that are possible, of which any could have named an original."""
@@ -287,7 +287,7 @@ class Finder(Generic[AnyOriginals]):
             raise JaxmarkError(f"The catalogue {database.path} is damaged: the points of a shape are not whole.")
         return np.frombuffer(row["points"], "<f2").astype(np.float64).reshape(-1, 3)
 
-    def _compare(self, piece: Piece, depth: int, tried: int) -> Iterator[_Comparison]:
+    def _compare(self, piece: Piece, depth: int, readings: int) -> Iterator[_Comparison]:
         """Compare a piece with the originals that look like it; a piece that is a whole original is no part of one."""
         known: set[int] = set()
         is_whole = False
@@ -299,7 +299,7 @@ class Finder(Generic[AnyOriginals]):
                     continue
                 known.add(near.shape)
                 match = Match(found[0]["path"], found[0]["name"], piece.name, by, number, near.distance)
-                best = self._best(_Comparison(match, piece.mesh, piece.mesh, tried), near.shape)
+                best = self._best(_Comparison(match, piece.mesh, piece.mesh, readings), near.shape)
                 is_whole |= best.match.coverage >= _WHOLE
                 yield best
 
@@ -323,14 +323,14 @@ class Finder(Generic[AnyOriginals]):
         for name, key in self.keys.items():
             records, traced = self._held(shape, name)
             for record, recipients in traced:
-                yield self._trace(pair._replace(tried=pair.tried * len(traced)), key, record, recipients)
+                yield self._trace(pair._replace(readings=pair.readings * len(traced)), key, record, recipients)
             if self.only_recipients:
                 continue
             for record in records or [None]:
                 bits = self.bits if record is None else None
                 marker = make_marker(pair.original, key, bits=bits, record=record)
                 found, mark = alternatives(marker).read(pair.suspect, align=self.align)
-                evidence = found.evidence.charged(ledger.ORIGINALS.charge("original", pair.tried))
+                evidence = found.evidence.charged(ledger.ORIGINALS.charge("original", pair.readings))
                 found = found._replace(evidence=evidence)
                 match = pair.match._replace(
                     named=found.detected(self.alpha),
@@ -367,7 +367,7 @@ class Finder(Generic[AnyOriginals]):
         """Look for recipients' copies in a piece."""
         tracer = make_tracer(pair.original, key, record=record)
         mark, aligned = tracer.mark, tracer.register(pair.suspect, self.align)
-        charge = ledger.ORIGINALS.charge("copy", pair.tried)
+        charge = ledger.ORIGINALS.charge("copy", pair.readings)
         bounds = {one.recipient: one.charged(charge).log10_p for one in tracer.read(aligned, recipients)}
         accused = tuple(name for name, log10_p in bounds.items() if log10_p <= math.log10(self.alpha))
         accused = () if mark.caveats else accused

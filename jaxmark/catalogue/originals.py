@@ -33,7 +33,7 @@ class Prepared(NamedTuple):
 
     file: dict[str, Any]  # its row in the table `originals`, but for the time
     shapes: list[dict[str, Any]]  # the rows of its meshes in the table `shapes`, but for its number
-    left: Mapping[str, str]  # meshes that cannot be used, by name, and why
+    skipped: Mapping[str, str]  # meshes that cannot be used, by name, and why
 
 
 def meshes_of(path: str | os.PathLike[str]) -> Scene:
@@ -43,7 +43,7 @@ def meshes_of(path: str | os.PathLike[str]) -> Scene:
         JaxmarkError: see `load_scene`.
     """
     scene = load_scene(path)
-    if len(scene.meshes) + len(scene.left) > 1:
+    if len(scene.meshes) + len(scene.skipped) > 1:
         return scene
     return Scene({WHOLE: load_mesh(path)}, {})
 
@@ -63,10 +63,10 @@ def prepare_file(path: str | os.PathLike[str], *, copy: bool = False) -> Prepare
     if copy and size > _MAX_COPY:
         raise JaxmarkError(f"{path} has {size} bytes, too many to keep a copy in the catalogue; leave out --copy.")
     scene = meshes_of(path)
-    shapes, left = [], dict(scene.left)
+    shapes, skipped = [], dict(scene.skipped)
     for name, mesh in scene.meshes.items():
         if (shape := _describe(name, mesh)) is None:
-            left[name] = "it has no extent"
+            skipped[name] = "it has no extent"
         else:
             shapes.append(shape)
     if not shapes:
@@ -81,7 +81,7 @@ def prepare_file(path: str | os.PathLike[str], *, copy: bool = False) -> Prepare
         "copy": Path(path).read_bytes() if copy else None,
         "thumbnail": _thumbnail(seen.points, seen.normals),
     }
-    return Prepared(file, shapes, left)
+    return Prepared(file, shapes, skipped)
 
 
 def _describe(name: str, mesh: Mesh) -> dict[str, Any] | None:
@@ -116,8 +116,8 @@ def _thumbnail(points: Points, normals: Points) -> bytes:
     seen, facing = points @ _CAMERA.T, normals @ _CAMERA.T
     low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
     size = max(float((high - low).max()), np.finfo(float).tiny)
-    room = _PIXELS - 2 * _MARGIN - 1
-    place = np.rint((seen[:, :2] - (low + high) / 2) / size * room + (_PIXELS - 1) / 2).astype(int)
+    space = _PIXELS - 2 * _MARGIN - 1
+    place = np.rint((seen[:, :2] - (low + high) / 2) / size * space + (_PIXELS - 1) / 2).astype(int)
     # Surfaces without an outside are lit from either side.
     light = np.abs(facing @ _LIGHT)
     shade = (_DARKEST + (225 - _DARKEST) * light).astype(np.uint8)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmark.distortion._shading import Hiding, make_hiding, shading, vertex_means, visible_turn
+from jaxmark.distortion._shading import Masking, make_masking, shading, vertex_means, visible_turn
 from jaxmark.distortion.dihedral import Hinges, dame, make_hinges
 from jaxmark.distortion.geometric import PointPlanes, SurfaceDistance, gl, point_to_plane, stretch, surface_distance
 from jaxmark.distortion.norms import maximum, rms, with_dtype
@@ -117,8 +117,8 @@ class Reference:
         return PointPlanes.of(np.asarray(self.mesh.vertices))
 
     @cached_property
-    def hiding(self) -> Hiding:
-        return with_dtype(make_hiding(np.asarray(self.mesh.vertices), self.faces).padded(), jnp.float32)
+    def masking(self) -> Masking:
+        return with_dtype(make_masking(np.asarray(self.mesh.vertices), self.faces).padded(), jnp.float32)
 
     def measure(self, distorted: Mesh, metrics: Collection[Metric]) -> dict[Metric, float | None]:
         """Measure how far a mesh was distorted from this original; see `measure`."""
@@ -194,7 +194,7 @@ _METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
     "msdm2": lambda pair: msdm2(pair.x, pair.y, pair.views),
     "curvature": _Pair.tensor_distance,
     "stretch": lambda pair: stretch(*pair.common, pair.reference.hinges.edges),
-    "shading": lambda pair: shading(*pair.common, pair.reference.hiding),
+    "shading": lambda pair: shading(*pair.common, pair.reference.masking),
     "point_to_plane": _Pair.point_to_plane,
     "flip": lambda pair: flip(*pair.meshes).high,
     "ssim": lambda pair: ssim(*pair.meshes).high,
@@ -277,11 +277,11 @@ def shading_at_vertices(original: Mesh, distorted: Mesh) -> Float[np.ndarray, " 
     """
     check_faces("Shading", original)
     reference = Reference(original)
-    pair, hiding = _Pair(reference, distorted), reference.hiding
+    pair, masking = _Pair(reference, distorted), reference.masking
     if not pair.same:
         raise JaxmarkError("The turn of normals is known only between meshes of the same connectivity.")
     points = np.zeros(len(reference.used), np.float32)
-    points[reference.used] = vertex_means(visible_turn(pair.x, pair.y, hiding), hiding, len(pair.x))
+    points[reference.used] = vertex_means(visible_turn(pair.x, pair.y, masking), masking, len(pair.x))
     return points[reference.welded.point]
 
 

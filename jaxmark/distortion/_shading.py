@@ -64,8 +64,8 @@ _MIN_HEIGHT = 1e-5  # of a face over its longest side; flatter ones have no norm
 _MIN_AREA = 1e-3  # of a face over the mean, in its links
 
 
-class Hiding(NamedTuple):
-    """The turns of normals that an original masks, face by face; make it with `make_hiding`."""
+class Masking(NamedTuple):
+    """The turns of normals that an original masks, face by face; make it with `make_masking`."""
 
     faces: Int[Array | np.ndarray, "faces 3"]
     area: Float[Array | np.ndarray, " faces"]  # share of the whole; 0 for faces without a normal
@@ -75,19 +75,19 @@ class Hiding(NamedTuple):
     bare: Float[Array | np.ndarray, "bands faces"]  # the same if the surface had nothing that hides
     bend: Float[Array | np.ndarray, " faces"]  # second largest angle to a neighbour: 0 on planes and along their edges
 
-    def padded(self) -> "Hiding":
+    def padded(self) -> "Masking":
         """The same with faces of no area besides, as many as `links` has, so that many meshes share its shapes."""
         count = len(self.links.degree)
         if len(self.area) == count:
             return self
         threshold, bare = (pad_rows(np.asarray(values).T, count, 1).T for values in (self.threshold, self.bare))
         faces, area, bend = (pad_rows(np.asarray(rows), count) for rows in (self.faces, self.area, self.bend))
-        return Hiding(faces, area, pad_rows(np.asarray(self.turned), count, 1), self.links, threshold, bare, bend)
+        return Masking(faces, area, pad_rows(np.asarray(self.turned), count, 1), self.links, threshold, bare, bend)
 
 
-def make_hiding(
+def make_masking(
     vertices: Float[Array | np.ndarray, "vertices 3"], faces: Int[Array | np.ndarray, "faces 3"], bands: int = BANDS
-) -> Hiding:
+) -> Masking:
     """Compute what an original masks, on the host, in `bands` bands from the shortest waves on.
 
     Edges of one face, or of three or more, link nothing.
@@ -111,19 +111,19 @@ def make_hiding(
     padded = jnp.asarray(pad_rows(normals, count)), jnp.asarray(pad_rows(lengths, count))
     threshold, bare = (np.asarray(values)[:, : len(faces)] for values in _hidden(links, *padded, bands))
     share, bend = area / (area.sum() or 1.0), _second_largest(pairs, angle, len(faces))
-    return Hiding(faces.astype(np.int32), share, turned, links, threshold, bare, bend)
+    return Masking(faces.astype(np.int32), share, turned, links, threshold, bare, bend)
 
 
 @jax.jit
-def visible_turn(original: Positions, distorted: Positions, hiding: Hiding) -> Float[Array, " faces"]:
+def visible_turn(original: Positions, distorted: Positions, masking: Masking) -> Float[Array, " faces"]:
     """Compute how visible the turn of each face's normal is, in just noticeable differences."""
-    change = _normals(distorted, hiding) - _normals(original, hiding)
+    change = _normals(distorted, masking) - _normals(original, masking)
     # Compiled code may round equal positions to different normals. Only the value is mended: the derivative is sound.
-    unmoved = jnp.all((original == distorted)[hiding.faces], axis=(1, 2))[:, None]
+    unmoved = jnp.all((original == distorted)[masking.faces], axis=(1, 2))[:, None]
     change -= jax.lax.stop_gradient(jnp.where(unmoved, change, 0))
-    padded = jnp.pad(change, ((0, len(hiding.links.degree) - len(change)), (0, 0)))
-    energy = jnp.sum(_bands(hiding.links, padded, len(hiding.threshold))[:, : len(change)] ** 2, axis=2)
-    turn = root(energy) / jnp.asarray(hiding.threshold).astype(change.dtype)
+    padded = jnp.pad(change, ((0, len(masking.links.degree) - len(change)), (0, 0)))
+    energy = jnp.sum(_bands(masking.links, padded, len(masking.threshold))[:, : len(change)] ** 2, axis=2)
+    turn = root(energy) / jnp.asarray(masking.threshold).astype(change.dtype)
     largest = jax.lax.stop_gradient(jnp.max(turn, axis=0))
     largest = jnp.where(largest > 0, largest, 1)
     # Powers are taken of ratios, which neither overflow nor vanish.
@@ -132,7 +132,7 @@ def visible_turn(original: Positions, distorted: Positions, hiding: Hiding) -> F
 
 
 @jax.jit
-def shading(original: Positions, distorted: Positions, hiding: Hiding, share: float | Scalar = SHARE) -> Scalar:
+def shading(original: Positions, distorted: Positions, masking: Masking, share: float | Scalar = SHARE) -> Scalar:
     """The visible turn of normals that is exceeded on 1 % of the area (1 - `share`), in just noticeable differences.
 
     Normals are split into bands of spatial frequency; a turn in each is taken over the least that is seen there, which
@@ -141,13 +141,13 @@ def shading(original: Positions, distorted: Positions, hiding: Hiding, share: fl
     2016; sensitivity as by Barten, JOSA A 7(10), 1990). On a plane 0.2° are just noticeable, by our calibration. The
     gradient is that of the face at the percentile.
     """
-    return percentile(visible_turn(original, distorted, hiding), jnp.asarray(hiding.area), share)
+    return percentile(visible_turn(original, distorted, masking), jnp.asarray(masking.area), share)
 
 
-def vertex_means(values: Float[Array, " faces"], hiding: Hiding, count: int) -> Float[Array, " vertices"]:
+def vertex_means(values: Float[Array, " faces"], masking: Masking, count: int) -> Float[Array, " vertices"]:
     """Means of faces' values around each of `count` vertices, weighted by area, for heat maps; 0 where no face is."""
-    area = jnp.asarray(hiding.area).astype(values.dtype)[:, None]
-    zeros, corners = jnp.zeros(count, values.dtype), hiding.faces
+    area = jnp.asarray(masking.area).astype(values.dtype)[:, None]
+    zeros, corners = jnp.zeros(count, values.dtype), masking.faces
     return ratio(zeros.at[corners].add(area * values[:, None]), zeros.at[corners].add(area))
 
 
@@ -193,13 +193,13 @@ def _orient(pairs: np.ndarray, against: np.ndarray, count: int) -> np.ndarray:
     return np.where(front <= back, 1.0, -1.0)
 
 
-def _normals(x: Array, hiding: Hiding) -> Array:
+def _normals(x: Array, masking: Masking) -> Array:
     """Unit normals of the faces that have one."""
-    corners = x[hiding.faces]
+    corners = x[masking.faces]
     cross = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     square = jnp.sum(cross**2, axis=1, keepdims=True)
-    sound = (square > 0) & (jnp.asarray(hiding.area) > 0)[:, None]
-    sign = jnp.asarray(hiding.turned).astype(x.dtype)[:, None]
+    sound = (square > 0) & (jnp.asarray(masking.area) > 0)[:, None]
+    sign = jnp.asarray(masking.turned).astype(x.dtype)[:, None]
     return jnp.where(sound, sign * cross / jnp.sqrt(jnp.where(sound, square, 1)), 0)
 
 

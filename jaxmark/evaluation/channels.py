@@ -54,22 +54,22 @@ def rate(channels: Channels, beta: Float[Array, " bands"]) -> Float[Array, " att
 
 
 @jax.jit
-def measure(receiver: Receiver, seen: Observation, mark: Displacement) -> Channels:
-    """Measure the channel of one attack on a known mark; can be differentiated with respect to `seen`.
+def measure(receiver: Receiver, observation: Observation, mark: Displacement) -> Channels:
+    """Measure the channel of one attack on a known mark; can be differentiated with respect to `observation`.
 
     Args:
         receiver: the original, with bands that add up to 1 over the spectrum.
-        seen: what the attacked mesh shows of the displacement.
+        observation: what the attacked mesh shows of the displacement.
         mark: the displacement that was written, with some strength in each band, `[N, 3]`.
 
     Returns:
         The channel as a single row. A band of three dimensions or fewer gets gain 0 and no dimensions, because no
         variance can be estimated from it.
     """
-    received = receive(receiver, seen)
+    received = receive(receiver, observation)
 
     def project(x: Array) -> Array:
-        return matmul(clean(received.receiver, received.seen, received.factor, x), received.axes)
+        return matmul(clean(received.receiver, received.observation, received.factor, x), received.axes)
 
     (signs,) = probe_signs("channels", mark.shape, dtype=mark.dtype)
     written, found, probe = project(mark), received.residual, project(signs)

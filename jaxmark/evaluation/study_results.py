@@ -91,7 +91,7 @@ class Results:
             title,
             {name: self.plot(of) for of, name in _SHOWN.items()},
             alt=", over the strength of each attack",
-            tables=[{"title": "All points", "remark": "", "heads": heads, "lines": lines}],
+            tables=[{"title": "All points", "note": "", "heads": heads, "lines": lines}],
             notes=self._controls(),
             refusals=self._refusals(),
             nowrap=True,

@@ -52,7 +52,7 @@ class Trial(NamedTuple):
     signs: tuple[Int8[Array, "vertices channels"], ...]  # of each mark
     scales: tuple[float, ...]  # factor on each mark's displacement, within the limits, in diagonals
     used: Float64[np.ndarray, " limits"]  # share of each limit that the first mark uses up
-    seen: tuple[tuple[Observation, ...], ...]  # for each attack, copies of all marks, seed by seed
+    observations: tuple[tuple[Observation, ...], ...]  # for each attack, copies of all marks, seed by seed
     worth: Float64[np.ndarray, " attacks"]
     by_signs: Float64[np.ndarray, "marks attacks"]  # worth of each mark with its opposite
 
@@ -120,13 +120,13 @@ class Trials:
         signs = tuple(sign * jnp.asarray(one.chips.signs) for one in drawn for sign in (1, -1))
         tries = [(mark, seed + numbers.start) for seed in self.seeds for mark in marks]
         suspects = [[one(*some) for some in tries] for one in self.attacks]
-        seen = tuple(tuple(align(original, one).observation(original) for one in some) for some in suspects)
+        observations = tuple(tuple(align(original, one).observation(original) for one in some) for some in suspects)
         scales, used = tuple(one.scale for one in written for _ in (1, -1)), self._used(written[0])
         reader = carrier.reader()
-        left = [self._left(scheme, reader, word, signs, copies) for copies in seen]
+        left = [self._left(scheme, reader, word, signs, copies) for copies in observations]
         worth = np.array([self._worth(values) for values in left])
         by_signs = np.array([[self._worth(values[:, place]) for values in left] for place in range(len(numbers))])
-        return Trial(scheme, reader, word, signs, scales, used, seen, worth, by_signs)
+        return Trial(scheme, reader, word, signs, scales, used, observations, worth, by_signs)
 
     def ascend(self, start: Trial, cost: Float64[np.ndarray, "limits bands"]) -> Trial:
         """Change strengths along the gradient of what the worst attack leaves, as long as trials agree.
@@ -147,9 +147,11 @@ class Trials:
         scales = [jnp.asarray(scale, dtype) for scale in at.scales]
         drawn = [_with_signs(carrier, signs).displacement(at.word) for signs in at.signs]
         marks = [scale * shift for scale, shift in zip(scales, drawn, strict=True)]
-        most = max((one.nuisance.shape[1] for some in at.seen for one in some if one.nuisance is not None), default=0)
+        most = max(
+            (one.nuisance.shape[1] for some in at.observations for one in some if one.nuisance is not None), default=0
+        )
         copies: dict[object, list[_Copy]] = {}
-        for number, suspects in enumerate(at.seen):
+        for number, suspects in enumerate(at.observations):
             pairs = list(zip(suspects, cycle(zip(at.signs, scales, marks, strict=True)), strict=False))
             gains = [measure(at.reader.receiver, one, mark).gain[0] for one, (*_, mark) in pairs]
             gain = sum(gains[1:], gains[0]) / len(gains)
@@ -159,7 +161,7 @@ class Trials:
         groups = tuple(jax.tree.map(lambda *leaves: jnp.stack(leaves), *some) for some in copies.values())
         limits = _Limits(jnp.asarray(cost[:, : len(base)], dtype), jnp.asarray(at.used / at.used.max(), dtype))
         level = jnp.asarray(1 / max(at.worst, 1e-3), dtype)
-        strengths = np.asarray(_climb(at.reader, at.word, groups, limits, level, len(at.seen)), np.float64)
+        strengths = np.asarray(_climb(at.reader, at.word, groups, limits, level, len(at.observations)), np.float64)
         return at.scheme.with_profile(tuple(float(f"{value:.4g}") for value in strengths / strengths.max()))
 
     def _left(
@@ -199,9 +201,9 @@ class Trials:
 
 
 class _Copy(NamedTuple):
-    """An attacked copy of a mark, as it was seen."""
+    """An attacked copy of a mark, as it was observed."""
 
-    seen: Observation
+    observation: Observation
     gain: Float[Array, " passing"]  # share of the mark's amplitude that the attack leaves in each band
     signs: Int8[Array, "vertices channels"]  # of the mark
     scale: Float[Array, ""]  # factor on its displacement
@@ -225,11 +227,13 @@ def _with_signs(carrier: KeyedCarrier, signs: Int8[Array, "vertices channels"]) 
     return carrier._replace(chips=carrier.chips._replace(signs=signs))
 
 
-def _widened(seen: Observation, columns: int) -> Observation:
+def _widened(observation: Observation, columns: int) -> Observation:
     """The same with so many columns of nuisance, if it has any: the reader drops zeros, and one program serves all."""
-    if seen.nuisance is None:
-        return seen
-    return seen._replace(nuisance=jnp.pad(seen.nuisance, ((0, 0), (0, columns - seen.nuisance.shape[1]))))
+    if observation.nuisance is None:
+        return observation
+    return observation._replace(
+        nuisance=jnp.pad(observation.nuisance, ((0, 0), (0, columns - observation.nuisance.shape[1])))
+    )
 
 
 @partial(jax.jit, static_argnames="attacks")
@@ -255,7 +259,7 @@ def _climb(
             carrier = _with_signs(reader.carrier, copy.signs)
             moved = copy.scale * carrier.with_bands(copy.gain * left).displacement(word)
             changed = reader.with_carrier(carrier.with_bands(strengths))
-            received = changed.receive(copy.seen._replace(residual=copy.seen.residual + moved))
+            received = changed.receive(copy.observation._replace(residual=copy.observation.residual + moved))
             score, norm = changed.claim(received, word)
             return score / norm
 

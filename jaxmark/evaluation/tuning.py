@@ -59,10 +59,12 @@ class Report(NamedTuple):
     bound: float  # upper bound on the worst margin, by the channels, of any strengths within the budget
     gap: float  # (bound - worst margin) / bound
     binding: Mapping[str, float]  # weights of the limits in the channels' budget
-    tried: Float64[np.ndarray, " attacks"]  # what the detector has of the tuned strengths after each attack
-    tried_channels: Float64[np.ndarray, " attacks"]  # the same of the channels' best; 0 if the payload does not fit
-    tried_default: Float64[np.ndarray, " attacks"]  # the same of the scheme as `embed` takes it
-    kept: bool  # whether no strengths were better than those of the scheme as `embed` takes it, which is returned
+    trials: Float64[np.ndarray, " attacks"]  # what the detector has of the tuned strengths after each attack
+    channel_trials: Float64[np.ndarray, " attacks"]  # the same of the channels' best; 0 if the payload does not fit
+    default_trials: Float64[np.ndarray, " attacks"]  # the same of the scheme as `embed` takes it
+    default_kept: (
+        bool  # whether no strengths were better than those of the scheme as `embed` takes it, which is returned
+    )
 
 
 class Tuned(NamedTuple):
@@ -139,11 +141,11 @@ def tune(
     written = displace_within(original, probe, bounds)
     mark = original.to_traced(written.scale * probe)
     suspects = [[apply_attack(one, written.mesh, seed) for seed in seeds] for one in attacks]
-    seen = [[align(original, suspect).observation(original) for suspect in row] for row in suspects]
+    observations = [[align(original, suspect).observation(original) for suspect in row] for row in suspects]
 
     def measure_channels(profile: tuple[float, ...]) -> Channels:
         receiver = tunable.with_profile(profile).receiver(original, bits)
-        rows = [[measure(receiver, one, mark) for one in row] for row in seen]
+        rows = [[measure(receiver, one, mark) for one in row] for row in observations]
         means = [jax.tree.map(lambda *values: jnp.mean(jnp.stack(values), axis=0), *row) for row in rows]
         return Channels(*map(jnp.concatenate, zip(*means, strict=True)))
 
@@ -185,9 +187,9 @@ def _costs(
     """Share of each limit, squared, that β_j = 1 uses up in band j."""
     whole = band_energies(original.operator, jnp.asarray(family, signs.dtype), signs, signs)
     energy = np.maximum(np.asarray(whole, np.float64) / original.used.sum(), 1e-12)
-    seen = list(bounds.limits)
-    visible = band_visibility(original, family, seen, mask) if seen else []
-    rows = [energy * (row / bounds.limits[name]) ** 2 for name, row in zip(seen, visible, strict=True)]
+    names = list(bounds.limits)
+    visible = band_visibility(original, family, names, mask) if names else []
+    rows = [energy * (row / bounds.limits[name]) ** 2 for name, row in zip(names, visible, strict=True)]
     return np.stack(rows + ([energy / bounds.rms**2] if bounds.rms is not None else []))
 
 
@@ -249,8 +251,10 @@ def tune_blind(
     before = {width: some[0] for width, some in looks(mesh).items()}
 
     def left(attacker: Attacker, seed: int) -> dict[float, list[Left]]:
-        seen = looks(apply_attack(attacker, mesh, seed))
-        return {width: [way for look in some for way in compare(before[width], look)] for width, some in seen.items()}
+        anchors = looks(apply_attack(attacker, mesh, seed))
+        return {
+            width: [way for look in some for way in compare(before[width], look)] for width, some in anchors.items()
+        }
 
     found, size = [[left(one, seed) for seed in seeds] for one in attacks], carried(bits)
 

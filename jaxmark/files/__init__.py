@@ -56,7 +56,7 @@ class Scene(NamedTuple):
     """The meshes of a file."""
 
     meshes: Mapping[str, Mesh]  # by name, in the file's order, each in its own coordinates
-    left: Mapping[str, str]  # those that cannot be used, by name, and why
+    skipped: Mapping[str, str]  # those that cannot be used, by name, and why
 
 
 def load_mesh(path: str | os.PathLike) -> Mesh:
@@ -94,15 +94,15 @@ def load_scene(path: str | os.PathLike) -> Scene:
     if not source.parts:
         return Scene({_ONLY: _whole(source, path)}, {})
     meshes: dict[str, Mesh] = {}
-    left = dict(source.left)
+    skipped = dict(source.skipped)
     for part in source.parts:
         try:
             meshes[part.name] = make_mesh(source.positions[part.places], part.faces)
         except JaxmarkError as error:
-            left[part.name] = str(error).rstrip(".")
+            skipped[part.name] = str(error).rstrip(".")
     if not meshes:
-        raise JaxmarkError(f"{os.fspath(path)}: " + "; ".join(f"{name}: {reason}" for name, reason in left.items()))
-    return Scene(meshes, left)
+        raise JaxmarkError(f"{os.fspath(path)}: " + "; ".join(f"{name}: {reason}" for name, reason in skipped.items()))
+    return Scene(meshes, skipped)
 
 
 def load_texture(path: str | os.PathLike) -> Texture:
@@ -278,7 +278,7 @@ def _save(source: Source, positions: np.ndarray, path: str | os.PathLike, like: 
             with suppress(JaxmarkError):  # a file that is missing already, or lies elsewhere, does not come along
                 beside[companion] = read_beside(here)(companion)
     write_together(path, patched.file, beside)
-    return patched.remarks
+    return patched.notes
 
 
 def _check_spacing(source: Source, positions: Points, places: Indices) -> bool:

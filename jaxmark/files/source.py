@@ -158,7 +158,7 @@ class Patched(NamedTuple):
 
     file: bytes
     beside: Mapping[str, bytes] = {}  # other files that belong to it, by path relative to its folder
-    remarks: tuple[str, ...] = ()  # what could not stay as it was
+    notes: tuple[str, ...] = ()  # what could not stay as it was
     companions: tuple[str, ...] = ()  # paths of files that it refers to and that did not change
 
 
@@ -178,7 +178,7 @@ class Source:
         texture: reads the texture coordinates of each face's corners, NaN where there are none; None without any.
         skin: reads which joints move each point; None without any.
         parts: the meshes in the file that can be marked; empty if there is just one in it.
-        left: the other meshes by name, and why they cannot be marked.
+        skipped: the other meshes by name, and why they cannot be marked.
     """
 
     data: bytes
@@ -188,7 +188,7 @@ class Source:
     texture: Callable[[], Texture] = read_nothing
     skin: Callable[[], Skinning | None] = read_nothing
     parts: Sequence[Part] = ()
-    left: Mapping[str, str] = field(default_factory=dict)
+    skipped: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def positions(self) -> Points:
@@ -219,10 +219,10 @@ def concerning(where: object) -> Iterator[None]:
         raise JaxmarkError(f"{where}: {error}") from error
 
 
-def unusable(left: Mapping[str, str], count: int) -> str:
+def unusable(skipped: Mapping[str, str], count: int) -> str:
     """Return the sentence that none of several meshes can be marked, with the first reasons."""
-    reasons = "; ".join(f"{name!r}: {reason}" for name, reason in list(left.items())[:3])
-    return f"None of its {count} meshes can be marked: {reasons}{'; …' if len(left) > 3 else ''}."
+    reasons = "; ".join(f"{name!r}: {reason}" for name, reason in list(skipped.items())[:3])
+    return f"None of its {count} meshes can be marked: {reasons}{'; …' if len(skipped) > 3 else ''}."
 
 
 def linked(one: Indices, other: Indices, count: int) -> Indices:

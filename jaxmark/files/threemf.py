@@ -54,26 +54,26 @@ def parse(data: bytes) -> Source:
     names = iter(unique_names(mesh.name for _, _, meshes in found for mesh in meshes))
     models: list[_Model] = []
     parts: list[Part] = []
-    left: dict[str, str] = {}
+    skipped: dict[str, str] = {}
     size = 0
     for member, content, meshes in found:
         with concerning(member.shown):
-            objects = _read_objects(content, meshes, names, left)
+            objects = _read_objects(content, meshes, names, skipped)
         for item in objects:
             parts.append(Part(item.name, size + np.arange(len(item.numbers.values)), item.faces))
             size += len(item.numbers.values)
         if objects:
             models.append(_Model(member, content, JoinedNumbers([item.numbers for item in objects])))
-    if not parts and len(left) == 1:
-        raise JaxmarkError("The mesh {!r} cannot be marked: {}.".format(*left.popitem()))
+    if not parts and len(skipped) == 1:
+        raise JaxmarkError("The mesh {!r} cannot be marked: {}.".format(*skipped.popitem()))
     if not parts:
-        raise JaxmarkError(unusable(left, len(left)) if left else "The file has no object with a mesh.")
+        raise JaxmarkError(unusable(skipped, len(skipped)) if skipped else "The file has no object with a mesh.")
     return _ThreemfSource(
         data,
         JoinedNumbers([model.numbers for model in models]),
         np.concatenate([part.places[0] + part.faces for part in parts]),
-        parts=parts if len(parts) + len(left) > 1 else (),
-        left=left,
+        parts=parts if len(parts) + len(skipped) > 1 else (),
+        skipped=skipped,
         archive=archive,
         models=models,
         signed=signed,
@@ -113,9 +113,9 @@ def _model_members(archive: Archive) -> list[Member]:
 
 
 def _read_objects(
-    content: bytes, meshes: Sequence[RawMesh], names: Iterator[str], left: dict[str, str]
+    content: bytes, meshes: Sequence[RawMesh], names: Iterator[str], skipped: dict[str, str]
 ) -> list[_Object]:
-    """Read the numbers of a model's meshes; those that cannot be marked are put into `left`."""
+    """Read the numbers of a model's meshes; those that cannot be marked are put into `skipped`."""
     lists = [mesh.lists.get(kind, NO_TRIPLES) for mesh in meshes for kind in ("vertices", "triangles")]
     spans = np.concatenate([NO_TRIPLES, *lists])
     text = Spans(content, spans[..., 0].ravel(), spans[..., 1].ravel())
@@ -126,10 +126,10 @@ def _read_objects(
         name, numbers, faces = next(names), TextNumbers(text, next(pieces)), text.read(next(pieces), int)
         outside = ((faces < 0) | (faces >= len(numbers.values))).any(axis=1)
         if not len(faces):
-            left[name] = "it has no triangles"
+            skipped[name] = "it has no triangles"
         elif outside.any():
             bad = int(np.argmax(outside))
-            left[name] = (
+            skipped[name] = (
                 f"its triangle {bad} (zero-based) refers to vertices {faces[bad].tolist()}, but it has"
                 f" {len(numbers.values)}, numbered from 0"
             )

@@ -55,11 +55,11 @@ def similarity(source: PointSets, target: PointSets, mirrored: bool | None = Fal
     """
     source_mean, target_mean = source.mean(axis=-2, keepdims=True), target.mean(axis=-2, keepdims=True)
     u, size, vt = np.linalg.svd(np.swapaxes(target - target_mean, -1, -2) @ (source - source_mean))
-    hand, signs = np.sign(np.linalg.det(u @ vt)), np.ones(size.shape)  # with these signs, u @ vt fits best
+    reflection, signs = np.sign(np.linalg.det(u @ vt)), np.ones(size.shape)  # with these signs, u @ vt fits best
     if mirrored is None:
-        signs[..., 2] = np.where(size[..., 2] > _FLAT * size[..., 0], 1, hand)
+        signs[..., 2] = np.where(size[..., 2] > _FLAT * size[..., 0], 1, reflection)
     else:
-        signs[..., 2] = -hand if mirrored else hand
+        signs[..., 2] = -reflection if mirrored else reflection
     spread = np.maximum(((source - source_mean) ** 2).sum(axis=(-1, -2)), np.finfo(float).tiny)
     scale = (size * signs).sum(axis=-1) / spread
     matrix = scale[..., None, None] * ((u * signs[..., None, :]) @ vt)

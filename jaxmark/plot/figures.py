@@ -110,14 +110,14 @@ def draw_aside(axes: Any, line: Sequence[Any], place: int, count: int, points: i
         artist.set_transform(axes.transData + ScaledTranslation(step * (place - (count - 1) / 2), 0, inches))
 
 
-def fill_template(room: str, name: str, **values: Any) -> str:
-    """Fill the HTML template of a room with values, which are escaped.
+def fill_template(package: str, name: str, **values: Any) -> str:
+    """Fill the HTML template of a package with values, which are escaped.
 
     Raises:
         JaxmarkError: if Jinja2 is missing.
     """
     jinja2 = require("jinja2", "plot")
-    template = resources.files(room).joinpath(name).read_text(encoding="utf-8")
+    template = resources.files(package).joinpath(name).read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     return environment.from_string(template).render(values)
 

@@ -251,7 +251,7 @@ def graph_laplacian(
     neighbours = None
     if lowering != "segments":
         order = cuthill_mckee(pairs, size) if size >= _MIN_ORDERED_VERTICES else None
-        neighbours = make_neighbours(pairs, size, order, weighted=weights is not None, if_it_pays=lowering == "auto")
+        neighbours = make_neighbours(pairs, size, order, weighted=weights is not None, if_cheaper=lowering == "auto")
     return Laplacian(pairs.astype(np.int32), weights, degree, neighbours)
 
 
@@ -261,13 +261,13 @@ def make_neighbours(
     order: Int[np.ndarray, " vertices"] | None = None,
     *,
     weighted: bool,
-    if_it_pays: bool = False,
+    if_cheaper: bool = False,
     slots: int | None = None,
 ) -> Neighbours | None:
     """Build the table of neighbours in a graph of `size` vertices, which looks weights up if edges are `weighted`.
 
     The rows are in the vertices' own order unless their `order` is given. The number of slots is by default the even
-    number, or the next one, that makes a product cheapest. With `if_it_pays`, None is returned where segment-sums are
+    number, or the next one, that makes a product cheapest. With `if_cheaper`, None is returned where segment-sums are
     cheaper.
     """
     rank = None if order is None else np.argsort(order).astype(np.int32)
@@ -278,7 +278,7 @@ def make_neighbours(
     left = len(tail) - np.cumsum(np.bincount(slot))  # number of neighbours without a slot, for one slot, two, …
     addition = _SCATTER_COST_CPU if jax.default_backend() == "cpu" else _SCATTER_COST_ELSEWHERE
     costs = size * np.arange(1, 1 + len(left)) + addition * left + _SCATTER_COST_PER_VERTEX * size * (left > 0)
-    if if_it_pays and (len(left) == 0 or costs.min() > addition * len(tail)):
+    if if_cheaper and (len(left) == 0 or costs.min() > addition * len(tail)):
         return None
     if slots is None:
         # The number is made even, so that more meshes share the shape of their table.

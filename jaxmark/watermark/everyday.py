@@ -218,7 +218,7 @@ def read_blind(
         JaxmarkError: see `detect`.
     """
     check_mesh(suspect)
-    tried = schemes or tuple(BLIND_SCHEMES.values())
+    candidates = schemes or tuple(BLIND_SCHEMES.values())
     payload = DEFAULT_BITS if bits is None else bits
     if record is not None:
         payload = record.payload(key, bits)
@@ -226,7 +226,7 @@ def read_blind(
             raise JaxmarkError(
                 f"The record says that the scheme is {record.scheme!r}, which is read with the original."
             )
-        tried = (make_blind_scheme(record.scheme, record.parameters),)
+        candidates = (make_blind_scheme(record.scheme, record.parameters),)
     if message is not None:
         check_size(message, payload)
         if record is not None:
@@ -234,12 +234,12 @@ def read_blind(
     suspect, secret = blind_reading.register(suspect), Key(key)
     found: list[Detection] = []
     for one in blind_reading.try_each(
-        partial(blind_reading.read, suspect, secret, payload, scheme, message, record) for scheme in tried
+        partial(blind_reading.read, suspect, secret, payload, scheme, message, record) for scheme in candidates
     ):
         found.append(one)
         if blind_reading.is_sure(one):
             break
-    return blind_reading.best_of(found, ledger.BLIND_SCHEME, len(tried))
+    return blind_reading.best_of(found, ledger.BLIND_SCHEME, len(candidates))
 
 
 def with_blind(
@@ -347,7 +347,7 @@ def detect_scene(
         chosen = {name: originals[name] for name in record.meshes}
     if bits is None and record is None and message is not None:
         bits = 8 * len(message)
-    seen: dict[str, _Seen] = {}
+    readings: dict[str, _MeshReading] = {}
     skipped: dict[str, str] = {}
     known: set[tuple[bytes, bytes]] = set()
     found = pair(chosen, suspects)
@@ -362,18 +362,18 @@ def detect_scene(
                 raise JaxmarkError("It equals another mesh, and counts once.")
             aligned = marker.register(suspects[found[name]], align)
             # What a marker has computed to read is dropped: that of all meshes would not fit.
-            seen[name] = _Seen(replace(marker), aligned, marker.read(aligned, message))
+            readings[name] = _MeshReading(replace(marker), aligned, marker.read(aligned, message))
             known.add(mark)
         except JaxmarkError as error:
             skipped[name] = str(error).rstrip(".")
         after()
-    if not seen:
+    if not readings:
         raise JaxmarkError(f"None of the {len(chosen)} meshes could be compared: {_reasons(skipped)}.")
-    parts = {name: one.found for name, one in seen.items()}
-    return _unite_meshes(list(seen.values()), message)._replace(parts=parts, skipped=skipped)
+    parts = {name: one.found for name, one in readings.items()}
+    return _unite_meshes(list(readings.values()), message)._replace(parts=parts, skipped=skipped)
 
 
-class _Seen(NamedTuple):
+class _MeshReading(NamedTuple):
     """A mesh of a scene that was read, in a pose in which the key had no part."""
 
     marker: NonBlindMarker
@@ -387,29 +387,29 @@ class _Seen(NamedTuple):
         return np.asarray(score), np.asarray(norm)
 
 
-def _unite_meshes(seen: Sequence[_Seen], claimed: bytes | None) -> Detection:
+def _unite_meshes(readings: Sequence[_MeshReading], claimed: bytes | None) -> Detection:
     """Unite what meshes of a scene prove: one of them alone, or the sum of their scores for one message."""
-    alone = [one.found for one in seen]
+    alone = [one.found for one in readings]
     best = min(alone, key=lambda one: one.rank)
     if len(alone) == 1:
         return best
     charges = ledger.SCENE.charge("one mesh"), ledger.MESHES.charge("each", len(alone))
     evidence = Evidence.least(*(one.evidence.charged(*charges) for one in alone))
-    read, bits = best.message, seen[0].marker.bits
+    read, bits = best.message, readings[0].marker.bits
     if not bits:
         claimed = b""
     messages = {claimed} if claimed is not None else {one.message for one in alone if one.message is not None}
     for message in messages:
-        if any(8 * len(message) != one.marker.bits for one in seen):
+        if any(8 * len(message) != one.marker.bits for one in readings):
             continue
-        recorded = [is_recorded(one.marker.record, message, one.marker.choices) for one in seen]
+        recorded = [is_recorded(one.marker.record, message, one.marker.choices) for one in readings]
         fixed = claimed is not None or all(recorded)
-        charges = [ledger.SCENE.charge("sum over meshes"), ledger.SUM_ALIGNMENT.charge(seen[0].aligned.align)]
+        charges = [ledger.SCENE.charge("sum over meshes"), ledger.SUM_ALIGNMENT.charge(readings[0].aligned.align)]
         if fixed or any(one is not None for one in recorded):
             charges.append(ledger.MESSAGE.charge("claimed or recorded" if fixed else "another"))
-        scores, norms = zip(*(one.claim(message) for one in seen), strict=True)
+        scores, norms = zip(*(one.claim(message) for one in readings), strict=True)
         # Meshes are weighted by the numbers of their points that the suspect shows.
-        score = united_score(scores, norms, [float(np.sum(one.aligned.weights > 0)) for one in seen])
+        score = united_score(scores, norms, [float(np.sum(one.aligned.weights > 0)) for one in readings])
         united = weigh([(score, 1.0)], bits=bits, fixed=fixed, charges=charges)
         if united.log10_p < evidence.log10_p:
             read = message if any(one.message == message for one in alone) else None

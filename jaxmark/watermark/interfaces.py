@@ -50,7 +50,7 @@ class Claim(NamedTuple):
     norm: Float[Array, ""]  # ‖a‖
 
 
-class Room(NamedTuple):
+class FreeDimensions(NamedTuple):
     """What a reader leaves of a carrier's mark in each band; the capacity is computed from it."""
 
     dimensions: Float64[np.ndarray, " bands"]  # number of dimensions left in each band; 0 if the mark is not in it
@@ -109,11 +109,11 @@ class Carrier(Protocol):
         """D inner products of the displacements of single bits, `[k, k]`: column j is adjoint(displacement(e_j))."""
         ...
 
-    def claim(self, seen: Observation, bits: Float[Array, " bits"]) -> Claim:
+    def claim(self, observation: Observation, bits: Float[Array, " bits"]) -> Claim:
         """Compute the score and the norm of a claimed codeword.
 
         Args:
-            seen: what a suspect shows of each vertex's displacement.
+            observation: what a suspect shows of each vertex's displacement.
             bits: the codeword, ±1, `[k]`.
         """
         ...
@@ -182,7 +182,7 @@ class Reader(Protocol):
         """The carrier whose bits are read."""
         ...
 
-    def receive(self, seen: Observation) -> Any:
+    def receive(self, observation: Observation) -> Any:
         """Learn all that can be learned from a suspect without the key.
 
         Returns:
@@ -219,7 +219,7 @@ class Reader(Protocol):
         """
         ...
 
-    def glance(self, seen: Observation, beta: Strength = 1.0) -> Float[Array, " bits"] | None:
+    def read_quickly(self, observation: Observation, beta: Strength = 1.0) -> Float[Array, " bits"] | None:
         """Estimate soft values with little computation, well enough to read a suspect that was not attacked.
 
         Returns:
@@ -236,7 +236,7 @@ class Reader(Protocol):
         """
         ...
 
-    def room(self, moving: Float[Array, " vertices"]) -> Room | None:
+    def free_dimensions(self, moving: Float[Array, " vertices"]) -> FreeDimensions | None:
         """Measure what the reader leaves of the mark in each band.
 
         Args:
@@ -293,9 +293,9 @@ class Scheme(Protocol):
         ...
 
     def layout(self, original: Original, bits: int) -> Hashable:
-        """Name what the room for a payload depends on: payloads of equal layout leave the same room.
+        """Return a key for what the free dimensions depend on: payloads of equal layout have the same ones.
 
-        The room (see `Reader.room`) is then measured only once for all of them.
+        They (see `Reader.free_dimensions`) are then measured only once for all of these payloads.
         """
         return None
 

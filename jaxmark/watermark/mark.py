@@ -115,14 +115,14 @@ class Mark:
         return encode(message, self.choices, self.code_bits)
 
     def write(
-        self, amplitudes: Float64[np.ndarray, " code"], budget: BudgetLike = None, *, told: bytes = b""
+        self, amplitudes: Float64[np.ndarray, " code"], budget: BudgetLike = None, *, content: bytes = b""
     ) -> tuple[Mesh, EmbedInfo]:
         """Displace the original by the carrier, with any amplitudes of the code bits, as far as a budget allows.
 
         Args:
             amplitudes: one number for each code bit, up to a common factor.
             budget: see `embed`.
-            told: what the amplitudes say, which the record commits to; nothing if it is empty.
+            content: the message or the recipient of these amplitudes, which the record commits to; b"" for none.
 
         Raises:
             JaxmarkError: if the carrier does not displace this mesh at all; or see `displace_within`.
@@ -144,7 +144,7 @@ class Mark:
             key=commitment(self.key),
             parameters=parameters_of(self.scheme),
             content=self.content,
-            told=commit(told, self.choices) if told else "",
+            message_commitment=commit(content, self.choices) if content else "",
             imprint=seal_imprint(make_imprint(canonical, original.grid), self.key),
         ).sealed(self.key)
         return written.mesh, EmbedInfo(written.moved.rms, written.moved.max, written.scale, record)
@@ -172,10 +172,10 @@ class Mark:
         """Decode the message in soft decisions; None if the keyed tag of none among so many candidates fits."""
         return decode(np.asarray(soft, np.float64), self.bits, self.choices, candidates)
 
-    def read_quickly(self, seen: Observation) -> bytes | None:
-        """Read what was hardly attacked with little computation, see `Reader.glance`; None if nothing reads so."""
-        quick = self.reader.glance(seen)
-        found = self.decode(quick if quick is not None else self.soft_decisions(self.reader.receive(seen)))
+    def read_quickly(self, observation: Observation) -> bytes | None:
+        """Decode a lightly attacked suspect at low cost, see `Reader.read_quickly`; None if that decodes nothing."""
+        quick = self.reader.read_quickly(observation)
+        found = self.decode(quick if quick is not None else self.soft_decisions(self.reader.receive(observation)))
         return None if found is None else found.message
 
     def coverage(self, observed: Observation) -> float:

@@ -117,7 +117,7 @@ class NonBlindMarker(Mark):
         check_size(message, self.bits)
         budget = Budget.of(budget)
         bounds = budget.bounds(self.original.mesh)
-        marked, info = self.write(self.codeword(message), budget, told=message)
+        marked, info = self.write(self.codeword(message), budget, content=message)
         # A budget without limits is met up to rounding, so its own number is used.
         reached = info.rms if bounds.limits else bounds.rms or 0.0
         if budget.noise is not None:
@@ -179,14 +179,14 @@ class NonBlindMarker(Mark):
         unit = self.original.radius * rng.uniform(-1, 1, points.shape)
         near = points[:, 0] <= np.median(points[used, 0])  # half of the mesh, as if it was cut
 
-        def survives(noise: float, seen: np.ndarray) -> bool:
-            one = aligned._replace(displacement=aligned.displacement + noise * unit, weights=aligned.weights * seen)
+        def survives(noise: float, visible: np.ndarray) -> bool:
+            one = aligned._replace(displacement=aligned.displacement + noise * unit, weights=aligned.weights * visible)
             return self.read_quickly(self.observe(one)) == message if message else self._reads(one, message)
 
         found = []
-        for noise, seen in zip(predicted, (np.ones_like(near), near), strict=True):
+        for noise, visible in zip(predicted, (np.ones_like(near), near), strict=True):
             strengths = (share * min(noise, _MAX_TRIED_NOISE) for share in _SHARES_OF_NOISE)
-            reads = (strength for strength in strengths if survives(strength, seen))
+            reads = (strength for strength in strengths if survives(strength, visible))
             found.append(next(reads, 0.0) if 0 < noise < math.inf else noise)
         return Survival(*found)
 
@@ -237,8 +237,8 @@ class NonBlindMarker(Mark):
             return ""
         word = np.random.default_rng(0).choice([-1.0, 1.0], self.code_bits)
         marked, _ = self.write(word, min(rms, 0.5))
-        seen = distortion.measure(self.original.mesh, marked, bounds.limits.keys())
-        said = ", ".join(f"{name} would be {value or 0:.2g}" for name, value in seen.items())
+        values = distortion.measure(self.original.mesh, marked, bounds.limits.keys())
+        said = ", ".join(f"{name} would be {value or 0:.2g}" for name, value in values.items())
         return f" (at which {said})"
 
 
@@ -287,7 +287,7 @@ class BlindMarker:
             key=commitment(self.key),
             parameters={"width": written.plan.width, "step": written.plan.step},
             content="message" if self.bits else "presence",
-            told=commit(message, choices) if message else "",
+            message_commitment=commit(message, choices) if message else "",
         ).sealed(self.key)
         survives = self.writer.survives(written.plan, self.bits)
         return written.mesh, EmbedInfo(written.moved.rms, written.moved.max, record.beta, record, survives)
@@ -316,9 +316,9 @@ class BlindMarker:
         faces = np.asarray(marked.faces)
         near = (points[faces, 0] <= np.median(points[faces, 0])).all(axis=1)
         found = []
-        for most, seen in zip(predicted, (faces, faces[near]), strict=True):
+        for most, part in zip(predicted, (faces, faces[near]), strict=True):
             strengths = [share * most for share in _SHARES_OF_NOISE[:-1] if most > 0]
-            suspects = (Mesh(points + noise * unit, seen) for noise in strengths)
+            suspects = (Mesh(points + noise * unit, part) for noise in strengths)
             reads = (noise for noise, one in zip(strengths, suspects, strict=True) if self.reads(one, message))
             found.append(next(reads, 0.0))
         return Survival(*found)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from jaxmark.alignment import attempts
 from jaxmark.alignment.heights import VertexHeights
-from jaxmark.alignment.nonrigid import Bent
+from jaxmark.alignment.nonrigid import DeformedPoints
 from jaxmark.alignment.original import Original
 from jaxmark.alignment.result import Align, Alignment
 from jaxmark.errors import JaxmarkError
@@ -66,8 +66,8 @@ class Alternatives(NamedTuple):
             for charged, prepare in self.marks:
                 mark = prepare()
                 # A second reading takes seconds: only what is likeliest is read so.
-                seen = aligned._replace(heights=None, bent=None) if found else aligned
-                one = read(mark, seen, message, weights, charges=(*charged, *registered))
+                observation = aligned._replace(heights=None, deformed=None) if found else aligned
+                one = read(mark, observation, message, weights, charges=(*charged, *registered))
                 if one.detected(allow_estimate=True):
                     return one, mark
                 found.append((one, mark))
@@ -184,15 +184,15 @@ class _Reading(NamedTuple):
 
     def alternative(self, received: Received) -> Callable[[Charges], Detection] | None:
         """Return what reads a suspect again that has few vertices or is deformed; None for any other."""
-        if self.aligned.bent is not None:
-            return partial(self.read_nonrigid, self.aligned.bent)
+        if self.aligned.deformed is not None:
+            return partial(self.read_nonrigid, self.aligned.deformed)
         if self.aligned.heights is None or not isinstance(received, Reception):
             return None
         return partial(self.read_coarse, received, self.aligned.heights)
 
-    def read_nonrigid(self, bent: Bent, charges: Charges) -> Detection:
+    def read_nonrigid(self, deformed: DeformedPoints, charges: Charges) -> Detection:
         """Read a suspect by non-rigid registration; the detection's registration stays that of one map."""
-        received = self.mark.receive(self.aligned.straightened(self.mark.original, bent))
+        received = self.mark.receive(self.aligned.undeformed(self.mark.original, deformed))
         found = self.found._replace(
             coverage=self.mark.coverage(received.observed),
             notes=("Each point was brought back by a map of its own surroundings, as if the suspect was bent.",),
@@ -242,8 +242,8 @@ class _Reading(NamedTuple):
         # A claimed message has no tag to look at, unless it was another one that was read.
         tag = None
         if decoded is not None and (claimed is None or another):
-            paid = () if decoder is None else (ledger.DECODER.charge(decoder),)
-            tag = Tag(TAG_BITS, (*paid, ledger.RANK.charge("each", decoded.rank)))
+            charged = () if decoder is None else (ledger.DECODER.charge(decoder),)
+            tag = Tag(TAG_BITS, (*charged, ledger.RANK.charge("each", decoded.rank)))
         ways = claims_of(mark, received, message)
         caveats = found.evidence.caveats
         evidence = weigh(ways, bits=mark.bits, fixed=fixed, tag=tag, charges=charges, caveats=caveats)

@@ -28,7 +28,7 @@ from jaxmark.watermark.evidence.ledger import Charge
 _MAX_FILE_BYTES = 2**30  # of a record of some hundred million points, or as many digests
 _FORMAT = "jaxmark-record"
 _SCENE_FORMAT, _SCENE_VERSION = "jaxmark-scene", 1
-_COMMITMENT = "jaxmark-deposit"  # the format of its file
+_COMMITMENT = "jaxmark-deposit"  # the format of its file, which keeps its first name
 
 # TimeStampReq of RFC 3161, in DER: version 1, a SHA-256 imprint of 32 bytes, and the wish for the authority's
 # certificate.
@@ -43,7 +43,7 @@ RECORD_SUFFIX = ".jaxmark.json"  # is appended to the name of the marked file
 
 Content = Literal["message", "presence", "fingerprint"]
 
-_FIELDS = {
+_FIELDS = {  # of a file, where "told" is the commitment to the message
     "scheme": str,
     "bits": int,
     "beta": float,
@@ -70,7 +70,7 @@ class Record:
     parameters: Mapping[str, Any] = field(default_factory=dict)  # fields of the scheme
     content: Content = "message"  # what the mark carries
     version: int = SCHEME_VERSION  # version of the keyed choices and of the record
-    told: str = ""  # commitment to the message or the recipient, see `commit`, hexadecimal; empty for presence
+    message_commitment: str = ""  # to the message or the recipient, see `commit`, hexadecimal; empty for presence
     imprint: Mapping[str, Any] = field(default_factory=dict)  # of the original, its tags sealed; a blind mark has none
     code: str = ""  # authentication code by the key, over all other fields, hexadecimal
 
@@ -81,11 +81,11 @@ class Record:
 
     def to_json(self) -> str:
         """The record as JSON text."""
-        return json.dumps({"format": _FORMAT, **asdict(self)}, indent=2) + "\n"
+        return json.dumps({"format": _FORMAT, **self._stored()}, indent=2) + "\n"
 
     def digest(self) -> str:
         """SHA-256 of the record, hexadecimal, which anybody can compute: publish or date this, not the record."""
-        return hashlib.sha256(b"jaxmark/record" + canonical_json(asdict(self))).hexdigest()
+        return hashlib.sha256(b"jaxmark/record" + canonical_json(self._stored())).hexdigest()
 
     def sealed(self, key: bytes) -> "Record":
         """The record with the authentication code of its owner."""
@@ -123,9 +123,9 @@ class Record:
             raise JaxmarkError(f"The payload is {self.bits} bits by the record, not {bits}.")
         return self.bits
 
-    def commits_to(self, told: bytes, choices: Choices) -> bool:
+    def commits_to(self, content: bytes, choices: Choices) -> bool:
         """Whether the record commits to this message or recipient."""
-        return hmac.compare_digest(self.told, commit(told, choices))
+        return hmac.compare_digest(self.message_commitment, commit(content, choices))
 
     def check_claim(self, message: bytes, choices: Choices) -> None:
         """Check that the record does not commit to another message than the one claimed.
@@ -155,8 +155,13 @@ class Record:
         except (KeyError, ValueError, TypeError):
             raise JaxmarkError("The record is damaged: its imprint of the original is not whole.") from None
 
+    def _stored(self) -> dict[str, Any]:
+        """Return the fields under the names that they have in a file."""
+        fields = asdict(self)
+        return {**fields, "told": fields.pop("message_commitment")}
+
     def _code(self, key: bytes) -> str:
-        fields = canonical_json({name: value for name, value in asdict(self).items() if name != "code"})
+        fields = canonical_json({name: value for name, value in self._stored().items() if name != "code"})
         return Choices(Key(key), b"").derive("record", KEY_BYTES, fields).hex()
 
     @classmethod
@@ -186,7 +191,7 @@ class Record:
             raise JaxmarkError(f"The record {where} is damaged: its fields are not those of a record.")
         if data["content"] not in _READERS:
             raise JaxmarkError(f"The record {where} is of a {data['content']}, which this jaxmark does not know.")
-        return cls(**data)
+        return cls(message_commitment=data.pop("told"), **data)
 
 
 @dataclass(frozen=True)
@@ -206,9 +211,9 @@ class SceneRecord:
         return next(iter(self.meshes.values())).bits
 
     @property
-    def told(self) -> str:
-        """What all records commit to, if they commit to anything."""
-        return "".join(record.told for record in self.meshes.values())
+    def message_commitment(self) -> str:
+        """The commitments of all records, joined; empty if none commits to a message."""
+        return "".join(record.message_commitment for record in self.meshes.values())
 
     def to_json(self) -> str:
         """The records as JSON text."""
@@ -254,18 +259,18 @@ def read_json(path: str | os.PathLike[str]) -> Any:
         return None
 
 
-def is_recorded(record: Record | None, told: bytes, choices: Choices) -> bool | None:
+def is_recorded(record: Record | None, content: bytes, choices: Choices) -> bool | None:
     """Whether a record commits to this message or recipient; None if there is no record, or it commits to nothing."""
-    return record.commits_to(told, choices) if record is not None and record.told else None
+    return record.commits_to(content, choices) if record is not None and record.message_commitment else None
 
 
-def commit(told: bytes, choices: Choices) -> str:
+def commit(content: bytes, choices: Choices) -> str:
     """Commit to a message or a recipient, hexadecimal, without revealing it.
 
     It is SHA-256 of a salt of 32 bytes, which derives from the key, and of what is committed to: whoever is shown both
     can check it, and without the salt no guess can be tried.
     """
-    return hashlib.sha256(b"jaxmark/2/told" + choices.derive("told/salt", KEY_BYTES) + told).hexdigest()
+    return hashlib.sha256(b"jaxmark/2/told" + choices.derive("told/salt", KEY_BYTES) + content).hexdigest()
 
 
 def seal_imprint(imprint: Imprint, key: bytes) -> dict[str, Any]:
@@ -316,8 +321,10 @@ class TimestampedCommitment:
             JaxmarkError: if the record is not one of these.
         """
         if record.digest() not in self.digests:
-            raise JaxmarkError(f"The record (digest {record.digest()}) is not in the deposit; it is not dated by it.")
-        free = record.bits if claimed and not record.told else 0
+            raise JaxmarkError(
+                f"The record (digest {record.digest()}) is not in the commitment, which does not prove its age."
+            )
+        free = record.bits if claimed and not record.message_commitment else 0
         return (ledger.COMMITMENT.charge("each", len(self.digests), bits=free),)
 
     def timestamp_request(self) -> bytes:
@@ -341,10 +348,12 @@ class TimestampedCommitment:
             if data["format"] == _COMMITMENT and data["root"] == found.root:
                 return found
         except OSError as error:
-            raise JaxmarkError(f"The deposit {path} cannot be read: {error.strerror}.") from None
+            raise JaxmarkError(f"The commitment {path} cannot be read: {error.strerror}.") from None
         except (ValueError, TypeError, KeyError, RecursionError):
             pass
-        raise JaxmarkError(f"{path} is not a deposit of jaxmark, or was edited: its root is not that of its digests.")
+        raise JaxmarkError(
+            f"{path} is not a commitment of jaxmark, or was edited: its root is not that of its digests."
+        )
 
 
 def make_commitment(digests: Iterable[str]) -> TimestampedCommitment:
@@ -355,5 +364,5 @@ def make_commitment(digests: Iterable[str]) -> TimestampedCommitment:
     """
     distinct = tuple(sorted(set(digests)))
     if not distinct or not all(re.fullmatch("[0-9a-f]{64}", digest) for digest in distinct):
-        raise JaxmarkError("A deposit is made of at least one record's digest, 64 hexadecimal digits each.")
+        raise JaxmarkError("A commitment is made of at least one record's digest, 64 hexadecimal digits each.")
     return TimestampedCommitment(distinct)

@@ -135,4 +135,4 @@ def test_refusals(marked, unchecked):
     with pytest.raises(jm.JaxmarkError, match="too many parameters"):
         blind.evolution("vertices")
     with pytest.raises(jm.JaxmarkError, match="no scheme 'none'"):
-        jm.attack(mesh, blind.remarking(scheme="none"), 1e-3, seed=0)
+        jm.attack(mesh, blind.rewatermarking(scheme="none"), 1e-3, seed=0)

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
 from jaxmark.alignment.attempts import align
-from jaxmark.alignment.nonrigid import _STEPS, Bent, straighten
+from jaxmark.alignment.nonrigid import _STEPS, DeformedPoints, undo_deformation
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.geometry import asteroid
 from jaxmark.geometry.mesh import Mesh, edges
@@ -51,7 +51,7 @@ def test_maps_are_least_squares_with_the_weights_of_a_random_walk(monkeypatch):
     random, original = np.random.default_rng(0), make_original(bumpy_sphere(2))
     x = np.asarray(original.positions)
     y = x + 0.1 * np.sin(3 * x[:, [1, 2, 0]]) + 1e-3 * random.normal(size=x.shape)
-    found = straighten(original.operator, x, Bent(y, original.used))
+    found = undo_deformation(original.operator, x, DeformedPoints(y, original.used))
     walk = np.zeros((len(x), len(x)))
     walk[tuple(edges(original.points.faces).T)] = 1
     walk += walk.T
@@ -69,11 +69,11 @@ def test_maps_are_least_squares_with_the_weights_of_a_random_walk(monkeypatch):
 def test_a_turned_shape_leaves_nothing_and_what_is_unknown_counts_nothing(original):
     x = np.asarray(original.positions)
     turn = Rotation.from_euler("xyz", [40, -70, 10], degrees=True)
-    found = straighten(original.operator, x, Bent(turn.apply(x) + np.array([1.0, 2, 3]), original.used))
+    found = undo_deformation(original.operator, x, DeformedPoints(turn.apply(x) + np.array([1.0, 2, 3]), original.used))
     np.testing.assert_allclose(found.displacement, 0, atol=1e-10)
     known = x[:, 0] < 0.1
     lost = np.where(known[:, None], turn.apply(x), 1e6)
-    part = straighten(original.operator, x, Bent(lost, known))
+    part = undo_deformation(original.operator, x, DeformedPoints(lost, known))
     np.testing.assert_allclose(part.displacement, 0, atol=1e-10)
     assert (part.weights[known] > 0).all()
     assert (part.weights[~known] == 0).all()
@@ -84,9 +84,9 @@ def test_the_mark_turns_back_with_its_surroundings(mesh, original):
     rough = 1e-3 * np.random.default_rng(0).normal(size=mesh.vertices.shape)
     moved = Mesh(np.asarray(mesh.vertices) + original.diagonal * rough, mesh.faces)
     aligned = align(original, folded(moved, 40))
-    assert aligned.bent is not None
+    assert aligned.deformed is not None
     assert aligned.residual > 0.005
-    found = aligned.straightened(original, aligned.bent)
+    found = aligned.undeformed(original, aligned.deformed)
     assert found.residual < 0.3 * aligned.residual
     sound = found.weights > np.median(found.weights)
     alike = [
@@ -100,11 +100,11 @@ def test_the_mark_turns_back_with_its_surroundings(mesh, original):
 def test_what_no_map_brings_back_is_finite_or_counts_nothing(original):
     x = np.asarray(original.positions)
     for squeezed in ([1.0, 1, 0], [1.0, 0, 0], [0.0, 0, 0]):
-        found = straighten(original.operator, x, Bent(x * squeezed, original.used))
+        found = undo_deformation(original.operator, x, DeformedPoints(x * squeezed, original.used))
         assert np.isfinite(found.displacement).all()
         assert np.isfinite(found.weights).all()
     assert (found.weights == 0).all()
-    nothing = straighten(original.operator, x, Bent(x, np.zeros(len(x), bool)))
+    nothing = undo_deformation(original.operator, x, DeformedPoints(x, np.zeros(len(x), bool)))
     assert (nothing.weights == 0).all()
 
 
@@ -134,8 +134,8 @@ def test_without_a_mark_or_its_key_nothing_is_read(mesh, key: jm.Key):
 def test_a_mark_that_reads_by_one_map_is_not_straightened(mesh, key: jm.Key, monkeypatch):
     marker = jm.make_marker(mesh, key, bits=16)
     marked, _ = marker.embed(b"ok", 8e-4)
-    monkeypatch.setattr("jaxmark.alignment.result.straighten", None)
-    bent = jm.attack(marked, "bending", 45, seed=0)
-    assert align(marker.original, bent).bent is not None
-    assert marker.detect(bent).message == b"ok"
-    assert align(marker.original, marked).bent is None
+    monkeypatch.setattr("jaxmark.alignment.result.undo_deformation", None)
+    deformed = jm.attack(marked, "bending", 45, seed=0)
+    assert align(marker.original, deformed).deformed is not None
+    assert marker.detect(deformed).message == b"ok"
+    assert align(marker.original, marked).deformed is None

@@ -114,8 +114,8 @@ def test_a_similarity_mirrors_on_request_or_where_that_fits(mirror):
 
 def test_a_similarity_of_a_flat_shape_turns_if_nothing_tells():
     points = np.random.default_rng(0).normal(size=(50, 3)) * [1, 1, 0]
-    bent = points + 1e-3 * np.random.default_rng(1).normal(size=(50, 1)) * [0, 0, 1]
-    assert not similarity(bent, points, None).mirrors
+    deformed = points + 1e-3 * np.random.default_rng(1).normal(size=(50, 1)) * [0, 0, 1]
+    assert not similarity(deformed, points, None).mirrors
 
 
 @pytest.mark.parametrize("prepare", [turned_round, lambda mesh: mesh], ids=["outside", "inside"])

@@ -48,16 +48,16 @@ def workshop(tmp_path, monkeypatch, capfd, files: Path) -> Workshop:
 
 def test_a_deposit_and_a_request_to_date_it_are_written(workshop: Workshop):
     Path("second.json").write_text(json.dumps(json.loads(Path(RECORD[1]).read_text()) | {"beta": 1.0}))
-    told = workshop.json("deposit", RECORD[1], "second.json", "--output", "all.json")
+    told = workshop.json("commit", RECORD[1], "second.json", "--output", "all.json")
     deposit = TimestampedCommitment.load("all.json")
-    assert told == {"root": deposit.root, "records": 2, "deposit": "all.json", "request": "all.json.tsq"}
+    assert told == {"root": deposit.root, "records": 2, "commitment": "all.json", "request": "all.json.tsq"}
     assert bytes.fromhex(deposit.root) in Path("all.json.tsq").read_bytes()
     assert jm.Record.load(RECORD[1]).digest() in deposit.digests
     # Nothing of what the records commit to, not even the commitments.
     text = Path("all.json").read_text()
     record = json.loads(Path(RECORD[1]).read_text())
     assert not [name for name in ("key", "original", "told", "code") if record[name] in text]
-    said = workshop("deposit", RECORD[1], "second.json", "--output", "again.json")[1]
+    said = workshop("commit", RECORD[1], "second.json", "--output", "again.json")[1]
     assert said == f"2 records → again.json, root {deposit.root}, request → again.json.tsq\n"
     for arguments, sentence in [
         (("model.ply", "--output", "o.json"), "not a record"),
@@ -65,16 +65,16 @@ def test_a_deposit_and_a_request_to_date_it_are_written(workshop: Workshop):
         ((RECORD[1], "--output", RECORD[1]), "same file"),
         ((RECORD[1], "--output", "no/o.json"), "no"),
     ]:
-        assert sentence in workshop.refused("deposit", *arguments)
+        assert sentence in workshop.refused("commit", *arguments)
 
 
 def test_a_dossier_shows_all_but_the_secret(workshop: Workshop):
     Path("second.json").write_text(json.dumps(json.loads(Path(RECORD[1]).read_text()) | {"beta": 1.0}))
-    workshop.json("deposit", RECORD[1], "second.json", "--output", "all.json")
+    workshop.json("commit", RECORD[1], "second.json", "--output", "all.json")
     Path("secrets").mkdir()
     Path("owner.key").rename("secrets/mine.key")
     detect = ("detect", "marked.ply", "--original", "millimetres.stl", "--key", "secrets/mine.key", *RECORD)
-    more = ("--deposit", "all.json", "--obtained", "a shop <b>& co</b>, 1 May", "--dossier", "case")
+    more = ("--commitment", "all.json", "--obtained", "a shop <b>& co</b>, 1 May", "--dossier", "case")
     told = workshop.json(*detect, *more)
     assert told["detected"] is told["proof"] is True
     assert told["caveats"] == told["notes"] == []
@@ -109,10 +109,10 @@ def test_a_dossier_shows_all_but_the_secret(workshop: Workshop):
     words = facts["command"].split()
     assert words == ["jaxmark", *(word.replace("secrets/mine.key", "KEYFILE") for word in detect)]
 
-    _, said, _ = workshop(*detect, "--deposit", "all.json")
+    _, said, _ = workshop(*detect, "--commitment", "all.json")
     assert f"{power(told['log10_p'])} if key, original, message and record were fixed" in said
     assert f"{power(told['log10_p_uncommitted'])} if nothing dates them" in said
-    assert f"{power(told['log10_p_timestamped'])} if the deposit is older than the suspect" in said
+    assert f"{power(told['log10_p_timestamped'])} if the commitment is older than the suspect" in said
 
 
 def test_there_is_no_dossier_of_less_than_a_proof(workshop: Workshop):
@@ -127,10 +127,10 @@ def test_there_is_no_dossier_of_less_than_a_proof(workshop: Workshop):
     )
     sentence = workshop.refused("detect", "model.ply", *DETECT, *RECORD, "--dossier", "case")
     assert "Nothing was detected" in sentence
-    workshop.json("deposit", RECORD[1], "--output", "all.json")
+    workshop.json("commit", RECORD[1], "--output", "all.json")
     Path(RECORD[1]).write_text(json.dumps(json.loads(Path(RECORD[1]).read_text()) | {"beta": 1.0}))
-    assert "was edited" in workshop.refused("detect", "marked.ply", *DETECT, *RECORD, "--deposit", "all.json")
-    assert "not a deposit" in workshop.refused("detect", "marked.ply", *DETECT, *RECORD, "--deposit", RECORD[1])
+    assert "was edited" in workshop.refused("detect", "marked.ply", *DETECT, *RECORD, "--commitment", "all.json")
+    assert "not a commitment" in workshop.refused("detect", "marked.ply", *DETECT, *RECORD, "--commitment", RECORD[1])
     assert not Path("case").exists()
 
 

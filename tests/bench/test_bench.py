@@ -15,7 +15,7 @@ from scipy import stats
 
 import jaxmark as jm
 from jaxmark.app.bench_commands import ManyValues
-from jaxmark.bench import Method, Reading, calibration, leagues, paired
+from jaxmark.bench import Method, Reading, calibration, paired, tracks
 from jaxmark.bench import composed_attacks as compositions
 from jaxmark.bench import robustness_curves as quality
 from jaxmark.bench.corpus import corpus, known_hashes, make_member
@@ -256,15 +256,15 @@ def test_every_attack_of_2026_leaves_a_mesh():
     for package in ("igl", "pymeshlab", "skimage", "fast_simplification", "DracoPy"):
         pytest.importorskip(package)
     mesh = bumpy_sphere(3)
-    for name, line in leagues.LINES_2026.items():
-        for suspect in line.suspects(mesh, 1) if not line.family and name != leagues.OVERWRITTEN else ():
+    for name, line in tracks.LINES_2026.items():
+        for suspect in line.suspects(mesh, 1) if not line.family and name != tracks.OVERWRITTEN else ():
             assert len(jm.make_mesh(suspect.vertices, suspect.faces).faces) > 50, name
 
 
 def test_attacks_that_lack_a_package_are_named_and_left_out(monkeypatch):
-    monkeypatch.setattr(leagues, "find_spec", lambda name: None)
-    assert "pip install 'jaxmark[attacks]'" in leagues.LINES_2026["isotropic 1"].missing()
-    assert leagues.LINES_2026["bending 10"].missing() == ""
+    monkeypatch.setattr(tracks, "find_spec", lambda name: None)
+    assert "pip install 'jaxmark[attacks]'" in tracks.LINES_2026["isotropic 1"].missing()
+    assert tracks.LINES_2026["bending 10"].missing() == ""
 
 
 def test_the_corpus_is_large_and_its_small_members_are_those_that_are_known():
@@ -393,7 +393,7 @@ def test_a_run_of_ones_own_methods_is_calibrated_and_goes_on_where_it_was_ended(
     entries = jm.bench.entries(found)
     assert set(entries) == {"signs", "plain"}
     part = entries["plain"]["payloads"]["8"]
-    attacks = part["leagues"]["smi2010"]["limits"]["perceptual"]["attacks"]
+    attacks = part["tracks"]["smi2010"]["limits"]["perceptual"]["attacks"]
     assert attacks["none"]["read"] == attacks["none"]["trials"] == 1
     assert attacks["noise 0.001"]["published_bit_errors"] == {"cho": 0.03, "wang": 0.01}
     assert 0 < attacks["noise 0.001"]["costs"]["mrms"] < 0.002
@@ -426,7 +426,7 @@ def test_a_mark_is_written_over_by_a_second_one_of_the_same_method(small: dict):
         return Reading(None, float(shift @ signs(key, len(shift)) / max(np.linalg.norm(shift), 1e-300)))
 
     method = replace(SIGNS, read=read)
-    found = jm.bench.run(**{**small, "attacks": ["none", "overwritten"]}, leagues=["2026"], methods=[method])
+    found = jm.bench.run(**{**small, "attacks": ["none", "overwritten"]}, tracks=["2026"], methods=[method])
     scores = {one.task.attack: one.score / math.sqrt(len(small["meshes"]["ball"].vertices)) for one in found.suspects}
     assert scores["none"] == pytest.approx(1, abs=0.01), "the pose that the mark changed a little was undone"
     assert scores["overwritten"] == pytest.approx(math.sqrt(0.5), abs=0.12)
@@ -524,7 +524,7 @@ def test_names_that_no_league_has_are_refused(small: dict):
     for wrong, sentence in (
         ({"attacks": ["frost"]}, "no attack 'frost'; there are none, file"),
         ({"limits": ["hidden"]}, "no set of limits 'hidden'; there are perceptual, geometric"),
-        ({"leagues": ["1999"]}, "no league '1999'; there are smi2010, 2026"),
+        ({"tracks": ["1999"]}, "no track '1999'; there are smi2010, 2026"),
         ({"methods": ["nothing"]}, "no method 'nothing'"),
         ({"meshes": ["nowhere.ply"]}, "nowhere.ply"),
         ({"rate": 2.0}, "between 0 and 1"),
@@ -572,7 +572,7 @@ def test_a_method_that_fails_ends_nothing_but_its_cells(small: dict):
     run = {**small, "attacks": ["none"], "keys": 1}
     found = jm.bench.run(**run, methods=[replace(SIGNS, read=broken)], limits=["perceptual"])
     assert any("ZeroDivisionError: oh" in line for table in tables(found) for line in table.lines)
-    one = jm.bench.entries(found)["signs"]["payloads"]["64"]["leagues"]["smi2010"]["limits"]["perceptual"]["attacks"][
+    one = jm.bench.entries(found)["signs"]["payloads"]["64"]["tracks"]["smi2010"]["limits"]["perceptual"]["attacks"][
         "none"
     ]
     assert one["notes"] == ["ZeroDivisionError: oh"]
@@ -605,7 +605,7 @@ def test_the_command_writes_an_entry_for_each_method_and_a_page(tmp_path: Path, 
     assert done.returncode == 0, done.stderr[-2000:]
     found = json.loads((output / "results.json").read_text())
     assert set(found) == {"keyed", "harmonics", "plain"}
-    attacks = found["keyed"]["payloads"]["64"]["leagues"]["smi2010"]["limits"]["perceptual"]["attacks"]
+    attacks = found["keyed"]["payloads"]["64"]["tracks"]["smi2010"]["limits"]["perceptual"]["attacks"]
     assert attacks["none"]["read"] == 1
     page = (output / "page.html").read_text()
     assert "http" not in page.replace("http-equiv", "")

@@ -9,7 +9,7 @@ import pytest
 from scipy import sparse
 
 import jaxmark as jm
-from jaxmark.bench.leagues import PROTOCOL
+from jaxmark.bench.tracks import PROTOCOL
 from jaxmark.geometry.mesh import Mesh, edges, vertex_normals
 from jaxmark.geometry.pose import similarity
 from tests.samples import bumpy_sphere

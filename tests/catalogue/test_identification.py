@@ -77,7 +77,7 @@ def test_a_suspect_in_any_pose_is_named_with_its_message(shop: Shop):
     answer = verdict.as_json()
     assert (answer["message"], answer["recipient"]) == (MESSAGE.hex(), None)
     # All originals with both keys are paid for, beside what detection with this original alone would prove.
-    assert verdict.tried == 2 * COUNT
+    assert verdict.readings == 2 * COUNT
     alone = jm.detect(
         jm.attack(posed(shop.marked[3]), "noise", 0.002, seed=0), original=shop.originals[3], key=shop.key, bits=32
     )
@@ -109,7 +109,7 @@ def test_both_models_of_a_merged_file_are_named(shop: Shop):
     assert [piece.name for piece in pieces] == ["", "#1", "#2", "#3"]
     found, verdict = named(shop, merged, depth=1)
     assert sorted(found) == ["1", "3"]
-    assert verdict.tried == 4 * COUNT
+    assert verdict.readings == 4 * COUNT
 
 
 @pytest.mark.slow
@@ -130,7 +130,7 @@ def test_records_bind_and_are_paid_for(shop: Shop, tmp_path: Path):
             catalogue.add_record(jm.embed(mesh, message, shop.key, budget=0.004)[1].record)
         catalogue.add_record(info.record)
         verdict = catalogue.find(marked, [shop.key])
-        assert verdict.tried == 3
+        assert verdict.readings == 3
         assert (verdict.named[0].message, verdict.named[0].record) == (MESSAGE.hex(), info.record.digest())
 
 
@@ -156,7 +156,7 @@ def test_copies_are_issued_and_traced(workshop: Workshop):
     workshop("attack", "model-bob.ply", "leaked.ply", "noise", 0.001)
     found = workshop.json("catalogue", "find", "leaked.ply", *shop)
     assert (found["recipient"], Path(found["original"]).name) == ("bob", "model.ply")
-    assert found["tried"] == 3  # two originals, and one list of recipients
+    assert found["readings"] == 3  # two originals, and one list of recipients
     by_order = workshop.json("catalogue", "find", "leaked.ply", *shop, "--align", "same")
     assert by_order["recipient"] == "bob"
     assert by_order["log10_p"] > found["log10_p"] + 1.9  # another way than "auto" costs two decades

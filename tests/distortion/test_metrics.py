@@ -22,8 +22,8 @@ from jaxmark.distortion import (
     geometric_laplacian,
     gl,
     local_roughness,
-    make_hiding,
     make_hinges,
+    make_masking,
     msdm,
     msdm2,
     msdm2_views,
@@ -263,8 +263,8 @@ def metric(name: str, mesh: Mesh, dtype):
             views = msdm2_views(mesh, mesh)
             return lambda y: msdm2(x, y, views)
         case "shading":
-            hiding = make_hiding(mesh.vertices, mesh.faces)
-            return lambda y: shading(x, y, hiding)
+            masking = make_masking(mesh.vertices, mesh.faces)
+            return lambda y: shading(x, y, masking)
         case _:
             hinges, balls = (
                 make_hinges(mesh.faces),

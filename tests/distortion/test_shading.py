@@ -8,7 +8,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
-from jaxmark.distortion import Hiding, make_hiding, shading, vertex_means, visible_turn
+from jaxmark.distortion import Masking, make_masking, shading, vertex_means, visible_turn
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.watermark.schemes.keyed import KeyedScheme
 from tests.samples import rough_sphere
@@ -35,7 +35,7 @@ def wave(vertices: np.ndarray, length: float, turn: float) -> np.ndarray:
 
 
 def seen(original: np.ndarray, distorted: np.ndarray, faces: np.ndarray, share: float = 0.95) -> float:
-    return float(shading(jnp.asarray(original), jnp.asarray(distorted), make_hiding(original, faces), share))
+    return float(shading(jnp.asarray(original), jnp.asarray(distorted), make_masking(original, faces), share))
 
 
 @pytest.mark.parametrize("length", [3.0, 6.0, 9.0, 12.0, 18.0])
@@ -65,7 +65,7 @@ def test_what_is_seen_by_dense_matrices(x64):
         turn = gain * np.linalg.norm(band @ (moved - normals), axis=1)
         own = gain * np.sqrt(power @ np.sum((band @ normals) ** 2, axis=1))
         pooled += (turn / (JUST_SEEN * (1 + (0.0078 * 88.29 * own / JUST_SEEN) ** 4.207) ** (1 / 4.207))) ** 4
-    found = visible_turn(jnp.asarray(x), jnp.asarray(y), make_hiding(x, faces))
+    found = visible_turn(jnp.asarray(x), jnp.asarray(y), make_masking(x, faces))
     np.testing.assert_allclose(found, pooled**0.25, rtol=2e-3)
     order = np.argsort(pooled)
     share = np.cumsum(surface.area_faces[order]) / surface.area
@@ -93,8 +93,8 @@ def test_a_side_of_a_box_is_compared_with_itself(x64):
     top = (v[faces][:, :, 2] > 0.5 - 1e-9).all(axis=1)
     dent = np.where(v[:, 2] > 0.5 - 1e-9, 1e-3 * np.cos(np.pi * v[:, 0]) * np.cos(np.pi * v[:, 1]), 0)
     after = v - dent[:, None] * [0, 0, 1]
-    whole = visible_turn(jnp.asarray(v), jnp.asarray(after), make_hiding(v, faces))
-    alone = visible_turn(jnp.asarray(v), jnp.asarray(after), make_hiding(v * [1, 1, 1], faces[top]))
+    whole = visible_turn(jnp.asarray(v), jnp.asarray(after), make_masking(v, faces))
+    alone = visible_turn(jnp.asarray(v), jnp.asarray(after), make_masking(v * [1, 1, 1], faces[top]))
     np.testing.assert_allclose(np.asarray(whole)[top], alone, rtol=0.02, atol=1e-3)
     assert np.asarray(whole)[~top].max() < 1e-6 < 0.1 < alone.max()
 
@@ -118,15 +118,15 @@ def test_size_place_pose_and_the_order_of_corners_do_not_count(x64):
 
 def test_hard_meshes_have_finite_values_and_gradients(hard_graph: Mesh, dtype):
     x, faces = np.asarray(hard_graph.vertices), np.asarray(hard_graph.faces)
-    hiding = make_hiding(x, faces)
+    masking = make_masking(x, faces)
     y = jnp.asarray(x, dtype) + jnp.asarray(0.1 * np.random.default_rng(0).normal(size=x.shape), dtype)
     flat = jnp.asarray(x * [1, 0, 0], dtype)
     for moved in (jnp.asarray(x, dtype), y, flat):
-        values, slope = jax.value_and_grad(lambda z: visible_turn(jnp.asarray(x, dtype), z, hiding).sum())(moved)
+        values, slope = jax.value_and_grad(lambda z: visible_turn(jnp.asarray(x, dtype), z, masking).sum())(moved)
         assert values.dtype == dtype
         assert np.isfinite(values)
         assert np.isfinite(slope).all()
-    assert np.isfinite(shading(jnp.asarray(x, dtype), y, hiding))
+    assert np.isfinite(shading(jnp.asarray(x, dtype), y, masking))
 
 
 def test_of_a_mesh_itself_nothing_is_seen():
@@ -143,14 +143,14 @@ def test_without_faces_nothing_is_seen(x64):
 
 def test_means_around_vertices(x64):
     v, faces = sheet(5)
-    hiding: Hiding = make_hiding(np.vstack([v, [[9.0, 9, 9]]]), faces)
-    found = vertex_means(jnp.full(len(faces), 2.5), hiding, len(v) + 1)
+    masking: Masking = make_masking(np.vstack([v, [[9.0, 9, 9]]]), faces)
+    found = vertex_means(jnp.full(len(faces), 2.5), masking, len(v) + 1)
     np.testing.assert_allclose(found, [2.5] * len(v) + [0])
 
 
 def test_limits_are_kept(x64):
     """It bounds a mark as other metrics do."""
     mesh = make_mesh(*sheet(24))
-    marker = jm.make_marker(mesh, bytes(32), bits=8, scheme=KeyedScheme(hiding=False))
+    marker = jm.make_marker(mesh, bytes(32), bits=8, scheme=KeyedScheme(masking=False))
     marked, _ = marker.write(marker.codeword(b"c"), {"shading": 1.0})
     assert 0.98 < jm.compare(mesh, marked, ["shading"]).shading <= 1

@@ -118,9 +118,9 @@ def test_tuned_strengths_are_not_worse_than_those_given(mesh):
     poor = KeyedScheme(profile=(1.0,) * 8)
     found = tune(mesh, ATTACKS[:1], RMS, seed=jax.random.key(0), bits=16, scheme=poor)
     report = found.report
-    assert not report.kept
-    assert report.tried.min() >= max(1.1 * report.tried_default.min(), report.tried_channels.min())
+    assert not report.default_kept
+    assert report.trials.min() >= max(1.1 * report.default_trials.min(), report.channel_trials.min())
     # Started from the best, nothing is much better, and so it is kept as it is.
     kept = tune(mesh, ATTACKS[:1], RMS, seed=jax.random.key(0), bits=16, scheme=found.scheme)
-    assert kept.report.tried.min() >= report.tried.min()
-    assert kept.report.kept == (kept.scheme == found.scheme)
+    assert kept.report.trials.min() >= report.trials.min()
+    assert kept.report.default_kept == (kept.scheme == found.scheme)

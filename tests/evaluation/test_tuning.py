@@ -244,7 +244,7 @@ def test_any_function_is_an_attack_and_a_start_is_warm(tuned):
     named = (jm.adversaries.ATTACKS["smoothing"], 5)
     found = tune(mesh, [shrink, named], 5e-4, seed=jax.random.key(0), bits=16, start=before.beta)
     assert 0 <= found.report.gap < 0.02
-    assert found.report.tried[0] > found.report.tried[1]  # a change of size takes nothing of a mark
+    assert found.report.trials[0] > found.report.trials[1]  # a change of size takes nothing of a mark
 
 
 def test_refusals(x64, unchecked):

@@ -300,7 +300,7 @@ def test_draco_is_decoded_and_encoded_again(tmp_path: Path, joints: type) -> Non
     np.testing.assert_array_equal(mesh.faces, BALLS[0].faces)
     np.testing.assert_allclose(mesh.vertices, BALLS[0].vertices, atol=2e-4)
     moved = mesh._replace(vertices=np.asarray(mesh.vertices) * [1.01, 1, 0.99])
-    remarks = save_scene({"mesh": moved}, tmp_path / "b.glb", like=tmp_path / "a.glb")
+    notes = save_scene({"mesh": moved}, tmp_path / "b.glb", like=tmp_path / "a.glb")
     again = load_mesh(tmp_path / "b.glb")
     np.testing.assert_array_equal(again.faces, mesh.faces)
     np.testing.assert_allclose(again.vertices, moved.vertices, atol=5e-7)
@@ -309,7 +309,7 @@ def test_draco_is_decoded_and_encoded_again(tmp_path: Path, joints: type) -> Non
     text, chunk = json.loads(written[20 : 20 + size]), written[28 + size :]
     assert data.rstrip(b"\0") not in chunk  # nothing is left of the mesh as it was
     plain = joints == np.int16  # which the encoder does not know
-    assert len(remarks) == plain
+    assert len(notes) == plain
     assert ("extensionsRequired" in text) != plain
     if plain:
         other = next(iter(trimesh.load_scene(tmp_path / "b.glb", process=False).geometry.values()))

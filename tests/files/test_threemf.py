@@ -101,7 +101,7 @@ def model_with(change: tuple[bytes, bytes]) -> bytes:
 def test_everything_that_xml_allows(tmp_path: Path) -> None:
     scene = load_scene(written(tmp_path, "a.3mf", RICH))
     assert [*scene.meshes] == ["object 7", "caf\xe9 & tea", "object 2"]
-    assert scene.left == {"flat": "it has no triangles"}
+    assert scene.skipped == {"flat": "it has no triangles"}
     _, first, second = scene.meshes.values()
     np.testing.assert_array_equal(first.vertices, [[0.5, 0.25, 0.125], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     np.testing.assert_array_equal(first.faces, [[0, 1, 2], [0, 2, 3]])

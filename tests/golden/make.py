@@ -23,9 +23,9 @@ RECIPIENTS = ("alice", "bob")
 BUDGET = 2e-3
 MARKS: dict[str, Scheme] = {
     "hidden": KeyedScheme(),
-    "keyed": KeyedScheme(hiding=False),
+    "keyed": KeyedScheme(masking=False),
     "normals": KeyedScheme(direction="normals"),
-    "narrow": KeyedScheme(passband="narrow", hiding=False),
+    "narrow": KeyedScheme(passband="narrow", masking=False),
     "host": HostScheme(),
     "eigen": EigenScheme(),
 }

@@ -20,7 +20,7 @@ import trimesh
 
 import jaxmark as jm
 from jaxmark.app import cli
-from jaxmark.bench.leagues import PROTOCOL
+from jaxmark.bench.tracks import PROTOCOL
 from tests import ROOT
 from tests.samples import bumpy_sphere
 

@@ -89,7 +89,7 @@ def test_reading_back_means_the_message(sphere: Mesh, key: jm.Key, scheme):
 def test_reading_back_decodes_jointly_where_plain_correlations_fail(sphere: Mesh, key: jm.Key, monkeypatch):
     marker = jm.make_marker(sphere, key, bits=64)
     marked, _ = marker.embed(MESSAGE, 8e-4, read_back=False)
-    monkeypatch.setattr(KeyedReader, "glance", lambda *_: np.zeros(marker.code_bits))
+    monkeypatch.setattr(KeyedReader, "read_quickly", lambda *_: np.zeros(marker.code_bits))
     assert marker.reads(marked, MESSAGE)
 
 
@@ -114,7 +114,7 @@ def test_golden_displacement(key: jm.Key):
     mesh = exact_sheet(20)
     for scheme, message, golden in [
         (
-            KeyedScheme(hiding=False),
+            KeyedScheme(masking=False),
             b"\xc0",
             [[35.54, 5.6, -13.101], [-9.46, 3.277, -7.756], [3.14, 19.241, -12.517], [18.833, 11.017, -13.563]],
         ),
@@ -124,7 +124,7 @@ def test_golden_displacement(key: jm.Key):
             [[8.556, 7.762, -18.164], [0.802, 0.624, 4.384], [-0.182, -1.225, -3.372], [6.89, 1.826, 25.776]],
         ),
         (
-            KeyedScheme(passband="narrow", hiding=False),
+            KeyedScheme(passband="narrow", masking=False),
             b"\xc0",
             [[29.006, -8.459, -15.871], [-3.116, -7.197, 7.82], [23.682, 3.948, 19.709], [0.086, 4.778, 2.17]],
         ),
@@ -354,8 +354,8 @@ def test_schemes_are_data():
         again = make_scheme(scheme.name, dataclasses.asdict(scheme))
         assert again == scheme
     # Records from before pass bands were tapered do not say so.
-    assert make_scheme("keyed", {"bands": 64}) == KeyedScheme(passband="narrow", hiding=False)
-    assert get_nonblind("keyed") == KeyedScheme(passband="tapered", hiding=True)
+    assert make_scheme("keyed", {"bands": 64}) == KeyedScheme(passband="narrow", masking=False)
+    assert get_nonblind("keyed") == KeyedScheme(passband="tapered", masking=True)
     for parameters in ({"bands": "many"}, {"colour": 1}):
         with pytest.raises(jm.JaxmarkError, match="takes the parameters bands"):
             make_scheme("host", parameters)

@@ -55,7 +55,7 @@ def test_a_presence_mark_is_proven_where_messages_do_not_fit(small: Mesh, key: j
     with pytest.raises(jm.JaxmarkError, match="do not fit"):
         jm.embed(small, bytes(40), key)
     marked, info = jm.embed(small, b"", key)
-    assert (info.record.content, info.record.bits, info.record.told) == ("presence", 0, "")
+    assert (info.record.content, info.record.bits, info.record.message_commitment) == ("presence", 0, "")
     suspect = noisy(marked, 0.5 * info.survives.whole, 0)
     found = jm.detect(suspect, original=small, key=key, record=info.record)
     assert found.message is None

@@ -90,7 +90,7 @@ def test_the_owner_gets_other_choices_for_other_parameters(marked, original: Mes
     suspect, record = marked
     edited = edits(record)["parameters"].sealed(key)
     assert jm.detect(suspect, original=original, key=key, record=record, message=MESSAGE).detected()
-    edited = dataclasses.replace(edited, told="").sealed(key)
+    edited = dataclasses.replace(edited, message_commitment="").sealed(key)
     assert jm.detect(suspect, original=original, key=key, record=edited, message=MESSAGE).log10_p > -6
 
 
@@ -179,7 +179,9 @@ def test_the_record_commits_to_the_message(marked, original: Mesh, key: jm.Key):
     with pytest.raises(jm.JaxmarkError, match="commits to another message"):
         jm.detect(suspect, original=original, key=key, record=record, message=b"no")
     # A message that the record committed to counts as claimed, without paying for all others.
-    without = jm.detect(suspect, original=original, key=key, record=dataclasses.replace(record, told="").sealed(key))
+    without = jm.detect(
+        suspect, original=original, key=key, record=dataclasses.replace(record, message_commitment="").sealed(key)
+    )
     assert jm.detect(suspect, original=original, key=key, record=record).log10_p < without.log10_p
     choices = Choices(key, b"c" * 32)
     assert commit(b"a", choices) != commit(b"b", choices) != commit(b"b", Choices(key, b"d" * 32))
@@ -214,11 +216,11 @@ def test_deposits_date_records(marked, original: Mesh, key: jm.Key, tmp_path: Pa
         return figure(-20.0, dated.charges(one, claimed=claimed))
 
     assert charged(deposit, record, claimed=True) == pytest.approx(-20 + np.log10(7))
-    first = dataclasses.replace(record, told="")
+    first = dataclasses.replace(record, message_commitment="")
     dated = make_commitment([first.digest()])
     assert charged(dated, first, claimed=True) == pytest.approx(-20 + 16 * np.log10(2)), "it commits to none"
     assert charged(dated, first, claimed=False) == -20
-    with pytest.raises(jm.JaxmarkError, match="not in the deposit"):
+    with pytest.raises(jm.JaxmarkError, match="not in the commitment"):
         charged(make_commitment(others), record, claimed=True)
     path = tmp_path / "deposit.json"
     path.write_text(deposit.to_json())
@@ -227,7 +229,7 @@ def test_deposits_date_records(marked, original: Mesh, key: jm.Key, tmp_path: Pa
     assert len(roots) == 7
     for text in ("", "[]", "{}", deposit.to_json().replace(deposit.root, "00" * 32), '{"digests": ["x"]}'):
         path.write_text(text)
-        with pytest.raises(jm.JaxmarkError, match="not a deposit"):
+        with pytest.raises(jm.JaxmarkError, match="not a commitment"):
             TimestampedCommitment.load(path)
     with pytest.raises(jm.JaxmarkError, match="cannot be read"):
         TimestampedCommitment.load(tmp_path / "absent")

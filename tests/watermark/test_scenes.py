@@ -180,9 +180,9 @@ def test_commands_on_a_file_of_several_meshes(tmp_path, monkeypatch, capfd, orig
     before, after = load_scene("a.glb").meshes, load_scene("e.glb").meshes
     np.testing.assert_array_equal(before["right"].vertices, after["right"].vertices)
     assert "faces" in workshop.refused("attack", "b.glb", "f.glb", "midpoint", "1")
-    deposit = workshop.json("deposit", "b.glb.jaxmark.json", "--output", "d.json")
+    deposit = workshop.json("commit", "b.glb.jaxmark.json", "--output", "d.json")
     assert deposit["records"] == 1
-    assert workshop.json("detect", "b.glb", *read, "--deposit", "d.json")["log10_p_timestamped"] < -6
+    assert workshop.json("detect", "b.glb", *read, "--commitment", "d.json")["log10_p_timestamped"] < -6
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -341,8 +341,8 @@ class _GltfSource(Source):
         if plain:
             draco.forget_unused(document)
         why = "written without Draco, whose encoder does not know all types"
-        remarks = (f"{', '.join(plain)}: {why}",) if plain else ()
-        return self.document.encode(document, contents, name)._replace(remarks=remarks)
+        notes = (f"{', '.join(plain)}: {why}",) if plain else ()
+        return self.document.encode(document, contents, name)._replace(notes=notes)
 
 
 def _bound(accessor: dict[str, Any], positions: Points, elements: Elements) -> None:

@@ -106,7 +106,7 @@ class Pieces(NamedTuple):
     shares: Float64[np.ndarray, "samples 3"]  # of each corner in the sample's position
     part: Float64[np.ndarray, " samples"]  # of the face's area that the sample stands for
     piece: Int[np.ndarray, " samples"]  # number of the piece that it belongs to, ascending
-    room: Bool[np.ndarray, " pieces"]  # of no other use than its length
+    padding: Bool[np.ndarray, " pieces"]  # of no other use than its length
 
     def of(self, vertices: Float[Array, "vertices 3"]) -> Patches:
         """The pieces for vertices anywhere."""
@@ -117,7 +117,7 @@ class Pieces(NamedTuple):
         # The small number keeps roots and divisions, and their derivatives, finite where there is nothing.
         area = jnp.sqrt(jnp.sum(normals**2, axis=1) + _TINY**2)
         columns = jnp.concatenate([area[:, None] * points, normals, area[:, None]], axis=1)
-        sums = jax.ops.segment_sum(columns, self.piece, len(self.room), indices_are_sorted=True)
+        sums = jax.ops.segment_sum(columns, self.piece, len(self.padding), indices_are_sorted=True)
         total = jnp.maximum(sums[:, 6], _TINY)
         return Patches(sums[:, :3] / total[:, None], sums[:, 3:6], total)
 
@@ -151,8 +151,8 @@ def cut(mesh: Mesh, width: float) -> Pieces:
     keys = np.concatenate([cube, normals[face] > 0], axis=1)
     _, piece = np.unique(keys, axis=0, return_inverse=True)
     order = np.argsort(piece.ravel(), kind="stable")
-    room = np.zeros(int(piece.max(initial=0)) + 1, bool)
-    return Pieces(faces[face][order], shares[order], 1 / count[face][order], piece.ravel()[order], room)
+    padding = np.zeros(int(piece.max(initial=0)) + 1, bool)
+    return Pieces(faces[face][order], shares[order], 1 / count[face][order], piece.ravel()[order], padding)
 
 
 @jax.jit
@@ -237,8 +237,8 @@ def _alike(several: Sequence[Pieces | Anchors], padding: tuple[float, ...]) -> l
     for arrays, value in zip(zip(*several, strict=True), padding, strict=True):
         rows, *columns = np.max([one.shape for one in arrays], axis=0)
         shape = (common_size(int(rows)), *columns)
-        room = [[(0, most - own) for most, own in zip(shape, one.shape, strict=True)] for one in arrays]
-        named.append([np.pad(one, wide, constant_values=value) for one, wide in zip(arrays, room, strict=True)])
+        widths = [[(0, most - own) for most, own in zip(shape, one.shape, strict=True)] for one in arrays]
+        named.append([np.pad(one, wide, constant_values=value) for one, wide in zip(arrays, widths, strict=True)])
     return list(zip(*named, strict=True))
 
 

@@ -78,8 +78,8 @@ class FieldScheme(BlindScheme):
         faces = turned(faces) if placed.inside_out else faces
         matrix, shift = jnp.asarray(placed.pose.matrix, dtype), jnp.asarray(placed.pose.shift, dtype)
         closed, free, found = encloses(original.points), _inverse_areas(original), {}
-        seen = see(Mesh(placed.pose(original.positions), faces), self.widths, dtype)
-        for width, (pieces, surface, anchors) in seen.items():
+        views = see(Mesh(placed.pose(original.positions), faces), self.widths, dtype)
+        for width, (pieces, surface, anchors) in views.items():
             size = jnp.asarray(width, dtype)
             shape = Shape(matrix, shift, faces, pieces, anchors, size, closed)
             shown = look(surface, anchors, jnp.zeros(anchors.places.shape, dtype), size, jnp.zeros((), dtype))
@@ -100,12 +100,12 @@ class FieldScheme(BlindScheme):
         for steps in _UNDONE_STEPS:
             try:
                 placed = place(unsmoothed(suspect, steps))
-                seen = see(placed.mesh, self.widths, dtype)
+                views = see(placed.mesh, self.widths, dtype)
             except JaxmarkError:
                 if steps == 0:
                     raise
                 continue  # it was noise, not smoothing, and is too rough now to be looked at
-            for width, (_, surface, anchors) in seen.items():
+            for width, (_, surface, anchors) in views.items():
                 for blur in _BLURS if steps == 0 else _BLURS[:1]:
                     found = changes(surface, anchors, jnp.asarray(width, dtype), jnp.asarray(blur, dtype))
                     at = jnp.asarray(anchors.places, dtype)

@@ -222,7 +222,7 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
     soft = np.stack([one.soft for one in readings])
     choices, bits, claimed, record = claim
     decoded = None if claimed == b"" else decode_any(soft, bits, choices, TAG_BITS, _CANDIDATES)
-    recorded = record is not None and bool(record.told)
+    recorded = record is not None and bool(record.message_commitment)
     message = claimed
     if decoded is not None and decoded.message != claimed:
         message = decoded.message if is_recorded(record, decoded.message, choices) else None

@@ -30,7 +30,7 @@ from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import DEFAULT_BITS
 from jaxmark.watermark.perception.budget import Bounds, displace_within
 from jaxmark.watermark.perception.capacity import NOISE, Survival
-from jaxmark.watermark.perception.masking import apply_mask, hiding_directions
+from jaxmark.watermark.perception.masking import apply_mask, masking_directions
 
 _RIDGE = 3e-3  # of the mean square of a row: values that contradict each other are met halfway
 _HELD_RIDGE = 1e-4  # of the rows of what is held, which are scaled to the others' size
@@ -156,7 +156,7 @@ class Writer:
     def _mask(self) -> Float[Array, "rows 3 3"]:
         original = self.original
         if self.scheme.hiding:
-            return original.to_traced(hiding_directions(original))
+            return original.to_traced(masking_directions(original))
         return original.to_traced(np.tile(np.eye(3), (len(original.used), 1, 1)))
 
     def off(self, host: AnchoredHost, dither: Dither, word: Float64[np.ndarray, " code"], step: float) -> np.ndarray:

@@ -20,7 +20,7 @@ from jaxmark.spectral.chebyshev import band_energies, filter, transpose
 from jaxmark.spectral.laplacian import per_row
 from jaxmark.spectral.precision import matmul, sum_and_norm
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.interfaces import Claim, Displacement, Room, Strength, check_strength
+from jaxmark.watermark.interfaces import Claim, Displacement, FreeDimensions, Strength, check_strength
 from jaxmark.watermark.perception.masking import apply_mask
 from jaxmark.watermark.reading.reception import (
     Host,
@@ -101,10 +101,10 @@ class KeyedCarrier(NamedTuple):
         unit = jnp.eye(self.code_bits, dtype=self._signs.dtype)
         return jax.lax.map(lambda bits: self.adjoint(self.displacement(bits, beta), beta), unit)
 
-    def claim(self, seen: Observation, bits: Float[Array, " bits"]) -> Claim:
+    def claim(self, observation: Observation, bits: Float[Array, " bits"]) -> Claim:
         """See `Carrier`, and `KeyedReader.claim`."""
         reader = self.reader()
-        return reader.claim(reader.receive(seen), bits)
+        return reader.claim(reader.receive(observation), bits)
 
     def redraw(self, seed: Seed) -> "KeyedCarrier":
         """See `Carrier`; the slots stay as they are, and so do signs of 0, on vertices that do not move."""
@@ -199,9 +199,9 @@ class KeyedReader(NamedTuple):
         host = self.carrier.host
         return Receiver(host.operator, host.signal, host.coefficients, self.nuisance)
 
-    def receive(self, seen: Observation) -> Reception:
+    def receive(self, observation: Observation) -> Reception:
         """See `Reader`, and `jaxmark.watermark.reading.reception.receive`."""
-        return receive(self.receiver, seen)
+        return receive(self.receiver, observation)
 
     def ways(self, received: Reception) -> Sequence[Reception]:
         """See `Reader`; the bands are weighted by what the suspect shows of them, and then all alike.
@@ -227,14 +227,14 @@ class KeyedReader(NamedTuple):
         self, received: Reception, residual: Displacement, bits: Float[Array, " bits"]
     ) -> Float[Array, ""]:
         """See `Reader`; weights, gain, power and axes are held fixed."""
-        left = matmul(clean(received.receiver, received.seen, received.factor, residual), received.axes)
+        left = matmul(clean(received.receiver, received.observation, received.factor, residual), received.axes)
         return jnp.sum(bits * self.carrier.correlate(matmul(left, received.axes), self._matched_coefficients(received)))
 
     @jax.jit
-    def glance(self, seen: Observation, beta: Strength = 1.0) -> Float[Array, " bits"]:
+    def read_quickly(self, observation: Observation, beta: Strength = 1.0) -> Float[Array, " bits"]:
         """See `Reader`; plain correlations without the nuisance, in which the bits are noise to each other."""
         receiver = self.receiver
-        residual = clean(receiver, seen, normal_factor(receiver, seen), seen.residual)
+        residual = clean(receiver, observation, normal_factor(receiver, observation), observation.residual)
         return self.carrier.correlate(residual, self.carrier.coefficients(beta))
 
     @jax.jit
@@ -243,7 +243,7 @@ class KeyedReader(NamedTuple):
         residual = matmul(received.residual, received.axes)
         return self.carrier.correlate(residual, self._matched_coefficients(received))
 
-    def room(self, moving: Float[Array, " vertices"]) -> Room:
+    def free_dimensions(self, moving: Float[Array, " vertices"]) -> FreeDimensions:
         """See `Reader`; measured with one probe, which has random signs in place of the keyed ones."""
         whole, left = np.asarray(self._probe(moving), np.float64).clip(0)
         profile = self.carrier.profile
@@ -253,7 +253,7 @@ class KeyedReader(NamedTuple):
         energy = strength**2 / displaced if displaced > 0 else strength**2
         # Masked, the same energy is in fewer dimensions.
         share = self.carrier.masked_share()
-        return Room(share * left * (strength > 0), energy / share)
+        return FreeDimensions(share * left * (strength > 0), energy / share)
 
     def with_carrier(self, carrier: KeyedCarrier) -> "KeyedReader":
         """See `Reader`."""

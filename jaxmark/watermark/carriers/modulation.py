@@ -21,9 +21,9 @@ class PlainReader(NamedTuple):
 
     carrier: Any  # a `Carrier`
 
-    def receive(self, seen: Observation) -> Observation:
+    def receive(self, observation: Observation) -> Observation:
         """See `Reader`; returns the suspect itself."""
-        return seen
+        return observation
 
     def ways(self, received: Observation) -> Sequence[Observation]:
         """See `Reader`; the only way is to take the suspect as it is."""
@@ -39,7 +39,7 @@ class PlainReader(NamedTuple):
         """See `Reader`; a plain correlation is linear already."""
         return self.carrier.claim(received._replace(residual=residual), bits).score
 
-    def glance(self, seen: Observation, beta: Strength = 1.0) -> None:
+    def read_quickly(self, observation: Observation, beta: Strength = 1.0) -> None:
         """See `Reader`; there is no shortcut, because reading is fast anyway."""
         return None
 
@@ -47,7 +47,7 @@ class PlainReader(NamedTuple):
         """See `Reader`; detectors of plain carriers are fast."""
         return None
 
-    def room(self, moving: Float[Array, " vertices"]) -> None:
+    def free_dimensions(self, moving: Float[Array, " vertices"]) -> None:
         """See `Reader`; there is no model of noise."""
         return None
 
@@ -86,9 +86,9 @@ class ModulatedCarrier(NamedTuple):
         weighted = self._per_band(beta) * self._sequences
         return einsum("ajc,cjl,blc->ab", weighted, self.components.gram, weighted)
 
-    def claim(self, seen: Observation, bits: Float[Array, " bits"]) -> Claim:
+    def claim(self, observation: Observation, bits: Float[Array, " bits"]) -> Claim:
         """See `Carrier`; the keyed signs are one per band and coordinate, or one per band if coordinates share them."""
-        found = self.components.analyse(self._as_real(seen.weigh(seen.residual)))
+        found = self.components.analyse(self._as_real(observation.weigh(observation.residual)))
         if self.sequences.shape[-1] == 1:
             found = found.sum(axis=1, keepdims=True)
         return Claim(*sum_and_norm(einsum("k,kjc->jc", self._as_real(bits), self._as_real(self.sequences)) * found))

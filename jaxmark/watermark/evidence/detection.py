@@ -170,7 +170,7 @@ def accuse(
     scores: Float[np.ndarray, " recipients"],
     values: Float[np.ndarray, " slots"],
     biases: Float[np.ndarray, " slots"],
-    tried: int,
+    candidates: int,
 ) -> Float64[np.ndarray, " recipients"]:
     """Return log10 of a bound on the probability that any innocent of those who were tried has such a score.
 
@@ -178,9 +178,9 @@ def accuse(
         scores: of the recipients who are accused, see `jaxmark.watermark.tracing.tardos.scores`.
         values: of the slots, **independent of the codewords of innocents**.
         biases: of the slots.
-        tried: number of all recipients who were tried.
+        candidates: number of all recipients who were tried.
     """
-    charge = ledger.RECIPIENTS.charge("each", max(tried, 1))
+    charge = ledger.RECIPIENTS.charge("each", max(candidates, 1))
     return np.array([figure(one, [charge]) for one in bounds.log10_p_fingerprint(scores, values, biases)])
 
 

@@ -16,7 +16,7 @@ from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key
 from jaxmark.watermark.coding.message import TAG_BITS
-from jaxmark.watermark.interfaces import Carrier, Reader, Room, Scheme
+from jaxmark.watermark.interfaces import Carrier, FreeDimensions, Reader, Scheme
 from jaxmark.watermark.perception.budget import Bounds, displace_within
 
 _MAX_PAYLOAD_BYTES = 2**20  # if nothing else bounds the payload
@@ -105,7 +105,8 @@ class Conditions(NamedTuple):
 class Capacity:
     """Computes how many bits an original can carry with a scheme; measures each layout only once.
 
-    If the scheme's reader has no model of noise (see `Reader.room`), only the number of code bits limits the payload.
+    If the scheme's reader has no model of noise (see `Reader.free_dimensions`), only the number of code bits limits
+    the payload.
     """
 
     def __init__(
@@ -126,7 +127,7 @@ class Capacity:
         self.original, self.scheme = original, scheme
         self._known = {scheme.layout(original, bits): make for bits, make in (known or {}).items()}
         self._reference = reference
-        self._rooms: dict[Hashable, Room | None] = {}
+        self._free: dict[Hashable, FreeDimensions | None] = {}
         self._reached: dict[Hashable, float] = {}
 
     def least_budget(self, bits: int, conditions: Conditions) -> float:
@@ -204,13 +205,13 @@ class Capacity:
 
         return math.exp(optimize.root_scalar(excess, bracket=(-100.0, 0.0)).root)
 
-    def _left(self, bits: int) -> Room | None:
-        """The room for a payload."""
+    def _left(self, bits: int) -> FreeDimensions | None:
+        """Return the free dimensions for a payload."""
         layout = self.scheme.layout(self.original, bits)
-        if layout not in self._rooms:
+        if layout not in self._free:
             make = self._known.get(layout) or self._carrier(bits).reader
-            self._rooms[layout] = make().room(self.original.to_traced(self.original.used))
-        return self._rooms[layout]
+            self._free[layout] = make().free_dimensions(self.original.to_traced(self.original.used))
+        return self._free[layout]
 
     def reach(self, bits: int, bounds: Bounds) -> float:
         """RMS displacement, in diagonals, that bounds surely allow a mark with a payload of `bits` bits."""

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Float64, Int
 from scipy import sparse
 
 from jaxmark.alignment.original import Original
-from jaxmark.distortion import Hiding, make_hiding
+from jaxmark.distortion import Masking, make_masking
 from jaxmark.geometry.clouds import spacings
 from jaxmark.geometry.mesh import Mesh, area, edges, face_normals, open_sides, unit
 from jaxmark.spectral.bands import diffusion
@@ -24,7 +24,7 @@ from jaxmark.spectral.padding import pad_rows
 from jaxmark.spectral.precision import matmul
 
 Found = TypeVar("Found")
-_BAND = 2  # of `Hiding`: waves six edges long, of which marks mostly consist
+_BAND = 2  # of `Masking`: waves six edges long, of which marks mostly consist
 _SLOPE = 0.9  # largest slope of such a wave, times an edge, over its height
 _ALONG = 0.04  # displacement along the surface, in edges, that counts as much as a just noticeable one across it
 _BENT = np.radians(2)  # angle between faces from which on a surface may hide as much as that angle
@@ -39,7 +39,7 @@ _PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # of a matrix's entries a
 _SPACING_SCALE = 5  # spacings are averaged over 2^5 steps of diffusion
 
 
-def hiding_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
+def masking_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     """Matrices that turn and scale displacements so that each point is moved where, and as, it is hidden.
 
     Each face around a point allows a displacement along its normal as far as a wave of that height is just noticeable
@@ -128,10 +128,10 @@ def _heights(
 ) -> tuple[Float64[np.ndarray, " faces"], Float64[np.ndarray, " faces"], Float64[np.ndarray, " faces"]]:
     """Each face's share of the area, how high a wave is just noticeable on it, and how high where nothing hides it."""
     with jax.ensure_compile_time_eval():  # carriers may be made in traced code
-        hiding = make_hiding(mesh.vertices, mesh.faces, _BAND + 1)
-        bends = _bends(hiding)
-    shares = np.asarray(hiding.area)
-    bare, masked = hiding.bare[_BAND], hiding.threshold[_BAND]
+        masking = make_masking(mesh.vertices, mesh.faces, _BAND + 1)
+        bends = _bends(masking)
+    shares = np.asarray(masking.area)
+    bare, masked = masking.bare[_BAND], masking.threshold[_BAND]
     edge = np.sqrt(4 / np.sqrt(3) * shares * area(mesh))  # of an equilateral triangle
     least = _MIN_HIDDEN * bare
     return shares, edge * np.maximum(np.minimum(masked - bare, bends), least) / _SLOPE, edge * least / _SLOPE
@@ -156,11 +156,11 @@ def _by_spacing(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     return (factor / np.sqrt(np.mean(factor**2)))[:, None, None] * np.eye(3)
 
 
-def _bends(hiding: Hiding) -> Float64[np.ndarray, " faces"]:
+def _bends(masking: Masking) -> Float64[np.ndarray, " faces"]:
     """The most that faces hide by how they bend, as geometric means around each."""
-    logs = pad_rows(np.log(np.maximum(hiding.bend**2 / _BENT, _LEAST_BEND)), len(hiding.links.degree))
+    logs = pad_rows(np.log(np.maximum(masking.bend**2 / _BENT, _LEAST_BEND)), len(masking.links.degree))
     average = diffusion(_AVERAGING_SCALE + 1, 2**_AVERAGING_SCALE + 1)[_AVERAGING_SCALE]
-    return np.exp(np.asarray(filter(hiding.links, average, jnp.asarray(logs)), np.float64)[: len(hiding.bend)])
+    return np.exp(np.asarray(filter(masking.links, average, jnp.asarray(logs)), np.float64)[: len(masking.bend)])
 
 
 def _squares(x: Float64[np.ndarray, "rows 3"], size: Float64[np.ndarray, " rows"]) -> Float64[np.ndarray, "rows 6"]:

@@ -42,9 +42,9 @@ def band_visibility(
     (signs,) = probe_signs("visibility", original.signal.shape, dtype=original.signal.dtype)
     signs = signs * original.to_traced(original.used)[:, None]
     count = len(coefficients)
-    tried = np.unique(np.round(np.geomspace(1, count, min(_SAMPLED_BANDS, count))).astype(int)) - 1
+    candidates = np.unique(np.round(np.geomspace(1, count, min(_SAMPLED_BANDS, count))).astype(int)) - 1
     values = []
-    for band in tried:
+    for band in candidates:
         shift = original.to_host(apply_mask(mask, filter(original.operator, coefficients[band], signs)))
         size = float(distortion.rms(shift[original.used]))
         # A band beyond the mesh's spectrum is empty.
@@ -52,7 +52,9 @@ def band_visibility(
         values.append(found)
     known = np.array(values).T
     logs = [
-        np.interp(np.log(np.arange(count) + 1.0), np.log(tried[np.isfinite(row)] + 1.0), np.log(row[np.isfinite(row)]))
+        np.interp(
+            np.log(np.arange(count) + 1.0), np.log(candidates[np.isfinite(row)] + 1.0), np.log(row[np.isfinite(row)])
+        )
         for row in np.maximum(known, 1e-12)
     ]
     return np.exp(np.array(logs))

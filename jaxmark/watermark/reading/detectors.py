@@ -30,8 +30,8 @@ def correlate(reader: Reader, received: Received, beta: Strength = 1.0) -> Float
 
     Its sign is the bit if the components are nearly orthogonal.
     """
-    seen = received.observed
-    return reader.carrier.adjoint(seen.weigh(seen.residual), beta)
+    observation = received.observed
+    return reader.carrier.adjoint(observation.weigh(observation.residual), beta)
 
 
 def decorrelate(reader: Reader, received: Received, beta: Strength = 1.0) -> Float[Array, " bits"]:
@@ -93,11 +93,11 @@ def _decode_jointly(
 
     def forward(bits: Array) -> Array:
         spread = carrier.modulate(bits, model)
-        return whiten(matmul(clean(receiver, received.seen, received.factor, spread), received.axes))
+        return whiten(matmul(clean(receiver, received.observation, received.factor, spread), received.axes))
 
     def backward(white: Array) -> Array:
         filtered = matmul(transpose(receiver.operator, equaliser, white), received.axes)
-        return carrier.correlate(clean(receiver, received.seen, received.factor, filtered), model)
+        return carrier.correlate(clean(receiver, received.observation, received.factor, filtered), model)
 
     def whiten(x: Array) -> Array:
         return filter(receiver.operator, equaliser, x)
@@ -107,7 +107,7 @@ def _decode_jointly(
     # spectrum, contribute to the energy before and after matched filtering.
     bits, signs = probe_signs("detection", (carrier.code_bits,), observed.shape, dtype=observed.dtype)
     coloured = filter(receiver.operator, matmul(receiver.coefficients.T, jnp.sqrt(received.power)), signs)
-    noise = whiten(clean(receiver, received.seen, received.factor, coloured))
+    noise = whiten(clean(receiver, received.observation, received.factor, coloured))
     # The three run one after the other, so that there is less to compile.
     matched, response, after = jax.lax.map(backward, jnp.stack([observed, forward(bits), noise]))
     ridge = _noise_to_signal(

@@ -68,7 +68,7 @@ class Reception(NamedTuple):
     gain: Float[Array, " bands"]  # share of the host's amplitude, and so of the mark's, that the attack left
     power: Float[Array, " bands"]  # residual energy per dimension, relative to the largest
     axes: Float[Array, "3 3"]  # the symmetric matrix that made the residual equally strong along all directions
-    seen: Observation  # the suspect with lower weights for points that were edited or lost
+    observation: Observation  # the suspect with lower weights for points that were edited or lost
     factor: Float[Array, "unknowns unknowns"]  # Cholesky factor of the nuisance's normal equations, with these weights
 
 
@@ -118,11 +118,11 @@ def nuisance_basis(host: Host) -> Float[Array, "vertices columns"]:
     return _basis(columns, inside, jnp.moveaxis(smooth, 0, 1))
 
 
-def extend(receiver: Receiver, seen: Observation) -> Receiver:
+def extend(receiver: Receiver, observation: Observation) -> Receiver:
     """Add to the receiver's nuisance what the suspect shows to have happened to the host."""
-    if seen.nuisance is None:
+    if observation.nuisance is None:
         return receiver
-    return receiver._replace(nuisance=_join_bases(receiver.nuisance, seen.nuisance))
+    return receiver._replace(nuisance=_join_bases(receiver.nuisance, observation.nuisance))
 
 
 @jax.jit
@@ -188,34 +188,34 @@ def _sum_over_blocks(function: Callable[..., Array], *rows: Array) -> Array:
     return jax.lax.scan(lambda total, start: (total + block_sum(start), None), zero, starts)[0]
 
 
-def receive(receiver: Receiver, seen: Observation) -> Reception:
+def receive(receiver: Receiver, observation: Observation) -> Reception:
     """Project the nuisance off a residual, and measure gain and power of each band, and the power along each direction.
 
     Args:
         receiver: the original, from `make_receiver`.
-        seen: what the suspect shows of the displacement, in the units of the host.
+        observation: what the suspect shows of the displacement, in the units of the host.
 
     Raises:
         JaxmarkError: if the residual is neither float32 nor float64.
     """
-    check_precision("receive", seen.residual)
-    wider = extend(receiver, seen)
+    check_precision("receive", observation.residual)
+    wider = extend(receiver, observation)
     # Only `_receive` is compiled, because a compiled function would return copies of its arguments.
-    return Reception(wider, seen, *_receive(wider, seen))
+    return Reception(wider, observation, *_receive(wider, observation))
 
 
 @jax.jit
-def _receive(receiver: Receiver, seen: Observation) -> tuple[Array, Array, Array, Array, Observation, Array]:
+def _receive(receiver: Receiver, observation: Observation) -> tuple[Array, Array, Array, Array, Observation, Array]:
     # Points that are still far off without the nuisance were edited or lost, so they get lower weights.
-    strange = _huber_weights if seen.normals is None else _precision
-    seen = seen._replace(weights=seen.weights * strange(receiver, seen))
-    factor = normal_factor(receiver, seen)
+    strange = _huber_weights if observation.normals is None else _precision
+    observation = observation._replace(weights=observation.weights * strange(receiver, observation))
+    factor = normal_factor(receiver, observation)
     # The nuisance is projected off twice, because the ridge leaves a little of a large nuisance behind.
-    nuisance = _fit_nuisance(receiver, seen, factor, seen.residual)
-    residual = clean(receiver, seen, factor, seen.residual - nuisance)
+    nuisance = _fit_nuisance(receiver, observation, factor, observation.residual)
+    residual = clean(receiver, observation, factor, observation.residual - nuisance)
     # White noise is the reference for the power of each band.
     (probe,) = probe_signs("reception", residual.shape, dtype=residual.dtype)
-    pair = jnp.concatenate([residual, clean(receiver, seen, factor, probe)], axis=1)
+    pair = jnp.concatenate([residual, clean(receiver, observation, factor, probe)], axis=1)
     squares = gram(receiver.operator, receiver.coefficients, pair, method="moments")
     # Rounding may make the energy of a band negative.
     bands, reference = jnp.maximum(einsum("pcjj->pj", squares.reshape(2, 3, *squares.shape[1:])), 0)
@@ -234,8 +234,8 @@ def _receive(receiver: Receiver, seen: Observation) -> tuple[Array, Array, Array
     pair = jnp.concatenate([residual + nuisance, receiver.signal], axis=1)
     change, whole = over_bands(products, receiver.operator, receiver.coefficients, pair)
     gain = 1 + jnp.where(whole > 0, change / jnp.where(whole > 0, whole, 1), 0)
-    axes = _axes(filter(receiver.operator, whitening(receiver, power), residual), seen)
-    return (matmul(residual, axes), jnp.clip(gain, 0, 2), power, axes, seen, factor)
+    axes = _axes(filter(receiver.operator, whitening(receiver, power), residual), observation)
+    return (matmul(residual, axes), jnp.clip(gain, 0, 2), power, axes, observation, factor)
 
 
 def weigh_evenly(received: Reception) -> Reception:
@@ -253,9 +253,9 @@ def whitening(receiver: Receiver, power: Float[Array, " bands"]) -> Float[Array,
     return matmul(receiver.coefficients.T, 1 / jnp.sqrt(power))
 
 
-def _axes(white: Float[Array, "vertices 3"], seen: Observation) -> Float[Array, "3 3"]:
+def _axes(white: Float[Array, "vertices 3"], observation: Observation) -> Float[Array, "3 3"]:
     """C^-1/2 of the coordinates' covariance C, which an inverted stretch leaves unequal; of mean eigenvalue 1."""
-    if seen.normals is not None:
+    if observation.normals is not None:
         return jnp.eye(3, dtype=white.dtype)
     products = matmul(white.T, white)
     total = jnp.trace(products)
@@ -281,26 +281,26 @@ def _inverse_root_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Ar
     return matmul(vectors / root, vectors.T), einsum("ik,kl,jl->ij", vectors, change, vectors)
 
 
-def _huber_weights(receiver: Receiver, seen: Observation) -> Float[Array, " vertices"]:
+def _huber_weights(receiver: Receiver, observation: Observation) -> Float[Array, " vertices"]:
     """Huber weights on squared lengths: 1 up to four times their median, which Gaussian noise rarely exceeds."""
-    residual = clean(receiver, seen, normal_factor(receiver, seen), seen.residual)
+    residual = clean(receiver, observation, normal_factor(receiver, observation), observation.residual)
     square = jnp.sum(residual**2, axis=1)
-    limit = 4 * _median_where(seen.weights > 0, square)
+    limit = 4 * _median_where(observation.weights > 0, square)
     return jnp.where(square > limit, limit / jnp.where(square > limit, square, 1), 1)
 
 
-def _precision(receiver: Receiver, seen: Observation) -> Float[Array, " vertices"]:
+def _precision(receiver: Receiver, observation: Observation) -> Float[Array, " vertices"]:
     """Inverse energy of the residual around each point, at most four times that at the median.
 
     A surface that was meshed anew is right on planes and wrong along edges, by orders of magnitude on machine parts,
     and S/‖b‖ is largest with these weights. Each projection with better weights leaves less of the nuisance of the bad
     parts in the good ones, so that energies are found anew.
     """
-    known = (seen.weights > 0).astype(seen.residual.dtype)
+    known = (observation.weights > 0).astype(observation.residual.dtype)
 
     def again(weights: Array, _: None) -> tuple[Array, None]:
-        now = seen._replace(weights=seen.weights * weights)
-        rest = clean(receiver, now, normal_factor(receiver, now), seen.residual)
+        now = observation._replace(weights=observation.weights * weights)
+        rest = clean(receiver, now, normal_factor(receiver, now), observation.residual)
         square = jnp.sum(rest**2, axis=1) / jnp.where(now.weights > 0, now.weights, 1) ** 2
         pair = filter(receiver.operator, jnp.asarray(_AROUND, rest.dtype), jnp.stack([known * square, known], axis=1))
         energy = jnp.maximum(pair[:, 0], 0) / jnp.maximum(pair[:, 1], _LEAST_AROUND)
@@ -314,7 +314,7 @@ def _median_where(some: Bool[Array, " vertices"], values: Float[Array, " vertice
     return jnp.nanmedian(jnp.where(some, values, jnp.nan))
 
 
-def normal_factor(receiver: Receiver, seen: Observation) -> Float[Array, "unknowns unknowns"]:
+def normal_factor(receiver: Receiver, observation: Observation) -> Float[Array, "unknowns unknowns"]:
     """Cholesky factor of the nuisance's normal equations, with a ridge for columns that coincide where seen."""
 
     def products(weights: Array) -> Array:
@@ -322,30 +322,33 @@ def normal_factor(receiver: Receiver, seen: Observation) -> Float[Array, "unknow
             lambda fresh, rows, weight: matmul(rows.T, (fresh * weight)[:, None] * rows), receiver.nuisance, weights
         )
 
-    if seen.normals is None:
-        normal = products(seen.weights)
+    if observation.normals is None:
+        normal = products(observation.weights)
     else:
         # The unknowns are each column along each coordinate. Each pair of coordinates has a block of the matrix, which
         # is the same for a pair and its reverse.
         pairs, which = np.triu_indices(3), np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-        along = seen.normals.T
-        blocks = jax.lax.map(products, seen.weights * along[pairs[0]] * along[pairs[1]])[which]
+        along = observation.normals.T
+        blocks = jax.lax.map(products, observation.weights * along[pairs[0]] * along[pairs[1]])[which]
         normal = blocks.transpose(2, 0, 3, 1).reshape(3 * blocks.shape[2], -1)
     ridge = jnp.finfo(normal.dtype).eps * (jnp.trace(normal) + 1)
     return jnp.linalg.cholesky(normal + ridge * jnp.eye(len(normal), dtype=normal.dtype))
 
 
 def clean(
-    receiver: Receiver, seen: Observation, factor: Float[Array, "unknowns unknowns"], x: Float[Array, "vertices 3"]
+    receiver: Receiver,
+    observation: Observation,
+    factor: Float[Array, "unknowns unknowns"],
+    x: Float[Array, "vertices 3"],
 ) -> Float[Array, "vertices 3"]:
     """ΩPx: project the nuisance off a displacement, and weight the rest; symmetric in the plain inner product."""
-    return seen.weigh(x - _fit_nuisance(receiver, seen, factor, x))
+    return observation.weigh(x - _fit_nuisance(receiver, observation, factor, x))
 
 
-def _fit_nuisance(receiver: Receiver, seen: Observation, factor: Array, x: Array) -> Array:
+def _fit_nuisance(receiver: Receiver, observation: Observation, factor: Array, x: Array) -> Array:
     """Fit the nuisance to a displacement by least squares, with the weights and normals of the observation."""
-    matched = matmul(receiver.nuisance.T, seen.weigh(x))
-    if seen.normals is None:
+    matched = matmul(receiver.nuisance.T, observation.weigh(x))
+    if observation.normals is None:
         return matmul(receiver.nuisance, jsl.cho_solve((factor, True), matched))
     return matmul(receiver.nuisance, jsl.cho_solve((factor, True), matched.ravel()).reshape(-1, 3))
 

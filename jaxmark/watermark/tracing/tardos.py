@@ -125,13 +125,13 @@ def rank(values: Slots, recipients: Iterable[str], choices: Choices, *, top: int
         raise JaxmarkError("A slot's value is not finite: give 0 where nothing is known.")
     p = biases(choices, len(values))
     y = _remove_trend(np.asarray(values, np.float64), p)
-    tried = list(dict.fromkeys(recipients))
-    found = np.empty(len(tried))
-    for i in range(0, len(tried), _CHUNK_RECIPIENTS):
-        found[i : i + _CHUNK_RECIPIENTS] = scores(y, p, codewords(tried[i : i + _CHUNK_RECIPIENTS], choices, p))
+    candidates = list(dict.fromkeys(recipients))
+    found = np.empty(len(candidates))
+    for i in range(0, len(candidates), _CHUNK_RECIPIENTS):
+        found[i : i + _CHUNK_RECIPIENTS] = scores(y, p, codewords(candidates[i : i + _CHUNK_RECIPIENTS], choices, p))
     best = np.argsort(-found, kind="stable")[:top]
-    log10_p = accuse(found[best], y, p, len(tried))
-    return [Accusation(tried[i], float(found[i]), float(bound)) for i, bound in zip(best, log10_p, strict=True)]
+    log10_p = accuse(found[best], y, p, len(candidates))
+    return [Accusation(candidates[i], float(found[i]), float(bound)) for i, bound in zip(best, log10_p, strict=True)]
 
 
 def _remove_trend(y: np.ndarray, p: np.ndarray) -> np.ndarray:

@@ -42,7 +42,7 @@ class Tracer:
         choices, original = self.mark.choices, self.mark.original
         if self.mark.code_bits >= _MIN_SLOTS:
             word = codewords([recipient], choices, biases(choices, self.mark.code_bits))[0]
-            marked, info = self.mark.write(word.astype(float), budget, told=recipient.encode())
+            marked, info = self.mark.write(word.astype(float), budget, content=recipient.encode())
             if self.finds(marked, recipient):
                 return marked, info
         raise JaxmarkError(

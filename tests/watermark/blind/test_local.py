@@ -193,6 +193,6 @@ def test_commands_for_several_marks(shape: Mesh, tmp_path: Path, monkeypatch, ca
     assert (blind["message"], blind["scheme"]) == (CLI_MESSAGE, "local")
     both = workshop.json("detect", "marked.ply", *key, "--original", "model.ply", "--scheme", "keyed,local")
     assert both["message"] == CLI_MESSAGE
-    assert any("'local' alone" in remark for remark in both["notes"])
+    assert any("'local' alone" in note for note in both["notes"])
     assert "not one of" in workshop.refused("embed", "model.ply", "x.ply", *key, "--scheme", "keyed,nothing")
     assert "an informed one" in workshop.refused("embed", "model.ply", "x.ply", *key, "--scheme", "field,keyed")

@@ -124,23 +124,23 @@ def test_against_dense_algebra(direction, beta, small: Case, key: jm.Key, dtype)
     amplitudes, residual = random.normal(size=BITS), random.normal(size=small.x.shape)
     chips = random.normal(size=carrier.chips.signs.shape)
     given = jnp.asarray(strength, dtype)
-    seen, bits = jnp.asarray(residual, dtype), jnp.asarray(amplitudes, dtype)
+    observation, bits = jnp.asarray(residual, dtype), jnp.asarray(amplitudes, dtype)
     shape = carrier.coefficients(given)
 
     displacement = carrier.displacement(bits, given)
     assert displacement.dtype == dtype
     close(displacement, (columns @ amplitudes).reshape(-1, 3), dtype)
-    close(carrier.adjoint(seen, given), columns.T @ (mass * residual.ravel()), dtype)
+    close(carrier.adjoint(observation, given), columns.T @ (mass * residual.ravel()), dtype)
     close(carrier.gram(given), columns.T @ (mass[:, None] * columns), dtype)
     close(carrier.modulate(bits, shape), (columns @ amplitudes).reshape(-1, 3), dtype)
-    close(carrier.correlate(seen, shape), columns.T @ residual.ravel(), dtype)
+    close(carrier.correlate(observation, shape), columns.T @ residual.ravel(), dtype)
     close(carrier.filter_chips(jnp.asarray(chips, dtype), shape), (shaped @ chips.ravel()).reshape(-1, 3), dtype)
-    close(carrier.match_chips(seen, shape), (shaped.T @ residual.ravel()).reshape(-1, channels), dtype)
+    close(carrier.match_chips(observation, shape), (shaped.T @ residual.ravel()).reshape(-1, channels), dtype)
     if beta != "scalar":
         weight = random.uniform(size=bands)
         weighed = shaping(small, weight[:, None] * full, direction)
         shape = carrier.coefficients(given, jnp.asarray(weight, dtype))
-        close(carrier.match_chips(seen, shape), (weighed.T @ residual.ravel()).reshape(-1, channels), dtype)
+        close(carrier.match_chips(observation, shape), (weighed.T @ residual.ravel()).reshape(-1, channels), dtype)
 
 
 @pytest.mark.parametrize("direction", ["coordinates", "normals"])
@@ -173,22 +173,22 @@ def test_claim_is_a_sum_over_keyed_signs(direction, small: Case, key: jm.Key, dt
     random = np.random.default_rng(2)
     residual = jnp.asarray(1e-3 * random.normal(size=small.x.shape), dtype)
     weights = jnp.asarray(random.uniform(size=len(small.x)) * (random.uniform(size=len(small.x)) < 0.7), dtype)
-    seen = observe(residual, weights)
+    observation = observe(residual, weights)
     bits = jnp.asarray(random.choice([-1.0, 1.0], BITS), dtype)
-    score, norm = carrier.claim(seen, bits)
+    score, norm = carrier.claim(observation, bits)
     assert score.dtype == norm.dtype == dtype
     terms = np.zeros(carrier.chips.signs.shape)
     for place in np.argwhere(carrier.chips.signs):
         turned = carrier.chips.signs.copy()
         turned[tuple(place)] *= -1
-        other, same = carrier._replace(chips=carrier.chips._replace(signs=turned)).claim(seen, bits)
+        other, same = carrier._replace(chips=carrier.chips._replace(signs=turned)).claim(observation, bits)
         terms[tuple(place)] = (float(score) - float(other)) / 2
         assert float(same) == float(norm)
     tolerance = 1e-9 if dtype == np.float64 else 1e-3
     assert terms.sum() == pytest.approx(float(score), rel=tolerance, abs=tolerance * float(norm))
     assert np.linalg.norm(terms) == pytest.approx(float(norm), rel=tolerance)
     reader = carrier.reader()
-    matched = np.asarray(reader.matched_residual(reader.receive(seen)), np.float64)
+    matched = np.asarray(reader.matched_residual(reader.receive(observation)), np.float64)
     expected = matched * carrier.chips.signs * np.asarray(bits)[carrier.chips.slots]
     np.testing.assert_allclose(terms, expected, atol=tolerance * float(norm))
     assert np.abs(matched[~small.moving]).max() > 0  # and yet it takes no part
@@ -203,10 +203,10 @@ def test_what_signs_multiply_depends_on_no_key(direction, small: Case, key: jm.K
     norms, vectors, scores = [], [], []
     for secret in (key, jm.Key(bytes(32)), jm.Key(b"z" * 32)):
         carrier = make_carrier(small, secret, np.float64, direction, moving=moving)
-        seen = observe(jnp.asarray(residual))
+        observation = observe(jnp.asarray(residual))
         reader = carrier.reader()
-        vectors.append(np.asarray(reader.matched_residual(reader.receive(seen))))
-        score, norm = carrier.claim(seen, jnp.asarray(bits))
+        vectors.append(np.asarray(reader.matched_residual(reader.receive(observation))))
+        score, norm = carrier.claim(observation, jnp.asarray(bits))
         norms.append(float(norm))
         scores.append(float(score))
     assert norms[0] == norms[1] == norms[2]
@@ -310,8 +310,9 @@ def check_reading(condition, direction, case: Case, dtype):
     for number in range(6):
         carrier = make_carrier(case, jm.Key(bytes([number] * 32)), dtype, direction, bits)
         marked = embed_bits(x, jnp.asarray(message, dtype), carrier, beta)
-        seen = make_seen(case, condition, np.asarray(marked - x), dtype)
-        soft = detect_bits(x + seen.residual, x, carrier, joint, beta, weights=seen.weights, normals=seen.normals)
+        observation = make_seen(case, condition, np.asarray(marked - x), dtype)
+        known = {"weights": observation.weights, "normals": observation.normals}
+        soft = detect_bits(x + observation.residual, x, carrier, joint, beta, **known)
         assert soft.dtype == dtype
         read.append(np.asarray(soft) * message)
     assert np.sum(np.array(read) <= 0) <= (2 if condition == "normals" else 0)
@@ -339,11 +340,11 @@ def test_joint_is_regularised_least_squares(condition, noise, small: Case, key: 
     beta = random.uniform(0.5, 1, len(FAMILY))
     residual = np.asarray(carrier.displacement(jnp.asarray(message), jnp.asarray(beta)))
     residual = residual + noise * residual.std() * random.normal(size=residual.shape) @ np.diag([1.0, 4.0, 0.5])
-    seen = make_seen(small, condition, 1e-3 * residual, np.float64)
+    observation = make_seen(small, condition, 1e-3 * residual, np.float64)
     reader = carrier.reader()
-    soft = np.asarray(solved(reader, reader.receive(seen), jnp.asarray(beta)))
+    soft = np.asarray(solved(reader, reader.receive(observation), jnp.asarray(beta)))
 
-    products, matched = dense_equations(small, carrier, seen, beta)
+    products, matched = dense_equations(small, carrier, observation, beta)
     # With one ρ > 0 for all bits, whatever it is.
     ridge = soft @ (matched - products @ soft) / (soft @ soft)
     assert ridge > 0
@@ -351,26 +352,26 @@ def test_joint_is_regularised_least_squares(condition, noise, small: Case, key: 
     np.testing.assert_allclose(soft, expected, atol=1e-7 * np.abs(expected).max())
 
 
-def dense_equations(case: Case, carrier: KeyedCarrier, seen: Observation, beta) -> tuple[np.ndarray, np.ndarray]:
+def dense_equations(case: Case, carrier: KeyedCarrier, observation: Observation, beta) -> tuple[np.ndarray, np.ndarray]:
     """AᵀA and Aᵀy, given what is received."""
-    received = receive(make_receiver(carrier.host), seen)
-    clean = dense_clean(carrier, received.seen)
+    received = receive(make_receiver(carrier.host), observation)
+    clean = dense_clean(carrier, received.observation)
     whitening = np.kron(np.einsum("j,juv->uv", 1 / np.sqrt(received.power), case.filters), received.axes)
     model = shaping(case, (np.asarray(received.gain) * beta)[:, None] * np.ones(3), "coordinates")
     system = whitening @ clean @ model @ spreading(carrier)
-    return system.T @ system, system.T @ whitening @ clean @ np.asarray(seen.residual).ravel()
+    return system.T @ system, system.T @ whitening @ clean @ np.asarray(observation.residual).ravel()
 
 
-def dense_clean(carrier: KeyedCarrier, seen: Observation) -> np.ndarray:
+def dense_clean(carrier: KeyedCarrier, observation: Observation) -> np.ndarray:
     """x ↦ Ω(x - best nuisance), as a matrix `[3N, 3N]`, by least squares on what is seen."""
-    count = len(seen.weights)
+    count = len(observation.weights)
     columns = np.kron(np.asarray(make_receiver(carrier.host).nuisance), np.eye(3))
     look = np.eye(3 * count)
-    if seen.normals is not None:
+    if observation.normals is not None:
         look = np.zeros((count, count, 3))
-        look[np.arange(count), np.arange(count)] = np.asarray(seen.normals)
+        look[np.arange(count), np.arange(count)] = np.asarray(observation.normals)
         look = look.reshape(count, 3 * count)
-    weights = np.repeat(np.asarray(seen.weights), len(look) // count)
+    weights = np.repeat(np.asarray(observation.weights), len(look) // count)
     root = np.sqrt(weights)[:, None] * look
     fit = np.linalg.lstsq(root @ columns, root, rcond=None)[0]
     return look.T @ (weights[:, None] * look) @ (np.eye(3 * count) - columns @ fit)
@@ -381,11 +382,11 @@ def test_projected_correlations_by_dense_algebra(direction, small: Case, key: jm
     carrier, random = make_carrier(small, key, dtype, direction), np.random.default_rng(11)
     normals = carrier.normals if direction == "normals" else None
     weights = jnp.asarray(random.uniform(0.1, 1, len(small.x)), dtype)
-    seen = observe(jnp.asarray(random.normal(size=small.x.shape), dtype), weights, normals)
+    observation = observe(jnp.asarray(random.normal(size=small.x.shape), dtype), weights, normals)
     beta = random.uniform(size=len(FAMILY))
     mark = shaping(small, beta[:, None] * np.ones(len(carrier.chips.signs[0])), direction) @ spreading(carrier)
-    expected = mark.T @ dense_clean(carrier, seen) @ np.asarray(seen.residual, np.float64).ravel()
-    close(carrier.reader().glance(seen, jnp.asarray(beta, dtype)), expected, dtype, factor=100)
+    expected = mark.T @ dense_clean(carrier, observation) @ np.asarray(observation.residual, np.float64).ravel()
+    close(carrier.reader().read_quickly(observation, jnp.asarray(beta, dtype)), expected, dtype, factor=100)
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from jaxmark.geometry.mesh import Mesh, edges, face_normals, make_mesh
 from jaxmark.watermark.carriers import KeyedCarrier
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.perception.budget import VISIBILITY, visibility_of
-from jaxmark.watermark.perception.masking import hiding_directions
+from jaxmark.watermark.perception.masking import masking_directions
 from jaxmark.watermark.perception.visibility import band_visibility
 from jaxmark.watermark.schemes.keyed import KeyedScheme
 from jaxmark.watermark.schemes.registry import make_scheme, parameters_of
@@ -38,7 +38,7 @@ def box(cells: int = 12) -> Mesh:
 def directions(mesh: Mesh) -> np.ndarray:
     """Matrices of the mesh's own vertices."""
     original = make_original(mesh)
-    return hiding_directions(original)[original.weld.point]
+    return masking_directions(original)[original.weld.point]
 
 
 def test_a_program_that_ends_and_starts_no_more_threads_hides_as_well(monkeypatch: pytest.MonkeyPatch):
@@ -144,8 +144,8 @@ def test_the_adjoint_and_gram(key: jm.Key, dtype):
     np.testing.assert_allclose(gram, gram.T, atol=exact * np.abs(gram).max())
     assert float(bits @ gram @ bits) == pytest.approx(float(jnp.sum(mass * carrier.displacement(bits) ** 2)), rel=1e-3)
     # A direction that hides little is one that little is written in.
-    plain = KeyedScheme(hiding=False).carrier(original, Choices(key, b""), 8, 64)
-    expected = np.einsum("nij,nj->ni", hiding_directions(original), original.to_host(plain.displacement(bits)))
+    plain = KeyedScheme(masking=False).carrier(original, Choices(key, b""), 8, 64)
+    expected = np.einsum("nij,nj->ni", masking_directions(original), original.to_host(plain.displacement(bits)))
     np.testing.assert_allclose(original.to_host(carrier.displacement(bits)), expected, atol=10 * exact)
 
 
@@ -178,16 +178,16 @@ def test_planes_stay_plane(key: jm.Key):
     assert jm.detect(suspect, original=mesh, key=key, record=info.record).message == b"plane"
     # Without a record, as the scheme's defaults are.
     assert jm.detect(suspect, original=mesh, key=key, bits=40).message == b"plane"
-    plain = jm.make_marker(mesh, key, bits=40, scheme=KeyedScheme(hiding=False))
-    isotropic, told = plain.write(plain.codeword(b"plane"), None)
-    assert told.rms < info.rms / 3
-    assert plain.read_quickly(plain.observe(isotropic)) == b"plane"
+    plain = jm.make_marker(mesh, key, bits=40, scheme=KeyedScheme(masking=False))
+    isotropic, isotropic_info = plain.write(plain.codeword(b"plane"), None)
+    assert isotropic_info.rms < info.rms / 3
+    assert plain.read_quickly(plain.observe(plain.register(isotropic))) == b"plane"
 
 
 def test_capacity_counts_the_dimensions_that_are_left(key: jm.Key):
     """Half of what is hidden in one coordinate alone is hidden in a third of the dimensions."""
     original = make_original(rough_sphere(200))
-    carrier = KeyedScheme(hiding=False).carrier(original, Choices(key, b""), 8, 64)
+    carrier = KeyedScheme(masking=False).carrier(original, Choices(key, b""), 8, 64)
     assert isinstance(carrier, KeyedCarrier)
     assert carrier.masked_share() == 1
     rows = len(original.signal)
@@ -196,8 +196,8 @@ def test_capacity_counts_the_dimensions_that_are_left(key: jm.Key):
     assert carrier._replace(masking=flat).masked_share() == pytest.approx(rows / 200 / 3)
     half = np.where(np.arange(rows) < 100, 2.0, 0.0)
     assert carrier._replace(masking=half).masked_share() == pytest.approx(0.5)
-    room = carrier.reader().room(original.to_traced(original.used))
-    less = carrier._replace(masking=half).reader().room(original.to_traced(original.used))
+    room = carrier.reader().free_dimensions(original.to_traced(original.used))
+    less = carrier._replace(masking=half).reader().free_dimensions(original.to_traced(original.used))
     np.testing.assert_allclose(less.dimensions * less.energy, room.dimensions * room.energy, rtol=1e-6)
 
 
@@ -229,7 +229,7 @@ def test_records_keep_how_a_mark_was_hidden():
     assert parameters_of(KeyedScheme())["hiding"] is True
     assert make_scheme("keyed", parameters_of(KeyedScheme())) == KeyedScheme()
     before = {name: value for name, value in parameters_of(KeyedScheme()).items() if name != "hiding"}
-    assert make_scheme("keyed", before) == KeyedScheme(hiding=False)
+    assert make_scheme("keyed", before) == KeyedScheme(masking=False)
 
 
 def test_a_texture_drifts_as_far_as_its_surface_moves():

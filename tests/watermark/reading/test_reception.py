@@ -88,10 +88,10 @@ def dense_nuisance(case: Case) -> np.ndarray:
     return columns / np.linalg.norm(columns, axis=0)
 
 
-def dense_clean(case: Case, seen: Observation, x: np.ndarray) -> np.ndarray:
+def dense_clean(case: Case, observation: Observation, x: np.ndarray) -> np.ndarray:
     """Ω(x - what fits best), by weighted least squares on what is seen."""
-    columns, root = dense_nuisance(case), np.sqrt(np.asarray(seen.weights, np.float64))[:, None]
-    if seen.normals is None:
+    columns, root = dense_nuisance(case), np.sqrt(np.asarray(observation.weights, np.float64))[:, None]
+    if observation.normals is None:
         return root**2 * (x - columns @ np.linalg.lstsq(root * columns, root * x, rcond=1e-11)[0])
     normals = case.normals
     design = (columns[:, :, None] * normals[:, None, :]).reshape(len(x), -1)
@@ -135,14 +135,14 @@ def test_nuisance_is_nearly_orthonormal(case: Case, dtype):
 def test_nuisance_by_blocks_is_the_same(case: Case, x64, monkeypatch):
     """With a last block that is not full, and a sample that tells the basis."""
     whole = make(case, np.float64)
-    seen = looking(case, "weights", np.random.default_rng(3).normal(size=case.x.shape), np.float64)
-    expected = receive(whole, seen)
+    observation = looking(case, "weights", np.random.default_rng(3).normal(size=case.x.shape), np.float64)
+    expected = receive(whole, observation)
     jax.clear_caches()
     monkeypatch.setattr(reception, "_BLOCK_VERTICES", 50)
     monkeypatch.setattr(reception, "_SAMPLE_VERTICES", 100)
     assert len(case.x) % 50 > 0
     parts = make(case, np.float64)
-    found = receive(parts, seen)
+    found = receive(parts, observation)
     jax.clear_caches()
     # The same span: each explains the other.
     left = parts.nuisance - whole.nuisance @ jnp.linalg.lstsq(whole.nuisance, parts.nuisance)[0]
@@ -167,9 +167,9 @@ def test_nuisance_is_projected_off(condition, case: Case, dtype):
         1.1 * smoothed @ random.normal(size=(3, 3)) - case.x + 0.1,
         columns @ random.normal(size=(columns.shape[1], 3)),
     ):
-        seen = looking(case, condition, nuisance, dtype)
-        received = receive(host, seen)
-        once = clean(host, received.seen, received.factor, seen.residual)
+        observation = looking(case, condition, nuisance, dtype)
+        received = receive(host, observation)
+        once = clean(host, received.observation, received.factor, observation.residual)
         for left in (once, received.residual):
             assert left.dtype == dtype
             assert np.linalg.norm(left) < tolerance * np.linalg.norm(nuisance)
@@ -184,17 +184,17 @@ def test_clean_is_a_weighted_projection(condition, case: Case, x64):
     host = make(case, np.float64)
     a, b = random.normal(size=(2, *case.x.shape))
     received = receive(host, looking(case, condition, a, np.float64))
-    seen = received.seen
+    observation = received.observation
 
     def project(x):
-        return np.asarray(clean(host, seen, received.factor, jnp.asarray(x)))
+        return np.asarray(clean(host, observation, received.factor, jnp.asarray(x)))
 
     scale = np.abs(project(a)).max()
-    np.testing.assert_allclose(project(a), dense_clean(case, seen, a), atol=1e-7 * scale)
-    np.testing.assert_allclose(received.residual, dense_clean(case, seen, a) @ received.axes, atol=1e-7 * scale)
+    np.testing.assert_allclose(project(a), dense_clean(case, observation, a), atol=1e-7 * scale)
+    np.testing.assert_allclose(received.residual, dense_clean(case, observation, a) @ received.axes, atol=1e-7 * scale)
     assert np.vdot(project(a), b) == pytest.approx(np.vdot(a, project(b)), rel=1e-9, abs=1e-9 * scale)
     # Without the weights it changes nothing when it is done again.
-    weights = np.asarray(seen.weights)[:, None]
+    weights = np.asarray(observation.weights)[:, None]
     bare = np.divide(project(a), weights, out=np.zeros_like(a), where=weights > 0)
     np.testing.assert_allclose(project(bare), project(a), atol=1e-7 * scale)
 
@@ -254,12 +254,12 @@ def test_what_a_suspect_explains_is_projected_off_too(condition, case: Case, x64
     random = np.random.default_rng(8)
     host, columns = make(case, np.float64), random.normal(size=(len(case.x), 2))
     both = np.concatenate([columns, columns[:, :1] + np.asarray(host.nuisance)[:, :1]], axis=1)  # one depends on others
-    seen = looking(case, condition, columns @ random.normal(size=(2, 3)), np.float64)
-    assert extend(host, seen) is host
-    assert np.abs(receive(host, seen).residual).max() > 0.1
-    wide = extend(host, seen._replace(nuisance=jnp.asarray(1e-3 * both)))
+    observation = looking(case, condition, columns @ random.normal(size=(2, 3)), np.float64)
+    assert extend(host, observation) is host
+    assert np.abs(receive(host, observation).residual).max() > 0.1
+    wide = extend(host, observation._replace(nuisance=jnp.asarray(1e-3 * both)))
     assert np.linalg.matrix_rank(np.asarray(wide.nuisance)) == np.linalg.matrix_rank(np.asarray(host.nuisance)) + 2
-    assert np.abs(receive(wide, seen).residual).max() < 1e-6
+    assert np.abs(receive(wide, observation).residual).max() < 1e-6
 
 
 @pytest.mark.slow
@@ -294,16 +294,16 @@ def test_strange_points_count_for_less(case: Case, x64):
     received = receive(host, plain)
     square = np.sum(dense_clean(case, plain, residual) ** 2, axis=1)
     expected = np.minimum(1, 4 * np.median(square) / square)
-    np.testing.assert_allclose(received.seen.weights, expected, rtol=1e-6)
-    assert np.asarray(received.seen.weights)[[3, 50, 120]].max() < 0.05
-    assert np.mean(np.asarray(received.seen.weights) == 1) > 0.8
+    np.testing.assert_allclose(received.observation.weights, expected, rtol=1e-6)
+    assert np.asarray(received.observation.weights)[[3, 50, 120]].max() < 0.05
+    assert np.mean(np.asarray(received.observation.weights) == 1) > 0.8
     # Those that are masked neither count nor set the limit.
     masked = looking(case, "half", residual, np.float64)
     received = receive(host, masked)
-    seen = np.asarray(masked.weights) > 0
+    visible = np.asarray(masked.weights) > 0
     square = np.sum(dense_clean(case, masked, residual) ** 2, axis=1)
-    expected = np.where(seen, np.minimum(1, 4 * np.median(square[seen]) / np.where(seen, square, 1)), 0)
-    np.testing.assert_allclose(received.seen.weights, expected, rtol=1e-6)
+    expected = np.where(visible, np.minimum(1, 4 * np.median(square[visible]) / np.where(visible, square, 1)), 0)
+    np.testing.assert_allclose(received.observation.weights, expected, rtol=1e-6)
 
 
 def test_what_was_meshed_anew_is_weighed_by_the_energy_around_each_point(case: Case, x64):
@@ -311,12 +311,12 @@ def test_what_was_meshed_anew_is_weighed_by_the_energy_around_each_point(case: C
     random = np.random.default_rng(6)
     rough = case.x[:, 2] > np.quantile(case.x[:, 2], 0.7)
     noise = random.normal(size=(len(case.x), 1)) * case.normals * np.where(rough, 30, 1)[:, None]
-    seen = looking(case, "normals", noise, np.float64)
-    weights = np.asarray(receive(make(case, np.float64), seen).seen.weights)
+    observation = looking(case, "normals", noise, np.float64)
+    weights = np.asarray(receive(make(case, np.float64), observation).observation.weights)
     average = np.linalg.matrix_power(np.eye(len(case.x)) - laplacian_matrix(case.operator) / 2, 16)
     expected = np.ones(len(case.x))
     for _ in range(3):
-        rest = dense_clean(case, seen._replace(weights=jnp.asarray(expected)), noise) / expected[:, None]
+        rest = dense_clean(case, observation._replace(weights=jnp.asarray(expected)), noise) / expected[:, None]
         energy = average @ np.sum(rest**2, axis=1)
         expected = 1 / (energy / np.median(energy) + 0.25)
     np.testing.assert_allclose(weights, expected, rtol=1e-6)

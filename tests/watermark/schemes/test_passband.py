@@ -70,7 +70,7 @@ def test_the_usual_band_stays_where_marks_are_strong():
     assert usual.adapted(1e-5) is usual  # all bands cost the same
 
 
-@pytest.mark.parametrize("scheme", [KeyedScheme(hiding=False), KeyedScheme(profile=(1.0,) * 9), "host"])
+@pytest.mark.parametrize("scheme", [KeyedScheme(masking=False), KeyedScheme(profile=(1.0,) * 9), "host"])
 def test_other_schemes_stay_as_they_are(scheme):
     marker = jm.make_marker(SHAPE, jm.Key(bytes(32)), bits=16, scheme=scheme)
     assert marker.adapted(FAINT) is marker
@@ -172,5 +172,5 @@ def test_evidence_grows_with_the_mark_up_to_half_of_the_dimensions():
 @pytest.mark.long
 def test_tuning_begins_with_the_band_that_suits():
     tuned = tune(SHAPE, [("noise", 0.005)], FAINT, seed=jax.random.key(0), bits=16, margin="evidence")
-    assert tuned.report.tried_default.min() > 1.1 * evidence("tapered", FAINT)[0]
-    assert tuned.report.tried.min() >= tuned.report.tried_default.min()
+    assert tuned.report.default_trials.min() > 1.1 * evidence("tapered", FAINT)[0]
+    assert tuned.report.trials.min() >= tuned.report.default_trials.min()

@@ -1,4 +1,4 @@
-"""Leagues: attacks that marks must survive, and the limits of distortion that every method keeps.
+"""Tracks: attacks that marks must survive, and the limits of distortion that every method keeps.
 
 `smi2010` is the field's protocol: Wang, Lavoué, Denis, Baskurt, He, "A benchmark for 3D mesh watermarking", SMI 2010.
 `2026` adds remeshing, deformation, file formats, and attackers who choose.
@@ -25,7 +25,7 @@ _EXTRAS = {"igl": "align", "DracoPy": "files"}  # of packages; else `attacks`
 
 
 class Line(NamedTuple):
-    """One attack of a league; of the protocol also the bit error rates published for it, under both sets of limits."""
+    """One attack of a track; of the protocol also the bit error rates published for it, under both sets of limits."""
 
     kind: str | Attack
     strength: float
@@ -46,7 +46,7 @@ class Line(NamedTuple):
         return f"{gone[0]} is missing: pip install 'jaxmark[{_EXTRAS.get(gone[0], 'attacks')}]'" if gone else ""
 
 
-class League(NamedTuple):
+class Track(NamedTuple):
     """Attacks, and sets of limits on the distortion by a mark."""
 
     limits: Mapping[str, Mapping[str, float]]  # by metric; an empty one is that of hidden marks on each mesh
@@ -138,17 +138,15 @@ LINES_2026: Mapping[str, Line] = {
     },
 }
 
-#: The leagues by their names.
-LEAGUES: Mapping[str, League] = {
-    "smi2010": League(
-        {"perceptual": {"mrms": 8e-4, "msdm": 0.20}, "geometric": {"mrms": 2e-4, "msdm": 0.30}}, PROTOCOL
-    ),
-    "2026": League({"hidden": {}}, LINES_2026),
+#: The tracks by their names.
+TRACKS: Mapping[str, Track] = {
+    "smi2010": Track({"perceptual": {"mrms": 8e-4, "msdm": 0.20}, "geometric": {"mrms": 2e-4, "msdm": 0.30}}, PROTOCOL),
+    "2026": Track({"hidden": {}}, LINES_2026),
 }
 
 
-def get_league(name: str) -> League:
-    """Return a league by its name, or raise `JaxmarkError`."""
-    if name not in LEAGUES:
-        raise JaxmarkError(f"There is no league {name!r}; there are {', '.join(LEAGUES)}.")
-    return LEAGUES[name]
+def get_track(name: str) -> Track:
+    """Return a track by its name, or raise `JaxmarkError`."""
+    if name not in TRACKS:
+        raise JaxmarkError(f"There is no track {name!r}; there are {', '.join(TRACKS)}.")
+    return TRACKS[name]
