@@ -59,7 +59,7 @@ docs/notebooks/%.ipynb: notebooks/%.py | $(VENV)/.docs
 pictures: $(VENV)/.all $(NOTEBOOKS)  ## the pictures of README, front page and gallery, where their sources changed
 	$(BIN)/python benchmarks/pictures/front.py
 
-looks: $(VENV)/.all  ## the pictures of docs/visibility.md, of meshes that are not in the project: make looks MESHES=folder
+looks: $(VENV)/.all  ## the pictures of docs/results/visibility.md, of meshes that are not in the project: make looks MESHES=folder
 	$(BIN)/python benchmarks/pictures/looks.py $(addprefix $(MESHES)/,$(PICTURED)) --levels fandisk_6475 bunny_oded_3301
 
 benchmark: $(VENV)/.all  ## the published benchmark of methods anew, some hours: docs/results/benchmark*

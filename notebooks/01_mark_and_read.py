@@ -11,10 +11,10 @@
 # ---
 
 # %% [markdown]
-# # Mark a mesh and read it again
+# # Mark a mesh and read the mark
 #
-# A key, a message, a budget: the marked mesh looks the same, and the owner, who keeps the original, reads the message
-# from an attacked copy.
+# This notebook shows the whole workflow to new users. Embed a message with a key and a distortion budget, attack the
+# marked mesh, and read the message from the attacked copies. The owner needs the original and the key for that.
 
 # %% tags=["remove-cell"]
 import importlib.util
@@ -36,8 +36,8 @@ marked, info = marker.embed(b"jaxmark!", budget=8e-4)
 print(f"{len(mesh.vertices)} vertices moved by RMS {info.rms:.4%} of the diagonal, at most {info.max:.4%}")
 
 # %% [markdown]
-# What was done to the mesh: nothing to be seen, but ten times as much shows where it is. The viewer turns it with the
-# mouse, and switches between them.
+# The mark is not visible. Ten times its displacement shows where the vertices moved. The interactive viewer rotates the
+# meshes with the mouse, and switches between them.
 
 # %%
 original = marker.original
@@ -49,9 +49,9 @@ views = [plot.View("original", mesh), plot.View("marked", marked), plot.exaggera
 plot.show(*views).save("01_viewer.html")
 
 # %% [markdown]
-# The marker has prepared the original, and reads as many suspects as you like. The unmarked mesh, and the right suspect
-# under a wrong key, must give nothing. `log10_p` bounds the probability of such a reading where there is no mark: -6 is
-# one in a million, and detected.
+# The marker prepares the original once, and reads any number of suspects. `log10_p` is the base-10 logarithm of a bound
+# on the false-positive probability: that a mesh which is independent of the key reads as well. A mark is detected from
+# -6 on, one in a million. The unmarked mesh, and the marked mesh under another key, must not be detected.
 
 # %%
 suspects = {
@@ -62,8 +62,8 @@ suspects = {
     "unmarked": mesh,
 }
 for name, suspect in suspects.items():
-    found = marker.detect(suspect)
-    print(f"{name:<20} {found.message!r:<14} log10 p {found.log10_p:6.1f}  detected: {found.detected()}")
+    detection = marker.detect(suspect)
+    print(f"{name:<20} {detection.message!r:<14} log10 p {detection.log10_p:6.1f}  detected: {detection.detected()}")
 
 stranger = jm.make_marker(mesh, jm.new_key(), bits=64)
 assert marker.detect(marked).message == b"jaxmark!"
@@ -71,7 +71,7 @@ assert stranger.detect(marked).message is None
 assert marker.detect(mesh).message is None
 
 # %% [markdown]
-# The attacked copies look worse than the marked one, and the message is still there.
+# The attacked copies look worse than the marked mesh, but the message can still be read from each of them.
 
 # %%
 shown = {name: suspect for name, suspect in suspects.items() if name != "unmarked"}

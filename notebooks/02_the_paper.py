@@ -14,9 +14,9 @@
 # # The paper, section by section
 #
 # Sohn, Choi, Kim, Kwon, Park, Shin, *A Digital Watermarking Scheme for Polygonal Meshes using Modified Spectral
-# Decomposition*: marks in the spectrum of a mesh, by polynomials of the Laplacian instead of its eigenvectors. This
-# notebook walks through it on a mesh about as large as theirs (1,494 vertices); `docs/paper.md` has all errata with
-# their tests, and `benchmarks/theory/paper.py` all figures at full size.
+# Decomposition*, write marks into the spectrum of a mesh by polynomials of the Laplacian instead of its eigenvectors.
+# This notebook is for readers of the paper: it repeats each section on a mesh about as large as theirs (1,494
+# vertices). `docs/paper.md` has all errata with their tests, and `benchmarks/theory/paper.py` all figures at full size.
 
 # %% tags=["remove-cell"]
 import importlib.util
@@ -61,10 +61,11 @@ print(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
 # %% [markdown]
 # ## Section 2: the spectrum of a mesh
 #
-# A mesh is a graph, and each coordinate a number for each vertex. The Laplacian $\Delta = I - D^{-1}W$ takes from each
-# value the mean of its neighbours'. It is not symmetric, but self-adjoint in $\langle x, y\rangle_D = x^T D y$ with $D$
-# the valences. (The paper prints $1/d$ there, for which it is not.) So its spectrum is real, in [0, 2], and its
-# eigenvectors are orthonormal in that sense:
+# A mesh is a graph, and each coordinate is a signal, one number for each vertex. The Laplacian $\Delta = I - D^{-1}W$
+# maps each value to its difference from the mean of the neighbours' values, where $W$ is the adjacency matrix and $D$
+# the diagonal matrix of valences. It is not symmetric, but self-adjoint in $\langle x, y\rangle_D = x^T D y$. (The
+# paper prints $1/d$ instead of the valences $d$, for which this does not hold.) So its eigenvalues λ are real, in
+# [0, 2], and its eigenvectors are orthonormal in this inner product:
 
 # %%
 operator = from_mesh(mesh)
@@ -77,14 +78,15 @@ assert (pairs.values > 0).all()
 assert (pairs.values < 2).all()
 
 # %% [markdown]
-# Low frequencies are the shape, high ones the roughness. What a mesh looks like by its lowest eigenvectors alone:
+# Small eigenvalues are low frequencies, which hold the shape; high frequencies hold the roughness. The pictures show
+# the mesh rebuilt from its lowest eigenvectors:
 
 # %%
 x = centre(operator, np.asarray(mesh.vertices))
 
 
 def lowest(count: int) -> plot.View:
-    """The mesh by so many eigenvectors."""
+    """Rebuild the mesh from its lowest eigenvectors."""
     vectors = pairs.vectors[:, :count]
     return plot.View(f"{count} of {len(pairs.values)}", mesh._replace(vertices=vectors @ (vectors.T @ (mass @ x))))
 
@@ -92,16 +94,17 @@ def lowest(count: int) -> plot.View:
 plot.draw([lowest(5), lowest(20), lowest(100), lowest(len(pairs.values))]).save("02_1.png")
 
 # %% [markdown]
-# Ohbuchi's scheme changes their coefficients. But eigenvectors cost O(N³), and Lanczos iterations get only the lowest.
-# The paper asks for less: operators $L_0 + \dots + L_n = I$ that split the mesh into components, nearly orthogonal and
-# ordered by frequency. Polynomials $L_j = f_j(\Delta)$ with $\sum_j f_j = 1$ do it, and need products with $\Delta$
-# only.
+# Ohbuchi's scheme changes the coefficients of these eigenvectors. But all eigenvectors cost O(N³), and Lanczos
+# iteration computes only the lowest. The paper needs less: operators $L_0 + \dots + L_n = I$ that split the mesh into
+# components, nearly orthogonal and ordered by frequency. Polynomials $L_j = f_j(\Delta)$ with $\sum_j f_j = 1$ are such
+# operators, and need only products with $\Delta$.
 #
 # ## Section 3: scaling functions
 #
-# The paper's polynomials are kernels $\sum_k T_k(\cdot)\,T_k(\xi_j)$, each a bump around its node $\xi_j$ (its Figures
-# 1 and 2). As printed, the term $k = 0$ counts in full, and the bumps stand on a pedestal; halved, they are the
-# Lagrange basis at the nodes (Theorem 3.4 holds for these). Jackson's damping takes their ripples away.
+# The paper's polynomials are kernels $\sum_k T_k(\cdot)\,T_k(\xi_j)$, each a bump around its node $\xi_j$ (Figures 1
+# and 2 of the paper). As printed, the term $k = 0$ has its full weight, and the bumps stand on a pedestal. With half of
+# this term they are the Lagrange basis at the nodes, for which Theorem 3.4 holds. Jackson's damping removes their
+# ripples.
 
 # %%
 FORMS = {
@@ -120,9 +123,9 @@ plot.responses(families, mark=[node]).save("02_2.png")
 # %% [markdown]
 # ## Methods 1 and 2
 #
-# Method 1 multiplies factors $\Delta - \lambda_i$ one by one; Method 2 adds $T_k(\Delta)x$ by their three-term
-# recurrence, which all bands share. Both, put right, are the same operator. In the order that the paper prints, Method
-# 1 loses its digits in float32: the factors must be taken in Leja's order.
+# Method 1 multiplies factors $\Delta - \lambda_i$ one by one. Method 2 adds the terms $T_k(\Delta - I)x$ by their
+# three-term recurrence, which all bands share. After correction, both compute the same operator. In the order that the
+# paper prints, Method 1 loses all digits in float32; Leja's order of the factors keeps them.
 
 # %%
 signal = jnp.asarray(x, jnp.float32)
@@ -135,8 +138,9 @@ for order in ("leja", "printed"):
     assert (off < 1e-3) == (order == "leja")
 
 # %% [markdown]
-# Each product looks at every edge once: linear in the mesh. (The paper counts O(nN²), for its matrices are dense; its
-# Figures 12 and 13 are `benchmarks/theory/paper.py --parts time degree`.) Twice, for the first time includes compiling:
+# Each product visits every edge once, so its time is linear in the size of the mesh. (The paper counts O(nN²), because
+# its matrices are dense; `benchmarks/theory/paper.py --parts time degree` repeats its Figures 12 and 13.) Each function
+# runs twice, because the first call includes compiling:
 
 # %%
 matrix = jnp.asarray(np.eye(len(x)) - (stiffness / mass.diagonal()[:, None]).toarray(), jnp.float32) * -1
@@ -155,20 +159,20 @@ for name, run in {
 # %% [markdown]
 # ## Condition 3: nearly orthogonal?
 #
-# All that follows rests on components that are nearly orthogonal. They are not: a mesh has nearly all of its energy
-# next to λ = 0, and there every ripple of every band lets some of it in. At unit length, the median of
+# The scheme assumes that the components $x_j$ are nearly orthogonal. As printed, they are not: nearly all energy of a
+# mesh is next to λ = 0, and every band passes some of it by its ripples. For components of unit length, the median of
 # $|\langle x_i, x_j\rangle_D|$ should be near 0.
 
 # %%
 for name, form in FORMS.items():
-    found = np.abs(np.asarray(host_bands(original.operator, original.signal, scaling(64, **form)).gram))
-    upper = np.triu(found, 1)
+    products = np.abs(np.asarray(host_bands(original.operator, original.signal, scaling(64, **form)).gram))
+    upper = np.triu(products, 1)
     print(f"{name:<23} median {np.median(upper[upper > 0]):.3f}")
     assert (np.median(upper[upper > 0]) < 0.1) == ("damped" in name.lower())
 
 # %% [markdown]
-# The paper's bound (3) on the detector, completed by what it leaves out, says what that means. It must be positive for
-# a bit to be read for certain:
+# The consequence is visible in the paper's bound (3) on the detector's score, after adding the terms that it omits. A
+# bit is certain to be read only if the bound is positive:
 
 # %%
 sequences = jnp.asarray(np.ones((1, 64)), jnp.float32)
@@ -179,10 +183,10 @@ for coherence in (0.0, 0.001, 0.7):
 # %% [markdown]
 # ## Section 2.2: embedding and detection
 #
-# $x^w = x + \sum_j \alpha\beta p_j x_j$: a bit α = ±1, a strength β, keyed signs $p_j$.
-# Several bits share the components by orthogonal sequences of signs. The reader has the original, and correlates what
-# was changed with the same components. We mark the mesh by three schemes, equally strongly: as printed; in a form that
-# works (damped, at unit norm, and all bits solved for at once); and by eigenvectors.
+# The marked mesh is $x^w = x + \sum_j \alpha\beta p_j x_j$, with a bit α = ±1, a strength β and keyed signs $p_j$.
+# Several bits share the components by orthogonal sequences of signs. The reader has the original, and correlates the
+# displacement with the same components. Three schemes mark the mesh at equal strength: the paper's as printed; a form
+# that works, with damping, components of unit norm, and all bits solved for at once; and Ohbuchi's eigenvectors.
 
 # %%
 MESSAGE = b"\xa5\x5a"
@@ -202,8 +206,8 @@ for name, (scheme, detector) in schemes.items():
 plot.draw([plot.displacement(original, marked, name) for name, marked in marks.items()]).save("02_3.png")
 
 # %% [markdown]
-# The pictures tell why. As printed, the mark is a scaled copy of the lowest frequencies, for all bands have the same in
-# them. The working form spreads over the spectrum:
+# The pictures show the reason. As printed, all bands contain the same lowest frequencies, so the mark is a scaled copy
+# of these. The mark of the working form spreads over the spectrum:
 
 # %%
 plot.spectra(original, {name: (mesh, marked) for name, marked in marks.items()}).save("02_4.png")
@@ -211,8 +215,8 @@ plot.spectra(original, {name: (mesh, marked) for name, marked in marks.items()})
 # %% [markdown]
 # ## Figure 14: robustness
 #
-# How often the message is read after uniform noise. (The paper counts single bits, without a code;
-# `benchmarks/theory/paper.py --parts attacks` does, too, for all of its attacks.)
+# This section counts how often the message is read after uniform noise. (The paper counts single bits, without a code,
+# as `benchmarks/theory/paper.py --parts attacks` does for all its attacks.)
 
 # %%
 NOISE = [0.001, 0.003, 0.01]
@@ -227,19 +231,20 @@ pictures.success(curves, jm.adversaries.ATTACKS["diagonal-noise"].unit).save("02
 # %% [markdown]
 # ## Figures 15 and 16: the Gibbs oscillation
 #
-# As future work the paper names polynomials for hat functions, against the oscillation. Here they are, by best uniform
-# approximation. Their ripples fall with the degree, those of scaling functions stay. Damped ones have none at all.
+# Against the oscillation, the paper proposes polynomials for hat functions as future work. Here they are computed by
+# best uniform approximation. Their ripples fall with the degree, while those of scaling functions do not. Damped
+# scaling functions have no ripples.
 
 # %%
 fine = {name: scaling(64, **form).reshape(16, 4, 64).sum(axis=1) for name, form in FORMS.items()}
 plot.responses({name: family[7:9] for name, family in (fine | {"hats": hat(nodes(16), 63)}).items()}).save("02_6.png")
 
 # %% [markdown]
-# ## What became of it
+# ## Conclusions
 #
-# - The idea holds: polynomials of the Laplacian do what eigenvectors do, in time linear in the mesh, and with
+# - The idea holds: polynomials of the Laplacian replace eigenvectors, in time linear in the size of the mesh, and with
 #   gradients.
-# - The scheme as printed does not: its components are nearly parallel. Damping, unit norm and a detector that solves
-#   for all bits mend it.
-# - The library's default goes on from there: keyed signs of its own in damped bands, instead of the host's components,
-#   so that neither the host's energy nor what an attack does to it decides what is read.
+# - The scheme as printed does not work, because its components are nearly parallel. Damping, unit norm and a detector
+#   that solves for all bits correct it.
+# - The library's default scheme goes further: it writes keyed signs in damped bands instead of the host's components.
+#   So the reading depends neither on the host's energy nor on the effect of an attack on the host.

@@ -11,11 +11,11 @@
 # ---
 
 # %% [markdown]
-# # Choosing bands, degree and payload
+# # Choose bands, degree and payload
 #
-# A mark is written in bands of frequencies. How the bands are cut out decides how cleanly they are told apart; their
-# degree, what they cost; the mesh, its budget and the noise to survive, how many bits they carry. This notebook
-# measures each on one mesh. `docs/bands.md` has all families on five meshes.
+# A mark is written in bands of frequencies. This notebook is for readers who design filters or choose a payload. It
+# measures, on one mesh, how cleanly families of filters separate bands, which degree they need, how visible each band
+# is, and how many bits a mesh can carry. `docs/bands.md` compares all families on five meshes.
 
 # %% tags=["remove-cell"]
 import importlib.util
@@ -43,21 +43,21 @@ print(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
 # %% [markdown]
 # ## Families
 #
-# A family is a matrix of Chebyshev coefficients, one band a row, whose responses sum to 1 at every frequency λ:
-# together the bands hold all of the mesh. Here are 16 bands of degree 63, four ways. To compare them at equal cost,
-# families that come with as many bands as terms are made with 64, of which four neighbours are summed.
+# A family is a matrix of Chebyshev coefficients with one band a row. Its responses sum to 1 at every frequency λ, so
+# the bands add up to the mesh. This cell makes 16 bands of degree 63 by four families. Three of them have as many bands
+# as terms; to compare all at equal cost, 64 of their bands are made, and every four neighbours are summed.
 
 # %%
 BANDS, DEGREE = 16, 63
 
 
 def summed(fine: np.ndarray) -> np.ndarray:
-    """Neighbours of a family of many bands as one each."""
+    """Sum neighbouring bands of a family, so that `BANDS` are left."""
     return fine.reshape(BANDS, -1, fine.shape[1]).sum(axis=1)
 
 
 def families(degree: int) -> dict[str, np.ndarray]:
-    """16 bands of one degree."""
+    """Make 16 bands of one degree by each family."""
     return {
         "scaling functions": summed(scaling(degree + 1)),
         "damped (Jackson)": summed(scaling(degree + 1, damping="jackson")),
@@ -72,10 +72,10 @@ for name, family in shown.items():
 plot.responses(shown).save("03_1.png")
 
 # %% [markdown]
-# The undamped ones ripple: the Gibbs oscillation of any cut-off series. That looks harmless, until one sees where a
-# mesh has its energy. Below is what each of 64 bands holds of the mesh, of a mark by the keyed scheme, and of three
-# attacks. The host has ten thousand times more next to λ = 0 than elsewhere, so that a ripple of 1 % there is as much
-# as all that a band should hold.
+# The undamped families ripple; this is the Gibbs oscillation of any truncated series. The next figure shows why the
+# ripples matter: it has the energy of the mesh (the host), of a mark by the keyed scheme, and of three attacks in each
+# of 64 bands. The host has ten thousand times more energy next to λ = 0 than elsewhere. So a ripple of 1 % there passes
+# as much energy as a band should hold in total.
 
 # %%
 marker = jm.make_marker(mesh, jm.new_key(), bits=64)
@@ -89,13 +89,14 @@ moves = {"mark": (mesh, marked)} | {name: (marked, suspect) for name, suspect in
 plot.spectra(original, moves).save("03_2.png")
 
 # %% [markdown]
-# The mark is written at low frequencies, but the very lowest, which belong to the host's shape. Noise and rounding are
-# about equal everywhere; above 1.5 the mesh has few frequencies. Smoothing moves the mesh far more than the mark did,
-# in all bands, but nearly all of it is what it does to the *host*: known, and projected off before reading.
+# The mark is written at low frequencies, except for the very lowest, which hold the host's shape. Noise and rounding
+# have about equal energy in all bands; above 1.5 the mesh has few frequencies. Smoothing displaces the mesh far more
+# than the mark does, in all bands. But nearly all of this is the effect of smoothing on the *host*, which the reader
+# knows and projects off.
 #
-# `report` puts numbers to "cleanly": *leakage* is the share of a band's energy that comes from outside its place, and
-# *coherence* how nearly parallel the components of two bands are. Both should be near 0. They are exact for the mesh,
-# by a quadrature of its spectral measure, without eigenvectors.
+# `report` measures how cleanly bands are separated. *Leakage* is the share of a band's energy that comes from outside
+# its pass band. *Coherence* is the absolute inner product of the normalised components of two bands. Both should be
+# near 0. A quadrature of the mesh's spectral measure computes them exactly, without eigenvectors.
 
 # %%
 operator = from_mesh(mesh)
@@ -103,23 +104,23 @@ measure = quadrature(operator, centre(operator, np.asarray(mesh.vertices))[:, 0]
 
 
 def measured(name: str, family: np.ndarray):
-    """Leakage and coherence of a family; Bernstein's bands are equally wide in λ, not in its angle."""
+    """Measure leakage and coherence of a family. Bernstein's bands are equally wide in λ, others in arccos(1 - λ)."""
     return report(measure, family, edges=np.linspace(0, 2, BANDS + 1) if name == "Bernstein" else None)
 
 
 print("family              leakage  coherence  overshoot")
 for name, family in shown.items():
-    found = measured(name, family)
-    leakage = np.median(found.leakage)
-    print(f"{name:<18} {leakage:8.4f} {found.coherence_median:10.4f} {found.overshoot.max():10.3f}")
+    figures = measured(name, family)
+    leakage = np.median(figures.leakage)
+    print(f"{name:<18} {leakage:8.4f} {figures.coherence_median:10.4f} {figures.overshoot.max():10.3f}")
 assert np.median(measured("damped", shown["damped (Jackson)"]).leakage) < 0.01
 
 # %% [markdown]
 # ## Degree
 #
-# A band of degree n takes n products with the Laplacian, each as long as one look at every edge, and all bands share
-# them. A sharper band takes a higher degree. With damping, twice as many terms as bands are plenty; without, eight
-# times as many only just do. The price of damping is a band that is nearly twice as wide.
+# Bands of degree n take n products with the Laplacian, which all bands share; each product visits every edge once. A
+# sharper band needs a higher degree. With damping, twice as many terms as bands are enough; without damping, eight
+# times as many are barely enough. Damping makes a band nearly twice as wide.
 
 # %%
 print("degree   " + "  ".join(f"{name:>18}" for name in shown))
@@ -129,14 +130,14 @@ for degree in (15, 31, 63, 127):
 plot.responses({f"degree {degree}": families(degree)["damped (Jackson)"] for degree in (15, 31, 63)}).save("03_3.png")
 
 # %% [markdown]
-# The keyed scheme has 64 damped bands of degree 63. Neighbours overlap, which does no harm: it writes in the lowest 20
-# of them, and weighs each by what is left in it.
+# The keyed scheme has 64 damped bands of degree 63. It writes in the lowest 20 of them, and its reader weights each
+# band by the part of the mark that is left in it. The overlap of neighbouring bands does no harm.
 #
-# ## Where the eye looks
+# ## Visibility
 #
-# Displacement of the same size is seen far more at high frequencies. DAME, the change of angles between neighbouring
-# faces, rises a hundredfold over the spectrum: another reason to stay low. `04_tune_the_bands.py` weighs it against
-# what attacks leave.
+# A displacement of the same size is far more visible at high frequencies. DAME, the change of angles between
+# neighbouring faces, rises by a factor of a hundred over the spectrum. This is another reason to use low frequencies.
+# `04_tune_the_bands.py` balances visibility against robustness.
 
 # %%
 pictures.band_visibility(original, ["rms", "gl", "dame"]).save("03_4.png")
@@ -144,17 +145,18 @@ pictures.band_visibility(original, ["rms", "gl", "dame"]).save("03_4.png")
 # %% [markdown]
 # ## Payload
 #
-# `jm.capacity` says how many bits survive the noise you name with half of the vertices lost. It comes from two things:
-# *room* (dimensions of the pass band, less what is projected off: every bit and the tag take some) and *energy* (each
-# bit takes its part of the mark's, against the noise's). Twice the displacement is four times the energy, and so many
-# times the bits, until the room is full. Below some dozens of bits, the tag takes most.
+# `jm.capacity` computes how many bits survive a given noise with half of the vertices lost. Two things limit it: the
+# *degrees of freedom* (dimensions of the pass band that projection leaves, shared by all bits and the tag), and the
+# *energy* of the mark, shared by all bits, against that of the noise. Twice the displacement is four times the energy,
+# and carries four times the bits, until the degrees of freedom are used up. Below some dozens of bits, the tag takes
+# most of the capacity.
 
 # %%
 for budget in (2e-4, 4e-4, 8e-4):
     print(f"RMS {budget:.2%} of the diagonal: {jm.capacity(mesh, jm.Budget(rms=budget, noise=0.005)):4} bits")
 
 # %% [markdown]
-# More is refused, with the mend:
+# A larger message is refused, and the error says how to mend it:
 
 # %%
 try:
@@ -163,8 +165,8 @@ except jm.JaxmarkError as refusal:
     print(refusal)
 
 # %% [markdown]
-# And what is the price of more bits, at the same displacement? Strength against noise. Each curve is the share of
-# messages read exactly, with 95 % intervals for the few samples that were taken.
+# At the same displacement, more bits survive less noise. Each curve is the share of messages read exactly, with 95 %
+# intervals, which are wide because there are few samples.
 
 # %%
 curves = {}
@@ -177,9 +179,9 @@ for size in (2, 16):
 pictures.success(curves, jm.adversaries.ATTACKS["noise"].unit).save("03_5.png")
 
 # %% [markdown]
-# ## In short
+# ## Recommendations
 #
-# - Damped scaling functions, 64 bands: the default, for nearly all meshes.
-# - As few bits as serve: 64 name anything in a table. The rest of the energy makes the mark stronger.
-# - As strong as the limits of a budget on a perceptual metric allow, not with one displacement for all meshes.
-# - `jm.capacity` before, and `jm.robustness` after.
+# - Use 64 bands of damped scaling functions, the default, for nearly all meshes.
+# - Use as few bits as you need; 64 identify any entry of a table. The energy that is left makes the mark stronger.
+# - Limit a perceptual metric, instead of using one displacement for all meshes.
+# - Run `jm.capacity` before marking, and `jm.robustness` after.

@@ -13,9 +13,9 @@
 # %% [markdown]
 # # Tune the bands under a perceptual budget
 #
-# People tolerate far more displacement at low spatial frequencies than at high ones, and attacks leave more of some
-# bands than of others. `tune` measures both on the mesh, and gives the bands the strengths at which the worst attack is
-# least bad.
+# This notebook is for owners who know the attacks to expect. People notice a displacement far less at low spatial
+# frequencies than at high ones, and attacks damage some bands more than others. `jm.tune` measures both on the mesh,
+# and computes the strength of each band that is best against the worst attack.
 
 # %% tags=["remove-cell"]
 import importlib.util
@@ -44,26 +44,27 @@ for band in (0, 1, 3, 7, 15, 31):
     )
 
 # %% [markdown]
-# One limit and two attacks: noise that looks like a mark, and a filter that leaves only the lowest tenth of the
-# spectrum. `tune` writes, attacks and reads marks of several strengths; `tried` is the evidence that the detector has
-# after each attack, in nats. Only the worst attack counts, so what another leaves may shrink down to it. No strengths
-# whatever could exceed `bound`, by a model of the attacks.
+# This example has one limit and two attacks: noise in the bands that carry marks, and a filter that keeps only the
+# lowest tenth of the spectrum. `tune` writes, attacks and reads marks of several strengths. `trials` is the measured
+# evidence after each attack, in nats. Only the worst attack counts, so the evidence after the other may fall to the
+# same value. `bound` is the evidence that no strengths can exceed, by a model of the attacks.
 #
-# The default strengths are good against many attacks, and kept where nothing does better by a fifth: try noise and
-# smoothing instead.
+# The default strengths are good against many attacks. They are kept unless others are better by a fifth; noise and
+# smoothing are an example.
 
 # %%
 LIMITS = {"dame": 0.008}
 ATTACKS = [("jamming", 0.002), ("low-pass", 0.9)]
 tuned = jm.tune(mesh, ATTACKS, LIMITS, seed=0, bits=16, margin="evidence")
 report = tuned.report
-print("kept: the default is as good" if report.default_kept else "found: better strengths than the default's")
-for (kind, strength), left, before in zip(ATTACKS, report.trials, report.default_trials, strict=True):
-    print(f"after {kind} {strength:g}: {left:.0f} nats, by default {before:.0f}")
-print(f"worst {report.trials.min():.0f}, by default {report.default_trials.min():.0f}, bound {report.bound:.0f}")
+print("the default strengths are kept" if report.default_kept else "the tuned strengths are better than the default")
+for (kind, strength), nats, before in zip(ATTACKS, report.trials, report.default_trials, strict=True):
+    print(f"evidence after {kind} {strength:g}: {nats:.0f} nats, with default strengths {before:.0f}")
+print(f"worst attack: {report.trials.min():.0f}, default {report.default_trials.min():.0f}, bound {report.bound:.0f}")
 
 # %% [markdown]
-# Beside a mark of the default strengths, at the same limit. The claims are of another key than those that were tried.
+# The next cell compares a tuned mark with one of default strengths, within the same limit. Both use a key that had no
+# part in tuning.
 
 # %%
 key, message = jm.new_key(), b"ok"
@@ -73,22 +74,23 @@ for name, scheme in (("default", "keyed"), ("tuned", tuned.scheme)):
     marked, info = marker.embed(message, jm.Budget(limits=LIMITS, noise=0))
     print(f"{name}: RMS {info.rms:.4%} of the diagonal, DAME {jm.compare(mesh, marked, ['dame']).dame:.4f}")
     claims = [marker.detect(jm.attack(marked, *one, seed=1), message) for one in ATTACKS]
-    for (kind, strength), found in zip(ATTACKS, claims, strict=True):
-        print(f"  after {kind} {strength:g}: log10 p of the claim {found.evidence.log10_p_unfloored:.1f}")
-    worst[name] = max(found.evidence.log10_p_unfloored for found in claims)
+    for (kind, strength), claim in zip(ATTACKS, claims, strict=True):
+        print(f"  after {kind} {strength:g}: log10 p of the claim {claim.evidence.log10_p_unfloored:.1f}")
+    worst[name] = max(claim.evidence.log10_p_unfloored for claim in claims)
     betas[name] = info.record.beta * np.asarray(marker.reader.carrier.profile)
     shown[name] = marked
 assert worst["tuned"] < -6
 assert report.default_kept or worst["tuned"] < worst["default"]
 
 # %% [markdown]
-# The strengths over frequency: β is what is written in a band, in diagonals of the bounding box.
+# The figure shows the strength β of each band over frequency, as a fraction of the bounding box's diagonal.
 
 # %%
 plot.strengths({name: np.pad(beta, (0, 64 - len(beta))) for name, beta in betas.items()}).save("04_1.png")
 
 # %% [markdown]
-# The mark, ten times the mark, and where it shows: displacement over what the roughness around it hides.
+# The last figure shows the original, ten times the mark, its displacement, and its visibility: the displacement
+# relative to the displacement that the surrounding roughness masks.
 
 # %%
 plot.draw(

@@ -11,9 +11,10 @@
 # ---
 
 # %% [markdown]
-# # A robustness study with your own mesh
+# # A robustness study of your own mesh
 #
-# A study is declared as a grid and run by one line. To use a mesh of your own, change the one line below.
+# A study measures how often messages are read after attacks, with controls and confidence intervals. It is declared as
+# a grid, and run by one line. To study a mesh of your own, change the line `MESH = …`.
 
 # %% tags=["remove-cell"]
 import importlib.util
@@ -36,20 +37,20 @@ FOLDER.mkdir(parents=True, exist_ok=True)
 study = jm.Study(
     meshes={"model": MESH},
     schemes=["keyed"],
-    budgets=[4e-4],  # RMS of the mark over the diagonal: weak, so that there is something to lose
+    budgets=[4e-4],  # RMS displacement over the diagonal; weak, so that some readings fail
     attacks={"noise": [0.002, 0.005, 0.02], "quantisation": [9, 7]},
     samples=3,
 )
 results = study.run(FOLDER / "results.jsonl", say=print)
 
 # %% [markdown]
-# Each line of `results.jsonl` is a finished cell. Run the cell above again: nothing is left to do, and it ends at once.
-# Add a strength, and only that is done. With `workers=2` there are two processes; a script (not Jupyter) then has to
-# start them below `if __name__ == "__main__":`.
+# Each line of `results.jsonl` is a finished cell of the grid. If you run the code again, it ends at once, because no
+# cell is missing. If you add a strength, only the new cells are computed. `workers=2` uses two processes; a script
+# (unlike Jupyter) must then start them below `if __name__ == "__main__":`.
 #
-# Every sample has a seed of its own: another key, another message, another attack. So the trials are independent,
-# and the share that was read has an exact interval (Clopper and Pearson, 1934), which covers the true rate with at
-# least 95 % probability whatever it is. From three trials that all read, it begins at 29 %: few trials prove little.
+# Every sample has its own seed, and so its own key, message and random choices of the attack. The trials are therefore
+# independent, and the rate of reading has an exact interval (Clopper and Pearson, 1934) that covers the true rate with
+# a probability of at least 95 %. If all of three trials succeed, the interval begins at 29 %, so take more samples.
 
 # %%
 print(results.markdown())
@@ -61,9 +62,9 @@ for rate in results.rates(["attack", "strength", "control"]):
         )
 
 # %% [markdown]
-# A reading proves something only if what is not marked is not read. Two controls went through the same pipeline: the
-# unmarked mesh after the same attacks, read with the right key, and the marked one read with another key. Here they are
-# pooled over all attacks.
+# A reading proves something only if unmarked meshes are not detected. Two controls go through the same pipeline: the
+# unmarked mesh after the same attacks, read with the right key, and the marked mesh, read with another key. The next
+# cell pools them over all attacks.
 
 # %%
 for rate in results.rates(["control"]):
@@ -72,9 +73,9 @@ for rate in results.rates(["control"]):
         assert rate["detected"] == 0
 
 # %% [markdown]
-# The curves: the share of messages read over the strength of each attack, the controls in grey; and the evidence, with
-# the level at which a mark counts as detected and the floor below which nothing is proven. With pandas (extra `study`),
-# `results.frame()` is a table of all readings.
+# The first figure shows the share of messages read over the strength of each attack, with the controls in grey. The
+# second shows the evidence, with the level from which a mark is detected, and the floor beyond which nothing is proven.
+# With pandas (extra `study`), `results.frame()` returns a table of all readings.
 
 # %%
 results.plot().save("05_1.png")

@@ -13,10 +13,11 @@
 # %% [markdown]
 # # A gradient attack and a defence
 #
-# Marking, attack and reading are differentiable, so an attacker can be optimised. Here the worst attacker of all, one
-# who holds original, key and message, goes against the evidence S/‖a‖ of a claim. It needs to fall below 5.26 for the
-# false-positive probability to exceed one in a million. (Strengths of bands that hold against an attacker are found in
-# "Tune the bands under a perceptual budget".)
+# Marking, attacks and reading are differentiable, so attacks can be optimised by gradients. This notebook, for readers
+# who assess security, shows two attackers, and the defence of the reader against the first. The strongest attacker has
+# original, key and message, and reduces the evidence S/‖a‖ for a claim: the score S of the message over the norm of the
+# vector a that it is computed from. The mark is no longer detected if S/‖a‖ falls below 5.26, where the false-positive
+# probability exceeds one in a million. ("Tune the bands under a perceptual budget" computes strengths against attacks.)
 
 # %% tags=["remove-cell"]
 import importlib.util
@@ -35,8 +36,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxmark as jm
-from jaxmark import adversaries as enemies
-from jaxmark import plot
+from jaxmark import adversaries, plot
 from jaxmark.adversaries.expected import evidence, make_surrogate, random_mark, rescale
 from jaxmark.adversaries.keyless import descend
 from jaxmark.geometry import asteroid
@@ -50,26 +50,27 @@ needed = math.sqrt(2 * 6 * math.log(10))
 print(f"{len(mesh.vertices)} vertices, evidence needed {needed:.2f}")
 
 # %% [markdown]
-# ## With the key: what the receiver learns of a suspect is attacked, too
+# ## An attacker with the key
 #
-# The receiver weighs each band by what little is in it. Who empties a band, and leaves the mark there with its sign
-# turned, makes that band speak for all; so the gradient finds. The defence: a second way of weighing, all bands alike,
-# which nobody can steer. Whoever takes the better of two proofs pays for both, a factor of 2 in the probability, and
-# the attacker has to defeat both.
+# The reader weights a band more if it contains less noise. The gradient finds an attack on these weights: empty a band,
+# leave the mark there with reversed sign, and this band dominates the score. The defence is a second score that weights
+# all bands equally, which no attacker can influence. The reader takes the better of two proofs, at the cost of a factor
+# of 2 in the probability, and the attacker must defeat both.
 
 # %%
 word = jnp.asarray(marker.codeword(message), jnp.float32)
 share = 0.3
-weak = enemies.erasure_by_descent(marker, message, steps=8)
+weak = adversaries.erasure_by_descent(marker, message, steps=8)
 suspect = jm.attack(marked, weak, share * size, seed=0)
 scores, norms = claims(marker.reader, marker.receive(marker.register(suspect)), word)
-by_bands, all_alike = np.asarray(scores / norms)
-print(f"displaced by {share:.0%} of the mark's RMS: {by_bands:.1f} weighed by bands, {all_alike:.1f} all alike")
-print(f"claimed: log10 p {marker.detect(suspect, message).log10_p:.1f}")
+by_bands, equal = np.asarray(scores / norms)
+print(f"displaced by {share:.0%} of the mark's RMS: S/‖a‖ is {by_bands:.1f} weighted, {equal:.1f} with equal weights")
+print(f"log10 p of the claim: {marker.detect(suspect, message).log10_p:.1f}")
 assert marker.detect(suspect, message).detected()
 
 # %% [markdown]
-# What it takes in the end, by bisection. Subtracting the mark itself, which every holder of the key can do, costs 1.
+# Bisection finds the displacement at which the mark is no longer detected, relative to the mark's own RMS. For
+# comparison, subtracting the mark itself, which the key holder can always do, costs 1.
 
 # %%
 broken = jm.evaluation.minimum_distortion(
@@ -78,10 +79,11 @@ broken = jm.evaluation.minimum_distortion(
 print(f"with the key: {broken.cost('rms'):.2f} of the mark's RMS")
 
 # %% [markdown]
-# ## Without the key: the expected detector
+# ## A keyless attacker
 #
-# This attacker takes the marked mesh for the original, writes marks of random keys in it, and lowers the evidence that
-# is *expected*. All of it is one compiled function, which `vmap` restarts. Beside it, what writing another mark does.
+# A keyless attacker has the marked mesh and this library. The attacker uses the marked mesh as the original, writes
+# marks of random keys into it, and reduces the evidence *expected* over these keys. The optimisation is one compiled
+# function. It is compared with re-watermarking, which adds another mark of the same size.
 
 # %%
 surrogate, original = make_surrogate(marked, "keyed", 16, size)
@@ -96,21 +98,22 @@ def expected(surrogate, shift):
 
 seek = jax.jit(partial(descend, family="bands", steps=30))
 other = rescale(surrogate, random_mark(surrogate, jax.random.key(1))[1], strength)
-found = seek(surrogate, strength, jax.random.key(1))
-nothing, another, best = (float(expected(surrogate, shift)) for shift in (jnp.zeros_like(other), other, found))
-print(f"expected evidence at {4 * size:g}: another mark {another:.1f}, optimised {best:.1f}")
+optimised = seek(surrogate, strength, jax.random.key(1))
+nothing, another, best = (float(expected(surrogate, shift)) for shift in (jnp.zeros_like(other), other, optimised))
+print(f"expected evidence after a displacement of {4 * size:g}: another mark {another:.1f}, optimised {best:.1f}")
 assert best < another < nothing
-moved = marked._replace(vertices=marked.vertices + original.diagonal * original.to_host(found)[original.weld.point])
-print(f"the owner's claim of it: log10 p {marker.detect(moved, message).log10_p:.1f}")
+moved = marked._replace(vertices=marked.vertices + original.diagonal * original.to_host(optimised)[original.weld.point])
+print(f"log10 p of the owner's claim: {marker.detect(moved, message).log10_p:.1f}")
 
 # %% [markdown]
-# The mark, and what both attackers did to the marked mesh. Without the key, it takes several times the mark's size.
+# The figure shows the displacement by the mark, and by both attackers. Without the key, the attack needs several times
+# the displacement of the mark.
 
 # %%
 plot.draw(
     [
         plot.displacement(marker.original, marked, "the mark"),
         plot.displacement(original, suspect, "with the key"),
-        plot.displacement(original, moved, "without it"),
+        plot.displacement(original, moved, "without the key"),
     ]
 ).save("06_1.png")

@@ -13,8 +13,9 @@
 # %% [markdown]
 # # Parts of your own: an attack, a metric, a carrier
 #
-# Attacks, metrics and schemes are plain Python objects, and one of yours goes wherever a name of the library's does.
-# Here we write one of each, and put them through marking, reading, robustness and limits.
+# This notebook is for researchers who extend the library. Attacks, metrics and schemes are plain Python objects, and
+# you can pass your own wherever the library accepts a name. The sections below implement one of each, and use them for
+# marking, reading, robustness curves and limits.
 
 # %% tags=["remove-cell"]
 import importlib.util
@@ -47,21 +48,21 @@ from jaxmark.watermark.interfaces import Detector, Scheme
 from jaxmark.watermark.reading.detectors import decorrelate
 
 mesh = asteroid(2800)
-key = jm.Key(bytes(range(32)))  # the same each time; real ones are `jm.new_key()`
+key = jm.Key(bytes(range(32)))  # the same in each run; make real keys by `jm.new_key()`
 print(f"{len(mesh.vertices)} vertices")
 
 # %% [markdown]
 # ## An attack
 #
-# An attack is a function of a mesh, a strength and a random key, with the unit of its strength and a usual range. This
-# one presses plane waves into the surface, as a worn 3D printer does. Written in JAX, it is given the mesh near the
-# origin and at unit size (diagonal 1), and can be differentiated. (`host=True` marks one in NumPy, which gets the mesh
-# as it is, and a NumPy generator instead of a key.)
+# An attack is a function of a mesh, a strength and a random key, together with the unit of its strength and a usual
+# range. This one adds plane waves to the surface, as a worn 3D printer does. An attack in JAX gets the mesh near the
+# origin and with a diagonal of 1, and can be differentiated. (With `host=True`, an attack is written in NumPy. It gets
+# the mesh as it is, and a NumPy generator instead of a key.)
 
 
 # %%
 def chatter(mesh: Mesh, strength: float, key: jax.Array) -> Mesh:
-    """Waves of a twentieth of the diagonal, of a random phase, along z."""
+    """Displace vertices along z by waves of a twentieth of the diagonal, with a random phase."""
     phase = jax.random.uniform(key, maxval=2 * jnp.pi)
     height = strength * jnp.sin(2 * jnp.pi * 20 * mesh.vertices[:, 1] + phase)
     return Mesh(mesh.vertices + height[:, None] * jnp.array([0.0, 0.0, 1.0]), mesh.faces)
@@ -75,26 +76,26 @@ plot.draw(
 ).save("07_1.png")
 
 # %% [markdown]
-# It goes where names go: into `attack`, into chains with others, into `robustness`.
+# Pass the attack to `attack`, to chains with other attacks, or to `robustness`.
 
 # %%
 marker = jm.make_marker(mesh, key, bits=16)
 marked, info = marker.embed(b"ok", jm.Budget(rms=8e-4, noise=0))
 both = jm.adversaries.chain(marked, [(chattering, 0.001), ("quantisation", 10)], seed=1)
-print("after chatter and quantisation:", marker.detect(both).message)
+print("message after chatter and quantisation:", marker.detect(both).message)
 curve = jm.robustness(marker, marked, b"ok", chattering, [0.02, 0.1], samples=1)
-print("read at 2 % and 10 % of the diagonal:", curve.success[:, 0])
+print("message read at amplitudes of 2 % and 10 % of the diagonal:", curve.success[:, 0])
 
 # %% [markdown]
 # ## A metric
 #
-# A metric is a function of an original and a distorted mesh: 0 where they are the same, and rising. A print shop may
-# care how much material a mark takes; an engineer, how much edges are stretched.
+# A metric is a function of an original and a distorted mesh. It is 0 if they are equal, and rises with the distortion.
+# This one measures how much the edges are stretched.
 
 
 # %%
 def stretch(original: Mesh, distorted: Mesh) -> float:
-    """Root mean square of the relative change of edges' lengths."""
+    """Compute the root mean square of the relative change of edge lengths."""
 
     def lengths(one: Mesh) -> np.ndarray:
         corners = np.asarray(one.vertices)[np.asarray(original.faces)]
@@ -107,9 +108,9 @@ for name, value in jm.distortion.measure(mesh, marked, ["rms", "dame", stretch])
     print(f"{name:>8}: {value:.5f}")
 
 # %% [markdown]
-# Limits take it, too: the mark becomes as strong as no edge, in the mean, is stretched by more than 1 %. And as any
-# metric, it has a visibility per band of frequencies, by which `jm.tune` would balance it against attacks. Edges are
-# stretched by high frequencies, as dihedral angles are bent by them.
+# The metric can be a limit: here the mark is as strong as a root mean square stretch of 1 % allows. Like any metric, it
+# also has a visibility for each band of frequencies, which `jm.tune` balances against attacks. High frequencies stretch
+# edges, as they change dihedral angles.
 
 # %%
 gentle, _ = marker.embed(b"ok", jm.Budget(limits={stretch: 0.01}, noise=0))
@@ -120,45 +121,45 @@ pictures.band_visibility(original, ["rms", "dame", stretch]).save("07_2.png")
 # %% [markdown]
 # ## A carrier, and the scheme that makes it
 #
-# A carrier is a linear map from bits to a displacement, and its adjoint. Most are *components*, fixed directions that
-# do not depend on the key, modulated by keyed sequences of signs; then `ModulatedCarrier` does the rest and only the
-# components are to be written. Ours are waves through space, which move each vertex along its normal:
-# $w(v) = n_v \cos(k_j \cdot v + \varphi_j)$. No spectrum, no eigenvectors, no edges.
+# A carrier is a linear map from bits to a displacement, together with its adjoint. Most carriers modulate *components*,
+# fixed displacements that do not depend on the key, by keyed sequences of signs. `ModulatedCarrier` implements this, so
+# only the components have to be written. These are waves through space that move each vertex along its normal:
+# $w(v) = n_v \cos(k_j \cdot v + \varphi_j)$. They use no spectrum, no eigenvectors and no edges.
 #
-# Components have three methods: how they add up, what they find, and their inner products. It is a `NamedTuple` of
-# arrays, so that JAX can trace it.
+# Components have three methods: `synthesise` adds them up, `analyse` is its adjoint, and `gram` has their inner
+# products. The class is a `NamedTuple` of arrays, so that JAX can trace it.
 
 
 # %%
 class Waves(NamedTuple):
-    """Cosines of the position, along normals."""
+    """Displacements along the normals by cosines of the position."""
 
     heights: jax.Array  # vertices, waves
     normals: jax.Array  # vertices, 3
 
     @property
     def gram(self) -> jax.Array:
-        """Inner products of the waves for each coordinate."""
+        """The inner products of the waves, for each coordinate."""
         return einsum("vj,vc,vk->cjk", self.heights, self.normals**2, self.heights)
 
     def synthesise(self, amplitudes: jax.Array) -> jax.Array:
-        """From an amplitude for each wave and coordinate to a displacement."""
+        """Compute a displacement from an amplitude for each wave and coordinate."""
         return self.normals * matmul(self.heights, amplitudes)
 
     def analyse(self, residual: jax.Array) -> jax.Array:
-        """Back: the adjoint."""
+        """Compute the adjoint of `synthesise`."""
         return matmul(self.heights.T, self.normals * residual)
 
 
 # %% [markdown]
-# A scheme is a frozen dataclass that makes the carrier for an original, a key and a payload, and inherits from `Scheme`
-# what it does not say. Its fields go into the record of a mark. It says which detector reads it: `decorrelate` solves
-# for all bits at once, as the waves are not orthogonal on the surface.
+# A scheme is a frozen dataclass that makes the carrier for an original, a key and a payload, and inherits everything
+# else from `Scheme`. Its fields are stored in the record of a mark. It names its detector: `decorrelate` solves for all
+# bits at once, because the waves are not orthogonal on the surface.
 #
-# `choices` has all that depends on the key: signs, permutations and bytes, by a label of our own. They are bound to
-# the scheme's name and fields, to payload and original: with another wavelength, all signs are others. Only the signs
-# may depend on the key; the waves must not, or the proof of a detection would not hold. Nobody but you can know that,
-# so that a reading with a scheme of your own is an estimate, and `evidence.caveats` says why.
+# `choices` provides everything that depends on the key: signs, permutations and bytes, for a label of your own. They
+# are bound to the scheme's name and fields, the payload and the original, so another wavelength gives other signs. Only
+# the signs may depend on the key. If the waves did, the proof of a detection would not hold. The library cannot check
+# this, so a reading with a scheme of your own is an estimate, and `evidence.caveats` gives the reason.
 
 
 # %%
@@ -172,16 +173,16 @@ class WaveScheme(Scheme):
 
     @property
     def detector(self) -> Detector:
-        """What reads it."""
+        """The detector of this scheme."""
         return decorrelate
 
     def code_length(self, original, bits: int) -> int:
-        """How many code bits carry a payload: at most one for two waves."""
+        """Return the number of code bits for a payload: at most one for every two waves."""
         return code_length(bits, self.waves // 2, 4)
 
     def carrier(self, original, choices: Choices, bits: int, code_bits: int) -> ModulatedCarrier:
-        """The waves, and a keyed sequence of signs for each code bit."""
-        random = np.random.default_rng(0)  # no secret: the same for every key
+        """Make the carrier: the waves, and a keyed sequence of signs for each code bit."""
+        random = np.random.default_rng(0)  # not secret: the same waves for every key
         vectors = random.normal(size=(3, self.waves))
         vectors *= 2 * np.pi / self.wavelength * random.uniform(0.3, 1, self.waves) / np.linalg.norm(vectors, axis=0)
         heights = np.cos(original.positions @ vectors + random.uniform(0, 2 * np.pi, self.waves))
@@ -195,31 +196,33 @@ class WaveScheme(Scheme):
 
 scheme = WaveScheme()
 waves = jm.make_marker(mesh, key, bits=16, scheme=scheme)
-waved, record = waves.embed(b"ok", {stretch: 0.01})
-print(f"RMS {record.rms:.3%} of the diagonal; read: {waves.detect(waved).message}, {record.record.parameters}")
+waved, info = waves.embed(b"ok", {stretch: 0.01})
+print(f"RMS {info.rms:.3%} of the diagonal; message {waves.detect(waved).message}, parameters {info.record.parameters}")
 plot.draw(
     [plot.exaggerate(original, gentle), plot.exaggerate(original, waved), plot.displacement(original, waved)]
 ).save("07_3.png")
 
 # %% [markdown]
-# Everything else is the library's: alignment, tags, evidence, records. A wrong key reads nothing, and the reader asks
-# for no more than the record and the scheme.
+# The library provides everything else: alignment, tags, evidence and records. The reader needs the record and the
+# scheme. A wrong key reads no message.
 
 # %%
 noisy = jm.attack(waved, "noise", 0.002, seed=0)
-found = jm.detect(noisy, original=mesh, key=key, record=record.record, scheme=scheme)
-print(f"read {found.message}, log10 p {found.log10_p:.1f}; claimed {waves.detect(noisy, b'ok').log10_p:.1f}")
-print("an estimate, for", *found.evidence.caveats)
+detection = jm.detect(noisy, original=mesh, key=key, record=info.record, scheme=scheme)
+claimed = waves.detect(noisy, b"ok").log10_p
+print(f"message {detection.message}, log10 p {detection.log10_p:.1f}; of a claim {claimed:.1f}")
+print("an estimate, because:", *detection.evidence.caveats)
 stranger = jm.make_marker(mesh, jm.Key(bytes(32)), bits=16, scheme=scheme)
-assert found.message == b"ok"
-assert found.evidence.caveats
+assert detection.message == b"ok"
+assert detection.evidence.caveats
 assert stranger.detect(waved).message is None
 
 # %% [markdown]
-# ## All together
+# ## Compare both schemes
 #
-# Both schemes under our attack, marked up to the same limit of our metric. Waves through space are what chatter is made
-# of, so that the reader of the waves hears it; the keyed scheme weighs bands by what is left in them, and loses little.
+# Both schemes mark the mesh up to the same limit of the new metric, and read after the new attack. Chatter consists of
+# waves through space, so it disturbs the reader of the waves. The keyed scheme weights bands by the noise in them, and
+# loses little.
 
 # %%
 curves = {

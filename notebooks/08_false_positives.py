@@ -13,9 +13,9 @@
 # %% [markdown]
 # # What a detection proves, and what it does not
 #
-# A detector that always says "marked" finds every mark. What counts is how seldom it says so without reason, and
-# whether that is measured on a few meshes or *proven* for all. Here it is proven; this notebook shows the proof at
-# work, and each condition it rests on, by breaking it.
+# This notebook is for readers who must judge a detection. A detector that always says "marked" detects every mark. So
+# its quality is its false-positive rate, and whether that rate is measured on a few meshes or *proven* for all. Here it
+# is proven. The notebook repeats the proof by hand, and then breaks each of its conditions in turn.
 
 # %% tags=["remove-cell"]
 import importlib.util
@@ -46,7 +46,7 @@ MESSAGE = b"jaxmark!"
 
 
 def key_of(number: int) -> jm.Key:
-    """Keys for the experiment, the same each time; real ones are `jm.new_key()`."""
+    """Return a key for the experiment, the same in each run; make real keys by `jm.new_key()`."""
     return jm.Key(number.to_bytes(32, "little"))
 
 
@@ -58,57 +58,57 @@ print(f"{len(mesh.vertices)} vertices, RMS displacement {info.rms:.3%} of the di
 # %% [markdown]
 # ## The proof
 #
-# The reader brings a suspect back to the original, takes the host's part off, weighs the bands, and is left with one
-# number $a_v$ for each coordinate of each vertex. **No step so far has used the key.** Only now come the keyed signs
-# $s_v = \pm 1$, times the claimed codeword: the score is $S = \sum_v s_v a_v$.
+# The reader registers the suspect to the original, projects off the host's part, and weights the bands. This leaves one
+# number $a_v$ for each coordinate of each vertex. **No step so far has used the key.** The score of a claimed message
+# is $S = \sum_v s_v a_v$, where $s_v = \pm 1$ are the keyed signs times the message's codeword.
 #
-# If the suspect knows nothing of the key, neither does $a$, and the signs are fair coins. Hoeffding's inequality (1963)
-# then bounds the score, whatever $a$ is, and so whatever the suspect is:
+# If the suspect is independent of the key, so is $a$, and the signs are fair coins. Hoeffding's inequality (1963) then
+# bounds the score for every $a$, and so for every suspect:
 #
 # $$P(S \ge t \|a\|) \le e^{-t^2/2}.$$
 
 
 # %%
 @jax.jit
-def vector(seen):
-    """What the keyed signs multiply; the key is nowhere in it."""
-    return owner.reader.matched_residual(owner.reader.receive(seen))
+def vector(observation):
+    """Compute the vector a that the keyed signs multiply; it does not depend on the key."""
+    return owner.reader.matched_residual(owner.reader.receive(observation))
 
 
 def scores(suspect: jm.Mesh, claims: list[tuple[jm.Key, bytes]]) -> tuple[np.ndarray, float]:
-    """S of each claim of a key and a message, and ‖a‖."""
+    """Compute S for each claim, a key and a message, and ‖a‖."""
     a = np.asarray(vector(owner.observe(owner.register(suspect))), np.float64)
     a[~original.moving] = 0
-    found = []
+    values = []
     for key, message in claims:
         choices = owner.choices_of(key)
         chips = make_chips(choices, original.chip_places, owner.code_bits)
         word = encode(message, choices, owner.code_bits)
-        found.append(np.sum(chips.signs * word[chips.slots] * a))
-    return np.array(found), float(np.linalg.norm(a))
+        values.append(np.sum(chips.signs * word[chips.slots] * a))
+    return np.array(values), float(np.linalg.norm(a))
 
 
 def bound(suspect: jm.Mesh, claims: list[tuple[jm.Key, bytes]]) -> np.ndarray:
-    """The proven log10 p of each claim."""
-    found, norm = scores(suspect, claims)
-    return np.array([log10_p_score(score, norm) for score in found])
+    """Compute the proven log10 p of each claim."""
+    values, norm = scores(suspect, claims)
+    return np.array([log10_p_score(score, norm) for score in values])
 
 
 noisy = jm.attack(marked, "noise", 0.02, seed=0)
 (by_hand,) = bound(noisy, [(key_of(0), MESSAGE)])
 by_library = owner.detect(noisy, MESSAGE).log10_p
 print(f"log10 p by hand {by_hand:.2f}, by the library {by_library:.2f}")
-# The library charges for two ways to weight the bands, of which this is one and the other may prove more, and 3 % each
-# for other alignments and for other messages.
+# The library takes the better of two ways to weight the bands, of which this is one, and charges a factor of 2. It
+# reserves 3 % of the significance budget for other alignments, and 3 % for other messages.
 assert by_library < 0.99 * (by_hand + math.log10(2 / 0.97**2))
 
 # %% [markdown]
 # ## Wrong keys and unmarked meshes
 #
-# Two thousand keys that had no part in it are tried on an unmarked mesh with noise, and on one that somebody else has
-# marked. The proof says that the curves stay below the dashed line. They stay well below: Hoeffding's bound must hold
-# for every suspect, the worst included. The estimate that takes $S$ to be Gaussian (`log10_p_gaussian`) follows the
-# line closely, here.
+# Two thousand independent keys are tried on an unmarked mesh with noise, and on a mesh marked with another key. By the
+# proof, the curves stay below the dashed line. They stay well below it, because Hoeffding's bound must hold for the
+# worst suspect, too. The estimate `log10_p_gaussian`, which assumes a Gaussian $S$, follows the line closely in this
+# case.
 
 # %%
 strangers = [(key_of(1000 + number), MESSAGE) for number in range(2000)]
@@ -118,37 +118,36 @@ unmarked = {
     "marked with another key": other,
 }
 proven = {name: bound(suspect, strangers) for name, suspect in unmarked.items()}
-found, norm = scores(unmarked["unmarked, with noise"], strangers)
-fitted = np.array([log10_p_gaussian(score, norm) for score in found])
+values, norm = scores(unmarked["unmarked, with noise"], strangers)
+gaussian = np.array([log10_p_gaussian(score, norm) for score in values])
 for name, values in proven.items():
     for level in (-1, -2):
         hits = int(np.sum(values <= level))
         print(f"{name}: {hits} of {len(values)} below 10^{level}")
         assert clopper_pearson(hits, len(values), 0.999).low <= 10.0**level
-pictures.p_values({**proven, "the Gaussian estimate": fitted}).save("08_1.png")
+pictures.p_values({**proven, "the Gaussian estimate": gaussian}).save("08_1.png")
 
 # %% [markdown]
-# Why not use the estimate, then? Because it is none for suspects made to be hard. Let the residual be the same at four
-# vertices and nothing elsewhere. All 16 outcomes of the coins can be counted:
+# The estimate is not used for decisions, because an adversary can construct suspects for which it is wrong. Let the
+# residual be equal at a few vertices, and 0 elsewhere. Then all outcomes of the coins can be counted, 16 for four
+# vertices:
 
 # %%
 for k in (1, 4, 9):
     sums = np.array([sum(signs) for signs in itertools.product((-1, 1), repeat=k)])
     truth = np.mean(sums >= k)
-    print(
-        f"{k} vertices, all agree: truth {truth:.4f}, Gaussian {ndtr(-math.sqrt(k)):.4f}, proven {math.exp(-k / 2):.4f}"
-    )
+    print(f"{k} vertices: exact {truth:.4f}, Gaussian {ndtr(-math.sqrt(k)):.4f}, proven bound {math.exp(-k / 2):.4f}")
     assert ndtr(-math.sqrt(k)) < truth <= math.exp(-k / 2)
 
 # %% [markdown]
-# The Gaussian says less than the truth, the bound never does. What that costs a mark is a factor in $p$, not in the
-# exponent: at $t = 6$ the bound is 1.5e-8, the Gaussian 1e-9.
+# The Gaussian estimate is below the exact probability; the bound never is. The bound costs a mark only a factor in $p$:
+# at $t = 6$ it is 1.5e-8, and the Gaussian estimate 1e-9.
 #
-# ## How many marks are found: the ROC curve
+# ## The ROC curve
 #
-# The same suspects, marked and under noise so strong that the message no longer reads, are claimed with the right key
-# and with a wrong one. The curve says which share is detected at each nominal probability of false alarm: the library's
-# usual one is α = 1e-6. Shades are 95 % Clopper-Pearson intervals.
+# Marked suspects, under noise so strong that the message can no longer be decoded, are claimed with the right key and
+# with a wrong key. The curve shows the share that is detected at each nominal false-positive rate; the library's
+# default is α = 1e-6. Shaded areas are 95 % Clopper-Pearson intervals.
 
 # %%
 right, wrong = [], []
@@ -157,7 +156,8 @@ for seed in range(30):
     both = bound(suspect, [(key_of(0), MESSAGE), (key_of(2), MESSAGE)])
     right.append(both[0])
     wrong.append(both[1])
-print(f"detected at 1e-6: {np.mean(np.array(right) <= -6):.0%} of the right key, {np.mean(np.array(wrong) <= -6):.0%}")
+rates = [np.mean(np.array(claims) <= -6) for claims in (right, wrong)]
+print(f"detected at 1e-6: {rates[0]:.0%} of the claims with the right key, {rates[1]:.0%} with a wrong key")
 assert np.median(right) < -5
 assert min(wrong) > -4
 pictures.roc({"right key": np.array(right), "wrong key": np.array(wrong)}, lowest=-15).save("08_2.png")
@@ -165,32 +165,32 @@ pictures.roc({"right key": np.array(right), "wrong key": np.array(wrong)}, lowes
 # %% [markdown]
 # ## Searching
 #
-# The bound is for *one* key and *one* message, fixed before the suspect was seen. Anybody who tries fifty and shows the
-# best has made fifty attempts: its probability is not that of one. The Bonferroni correction multiplies it by fifty, or
-# adds log10 50.
+# The bound holds for *one* key and *one* message, fixed before the suspect was seen. If you try fifty keys and show the
+# best, you have made fifty attempts. The Bonferroni correction multiplies the probability by fifty, that is, adds
+# log10 50 to log10 p.
 #
-# The library charges for its own searches: a message that was *decoded*, not claimed, is the best of all, so that its
-# bound counts all of them, and the keyed tag of 28 bits counts the candidates that were tried before it fitted, 64 at
-# most. `evidence.charges` lists all of this. The library cannot know how many suspects, keys or originals *you* tried.
-# A reader who does not trust you takes `evidence.log10_p_uncommitted`, which assumes that you tried 2^64, each with all
-# messages.
+# The library charges for its own searches. A message that was *decoded* instead of claimed is the best of all messages,
+# so its bound counts all of them. The keyed tag of 28 bits counts the candidates that were tried until it matched, at
+# most 64. `evidence.charges` lists all charges. The library cannot know how many suspects, keys or originals *you*
+# tried. Someone who does not trust you uses `evidence.log10_p_uncommitted`, which assumes that you tried 2^64 of them,
+# each with all messages.
 
 # %%
 TRIES = 50
 best = proven["unmarked, with noise"].reshape(-1, TRIES).min(axis=1)
-estimate = fitted.reshape(-1, TRIES).min(axis=1)
-paid = np.minimum(0, best + math.log10(TRIES))
+estimate = gaussian.reshape(-1, TRIES).min(axis=1)
+corrected = np.minimum(0, best + math.log10(TRIES))
 assert np.mean(best <= -1) > 0.1
-assert clopper_pearson(int(np.sum(paid <= -1)), len(paid), 0.999).low <= 0.1
-tried = {"best of 50 keys": best, "best of 50, Gaussian": estimate, "best of 50, paid for": paid}
-pictures.p_values(tried).save("08_3.png")
+assert clopper_pearson(int(np.sum(corrected <= -1)), len(corrected), 0.999).low <= 0.1
+searches = {"best of 50 keys": best, "best of 50, Gaussian": estimate, "best of 50, corrected": corrected}
+pictures.p_values(searches).save("08_3.png")
 
 # %% [markdown]
 # ## Other messages under the same key
 #
-# The proof needs a suspect that is independent of the key. A mesh that was marked *with that key* is not, whatever its
-# message: codewords of two messages agree in more or fewer of their bits, and the score of the wrong one gets its share
-# of the mark. So six thousand wrong messages are claimed in the very copy with the right one:
+# The proof needs a suspect that is independent of the key. A mesh that was marked *with this key* is not, whatever its
+# message is. The codewords of two messages agree in some bits, so the score of a wrong message contains a part of the
+# mark. Here six thousand wrong messages are claimed in the marked copy:
 
 # %%
 random = np.random.default_rng(0)
@@ -202,15 +202,15 @@ both = {"wrong messages, right key": same_key, "wrong keys": proven["marked with
 pictures.p_values(both).save("08_4.png")
 
 # %% [markdown]
-# The line is crossed: with the same key for several messages, a claim proves that *this key* marked the mesh, not which
-# message it wrote. Where `detect` can read the true message, it says so, and log10 p is that of the message that was
-# read. A record commits to its message, and claiming another one is refused. Beyond that, only a code made for it tells
-# recipients apart (`jm.fingerprint`, `jm.identify`), whose proof rests on other coins.
+# The curve crosses the line. If one key writes several messages, a claim proves that *this key* marked the mesh, but
+# not which message it wrote. If `detect` can decode the true message, it says so, and log10 p is that of the decoded
+# message. A record commits to its message, and another claim is refused. To distinguish recipients, use a code made for
+# it (`jm.fingerprint`, `jm.identify`), whose proof does not need this condition.
 
 # %%
 lie = lies[int(np.argmin(same_key))][1]
 refuted = owner.detect(marked, lie)
-print(f"claimed {lie.hex()}, but {refuted.message!r} reads, log10 p {refuted.log10_p:.1f}:", *refuted.notes)
+print(f"claimed {lie.hex()}, decoded {refuted.message!r}, log10 p {refuted.log10_p:.1f}:", *refuted.notes)
 assert refuted.message == MESSAGE
 assert "Another message" in refuted.notes[0]
 try:
@@ -221,27 +221,28 @@ except jm.JaxmarkError as refusal:
 # %% [markdown]
 # ## The right original
 #
-# Reading compares with the original, and who can choose the original may try to make one up: take the mark of your own
-# off the owner's mesh, call the rest your original, and the owner's mesh seems to carry your mark (Craver, Memon, Yeo,
-# Yeung, "Resolving rightful ownerships with invisible watermarking techniques", 1998). Signs derive from the key *and*
-# the original's geometry, so that a made-up original has other signs than the mark that was taken off:
+# Non-blind reading uses the original, so a forger may try to invent an original. The forger subtracts a mark of their
+# own from the owner's mesh, and calls the result the original. Then the owner's mesh seems to carry the forger's mark
+# (Craver, Memon, Yeo, Yeung, "Resolving rightful ownerships with invisible watermarking techniques", 1998). This fails
+# here, because the signs derive from the key *and* the original's geometry: the invented original has other signs than
+# the mark that was subtracted.
 
 # %%
 forger = key_of(3)
 forged, _ = jm.make_marker(marked, forger, bits=64).embed(b"my mesh!", jm.Budget(rms=8e-4, noise=0))
-made_up = marked._replace(vertices=2 * marked.vertices - forged.vertices)
-claim = jm.detect(marked, original=made_up, key=forger, message=b"my mesh!")
+invented = marked._replace(vertices=2 * marked.vertices - forged.vertices)
+claim = jm.detect(marked, original=invented, key=forger, message=b"my mesh!")
 print(f"the forger's claim: log10 p {claim.log10_p:.1f}")
 assert not claim.detected()
 assert owner.detect(marked, MESSAGE).detected()
 
 # %% [markdown]
-# This makes forging a search, and a search must be charged, as above. An adversary who may choose original, key and
-# message *after* seeing the suspect can go on searching for as long as they like. That is why all three must be fixed
-# before, by a timestamped commitment: `info.record` commits to key, original and message without showing any, and
-# `jaxmark commit` makes of many records one number to publish.
+# So forging remains a search, and searches must be charged, as above. An adversary who may choose original, key and
+# message *after* seeing the suspect can search for as long as they like. So all three must be fixed before, by a
+# timestamped commitment. `info.record` commits to key, original and message without revealing them, and
+# `jaxmark commit` commits to many records by one number, which you publish.
 #
-# A mesh that is no copy of the original at all is not compared in vain, but refused:
+# A suspect that is no copy of the original is refused:
 
 # %%
 ball = asteroid(3000, seed=1)
@@ -251,14 +252,14 @@ except jm.JaxmarkError as refusal:
     print(refusal)
 
 # %% [markdown]
-# ## In short
+# ## Summary
 #
-# | the bound holds | it does not hold |
+# | the bound holds | the bound does not hold |
 # |---|---|
-# | for any suspect made without the key: attacked, or marked by others | for which message a mark under that key has |
-# | for one key, original, message and record, fixed before | for the best of many, unless their number is paid for |
-# | with weights, pose and masks from suspect and original | with weights that were chosen by the score |
-# | whatever the residual looks like | for `log10_p_gaussian`, an estimate |
+# | for any suspect made without the key: attacked, or marked with another key | for the message under this key |
+# | for one key, original, message and record, fixed before | for the best of many, unless their number is charged |
+# | with weights, pose and masks computed from suspect and original | with weights that were chosen by the score |
+# | for any residual | for `log10_p_gaussian`, which is an estimate |
 #
-# `python benchmarks/security/false_positives.py` counts a million pairs of key and suspect, with suspects made to be
-# hard.
+# `python benchmarks/security/false_positives.py` counts a million pairs of a key and a suspect, including suspects that
+# are constructed to be hard.

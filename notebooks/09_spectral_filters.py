@@ -13,8 +13,8 @@
 # %% [markdown]
 # # Spectral filters
 #
-# `jaxmark.spectral` is a library by itself: filters of any graph as pure functions, without eigenvectors, with
-# derivatives with respect to all that goes in. No watermark in this notebook.
+# This notebook is for researchers who want spectral filters in JAX, and no watermark. `jaxmark.spectral` filters
+# signals on any graph by pure functions, without eigenvectors. Derivatives are available with respect to every input.
 
 # %% tags=["remove-cell"]
 import importlib.util
@@ -39,15 +39,15 @@ size = float(jnp.linalg.norm(jnp.ptp(x, axis=0)))  # the diagonal
 
 
 def error(y):
-    """RMS distance to the original, relative to the diagonal."""
+    """Compute the RMS distance to the original, relative to the diagonal."""
     return float(jnp.sqrt(jnp.mean(jnp.sum((y - x) ** 2, axis=1))) / size)
 
 
 # %% [markdown]
-# ## A noisy scan, by one filter
+# ## Denoise a scan by one filter
 #
-# 1/(1 + τλ²) keeps smooth signals and damps noise. How strongly, the gradient finds here, with respect to τ, through
-# conjugate gradients; a scan would be compared with a second one.
+# The filter 1/(1 + τλ²) keeps low frequencies λ and damps noise. Gradient descent finds τ, by differentiating through
+# conjugate gradients. The example compares with the true surface; in practice, compare with a second scan.
 
 # %%
 scan = x + 0.002 * size * jax.random.normal(jax.random.key(0), x.shape)
@@ -66,7 +66,7 @@ for _ in range(20):
     log_tau -= 0.5 * jnp.sign(slope) * jnp.minimum(jnp.abs(slope), 1)
 section = jnp.array([[1, 0, 0, 1, 0, jnp.exp(log_tau)]])
 smooth = spectral.filter_rational(operator, section, scan)
-print(f"off by {error(scan):.2e} before, {error(smooth):.2e} after, with τ = {float(jnp.exp(log_tau)):.1f}")
+print(f"error {error(scan):.2e} before, {error(smooth):.2e} after, with τ = {float(jnp.exp(log_tau)):.1f}")
 assert error(smooth) < error(scan)
 
 
@@ -79,7 +79,8 @@ plot.draw([view("original", x), view("scan", scan), view("filtered", smooth)]).s
 # %% [markdown]
 # ## Heat on a point cloud
 #
-# Any graph will do, such as that of points and their nearest ones. Heat starts at one point; its time may be long.
+# Filters work on any graph, such as that of points and their nearest neighbours. Here heat flows from one point, for up
+# to 10⁴ units of time.
 
 # %%
 cloud = spectral.from_points(mesh.vertices, 8, "gaussian")
@@ -88,14 +89,15 @@ views = []
 for time in (1.0, 100.0, 1e4):
     warm = spectral.heat(cloud, spark, time)
     reached, whole = np.mean(np.asarray(warm) > 1e-6), float(cloud.inner(warm, jnp.ones_like(warm)))
-    print(f"t = {time:g}: {reached:.1%} of the points are warm, {whole:.3f} in all")
+    print(f"t = {time:g}: {reached:.1%} of the points are warm, total heat {whole:.3f}")
     views.append(plot.View(f"t = {time:g}", mesh, np.asarray(warm / warm.max(), np.float64), "of the warmest"))
 plot.draw(views).save("09_2.png")
 
 # %% [markdown]
-# ## Wavelets, and back
+# ## Wavelets and their inverse
 #
-# A bank of filters whose parts determine the signal. What is small in all details is noise.
+# Meyer wavelets are a frame: the parts of a signal determine the signal. Small coefficients are mostly noise, so they
+# are set to 0 before the inverse.
 
 # %%
 bank = spectral.bands.meyer(6)
@@ -103,31 +105,31 @@ lower, upper = spectral.frame_bounds(bank)
 details = spectral.band_components(operator, bank, scan)
 clean = spectral.inverse(operator, bank, jnp.where(jnp.abs(details) > 0.003 * size, details, 0))
 back = spectral.inverse(operator, bank, details)
-print(f"frame bounds {lower:.4f}, {upper:.4f}; off by {error(clean):.2e}, and unchanged parts give the scan back")
+print(f"frame bounds {lower:.4f}, {upper:.4f}; error {error(clean):.2e}; unchanged parts reproduce the scan")
 assert jnp.allclose(back, scan, atol=1e-4 * size)
 assert error(clean) < error(scan)
 
 # %% [markdown]
 # ## A learned filter
 #
-# Two layers of Chebyshev convolution learn what the noise is, on scans that are drawn anew in each step.
+# Two layers of Chebyshev convolution learn to estimate the noise. Each step draws a new noisy scan.
 
 # %%
 keys = jax.random.split(jax.random.key(1), 2)
 layers = [spectral.init_cheb_conv(key, *shape, degree=6) for key, shape in zip(keys, ((3, 8), (8, 3)), strict=True)]
-layers[1] = jax.tree.map(jnp.zeros_like, layers[1])  # which leaves scans as they are, to begin with
+layers[1] = jax.tree.map(jnp.zeros_like, layers[1])  # so that the network starts as the identity
 
 
-def denoise(layers, seen):
-    deformed = 100 * operator.apply(seen)  # where a vertex lies off the mean of its neighbours
-    hidden = jax.nn.tanh(spectral.cheb_conv(operator, layers[0], deformed))
-    return seen - 0.01 * spectral.cheb_conv(operator, layers[1], hidden)
+def denoise(layers, noisy):
+    differences = 100 * operator.apply(noisy)  # of each vertex from the mean of its neighbours
+    hidden = jax.nn.tanh(spectral.cheb_conv(operator, layers[0], differences))
+    return noisy - 0.01 * spectral.cheb_conv(operator, layers[1], hidden)
 
 
 @jax.jit
 def step(layers, momentum, key, rate):
-    seen = (x + 0.002 * size * jax.random.normal(key, x.shape)) / size
-    slope = jax.grad(lambda layers: 1e5 * jnp.mean((denoise(layers, seen) - x / size) ** 2))(layers)
+    noisy = (x + 0.002 * size * jax.random.normal(key, x.shape)) / size
+    slope = jax.grad(lambda layers: 1e5 * jnp.mean((denoise(layers, noisy) - x / size) ** 2))(layers)
     momentum = jax.tree.map(lambda old, new: 0.9 * old + new, momentum, slope)
     norm = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(momentum)))
     return jax.tree.map(lambda value, change: value - rate * change / norm, layers, momentum), momentum
@@ -138,15 +140,15 @@ rates = 0.02 * np.cos(np.linspace(0, np.pi / 2, 150)) ** 2
 for key, rate in zip(jax.random.split(jax.random.key(2), 150), rates, strict=True):
     layers, momentum = step(layers, momentum, key, rate)
 learned = size * denoise(layers, scan / size)
-print(f"off by {error(learned):.2e}, learned")
+print(f"error of the learned filter {error(learned):.2e}")
 assert error(learned) < error(scan)
 plot.draw([view("scan", scan), view("wavelets", clean), view("learned", learned)]).save("09_3.png")
 
 # %% [markdown]
-# ## Through the operator
+# ## Differentiate through the operator
 #
-# Cotangent weights are functions of the positions, and so is what a filter with them gives. Here the vertices move down
-# the gradient of the energy of the details of the surface. Memory stays O(N) at any degree.
+# Cotangent weights are functions of the positions, so a filter with these weights is, too. Here the vertices descend
+# along the gradient of the energy of the surface's details. Memory is O(N) at any degree.
 
 
 # %%
@@ -162,5 +164,5 @@ vertices = scan
 for _ in range(20):
     value, slope = roughness(vertices)
     vertices -= 2e-4 * size * slope / jnp.sqrt(jnp.mean(jnp.sum(slope**2, axis=1)))
-print(f"roughness {float(roughness(scan)[0]):.2e} → {float(value):.2e}; off by {error(vertices):.2e}")
+print(f"roughness {float(roughness(scan)[0]):.2e} → {float(value):.2e}; error {error(vertices):.2e}")
 assert value < 0.9 * roughness(scan)[0]

@@ -13,8 +13,9 @@
 # %% [markdown]
 # # A learned attack
 #
-# A network of two Chebyshev convolutions learns to displace a marked mesh so that little of the evidence is left. It
-# knows the program, but no key: each step draws a fresh one, and what counts is the evidence that is expected.
+# This notebook, for readers who assess security, trains an attack. A network of two Chebyshev convolutions learns to
+# displace a marked mesh so that little evidence for the mark is left. The attacker has this library, but no key: each
+# step draws a new key, so the network reduces the expected evidence S/‖a‖, a score over its norm.
 
 # %% tags=["remove-cell"]
 import importlib.util
@@ -44,8 +45,8 @@ layers = [spectral.init_cheb_conv(key, *size, degree=8) for key, size in zip(dra
 
 
 def displaced(layers, noise):
-    seen = jnp.concatenate([100 * surrogate.operator.apply(surrogate.signal), noise], axis=1)
-    hidden = jnp.tanh(spectral.cheb_conv(surrogate.operator, layers[0], seen))
+    inputs = jnp.concatenate([100 * surrogate.operator.apply(surrogate.signal), noise], axis=1)
+    hidden = jnp.tanh(spectral.cheb_conv(surrogate.operator, layers[0], inputs))
     return adversaries.rescale(surrogate, spectral.cheb_conv(surrogate.operator, layers[1], hidden), 4 * 8e-4)
 
 
@@ -71,18 +72,19 @@ finish(axes, xlabel="step", ylabel="S/‖a‖")
 Picture(figure).save("10_1.png")
 
 # %% [markdown]
-# What the owner reads after it, and after white noise of the same size.
+# The owner claims the message after the learned attack, and after random noise of the same size in the bands that carry
+# marks (`jamming`).
 
 # %%
 shift = original.to_host(displaced(layers, jax.random.normal(draws[0], surrogate.signal[:, :1].shape)))
 attacked = marked._replace(vertices=marked.vertices + original.diagonal * shift[original.weld.point])
 noisy = jm.attack(marked, "jamming", 4 * 8e-4, seed=1)
-for name, suspect in {"learned": attacked, "another mark": noisy}.items():
+for name, suspect in {"learned": attacked, "jamming": noisy}.items():
     print(f"{name:<12} log10 p {marker.detect(suspect, b'ok').log10_p:6.1f}")
 plot.draw(
     [
         plot.View("marked", marked),
         plot.displacement(original, attacked, "learned"),
-        plot.displacement(original, noisy, "another mark"),
+        plot.displacement(original, noisy, "jamming"),
     ]
 ).save("10_2.png")

@@ -13,9 +13,10 @@
 # %% [markdown]
 # # Strengths trained against a learned attack
 #
-# `log_evidence` is what a suspect proves, in nats, as a pure function of the suspect and, through the carrier, of the
-# strengths of the bands. Signs and codeword are made once on the host, and gradients hold them fixed. A network of two
-# Chebyshev convolutions attacks; network and strengths take a step in turn.
+# This notebook, for researchers who train marks against attacks, lets a network and the strengths of the bands play
+# against each other. `log_evidence` computes the evidence for a message in nats, as a pure function of the suspect and,
+# through the carrier, of the strengths. Signs and codeword are computed once, and gradients treat them as constants. In
+# each step the attacking network of two Chebyshev convolutions descends on the evidence, and the strengths ascend.
 
 # %% tags=["remove-cell"]
 import importlib.util
@@ -43,28 +44,28 @@ moving = jnp.asarray(marker.original.to_traced(marker.original.used))[:, None]
 
 
 def scaled(displacement):
-    """The displacement at an RMS of 1."""
+    """Scale a displacement to an RMS of 1."""
     return displacement / jnp.sqrt(jnp.sum((moving * displacement) ** 2) / moving.sum())
 
 
 @jax.jit
-def left(strengths, layers, key):
+def evidence(strengths, layers, key):
     mine = carrier.with_bands(jnp.exp(strengths))
     marked = x + size * scaled(mine.displacement(word))
     noise = jax.random.normal(key, x[:, :1].shape)
-    seen = jnp.concatenate([100 * carrier.host.operator.apply(marked), noise], axis=1)
-    hidden = jnp.tanh(spectral.cheb_conv(carrier.host.operator, layers[0], seen))
+    inputs = jnp.concatenate([100 * carrier.host.operator.apply(marked), noise], axis=1)
+    hidden = jnp.tanh(spectral.cheb_conv(carrier.host.operator, layers[0], inputs))
     shift = moving * spectral.cheb_conv(carrier.host.operator, layers[1], hidden)
     return log_evidence(marked + 3 * size * scaled(shift), x, mine, word)
 
 
-both = jax.jit(jax.value_and_grad(left, (0, 1)))
+both = jax.jit(jax.value_and_grad(evidence, (0, 1)))
 draws = jax.random.split(jax.random.key(0), 3)
 start = [spectral.init_cheb_conv(key, *shape, degree=8) for key, shape in zip(draws, ((4, 8), (8, 3)), strict=False)]
 
 
 def play(strengths, layers, answer):
-    """Let the network learn, and the strengths answer or not."""
+    """Train the network, and the strengths at the rate `answer`; return the evidence of each step, and strengths."""
     history = []
     for key in jax.random.split(draws[2], 40):
         nats, (up, down) = both(strengths, layers, key)
@@ -76,9 +77,9 @@ def play(strengths, layers, answer):
 
 fixed = jnp.log(jnp.ones(bands) if carrier.profile is None else jnp.asarray(carrier.profile))
 figure, (axes,) = panels(1, 6.5, 3.6)
-for name, answer in {"as they are": 0.0, "trained": 0.05}.items():
+for name, answer in {"fixed": 0.0, "trained": 0.05}.items():
     history, strengths = play(fixed, start, answer)
-    print(f"strengths {name:<12} nats that are left:", *(f"{nats:.0f}" for nats in history[::8]), f"{history[-1]:.0f}")
+    print(f"strengths {name:<8} evidence in nats:", *(f"{nats:.0f}" for nats in history[::8]), f"{history[-1]:.0f}")
     axes.plot(history, label=f"strengths {name}")
-finish(axes, xlabel="step of network and strengths", ylabel="evidence that is left, in nats")
+finish(axes, xlabel="step of network and strengths", ylabel="evidence after the attack, in nats")
 Picture(figure).save("11_1.png")

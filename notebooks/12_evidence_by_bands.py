@@ -11,10 +11,11 @@
 # ---
 
 # %% [markdown]
-# # The evidence's gradient to the bands
+# # The gradient of the evidence with respect to the bands
 #
-# What a suspect proves is a smooth function of the Chebyshev coefficients of all bands that the mark is written and
-# read by. Its gradient takes O(N) memory, forward mode confirms it, and a step along it is worth something.
+# This notebook is for researchers who design filters for marks. The evidence of a suspect is a smooth function of the
+# Chebyshev coefficients of the bands in which the mark is written and read. Its gradient takes O(N) memory. Forward
+# mode confirms the gradient, and a step along it increases the evidence.
 
 # %% tags=["remove-cell"]
 import importlib.util
@@ -52,12 +53,12 @@ def evidence(bands):
 slope = jax.jit(jax.grad(evidence))(bands)
 length = jnp.linalg.norm(slope)
 value, rate = jax.jvp(evidence, (bands,), (slope / length,))
-print(f"{slope.shape} coefficients, {float(value):.1f} nats")
-print(f"gradient {float(length):.1f}, by forward mode {float(rate):.1f}")
+print(f"{slope.shape} coefficients, evidence {float(value):.1f} nats")
+print(f"norm of the gradient {float(length):.1f}, by forward mode {float(rate):.1f}")
 assert jnp.allclose(rate, length, rtol=1e-2)
 lengths = (0.0, 0.01, 0.02, 0.05, 0.1)
 steps = [float(evidence(bands + t * slope / length)) for t in lengths]
-print("nats after a step along it:", *(f"{nats:.1f}" for nats in steps))
+print("evidence in nats after steps along the gradient:", *(f"{nats:.1f}" for nats in steps))
 assert max(steps) > steps[0]
 figure, (axes,) = panels(1, 6.5, 3.6)
 axes.plot(lengths, steps, marker="o", label="evidence")

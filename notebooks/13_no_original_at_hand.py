@@ -11,10 +11,11 @@
 # ---
 
 # %% [markdown]
-# # No original at hand
+# # Read without the original
 #
-# Marks of the scheme `field` are read by the key and the suspect alone. Here one is written, attacked, remeshed and
-# read, and what it is made of is looked at: values on a lattice that belongs to the shape, not to its triangles.
+# Marks of the scheme `field` are blind: they are read from the key and the suspect alone. This notebook is for readers
+# who want to know how this works. It writes a mark, attacks and remeshes the mesh, and reads the mark. It then shows
+# the values that carry the mark, on a lattice that depends on the shape and not on its triangles.
 
 # %% tags=["remove-cell"]
 import importlib.util
@@ -38,7 +39,7 @@ from jaxmark.watermark.blind.reading import codeword, context
 from jaxmark.watermark.blind.scheme import AnchoredHost
 
 MESSAGE = b"jaxmark!"
-SCHEME = FieldScheme(widths=(0.018,))  # one of three widths, so that this takes a minute; usually "field" will do
+SCHEME = FieldScheme(widths=(0.018,))  # one of three widths, to save time; usually use "field"
 mesh = asteroid(10_000)
 key = jm.new_key()
 marked, info = jm.embed(mesh, MESSAGE, key, budget={"msdm": 0.2, "rms": 8e-4}, scheme=SCHEME)
@@ -46,8 +47,8 @@ width, step = (info.record.parameters[name] for name in ("width", "step"))
 print(f"{len(mesh.vertices)} vertices moved by RMS {info.rms:.4%} of the diagonal; width {width}, step {step:.2e}")
 
 # %% [markdown]
-# Now forget the mesh. The suspects are another meshing of the marked one, in another pose, order and size; a smoothed
-# one; and for control the unmarked mesh, and another key.
+# The reader does not get the original. The suspects are the marked mesh, and the same with four times the triangles in
+# another pose and size. Two controls follow: the unmarked mesh, and the marked mesh with another key.
 
 # %%
 random = np.random.default_rng(0)
@@ -61,21 +62,23 @@ suspects = {
     ),
 }
 for name, suspect in suspects.items():
-    found = jm.detect(suspect, key=key, scheme=SCHEME)
-    print(f"{name:<51} {found.message!r} log10 p {found.log10_p:6.1f}  agreement {found.registration.agreement:.2f}")
-    assert found.message == MESSAGE
-known = SCHEME.fixed(width, step)  # less to try
-for name, suspect, tried in (("unmarked", mesh, key), ("marked, another key", marked, jm.new_key())):
-    found = jm.detect(suspect, key=tried, scheme=known)
-    print(f"{name:<51} detected: {found.detected()}")
-    assert not found.detected()
+    detection = jm.detect(suspect, key=key, scheme=SCHEME)
+    agreement = detection.registration.agreement
+    print(f"{name:<51} {detection.message!r} log10 p {detection.log10_p:6.1f}  agreement {agreement:.2f}")
+    assert detection.message == MESSAGE
+known = SCHEME.fixed(width, step)  # fewer alternatives to try
+for name, suspect, other in (("unmarked", mesh, key), ("marked, another key", marked, jm.new_key())):
+    detection = jm.detect(suspect, key=other, scheme=known)
+    print(f"{name:<51} detected: {detection.detected()}")
+    assert not detection.detected()
 
 # %% [markdown]
-# ## What was written
+# ## The values that carry the mark
 #
-# Around each anchor, a point of a lattice in the shape's own pose, the surface is averaged twice, once twice as widely.
-# How far apart the averages are is the anchor's value. A mark moves it most of the way to the nearest number of those
-# that the key allows for its code bit: whole steps from its keyed offset. Before, values are anywhere between them.
+# An anchor is a point of a lattice in the shape's own pose. Around each anchor the surface is averaged twice, the
+# second time twice as widely, and the distance of the two averages is the anchor's value. Key and code bit allow the
+# values that are whole quantisation steps away from a keyed offset. The mark moves each value most of the way to the
+# nearest of these. The histograms show the difference from it, in steps. It is uniform before marking, and small after.
 
 
 # %%
@@ -83,7 +86,7 @@ choices = context(key, 8 * len(MESSAGE), SCHEME.name)
 
 
 def phases(host: AnchoredHost) -> np.ndarray:
-    """How far each value is from what key and message allow, in steps."""
+    """Compute the difference of each value from the nearest one that key and message allow, in steps."""
     word = codeword(MESSAGE, choices)
     dither = make_dither(choices, SCHEME.name, host.names, len(word))
     off = (host.values / step - dither.offset - np.where(dither.sign * word[dither.slot] < 0, 0.5, 0))[host.good > 0]
@@ -94,15 +97,16 @@ before, after = (phases(SCHEME.hosts(make_original(one), choices)[width]) for on
 figure, axes = panels(2, 4.5, 3.0, sharey=True)
 for panel, title, off in zip(axes, ("original", "marked"), (before, after), strict=True):
     panel.hist(off, bins=np.linspace(-0.5, 0.5, 41), color=COLOURS[0])
-    finish(panel, title=f"{title}: mean cosine {np.cos(2 * np.pi * off).mean():.2f}", xlabel="off, in steps")
+    finish(panel, title=f"{title}: mean cosine {np.cos(2 * np.pi * off).mean():.2f}", xlabel="difference, in steps")
 assert np.cos(2 * np.pi * after).mean() > 0.5 > abs(np.cos(2 * np.pi * before).mean())
 Picture(figure).save("13_1.png")
 
 # %% [markdown]
-# ## What is left of it
+# ## Robustness
 #
-# The agreement is the mean cosine of what values are off. Noise and smoothing lower it; while some of it is left, a
-# few hundred anchors still say the message. With its record, which names width and step, there is less to try.
+# The agreement is the mean cosine of these differences, as phases. Noise and smoothing lower it. While some agreement
+# is left, a few hundred anchors are enough to decode the message. The record names width and step, so the reader has
+# fewer alternatives to try.
 
 # %%
 STRENGTHS = {"noise": [0.001, 0.004, 0.008], "smoothing": [10, 30, 50]}
@@ -111,16 +115,16 @@ for panel, (kind, strengths) in zip(axes, STRENGTHS.items(), strict=True):
     readings = [
         jm.detect(jm.attack(marked, kind, strength, seed=0), key=key, record=info.record) for strength in strengths
     ]
-    for strength, found in zip(strengths, readings, strict=True):
-        agreement = found.registration.agreement
-        print(f"{kind} {strength:g}: {found.message!r}, log10 p {found.log10_p:.1f}, agreement {agreement:.2f}")
-    panel.plot(strengths, [found.registration.agreement for found in readings], color=COLOURS[0], marker="o")
+    for strength, reading in zip(strengths, readings, strict=True):
+        agreement = reading.registration.agreement
+        print(f"{kind} {strength:g}: {reading.message!r}, log10 p {reading.log10_p:.1f}, agreement {agreement:.2f}")
+    panel.plot(strengths, [reading.registration.agreement for reading in readings], color=COLOURS[0], marker="o")
     finish(panel, title=kind, xlabel="strength", ylabel="agreement", ylim=(0, 1))
 Picture(figure).save("13_2.png")
 
 # %% [markdown]
-# Smoothing lowers it less, as the reader undoes it. In the picture of what moved, the mark is as smooth as the averages
-# that carry it.
+# Smoothing lowers the agreement less, because the reader undoes it. The last figure shows the displacement, which is as
+# smooth as the averages that carry the mark.
 
 # %%
 original = make_original(mesh)

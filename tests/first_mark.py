@@ -28,7 +28,7 @@ import time
 
 seconds = time.time() - {start}
 print(f"first mark read back after {{seconds:.0f}} s, installation included", flush=True)
-assert found.message == b"jaxmark!", found
+assert detection.message == b"jaxmark!", detection
 assert seconds < {longest}, "the first mark took too long"
 """
 
@@ -51,7 +51,7 @@ def main() -> None:
     page = (ROOT / "README.md").read_text()
     guides = [(ROOT / "docs" / "how-to" / f"{name}.md").read_text() for name in GUIDES]
     lines = shell_lines((ROOT / "docs" / "reference" / "command_line.md").read_text())
-    assert "`pip install '.[all]'`" in page
+    assert "pip install '.[all]'" in page
     assert [line for line in lines if line in shell_lines(page)] == shell_lines(page), "the README has other lines"
     with tempfile.TemporaryDirectory() as folder:
         venv.create(Path(folder, "venv"), with_pip=True)

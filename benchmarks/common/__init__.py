@@ -1,1 +1,1 @@
-"""What several programs share; each puts the folder above its own on the path, and so runs wherever it is copied to."""
+"""Modules that several programs share. Each program adds the folder above its own to the path, so it runs anywhere."""

@@ -1,4 +1,4 @@
-"""What the programs' command lines have in common."""
+"""Arguments that the command lines of several programs have in common."""
 
 import argparse
 from collections.abc import Sequence

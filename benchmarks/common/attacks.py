@@ -1,4 +1,4 @@
-"""Attacks one after the other, as text."""
+"""Chains of attacks, written as text."""
 
 from collections.abc import Callable, Mapping
 

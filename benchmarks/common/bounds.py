@@ -1,28 +1,30 @@
-"""What the vertices of a simplified suspect can carry at most, by a model of them.
+"""An upper bound on the evidence and the bits that the vertices of a simplified suspect can carry, by a model.
 
-Each of a suspect's M vertices, where the original lies, is d_i = n_i · (q_i - foot_i) above the original's surface. The
-foot is the point of that surface that is closest to the vertex q_i, and n_i the original's normal there. The model is
+Each of a suspect's M vertices q_i that lies near the original is d_i = n_i · (q_i - foot_i) above the original's
+surface. The foot is the point of that surface that is closest to q_i, and n_i is the original's normal there. The model
+is
 
     d = A w + B c + e.
 
-A interpolates the mark's displacement w at the feet (barycentric) and takes it along the normals; B does the same to
-affine maps, which have any coefficients c, as nobody knows the pose of a suspect exactly. The errors e_i are
+A interpolates the mark's displacement w at the feet (barycentric) and projects it on the normals. B does the same to
+affine maps with any coefficients c, because the pose of a suspect is never known exactly. The errors e_i are
 independent and Gaussian; their means and variances are those of simplifications of the original with other marks. A
-keyed mark is w = T r with random signs r, so that its covariance is T Tᵀ. Divide each height by its error's standard
-deviation, project B off, and let s_i be the eigenvalues of the covariance of A w then. Each score S = r · a with an a
-that is linear in d has
+keyed mark is w = T r with random signs r, so its covariance is T Tᵀ. Divide each height by the standard deviation of
+its error, project B off, and let s_i be the eigenvalues of the covariance of A w after that. Each score S = r · a with
+an a that is linear in d has
 
     (E S)² / E‖a‖² ≤ Σ s_i / (1 + s_i) ≤ M,
 
-which `matched` reaches. By Hoeffding's bound, exp(-S² / 2‖a‖²), a claim proves half of it in nats. And d tells at most
-½ Σ log₂(1 + s_i) bits of a message and its tag, the capacity of parallel Gaussian channels.
+and `matched` reaches this bound. By Hoeffding's bound, exp(-S² / 2‖a‖²), a claim proves half of it in nats. A message
+and its tag can have at most ½ Σ log₂(1 + s_i) bits, the capacity of parallel Gaussian channels.
 
-This bounds what the model describes, no more. Receivers can beat it by what it leaves out: where vertices lie along the
-surface, how faces join them, what errors have in common. They can fall short as the model assumes too much: the mark
-is as strong as it was written, whereas smoothing weakens it; errors do depend on the mark, and are not Gaussian; their
-means are known only to those who know the attack. A variance that was estimated from 16 values makes 1/σ² larger by
-15/13 in the mean, and so the bound, by up to 0.6 dB. More other marks have vertices nearer to each of a suspect's,
-which tell its error better: the bound grows with their number, and no number is enough. With few, claims beat it.
+The bound holds for the model only. Receivers can exceed it by using what the model omits: the positions of vertices
+along the surface, the faces that join them, and correlations of errors. They can fall short of it, because the model
+assumes too much: that the mark has its full strength, although smoothing weakens it; that errors do not depend on the
+mark, and are Gaussian; and that their means are known, although only a reader who knows the attack knows them. A
+variance estimated from 16 values makes 1/σ² larger by 15/13 in the mean, and so the bound by up to 0.6 dB. The bound
+grows with the number of other marks, because more of them have vertices near those of a suspect and estimate its errors
+better; it does not converge. With few other marks, claims exceed the bound.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""What it costs to bring a mark below detection, with its message claimed."""
+"""The distortion that brings a mark below detection, with its message claimed."""
 
 import math
 from typing import NamedTuple

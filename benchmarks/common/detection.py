@@ -1,4 +1,4 @@
-"""Detection in a process of its own, from files."""
+"""Detection in a separate process, from files."""
 
 import os
 import subprocess

@@ -1,8 +1,7 @@
-"""The pictures that documents show, and hashes of what they were drawn by.
+"""The pictures in documents, with hashes of the pictures and of their sources.
 
-`docs/pictures/drawn.json` holds a hash of each picture and of what it was drawn by, which
-`tests/project/test_pictures.py` compares. Where the measurement that a picture shows is not in the project, the
-picture alone is compared.
+`docs/pictures/drawn.json` has a hash of each picture and of the files that draw it; `tests/project/test_pictures.py`
+compares them. If the measurement in a picture is not part of the project, the picture alone is compared.
 """
 
 import hashlib
@@ -41,8 +40,10 @@ def sources(picture: str) -> list[Path]:
     elif picture.startswith("gallery_"):
         notebooks = (ROOT / "notebooks").glob(f"{picture.removeprefix('gallery_')[:2]}_*.py")
         found = {*notebooks, programs / "front.py"}
+    elif picture == "methods.png":
+        found = {ROOT / "docs" / "results" / "benchmark.csv", package / "plot" / "figures.py", programs / "front.py"}
     else:
-        found = {*(package / "plot").glob("*.py"), package / "evaluation" / "pictures.py", programs / "front.py"}
+        found = {*(package / "plot").glob("*.py"), programs / "front.py"}
     return sorted({*found, Path(__file__).resolve()})
 
 

@@ -1,4 +1,4 @@
-"""Marks that several programs write, and the options that say how."""
+"""Marks that several programs write, and the options for them."""
 
 import argparse
 from typing import NamedTuple

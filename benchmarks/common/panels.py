@@ -1,4 +1,4 @@
-"""What the figures of `paper.py` show, and how they are drawn, by matplotlib."""
+"""The figures of `paper.py`, drawn by matplotlib."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,6 +1,6 @@
-"""The same filter by other programs, for `speed.py`: f(Δ)x for Chebyshev coefficients, by the recurrence.
+"""The filter f(Δ)x in other libraries, for `speed.py`: Chebyshev coefficients, evaluated by the recurrence.
 
-Each takes Δ - I as a SciPy matrix, coefficients and a signal, and gives a function that filters once.
+Each function takes Δ - I as a SciPy matrix, coefficients and a signal, and returns a function that filters once.
 """
 
 import os

@@ -1,7 +1,7 @@
-"""The stages that `speed.py` measures, each in a fresh process: python stages.py STAGE FOLDER REPEAT.
+"""The stages that `speed.py` measures, each in a new process: python stages.py STAGE FOLDER REPEAT.
 
-The folder has the mesh, `mesh.ply`; what is measured is printed as JSON. A stage is a function that makes from the
-folder, uncounted, the call that counts. It is no program of its own: `apart` runs this file.
+The folder contains the mesh, `mesh.ply`; the measurements are printed as JSON. A stage is a function that prepares the
+call to measure, from the folder; the preparation is not measured. Not a program of its own: `apart` runs it.
 """
 
 import json

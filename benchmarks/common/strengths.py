@@ -1,4 +1,4 @@
-"""The largest strength of an attack from which a message still reads."""
+"""The largest strength of an attack after which a message can still be read."""
 
 import math
 from collections.abc import Callable, Sequence

@@ -1,8 +1,8 @@
-"""Sub-meshes, each marked on its own, so that the loss of one part leaves the messages of the others whole.
+"""Sub-meshes, each with a mark of its own, so that the loss of one part leaves the messages of the others intact.
 
 Parts grow from feature vertices by breadth-first search (Sohn et al.), all at once: a point belongs to the feature that
-is the fewest edges away. Every point is in one part, and a part has the faces whose corners are all in it. The faces
-along seams belong to no part, so that a mesh that is put together again has the same faces as before and no gap.
+is the fewest edges away. Every point is in one part, and a part has the faces whose corners are all in it. Faces along
+the seams belong to no part, so a mesh that is put together again has its original faces and no gap.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Tables in Markdown, and what is written beside them."""
+"""Tables in Markdown, and the files that are written with them."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Seconds of calls."""
+"""Seconds that calls take."""
 
 import os
 import statistics

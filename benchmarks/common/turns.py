@@ -1,4 +1,4 @@
-"""How far the normals of faces turn, and which faces are planes."""
+"""Angles by which the normals of faces turn, and the faces that form planes."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""Many originals from few: bent, twisted, stretched, with a joint turned, noisy, and as coarse as other models are."""
+"""Many originals from a few: bent, twisted, stretched, with a joint turned, noisy, and as coarse as other models."""
 
 from collections.abc import Iterator
 from pathlib import Path

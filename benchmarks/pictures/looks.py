@@ -1,9 +1,8 @@
-"""Draws the pictures of docs/visibility.md: python benchmarks/pictures/looks.py MESH ... [--output FOLDER].
+"""Draw the pictures of docs/results/visibility.md: python benchmarks/pictures/looks.py MESH ... [--output FOLDER].
 
-For each mesh, and for each shape that is made on the spot, a strip of six pictures: the original, the mesh with a mark
-of 64 bits at the default strength, and ten times the displacement, each shaded flat and with the reflection of stripes,
-which shows what normals do. For meshes named by --levels there is a strip of the original and each name of visibility,
-too.
+For each mesh, and for each built-in shape, it draws a strip of six pictures: the original, the mesh with a mark of 64
+bits at the default strength, and ten times the displacement, each shaded flat and with the reflection of stripes, which
+shows changes of normals. For meshes named by --levels, another strip has the original and each name of visibility.
 """
 
 import io

@@ -1,11 +1,11 @@
-"""Methods of the literature against their published rates: python benchmarks/robustness/anchors.py MESH... [options].
+"""Validate published methods against published rates: python benchmarks/robustness/anchors.py MESH... [options].
 
-Cho, Prost, Jung 2007 and Wang et al. 2011, as `jaxmark.bench.methods` has them, write 64 bits as strongly as the limits
-of SMI 2010 allow, and are read after its attacks. Beside the bit error rates, the mean over meshes and trials, stand
-those of the protocol's result page, for its model Venus, a head of 100,759 vertices. A method is anchored where the two
-differ by no more than TOLERANCE in the mean over the attacks: other meshes, keys and programs have other rates, and
-limits that are perceptual allow other displacements. As in the protocol, the reader of volume moments knows the step.
-The other methods have no published rate that could be held against them here.
+Cho, Prost, Jung 2007 and Wang et al. 2011, as implemented in `jaxmark.bench.methods`, write 64 bits as strongly as the
+limits of SMI 2010 allow, and are read after its attacks. The tables have the bit error rates, means over meshes and
+trials, and those of the protocol's result page for its model Venus, a head of 100,759 vertices. A method is anchored if
+the mean difference over the attacks is at most TOLERANCE. Closer agreement is not expected, because meshes, keys and
+programs differ, and perceptual limits allow different displacements. As in the protocol, the reader of volume moments
+knows the step. The other methods have no published rate to validate against.
 """
 
 import argparse

@@ -1,11 +1,11 @@
-"""Whatever files somebody has: marked, attacked and read by the command line, and loaded by another program.
+"""Mark, attack and read all mesh files of a folder by the command line, and load them by another program.
 
-Walks a folder, and runs the commands `embed`, `detect`, `attack` and `detect` on each mesh file, each as a process with
-limits of time and memory. The attack is noise of half the strength that `embed` says the mark survives. A file counts
-as marked if the message reads from every mesh that `embed` marked, each alone; where equal meshes count once, one of
-them. trimesh loads the source and the marked file, and must find the same meshes, moved by no more than `embed` said.
-Each file's outcome is a line of `results.jsonl` in the output folder; files that have one are not run again. Printed
-are a table by format, what was refused and why, and whatever went wrong.
+The program runs the commands `embed`, `detect`, `attack` and `detect` on each file, each as a process with limits of
+time and memory. The attack is noise of half the strength that, by `embed`, the mark survives. A file counts as marked
+if the message can be read from every mesh that `embed` marked, each alone; of equal meshes, which count once, one is
+enough. trimesh loads the source and the marked file, and must find the same meshes, displaced by no more than `embed`
+printed. The outcome of each file is a line of `results.jsonl` in the output folder; files with a line are not run
+again. The output is a table by format, all refusals with their reasons, and all failures.
 
     python benchmarks/robustness/assets.py FOLDER --output RESULTS
 """

@@ -1,21 +1,21 @@
-"""Marks that are read without their originals, after attacks: python benchmarks/robustness/blind.py MESH...
+"""Read blind marks after attacks: python benchmarks/robustness/blind.py MESH...
 
-With each of --keys keys, 64 bits are written with --scheme within --limits: the two of the protocol of SMI 2010 (a
-track of `jaxmark bench`), or hidden as by default. Each suspect is read with key and suspect alone. A table for each
-mesh has a line for each attack, written as soon as it is known:
+With each of --keys keys, 64 bits are written by --scheme within --limits: either set of the protocol of SMI 2010 (a
+track of `jaxmark bench`), or hidden, as by default. Each suspect is read with the key alone. The table of a mesh has a
+line for each attack, written as soon as it is known:
 
-read        in how many of the copies the exact message was read
+read        number of copies from which the exact message was read
 log10 p     of the false-positive probability, the worst and the best of the copies; [...] without its floor at -77
 agreement   mean cosine of the anchors' phases, the least of the copies
 seconds     of the slowest reading
-predicted   nρ² after the attack, by the unmarked mesh: n anchors are found, ρ is the mean cosine that is left of them
+predicted   nρ² after the attack, from the unmarked mesh: n anchors are found, and ρ is the mean cosine that is left
 
 For the prediction, the unmarked mesh is attacked, and its anchors' values, after the best small change of pose, are
-compared with those that they had: with σ the root mean square of their changes and α the part of the way to the lattice
-that the mark went, ρ = sinc(1 - α) exp(-2 (πσ/step)²), times the share of the suspect's anchors that were there before.
-The best of all ways of looking at the suspect counts, as it does for the reader. What 64 bits and their tag need of it
-by the capacity of many weak anchors is printed above the table; few good ones get by with less. Below the table are
-controls: the unmarked mesh, attacked or not, and the marked ones under other keys.
+compared with the values before. With the root mean square σ of the changes, and the share α of the way to the lattice
+that the mark goes, ρ = sinc(1 - α) exp(-2 (πσ/step)²), times the share of the suspect's anchors that existed before.
+The best view of the suspect counts, as for the reader. Above the table is the nρ² that 64 bits and their tag need, by
+the capacity of many weak anchors; a few good anchors need less. Below the table are controls: the unmarked mesh,
+attacked or not, and the marked meshes with other keys.
 """
 
 import argparse

@@ -1,16 +1,16 @@
-"""Which of thousands of originals a suspect is: how often the right one is found, how long it takes, and who is named.
+"""Measure how often a catalogue of thousands of originals finds the right one, how long it takes, and whom it names.
 
-The originals are made of the given meshes, so that near duplicates exist: bent, twisted, stretched, with a joint
-turned, noisy, and as coarse as others are. They are written to a folder and added to a catalogue there, both of which
-are taken over by the next run.
+The originals are variants of the given meshes, so that near duplicates exist: bent, twisted, stretched, with a joint
+turned, noisy, and as coarse as others. They are written to a folder and added to a catalogue there; the next run reuses
+both.
 
     python benchmarks/robustness/catalogue.py MESH... --folder shop
     python benchmarks/robustness/catalogue.py MESH... --folder shop --count 500 --suspects 40 --halves 10 --answers 5
 
-Suspects are made of originals by ten attacks, in any pose and scale; half crops lose half of their vertices beyond a
-plane, and `--anew` are meshed anew after that, so that no landmark is left. What is ranked is not marked: a mark moves
-nothing that landmarks and descriptors see. `--answers` are marked, attacked and sought to the end. `--strangers` come
-from files of other meshes, each deformed many times.
+Suspects are made of originals by ten attacks, in any pose and scale. Half crops lose half of their vertices beyond a
+plane; `--anew` of them are also remeshed, so that no landmark is left. Suspects that are only ranked are not marked,
+because landmarks and descriptors do not respond to a mark. `--answers` suspects are marked, attacked and searched
+completely. `--strangers` are made of files of other meshes, each deformed many times.
 """
 
 import argparse

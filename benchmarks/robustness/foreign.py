@@ -1,19 +1,19 @@
-"""Marks in what other programs make of them: python benchmarks/robustness/foreign.py MESH... [--case 64:8e-4 ...].
+"""Read marks after other programs remeshed them: python benchmarks/robustness/foreign.py MESH... [--case 64:8e-4 ...].
 
-Each suspect is a marked mesh after ATTACKS, turned, shifted, scaled by 0.01 to 100 and shuffled, written to a file and
-read by a process, `jaxmark detect`. Printed are whether the message is exact, what its reading proves, or how many
-bits, with their tag, such a suspect could carry at most where it does not read, and how far the pose found is from the
-true one. With --controls, also how often something is detected in suspects without this mark.
+Each suspect is a marked mesh after ATTACKS, rotated, shifted, scaled by 0.01 to 100 and shuffled, written to a file and
+read by a process, `jaxmark detect`. The table says whether the message is exact, what its reading proves or, if it
+cannot be read, how many bits with their tag such a suspect can carry at most, and the distance of the estimated pose
+from the true one. With --controls, it also has the rate of detection in suspects without this mark.
 
-Beside each suspect of at most 5,000 vertices stands a bound on what they can carry, from original and suspect. It is a
-bound by a model, see `common/bounds.py`, which says what the model leaves out; nothing else makes it true. In chains it
-is that of the step that leaves the fewest vertices, as what comes after adds nothing of the mark. The columns:
+For each suspect of at most 5,000 vertices, the table has a bound on what the vertices can carry, from original and
+suspect. It is a bound by a model; `common/bounds.py` describes the model and its omissions. For a chain of attacks, it
+is that of the step with the fewest vertices, as later steps add nothing of the mark. The columns:
 
-    claim      log10 p of a claim of the true message, without its floor, which orders attacks and proves nothing
+    claim      log10 p of a claim of the true message, without its floor; it compares attacks, and proves nothing
     bound      the least log10 p of a claim by the model
-    gap dB     how far S²/‖a‖² of the claim is below the bound; where it is negative, the claim beats the model
-    matched    log10 p by the model's own best receiver, in the true pose, with the errors of the same attack known
-    bits bound how many bits, with their tag, the vertices tell at most by the model
+    gap dB     distance of the claim's S²/‖a‖² below the bound; where it is negative, the claim exceeds the model
+    matched    log10 p by the model's own best receiver, with the true pose and the errors of the same attack
+    bits bound number of bits, with their tag, that the vertices carry at most by the model
 """
 
 import argparse

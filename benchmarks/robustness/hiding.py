@@ -1,8 +1,9 @@
-"""Evidence at equal visibility, with and without hidden directions: python benchmarks/robustness/hiding.py MESH ...
+"""Compare evidence with and without masking at equal visibility: python benchmarks/robustness/hiding.py MESH ...
 
-A line for each mesh and each shape that is made on the spot, marked with 64 bits within the limits: all points alike in
-all directions → as they are hidden. Columns of attacks, which are those of `jaxmark attack`, say what a claim of the
-message then proves, in nats of the bound exp(-S²/2‖a‖²). Others:
+There is a line for each mesh and each built-in shape, marked with 64 bits within the limits; values without masking,
+all points alike in all directions, are left of the arrow, and values with masking right of it. Columns of attacks,
+which are those of `jaxmark attack`, have the evidence for a claim of the message after the attack, in nats of the bound
+exp(-S²/2‖a‖²). Other columns:
 
 rms        displacement, 1e-3 of the diagonal
 shading    visible turn of normals that 5 % / 1 % of the area exceed, in just noticeable differences

@@ -1,9 +1,9 @@
-"""Mirrored suspects beside the same ones as they were: python benchmarks/robustness/mirrors.py MESH...
+"""Compare reflected suspects with the same ones unreflected: python benchmarks/robustness/mirrors.py MESH...
 
-Each mesh is marked by default with a random key, attacked, turned and scaled at random, and mirrored, as a program
-does that turns the faces round so that normals stay outside ("mirrored"), and as coordinates that are negated leave it
-("inside out"). Printed are log10 p of the claimed message, "*" where the message also reads, and the seconds that
-alignment takes; then how many mirrored suspects come within a tenth of the evidence of those that are not.
+Each mesh is marked by default with a random key, attacked, rotated and scaled at random, and reflected in two ways:
+with faces reversed so that normals still point outwards ("mirrored"), and by negated coordinates alone ("inside out").
+The output has log10 p of the claimed message, "*" if the message can also be decoded, and the seconds of alignment;
+then the number of reflected suspects whose evidence is within a tenth of that of the unreflected ones.
 """
 
 import sys

@@ -1,10 +1,10 @@
-"""Originals as their owners keep them: saved again in another format, rounded, scaled, turned, in another order.
+"""Read with originals that were saved again: in another format, rounded, scaled, rotated, or in another order.
 
-Each mesh is marked with 64 bits at 0.08 % RMS, and attacked by noise and smoothing, so strongly that log10 p is above
-its floor of -77. The suspect keeps the vertex order, and is read with the record and each copy of the original, with
-the message claimed. Printed are log10 p, "*" where the message also reads; then, for each way to keep an original, how
-many meshes read and give the evidence within a tenth of the exact original's, the largest difference of log10 p, and
-medians of the seconds that preparing and reading take.
+Each mesh is marked with 64 bits at 0.08 % RMS, and attacked by noise and smoothing so strong that log10 p is above its
+floor of -77. The suspect keeps the vertex order, and is read with the record and each copy of the original, with the
+message claimed. The output has log10 p, and "*" if the message can also be decoded. Then, for each kind of copy, it has
+the number of meshes that are read and whose evidence is within a tenth of that with the exact original, the largest
+difference of log10 p, and the median seconds of preparing and reading.
 
     python benchmarks/robustness/originals.py MESH...
 """

@@ -1,26 +1,25 @@
-"""Marks in point clouds and splats, after attacks one by one: python benchmarks/robustness/points.py MESH ...
+"""Read marks in point clouds and splats after attacks: python benchmarks/robustness/points.py MESH ...
 
-64 bits are written into clouds of --points points: with --budget, or as hidden as by default, which is an RMS
-displacement of 0.02 % of the diagonal, or less. Without meshes, the clouds are a
-bumpy sphere, and a laser scan of a street that was made up: rings of points on ground, walls and cars, ever further
-apart, with noise in range. Points of meshes are sampled from their surfaces by area. The first table says how each
-cloud was marked:
+64 bits are written into clouds of --points points, with --budget or, by default, hidden: an RMS displacement of at most
+0.02 % of the diagonal. Without meshes, the clouds are a bumpy sphere and an artificial laser scan of a street: rings of
+points on ground, walls and cars, whose distance grows, with noise in range. Points of meshes are sampled from their
+surfaces by area. The first table describes the mark of each cloud:
 
-bits, usual     what `jaxmark.capacity` says the cloud carries in noise of half a percent of its size, half of it lost
+bits, usual     result of `jaxmark.capacity` for noise of half a percent of the cloud's size, with half of it lost
 RMS             of the displacement, over the diagonal
 spacing         mean distance of a point to the nearest other one, over the diagonal
 point_to_plane  displacement across the surface that 5 % of the points exceed, over that spacing
 embed           seconds
 
-The second table has a line for each attack, and for each cloud how many of --seeds messages read exactly, the worst
-log10 of the false-positive probability for the claimed message, in square brackets without its floor at -77, the share
-of the points that were seen, and the seconds of the last detection. "turned" stands for any rotation, with a shift and
-another scale, in random order.
+The second table has a line for each attack. For each cloud it has the number of --seeds messages that are read exactly,
+the worst log10 of the false-positive probability for the claimed message, in square brackets without its floor at -77,
+the coverage, and the seconds of the last detection. "turned" is any rotation, with a shift and another scale, in random
+order.
 
-With --splats, the clouds are the centres of Gaussians besides, as large as their points are apart and with colours of
-their own. A third table has the PSNR in decibels of pictures before and after the mark from three sides, by an
-orthographic renderer that composites projected Gaussians from front to back, and readings after pruning: the least
-opaque Gaussians are left out of the file.
+With --splats, the clouds are also the centres of Gaussians, with the size of the points' spacing and colours of their
+own. A third table has the PSNR in decibels of pictures before and after the mark from three sides, by an orthographic
+renderer that composites projected Gaussians from front to back, and readings after pruning, which removes the least
+opaque Gaussians from the file.
 """
 
 import sys

@@ -1,11 +1,11 @@
-"""Marks in bent and posed suspects: python benchmarks/robustness/poses.py MESH... [--bits 64] [--budget 8e-4].
+"""Read marks in bent and posed suspects: python benchmarks/robustness/poses.py MESH... [--bits 64] [--budget 8e-4].
 
-GLB and glTF files with a skin are posed: every joint turns by some degrees about a random axis, with all that hangs on
-it, and skins blend linearly. Joints hang together as they share vertices. Others are bent, twisted, and dragged as
-rigidly as possible. Vertices keep their order, as they do in a modelling tool. Printed are the RMS distance that
-vertices moved in the best common pose, in diagonals, whether the message is read, and log10 p of a claim of it, without
-its floor, by a single map, by maps of each point's own surroundings, and by the skeleton (`jaxmark.geometry.unpose`),
-which only files with a skin have.
+GLB and glTF files with a skin are posed: every joint rotates by some degrees about a random axis, together with all
+joints attached to it, and skins blend linearly. Joints that share vertices are attached to each other. Other meshes are
+bent, twisted, and dragged as rigidly as possible. Vertices keep their order, as in a modelling tool. The output has the
+RMS displacement of the vertices in the best common pose, in diagonals; and whether the message is read, and log10 p of
+a claim of it without its floor, by three registrations: a single map, a map of each point's neighbourhood, and the
+skeleton (`jaxmark.geometry.unpose`), for files with a skin.
 """
 
 import sys

@@ -1,9 +1,10 @@
-"""What a mark survives: python benchmarks/robustness/robustness.py MESH... [--case 64:2e-4 ...] [--schemes ...].
+"""Measure the attacks that a mark survives: python benchmarks/robustness/robustness.py MESH... [--case 64:2e-4 ...].
 
-Up to three tables: how many messages read after REQUIRED attacks, for several keys, messages and random seeds; the
-largest strength of each attack that still reads, by bisection; and with --directions a mark along coordinates beside
-one along normals that bends the surface as much. Only the exact message counts; log10 p is of a claim of it where it
-does not read. With --processes each reading of the first table is a run of `jaxmark detect`, on files.
+There are up to three tables. The first has the number of messages read after the REQUIRED attacks, for several keys,
+messages and random seeds. The second has the largest strength of each attack after which the message can still be read,
+by bisection. With --directions, the third compares a mark along coordinates with one along normals that bends the
+surface as much. Only the exact message counts; if it cannot be decoded, log10 p is that of a claim. With --processes,
+each reading of the first table is a run of `jaxmark detect` on files.
 """
 
 import argparse

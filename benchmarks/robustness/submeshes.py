@@ -1,16 +1,16 @@
-"""Sub-meshes marked one by one, beside one mark of as many bits: python benchmarks/robustness/submeshes.py MESH ...
+"""Compare marks of sub-meshes with one mark of as many bits: python benchmarks/robustness/submeshes.py MESH ...
 
-A line for each number of parts, grown from vertices far from each other, and one for the mesh as a whole with the same
-payload and budget. Columns:
+There is a line for each number of parts, which grow from vertices far from each other, and one for the whole mesh with
+the same payload and budget. Columns:
 
 bits       payload: --bits for each part
-carries    what `jaxmark.capacity` says at the budget, in the same noise: of the part that carries least, and of all
-           together
+carries    result of `jaxmark.capacity` at the budget, in the same noise: of the part that carries least, and of all
+           parts together
 prepare, embed, detect
-           seconds, of the first seed / of the last, for which nothing has to be compiled; detection is of the mark
-           that nobody attacked, aligned by its order
-others     how many parts read, over all seeds: keys, messages, noise and planes. "crop" keeps one side of a plane that
-           has half of the vertices on it
+           seconds, of the first seed / of the last, for which nothing is compiled; detection is of the mark without
+           attack, aligned by its order
+others     number of parts that are read, over all seeds: keys, messages, noise and planes. "crop" keeps one side of a
+           plane with half of the vertices on each side
 """
 
 import sys

@@ -1,13 +1,13 @@
-"""What tuning the bands is worth: python benchmarks/robustness/tuning.py [MESH...] [--train MESH...] [--limit ...].
+"""Measure the gain from tuning the bands: python benchmarks/robustness/tuning.py [MESH...] [--train MESH...].
 
-For each mesh and limit, marks of equal distortion: flat over the whole spectrum, low-pass by hand, the library's
-default, the same in the usual pass band whatever the limit, the mean profile of the training meshes (never those
-reported on), tuned on the mesh itself, and --around profiles whose strengths differ from the tuned ones by chance. Each
-is attacked with seeds, and written with keys, that tuning has not seen. The margin is the evidence for a claimed
-message in nats, S²/2‖a‖², and the bound is what no profile of these bands exceeds on the measured channels. --strengths
-adds the largest strength of each kind of attack from which a message of --bits bits still reads. --untuned leaves out
-tuning, which takes minutes. Without meshes to report on, only the mean profile is printed: so the library's default is
-derived (`schemes.DERIVED`).
+For each mesh and limit, marks of equal distortion are compared: flat over the whole spectrum, low-pass by hand, the
+library's default, the same in the usual pass band whatever the limit, the mean profile of the training meshes (never
+those reported on), tuned on the mesh itself, and --around profiles whose strengths differ from the tuned ones by
+chance. They are attacked with seeds, and written with keys, that had no part in tuning. The margin is the evidence for
+a claimed message in nats, S²/2‖a‖², and the bound is the margin that no profile of these bands exceeds on the measured
+channels. --strengths adds the largest strength of each kind of attack after which a message of --bits bits can still be
+read. --untuned omits tuning, which takes minutes. Without meshes to report on, only the mean profile is printed, from
+which the library's default is derived (`schemes.DERIVED`).
 """
 
 import argparse

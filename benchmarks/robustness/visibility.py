@@ -1,15 +1,15 @@
-"""What is seen of marks, point by point: python benchmarks/robustness/visibility.py MESH ...
+"""Measure the visibility of marks, point by point: python benchmarks/robustness/visibility.py MESH ...
 
-A line for each mesh, of which there may be none, and for each shape that is made on the spot, marked with 64 bits at
-the default strength or within --limit. Columns:
+There is a line for each given mesh, and for each built-in shape, marked with 64 bits at the default strength or within
+--limit. Columns:
 
 rms        displacement over the diagonal
 dame       mean masked change of dihedral angles, in radians
 stretch    change of length that 1 % of the edges exceed
 turn       of face normals, in degrees, that half / 5 % of the area exceed
 shading    visible turn of normals, in just noticeable differences, that half / 5 % / 1 % of the area exceed
-on planes  the same of planes, in degrees, that 5 % of their area exceeds; their edges turn by less than 0.1°
-least      the turn of normals that is just noticed, in degrees, where the original hides least (5 % of the area, the
+on planes  turn of the normals of planes, in degrees, that 5 % of their area exceeds; their edges turn by less than 0.1°
+least      the turn of normals that is just noticed, in degrees, where the original masks least (5 % of the area, the
            most sensitive band)
 flip, ssim differences of pictures that 1 % of their pixels exceed, with --pictures
 seconds    to prepare the original / to measure / to take the gradient, once compiled

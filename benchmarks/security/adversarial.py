@@ -1,16 +1,17 @@
-"""What enemies must pay: python benchmarks/security/adversarial.py MESH... --output FOLDER [--schemes keyed ...].
+"""Measure the cost of removing a mark: python benchmarks/security/adversarial.py MESH... --output FOLDER.
 
-For each attacker, the least distortion that brings a mark of 64 bits at 0.08 % RMS below detection at 1e-6, its message
-claimed, over the mark's own distortion, in each metric; and the least of all attackers who know as much:
+For each attacker, the table has the least distortion that brings a mark of 64 bits at 0.08 % RMS below detection at
+1e-6, with its message claimed, relative to the mark's own distortion, in each metric; and the least of all attackers
+with the same knowledge:
 
   program: the marked mesh and this library
-  oracle:  the answers of the owner's detector besides, of which so many are asked
-  copies:  more copies with other messages under the same key
+  oracle:  also the answers of the owner's detector to a number of queries
+  copies:  also more copies with other messages under the same key
   key:     key, original and message; subtracting the mark itself costs 1
 
-"noise by theory" is noise of the mark's own spectrum that leaves so little evidence, by
-`jaxmark.evaluation.channels.margins`: what an attacker who only adds noise pays in RMS. Resumable: the same command
-goes on where it was ended.
+"noise by theory" is noise of the mark's own spectrum that leaves too little evidence, by
+`jaxmark.evaluation.channels.margins`: the RMS cost of an attacker who only adds noise. The same command resumes an
+interrupted run.
 """
 
 import math

@@ -1,25 +1,25 @@
-"""What marks prove that are read without the original, and what it costs to erase and to copy them.
+"""Measure the evidence of blind marks, and the cost of erasing and copying them.
 
-Tables in Markdown, by part; `--only` chooses some:
+The output is tables in Markdown, by part; `--only` selects parts:
 
-  bound      simulated pairs of suspect and key, without a mesh: how many state a probability at most so small, beside
-             the most that are expected; for a pose chosen blindly, for one at which all offsets fit exactly, and for
-             the best of many, paid for; by the squares of the cosines, as `jaxmark.detect` states it, and by the number
-             of anchors, which a search breaks
-  unmarked   the smallest log10 p that is read from unmarked meshes, and expected by chance
-  erasure    values of all anchors moved by shares of a step, without the key
-  rewatermarking  a second mark by another key, of the same limits
-  copying    the phases of one marked work written in another shape, without the key
-  averaging  the lattice of values estimated from several works of one key with different messages, and another work
-             moved to halfway between
-  answers    values moved as a detector's answers tell: by so many scores, or by so many decisions at 1e-6; answers are
-             those of the right pose, the last reading is of the mesh
-  mixing     if each value were a keyed mixture of several neighbouring ones: how far all must be moved without the key
-             until nothing is left, in formulas, and how many mixtures keep all of their values
-  salts      seconds and evidence that a reader pays who tries so many lattices of one key
+  bound      simulated pairs of suspect and key, without a mesh: the number that state at most a given probability, and
+             the largest number expected; for a pose chosen independently of the key, for one at which all offsets fit
+             exactly, and for the best of many, with a Bonferroni correction; by the squares of the cosines, as
+             `jaxmark.detect` computes it, and by the number of anchors, which a search defeats
+  unmarked   the smallest log10 p read from unmarked meshes, and the smallest expected by chance
+  erasure    a keyless attacker moves the values of all anchors by shares of a step
+  rewatermarking  a second mark with another key and the same limits
+  copying    a keyless attacker writes the phases of one marked work into another shape
+  averaging  the lattice of values is estimated from several works of one key with different messages, and another work
+             is moved to halfway between its values
+  answers    values are moved according to a detector's answers: a number of scores, or of decisions at 1e-6; answers
+             are those of the right pose, and the last reading is of the mesh
+  mixing     if each value were a keyed mixture of several neighbouring ones: the displacement by which a keyless
+             attacker erases the mark, by formulas, and the number of mixtures that keep all of their values
+  salts      seconds and evidence that trying several lattices of one key costs a reader
   codes      if the lattice depended on the shape around each anchor, on its normal and on the sign of its curvature at
-             some scales: how many anchors have a clear code, and how many of these keep it, in attacked works and in
-             another shape that the mark is copied to
+             some scales: the number of anchors with a clear code, and the number that keep it, in attacked works and in
+             another shape to which the mark is copied
 
 RMS is that of the attack over that of the mark, MSDM that of the attack alone. Figures are of one seed.
 

@@ -1,7 +1,7 @@
-"""Who is accused when several recipients make one copy of theirs: by averaging, per-vertex mixing, median, minimum.
+"""Count the accused if several recipients combine their copies: by averaging, per-vertex mixing, median or minimum.
 
-For coalitions of 1 to 10 it prints how many of their members are accused at 1e-6, how many innocents, the best
-log10 p (which covers all recipients tried), and the time to rank them.
+For coalitions of 1 to 10 recipients, the table has the number of members accused at 1e-6, the number of innocents
+accused, the best log10 p (which covers all recipients tried), and the time to rank them.
 
     python benchmarks/security/collusion.py MESH [--recipients 100000] [--noise 0.002] [--budget 0.0008]
 """

@@ -1,17 +1,17 @@
-"""What each defence buys: python benchmarks/security/defences.py MESH [--attackers NAME...] [--queries 300].
+"""Measure the gain from each defence: python benchmarks/security/defences.py MESH [--attackers NAME...].
 
-As `adversarial.py`: a mark of 64 bits at 0.08 % RMS, brought below detection at 1e-6 with its message claimed; what
-that costs over the mark's own distortion. First defences of the mark, against who knows the program and, where
-strengths are tuned, these; then of the detector's answers, against who may ask so many times.
+As in `adversarial.py`, a mark of 64 bits at 0.08 % RMS is brought below detection at 1e-6 with its message claimed, and
+the table has the cost relative to the mark's own distortion. Defences of the mark come first, against attackers who
+have the program and, if strengths are tuned, these strengths. Defences of the detector's answers follow, against
+attackers with a limited number of queries.
 
-  tuned: strengths by `jaxmark.tune`, in rounds; in each the attackers go against the strengths of the last, and what
-         they do is added to all that the next are tuned to (min-max by fictitious play)
-  jittered: the strength of each band times a factor that the key draws, log-normal, spread 0.5; the attacker takes its
-         median for it
+  tuned: strengths by `jaxmark.tune`, in rounds; in each round the attackers attack the strengths of the round before,
+         and their attacks are added to those that the next strengths are tuned to (min-max by fictitious play)
+  jittered: the strength of each band times a keyed log-normal factor with spread 0.5; the attacker assumes the median
 
 The attackers of marks are `bands` and `vertices`, by gradient, unless others are named: `shrinkage` of wavelets, and
-`rewatermarking`, another mark of the same strengths. The table also gives the cost of a defence elsewhere: the mark's
-own DAME and MSDM2, and log10 p of a claim after noise of 0.5 % and 50 steps of smoothing, without its floor.
+`rewatermarking`, another mark of the same strengths. The table also has the other costs of a defence: the mark's own
+DAME and MSDM2, and log10 p of a claim after noise of 0.5 % and 50 steps of smoothing, without its floor.
 """
 
 import sys

@@ -1,12 +1,13 @@
-"""How often a claimed message is "detected" where there is no mark: nominal probabilities against counted ones.
+"""Count how often a claimed message is "detected" without a mark, and compare with the nominal probabilities.
 
-For many keys and hard suspects, through `NonBlindMarker.observe`, `detectors.claims` and `weigh`, which
-`jaxmark.detect` calls. Every rate must not exceed its level (Clopper-Pearson, one-sided, 99.9 %), for each suspect, and
-the rate over all must be at least a thirtieth of it, at levels where that makes 10 hits or more (down to 1e-3 with the
-default number of keys): a bound that never fires proves nothing. As a control, the same checks of a bound with the
-exponent doubled must fail. The same for a message that was read: the best of all, charged by the union bound, and
-without it as a control. Exit status 1 if a check does not end so. With --surfaces, suspects were meshed anew, so that
-only their surface is known; with --vertices, few vertices are left, by which they are read.
+The counts are for many keys and hard suspects, through `NonBlindMarker.observe`, `detectors.claims` and `weigh`, which
+`jaxmark.detect` calls. For each suspect, every rate must not exceed its level (Clopper-Pearson, one-sided, 99.9 %). The
+rate over all suspects must be at least a thirtieth of the level, at levels where that makes 10 hits or more (down to
+1e-3 with the default number of keys), because a bound that is never reached proves nothing. As a control, the same
+checks must fail for a bound with the exponent doubled. The same is done for a decoded message, the best of all, charged
+by the union bound, and without the charge as a control. The exit status is 1 if a check has another result. With
+--surfaces, suspects are remeshed, so that only their surface is known; with --vertices, suspects have few vertices, and
+are read from these.
 
     python benchmarks/security/false_positives.py [--keys N] [--surfaces | --vertices] [--mesh FILE]
 """

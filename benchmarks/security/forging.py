@@ -1,17 +1,17 @@
-"""What the owner of a key could forge, and what it buys: proofs from suspects that know nothing of the key.
+"""Measure what the owner of a key can forge: evidence from suspects that are independent of the key.
 
-For suspects without the owner's mark, five ways to choose afterwards what should have been fixed before:
+For suspects without the owner's mark, the owner chooses afterwards what should have been fixed before:
 
   strengths  a profile of 64 and more bands is fitted to score and norm by non-negative least squares, with the chips of
-             an honest record, which is then made again with the fitted profile
-  grinding   the profile's last entry is moved in its last digits; each time all chips are drawn anew
-  original   the original that is presented is moved against the mark, as a whole or only half of it
+             an honest record; the record is then made again with the fitted profile
+  grinding   the last digits of the profile's last entry are varied; each variation gives new chips
+  original   the presented original is moved against the mark, completely or by half
   message    the message is the one that decodes best, whatever its tag
 
-Printed are log10 p as `jaxmark.detect` prints it, committed and uncommitted; the lowest over keys and suspects, where
-there are several. Exit status 1 if a figure is not explained by chance: if it is lower than one in so many tries is, by
-two orders of magnitude. The search for the message stops short of its tag, which takes 2^28 hashes; it is judged by
-what it says would be printed.
+The output has log10 p as `jaxmark.detect` prints it, committed and uncommitted; the lowest over keys and suspects, if
+there are several. The exit status is 1 if chance does not explain a figure: if it is lower, by two orders of magnitude,
+than the least of that many tries. The search for the message stops before its tag, which would take 2^28 hashes; it is
+judged by the figure that would be printed.
 
     python benchmarks/security/forging.py MESH [--keys N] [--tries N] [--bands N ...]
 """

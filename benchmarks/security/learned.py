@@ -1,16 +1,16 @@
-"""What attackers who learned must pay: python benchmarks/security/learned.py MESH... --output FOLDER [--steps 400].
+"""Measure the cost of removal by learned attacks: python benchmarks/security/learned.py MESH... --output FOLDER.
 
-They learn on meshes by formula, 20 that this library marks with random keys and 4 by which it is measured what they
-learned, and go against marks of 64 bits on the meshes that are given, at 0.08 % RMS and as strong as is hidden. What
-is printed is as of `adversarial.py`: the least distortion that brings a mark below detection at 1e-6, its message
-claimed, over the mark's own, in each metric.
+Attacks are trained on meshes by formula: 20 that this library marks with random keys, and 4 for validation. They attack
+marks of 64 bits on the given meshes, at 0.08 % RMS and hidden. The table is that of `adversarial.py`: the least
+distortion that brings a mark below detection at 1e-6, with its message claimed, relative to the mark's own, in each
+metric.
 
   estimate: a network that estimates the mark, and subtracts it
   removal:  a network that lowers the expected evidence
   chain:    up to four tools one after the other, found by evolution on two marked meshes for the least MSDM2
 
-Beside them denoising that learns nothing. Resumable: the same command goes on where it was ended; the folder keeps
-networks and chain, and is refused with other settings of these.
+For comparison, the table has denoising without training. The same command resumes an interrupted run; the folder keeps
+networks and chain, and is refused if their settings differ.
 """
 
 import argparse

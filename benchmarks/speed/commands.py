@@ -1,19 +1,19 @@
-"""Whole commands on files, with default options, stage by stage: python benchmarks/speed/commands.py MESH...
+"""Time whole commands on files, with default options, stage by stage: python benchmarks/speed/commands.py MESH...
 
-`jaxmark embed` and `jaxmark detect` run as processes of their own, twice each with the same cache of compiled programs,
-which is empty before the first. A table has a line for each run: seconds of each stage without those in it, of the
-whole process, and the most memory that it held.
+`jaxmark embed` and `jaxmark detect` run as processes, twice each with the same cache of compiled programs, which is
+empty before the first run. The table has a line for each run: seconds of each stage without the stages inside it, of
+the whole process, and its peak memory.
 
-start    until the command line is read: interpreter and imports
-read     of files, each time that one is read
-prepare  the original: welded, hashed, its Laplacian, where it hides a mark, the carrier
-limits   how visible trial displacements are
+start    until the command line is parsed: interpreter and imports
+read     files, each time that one is read
+prepare  the original: welding, hashing, Laplacian, masking, carrier
+limits   visibility of trial displacements
 write    the rest of writing the mark
-back     reading the written file, and trying what the mark survives
+back     reading the written file, and measuring the noise that the mark survives
 save     the marked file
-align    the suspect beside the original
-receive  bands weighed, and what is proven
-other    what is left
+align    the suspect with the original
+receive  weighting of bands, and evidence
+other    the rest
 """
 
 import argparse

@@ -1,8 +1,8 @@
-"""A corpus marked, attacked and read on many workers: python benchmarks/speed/corpus.py MESH... --output corpus.jsonl.
+"""Mark, attack and read a corpus on many workers: python benchmarks/speed/corpus.py MESH... --output corpus.jsonl.
 
-One cell for each mesh, key and attack, run by any `concurrent.futures` executor: processes, or Dask's workers. Each
-finished cell is a line of the output, and is skipped when the same command is run again, after whatever ended the last
-run. Where a worker is killed, a new pool goes on with what is left.
+There is one cell for each mesh, key and attack, run by any `concurrent.futures` executor: processes, or Dask's workers.
+Each finished cell is a line of the output, and is skipped if the same command runs again. If a worker is killed, a new
+pool continues with the remaining cells.
 """
 
 import os

@@ -1,9 +1,10 @@
-"""Filters over several devices, one machine: python benchmarks/speed/devices.py [--vertices 200000] [--degree 32].
+"""Time filters over devices of one machine: python benchmarks/speed/devices.py [--vertices 200000] [--degree 32].
 
-A torus of triangles, three float32 columns. Strong scaling keeps the mesh and adds devices, weak scaling has so many
-vertices for each device; devices lie in one process, or two processes that talk by `jax.distributed`. One process
-prepares the parts and leaves them as files, which the others map: each touches only its own. Devices here are threads
-of one processor: the table shows what is sent and held and that results agree, not how fast several machines are.
+The mesh is a torus of triangles, with three float32 columns. Strong scaling keeps the mesh and adds devices; weak
+scaling keeps the number of vertices for each device. Devices are in one process, or in two processes that communicate
+by `jax.distributed`. One process prepares the parts and writes them to files, which the others map, so that each reads
+only its own. Devices here are threads of one processor: the table shows the amounts of data that are sent and held, and
+that results agree, but not the speed of several machines.
 """
 
 import math

@@ -1,13 +1,13 @@
-"""Folders of meshes of unlike size, marked and read: python benchmarks/speed/folders.py MESH...
+"""Time marking and reading a folder of meshes of different sizes: python benchmarks/speed/folders.py MESH...
 
-The folder is made of the meshes, simplified to sizes between 1,500 vertices and their own. `jaxmark embed` and
-`jaxmark detect` work on it in one process, in several by --workers, and on some of its files in a process each, as many
-at a time as there are processors. Each starts with an empty cache of compiled programs, and is run twice.
+The folder has the meshes, simplified to sizes between 1,500 vertices and their own. `jaxmark embed` and `jaxmark
+detect` process it in one process, in several by --workers, and some of its files in one process each, as many at a time
+as there are processors. Each starts with an empty cache of compiled programs, and is run twice.
 
 s a file   seconds of the whole, over the number of files
-over       how many times as many files in a second as by a process each, in the same run
-programs   compiled, or found in the cache, as JAX logs it
-kinds      of these, that differ in name and shapes, not only in what is fixed, such as a number of bands
+over       files per second, relative to a process for each file in the same run
+programs   number compiled, or loaded from the cache, as JAX logs it
+kinds      number of these that differ in name and shapes, not only in constants such as a number of bands
 memory     of all processes when each quarter of the files is done
 """
 

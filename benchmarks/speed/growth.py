@@ -1,16 +1,15 @@
-"""How time and memory grow with the vertices: python benchmarks/speed/growth.py [MESH] --output growth.json.
+"""Measure how time and memory grow with the mesh: python benchmarks/speed/growth.py [MESH] --output growth.json.
 
 Each stage runs in a process of its own, on a MESH that is simplified to each size, or subdivided and then simplified,
-or without one on bumpy tori: the filter of degree 64 of three float32 columns, also by SciPy and PyGSP, and with both
-gradients; marks of 64 bits with default options, and reading them beside the original; marks that are read without it;
-and the lowest 64 eigenvectors by SciPy's eigsh, of which the eigenvector schemes consist. A stage that took longer than
---patience is left out at the larger sizes.
+or without a MESH on bumpy tori. The stages are: the filter of degree 64 of three float32 columns, also by SciPy and
+PyGSP, and with both gradients; writing marks of 64 bits with default options, and reading them, with the original and
+blind; and the lowest 64 eigenvectors by SciPy's eigsh, on which the eigenvector schemes are based. A stage that took
+longer than --patience is left out at the larger sizes.
 
-Times are of the second call, nothing compiled; memory is the most during the first call beyond what was held before,
-so that calls which use what was freed before show less than they take.
-Exponents are slopes of logarithms, by least squares over all sizes of a stage and over its last three. Beside the JSON
-file, growth.png draws both over the vertices, with the extra `plot`. A file that is there already is added to: stages
-that are in it are not measured again.
+Times are of the second call, without compiling. Memory is the maximum during the first call beyond the memory held
+before; calls that reuse freed memory show less than they need. Exponents are slopes of logarithms, by least squares
+over all sizes of a stage and over its last three. With the extra `plot`, growth.png, in the same folder, shows time and
+memory over the number of vertices. An existing output file is extended: its stages are not measured again.
 """
 
 import json

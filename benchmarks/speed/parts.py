@@ -1,8 +1,8 @@
-"""Cut a mesh into parts of as many faces each: python benchmarks/speed/parts.py MESH PARTS.glb [--parts 10].
+"""Cut a mesh into parts with equal numbers of faces: python benchmarks/speed/parts.py MESH PARTS.glb [--parts 10].
 
-A model that is too large for the memory is marked as a file of several meshes, one after the other. The parts are slabs
-across the longest side; points on a cut are in both of its parts. `/usr/bin/time -v jaxmark embed PARTS.glb ...` and
-`detect` say what that takes.
+A model that is too large for the memory can be marked as a file of several meshes, one after the other. The parts are
+slabs across the longest side; points on a cut are in both of its parts. `/usr/bin/time -v jaxmark embed PARTS.glb ...`
+and `detect` measure time and memory.
 """
 
 import sys

@@ -1,19 +1,20 @@
-"""Beside other libraries, what each can do and its time on the same work: python benchmarks/speed/peers.py [MESH].
+"""Compare features and times with those of other libraries: python benchmarks/speed/peers.py [MESH].
 
-On a bumpy torus of --size vertices, and on MESH. What is missing of the extra `peers` is "not installed". Times are the
-least of --repeat calls after one that does not count, since other work on the machine only adds to them; what JAX runs
-is compiled. The parts:
+The meshes are a bumpy torus of --size vertices, and MESH. Libraries of the extra `peers` that are missing are "not
+installed". Times are the least of --repeat calls after a first one that is not counted, because other work on the
+machine only makes calls slower; JAX code is compiled. The parts:
 
 features    by the libraries' documents and code, in the versions that VERSIONS names.
 filter      exp(-5 Δ) of three float32 columns, the positions, by a series of degree 40; with the gradient of the sum of
-            squares to the columns. matfree is given our product with Δ.
+            squares with respect to the columns. matfree is given our product with Δ.
 ChebConv    a layer of degree 40 from three columns to three, with the same weights, symmetric; with the gradient of the
-            sum of squares to columns and parameters. "gradient, MB" is what the compiled program allocates beside
-            inputs and results, or, in PyTorch, what is saved for the way back.
+            sum of squares with respect to columns and parameters. "gradient, MB" is the memory that the compiled
+            program allocates besides inputs and results or, in PyTorch, that is saved for the backward pass.
 log-det     log det(I + 10 Δ) by the same 8 random probes and 20 products each, Chebyshev moments against Lanczos, with
-            the derivative to the factor 10; and exactly by a sparse factorisation.
+            the derivative with respect to the factor 10; and exactly, by a sparse factorisation.
 
-Differences are from our result, over its largest value; those of gradients, of the gradient to the columns or factor.
+Differences are from our result, over its largest value; those of gradients are of the gradient with respect to the
+columns or the factor.
 """
 
 import os

@@ -1,23 +1,23 @@
-"""Time and memory, beside other programs on the same work: python benchmarks/speed/speed.py [MESH] [--parts ...].
+"""Measure time and memory, with other programs on the same work: python benchmarks/speed/speed.py [MESH] [--parts ...].
 
-Meshes are bumpy tori of the given sizes, every square cut along either diagonal, vertices row by row or --shuffled; a
-MESH takes the place of the first. Medians of --repeat calls after one that does not count, of fewer where they take
-over a minute. The parts:
+Meshes are bumpy tori of the given sizes, with every square cut along either diagonal, and vertices row by row or
+--shuffled; a MESH replaces the first. Times are medians of --repeat calls after a first one that is not counted, or of
+fewer calls if these take over a minute. The parts:
 
-filter     f(Δ)x of three float32 columns, ours against SciPy, PyGSP and torch (extra `peers`; what is missing is
-           named), with the largest difference from ours over the largest value. Traffic counts once a step the
-           neighbours' indices, and weights if any, two numbers of each vertex, x, the term before, the next one, and
-           the sum read and written; "of a copy" is its share of what a pass over a large array, read and written,
-           reaches then.
+filter     f(Δ)x of three float32 columns, compared with SciPy, PyGSP and torch (extra `peers`; missing libraries are
+           named), with the largest difference from our result over the largest value. Traffic counts, once a step, the
+           neighbours' indices, the weights if any, two numbers of each vertex, x, the previous term, the next term, and
+           the sum read and written; "of a copy" is this traffic per second over that of a pass which reads and writes a
+           large array.
 gradients  all bands, moments, and the filter with both gradients: time over the plain filter's; and peak memory, each
-           in a process of its own, beyond what is held once the operator is built and the function compiled.
-stages     the library's functions from end to end, each in a process of its own: first call, of which lowering and
-           compiling (durations of `jax.monitoring`; tracing is not among them), later calls, and the whole process;
-           the eigenvector scheme over the keyed one, in writing and in embedding, which reads back; and dense
+           in a process of its own, beyond the memory held once the operator is built and the function compiled.
+stages     the library's functions from end to end, each in a process of its own: the first call, with its lowering and
+           compiling (durations of `jax.monitoring`, without tracing), later calls, and the whole process; the
+           eigenvector scheme over the keyed one, in writing and in embedding, which reads the mark again; and dense
            decompositions.
-scaling    exponents of vertices and degree, by least squares on logarithms, compiling not counted.
-memory     only where asked for: peak resident memory and time of stages in processes of their own, by default at 0.1,
-           1 and 4 million vertices.
+scaling    exponents of vertices and degree, by least squares on logarithms, without compiling.
+memory     only on request: peak resident memory and time of stages in processes of their own, by default at 0.1, 1 and
+           4 million vertices.
 
 On an accelerator the filter runs there, by default at 1 and 10 million vertices. --output FILE.json also draws
 FILE.png, with the extra `plot`.

@@ -1,19 +1,19 @@
-"""All families of bands beside each other: python benchmarks/theory/families.py MESH ... [--bands 16] [--degree 63].
+"""Compare all families of bands: python benchmarks/theory/families.py MESH ... [--bands 16] [--degree 63].
 
 The parts:
 
 table      one row a family, one cell a mesh: median leakage / median coherence / ε, the largest coherence, of the unit
-           components of x, y and z (the paper's Condition 3 wants both near 0) / the degree, or order, from which on
-           median leakage is at most 1 % ("-": not by degree 255, or order 8). A band's pass band is its own part and
-           both its neighbours'; bands without energy have leakage 1. Overshoot is the largest of a response beyond
-           [0, 1]. Products are with Δ, for all bands and three columns at once; of conjugate gradients, the range over
-           the meshes, counted in float64 at float32's tolerance.
-           Families of fixed degree get as many more bands, of which neighbours are summed. "count" and "energy" place
-           the edges by the mesh's spectral density or the host's energy, by --degree moments. "exact" is what Lagrange
-           polynomials at the eigenvalues would do, were there no rounding.
-methods    the scaling functions, and Lagrange polynomials at a polyhedron's eigenvalues, by Method 1 and Method 2:
-           largest error against dense eigenvectors over the largest value ("lost": above 1); time one by one over one
-           pass of Method 2. On meshes of at most 2,500 points.
+           components of x, y and z (the paper's Condition 3 requires both near 0) / the lowest degree, or order, at
+           which median leakage is at most 1 % ("-": above degree 255, or order 8). The pass band of a band is its own
+           interval and both neighbouring ones; bands without energy have leakage 1. Overshoot is the largest value of a
+           response outside [0, 1]. Products are with Δ, for all bands and three columns at once; for conjugate
+           gradients, the range over the meshes, counted in float64 at float32's tolerance.
+           Families of fixed degree get more bands, of which neighbours are summed. "count" and "energy" place the edges
+           by the mesh's spectral density or the host's energy, from --degree moments. "exact" is the result of Lagrange
+           polynomials at the eigenvalues without rounding errors.
+methods    the scaling functions, and Lagrange polynomials at a polyhedron's eigenvalues, by Method 1 and Method 2: the
+           largest error against dense eigenvectors over the largest value ("lost": above 1); and the time band by band
+           over that of one pass of Method 2. On meshes of at most 2,500 points.
 """
 
 import sys

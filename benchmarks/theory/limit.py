@@ -1,19 +1,19 @@
-"""How far from the limits of white noise: python benchmarks/theory/limit.py MESH [--payloads ...] [--trials 1000].
+"""Measure the distance from the limits of white noise: python benchmarks/theory/limit.py MESH [--trials 1000].
 
-Message error rate of the whole chain against Eb/N0: messages are written by `Mark.write`, white Gaussian noise is put
-on every coordinate, and the suspects are read by what `jaxmark.detect` calls: `attempts.align`, `Mark.receive`
-(projection), `Mark.soft_decisions` (joint detector) and `Mark.decode` (list decoder, keyed tag). A wrong message and
-none are both errors. Before it the code alone: the same decoder on code bits in white Gaussian noise, where a word is
-read if it is on the list, as the tag picks it but with probability 64 · 2^-28. `--code-only` stops there; without a
-MESH, codes are then as long as is of use.
+The result is the message error rate of the whole chain against Eb/N0. Messages are written by `Mark.write`, white
+Gaussian noise is added to every coordinate, and the suspects are read by the functions that `jaxmark.detect` calls:
+`attempts.align`, `Mark.receive` (projection), `Mark.soft_decisions` (joint detector) and `Mark.decode` (list decoder,
+keyed tag). A wrong message and no message are both errors. The code alone is measured first: the same decoder on code
+bits in white Gaussian noise, where a word counts as read if it is on the list, because the tag selects it except with
+probability 64 · 2^-28. `--code-only` stops there; without a MESH, codes have the longest useful length.
 
 Eb/N0 = η |w|² / (2 k σ²): w is the mark as written, η the share of such marks that survives the projection (`energy` of
-a reader's free dimensions, from one probe), k the payload without the tag, σ the noise of a coordinate. Limits:
+a reader's free dimensions, from one probe), k the payload without the tag, σ the noise of a coordinate. The limits are
 Shannon's, the least energy of any code (the converse of Polyanskiy, Poor, Verdú 2011), and a matched filter for each
 bit, uncoded.
 
 Intervals are Clopper-Pearson's, 95 %; a point ends early after 100 errors. Eb/N0 at error 1e-3 is interpolated on the
-logarithm of the rate; where no error was seen, the upper end of the interval is the rate, and the result "at most".
+logarithm of the rate. Without an error, the upper end of the interval is used as the rate, and the result is "at most".
 """
 
 import math

@@ -1,24 +1,25 @@
-"""The figures of Sohn et al. on their meshes: python benchmarks/theory/paper.py bunny.ply dragon.ply hand.ply [...].
+"""Repeat the figures of Sohn et al.: python benchmarks/theory/paper.py bunny.ply dragon.ply hand.ply [...].
 
-Theirs have 1494, 1257 and 1055 vertices; any meshes will do. The parts, each of tables and figures:
+The paper's meshes have 1494, 1257 and 1055 vertices; any meshes will do. Each part has tables and figures; numbers are
+those of the paper's figures:
 
 kernel     1 and 2: a scaling function, and its pass band B(δ), where it has at least δ = 0.5 of its value at the node.
            Bands are counted from the lowest.
 time       12: f(Δ)x of three float32 columns at degree 64, over N, on the meshes and bumpy tori of --sizes. "dense" is
-           what the paper does, n products with an N × N matrix, up to --largest, "sparse" ours; both compiled. Medians
-           of --repeat calls after one that does not count; exponents by least squares on logarithms.
-degree     13: the same over the degree; "all bands" forms all n + 1 components in one pass, as the paper does.
+           the paper's method, n products with an N × N matrix, up to --largest; "sparse" is ours; both are compiled.
+           Medians of --repeat calls after one that is not counted; exponents by least squares on logarithms.
+degree     13: the same over the degree; "all bands" computes all n + 1 components in one pass, as the paper does.
 attacks    14: bit error rate of 64 bits without a code, RMS 0.08 % of the diagonal, mean of --trials keys, messages
-           and seeds. "as printed": printed kernel, components as they are, plain correlation; "working": Jackson-damped
+           and seeds. "as printed": printed kernel, unscaled components, plain correlation; "working": Jackson-damped
            bands at unit norm, decorrelated; "eigenvectors": decorrelated, too. The attacks are `jaxmark.attacks`'s:
-           diagonal-noise, mark_noise, similarity and edge-flips; the last two are aligned by
-           `jaxmark.alignment.attempts.align`, the others compared as they stand.
+           diagonal-noise, mark_noise, similarity and edge-flips; suspects of the last two are aligned by
+           `jaxmark.alignment.attempts.align`, others are compared without alignment.
 collinear  median |⟨x_i, x_j⟩_D| of unit components that are not empty, over x, y and z, and bit errors of 64 bits
-           with no attack, components as they are and plain correlation, for each form of the kernel.
+           without an attack, with unscaled components and plain correlation, for each form of the kernel.
 gibbs      15 and 16: 16 bands of best approximated hats, and of sums of neighbouring scaling functions of the same
-           degree: the largest of a response beyond [0, 1], over its peak.
+           degree: the largest value of a response outside [0, 1], over its peak.
 
---output FILE.json has all tables and curves; with the extra `plot` each figure becomes FILE-N.png beside it.
+--output FILE.json has all tables and curves; with the extra `plot` each figure becomes FILE-N.png in the same folder.
 """
 
 import argparse

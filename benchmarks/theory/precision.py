@@ -1,7 +1,7 @@
-"""What float32 costs, stage by stage, beside float64: python benchmarks/theory/precision.py [MESH].
+"""Compare float32 with float64, stage by stage: python benchmarks/theory/precision.py [MESH].
 
-The whole chain runs twice on the same meshes, key and message: an error is that of all stages so far. The suspect is a
-weakly marked mesh in noise, so that its claim lies above the floor of the evidence.
+The whole chain runs twice on the same meshes, key and message; an error includes those of all earlier stages. The
+suspect is a weakly marked mesh in noise, so that its claim is above the floor of the evidence.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Marks the object `model` of scene.blend, and reads the mark from marked.blend; keeps key, original and record."""
+"""Mark the object `model` of scene.blend, save key, original and record, and read the mark from marked.blend."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import jaxmark as jm
 
 
 def get_mesh(data: bpy.types.Mesh) -> jm.Mesh:
-    """Take a mesh out of a scene, its polygons as the triangles that Blender draws."""
+    """Return a mesh of a scene, with its polygons as the triangles that Blender draws."""
     vertices = np.empty(3 * len(data.vertices), np.float32)
     data.vertices.foreach_get("co", vertices)
     data.calc_loop_triangles()
@@ -19,7 +19,7 @@ def get_mesh(data: bpy.types.Mesh) -> jm.Mesh:
 
 
 def put_back(data: bpy.types.Mesh, mesh: jm.Mesh) -> None:
-    """Move the vertices of a mesh in a scene to where a mesh of the same vertices has them."""
+    """Move the vertices of a mesh in a scene to the positions of a mesh with the same vertices."""
     if data.shape_keys:
         raise SystemExit("This mesh has shape keys; remove or apply them first.")
     data.vertices.foreach_set("co", np.ravel(mesh.vertices).astype(np.float32))
@@ -33,17 +33,17 @@ if __name__ == "__main__":
     marked, info = jm.embed(original, b"jaxmark!", key)
     put_back(data, marked)
     bpy.ops.wm.save_as_mainfile(filepath="marked.blend")
-    jm.save_key(key, "owner.key")
+    jm.watermark.save_key(key, "owner.key")
     jm.save_mesh(original, "original.ply")
     Path("record.json").write_text(info.record.to_json())
 
-    # The same, later: whether a scene has the mark.
+    # Later: read the mark from a scene.
     bpy.ops.wm.open_mainfile(filepath="marked.blend")
     suspect = get_mesh(bpy.data.objects["model"].data)
-    found = jm.detect(
+    detection = jm.detect(
         suspect,
         original=jm.load_mesh("original.ply"),
-        key=jm.load_key("owner.key"),
+        key=jm.watermark.load_key("owner.key"),
         record=jm.Record.load("record.json"),
     )
-    print(found.message, f"log10 p {found.log10_p:.1f}")
+    print(detection.message, f"log10 p {detection.log10_p:.1f}")

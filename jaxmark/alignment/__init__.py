@@ -1,6 +1,7 @@
-"""Align a suspect mesh with the original and observe how each point of the original was displaced.
+"""Register a suspect mesh to the original, and measure how each point of the original was displaced.
 
-`make_original` prepares the original, `align` finds the pose and the displacements; all on the host, without the key.
+`make_original` prepares the original; `align` finds the pose and the displacements. All computations run on the host,
+and none uses the key.
 """
 
 from jaxmark.alignment.attempts import align as align

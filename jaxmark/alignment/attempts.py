@@ -1,8 +1,9 @@
-"""Start here: `align` attempts the ways of `by_vertices`, `by_cloud` and `by_surface` in their order, until one works.
+"""`align`, the entry point: tries registration by vertices, by point clouds and by surfaces, until one works.
 
-They find the displacement of each point of the original; on the host, without the key. An affine attack moves the mark
-with the host, so that its map is inverted first, by least squares on the points that agree with it. Points that lie far
-off were cut away, replaced or lost, and are masked. Every map may mirror, where that fits better.
+Registration finds the displacement of each point of the original. It runs on the host, without the key. An affine
+attack moves the mark together with the mesh; therefore the affine map is fitted to the points that agree with it, by
+least squares, and inverted first. Points with a large residual were cropped, replaced or lost, and are masked. Every
+map may be a reflection, if that fits better.
 """
 
 import time
@@ -28,28 +29,29 @@ def align(
     Args:
         original: from `make_original`.
         suspect: any mesh.
-        align: `"same"` demands the original's vertices and faces in the same order; `"similarity"` and `"affine"` align
-            surfaces, up to such a map; `"auto"` takes the first way that works: vertices by their order, vertices by
-            connectivity, surfaces up to a similarity; for point clouds, points by their order, else the nearest ones
-            where they are or up to a similarity. Each map may mirror, and faces may be reversed.
-        reflections: whether the pose of a surface may be one that does not mirror (False), one that mirrors (True), or
-            either; the surface of a shape that is nearly its own mirror image does not tell.
+        align: `"same"` requires the original's vertices and faces in the same order. `"similarity"` and `"affine"`
+            align surfaces, up to such a map. `"auto"` takes the first way that works: vertices by their order, vertices
+            by connectivity, surfaces up to a similarity. For point clouds, `"auto"` takes points by their order, else
+            nearest points, first in the pose of the file, then up to a similarity. Each map may be a reflection, and
+            faces may be reversed.
+        reflections: whether the pose of a surface may be a rotation (False), a reflection (True), or either. A shape
+            that is nearly its own mirror image fits both.
 
     Raises:
-        JaxmarkError: if the suspect does not share the original's connectivity under `"same"`, cannot be aligned (the
-            residual is over 1 % of the diagonal, or over 0.5 % where less than half of the original is seen, or less
-            than 5 % is seen), or libigl is missing, which surfaces need.
+        JaxmarkError: if the suspect does not have the original's connectivity under `"same"`; if it cannot be aligned,
+            which means that the residual is over 1 % of the diagonal, or over 0.5 % with a coverage of less than half,
+            or the coverage is less than 5 %; or if libigl is missing, which surfaces need.
     """
     if align not in get_args(Align):
         raise JaxmarkError(f"A suspect is aligned by {', '.join(get_args(Align))}, not {align!r}.")
     start = time.perf_counter()
     ready = make_suspect(original, suspect)
-    found = _attempt(original, ready, align, reflections)
-    return found._replace(pose=ready.pose.then(found.pose), seconds=time.perf_counter() - start, align=align)
+    result = _attempt(original, ready, align, reflections)
+    return result._replace(pose=ready.pose.then(result.pose), seconds=time.perf_counter() - start, align=align)
 
 
 def _attempt(original: Original, suspect: PreparedSuspect, align: Align, reflections: Sequence[bool]) -> Alignment:
-    """Attempt the ways of aligning in their order, until one works."""
+    """Try the ways of registration one after another, until one works."""
     if align == "same":
         return align_in_order(original, suspect.mesh)
     if suspect.is_cloud or len(original.points.faces) == 0:
@@ -58,6 +60,6 @@ def _attempt(original: Original, suspect: PreparedSuspect, align: Align, reflect
     if align == "auto":
         if suspect.has_order_of(original):
             return align_in_order(original, suspect.mesh)
-        if (found := align_by_connectivity(original, suspect)) is not None:
-            return found
+        if (by_connectivity := align_by_connectivity(original, suspect)) is not None:
+            return by_connectivity
     return align_surfaces(original, suspect, reflections, by_affine=align == "affine")

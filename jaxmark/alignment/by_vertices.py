@@ -1,4 +1,4 @@
-"""Align a suspect whose vertices are recognised: by their order, or by the connectivity around them."""
+"""Registration of a suspect whose vertices are recognised: by their order, or by the connectivity around them."""
 
 from typing import Literal
 
@@ -16,21 +16,21 @@ from jaxmark.geometry.connectivity import matching_vertices
 from jaxmark.geometry.mesh import Mesh, component_of
 from jaxmark.geometry.pose import Points, Pose
 
-MIN_COVERAGE = 0.05  # share of the original that an alignment must show
-_ROUNDING = 1e-12  # error of sums over all points, in diagonals; if no coordinate is off by more, the displacement is 0
+MIN_COVERAGE = 0.05  # least coverage of an alignment
+_ROUNDING = 1e-12  # rounding error of sums over all points, in diagonals; smaller displacements are set to 0
 
 
 def align_in_order(original: Original, suspect: Mesh) -> Alignment:
-    """Align a suspect whose vertices are the original's, one by one.
+    """Align a suspect whose vertices are those of the original, in the same order.
 
     Raises:
-        JaxmarkError: if the suspect has other faces or another number of vertices, or the original's file has another
-            order than the one that was marked.
+        JaxmarkError: if the suspect has other faces or another number of vertices, or if the order of the original's
+            file differs from the order in which it was marked.
     """
     if not original.in_order:
         raise JaxmarkError(
-            "The original's file has another order than the one that was marked, so that vertices cannot be compared in"
-            " order; align by 'auto'."
+            "The order of vertices in the original's file differs from the order in which it was marked, so that the"
+            " suspect cannot be aligned vertex by vertex; align by 'auto'."
         )
     y = np.asarray(original.positions, np.float64) + residual(original, suspect)
     back = file_pose(original).inverse()
@@ -38,22 +38,22 @@ def align_in_order(original: Original, suspect: Mesh) -> Alignment:
 
 
 def align_by_connectivity(original: Original, suspect: PreparedSuspect) -> Alignment | None:
-    """Align a suspect by vertices whose surroundings have the original's connectivity; None if there are too few."""
-    # If a suspect has no copies of points, the welded mesh is the suspect itself.
+    """Align a suspect by vertices whose neighbourhoods have the original's connectivity; None if there are too few."""
+    # If no two vertices of a suspect coincide, the welded mesh is the suspect itself.
     copies = len(suspect.welded.vertices) < len(suspect.mesh.vertices)
     for points in (suspect.welded, suspect.mesh) if copies else (suspect.welded,):
         match = matching_vertices(Mesh(original.positions, original.points.faces), points)
-        found = original.used & (match >= 0)
+        matched = original.used & (match >= 0)
         y = np.asarray(points.vertices)[match]
-        size = np.ptp(y[found], axis=0).max() if found.any() else 0.0
-        if found.sum() >= max(4, MIN_COVERAGE * original.used.sum()) and size > 0:
+        size = np.ptp(y[matched], axis=0).max() if matched.any() else 0.0
+        if matched.sum() >= max(4, MIN_COVERAGE * original.used.sum()) and size > 0:
             scale = Pose(np.eye(3) / size, np.zeros(3))
-            # The suspect's faces between points that were found, as indices of the original's points.
+            # The suspect's faces between matched points, as indices of the original's points.
             point = np.full(len(points.vertices), -1)
-            point[match[found]] = np.flatnonzero(found)
+            point[match[matched]] = np.flatnonzero(matched)
             faces = point[np.asarray(points.faces)]
             faces = faces[(faces >= 0).all(axis=1)]
-            return align_points(original, scale(y), found, faces, "connectivity", scale)
+            return align_points(original, scale(y), matched, faces, "connectivity", scale)
     return None
 
 
@@ -69,20 +69,21 @@ def align_points(
 
     Args:
         original: the original.
-        y: position of each known point in the suspect, after the map `before`.
+        y: position of each recognised point in the suspect, after the map `before`.
         known: mask of the points that were recognised.
-        faces: the suspect's faces between known points.
-        method: how they were recognised.
-        before: a map that has been applied to the suspect's coordinates.
+        faces: the suspect's faces between recognised points.
+        method: how the points were recognised.
+        before: the map that has been applied to the suspect's coordinates.
     """
     x = np.asarray(original.positions, np.float64)
     moved = y - x
-    # A coordinate of 1e200 would spoil every sum; such a point is lost in any case.
+    # Points with huge coordinates, such as 1e200, are left out, because they would dominate every sum.
     spread = np.abs(moved - np.median(moved[known], axis=0)).max(axis=1)
     sound = known & (spread <= 1e6 * max(np.quantile(spread[known], 0.6), 1e-6))
     pose, agreeing = fit_whole(x, y, sound, spread)
     error = np.where(agreeing[:, None], pose(y) - x, 0)
-    # Points that do not agree may belong to pieces that moved apart; if the residual is large, so may all points.
+    # Points that do not agree with the map may belong to pieces that moved apart. If the residual is large, all points
+    # may.
     far = rms(error[agreeing]) > FAR_DISTANCE
     has_pieces = far or np.sum(sound & ~agreeing) >= min_piece_points(x)
     deformed = DeformedPoints(pose(y), sound) if has_pieces else None

@@ -1,9 +1,10 @@
-"""Find poses by local shape, for suspects of which much is missing; on the host, deterministic, without the key.
+"""Candidate poses by local shape descriptors, for cropped suspects; on the host, deterministic, without the key.
 
-Points are described by how the normals around them turn (Rusu, Blodow, Beetz, "Fast point feature histograms (FPFH) for
-3D registration", ICRA 2009). Points of the two surfaces whose descriptors are nearest to each other are matched. Three
-matches with equal ratios of distances make a pose (Fischler, Bolles, "Random sample consensus", 1981), which other
-matches confirm. Descriptors of a mirrored surface are those of the surface in another order.
+Points are described by histograms of the angles between the normals around them (Rusu, Blodow, Beetz, "Fast point
+feature histograms (FPFH) for 3D registration", ICRA 2009). Points of the two surfaces are matched if their descriptors
+are mutually nearest. Three matches whose distances have equal ratios determine a pose (Fischler, Bolles, "Random sample
+consensus", 1981), and other matches confirm it. The descriptors of a reflected surface are a permutation of those of
+the surface.
 """
 
 from collections.abc import Sequence
@@ -22,20 +23,20 @@ from jaxmark.geometry.surfaces import Geometry
 class FeatureSettings:
     """Settings of `poses_by_features`; lengths are relative to an original that is about 1 in size."""
 
-    points: int = 2500  # sampled on the original; the suspect is sampled as densely
+    points: int = 2500  # points sampled on the original; the suspect is sampled with the same density
     radius: float = 0.12  # radius of the neighbourhood that a descriptor describes
-    neighbours: int = 80  # largest number of points in a neighbourhood, the nearest ones
+    neighbours: int = 80  # largest number of points in a neighbourhood; the nearest ones are used
     bins: int = 11  # histogram bins for each of the three angles
-    shares: int = 8  # shares of the original's area that the suspect may have: 1, 0.8, 0.64 … 0.21
-    share_ratio: float = 0.8  # ratio of each of these shares to the one before
-    triples: int = 20_000  # random triples of matches that are tried as poses
-    min_side: float = 0.1  # shortest side of a triple's triangle on the original; shorter ones determine a pose badly
+    shares: int = 8  # number of assumed ratios of the suspect's area to the original's: 1, 0.8, 0.64 … 0.21
+    share_ratio: float = 0.8  # quotient of successive area ratios
+    triples: int = 20_000  # random triples of matches that are tested as poses
+    min_side: float = 0.1  # shortest side of a triple's triangle on the original; small triangles give inaccurate poses
     max_side_ratio: float = 1.12  # largest ratio of the scales of two sides; and of their mean to the expected scale
     max_distance: float = 0.03  # largest distance between the two points of a match that confirms a pose
 
 
 FEATURE_SETTINGS = FeatureSettings()
-EITHER = (False, True)  # poses that do not mirror, and poses that mirror
+EITHER = (False, True)  # both rotations (False) and reflections (True)
 
 
 def poses_by_features(
@@ -46,39 +47,40 @@ def poses_by_features(
     *,
     settings: FeatureSettings = FEATURE_SETTINGS,
 ) -> list[Pose]:
-    """Find the likeliest similarities that bring a suspect, whole or in part, onto an original.
+    """Find the similarities that most likely map a suspect, whole or in part, to an original.
 
     Args:
         original: the original's shape, about 1 in size.
-        suspect: in any pose and scale, with at least a fifth of the original's area.
-        count: largest number of poses, and as many that mirror.
-        reflections: which poses are looked for: those that mirror (True), those that do not (False), or both.
+        suspect: the suspect in any pose and scale, with at least a fifth of the original's area.
+        count: largest number of rotations, and largest number of reflections.
+        reflections: which poses are searched for: reflections (True), rotations (False), or both.
         settings: see `FeatureSettings`.
 
     Returns:
-        The poses, those that do not mirror first, by descending number of matches that confirm them.
+        The poses, in the order of `reflections`, each kind by descending number of matches that confirm them.
     """
     target, source = original.sample(settings.points), suspect.sample(settings.points)
-    wanted = descriptors(target.points, target.normals, settings.radius, settings=settings)
+    target_descriptors = descriptors(target.points, target.normals, settings.radius, settings=settings)
     random = {mirrored: np.random.default_rng(0) for mirrored in reflections}
-    found: dict[bool, list[tuple[int, Pose]]] = {mirrored: [] for mirrored in reflections}
+    candidates: dict[bool, list[tuple[int, Pose]]] = {mirrored: [] for mirrored in reflections}
     for share in settings.share_ratio ** np.arange(settings.shares):
-        # The number of points makes them as dense as on the original if the suspect has this share of its area.
+        # With so many points, the density is that on the original, if the suspect has this share of the original's
+        # area.
         points, normals = (array[: int(share * settings.points)] for array in source[:2])
         scale = float(np.sqrt(share * target.area / source.area))
-        described = descriptors(points, normals, settings.radius / scale, settings=settings)
+        source_descriptors = descriptors(points, normals, settings.radius / scale, settings=settings)
         for mirrored in reflections:
-            for seen in _reflected(described) if mirrored else (described,):
-                on_source, on_target = _mutually_nearest(seen, wanted)
-                matched = points[on_source], target.points[on_target]
-                found[mirrored] += _consensus(*matched, scale, mirrored, random[mirrored], count, settings)
-    return [pose for poses in found.values() for _, pose in sorted(poses, key=lambda scored: -scored[0])[:count]]
+            for variant in _reflected(source_descriptors) if mirrored else (source_descriptors,):
+                on_source, on_target = _mutually_nearest(variant, target_descriptors)
+                matches = points[on_source], target.points[on_target]
+                candidates[mirrored] += _consensus(*matches, scale, mirrored, random[mirrored], count, settings)
+    return [pose for poses in candidates.values() for _, pose in sorted(poses, key=lambda scored: -scored[0])[:count]]
 
 
 def descriptors(
     points: Points, normals: Points, radius: float, *, settings: FeatureSettings = FEATURE_SETTINGS
 ) -> Float64[np.ndarray, "points bins"]:
-    """Fast point feature histograms: histograms of three angles between the normals of each point and its neighbours.
+    """Compute fast point feature histograms: of three angles between the normals of each point and its neighbours.
 
     Args:
         points: points sampled on a surface.
@@ -87,8 +89,8 @@ def descriptors(
         settings: the number of neighbours and of bins.
     """
     bins = settings.bins
-    found = KDTree(points).query(points, k=settings.neighbours + 1, distance_upper_bound=radius)
-    distance, other = (np.asarray(array)[:, 1:] for array in found)  # without the point itself
+    nearest = KDTree(points).query(points, k=settings.neighbours + 1, distance_upper_bound=radius)
+    distance, other = (np.asarray(array)[:, 1:] for array in nearest)  # without the point itself
     near = np.isfinite(distance) & (distance > 0)
     other, distance = np.where(near, other, 0), np.where(near, distance, 1)
     towards = (points[other] - points[:, None]) / distance[..., None]
@@ -115,10 +117,10 @@ def descriptors(
 def _reflected(
     described: Float64[np.ndarray, "points bins"],
 ) -> tuple[Float64[np.ndarray, "points bins"], Float64[np.ndarray, "points bins"]]:
-    """Descriptors of the mirrored surface: with its faces turned round, so that normals stay outside, and without.
+    """Compute the descriptors of the reflected surface, with its faces reversed, so that normals stay outside, or not.
 
-    The angle out of the plane of normal and neighbour changes its sign by mirroring, the other two by normals that
-    point the other way.
+    The reflection changes the sign of the angle out of the plane of normal and neighbour. Reversed normals change the
+    signs of the other two angles.
     """
     angles = described.reshape(len(described), 3, -1)
     outside = np.concatenate([angles[:, :1, ::-1], angles[:, 1:]], axis=1)
@@ -128,7 +130,7 @@ def _reflected(
 def _mutually_nearest(
     first: Float64[np.ndarray, "first bins"], second: Float64[np.ndarray, "second bins"]
 ) -> tuple[Int64[np.ndarray, " matches"], Int64[np.ndarray, " matches"]]:
-    """Match the descriptors that are each other's nearest; returns the indices of both."""
+    """Match the descriptors that are mutually nearest; returns the indices of both."""
     square = (first**2).sum(axis=1)[:, None] - 2 * first @ second.T + (second**2).sum(axis=1)
     forth, back = square.argmin(axis=1), square.argmin(axis=0)
     mutual = np.flatnonzero(back[forth] == np.arange(len(first)))
@@ -144,7 +146,7 @@ def _consensus(
     count: int,
     settings: FeatureSettings,
 ) -> list[tuple[int, Pose]]:
-    """Find similarities of about a scale that bring many source points near their targets, and count these points."""
+    """Find similarities with about a given scale that map many source points near their targets; count these points."""
     if len(source) < 3:
         return []
     triple = random.integers(len(source), size=(settings.triples, 3))

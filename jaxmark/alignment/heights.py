@@ -1,6 +1,7 @@
-"""How far a suspect's own vertices are above the original.
+"""The heights of a suspect's own vertices above the original's surface.
 
-A simplified surface is right at its vertices, and a chord between them.
+A simplified surface is accurate at its vertices, but cuts corners between them. Therefore its vertices are compared
+with the original, instead of the original's points with the suspect.
 """
 
 from typing import NamedTuple
@@ -12,44 +13,44 @@ from scipy import sparse
 from jaxmark.geometry.mesh import Mesh, unit, used_vertices, vertex_normals
 from jaxmark.geometry.surfaces import Surface, barycentric
 
-_FAR = 0.005  # distance from the original, in diagonals, beyond which a vertex is no part of it
+_FAR = 0.005  # largest distance of a vertex from the original, in diagonals; other vertices do not belong to it
 
 Numbers = Float64[np.ndarray, " vertices"]
 Unknowns = Float64[np.ndarray, "vertices unknowns"]
 
 
 class VertexHeights(NamedTuple):
-    """The heights of a suspect's vertices above the original's surface, along its normals at their feet.
+    """The heights of a suspect's vertices above the original's surface, along its normals.
 
-    The foot of a vertex is the point of the original's surface that is closest to it.
+    The foot of a vertex is the closest point of the original's surface.
     """
 
     places: Float64[np.ndarray, "vertices 3"]  # of the vertices, in diagonals, centred as `Original.positions`
     height: Numbers  # in diagonals
-    normals: Float64[np.ndarray, "vertices 3"]  # of the original at the feet, unit length
+    normals: Float64[np.ndarray, "vertices 3"]  # unit normals of the original at the feet
     share: sparse.csr_array  # barycentric coordinates of the feet, [vertices, points]
-    faces: int = 0  # number that as fine a mesh of the whole original would have
+    faces: int = 0  # number of faces that a mesh of the whole original would have at the suspect's density
 
     def along(self, displacement: Float64[np.ndarray, "points 3"]) -> Numbers:
-        """Heights by a displacement of the original's points."""
+        """Compute the heights that a displacement of the original's points causes."""
         return np.sum(self.normals * (self.share @ displacement), axis=1)
 
     def adjoint(self, height: Numbers) -> Float64[np.ndarray, "points 3"]:
-        """The adjoint of `along`."""
+        """Apply the adjoint of `along`."""
         return self.share.T @ (self.normals * height[:, None])
 
     def columns(self, basis: Float64[np.ndarray, "points columns"]) -> Unknowns:
-        """Heights by each column of a basis, along each coordinate."""
-        there = self.share @ basis
-        return np.concatenate([self.normals[:, axis, None] * there for axis in range(3)], axis=1)
+        """Compute the heights that each column of a basis causes, as a displacement along each coordinate axis."""
+        at_feet = self.share @ basis
+        return np.concatenate([self.normals[:, axis, None] * at_feet for axis in range(3)], axis=1)
 
 
 def measure_heights(original: Surface, suspect: Mesh, faces: int = 0) -> VertexHeights:
-    """Measure the heights of a suspect's vertices, those that faces use and that are near the original.
+    """Measure the heights of a suspect's vertices: of all that a face uses and that are near the original.
 
     Args:
         original: the original's points and faces, in diagonals.
-        suspect: the suspect, where the original is.
+        suspect: the suspect, in the original's pose.
         faces: see `VertexHeights`.
 
     Raises:

@@ -1,8 +1,9 @@
-"""Compare point clouds by nearest points, in a pose; on the host, without the key.
+"""Comparison of point clouds by nearest points, in a given pose; on the host, without the key.
 
-A copy of which points were lost, added or shuffled still has many of the original's own: those that are each other's
-nearest are taken for the same. What was sampled anew has none of them, but the surface: planes through the nearest
-points of both clouds show how far it moved across itself, whatever either cloud's points do along it.
+A copy in which points were removed, added or shuffled still has many of the original's own points: mutually nearest
+points are assumed to be the same point. A resampled cloud has none of the original's points, but it has the surface.
+Its displacement along the normal is measured by planes through the nearest points of both clouds, which do not depend
+on where the surface was sampled.
 """
 
 from typing import NamedTuple
@@ -14,38 +15,38 @@ from scipy.spatial import KDTree
 from jaxmark.geometry.clouds import Cloud, planes, spacings
 from jaxmark.geometry.pose import Points, Pose, similarity
 
-_REACH = 0.8  # of the local spacing, beyond which a nearest point is taken for another one
-_SPACING_POINTS = 3  # nearest points whose mean distance is the local spacing
-_CLOSE = 0.25  # of the local spacing; within it, points of another sampling are rare
-_CHANCE = 1.67  # times the square of that share: how often another point of an equally dense sampling is so close
-_MIN_EXCESS = 1.3  # of points so close, over how many another sampling of the same surface would have
-_SEEN = 3.0  # spacings within which a suspect shows a point, or another one in its place
-_MIN_SURVIVING = 0.01  # share of the original's points that must be so close
-_MAX_ROUNDS = 8  # of pairing points and moving the suspect onto its partners
-_FIRST_REACH, _APPROACHES = 8.0, 30  # spacings, and rounds, of coming nearer
-_MIN_PAIRS = 10  # that a pose is fitted to
-_PLANE_POINTS = 12  # of the sparser cloud, that a plane is fitted to
-_MAX_PLANE_POINTS = 60  # of the denser one, whose plane is about as wide
-_MAX_GAP = 4.0  # spacings of the sparser cloud, beyond which a place is a hole
+_REACH = 0.8  # largest distance of partners, in units of the local spacing
+_SPACING_POINTS = 3  # number of nearest points whose mean distance is the local spacing
+_CLOSE = 0.25  # largest distance of a close point, in local spacings; points of another sampling are rarely as close
+_CHANCE = 1.67  # expected number of points of an equally dense sampling within distance c is 1.67 c² (c in spacings)
+_MIN_EXCESS = 1.3  # least ratio of the number of close points to the number that another sampling would have by chance
+_SEEN = 3.0  # distance, in spacings, within which the suspect covers a point
+_MIN_SURVIVING = 0.01  # least fraction of the original's points that are close, if its own points survive
+_MAX_ROUNDS = 8  # rounds of pairing points and fitting the pose to the pairs
+_FIRST_REACH, _APPROACHES = 8.0, 30  # first reach, in spacings, and number of rounds, of the coarse fit
+_MIN_PAIRS = 10  # least number of pairs to which a pose is fitted
+_PLANE_POINTS = 12  # number of points of the sparser cloud to which a plane is fitted
+_MAX_PLANE_POINTS = 60  # largest such number for the denser cloud, whose planes should be equally wide
+_MAX_GAP = 4.0  # largest distance of a plane's points, in spacings of the sparser cloud; larger gaps are holes
 
 
 Others = Float64[np.ndarray, "others 3"]  # points of a suspect
 
 
 class Partners(NamedTuple):
-    """Points of a suspect that are taken for the original's."""
+    """The points of a suspect that are assumed to be the original's points."""
 
     place: Int64[np.ndarray, " points"]  # index of each point's partner in the suspect
-    known: Bool[np.ndarray, " points"]  # whether it has one
-    surviving: bool  # whether so many lie so close that the suspect must have the original's own points
+    known: Bool[np.ndarray, " points"]  # whether the point has a partner
+    surviving: bool  # whether so many pairs are so close that the suspect must have the original's own points
 
 
 class Heights(NamedTuple):
-    """How far a suspect's surface is above the original's."""
+    """The heights of a suspect's surface above the original's, at each of the original's points."""
 
     height: Float64[np.ndarray, " points"]  # along the normal
-    normals: Points  # of the original's surface, of either side
-    known: Bool[np.ndarray, " points"]  # whether the suspect has a surface there
+    normals: Points  # normals of the original's surface, with arbitrary signs
+    known: Bool[np.ndarray, " points"]  # whether the suspect has a surface near the point
 
 
 def find_partners(x: Points, y: Others, reach: float = _REACH) -> Partners:
@@ -53,34 +54,34 @@ def find_partners(x: Points, y: Others, reach: float = _REACH) -> Partners:
 
     Args:
         x: the original's points.
-        y: the suspect's, in the original's pose.
-        reach: times the local spacing, the distance of partners at most.
+        y: the suspect's points, in the original's pose.
+        reach: largest distance of partners, in units of the local spacing.
     """
-    apart = spacings(x, _SPACING_POINTS)
+    spacing = spacings(x, _SPACING_POINTS)
     distance, place = (np.asarray(part) for part in KDTree(y).query(x))
     mutual = np.asarray(KDTree(x).query(y[place])[1]) == np.arange(len(x))
-    close, seen = float(np.mean(distance <= _CLOSE * apart)), float(np.mean(distance <= _SEEN * apart))
-    # Random points on a surface have their three nearest at 0.73 of the root of a point's area in the mean, so that
-    # 1.67 c² others lie within the share c of that distance.
-    chance = seen * -np.expm1(-_CHANCE * _CLOSE**2 * len(y) / max(seen * len(x), 1))
+    close, covered = float(np.mean(distance <= _CLOSE * spacing)), float(np.mean(distance <= _SEEN * spacing))
+    # For random points on a surface, the mean distance to the three nearest points is 0.73 times the square root of the
+    # area per point, so that 1.67 c² other points are expected within c times that distance.
+    chance = covered * -np.expm1(-_CHANCE * _CLOSE**2 * len(y) / max(covered * len(x), 1))
     surviving = close >= max(_MIN_SURVIVING, _MIN_EXCESS * chance)
-    return Partners(place, mutual & (distance <= reach * apart), bool(surviving))
+    return Partners(place, mutual & (distance <= reach * spacing), bool(surviving))
 
 
 def settle(x: Points, y: Others, pose: Pose) -> tuple[Pose, Partners]:
-    """Improve a pose by the points that are mutually nearest, until these stay the same.
+    """Refine a pose by mutually nearest points, until the pairs stay the same.
 
     Args:
         x: the original's points.
-        y: the suspect's, in coordinates of its own.
-        pose: from the suspect's coordinates to the original's, nearly.
+        y: the suspect's points, in the suspect's coordinates.
+        pose: approximate map from the suspect's coordinates to the original's.
     """
     partners = find_partners(x, pose(y))
-    if not partners.surviving:  # unless few points are near their own, the pose may be off by some spacings
-        found = _approach(x, y, pose)
-        nearer = find_partners(x, found(y))
+    if not partners.surviving:  # the pose may be wrong by some spacings, so that few points are near their own
+        coarse = _approach(x, y, pose)
+        nearer = find_partners(x, coarse(y))
         if nearer.surviving:
-            pose, partners = found, nearer
+            pose, partners = coarse, nearer
     for _ in range(_MAX_ROUNDS):
         known = np.flatnonzero(partners.known)
         if len(known) < _MIN_PAIRS:
@@ -94,7 +95,7 @@ def settle(x: Points, y: Others, pose: Pose) -> tuple[Pose, Partners]:
 
 
 def _approach(x: Points, y: Others, pose: Pose) -> Pose:
-    """Move a suspect onto the points that are mutually nearest, first far ones, then ever nearer ones."""
+    """Fit a pose to mutually nearest points, whose largest distance decreases from round to round."""
     for reach in np.geomspace(_FIRST_REACH, _REACH, _APPROACHES):
         partners = find_partners(x, pose(y), reach)
         known = np.flatnonzero(partners.known)
@@ -105,23 +106,24 @@ def _approach(x: Points, y: Others, pose: Pose) -> Pose:
 
 
 def find_heights(x: Cloud, y: Others) -> Heights:
-    """Measure how far a suspect's surface is above the original's at each of the original's points.
+    """Measure the heights of a suspect's surface above the original's, at each of the original's points.
 
-    Both surfaces are planes through nearest points, about as wide, so that what bends or roughens both cancels.
+    Both surfaces are approximated by planes through nearest points. The planes are about equally wide, so that the
+    effects of curvature and roughness cancel.
 
     Args:
         x: the original's points.
-        y: the suspect's, in the original's pose.
+        y: the suspect's points, in the original's pose.
     """
     other = Cloud(y)
     ratio = (x.spacing / max(other.spacing, 1e-300)) ** 2
-    mine, theirs = (
+    count, other_count = (
         int(np.clip(round(_PLANE_POINTS * by), _PLANE_POINTS, _MAX_PLANE_POINTS))
         for by in (1 / max(ratio, 1e-9), ratio)
     )
     points = x.points
-    # Each of the original's points is among its own nearest, which makes a plane narrower by about two of them.
-    before, after = planes(x.tree, points, mine + 2), planes(other.tree, points, theirs)
+    # Each of the original's points is one of its own nearest points. Two more points compensate for the narrower plane.
+    before, after = planes(x.tree, points, count + 2), planes(other.tree, points, other_count)
     normals = before.normals
     turned = np.sum(normals * after.normals, axis=1)
     first = np.sum((before.centres - points) * normals, axis=1)

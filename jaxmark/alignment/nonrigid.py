@@ -1,8 +1,8 @@
-"""Undo bends, by a map of its own for the surroundings of each recognised point; on the host, without the key.
+"""Non-rigid registration: a separate affine map for the neighbourhood of each recognised point.
 
-A character in another pose, or a part that was bent, moves as rigid or sheared pieces that pass into each other. Around
-each point the suspect is an affine map of the original, nearly, and what such a map cannot explain is the mark, turned
-and stretched with its surroundings, and noise.
+A character in another pose, or a bent part, moves in rigid or sheared pieces with smooth transitions. Near each point,
+the suspect is approximately an affine map of the original. The residual of this map is noise and the mark, which is
+transformed with its neighbourhood. All computations run on the host, without the key.
 """
 
 from typing import NamedTuple
@@ -14,42 +14,43 @@ from scipy import sparse
 from jaxmark.geometry.pose import Points
 from jaxmark.spectral.laplacian import Laplacian
 
-_STEPS = 20  # halfway to the neighbours' mean: surroundings of about a hundred points
-_RIDGE = 1e-3  # of the variance around a point, by which a rotation is preferred where planes do not tell
-_LEAST_VARIANCE = 1e-12  # in squared diagonals, of which rounding makes no singular matrix
-_FLAT = 1e-3  # volume of a unit cube after a map that can be undone
-_LEAST_ENERGY = 0.25  # of the median, which is added: no place gains much weight by being quiet
+_STEPS = 20  # diffusion steps, each halfway to the neighbours' mean: neighbourhoods of about a hundred points
+_RIDGE = 1e-3  # weight of the rotation in the fit, relative to the variance around a point; it decides in flat regions
+_LEAST_VARIANCE = 1e-12  # in squared diagonals; added to the variance, so that no matrix is singular
+_FLAT = 1e-3  # least absolute determinant of a map that is inverted
+_LEAST_ENERGY = 0.25  # fraction of the median energy that is added to each energy, to limit the weights
 
 
 class DeformedPoints(NamedTuple):
-    """Where the points of an original are in a suspect that no single map brings back."""
+    """The positions of an original's points in a suspect that no single affine map aligns."""
 
-    places: Points  # after a single map, in diagonals
+    places: Points  # positions after the best single map, in diagonals
     known: Bool[np.ndarray, " points"]  # mask of the points that were recognised
 
 
 class Undeformed(NamedTuple):
-    """A suspect without its bends."""
+    """The displacements of an original's points after non-rigid registration."""
 
-    displacement: Points  # in diagonals; 0 where nothing is known
-    weights: Float64[np.ndarray, " points"]  # inverse energy around each point; 0 where nothing is known
+    displacement: Points  # in diagonals; 0 for unknown points
+    weights: Float64[np.ndarray, " points"]  # inverse energy of the residual around each point; 0 for unknown points
 
 
 def undo_deformation(operator: Laplacian, positions: Points, deformed: DeformedPoints) -> Undeformed:
-    """Invert an affine map around each point, fitted to its surroundings.
+    """Invert the affine map of each point's neighbourhood.
 
-    Its surroundings are weighed by diffusion. Moments of first and second order give the best map by least squares,
-    with a ridge towards the best rotation (Kabsch, Acta Crystallographica A 32, 1976), which planes need. Where pieces
-    join, no affine map fits: a point counts by the inverse energy of what its surroundings leave.
+    The points of a neighbourhood are weighted by diffusion. Their first and second moments give the affine map, by
+    least squares with a ridge towards the best rotation (Kabsch, Acta Crystallographica A 32, 1976), which flat
+    neighbourhoods need. Where pieces meet, no affine map fits. Therefore each point is weighted by the inverse energy
+    of the residual in its neighbourhood.
 
     Args:
-        operator: the Laplacian of the original's points; only its edges count.
-        positions: positions of these points, in diagonals.
-        deformed: where they are in the suspect.
+        operator: the Laplacian of the original's points; only its edges are used.
+        positions: positions of the original's points, in diagonals.
+        deformed: positions of the points in the suspect.
     """
     x, y, known = positions, deformed.places, deformed.known
     x, y = (np.where(known[:, None], points, 0) for points in (x, y))
-    around = _Surroundings(operator, known)
+    around = _Neighbourhoods(operator, known)
     first = around.mean(np.concatenate([x, y], axis=1))
     centre, image = first[:, :3], first[:, 3:]
     second = around.mean(np.concatenate([_products(x, x), _products(x, y)], axis=1)).reshape(len(x), 2, 3, 3)
@@ -70,8 +71,8 @@ def undo_deformation(operator: Laplacian, positions: Points, deformed: DeformedP
     return Undeformed(displacement, np.where(sound, 1 / (energy / (middle or 1.0) + _LEAST_ENERGY), 0))
 
 
-class _Surroundings:
-    """Means over the known surroundings of each point."""
+class _Neighbourhoods:
+    """The neighbourhoods of all points, restricted to known points."""
 
     def __init__(self, operator: Laplacian, known: Bool[np.ndarray, " points"]) -> None:
         count = len(known)
@@ -85,7 +86,7 @@ class _Surroundings:
         self._stays = np.where(degree > 0, 0.5, 1)[:, None]
 
     def mean(self, values: Float64[np.ndarray, "points columns"]) -> Float64[np.ndarray, "points columns"]:
-        """The mean of each column around each point."""
+        """Compute the weighted mean of each column over the neighbourhood of each point."""
         for _ in range(_STEPS):
             values = self._stays * values + self._halfway @ values
         return values

@@ -17,31 +17,32 @@ from jaxmark.spectral.padding import common_laplacian, pad_rows
 
 @dataclass(frozen=True, eq=False)
 class Original:
-    """An original as embedding and detection need it; lengths are in units of its bounding-box diagonal.
+    """An original, prepared for embedding and detection; lengths are in units of its bounding-box diagonal.
 
-    Traced arrays are padded with rows of isolated vertices beyond the points: see `jaxmark.spectral.padding`.
+    Arrays for traced code are padded with rows of isolated vertices: see `jaxmark.spectral.padding`.
     """
 
-    mesh: Mesh  # as in its file; what is displaced
+    mesh: Mesh  # the mesh as in its file, which embedding displaces
     grid: float  # spacing of the grid that points are rounded to, in the file's units
-    weld: Weld  # which vertices stand at which point
-    points: Mesh  # the canonical geometry, in the file's units: what suspects are compared with
+    weld: Weld  # the point of each vertex, as vertices at one position are welded
+    points: Mesh  # the canonical geometry with which suspects are compared, in the file's units
     used: Bool[np.ndarray, " points"]  # mask of the points that faces use
     diagonal: float  # of the points, in the file's units
     geometry: bytes  # hash of the canonical geometry
     order: bytes  # hash of the file's order of points and faces, see `jaxmark.geometry.canonical.rounded`
-    places: Int64[np.ndarray, " points"]  # number of each point among those that faces use in this geometry, or -1
-    count: int  # number of points that faces use in this geometry
-    in_order: bool  # whether the file has the order that was marked, so that suspects are compared vertex by vertex
+    places: Int64[np.ndarray, " points"]  # number of each point among the points that faces use, or -1
+    count: int  # number of points that faces use
+    in_order: bool  # whether the file has the order in which it was marked, so that vertices can be compared in order
     operator: Laplacian  # the Laplacian of the points, traced
     positions: Float64[np.ndarray, "points 3"]  # points, centred as a whole, in diagonals
     signal: Float[Array, "rows 3"]  # points, centred per connected component, in diagonals, traced
 
     @property
     def density(self) -> float:
-        """Dimensions of each coordinate below a small λ, over λ and the number of points.
+        """The spectral density: the number of eigenvalues below a small λ, over λ and the number of points.
 
-        Counted on regular triangles for meshes; for clouds, on points of which each is joined to all within a disc.
+        For meshes, it is the density of a regular triangular grid. For clouds, it is that of points which are joined to
+        all points within a disc.
         """
         if len(self.points.faces):
             return math.sqrt(3) / (2 * math.pi)
@@ -60,15 +61,15 @@ class Original:
 
     @property
     def chip_places(self) -> Int64[np.ndarray, " rows"]:
-        """`places` for the rows of traced arrays."""
+        """The array `places`, padded to the rows of traced arrays."""
         return pad_rows(self.places + 1, len(self.signal)) - 1
 
     def to_traced(self, values: Shaped[np.ndarray, " points *columns"]) -> Float[Array, " rows *columns"]:
-        """Convert one value per point to a padded array in the dtype of traced code."""
+        """Convert values per point to a padded array in the dtype of traced code."""
         return jnp.asarray(pad_rows(values, len(self.signal)), self.signal.dtype)
 
     def to_host(self, values: Float[Array, " rows *columns"]) -> Float64[np.ndarray, " points *columns"]:
-        """Convert an array of traced code back to one value per point."""
+        """Convert an array of traced code back to values per point."""
         return np.asarray(values[: len(self.used)], np.float64)
 
 
@@ -114,13 +115,16 @@ def make_original(mesh: Mesh, grid: float | None = None) -> Original:
 
 
 def displace(original: Original, shift: Float64[np.ndarray, "points 3"]) -> Mesh:
-    """Move the points of an original by `shift`, in diagonals; copies of a point move together, and are not rounded."""
+    """Displace the points of an original by `shift`, in diagonals.
+
+    Vertices that share a point move together; the result is not rounded to the grid.
+    """
     moved = original.mesh.vertices + original.diagonal * shift[original.weld.point]
     return Mesh(moved, original.mesh.faces)
 
 
 def shift_of(original: Original, displaced: Mesh) -> Float64[np.ndarray, "points 3"]:
-    """How far each point was moved from where it is in the original's file, in diagonals of the file's box.
+    """Compute the displacement of each point from its position in the original's file, in diagonals of that mesh.
 
     Raises:
         JaxmarkError: see `jaxmark.geometry.mesh.displacement`.
@@ -129,7 +133,7 @@ def shift_of(original: Original, displaced: Mesh) -> Float64[np.ndarray, "points
 
 
 def residual(original: Original, suspect: Mesh) -> Float64[np.ndarray, "points 3"]:
-    """Displacement of each point from the original's canonical geometry to a suspect, in diagonals.
+    """Compute the displacement of each point from the original's canonical geometry to a suspect, in diagonals.
 
     Raises:
         JaxmarkError: see `jaxmark.geometry.mesh.displacement`.

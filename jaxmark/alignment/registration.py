@@ -1,12 +1,14 @@
-"""Find the pose of a suspect of foreign connectivity by its surface; on the host, deterministic, without the key.
+"""Rigid registration of a remeshed suspect by its surface; on the host, deterministic, without the key.
 
-A whole suspect's principal axes are brought onto the original's in all 48 ways, of which half mirror, and what fits by
-far the worst is left out. Each pose is improved by trimmed closest points (Chetverikov et al., "Robust Euclidean
-alignment of 3D point sets: the trimmed iterative closest point algorithm", 2005), from either surface to the other, so
-that the scale is determined. If several poses fit, those by local shape (`jaxmark.alignment.features`) are tried,
-too, and turns about the axis of a round shape. A part is posed by local shape only. In both cases, the best pose
-is refined by distances along normals; a pose that mirrors must fit clearly better than the best that does not.
-trimesh's own registration is no alternative, because it compares against an absolute threshold.
+For a whole suspect, the first poses map its principal axes to the original's in all 48 ways, half of which are
+reflections; those that fit by far the worst are dropped. Each pose is refined by trimmed closest points (Chetverikov
+et al., "Robust Euclidean alignment of 3D point sets: the trimmed iterative closest point algorithm", 2005), from either
+surface to the other, so that the scale is determined. If several poses fit, poses by local shape
+(`jaxmark.alignment.features`) and rotations about the axis of a round shape are tested, too.
+
+For a part, the first poses are those by local shape only. In both cases, the best pose is refined by distances along
+normals. A reflection must fit clearly better than the best rotation. The registration of trimesh is not used, because
+it compares residuals with an absolute threshold.
 """
 
 from collections.abc import Sequence
@@ -29,30 +31,30 @@ class RegistrationSettings:
     """Settings of registration; lengths are relative to an original that is about 1 in size."""
 
     samples: int = 20_000  # points sampled on each surface
-    coarse_points: int = 300  # points on each surface by which the 48 first poses are improved and told apart
-    rough_points: int = 500  # vertices of the original by which all candidate poses are refined
-    fine_points: int = 2000  # points by which likely poses are improved, and the best ones refined and compared
-    inlier_share: float = 0.8  # share of the closest pairs that a round of trimmed closest points keeps
+    coarse_points: int = 300  # points on each surface for refining and comparing the 48 first poses
+    rough_points: int = 500  # vertices of the original for refining all candidate poses
+    fine_points: int = 2000  # points for refining likely poses, and for comparing the best ones
+    inlier_share: float = 0.8  # fraction of the closest pairs that a round of trimmed closest points uses
     rounds: int = 30  # largest number of rounds of closest points, and of the final refinement
-    comparison_rounds: int = 10  # rounds of refinement before poses are compared: enough to tell which one is the best
-    reach: float = 0.03  # distances up to this count in the first round of refinement, however small the others are
-    outlier_distance: float = 0.005  # points that are further off count as this far off when poses are compared
-    first_ratio: float = 12.0  # of the first poses, those that leave up to this many times the least are improved
-    likely_ratio: float = 2.0  # poses that leave up to this many times the least distance are pursued
-    mirror_ratio: float = 1.05  # a pose that mirrors must leave so many times less than one that does not
-    whole_distance: float = 0.01  # the most that a whole suspect's pose may leave, several times what sampling leaves
-    # Of these, as many again may mirror.
-    distinct_poses: int = 32  # most poses that are pursued, which differ by more than `whole_distance`
+    comparison_rounds: int = 10  # rounds of refinement before poses are compared, enough to determine the best one
+    reach: float = 0.03  # distances up to this are used in the first round of refinement, even if all others are small
+    outlier_distance: float = 0.005  # larger distances are reduced to this one when poses are compared
+    first_ratio: float = 12.0  # first poses are dropped if their distance exceeds this multiple of the least one
+    likely_ratio: float = 2.0  # refined poses are dropped if their distance exceeds this multiple of the least one
+    mirror_ratio: float = 1.05  # factor on the distance of a reflection when poses are compared
+    whole_distance: float = 0.01  # largest distance of a whole suspect's pose, several times that of two samplings
+    # The following numbers apply to rotations and to reflections separately.
+    distinct_poses: int = 32  # most candidate poses, which differ by more than `whole_distance`
     best_poses: int = 4  # most poses that are refined by the fine points
-    round_ratio: float = 1.1  # a shape with two principal axes of widths within this ratio is round about the third
-    turn: float = 1.0  # in degrees, between the turns about the axis of a round shape
-    turned_poses: int = 100  # most of these turns that are pursued, those that fit best
-    feature_poses: int = 6  # most poses by local shape that are pursued
+    round_ratio: float = 1.1  # a shape is round about an axis if its widths along the other two have at most this ratio
+    turn: float = 1.0  # in degrees, step of the rotations about the axis of a round shape
+    turned_poses: int = 100  # most of these rotations that become candidates, the ones that fit best
+    feature_poses: int = 6  # most poses by local shape that become candidates
     features: FeatureSettings = FEATURE_SETTINGS
 
 
 SETTINGS = RegistrationSettings()
-Others = Float64[np.ndarray, "others 3"]  # points of a suspect, where those of an original are there, too
+Others = Float64[np.ndarray, "others 3"]  # points of a suspect, in contrast to those of an original
 
 
 def register_whole(
@@ -62,16 +64,16 @@ def register_whole(
     *,
     settings: RegistrationSettings = SETTINGS,
 ) -> Pose | None:
-    """Find the similarity that brings a suspect's surface onto an original's.
+    """Find the similarity that maps a suspect's surface to an original's.
 
     Args:
         original: the surface of the welded points, about 1 in size.
-        suspect: in any pose and scale, with an area.
-        reflections: whether the pose may be one that does not mirror (False), one that mirrors (True), or either.
+        suspect: the suspect in any pose and scale; its area must not be 0.
+        reflections: whether the pose may be a rotation (False), a reflection (True), or either.
         settings: see `RegistrationSettings`.
 
     Returns:
-        The pose; None if much of the original is missing, or much else is beside it.
+        The pose; None if large parts of the original are missing, or the suspect has large other parts.
 
     Raises:
         JaxmarkError: if libigl is missing, or a surface has no area.
@@ -85,7 +87,7 @@ def register_whole(
     ends = []
     for mirrored in reflections:
         alike = [start for start in starts if start.mirrors == mirrored]
-        if len(alike) > 1:  # the principal axes of a shape that is nearly symmetric leave small features to decide
+        if len(alike) > 1:  # for a nearly symmetric shape, small features must decide between poses by principal axes
             count, features = settings.feature_poses, settings.features
             alike += poses_by_features(original, suspect, count, [mirrored], settings=features)
             alike += _turned(suspect, target, source, alike, settings)
@@ -99,7 +101,7 @@ def register_whole(
 def _best(
     surface: Geometry, points: Points, normals: Points, starts: list[Pose], settings: RegistrationSettings
 ) -> list[tuple[float, Pose]]:
-    """Refine a surface's poses by few points, then the best of them by more; returns the distances that these leave."""
+    """Refine a surface's poses by few points, then the best poses by more points; returns distances and poses."""
     ends: list[tuple[float, Pose]] = []
     for count in (settings.rough_points, settings.fine_points):
         few, rounds = slice(count), settings.comparison_rounds
@@ -119,7 +121,7 @@ def register_part(
     *,
     settings: RegistrationSettings = SETTINGS,
 ) -> Pose | None:
-    """Find the similarity that brings a suspect onto the part of the original that it shows, at least a fifth.
+    """Find the similarity that maps a suspect to the part of the original that it covers, at least a fifth.
 
     Args and raises: see `register_whole`.
 
@@ -130,8 +132,8 @@ def register_part(
     fine, rounds = slice(settings.fine_points), settings.comparison_rounds
     ends = []
     for start in poses_by_features(original, suspect, settings.feature_poses, reflections, settings=settings.features):
-        # Every point of a part has its place on the original, but not the other way round: the original is brought
-        # onto the part, and that map is inverted.
+        # Every point of the part has a corresponding point on the original, but not vice versa. Therefore the original
+        # is registered to the part, and the map is inverted.
         posed, along = start(points), unit(normals @ start.matrix.T)
         back = refine(original, posed[fine], along[fine], IDENTITY, rounds=rounds, settings=settings)
         ends.append((_distance(original, posed[fine], back, settings), start, back))
@@ -143,16 +145,15 @@ def register_part(
 
 
 def _unlikeliness(distance: float, pose: Pose, settings: RegistrationSettings) -> float:
-    """The distance that a pose leaves, by which poses are compared.
+    """Return the distance of a pose with a penalty for reflections, for the comparison of poses.
 
-    That of a pose that mirrors counts for more: where a shape is its own mirror image, either leaves no more than
-    the mark.
+    A shape that is its own mirror image fits both as a rotation and as a reflection, up to the mark.
     """
     return distance * (settings.mirror_ratio if pose.mirrors else 1)
 
 
 def _distance(surface: Geometry, points: Points, pose: Pose, settings: RegistrationSettings) -> float:
-    """Mean distance of points from a surface, where points that are lost count as a bounded distance."""
+    """Compute the mean distance of points from a surface; distances of missing points are bounded."""
     distance = np.linalg.norm(surface.closest(points, pose)[0] - points, axis=1)
     return float(np.mean(np.minimum(distance, settings.outlier_distance)))
 
@@ -167,15 +168,15 @@ def refine(
     rounds: int | None = None,
     settings: RegistrationSettings = SETTINGS,
 ) -> Pose:
-    """Bring a surface closer to points along their normals, by a similarity or an affine map (Gauss-Newton).
+    """Register a surface to points by their distances along normals (Gauss-Newton).
 
     Args:
         surface: the surface to be moved.
-        points: the points that it is brought to.
+        points: the points to which it is registered.
         normals: unit normals at the points.
-        pose: the surface's pose to begin with.
+        pose: the surface's initial pose.
         by_affine: whether to fit an affine map instead of a similarity.
-        rounds: largest number of rounds; that of the settings unless given.
+        rounds: largest number of rounds; by default `settings.rounds`.
         settings: the reach of the first round, and the number of rounds.
 
     Returns:
@@ -184,7 +185,7 @@ def refine(
     for number in range(settings.rounds if rounds is None else rounds):
         closest, _ = surface.closest(points, pose)
         distance = np.sum(normals * (closest - points), axis=1)
-        # If most of a shape fits in many poses, the rest must decide: in the first rounds nearly all points count.
+        # If most of a shape fits in many poses, the rest must decide. Therefore the first rounds use nearly all points.
         near = np.abs(distance) <= max(4 * np.median(np.abs(distance)), settings.reach * 0.8**number) + 1e-12
         near &= np.linalg.norm(closest - points, axis=1) <= 2 * np.abs(distance) + 1e-6
         c, n, d = closest[near], normals[near], distance[near]
@@ -206,21 +207,21 @@ def refine(
 
 
 def _coarse(target: Points, source: Others, settings: RegistrationSettings) -> list[Pose]:
-    """Find the likeliest poses of either reflection by principal axes and closest points; none if all fit badly."""
+    """Find the likeliest rotations and reflections by principal axes and closest points; none if all fit badly."""
     forward, backward = KDTree(target), KDTree(source)
     coarse, fine = slice(settings.coarse_points), slice(settings.fine_points)
     starts = poses_by_axes(target, source)
     first = [_closest_pairs(start, target[coarse], source[coarse], forward, backward, settings)[2] for start in starts]
     ends = [
         _closest_points(start, target[coarse], source[coarse], forward, backward, settings)
-        for start, off in zip(starts, first, strict=True)
-        if off <= settings.first_ratio * min(first)
+        for start, distance in zip(starts, first, strict=True)
+        if distance <= settings.first_ratio * min(first)
     ]
-    least = min(off for _, off in ends)
+    least = min(distance for _, distance in ends)
     improved = [
         _closest_points(pose, target[fine], source[fine], forward, backward, settings)
-        for pose, off in ends
-        if off <= min(settings.likely_ratio * least, settings.whole_distance)
+        for pose, distance in ends
+        if distance <= min(settings.likely_ratio * least, settings.whole_distance)
     ]
     distinct: dict[bool, list[Pose]] = {False: [], True: []}
     for pose, _ in sorted(improved, key=lambda end: end[1]):
@@ -232,12 +233,15 @@ def _coarse(target: Points, source: Others, settings: RegistrationSettings) -> l
 
 
 def poses_by_axes(target: Points, source: Others) -> list[Pose]:
-    """The poses that bring the source's principal axes onto the target's, in all 48 ways, of which half mirror."""
-    (target_mean, wide, onto), (source_mean, size, of) = (_principal(points) for points in (target, source))
+    """Compute the 48 poses that map the source's principal axes to the target's; half of them are reflections."""
+    (target_mean, target_widths, target_axes), (source_mean, source_widths, source_axes) = (
+        _principal(points) for points in (target, source)
+    )
     starts = []
     for order, signs in product(permutations(range(3)), product([1, -1], repeat=3)):
         change = np.eye(3)[list(order)] * signs
-        matrix = np.linalg.norm(wide) / np.linalg.norm(size) * onto @ change @ of.T
+        scale = np.linalg.norm(target_widths) / np.linalg.norm(source_widths)
+        matrix = scale * target_axes @ change @ source_axes.T
         starts.append(Pose(matrix, target_mean - matrix @ source_mean))
     return starts
 
@@ -245,33 +249,33 @@ def poses_by_axes(target: Points, source: Others) -> list[Pose]:
 def _turned(
     suspect: Geometry, target: Points, source: Others, starts: list[Pose], settings: RegistrationSettings
 ) -> list[Pose]:
-    """Turn poses about the axis of a round shape, upright and upside down, and keep the turns that fit locally best.
+    """Rotate poses about the axis of a round shape, upright and upside down, and return the local optima.
 
-    A wheel with teeth fits in as many poses as it has teeth.
+    A gear, for example, fits in as many poses as it has teeth.
     """
-    (centre, wide, axes), (_, _, of) = _principal(target), _principal(source)
+    (centre, widths, axes), (_, _, source_axes) = _principal(target), _principal(source)
     ratio, points = settings.round_ratio, target[: settings.coarse_points]
-    for column, is_round in ((0, wide[2] < ratio * wide[1]), (2, wide[1] < ratio * wide[0])):
+    for column, is_round in ((0, widths[2] < ratio * widths[1]), (2, widths[1] < ratio * widths[0])):
         if not is_round:
             continue
         axis = axes[:, column]
         turns = Rotation.from_rotvec(np.arange(0, 360, settings.turn)[:, None] * axis, degrees=True).as_matrix()
         ends = []
         for upright in (True, False):
-            same = [start for start in starts if (axis @ start.matrix @ of[:, column] > 0) == upright]
+            same = [start for start in starts if (axis @ start.matrix @ source_axes[:, column] > 0) == upright]
             if not same:
                 continue
             best = min(same, key=lambda pose: _distance(suspect, points, pose, settings))
             turned = [best.then(Pose(turn, centre - turn @ centre)) for turn in turns]
-            off = np.array([_distance(suspect, points, pose, settings) for pose in turned])
-            least = np.flatnonzero((off <= np.roll(off, 1)) & (off <= np.roll(off, -1)))
-            ends += [(off[place], turned[place]) for place in least]
+            distance = np.array([_distance(suspect, points, pose, settings) for pose in turned])
+            minima = np.flatnonzero((distance <= np.roll(distance, 1)) & (distance <= np.roll(distance, -1)))
+            ends += [(distance[place], turned[place]) for place in minima]
         return [pose for _, pose in sorted(ends, key=lambda end: end[0])[: settings.turned_poses]]
     return []
 
 
 def _principal(points: Points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The mean of points, their widths along the principal axes, ascending, and these axes as columns."""
+    """Compute the mean of points, their widths along the principal axes, ascending, and the axes as columns."""
     centre = points.mean(axis=0)
     variance, axes = np.linalg.eigh(np.cov((points - centre).T))
     return centre, np.sqrt(np.maximum(variance, 0)), axes * [1, 1, np.sign(np.linalg.det(axes))]
@@ -280,28 +284,28 @@ def _principal(points: Points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _closest_points(
     pose: Pose, target: Points, source: Others, forward: KDTree, backward: KDTree, settings: RegistrationSettings
 ) -> tuple[Pose, float]:
-    """Improve a similarity, which may mirror, by trimmed iterative closest points, from source to target and back.
+    """Refine a rotation or reflection by trimmed iterative closest points, from source to target and back.
 
     Returns:
-        The pose, and the root mean square distance of the pairs that were kept in the last round.
+        The pose, and the root mean square distance of the pairs that were used in the last round.
     """
-    off = np.inf
+    distance = np.inf
     for _ in range(settings.rounds):
-        before = off
-        points, places, off = _closest_pairs(pose, target, source, forward, backward, settings)
+        before = distance
+        points, places, distance = _closest_pairs(pose, target, source, forward, backward, settings)
         pose = similarity(points, places, pose.mirrors)
-        if off > 0.99 * before:
+        if distance > 0.99 * before:
             break
-    return pose, off
+    return pose, distance
 
 
 def _closest_pairs(
     pose: Pose, target: Points, source: Others, forward: KDTree, backward: KDTree, settings: RegistrationSettings
 ) -> tuple[Float64[np.ndarray, "pairs 3"], Float64[np.ndarray, "pairs 3"], float]:
-    """Pair points with the closest ones of the other surface, and keep the closest pairs.
+    """Pair points with the closest points of the other surface, and select the closest pairs.
 
     Returns:
-        The points of the source, those of the target, and their root mean square distance in the pose.
+        The source points, the target points, and the root mean square distance of the selected pairs in the pose.
     """
     to_target, to_source = forward.query(pose(source)), backward.query(pose.inverse()(target))
     scale = np.cbrt(abs(np.linalg.det(pose.matrix)))
@@ -310,6 +314,6 @@ def _closest_pairs(
         (backward.data[to_source[1]], target, to_source[0] * scale),
     ]
     share = settings.inlier_share
-    kept = [(s[near], t[near], d[near]) for s, t, d in pairs for near in [d <= np.quantile(d, share)]]
-    points, places, distance = (np.concatenate(arrays) for arrays in zip(*kept, strict=True))
+    closest = [(s[near], t[near], d[near]) for s, t, d in pairs for near in [d <= np.quantile(d, share)]]
+    points, places, distance = (np.concatenate(arrays) for arrays in zip(*closest, strict=True))
     return points, places, float(np.sqrt(np.mean(distance**2)))

@@ -1,8 +1,8 @@
-"""Smooth the original as a suspect was evidently smoothed, without the key.
+"""Replay of smoothing: smooth the original as the suspect was smoothed, to explain its displacements without the key.
 
 The original is smoothed by the Laplacian of the suspect's mesh or, if the suspect's vertices are recognised, by the
-original's cotangent Laplacian. Displacements that this explains are nuisance, as are those that the original's own
-operator explains.
+original's cotangent Laplacian. Displacements that this smoothing explains are treated as nuisance. Displacements that
+the original's valence Laplacian explains are nuisance in any case.
 """
 
 import jax.numpy as jnp
@@ -20,13 +20,13 @@ from jaxmark.spectral.padding import common_laplacian, pad_rows
 
 _SCALES = 9  # smoothing by 1, 2, 4 … 256 steps, each halfway to the neighbours' mean
 _WEIGHTINGS: tuple[Weighting, ...] = ("valence", "cotangent")
-# Smoothing is assumed if it leaves at most this share of the squared displacement unexplained. Where displacements are
-# known along normals only, the columns also explain a good part of the mark; at recognised points, hardly any of it.
+# Smoothing is assumed if it leaves at most this fraction of the squared displacement unexplained. If displacements are
+# known along normals only, smoothing also explains a large part of the mark; at recognised points, hardly any of it.
 _MAX_UNEXPLAINED_ON_SURFACES, _MAX_UNEXPLAINED_AT_POINTS = 0.1, 0.5
-# The same for the quick check by two columns: on real meshes, these leave over 99.5 % of marks and noise unexplained,
-# and less than 87 % of smoothing.
+# The same limit for the quick check by two columns. On real meshes, the two columns leave over 99.5 % of marks and
+# noise unexplained, but less than 87 % of smoothing.
 _MAX_UNEXPLAINED_AT_FIRST = 0.98
-_MAX_FIT_POINTS = 20_000  # random points that least squares are computed on
+_MAX_FIT_POINTS = 20_000  # number of random points in the least-squares fits
 
 Columns = Float[np.ndarray, "points columns"]
 
@@ -39,20 +39,22 @@ def replay_smoothing(
     normals: Points,
     weights: Bool[np.ndarray, " points"],
 ) -> Columns | None:
-    """Smooth the original by the suspect's mesh; None unless that explains nearly all of the displacement.
+    """Smooth the original by the Laplacian of the suspect's mesh.
 
-    A suspect that was simplified and then smoothed has shrunk by another operator than the original's.
+    A suspect that was first simplified and then smoothed was smoothed by the Laplacian of its own mesh, not by the
+    original's.
 
     Args:
         original: the original's surface, about 1 in size.
-        suspect: the suspect in the original's pose, with an area.
+        suspect: the suspect in the original's pose; its area must not be 0.
         face: for each of the original's points, the face on which the suspect comes closest to it.
         closest: the closest point on this face.
         normals: unit vectors along which the displacement of each point is known.
-        weights: mask of the points where it is known.
+        weights: mask of the points whose displacement is known.
 
     Returns:
-        Positions of the original's points after smoothing, three columns for each number of steps.
+        Positions of the original's points after smoothing, three columns for each number of steps. None unless they
+        explain nearly all of the displacement.
     """
     x = np.asarray(original.mesh.vertices)
     signal = original.closest(np.asarray(suspect.vertices))[0]
@@ -70,21 +72,23 @@ def replay_smoothing(
 def replay_smoothing_of_points(
     operator: Laplacian, original: Mesh, displacement: Points, weights: Bool[np.ndarray, " points"]
 ) -> Columns | None:
-    """Smooth the original by its cotangents; None unless that explains much of the displacement of recognised points.
+    """Smooth the original by its cotangent Laplacian, for a suspect whose vertices are recognised.
 
-    Displacements that its valence weights explain are nuisance in any case.
+    Displacements that the valence Laplacian explains are nuisance in any case.
 
     Args:
-        operator: the original's Laplacian, by valences.
-        original: the mesh of its points, about 1 in size.
-        displacement: displacement of its points.
-        weights: mask of the points where it is known.
+        operator: the original's valence Laplacian.
+        original: the mesh of the original's points, about 1 in size.
+        displacement: displacement of these points.
+        weights: mask of the points whose displacement is known.
 
     Returns:
-        Positions of the original's points after smoothing, three columns for each number of steps.
+        Positions of the original's points after smoothing, three columns for each number of steps. None unless they
+        explain much of the displacement.
     """
     x = np.asarray(original.vertices)
-    # Smoothing of any kind and amount shows in Δx and Δ²x already; marks and noise do not, and end here.
+    # Smoothing of any kind and amount is partly explained by Δx and Δ²x; marks and noise are not. This quick check
+    # avoids the smoothing below for most suspects.
     once = operator.apply(jnp.asarray(pad_rows(x, len(operator.degree)), jnp.float32))
     powers = np.concatenate([once, operator.apply(once)], axis=1)[: len(x)]
     if _likeliest([powers], x, displacement, None, weights, _MAX_UNEXPLAINED_AT_FIRST) is None or area(original) == 0:
@@ -109,19 +113,19 @@ def _likeliest(
     weights: Bool[np.ndarray, " points"],
     max_unexplained: float,
 ) -> Columns | None:
-    """Choose the columns that explain most of what an affine map does not; None if they explain too little of it."""
+    """Choose the columns that explain most of the displacement that an affine map leaves; None if it is too little."""
     chosen = np.flatnonzero(weights)
     chosen = chosen[np.random.default_rng(0).permutation(len(chosen))[:_MAX_FIT_POINTS]]
     if not len(chosen):
         return None
-    affine, known = np.concatenate([np.ones((len(chosen), 1)), x[chosen]], axis=1), displacement[chosen]
+    affine, moved = np.concatenate([np.ones((len(chosen), 1)), x[chosen]], axis=1), displacement[chosen]
 
     def unexplained(columns: Columns) -> float:
         if normals is None:
-            design, along = columns, known
+            design, along = columns, moved
         else:
             design = (columns[:, :, None] * normals[chosen][:, None, :]).reshape(len(chosen), -1)
-            along = np.sum(normals[chosen] * known, axis=1)
+            along = np.sum(normals[chosen] * moved, axis=1)
         return float(np.sum((along - design @ np.linalg.lstsq(design, along, rcond=1e-9)[0]) ** 2))
 
     rest = [unexplained(np.concatenate([affine, columns[chosen].astype(np.float64)], axis=1)) for columns in candidates]

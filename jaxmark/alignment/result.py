@@ -1,4 +1,4 @@
-"""A suspect that was aligned with an original: the result of every way of aligning."""
+"""The result of a registration: `Alignment`, a suspect aligned with an original."""
 
 from typing import Any, Literal, NamedTuple
 
@@ -19,27 +19,27 @@ class Alignment(NamedTuple):
     """A suspect aligned with an original."""
 
     displacement: Float64[np.ndarray, "points 3"]  # displacement of the original's points, in diagonals
-    weights: Float64[np.ndarray, " points"]  # 1; 0 where a point is masked or no face uses it
+    weights: Float64[np.ndarray, " points"]  # 1; 0 for points that are masked or that no face uses
     normals: Float64[np.ndarray, "points 3"] | None  # if given, only displacements along these unit vectors are known
-    nuisance: Float[np.ndarray, "points columns"] | None  # displacements by smoothing, if that explains much
-    method: Method  # recognition of vertices: by order, by connectivity, as nearest points of clouds, or none
+    nuisance: Float[np.ndarray, "points columns"] | None  # displacements by smoothing, if they explain the suspect
+    method: Method  # how vertices were recognised: by order, by connectivity, as nearest points, or not at all
     pose: Pose  # from the suspect's coordinates to the original's, as in their files
     residual: float  # root mean square displacement of the points with weight 1, in diagonals
     seconds: float = 0.0  # duration of the alignment
-    align: Align = "auto"  # how it was asked for
-    heights: VertexHeights | None = None  # of the vertices of a surface that has few, above the original
-    deformed: DeformedPoints | None = None  # recognised points that no single map brings back
+    align: Align = "auto"  # the way of registration that was requested
+    heights: VertexHeights | None = None  # heights of the suspect's vertices above the original, if there are few
+    deformed: DeformedPoints | None = None  # recognised points, if no single affine map aligns them
 
     def facts(self) -> dict[str, Any]:
-        """Return what a report says of the registration, as values for JSON."""
+        """Return the facts of the registration for reports, as values for JSON."""
         return {"method": self.method, "pose": self.pose.facts(), "residual": self.residual, "seconds": self.seconds}
 
     def coverage(self, original: Original) -> float:
-        """Compute the share of the original's points that the suspect shows."""
+        """Compute the fraction of the original's points that are registered to the suspect."""
         return float(np.sum(self.weights > 0) / original.used.sum())
 
     def observation(self, original: Original) -> Observation:
-        """Convert to what detectors read: displacements in diagonals, padded, in the original's dtype."""
+        """Convert to an observation for detectors: displacements in diagonals, padded, in the original's dtype."""
 
         def array(value: np.ndarray | None) -> Array | None:
             return None if value is None else original.to_traced(value)
@@ -48,7 +48,7 @@ class Alignment(NamedTuple):
         return Observation(*known, array(self.normals), array(self.nuisance))
 
     def undeformed(self, original: Original, deformed: DeformedPoints) -> "Alignment":
-        """Align by a map of its own around each point, see `nonrigid.undo_deformation`."""
+        """Align by non-rigid registration, see `nonrigid.undo_deformation`."""
         displacement, weights = undo_deformation(
             original.operator, np.asarray(original.positions, np.float64), deformed
         )

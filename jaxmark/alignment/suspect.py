@@ -1,4 +1,4 @@
-"""A suspect made ready for alignment: of a usual size, with the original's own faces where it has these."""
+"""Preparation of a suspect for alignment: scale it to a usual size, and restore the corner order of its faces."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,20 +9,20 @@ from jaxmark.alignment.original import Original
 from jaxmark.geometry.mesh import Mesh, host_mesh, same_connectivity, weld, weld_mesh
 from jaxmark.geometry.pose import IDENTITY, Pose
 
-_SMALLEST = 1e-50  # size of a suspect, in its file's units, whose powers do not vanish
-_COPIES_APART = 0.1  # distance of copies of a point, over the size of the suspect, above which its order is another
+_SMALLEST = 1e-50  # least size of a suspect, in its file's units, whose powers do not underflow
+_COPIES_APART = 0.1  # largest median distance of vertices that share a point, over the suspect's size, if order is kept
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedSuspect:
-    """A suspect made ready for alignment with an original; make one with `make_suspect`."""
+    """A suspect, prepared for alignment with an original by `make_suspect`."""
 
-    mesh: Mesh  # of a size whose powers neither overflow nor vanish
+    mesh: Mesh  # the suspect, scaled so that powers of its coordinates neither overflow nor underflow
     pose: Pose  # from the file's coordinates to those of `mesh`
 
     @property
     def is_cloud(self) -> bool:
-        """Whether it has no faces."""
+        """Whether the suspect has no faces."""
         return len(self.mesh.faces) == 0
 
     @cached_property
@@ -31,28 +31,29 @@ class PreparedSuspect:
         return weld_mesh(self.mesh, weld(self.mesh.vertices))
 
     def has_order_of(self, original: Original) -> bool:
-        """Whether its vertices seem to be in the order of the original that was marked."""
+        """Whether the suspect's vertices seem to have the order in which the original was marked."""
         alike = original.in_order and same_connectivity(self.mesh, original.mesh)
         return alike and self._has_copies_together(original)
 
     def _has_copies_together(self, original: Original) -> bool:
-        """Whether the copies of a point are still near each other; of shuffled triangle soup they are not.
+        """Whether vertices that share a point of the original are near each other in the suspect.
 
-        All triangle soups of one size have the same faces, so that connectivity alone tells nothing about their order.
+        In a shuffled triangle soup they are not. Connectivity does not show this, because all triangle soups with the
+        same number of triangles have the same faces.
         """
         first = original.weld.first[original.weld.point]
         copies = np.flatnonzero(first != np.arange(len(first)))
         vertices = np.asarray(self.mesh.vertices, np.float64)
-        with np.errstate(over="ignore", invalid="ignore"):  # a vertex may be thrown anywhere
+        with np.errstate(over="ignore", invalid="ignore"):  # coordinates of a suspect may be huge
             apart = np.abs(vertices[copies] - vertices[first[copies]]).max(axis=1)
             size = np.abs(vertices - np.median(vertices, axis=0)).max(axis=1)
         return len(copies) == 0 or bool(np.median(apart) <= _COPIES_APART * np.median(size))
 
 
 def make_suspect(original: Original, mesh: Mesh) -> PreparedSuspect:
-    """Check a mesh, scale it to a usual size, and give it the original's faces if these differ by corners' order only.
+    """Check a mesh and scale it to a usual size; if its faces differ only in the order of corners, restore that order.
 
-    Programs that mirror a mesh reverse its faces, so that normals point outwards again.
+    Programs that reflect a mesh also reverse its faces, so that normals point outwards again.
 
     Raises:
         JaxmarkError: see `make_mesh`.
@@ -65,7 +66,7 @@ def make_suspect(original: Original, mesh: Mesh) -> PreparedSuspect:
     size = float(np.quantile(np.abs(vertices - np.median(vertices, axis=0)).max(axis=1), 0.6))  # of most points
     if not 0 < size < np.inf or _SMALLEST < size < 1 / _SMALLEST:
         return PreparedSuspect(mesh, IDENTITY)
-    # In two steps, as a factor may be out of range itself.
+    # Scale in two steps, because the factor itself may be out of range.
     exponent = -int(np.floor(np.log2(size)))
     half = np.ldexp(1.0, exponent // 2)
     scaled = vertices * half * np.ldexp(1.0, exponent - exponent // 2)

@@ -1,1 +1,1 @@
-"""Whole jobs on files: the command line, folders of files, the demo."""
+"""The command line: commands that mark and read files and folders, the demo, the dossier, and the catalogue's page."""

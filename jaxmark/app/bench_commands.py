@@ -1,4 +1,4 @@
-"""The benchmark of the field as commands."""
+"""The commands `jaxmark bench`, `bench-equal` and `bench-corpus`, which compare watermarking methods."""
 
 from __future__ import annotations
 
@@ -37,38 +37,44 @@ _PATH = click.Path(path_type=Path)
 
 
 class ManyValues(click.Command):
-    """A command whose options that may be repeated take all values up to the next option."""
+    """A command in which an option with several values takes all arguments up to the next option."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Repeat the option before each of its values, as click has it."""
-        many = {name for one in self.params if getattr(one, "multiple", False) for name in one.opts}
-        found, option = [], ""
+        """Insert the option before each of its values, as click expects it."""
+        repeatable = {name for param in self.params if getattr(param, "multiple", False) for name in param.opts}
+        expanded, option = [], ""
         for number, arg in enumerate(args):
             if arg == "--":
-                found += args[number:]
+                expanded += args[number:]
                 break
             if arg.startswith("-") and arg != "-":
-                option = arg if arg in many else ""
+                option = arg if arg in repeatable else ""
                 if option and (number + 1 == len(args) or args[number + 1].startswith("--")):
                     raise click.BadOptionUsage(option, f"Option {option!r} needs a value.", ctx)
-                found += [] if option else [arg]
+                expanded += [] if option else [arg]
             else:
-                found += [option, arg] if option else [arg]
-        return super().parse_args(ctx, found)
+                expanded += [option, arg] if option else [arg]
+        return super().parse_args(ctx, expanded)
 
 
 MESHES = click.argument("meshes", nargs=-1, type=_PATH, metavar="MESH...", required=True)
 METHODS_OPTION = click.option(
-    "--methods", multiple=True, help=f"Names: {', '.join(METHODS)}; or files, as --method.  [default: keyed]"
+    "--methods",
+    multiple=True,
+    help=f"Methods to compare, by name: {', '.join(METHODS)}; or files as for --method.  [default: keyed]",
 )
 OWN = click.option(
     "--method", "own", multiple=True, type=_PATH, help="A Python or TOML file that declares a method of your own."
 )
 SAMPLES = click.option(
-    "--samples", type=click.IntRange(1), default=1, show_default=True, help="Number of keys, messages and attacks."
+    "--samples",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Number of repetitions, each with its own key, message and seed of the attacks.",
 )
 WORKERS = click.option(
-    "--workers", type=click.IntRange(1), default=os.cpu_count(), help="Processes.  [default: all cores]"
+    "--workers", type=click.IntRange(1), default=os.cpu_count(), help="Number of processes.  [default: all cores]"
 )
 OUTPUT = click.option("--output", type=_PATH, required=True, help="Folder for the results.")
 
@@ -82,21 +88,39 @@ OUTPUT = click.option("--output", type=_PATH, required=True, help="Folder for th
     "tracks",
     multiple=True,
     type=click.Choice(list(TRACKS)),
-    help="Attacks and limits.  [default: smi2010]",
+    help="Track: a set of attacks and distortion limits.  [default: smi2010]",
 )
-@click.option("--attacks", multiple=True, help="Attacks of the track, or the first words of some.  [default: all]")
-@click.option("--limits", multiple=True, help="Sets of limits of the track.  [default: all]")
-@click.option("--payloads", multiple=True, type=click.IntRange(1), help="Bits of a message.  [default: 64]")
+@click.option(
+    "--attacks",
+    multiple=True,
+    help="Attacks of the track, by name or by the first words of their names.  [default: all]",
+)
+@click.option("--limits", multiple=True, help="Sets of distortion limits of the track, by name.  [default: all]")
+@click.option("--payloads", multiple=True, type=click.IntRange(1), help="Payloads in bits.  [default: 64]")
 @SAMPLES
-@click.option("--others", multiple=True, type=_PATH, help="Further meshes, read unmarked in place of each MESH.")
 @click.option(
-    "--keys", type=click.IntRange(1), default=KEYS, show_default=True, help="Keys for each suspect without a mark."
+    "--others", multiple=True, type=_PATH, help="Unmarked meshes that are read as further suspects for each MESH."
 )
 @click.option(
-    "--rate", type=click.FloatRange(0, 1, True, True), default=RATE, show_default=True, help="Of false positives."
+    "--keys",
+    type=click.IntRange(1),
+    default=KEYS,
+    show_default=True,
+    help="Number of keys with which each unmarked suspect is read.",
+)
+@click.option(
+    "--rate",
+    type=click.FloatRange(0, 1, True, True),
+    default=RATE,
+    show_default=True,
+    help="False-positive rate at which methods are compared.",
 )
 @WORKERS
-@click.option("--against", type=_PATH, help="Published readings, as readings.csv: say where this run disagrees.")
+@click.option(
+    "--against",
+    type=_PATH,
+    help="Published readings.csv to compare this run with; differences are printed.",
+)
 @OUTPUT
 @QUIET
 @JSON
@@ -117,18 +141,23 @@ def bench_command(
     output: Path,
     as_json: bool,
 ) -> None:
-    """Measure watermarking methods on meshes as papers do: what they survive, and how often they err.
+    """Measure the robustness and the false-positive rates of watermarking methods.
 
-    Every method marks every MESH as strongly as one set of limits allows, and is read after every attack of a track;
-    its score is calibrated on suspects that have no mark. Options that may be repeated take all values up to the next
-    option. The folder gets results.json, with an entry for each method, results.md, readings.csv (of marks, to
-    publish), all_readings.csv (of nulls, too), and with the extra `plot` page.html. The same command goes on where it
-    was ended, and a wider one takes over what both have. With --against, the exit status is 1 where readings disagree
-    or none is published.
+    Every method marks every MESH as strongly as a set of distortion limits allows, and is read after every attack of
+    the track. Its score is calibrated on suspects without a mark. Options with several values take all values up to the
+    next option.
+
+    Writes to the folder --output: results.json, with an entry for each method; results.md; readings.csv, the readings
+    of marks, for publication; all_readings.csv, with the readings of unmarked suspects; and page.html, if the extra
+    `plot` is installed. If a run was interrupted, the same command resumes it. A run with more meshes, methods or
+    attacks reuses the readings that are in the folder.
+
+    Exit status 0 if done, 2 if the input is refused. With --against, 1 if readings differ from the published ones, or
+    if none of them is published.
     """
     start = time.time()
     published = None if against is None else load_published(against)
-    found = run(
+    results = run(
         meshes,
         output,
         methods=[*methods, *own] or ["keyed"],
@@ -140,26 +169,26 @@ def bench_command(
         others=others,
         keys=keys,
         rate=rate,
-        workers=processes(workers, keep_programs),  # in its own process a program that an attack calls may crash
+        workers=processes(workers, keep_programs),  # in separate processes, because a program of an attack may crash
         after=release_programs,
-        say=current().doing,
+        log=current().doing,
     )
-    repeated = hold_against(found, published) if published is not None else None
-    hours, projected = found.seconds / 3600, found.projected(8, 5) / 3600
+    repeated = hold_against(results, published) if published is not None else None
+    hours, projected = results.seconds / 3600, results.projected(8, 5) / 3600
     about = (
         f"`{_command()}`, jaxmark {importlib.metadata.version('jaxmark')}, {_machine()}: {hours:.2g} hours of work for"
-        f" one process. 8 meshes and 5 seeds would take {projected:.2g}."
+        f" one process. 8 meshes and 5 seeds would take {projected:.2g} hours."
     )
-    _write(found, output, about)
+    _write(results, output, about)
     spent = {"command": _command(), "machine": _machine(), "seconds": round(time.time() - start, 1)}
     spent |= {"hours_of_one_process": hours, "hours_for_8_meshes_and_5_seeds": projected}
     write_atomically(output / "run.json", json.dumps(spent).encode())
-    said = "\n\n".join(table.markdown() for table in tables(found)[:2])
+    text = "\n\n".join(table.markdown() for table in tables(results)[:2])
     if repeated is not None:
-        lines = [f"{repeated.shared} readings are published, {len(repeated.differences)} disagree:"]
-        said += "\n\n" + "\n".join([*lines, *repeated.differences])
+        lines = [f"{repeated.shared} readings are published; {len(repeated.differences)} of them differ:"]
+        text += "\n\n" + "\n".join([*lines, *repeated.differences])
     values = {} if repeated is None else {"repeated": repeated.shared, "differences": list(repeated.differences)}
-    answer(as_json, {"output": str(output), "methods": entries(found), **values}, said)
+    answer(as_json, {"output": str(output), "methods": entries(results), **values}, text)
     if repeated is not None and (repeated.differences or not repeated.shared):
         sys.exit(1)
 
@@ -168,8 +197,13 @@ def bench_command(
 @MESHES
 @METHODS_OPTION
 @OWN
-@click.option("--payloads", multiple=True, type=click.IntRange(1), help="Bits of a message.  [default: 16 64]")
-@click.option("--shares", multiple=True, type=float, help="Of the limits of what is hidden.  [default: 0.5 1 2]")
+@click.option("--payloads", multiple=True, type=click.IntRange(1), help="Payloads in bits.  [default: 16 64]")
+@click.option(
+    "--shares",
+    multiple=True,
+    type=float,
+    help="Visibilities, as multiples of the limits of a hidden mark.  [default: 0.5 1 2]",
+)
 @SAMPLES
 @WORKERS
 @OUTPUT
@@ -186,9 +220,10 @@ def bench_equal_command(
     output: Path,
     as_json: bool,
 ) -> None:
-    """Bring methods to the same visibility on each MESH, and find the strongest noise that each survives.
+    """Compare the strongest noise that methods survive, at equal visibility of their marks.
 
-    The folder gets equal.md, and equal.jsonl, from which the same command goes on where it was ended.
+    Every method marks every MESH so that the visibility of the marks is equal. Writes equal.md and equal.jsonl to the
+    folder --output. If a run was interrupted, the same command resumes it from equal.jsonl.
     """
     table = equal_visibility(
         meshes,
@@ -198,7 +233,7 @@ def bench_equal_command(
         shares=shares or SHARES,
         samples=samples,
         workers=processes(workers, keep_programs),
-        say=current().doing,
+        log=current().doing,
     )
     write_atomically(output / "equal.md", (table.markdown() + "\n").encode())
     answer(as_json, {"heads": list(table.heads), "lines": [list(line) for line in table.lines]}, table.markdown())
@@ -207,32 +242,37 @@ def bench_equal_command(
 @click.command(name="bench-corpus")
 @click.argument("folder", type=_PATH)
 @click.option(
-    "--most-vertices", type=click.IntRange(1), default=10**6, show_default=True, help="Larger meshes are left out."
+    "--most-vertices",
+    type=click.IntRange(1),
+    default=10**6,
+    show_default=True,
+    help="Meshes with more vertices are left out.",
 )
 @QUIET
 @JSON
 def bench_corpus_command(folder: Path, most_vertices: int, as_json: bool) -> None:
-    """Write the meshes of the benchmark's corpus to FOLDER, by formula and of packages that are installed.
+    """Write the meshes of the benchmark's corpus to FOLDER.
 
-    A line for each says whether its hash is the one that is known; hashes.json holds them.
+    Some meshes are computed from formulas; others are copied from installed packages. For each mesh, prints whether its
+    hash is the expected one. Also writes hashes.json.
     """
-    made = make_corpus(folder, most_vertices=most_vertices, say=partial(say, err=as_json))
+    made = make_corpus(folder, most_vertices=most_vertices, log=partial(say, err=as_json))
     answer(as_json, {"output": str(folder), "hashes": made}, f"{len(made)} meshes → {folder}")
 
 
-def _write(found: BenchResults, output: Path, about: str) -> None:
-    """All files but the cells."""
-    title = f"What watermarks of meshes survive: {', '.join(dict.fromkeys(task.track for task, _ in found.tasks))}"
-    save_entries(found, output / "results.json")
-    found.save_csv(output / "all_readings.csv")
-    save_readings(found, output / "readings.csv")
-    write_atomically(output / "results.md", page.markdown(found, title, about).encode())
+def _write(results: BenchResults, output: Path, about: str) -> None:
+    """Write all files of a run, except those from which it resumes."""
+    title = f"Robustness of mesh watermarks: {', '.join(dict.fromkeys(task.track for task, _ in results.tasks))}"
+    save_entries(results, output / "results.json")
+    results.save_csv(output / "all_readings.csv")
+    save_readings(results, output / "readings.csv")
+    write_atomically(output / "results.md", page.markdown(results, title, about).encode())
     if importlib.util.find_spec("pyarrow") and importlib.util.find_spec("pandas"):
         require("pandas", "study").read_csv(output / "all_readings.csv").to_parquet(output / "all_readings.parquet")
     try:
-        page.save_page(found, output / "page.html", title, about.replace("`", ""))
+        page.save_page(results, output / "page.html", title, about.replace("`", ""))
     except JaxmarkError as error:
-        say(f"No page: {error}")
+        say(f"No page is written: {error}")
 
 
 def _command() -> str:

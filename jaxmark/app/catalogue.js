@@ -1,5 +1,5 @@
 "use strict";
-// What comes from the catalogue or a file is shown as text, never as markup.
+// All values from the catalogue or a file are inserted as text, never as markup.
 const place = (name) => document.getElementById(name);
 const make = (kind, text, ...children) => {
   const element = document.createElement(kind);
@@ -17,59 +17,59 @@ const power = (value) => `10^${(Math.ceil(value * 10 - 1e-9) / 10).toFixed(1)}`;
 const text = (hexadecimal) => {
   try {
     const bytes = Uint8Array.from(hexadecimal.match(/../g), (pair) => parseInt(pair, 16));
-    const found = new TextDecoder("utf-8", { fatal: true }).decode(bytes);
-    return /^[\p{L}\p{N}\p{P}\p{S} ]+$/u.test(found) ? `${hexadecimal} ("${found}")` : hexadecimal;
+    const decoded = new TextDecoder("utf-8", { fatal: true }).decode(bytes);
+    return /^[\p{L}\p{N}\p{P}\p{S} ]+$/u.test(decoded) ? `${hexadecimal} ("${decoded}")` : hexadecimal;
   } catch { return hexadecimal; }
 };
-const said = (match) =>
+const content = (match) =>
   match.recipient ? `copy for ${match.accused.join(", ")}` : match.message ? `message ${text(match.message)}` :
-  match.named ? "a mark" : match.refused || "nothing";
+  match.named ? "a mark" : match.refused || "nothing detected";
 
-let shown = 0;
+let listed = 0;
 async function list() {
-  const found = await (await fetch(`originals?start=${shown}`)).json();
-  if (found.refused) { place("count").textContent = found.refused; return; }
-  shown += found.originals.length;
-  place("count").textContent = `${found.count} originals`;
-  for (const one of found.originals) {
-    const held = `${one.vertices} vertices, ${one.records} records, ${one.recipients} recipients`;
-    place("originals").append(make("figure", null, picture(one.id), make("figcaption", `${one.id}  ${one.name}: ${held}`)));
+  const answer = await (await fetch(`originals?start=${listed}`)).json();
+  if (answer.refused) { place("count").textContent = answer.refused; return; }
+  listed += answer.originals.length;
+  place("count").textContent = `${answer.count} originals`;
+  for (const entry of answer.originals) {
+    const counts = `${entry.vertices} vertices, ${entry.records} records, ${entry.recipients} recipients`;
+    place("originals").append(make("figure", null, picture(entry.id), make("figcaption", `${entry.id}  ${entry.name}: ${counts}`)));
   }
-  place("more").hidden = shown >= found.count;
+  place("more").hidden = listed >= answer.count;
 }
 
-function show(found) {
+function show(answer) {
   const verdict = place("verdict");
   verdict.replaceChildren();
-  if (found.refused) { verdict.append(make("p", found.refused)); return; }
-  const named = found.matches.filter((match) => match.named);
-  const head = named.length ? named.map((match) => `${match.original}: ${said(match)}`).join("; ") : "Nobody's";
+  if (answer.refused) { verdict.append(make("p", answer.refused)); return; }
+  const named = answer.matches.filter((match) => match.named);
+  const head = named.length ? named.map((match) => `${match.original}: ${content(match)}`).join("; ") : "No original is named";
   const box = make("div", null, make("b", head));
   box.className = "key";
   if (named.length) {
-    box.append(make("p", `Such a naming would come about by chance with a probability of at most ${power(found.log10_p)}, if `
-      + "keys, originals and records were fixed before the file existed; "
-      + `${power(found.log10_p_uncommitted)} if nothing dates them. All ${found.readings} readings that could have been made are paid for.`));
+    box.append(make("p", `The false-positive probability of this result is at most ${power(answer.log10_p)} if `
+      + "keys, originals and records were fixed before the file existed, and at most "
+      + `${power(answer.log10_p_uncommitted)} even if they were chosen afterwards. Both bounds count all ${answer.readings} readings that could have been made.`));
   }
-  if (found.dossier) {
+  if (answer.dossier) {
     const link = make("a", "Dossier");
-    link.href = `dossiers/${found.dossier}`;
-    box.append(make("p", null, link, ` (of this original alone: its figures do not pay for the other ${found.readings - 1} readings)`));
+    link.href = `dossiers/${answer.dossier}`;
+    box.append(make("p", null, link, ` (of this original only: its bounds do not count the other ${answer.readings - 1} readings)`));
   }
-  const rows = found.matches.map((match) => make("tr", null,
+  const rows = answer.matches.map((match) => make("tr", null,
     make("td", null, picture(match.id)), make("td", match.original), make("td", `${match.by}, rank ${match.rank}`),
-    make("td", said(match)), make("td", power(match.log10_p))));
-  const titles = ["", "original", "looked like", "found", "probability"].map((title) => make("th", title));
+    make("td", content(match)), make("td", power(match.log10_p))));
+  const titles = ["", "original", "similar by", "result", "false-positive probability"].map((title) => make("th", title));
   verdict.append(box, make("table", null, make("tr", null, ...titles), ...rows));
 }
 
 async function find(file) {
-  show({ refused: `Looking for ${file.name} …` });
+  show({ refused: `Comparing ${file.name} with the originals …` });
   try {
-    const sent = { method: "POST", headers: { "x-jaxmark": "find" }, body: file };
-    show(await (await fetch(`find?name=${encodeURIComponent(file.name)}`, sent)).json());
+    const request = { method: "POST", headers: { "x-jaxmark": "find" }, body: file };
+    show(await (await fetch(`find?name=${encodeURIComponent(file.name)}`, request)).json());
   } catch (error) {
-    show({ refused: `No answer: ${error.message}` });
+    show({ refused: `The server does not answer: ${error.message}` });
   }
 }
 

@@ -1,4 +1,4 @@
-"""The commands of `jaxmark catalogue`, and the one that marks a copy for a recipient."""
+"""The commands of `jaxmark catalogue`, and `jaxmark mark-for`, which marks a copy for a recipient."""
 
 import os
 import re
@@ -20,15 +20,15 @@ from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.perception.budget import Budget
 from jaxmark.watermark.record import RECORD_SUFFIX, Record, load_record
 
-_PLAIN = re.compile(r"\w[\w.@+-]*")  # recipients whose names may be in file names
-CATALOGUE = click.option("--catalogue", "catalogue_file", type=FILE, required=True, help="The catalogue's file.")
+_PLAIN = re.compile(r"\w[\w.@+-]*")  # names of recipients that may become part of a file name
+CATALOGUE = click.option("--catalogue", "catalogue_file", type=FILE, required=True, help="File of the catalogue.")
 
 
 @click.group(name="catalogue")
 def catalogue_group() -> None:
-    """Know which of many originals a suspect is, and whose copy.
+    """Identify the original and the recipient of a suspect, among many originals.
 
-    A catalogue is one file with originals, records, recipients and verdicts. It holds no key.
+    A catalogue is one file with originals, records, recipients and verdicts. It contains no key.
     """
 
 
@@ -38,23 +38,26 @@ def catalogue_group() -> None:
 @click.option(
     "--records",
     is_flag=True,
-    help=f"Add the records that lie in the folders of FILES, too (names end in {RECORD_SUFFIX}).",
+    help=f"Also add all records in the folders of FILES; their names end in {RECORD_SUFFIX}.",
 )
-@click.option("--copy", is_flag=True, help="Keep the files themselves in the catalogue.")
+@click.option("--copy", is_flag=True, help="Store copies of the mesh files in the catalogue.")
 @QUIET
 @JSON
 def add_command(files: tuple[Path, ...], catalogue_file: Path, records: bool, copy: bool, as_json: bool) -> None:
-    """Add originals: mesh FILES, or all of a folder; and records, by their files.
+    """Add originals and records to a catalogue.
 
-    A known file changes nothing. With --json there is a line for each file. A file that is refused stops none of the
-    others; the exit status is then 2.
+    FILES are mesh files, folders of mesh files, and files of records. If the catalogue does not exist, it is created. A
+    file that is in the catalogue already changes nothing. Prints one line per file. A refused file does not stop the
+    others.
+
+    Exit status 0 if all files are added, 2 if a file is refused.
     """
     status = 0
     meshes = [file for file in files if not file.name.endswith(RECORD_SUFFIX)]
-    given = [file for file in files if file.name.endswith(RECORD_SUFFIX)]
+    record_files = [file for file in files if file.name.endswith(RECORD_SUFFIX)]
     if records:
         folders = dict.fromkeys(file if file.is_dir() else file.parent for file in files)
-        given += [file for folder in folders for file in sorted(folder.glob("*" + RECORD_SUFFIX))]
+        record_files += [file for folder in folders for file in sorted(folder.glob("*" + RECORD_SUFFIX))]
     with Catalogue(catalogue_file) as catalogue:
         for file in _each_file(meshes):
             current().doing(f"adding {file}")
@@ -64,19 +67,19 @@ def add_command(files: tuple[Path, ...], catalogue_file: Path, records: bool, co
                 status = 2
                 _refused(as_json, file, error)
                 continue
-            said = f"{file}: {added.status} as {added.id}"
-            said += f", {added.meshes} meshes" * (added.meshes > 1) + _left(added.skipped)
-            answer(as_json, {"file": str(file), **added._asdict()}, said)
-        for file in dict.fromkeys(given):
+            text = f"{file}: {added.status} as {added.id}"
+            text += f", {added.meshes} meshes" * (added.meshes > 1) + _skipped_text(added.skipped)
+            answer(as_json, {"file": str(file), **added._asdict()}, text)
+        for file in dict.fromkeys(record_files):
             try:
-                kept = catalogue.add_record(load_record(file))
+                entries = catalogue.add_record(load_record(file))
             except (JaxmarkError, OSError) as error:
                 status = 2
                 _refused(as_json, file, error)
                 continue
-            fresh = sum(one.status == "added" for one in kept)
-            said = f"{len(kept)} records, {fresh} new" if len(kept) > 1 else f"record {kept[0].status}"
-            answer(as_json, {"file": str(file), "records": len(kept), "new": fresh}, f"{file}: {said}")
+            new = sum(entry.status == "added" for entry in entries)
+            text = f"{len(entries)} records, {new} new" if len(entries) > 1 else f"record {entries[0].status}"
+            answer(as_json, {"file": str(file), "records": len(entries), "new": new}, f"{file}: {text}")
     sys.exit(status)
 
 
@@ -86,15 +89,15 @@ def _each_file(files: Sequence[Path]) -> Iterator[Path]:
 
 
 def _refused(as_json: bool, file: Path, error: Exception) -> None:
-    said = error_text(error)
+    text = error_text(error)
     if as_json:
-        answer(True, {"file": str(file), "refused": said}, "")
+        answer(True, {"file": str(file), "refused": text}, "")
     else:
-        say(f"{file}: refused. {said}")
+        say(f"{file}: refused. {text}")
 
 
-def _left(left: object) -> str:
-    names = list(left) if isinstance(left, dict) else []
+def _skipped_text(skipped: object) -> str:
+    names = list(skipped) if isinstance(skipped, dict) else []
     return f"; without {', '.join(map(repr, names[:3]))}{', …' * (len(names) > 3)}" if names else ""
 
 
@@ -102,11 +105,11 @@ def _left(left: object) -> str:
 @CATALOGUE
 @JSON
 def list_command(catalogue_file: Path, as_json: bool) -> None:
-    """List the originals. With --json, one object a line."""
+    """List the originals in a catalogue, one per line."""
     with Catalogue(catalogue_file, read_only=True) as catalogue:
         for entry in catalogue.originals():
-            held = f"{entry.vertices} vertices, {entry.records} records, {entry.recipients} recipients"
-            answer(as_json, entry._asdict(), f"{entry.id}  {entry.path}  {held}")
+            counts = f"{entry.vertices} vertices, {entry.records} records, {entry.recipients} recipients"
+            answer(as_json, entry._asdict(), f"{entry.id}  {entry.path}  {counts}")
 
 
 @catalogue_group.command(name="show")
@@ -114,7 +117,10 @@ def list_command(catalogue_file: Path, as_json: bool) -> None:
 @CATALOGUE
 @JSON
 def show_command(original: str, catalogue_file: Path, as_json: bool) -> None:
-    """Show what is known of ORIGINAL: its number, path, or the beginning of its hash."""
+    """Show the meshes, records and recipients of ORIGINAL.
+
+    ORIGINAL is given by its number, its path, or the beginning of its hash.
+    """
     with Catalogue(catalogue_file, read_only=True) as catalogue:
         shown = catalogue.show(original)
     lines = [f"{shown['id']}  {shown['path']}", f"SHA-256 {shown['content']}, added {shown['added']}"]
@@ -122,9 +128,12 @@ def show_command(original: str, catalogue_file: Path, as_json: bool) -> None:
         named = f"mesh {shape['name']!r}: " if shape["name"] else ""
         lines.append(f"{named}{shape['vertices']} vertices, {shape['faces']} faces")
         lines += [
-            f"  record {one['digest'][:16]} of a {one['content']}, key {one['key'][:16]}" for one in shape["records"]
+            f"  record {record['digest'][:16]} of a {record['content']}, key {record['key'][:16]}"
+            for record in shape["records"]
         ]
-        lines += [f"  copy for {one['recipient']}, key {one['key'][:16]}, {one['added']}" for one in shape["copies"]]
+        lines += [
+            f"  copy for {copy['recipient']}, key {copy['key'][:16]}, {copy['added']}" for copy in shape["copies"]
+        ]
     answer(as_json, shown, "\n".join(lines))
 
 
@@ -132,11 +141,14 @@ def show_command(original: str, catalogue_file: Path, as_json: bool) -> None:
 @click.argument("original")
 @CATALOGUE
 @click.option(
-    "--with-records", is_flag=True, help="Remove its records and recipients, too: its copies are traced no more."
+    "--with-records", is_flag=True, help="Also remove its records and recipients; its copies can then not be traced."
 )
 @JSON
 def remove_command(original: str, catalogue_file: Path, with_records: bool, as_json: bool) -> None:
-    """Remove ORIGINAL from the catalogue; its file stays."""
+    """Remove ORIGINAL from the catalogue; its file is not deleted.
+
+    ORIGINAL is given by its number, its path, or the beginning of its hash.
+    """
     with _existing(catalogue_file) as catalogue:
         entry = catalogue.remove(original, records=with_records)
     answer(as_json, entry._asdict(), f"removed {entry.path}")
@@ -147,12 +159,12 @@ def remove_command(original: str, catalogue_file: Path, with_records: bool, as_j
 @CATALOGUE
 @JSON
 def export_command(file: Path, catalogue_file: Path, as_json: bool) -> None:
-    """Write all that the catalogue holds to FILE, as JSON Lines."""
+    """Write the whole content of the catalogue to FILE, as JSON Lines."""
     if file.resolve() == catalogue_file.resolve():
         raise JaxmarkError(f"FILE and --catalogue are the same file, {file}; give another name.")
     with Catalogue(catalogue_file, read_only=True) as catalogue:
-        counted = export_catalogue(catalogue, file)
-    answer(as_json, counted._asdict(), f"{_counts(counted)} → {file}")
+        counts = export_catalogue(catalogue, file)
+    answer(as_json, counts._asdict(), f"{_counts_text(counts)} → {file}")
 
 
 @catalogue_group.command(name="import")
@@ -160,19 +172,25 @@ def export_command(file: Path, catalogue_file: Path, as_json: bool) -> None:
 @CATALOGUE
 @JSON
 def import_command(file: Path, catalogue_file: Path, as_json: bool) -> None:
-    """Merge FILE, an export, into the catalogue, which is made if it does not exist; all of it or nothing."""
+    """Merge FILE, which `jaxmark catalogue export` wrote, into the catalogue.
+
+    If the catalogue does not exist, it is created. If FILE is refused, nothing of it is imported.
+    """
     if not file.is_file():
-        raise JaxmarkError(f"{file} is no file that could be imported.")
+        raise JaxmarkError(f"{file} is not a file; give one that `jaxmark catalogue export` wrote.")
     with Catalogue(catalogue_file) as catalogue:
-        counted = import_catalogue(catalogue, file)
-    answer(as_json, counted._asdict(), f"{_counts(counted)}, new in {catalogue_file}")
+        counts = import_catalogue(catalogue, file)
+    answer(as_json, counts._asdict(), f"{_counts_text(counts)}, new in {catalogue_file}")
 
 
 @catalogue_group.command(name="check")
 @CATALOGUE
 @JSON
 def check_command(catalogue_file: Path, as_json: bool) -> None:
-    """Check that the catalogue is whole, and the originals' files are there and unchanged; else exit status 1."""
+    """Check that the catalogue is undamaged, and that the files of all originals exist and are unchanged.
+
+    Exit status 0 if so, 1 if a file is missing or changed, 2 if the catalogue is damaged.
+    """
     wrong = 0
     with Catalogue(catalogue_file, read_only=True) as catalogue:
         if problems := catalogue.database.problems():
@@ -186,18 +204,18 @@ def check_command(catalogue_file: Path, as_json: bool) -> None:
             elif problem is not None:
                 answer(False, {}, f"{entry.id}  {entry.path}: {problem}")
     if not as_json:
-        answer(False, {}, f"{count - wrong} of {count} originals are there, unchanged")
+        answer(False, {}, f"{count - wrong} of {count} originals exist and are unchanged")
     sys.exit(1 if wrong else 0)
 
 
 def _existing(catalogue_file: Path) -> Catalogue:
-    """A catalogue to change, which must exist: a mistyped name makes no new one."""
+    """Open an existing catalogue for writing; a mistyped name does not create a new one."""
     Catalogue(catalogue_file, read_only=True).close()
     return Catalogue(catalogue_file)
 
 
-def _counts(counted: tuple[int, ...]) -> str:
-    originals, records, recipients, verdicts = counted
+def _counts_text(counts: tuple[int, ...]) -> str:
+    originals, records, recipients, verdicts = counts
     return f"{originals} originals, {records} records, {recipients} recipients, {verdicts} verdicts"
 
 
@@ -206,7 +224,11 @@ def _counts(counted: tuple[int, ...]) -> str:
 @click.argument("original", type=FILE)
 @CATALOGUE
 @KEY
-@click.option("--output", type=FILE, help="File for the copy.  [default: ORIGINAL's name, - and RECIPIENT, here]")
+@click.option(
+    "--output",
+    type=FILE,
+    help="File for the copy.  [default: in the working directory, named after ORIGINAL and RECIPIENT: model-alice.ply]",
+)
 @budget_options(limits=False)
 @QUIET
 @JSON
@@ -219,16 +241,17 @@ def mark_for_command(
     budget: Budget,
     as_json: bool,
 ) -> None:
-    """Make the copy of ORIGINAL for RECIPIENT, and keep both in the catalogue, for `catalogue find` and `identify`.
+    """Make the copy of ORIGINAL for RECIPIENT, and store both in the catalogue.
 
-    The recipient is in the catalogue before the copy is there. The same recipient always gets the same copy.
+    Needs the key. Writes the copy and its record. `jaxmark catalogue find` and `jaxmark identify` trace the copy by the
+    catalogue. The recipient is stored before the copy is written. The same recipient always gets the same copy.
     """
     if output is None:
         if not _PLAIN.fullmatch(recipient):
             raise JaxmarkError(f"{recipient!r} cannot be part of a file's name; name the copy by --output.")
         output = Path(f"{original.stem}-{recipient}{original.suffix}")
     if os.path.realpath(output) in map(os.path.realpath, (original, key_file, catalogue_file)):
-        raise JaxmarkError(f"{output} is the original, the key or the catalogue; give another name by --output.")
+        raise JaxmarkError(f"{output} is the original, the key or the catalogue; name the copy by --output.")
     key = read_key(key_file)
     current().doing(f"marking {original} for {recipient}")
     with Catalogue(catalogue_file) as catalogue:
@@ -239,13 +262,13 @@ def mark_for_command(
 def mark_copy(
     catalogue: Catalogue, recipient: str, original: Path, copy: Path, key: Key, budget: Budget
 ) -> FileOutcome:
-    """Make a recipient's copy, with its record beside it, and keep both in the catalogue.
+    """Make a recipient's copy and its record, and store original, record and recipient in the catalogue.
 
     Args:
-        catalogue: to which the original is added, if it is not in it.
-        recipient: identifier.
-        original: the mesh file.
-        copy: file for the copy.
+        catalogue: the catalogue; the original is added to it, if necessary.
+        recipient: the recipient's identifier.
+        original: the original's mesh file.
+        copy: path of the copy; the record is written next to it.
         key: the key to mark with.
         budget: how strong the mark may be, see `embed`.
 
@@ -256,7 +279,8 @@ def mark_copy(
     record = copy.with_name(copy.name + RECORD_SUFFIX)
     with replacing(copy) as draft, replacing(record) as record_draft:
         outcome = mark_file(original, draft, record_draft, key=key, recipient=recipient, budget=budget)
-        # In the catalogue first: a copy that is not known is not traced, a recipient without a copy does no harm.
+        # The recipient is stored first: a recipient without a copy does no harm, but a copy without a recipient in the
+        # catalogue could not be traced.
         catalogue.add_copy(Record.load(record_draft), recipient, file_hash(draft))
     places = {str(draft): str(copy), str(record_draft): str(record)}
     text = outcome.text

@@ -1,8 +1,9 @@
-"""The command line: files in, files and one answer out.
+"""The command line: every command reads files, writes files, and prints one answer.
 
-Exit status 0: done, or detected. 1: `detect` found nothing, or `identify` nobody. 2: refused, with one sentence on
-standard error and no output file. With --json, standard output holds exactly one JSON object. For a folder, there is a
-line, or such an object, for each file, and the exit status is the worst of theirs.
+The exit status is 0 if the command is done or a mark is detected, and 1 if `detect` detects nothing or `identify`
+accuses nobody. It is 2 if the input is refused; then standard error has one sentence, and no output file is written.
+With --json, standard output is exactly one JSON object. For a folder, it is one line or one object per file, and the
+exit status is the largest of all files.
 """
 
 import math
@@ -64,22 +65,22 @@ from jaxmark.watermark.tracing.tracer import identify
 
 @click.group(
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog="Exit status: 0 done or detected, 1 nothing detected, 2 refused. Compiled programs are kept in"
-    " ~/.cache/jaxmark for the next command; JAX_ENABLE_COMPILATION_CACHE=false keeps none.",
+    epilog="Exit status: 0 if done or detected, 1 if nothing is detected, 2 if the input is refused. Compiled programs"
+    " are cached in ~/.cache/jaxmark for later commands; JAX_ENABLE_COMPILATION_CACHE=false turns the cache off.",
 )
 @click.version_option(package_name="jaxmark", prog_name="jaxmark")
 def cli() -> None:
-    """Hide a keyed message in the vertex positions of a mesh, and read it again from a suspect.
+    """Hide a keyed message in the vertex positions of a mesh, and read it from a suspect.
 
     \b
-    A first round:
+    A first example:
       jaxmark keygen owner.key
       jaxmark embed model.ply marked.ply --key owner.key --message 0123456789abcdef
       jaxmark attack marked.ply suspect.ply noise 0.001
       jaxmark detect suspect.ply --original model.ply --key owner.key
 
-    Meshes are OBJ, PLY, OFF, STL, GLB, glTF or 3MF; point clouds PLY, XYZ, LAS or LAZ, too. Keep the key secret, and
-    keep the original: detection needs both, but for marks of `field` and `local`.
+    Mesh files are OBJ, PLY, OFF, STL, GLB, glTF or 3MF. Point clouds are PLY, XYZ, LAS or LAZ. Keep the key secret.
+    Keep the original, too: only marks of the blind schemes `field` and `local` are detected without it.
     """  # noqa: D301
 
 
@@ -87,9 +88,10 @@ def cli() -> None:
 @click.argument("keyfile", type=FILE)
 @JSON
 def keygen(keyfile: Path, as_json: bool) -> None:
-    """Make a key of 256 random bits in a new file that only you can read.
+    """Make a key of 256 random bits.
 
-    The file is never overwritten, and there is no copy: without it a mark can be neither read nor proven.
+    Writes KEYFILE, which only you can read; a file that exists is not overwritten. Keep a backup: without the key, a
+    mark can be neither read nor proven.
     """
     key = new_key()
     save_key(key, keyfile)
@@ -101,14 +103,14 @@ def keygen(keyfile: Path, as_json: bool) -> None:
 @click.argument("marked", type=FILE)
 @KEY
 @message_options(
-    "Hexadecimal digits; 16 of them are 64 bits.",
-    "The message as text instead, in UTF-8: 8 bits for most letters.",
-    "Instead of a message: say nothing but that the mark is there.",
+    "The message in hexadecimal digits; 16 digits are 64 bits.",
+    "The message as text, in UTF-8; most letters take 8 bits.",
+    "Embed a presence mark: it has no message, and proves only that the mesh is marked.",
 )
-@click.option("--recipient", help="Instead of a message: the recipient of this copy, for `jaxmark identify`.")
+@click.option("--recipient", help="Mark a copy for this recipient instead of a message; see `jaxmark identify`.")
 @budget_options(
-    noise_help="Noise that the message must survive with half of the vertices lost: half width, relative to the mean"
-    " distance of vertices to the centre.  [default: none; what it survives is told]"
+    noise_help="Noise that the message must survive with half of the vertices lost: half width of the uniform noise,"
+    " relative to the mean distance of vertices to the centre.  [default: none; the noise survived is printed]"
 )
 @MESHES
 @click.option(
@@ -117,8 +119,8 @@ def keygen(keyfile: Path, as_json: bool) -> None:
     type=Schemes(),
     default=DEFAULT_SCHEME,
     show_default=True,
-    help=f"Scheme that carries the bits, of {', '.join(NAMES)}; marks of `field` and `local` are read without the"
-    " original. Several with commas between, such as keyed,field, mark for both.",
+    help=f"Scheme that carries the bits: {', '.join(NAMES)}. Marks of `field` and `local` are read without the"
+    " original. Several schemes, separated by commas (keyed,field), mark the mesh with each of them.",
 )
 @click.option("--record", "record_file", type=FILE, help=f"File for the record.  [default: MARKED{RECORD_SUFFIX}]")
 @WORKERS
@@ -138,14 +140,20 @@ def embed_command(
     workers: int,
     as_json: bool,
 ) -> None:
-    """Mark ORIGINAL and write MARKED, of the same format; or every mesh file of a folder into another folder.
+    """Embed a message in ORIGINAL: a mesh file, or a folder of mesh files.
 
-    Only positions change (and normals, where the file has them); materials, colours, groups and comments stay byte by
-    byte. A record is written beside MARKED: it holds no secret, and with it nothing about the mark needs remembering.
+    Needs the key and a message, --presence or --recipient.
 
-    Of a file of several meshes, all are marked that can carry the message; the others are left alone and named.
+    Writes MARKED, in the same format, and its record. Only positions change, and normals where the file has them;
+    materials, colours, groups and comments stay the same, byte by byte. The record holds no secret. `jaxmark detect`
+    takes scheme and payload from it.
 
-    For a folder, each file gets a line of output, and a refused file does not stop the others.
+    In a file of several meshes, all that can carry the message are marked; the output names those left unchanged.
+
+    If ORIGINAL is a folder, MARKED is the folder for the marked files, and one line is printed per file. A refused file
+    does not stop the others.
+
+    Exit status 0 if ORIGINAL is marked, 2 if it or a file of it is refused.
     """
     if presence and message is not None:
         raise JaxmarkError("Give either --message or --presence.")
@@ -165,7 +173,7 @@ def embed_command(
         outcome = mark(original, marked, record_file, key=read_key(key_file), doing=current().doing)
         return answer(as_json, outcome.values, outcome.text)
     if record_file is not None:
-        raise JaxmarkError("Each file of a folder has a record beside it; leave out --record.")
+        raise JaxmarkError("In a folder, each marked file gets a record next to it; leave out --record.")
     work = partial(_mark_member, partial(mark, key=read_key(key_file)), marked)
     mesh_files(original)  # refuses a folder without any before another is made
     marked.mkdir(parents=True, exist_ok=True)
@@ -174,36 +182,42 @@ def embed_command(
 
 @cli.command(name="detect")
 @click.argument("suspect", type=FILE)
-@click.option("--original", type=FILE, help="The unmarked mesh; marks of `field` and `local` are read without it.")
+@click.option("--original", type=FILE, help="The unmarked mesh; not needed for marks of `field` and `local`.")
 @KEY
-@click.option("--bits", type=int, help=f"Payload, a multiple of 8.  [default: the record's, else {DEFAULT_BITS}]")
+@click.option(
+    "--bits", type=int, help=f"Payload in bits, a multiple of 8.  [default: the record's, else {DEFAULT_BITS}]"
+)
 @message_options(
-    "A message that you claim is there; it can be proven even where it cannot be read.",
-    "The claimed message as text instead.",
-    "Claim that a presence mark is there; its record says so, too.",
+    "The claimed message, in hexadecimal digits. Testing a claim detects marks that are too weak to be decoded.",
+    "The claimed message as text.",
+    "Claim a presence mark. Not needed with its record, which says that it is one.",
 )
 @click.option(
     "--record",
     "record_file",
     type=FILE,
-    help="The mark's record, which gives scheme and payload, and binds key and original.",
+    help="The mark's record. It gives scheme and payload, and it is checked against key and original.",
 )
 @MESHES
 @click.option(
     "--scheme",
     "schemes",
     type=Schemes(),
-    help="Without a record: scheme that carries the bits; several as in `embed`, to unite what they prove."
-    f"  [default: {DEFAULT_SCHEME}, without --original any blind one]",
+    help="Scheme that carries the bits, if there is no record. Several, as in `embed`, combine their evidence."
+    f"  [default: {DEFAULT_SCHEME}; without --original, all blind schemes]",
 )
 @ALIGN
 @click.option(
     "--commitment", "commitment_file", type=FILE, help="Timestamped commitment to the record, from `jaxmark commit`."
 )
-@click.option("--obtained", default="", help="When and where SUSPECT was got, for the dossier.")
-@click.option("--report", type=FILE, help="Folder for a picture of how SUSPECT was aligned (needs the extra `plot`).")
-@click.option("--dossier", type=FILE, help="Folder for a page that shows a detection to others (extra `plot`).")
-@click.option("--charges", is_flag=True, help="Say what each choice of the reading cost, too.")
+@click.option("--obtained", default="", help="When and where SUSPECT was obtained, for the dossier.")
+@click.option("--report", type=FILE, help="Folder for a picture of the registration (needs the extra `plot`).")
+@click.option(
+    "--dossier", type=FILE, help="Folder for a page that explains a detection to others (needs the extra `plot`)."
+)
+@click.option(
+    "--charges", is_flag=True, help="Print how much each choice of the reader costs of the significance budget."
+)
 @ALPHA
 @WORKERS
 @QUIET
@@ -228,33 +242,36 @@ def detect_command(
     workers: int,
     as_json: bool,
 ) -> None:
-    """Look for a mark in SUSPECT: a file in any pose, with the original's connectivity or not; or a folder of files.
+    """Detect a mark in SUSPECT: a mesh file, in any pose and with any connectivity, or a folder of such files.
 
-    Exit status 0 if the false-positive probability is at most --alpha, else 1. The probability holds for any suspect
-    made without the key, as long as key, original, record and a claimed message were fixed before it existed. A second
-    figure is for claims that nothing dates; a deposit dates them.
+    Needs the key and, except for the blind schemes `field` and `local`, the original. With the mark's record, the
+    original may be a copy that was saved in another format, rounded, moved as a whole or reordered.
 
-    Of files of several meshes, each mesh is compared with the one that looks like it, and what all of them prove is
-    united.
+    Prints the message and a bound on the false-positive probability. The bound holds for every suspect that was made
+    without the key, if key, original, record and a claimed message were fixed before the suspect existed. A second
+    bound holds even if they were chosen afterwards. A timestamped commitment (`jaxmark commit`) proves that the record
+    is older than the suspect.
 
-    Without --original, marks of the schemes `field` and `local` are read.
+    In files of several meshes, each mesh of the suspect is compared with the most similar mesh of the original, and
+    the evidence of all meshes is combined.
 
-    With its record, an original will do as you have it now: saved again in another format, rounded, moved, reordered.
+    If SUSPECT is a folder, one line is printed per file. --original and --record may then be folders, with files of
+    the same names.
 
-    For a folder, each file gets a line of output, and the exit status is the worst of all. --original and --record may
-    then be folders, too, with files of the same names.
+    Exit status 0 if the false-positive probability is at most --alpha, 1 if it is larger, 2 if SUSPECT is refused; for
+    a folder, the largest of all files.
     """
     if commitment_file is not None and record_file is None:
-        raise JaxmarkError("A commitment applies to a record: give the --record that is in it, too.")
+        raise JaxmarkError("--commitment is to a record; also give the --record that it contains.")
     if presence and (message is not None or bits):
         raise JaxmarkError("A presence mark has no message; leave out --message and --bits, or --presence.")
     named = schemes or ()
     blind = [name for name in named if name in BLIND_SCHEMES]
     if original is None or len(named) == len(blind) == 1:
         if named and not blind:
-            raise JaxmarkError(f"The scheme {named[0]!r} is read beside the original; give --original.")
+            raise JaxmarkError(f"The scheme {named[0]!r} is not blind; give --original.")
         if align != "auto" or report is not None or dossier is not None:
-            raise JaxmarkError("--align, --report and --dossier are for reading beside the original; give --original.")
+            raise JaxmarkError("--align, --report and --dossier are for non-blind reading; give --original.")
         original = None
     reader = FileReader(
         read_key(key_file),
@@ -280,11 +297,16 @@ def detect_command(
 @click.argument("suspect", type=FILE)
 @click.option("--original", type=FILE, help="The unmarked mesh.")
 @KEY
-@click.option("--recipients", type=FILE, help="Text file with the recipients of copies, one identifier per line.")
+@click.option("--recipients", type=FILE, help="Text file of all recipients of copies, one identifier per line.")
 @click.option(
-    "--catalogue", "catalogue_file", type=FILE, help="Catalogue that knows originals and recipients, in place of both."
+    "--catalogue",
+    "catalogue_file",
+    type=FILE,
+    help="Catalogue that holds originals and recipients; replaces --original and --recipients.",
 )
-@click.option("--record", "record_file", type=FILE, help="The record of a copy, which binds key and original.")
+@click.option(
+    "--record", "record_file", type=FILE, help="The record of any copy; it is checked against key and original."
+)
 @click.option(
     "--top", type=click.IntRange(1), default=10, show_default=True, help="Number of recipients in the ranking."
 )
@@ -306,42 +328,46 @@ def identify_command(
 ) -> None:
     """Name the recipients whose copies SUSPECT was made from.
 
-    Exit status 0 if somebody is accused: if the probability that any innocent recipient scores so high is at most
-    --alpha; else 1.
+    Needs the key, and either the original and a list of recipients, or a catalogue. Prints each accused recipient. A
+    recipient is accused if the probability that any innocent recipient has as high a score is at most --alpha.
+
+    Exit status 0 if a recipient is accused, 1 if nobody is accused, 2 if SUSPECT is refused.
     """
     if not 0 < alpha < 1:
         raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
     if catalogue_file is not None:
         if original is not None or recipients is not None or record_file is not None:
-            raise JaxmarkError("A catalogue knows originals, recipients and records; leave those out.")
+            raise JaxmarkError(
+                "A catalogue holds originals, recipients and records; leave out --original, --recipients and --record."
+            )
         identify_by_catalogue(suspect, catalogue_file, key_file, align, alpha, as_json)
     if original is None or recipients is None:
-        raise JaxmarkError("Give --original and --recipients, or a --catalogue that knows them.")
+        raise JaxmarkError("Give --original and --recipients, or a --catalogue that holds them.")
     try:
         names = [line for line in recipients.read_text(encoding="utf-8").splitlines() if line]
     except UnicodeDecodeError:
-        raise JaxmarkError(f"{recipients} is no text in UTF-8; give one identifier a line.") from None
+        raise JaxmarkError(f"{recipients} is not text in UTF-8; write one identifier per line.") from None
     if not names:
-        raise JaxmarkError(f"{recipients} names nobody; give one identifier a line.")
+        raise JaxmarkError(f"{recipients} contains no recipient; write one identifier per line.")
     record = None if record_file is None else Record.load(record_file)
     key = read_key(key_file)
     current().doing(f"reading {suspect} and {original}")
     meshes = load_mesh(suspect), load_mesh(original)
-    current().doing(f"looking for the copies of {len(names)} recipients in {suspect}")
-    found = identify(meshes[0], names, original=meshes[1], key=key, record=record, top=top, align=align)
-    accused = [one for one in found if one.log10_p <= math.log10(alpha)]
+    current().doing(f"testing the copies of {len(names)} recipients in {suspect}")
+    ranking = identify(meshes[0], names, original=meshes[1], key=key, record=record, top=top, align=align)
+    accused = [entry for entry in ranking if entry.log10_p <= math.log10(alpha)]
     values = {
-        "accused": [one.recipient for one in accused],
-        "ranking": [one._asdict() for one in found],
+        "accused": [entry.recipient for entry in accused],
+        "ranking": [entry._asdict() for entry in ranking],
         "recipients": len(names),
     }
     lines = [
-        f"{one.recipient}: score {one.score:.1f}, probability "
-        + (f"about {power(one.log10_p)}, an estimate: {'; '.join(one.caveats)}" if one.caveats else "")
-        + ("" if one.caveats else f"at most {power(one.log10_p)}")
-        for one in accused
+        f"{entry.recipient}: score {entry.score:.1f}, probability "
+        + (f"about {power(entry.log10_p)}, an estimate: {'; '.join(entry.caveats)}" if entry.caveats else "")
+        + ("" if entry.caveats else f"at most {power(entry.log10_p)}")
+        for entry in accused
     ]
-    answer(as_json, values, "\n".join(lines) or f"nobody of {len(names)} is accused (--alpha {alpha:g})")
+    answer(as_json, values, "\n".join(lines) or f"none of {len(names)} recipients is accused (--alpha {alpha:g})")
     sys.exit(0 if accused else 1)
 
 
@@ -352,24 +378,30 @@ def identify_command(
 )
 @JSON
 def commit_command(records: tuple[Path, ...], output: Path, as_json: bool) -> None:
-    """Make a deposit of RECORDS, to be dated before anybody claims anything; it shows nothing of what they commit to.
+    """Commit to RECORDS, so that a timestamp can prove that they existed before a suspect.
 
-    Publish its root, sign a commit with it, print it; or send OUTPUT.tsq to a time-stamping authority (RFC 3161) and
-    keep the answer. `jaxmark detect --commitment OUTPUT` then counts a dated claim in full, less log10 of their number.
+    Writes OUTPUT, the commitment, which reveals nothing of the records; and OUTPUT.tsq, a request for a timestamp. To
+    timestamp the commitment, publish the root that is printed, or print it on paper, or sign a commit with it; or send
+    OUTPUT.tsq to a timestamping authority (RFC 3161), and keep the answer.
+
+    `jaxmark detect --commitment OUTPUT` then prints the bound on the false-positive probability that holds if the
+    commitment is older than the suspect. It charges log10 of the number of records.
     """
     check_distinct(output=output, **{f"record {place}": path for place, path in enumerate(records)})
-    found = make_commitment(load_record(path).digest() for path in records)
+    made = make_commitment(load_record(path).digest() for path in records)
     request = output.with_name(output.name + ".tsq")
     with replacing(request) as draft:
-        write_atomically(draft, found.timestamp_request())
-        write_atomically(output, found.to_json().encode())
-    values = {"root": found.root, "records": len(found.digests), "commitment": str(output), "request": str(request)}
-    size = f"{len(found.digests)} record{'s' if len(found.digests) > 1 else ''}"
-    answer(as_json, values, f"{size} → {output}, root {found.root}, request → {request}")
+        write_atomically(draft, made.timestamp_request())
+        write_atomically(output, made.to_json().encode())
+    values = {"root": made.root, "records": len(made.digests), "commitment": str(output), "request": str(request)}
+    size = f"{len(made.digests)} record{'s' if len(made.digests) > 1 else ''}"
+    answer(as_json, values, f"{size} → {output}, root {made.root}, request → {request}")
 
 
 # click keeps the lines of a paragraph that starts with \b.
-_KINDS = "\n".join(["\b", "KIND, and what STRENGTH is:", *(f"{name}: {entry.unit}" for name, entry in ATTACKS.items())])
+_KINDS = "\n".join(
+    ["\b", "Each KIND and the meaning of its STRENGTH:", *(f"{name}: {entry.unit}" for name, entry in ATTACKS.items())]
+)
 
 
 @cli.command(name="attack", epilog=_KINDS)
@@ -386,10 +418,10 @@ _KINDS = "\n".join(["\b", "KIND, and what STRENGTH is:", *(f"{name}: {entry.unit
 @QUIET
 @JSON
 def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int, as_json: bool) -> None:
-    """Apply one attack or several to a mesh, to see what a mark survives.
+    """Apply one or more attacks to a mesh, in the given order.
 
-    OUT is the file IN with other positions, or a new file if faces change. The RMS displacement is printed if the
-    connectivity stays.
+    Writes OUT, in the format of IN. If the connectivity stays, OUT is the file IN with other positions, and the RMS
+    displacement is printed; else OUT is a new file.
     """
     steps = _steps(words)
     check_suffix(source, target)
@@ -398,7 +430,7 @@ def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int
     scene = load_scene(source)
     if (
         len(scene.meshes) + len(scene.skipped) > 1 and source.suffix.lower() != ".obj"
-    ):  # whose objects lie in the same coordinates
+    ):  # the objects of an OBJ file share one coordinate system, and are attacked as one mesh
         return _attack_scene(source, target, steps, seed, as_json)
     mesh = load_mesh(source)
     with replacing(target) as draft:
@@ -407,29 +439,34 @@ def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int
         save_mesh(attacked, draft, like=source if same else None)
         change = distortion.displacement_size(mesh, load_mesh(draft))._asdict() if same else {"rms": None, "max": None}
     values = {"attacks": steps, "seed": seed, "vertices": len(attacked.vertices), "faces": len(attacked.faces)}
-    said = " + ".join(f"{kind} {strength:g}" for kind, strength in steps)
     size = f"{len(attacked.vertices)} vertices and {len(attacked.faces)} faces"
-    how = f"RMS {change['rms']:.3g} of the diagonal" if same else f"a mesh of {size}"
-    answer(as_json, {**values, **change}, f"{said} → {target}, {how}")
+    effect = f"RMS {change['rms']:.3g} of the diagonal" if same else f"a mesh of {size}"
+    answer(as_json, {**values, **change}, f"{_steps_text(steps)} → {target}, {effect}")
+
+
+def _steps_text(steps: list[tuple[str, float]]) -> str:
+    return " + ".join(f"{kind} {strength:g}" for kind, strength in steps)
 
 
 def _attack_scene(source: Path, target: Path, steps: list[tuple[str, float]], seed: int, as_json: bool) -> None:
-    """Attack each mesh of a file; they keep their connectivity, as their file has it."""
+    """Attack each mesh of a file of several meshes; attacks that change the connectivity are refused."""
     scene = load_scene(source)
     meshes = scene.meshes
     attacked = {name: chain(mesh, steps, seed=seed) for name, mesh in meshes.items()}
-    said = " + ".join(f"{kind} {strength:g}" for kind, strength in steps)
     for name, mesh in meshes.items():
         if not same_connectivity(mesh, attacked[name]):
-            raise JaxmarkError(f"{said} changes faces, which a file of several meshes keeps; save them apart.")
+            raise JaxmarkError(
+                f"{_steps_text(steps)} changes faces, which is not possible in a file of several meshes; save each"
+                " mesh in a file of its own."
+            )
     with replacing(target) as draft:
         save_scene(attacked, draft, like=source)
         after = load_scene(draft).meshes
     sizes = {name: distortion.displacement_size(mesh, after[name])._asdict() for name, mesh in meshes.items()}
     values = {"attacks": steps, "seed": seed, "meshes": sizes, "skipped": scene.skipped}
-    largest = max(one["rms"] for one in sizes.values())
-    lines = [f"{said} → {target}, {len(meshes)} meshes, RMS up to {largest:.3g} of their diagonals"]
-    lines += [f"left alone: {name!r}: {reason}" for name, reason in scene.skipped.items()]
+    largest = max(size["rms"] for size in sizes.values())
+    lines = [f"{_steps_text(steps)} → {target}, {len(meshes)} meshes, RMS up to {largest:.3g} of their diagonals"]
+    lines += [f"left unchanged: {name!r}: {reason}" for name, reason in scene.skipped.items()]
     answer(as_json, values, "\n".join(lines))
 
 
@@ -439,63 +476,74 @@ def _steps(words: tuple[str, ...]) -> list[tuple[str, float]]:
     for kind in kinds:
         get_attack(kind)
     if len(kinds) != len(strengths):
-        raise JaxmarkError(f"Give the strength of {kinds[-1]}, too: {get_attack(kinds[-1]).unit}.")
+        unit = get_attack(kinds[-1]).unit
+        raise JaxmarkError(f"The attack {kinds[-1]} has no strength; give it after the name: {unit}.")
     try:
         return [(kind, float(strength)) for kind, strength in zip(kinds, strengths, strict=True)]
     except ValueError as error:
-        raise JaxmarkError(f"A strength is a number: {error}.") from None
+        raise JaxmarkError(f"A strength must be a number: {error}.") from None
 
 
 @cli.command()
 @click.argument("original", type=FILE)
 @click.argument("distorted", type=FILE)
-@click.option("--pictures", is_flag=True, help="Compare pictures of the meshes, too; takes many seconds.")
+@click.option("--pictures", is_flag=True, help="Also compare rendered pictures of the meshes; takes many seconds.")
 @QUIET
 @JSON
 def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> None:
-    """Measure how DISTORTED differs from ORIGINAL, by all metrics.
+    """Measure the distortion of DISTORTED, compared with ORIGINAL, by all metrics.
 
-    rms, max, mrms, hausdorff and gl are relative to the original's bounding-box diagonal, dame is in radians, shading
-    in just noticeable differences, point_to_plane in distances of nearest points; the others lie between 0 and 1. Of
-    point clouds, only rms, max and point_to_plane are known. flip and ssim compare pictures, which takes many
-    seconds, and are left out without --pictures. Needs the extra `align`, with --pictures `render`.
+    Prints one line per metric. rms, max, mrms, hausdorff and gl are relative to the original's bounding-box diagonal.
+    dame is in radians, shading in just noticeable differences, and point_to_plane in distances of neighbouring points.
+    The other metrics are between 0 and 1. Point clouds have only rms, max and point_to_plane. flip and ssim compare
+    rendered pictures, and are measured with --pictures only.
+
+    Needs the extra `align`, and with --pictures the extra `render`.
     """
     first, second = load_mesh(original), load_mesh(distorted)
     metrics = distortion.metrics_of(first, second) + distortion.RENDERED * pictures
     current().doing(f"comparing {original} and {distorted} by {', '.join(metrics)}")
     compared = distortion.compare(first, second, metrics)._asdict()
-    found = {name: compared[name] for name in metrics}
+    values = {name: compared[name] for name in metrics}
     lines = [
         f"{name:<14} {'needs the same connectivity' if value is None else f'{value:.6g}'}"
-        for name, value in found.items()
+        for name, value in values.items()
     ]
-    answer(as_json, found, "\n".join(lines))
+    answer(as_json, values, "\n".join(lines))
 
 
 @cli.command(name="capacity")
 @click.argument("mesh", type=FILE)
 @budget_options(
     noise=NOISE,
-    noise_help="Noise that the message must survive: half width, relative to the mean distance of vertices to the"
-    " centre.",
+    noise_help="Noise that the message must survive: half width of the uniform noise, relative to the mean distance of"
+    " vertices to the centre.",
 )
 @click.option(
-    "--coverage", type=float, default=COVERAGE, show_default=True, help="Share of the vertices that may be left."
+    "--coverage",
+    type=float,
+    default=COVERAGE,
+    show_default=True,
+    help="Fraction of the vertices that remains after cropping.",
 )
 @click.option(
-    "--scheme", type=click.Choice(NAMES), default=DEFAULT_SCHEME, show_default=True, help="Scheme that carries them."
+    "--scheme",
+    type=click.Choice(NAMES),
+    default=DEFAULT_SCHEME,
+    show_default=True,
+    help="Scheme that carries the bits.",
 )
 @QUIET
 @JSON
 def capacity_command(mesh: Path, budget: Budget, coverage: float, scheme: str, as_json: bool) -> None:
-    """Say how many bits can be hidden in MESH so that they survive noise and the loss of vertices."""
+    """Compute the largest payload, in bits, that MESH carries so that it survives noise and the loss of vertices."""
     loaded = load_mesh(mesh)
     bounds, noise = budget.bounds(loaded), budget.noise
-    current().doing(f"measuring the room in {mesh}")
+    current().doing(f"computing the capacity of {mesh}")
     bits = capacity(loaded, budget, coverage=coverage, scheme=scheme)
     values = {"bits": bits, "budget": bounds.rms, "limits": bounds.limits, "noise": noise, "coverage": coverage}
-    said = f"{bits} bits at {bounds}, noise {noise:g}, coverage {coverage:g}"
-    answer(as_json, values, said if bits else f"{said}; `embed` says what less a mark in it survives")
+    text = f"{bits} bits at {bounds}, noise {noise:g}, coverage {coverage:g}"
+    answer(as_json, values, text if bits else f"{text}; `embed` without --noise prints the noise that a mark survives")
 
 
 @cli.command()
@@ -504,9 +552,10 @@ def capacity_command(mesh: Path, budget: Budget, coverage: float, scheme: str, a
 @QUIET
 @JSON
 def demo(mesh: Path | None, output: Path, as_json: bool) -> None:
-    """Mark MESH, attack it, read it again, and write tables and pictures. Without MESH, a sample is used.
+    """Mark MESH with each non-blind scheme, attack the marked meshes, and read them.
 
-    Needs the extra `plot`, and `attacks` for the sample.
+    Without MESH, a sample mesh is used. Writes the marked meshes with their records, a table and pictures to the
+    folder --output. Needs the extra `plot`, and for the sample mesh the extra `attacks`.
     """
     from jaxmark.app.demo import run_demo, verdict
 
@@ -522,7 +571,7 @@ def demo(mesh: Path | None, output: Path, as_json: bool) -> None:
 @QUIET
 @JSON
 def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None:
-    """Run the study that a TOML FILE declares: what marks survive, with intervals and controls.
+    """Run the robustness study that a TOML FILE declares, with confidence intervals and controls.
 
     \b
       samples = 5
@@ -535,10 +584,10 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
       noise = [0.001, 0.005]
       smoothing = [10, 50]
 
-    Only meshes, with paths relative to the folder of FILE, and attacks are required. The command writes results.jsonl,
-    from which it resumes when run again, results.csv, rates.md and, with the extra `plot`, study.html, one page of
-    all to look at or to hand on, and its pictures: read.png, log10_p.png and log10_p_unfloored.png, where the evidence
-    goes on below the floor at -77.
+    Only meshes and attacks are required; paths of meshes are relative to the folder of FILE. Writes results.jsonl,
+    results.csv and rates.md. If the command is run again, it resumes from results.jsonl. With the extra `plot`, it also
+    writes study.html, a single page with all results, and the pictures read.png, log10_p.png and
+    log10_p_unfloored.png. The last picture shows the evidence without the floor of log10 p at -77.
     """  # noqa: D301
     study = load_study(file)
     output.mkdir(parents=True, exist_ok=True)
@@ -551,11 +600,11 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
         for module in ("matplotlib", "jinja2"):
             require(module, "plot")
     except JaxmarkError as error:
-        say(f"No page, no pictures: {error}")
+        say(f"No page and no pictures are written: {error}")
     else:
         current().doing("drawing pictures")
-        for of in get_args(Measure):
-            results.plot(of).save(output / f"{of}.png")
+        for measure in get_args(Measure):
+            results.plot(measure).save(output / f"{measure}.png")
         results.save_page(output / "study.html")
     answer(as_json, {"output": str(output), "readings": len(results.rows), "rates": results.rates()}, table.rstrip())
 
@@ -567,18 +616,19 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
 @QUIET
 @JSON
 def unpose_command(suspect: Path, original: Path, target: Path, as_json: bool) -> None:
-    """Bring SUSPECT, in any pose of the skeleton of ORIGINAL, back to the pose in which ORIGINAL is stored.
+    """Transform SUSPECT, which is posed by the skeleton of ORIGINAL, to the pose in which ORIGINAL is stored.
 
-    ORIGINAL is a GLB or glTF file with a skin, as it is, unmarked; SUSPECT has its vertices in its order. OUT is the
-    file SUSPECT with other positions, which `jaxmark detect` reads.
+    Needs ORIGINAL as an unmarked GLB or glTF file with a skin, and SUSPECT with its vertices in the order of ORIGINAL.
+    Writes OUT, the file SUSPECT with other positions, which `jaxmark detect` reads.
     """
     check_suffix(suspect, target)
     check_distinct(SUSPECT=suspect, ORIGINAL=original, OUT=target)
-    current().doing(f"bringing {suspect} back")
-    back = unpose(load_mesh(original), load_skin(original), load_mesh(suspect))
+    current().doing(f"removing the pose of {suspect}")
+    unposed = unpose(load_mesh(original), load_skin(original), load_mesh(suspect))
     with replacing(target) as draft:
-        save_mesh(back, draft, like=suspect)
-    answer(as_json, {"vertices": len(back.vertices), "output": str(target)}, f"{suspect} as {original} lies → {target}")
+        save_mesh(unposed, draft, like=suspect)
+    values = {"vertices": len(unposed.vertices), "output": str(target)}
+    answer(as_json, values, f"{suspect} in the pose of {original} → {target}")
 
 
 for command in (bench_command, bench_equal_command, bench_corpus_command, catalogue_group, mark_for_command):
@@ -587,7 +637,7 @@ catalogue_group.add_command(serve_command)
 
 
 def main() -> None:
-    """Run the command line; refused input ends with exit status 2 and one sentence."""
+    """Run the command line; for refused input, print one sentence and end with exit status 2."""
     end_by_exception()
     try:
         cli(standalone_mode=False)
@@ -605,20 +655,20 @@ def _refuse(sentence: str) -> NoReturn:
 
 
 def _each(folder: Path, as_json: bool, work: Work, workers: int) -> NoReturn:
-    """Work on the mesh files of a folder, print a line for each, and exit with the worst status."""
+    """Process the mesh files of a folder, print a line for each, and exit with the largest status of all."""
     files, status, start = mesh_files(folder), 0, time.monotonic()
     current().doing(f"0/{len(files)} files of {folder}")
     with closing(each(files, work, workers)) as results:
-        for done, (file, one) in enumerate(results, 1):
-            status = max(status, 2 if one.refused else 0 if one.done else 1)
-            answer(as_json, {"file": file.name, **one.values}, f"{file.name}: {one.text}")
+        for done, (file, outcome) in enumerate(results, 1):
+            status = max(status, 2 if outcome.refused else 0 if outcome.done else 1)
+            answer(as_json, {"file": file.name, **outcome.values}, f"{file.name}: {outcome.text}")
             pace = (time.monotonic() - start) / done
             current().doing(f"{done}/{len(files)} files of {folder}, {left_over((len(files) - done) * pace)}")
     sys.exit(status)
 
 
 def _mark_member(mark: Callable[..., FileOutcome], folder: Path, file: Path) -> FileOutcome:
-    """Mark a file of a folder into another."""
+    """Mark a file, and write the marked file and its record to a folder."""
     return mark(file, folder / file.name, folder / (file.name + RECORD_SUFFIX))
 
 
@@ -630,7 +680,10 @@ def _read_member(
     dossier: Path | None,
     file: Path,
 ) -> FileOutcome:
-    """Read a file of a folder, with a folder each for originals, records, reports and dossiers, or one file for all."""
+    """Read one suspect file of a folder.
+
+    Original and record may be folders, with files of the same names, or one file for all suspects.
+    """
     return reader.read(
         file,
         None if original is None else _member(original, file.name),
@@ -641,5 +694,5 @@ def _read_member(
 
 
 def _member(path: Path, name: str) -> Path:
-    """The path itself, or the file of that name in it if it is a folder."""
+    """Return the path, or the file of the given name in it if the path is a folder."""
     return path / name if path.is_dir() else path

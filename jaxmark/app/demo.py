@@ -1,4 +1,4 @@
-"""The demo: mark one mesh, attack it, read it again, and write tables and pictures of it to a folder."""
+"""The demo: mark a mesh, attack it, read it, and write a table and pictures to a folder."""
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -38,64 +38,66 @@ _PICTURED = ("noise 0.005", "smoothing 50", "quantisation 8")
 _CONTROL_ATTACK = ("noise", 0.001)
 _HISTORICAL = {"host": "Sohn et al.", "eigen": "Ohbuchi et al."}
 _TERMS = (
-    "wrong code bits: of the message as it is coded, before its errors are corrected; 50 % is what chance gives",
-    "attack RMS: how far the attack moves vertices (root mean square) over the diagonal of the bounding box;"
-    " 0.001 is 0.1 % of it",
-    "log10 p: chance of a false alarm is at most 10^p: -6 is one in a million, and counts as detected",
-    f"floor: {MIN_LOG10_P:.0f}, as no key of 256 bits proves more; paying for other readings leaves a little less",
-    "without floor: the same formula below it, which tells strong marks apart and proves nothing",
-    "unmarked, wrong key: controls, in which nothing must be found",
-    "claimed: log10 p where the message was known beforehand, and only has to be confirmed",
+    "wrong code bits: errors in the encoded message, before error correction; chance gives 50 %",
+    "attack RMS: displacement of the vertices by the attack (root mean square), relative to the diagonal of the"
+    " bounding box; 0.001 is 0.1 %",
+    "log10 p: base-10 logarithm of a bound on the false-positive probability; -6 is one in a million, and counts as"
+    " detected",
+    f"floor: {MIN_LOG10_P:.0f}, because a key of 256 bits cannot prove more; the choices of the reader cost a little"
+    " of it",
+    "without floor: the same bound without the floor; it compares strong marks, and proves nothing beyond the floor",
+    "unmarked, wrong key: controls, in which nothing must be detected",
+    "claimed: log10 p if the message is known beforehand, and only has to be confirmed",
 )
 
 
 class DemoRow(NamedTuple):
-    """One line of the demo's table."""
+    """One row of the demo's table."""
 
     scheme: str
     attack: str
-    control: Control  # what was read: the marked mesh, the same attack on the unmarked one, or with a wrong key
+    control: Control  # "marked", or a control: an unmarked mesh after the same attack, or reading with a wrong key
     rms: float  # RMS displacement by the attack, over the diagonal
-    wrong: float  # share of the code bits that are wrong
-    message_read: bool  # the exact message was read, and its tag fits
-    detected: bool  # the chance of a false alarm is at most one in a million
-    log10_p: float  # log10 p with the message unknown
-    log10_p_unfloored: float  # the same without its floor
-    log10_p_claimed: float  # log10 p with the message claimed
+    wrong: float  # fraction of the code bits that are wrong
+    message_read: bool  # whether the exact message was read, and its tag matches
+    detected: bool  # whether the false-positive probability is at most one in a million
+    log10_p: float  # log10 p of a message that is not claimed
+    log10_p_unfloored: float  # log10 p without its floor
+    log10_p_claimed: float  # log10 p of the claimed message
 
 
 def sample_mesh() -> Path:
-    """Path of the closed bunny of 28,088 vertices in pymeshlab's wheel.
+    """Return the path of the closed bunny of 28,088 vertices, which pymeshlab contains.
 
     Raises:
         JaxmarkError: if pymeshlab is not installed.
     """
     path = package_folder("pymeshlab", "attacks") / "tests" / "sample_meshes" / "bunny.obj"
     if not path.is_file():
-        raise JaxmarkError(f"This pymeshlab carries no sample mesh at {path}; give a mesh of your own.")
+        raise JaxmarkError(f"The installed pymeshlab has no sample mesh at {path}; give a mesh of your own.")
     return path
 
 
 def run_demo(
     source: str | os.PathLike[str] | None,
     output: str | os.PathLike[str],
-    say: Callable[[str], None],
+    log: Callable[[str], None],
     doing: Doing = quietly,
 ) -> list[DemoRow]:
-    """Mark a mesh with a fresh key and message, attack it, and read it again, by each scheme.
+    """Mark a mesh with a new key and message, attack it, and read it, with each non-blind scheme.
 
-    The default scheme marks as strongly as the eye allows, the historical ones with the same displacement. The folder
-    `output` gets the marked mesh of each scheme with its record, the table `table.md`, and the pictures `mark.png` and
-    `attacked.png`. The key is thrown away.
+    The default scheme marks as strongly as an invisible mark may be. The historical schemes mark with the same RMS
+    displacement. The folder `output` receives the marked mesh of each scheme with its record, the table `table.md`,
+    and the pictures `mark.png` and `attacked.png`. The key is not saved.
 
     Args:
         source: a mesh file, or None for `sample_mesh`.
-        output: a folder, which is made if it does not exist.
-        say: function that is called with each line of the account.
-        doing: is told what begins.
+        output: a folder, which is created if it does not exist.
+        log: callback, called with each line of the output.
+        doing: progress callback, called with a description of each step that begins.
 
     Returns:
-        The rows of the table, controls among them.
+        The rows of the table, including the controls.
 
     Raises:
         JaxmarkError: if an extra is missing, the mesh is unusable, or the folder cannot be written.
@@ -106,13 +108,13 @@ def run_demo(
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise JaxmarkError(f"The folder {folder} cannot be made: {error.strerror}.") from None
+        raise JaxmarkError(f"The folder {folder} cannot be created: {error.strerror}.") from None
     doing(f"reading {source}")
     mesh = load_mesh(source)
-    say(f"{source.name}: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
+    log(f"{source.name}: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
     key = new_key()
     message = os.urandom(8)
-    say(f"message {message.hex()} (64 bits), as strong as the eye allows ({Budget().bounds(mesh)})")
+    log(f"message {message.hex()} (64 bits), as strong as an invisible mark may be ({Budget().bounds(mesh)})")
     rows: list[DemoRow] = []
     displacement: float | None = None
     for scheme in (DEFAULT_SCHEME, *(name for name in SCHEMES if name != DEFAULT_SCHEME)):
@@ -121,56 +123,58 @@ def run_demo(
             marker = make_marker(mesh, key, bits=8 * len(message), scheme=scheme)
             marked, info = marker.embed(message, displacement)
         except JaxmarkError as error:
-            say(f"{scheme}: refused. {error}")
+            log(f"{scheme}: refused. {error}")
             continue
         displacement = displacement or info.rms
         target = folder / f"marked-{scheme}{source.suffix}"
         save_mesh(marked, target, like=source)
         write_atomically(f"{target}{RECORD_SUFFIX}", info.record.to_json().encode())
-        say(f"{scheme}: marked, RMS {info.rms:.6f}, max {info.max:.6f} of the diagonal → {target}")
+        log(f"{scheme}: marked, RMS {info.rms:.6f}, max {info.max:.6f} of the diagonal → {target}")
         marked = load_mesh(target)
         for row in _attack_and_read(marker, marked, message, doing):
-            say("  " + _line(row))
+            log("  " + _line(row))
             rows.append(row)
         if scheme == DEFAULT_SCHEME:
             doing("drawing pictures")
             _save_pictures(
                 folder, marker.original, marked, {row.attack: row for row in rows if row.control == "marked"}
             )
-            say(f"pictures → {folder / 'mark.png'}, {folder / 'attacked.png'}")
+            log(f"pictures → {folder / 'mark.png'}, {folder / 'attacked.png'}")
     if not rows:
-        raise JaxmarkError(f"No scheme can mark {source.name}.")
+        raise JaxmarkError(f"No scheme can mark {source.name}; give another mesh.")
     write_atomically(folder / "table.md", _table(rows).encode())
-    say(f"table → {folder / 'table.md'}")
+    log(f"table → {folder / 'table.md'}")
     for line in (*(f"  {term}" for term in _TERMS), "Verdict:", *(f"  {sentence}" for sentence in verdict(rows))):
-        say(line)
+        log(line)
     return rows
 
 
 def verdict(rows: Sequence[DemoRow]) -> list[str]:
-    """What the table says, in sentences for somebody who does not read it."""
-    said = []
+    """Summarise the table in sentences."""
+    sentences = []
     for scheme in dict.fromkeys(row.scheme for row in rows):
-        mine = [row for row in rows if row.scheme == scheme and row.control == "marked"]
-        read = f"{sum(row.message_read for row in mine)} of {len(mine)} copies, marked and attacked"
+        marked_rows = [row for row in rows if row.scheme == scheme and row.control == "marked"]
+        attacked = sum(row.attack != "none" for row in marked_rows)
+        count = f"{sum(row.message_read for row in marked_rows)} of {len(marked_rows)} marked copies"
+        count += f" ({attacked} of them attacked)"
         if scheme in _HISTORICAL:
-            said.append(
-                f"The historical scheme {scheme!r} ({_HISTORICAL[scheme]}), which moved vertices as far, read it from"
-                f" {read}."
+            sentences.append(
+                f"The historical scheme {scheme!r} ({_HISTORICAL[scheme]}), with the same RMS displacement, read the"
+                f" message from {count}."
             )
             continue
-        weakest = max((row.log10_p for row in mine if row.message_read), default=0.0)
-        floor = ", about the least that a key can prove" if weakest < MIN_LOG10_P + 1 else ""
-        said.append(f"The scheme {scheme!r} read the message from {read}.")
-        said.append(f"Each of its readings is a false alarm with a chance of at most {power(weakest)}{floor}.")
+        weakest = max((row.log10_p for row in marked_rows if row.message_read), default=0.0)
+        floor = ", which is close to the least that a key can prove" if weakest < MIN_LOG10_P + 1 else ""
+        sentences.append(f"The scheme {scheme!r} read the message from {count}.")
+        sentences.append(f"The false-positive probability of each of its readings is at most {power(weakest)}{floor}.")
     controls = [row for row in rows if row.control != "marked"]
     false = sum(row.detected for row in controls)
-    outcome = f"{false} were FALSE ALARMS" if false else "nothing was found, as it must be"
-    return [*said, f"In {len(controls)} controls, without a mark or with a wrong key, {outcome}."]
+    outcome = f"{false} were FALSE POSITIVES" if false else "nothing was detected, as expected"
+    return [*sentences, f"In {len(controls)} controls, without a mark or with a wrong key, {outcome}."]
 
 
 def _attack_and_read(marker: NonBlindMarker, marked: Mesh, message: bytes, doing: Doing) -> Iterator[DemoRow]:
-    """Read the marked mesh after each attack; then the controls."""
+    """Read the marked mesh after each attack, and then the controls."""
     name = marker.scheme.name
     for kind, strength in (("none", 0.0), *_ATTACKS):
         attack_name = kind if kind == "none" else f"{kind} {strength:g}"
@@ -204,10 +208,10 @@ def _read(
 
 
 def _outcome(row: DemoRow) -> str:
-    """What was read, in a word; of a control, nothing must be found."""
+    """Describe the result of a reading in one or two words; in a control, nothing must be detected."""
     if row.control == "marked":
         return "read" if row.message_read else "LOST"
-    return "FALSE ALARM" if row.detected else "none"
+    return "FALSE POSITIVE" if row.detected else "none"
 
 
 def _name(row: DemoRow) -> str:
@@ -258,4 +262,4 @@ def _save_pictures(folder: Path, original: Original, marked: Mesh, read: Mapping
 def _caption(row: DemoRow) -> str:
     if not row.message_read:
         return "message lost"
-    return f"message read, chance of error ≤ {power(row.log10_p)}"
+    return f"message read, p ≤ {power(row.log10_p)}"

@@ -1,7 +1,7 @@
-"""The dossier of a detection: one page for non-technical readers, and the same as JSON for those who check it.
+"""The dossier of a detection: a page for non-technical readers, and the same facts as JSON for verification.
 
-It holds nothing secret: no key, and of the original only pictures. `save_report` draws how a suspect was aligned. Both
-need the extra `plot`.
+A dossier contains no secret: it has no key, and only pictures of the original. `save_report` draws a picture of the
+registration. Both need the extra `plot`.
 """
 
 import base64
@@ -37,28 +37,28 @@ _PACKAGES = ("jaxmark", "jax", "numpy", "scipy", "trimesh")
 
 @dataclass(frozen=True)
 class Case:
-    """What a dossier is about."""
+    """The subject of a dossier: a detection, its files, and the facts that were given about them."""
 
     suspect: Path
     original: Path
     record: Path | None
-    mesh: Mesh  # the suspect's
-    mark: Mark  # that was read
+    mesh: Mesh  # the mesh of the suspect
+    mark: Mark  # the mark that was read
     found: Detection
     claimed: bool  # whether the message was claimed
     commitment: TimestampedCommitment | None
     timestamped: float | None  # log10 of the bound if the commitment is older than the suspect
-    obtained: str  # when and where the suspect was got
+    obtained: str  # when and where the suspect was obtained
 
 
 def save_report(folder: Path, original: Original, suspect: Mesh, alignment: Alignment) -> Path:
-    """Draw the original, the suspect in its pose, which points of it are seen, and how far they are off.
+    """Draw the original, the suspect in the original's pose, the weights of the points, and their residuals.
 
     Args:
-        folder: folder of the picture `alignment.png`, which is made if it does not exist.
-        original: what was aligned to.
-        suspect: the mesh that was aligned.
-        alignment: alignment of the suspect to the original.
+        folder: folder for the picture `alignment.png`, which is created if it does not exist.
+        original: the original.
+        suspect: the mesh that was aligned to it.
+        alignment: the alignment of the suspect.
 
     Returns:
         The picture's path.
@@ -67,13 +67,13 @@ def save_report(folder: Path, original: Original, suspect: Mesh, alignment: Alig
         JaxmarkError: if matplotlib is missing, or the picture cannot be written.
     """
     mesh, point = original.mesh, original.weld.point
-    off = _distances(alignment)
+    distances = _distances(alignment)
     posed = suspect._replace(vertices=alignment.pose(np.asarray(suspect.vertices, np.float64)))
     views = [
         View("Original", mesh),
         View(f"Suspect, aligned by {alignment.method}", posed),
-        View("Weight", mesh, alignment.weights[point], "1 seen, 0 masked"),
-        View("Residual", mesh, 100 * off[point], "% of the diagonal"),
+        View("Weight", mesh, alignment.weights[point], "1 registered, 0 masked"),
+        View("Residual", mesh, 100 * distances[point], "% of the diagonal"),
     ]
     path = make_folder(folder) / "alignment.png"
     save_views(views, path)
@@ -81,17 +81,19 @@ def save_report(folder: Path, original: Original, suspect: Mesh, alignment: Alig
 
 
 def save_dossier(folder: Path, case: Case) -> None:
-    """Write `dossier.html` and `dossier.json` to a folder, which is made if it does not exist.
+    """Write `dossier.html` and `dossier.json` to a folder, which is created if it does not exist.
 
     Raises:
-        JaxmarkError: if nothing was detected, if what was found is an estimate, if an extra is missing, or if a file
+        JaxmarkError: if nothing was detected, if the detection is an estimate, if an extra is missing, or if a file
             cannot be read or written.
     """
     if case.found.evidence.caveats:
         raise JaxmarkError(f"There is no dossier of an estimate: {'; '.join(case.found.evidence.caveats)}.")
     if not case.found.detected():
-        raise JaxmarkError("Nothing was detected that a dossier could show (at a probability of 10^-6).")
-    require("jinja2", "plot")  # before anything is drawn
+        raise JaxmarkError(
+            "Nothing was detected at a false-positive probability of 10^-6, which a dossier needs; leave out --dossier."
+        )
+    require("jinja2", "plot")  # checked before the pictures are drawn, which takes longer
     facts = _facts(case)
     make_folder(folder)
     text = fill_template("jaxmark.app", "dossier.html", **facts, pictures=_draw_sides(case))
@@ -100,9 +102,9 @@ def save_dossier(folder: Path, case: Case) -> None:
 
 
 def _facts(case: Case) -> dict[str, Any]:
-    """Everything that the dossier says, as values for JSON."""
-    found, record, commitment = case.found, case.mark.record, case.commitment
-    evidence, aligned = found.evidence, found.registration
+    """Collect all facts of the dossier, as values for JSON."""
+    detection, record, commitment = case.found, case.mark.record, case.commitment
+    evidence, alignment = detection.evidence, detection.registration
     roles = {"suspect": case.suspect, "original": case.original, "record": case.record}
     files = [
         {"role": role, "name": path.name, "sha256": file_hash(path)} for role, path in roles.items() if path is not None
@@ -115,22 +117,20 @@ def _facts(case: Case) -> dict[str, Any]:
         "suspect": files[0],
         "original": files[1],
         "files": files,
-        "message": None if found.message is None else found.message.hex(),
-        "notes": list(found.notes),
+        "message": None if detection.message is None else detection.message.hex(),
+        "notes": list(detection.notes),
         "log10_p": evidence.log10_p,
         "log10_p_uncommitted": evidence.log10_p_uncommitted,
-        "charges": [one._asdict() for one in evidence.charges],
+        "charges": [charge._asdict() for charge in evidence.charges],
         "chance": _in_words(evidence.log10_p_uncommitted if timestamped is None else timestamped["log10_p"]),
         "commitment": timestamped,
         "obtained": case.obtained,
-        "coverage": found.coverage,
-        "pose": "into the original's place, vertex by vertex"
-        if aligned.method != "surface"
-        else "into the original's place by its surface",
-        "registration": aligned.facts(),
+        "coverage": detection.coverage,
+        "pose": "vertex by vertex" if alignment.method != "surface" else "by its surface",
+        "registration": alignment.facts(),
         "record_digest": None if record is None else record.digest(),
         "key_commitment": commitment_to(case.mark.key),
-        "version": found.version,
+        "version": detection.version,
         "command": _command(case),
         "made": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "software": {name: version(name) for name in _PACKAGES} | {"Python": platform.python_version()},
@@ -138,15 +138,15 @@ def _facts(case: Case) -> dict[str, Any]:
 
 
 def _in_words(log10_p: float) -> str:
-    """A bound for people, rounded so that it stays one: 10^-9.7 is at most once in 10^9 cases."""
+    """Express a bound in words, rounded up: 10^-9.7 is at most once in 10^9 cases."""
     if log10_p > -3:
-        return "with a probability that only a date can bound, see below"
+        return "with a probability that is only small if the dates are proven, see below"
     cases = math.floor(-log10_p)
     return f"at most once in 10^{cases} cases" if cases > 9 else f"at most once in {10**cases:,} cases"
 
 
 def _command(case: Case) -> str:
-    """The command that repeats the detection; where the key is, is nobody's business."""
+    """Compose the command that repeats the detection, without the path of the key."""
     words = ["jaxmark", "detect", case.suspect.name, "--original", case.original.name, "--key", "KEYFILE"]
     if case.record is not None:
         words += ["--record", case.record.name]
@@ -158,25 +158,25 @@ def _command(case: Case) -> str:
 
 
 def _draw_sides(case: Case) -> dict[str, str]:
-    """Pictures of suspect and original from four sides, as PNG in base 64."""
-    original, aligned = case.mark.original, case.found.registration
-    posed = aligned.pose(np.asarray(case.mesh.vertices, np.float64))
+    """Draw suspect and original from four sides; returns PNG pictures, encoded in base 64."""
+    original, alignment = case.mark.original, case.found.registration
+    posed = alignment.pose(np.asarray(case.mesh.vertices, np.float64))
     mesh = original.mesh
     both = Mesh(
         np.concatenate([mesh.vertices, posed]),
         np.concatenate([mesh.faces, np.asarray(case.mesh.faces) + len(mesh.vertices)]),
     )
     which = np.repeat([0.0, 1.0], [len(mesh.vertices), len(posed)])
-    off = _distances(aligned)
+    distances = _distances(alignment)
     views = [
         View("original and suspect", both, which, "0 original, 1 suspect"),
-        View("distance", mesh, 100 * off[original.weld.point], "% of the diagonal"),
+        View("distance", mesh, 100 * distances[original.weld.point], "% of the diagonal"),
     ]
     return {side: base64.b64encode(draw(views, azimuth=azimuth).png()).decode() for side, azimuth in _SIDES.items()}
 
 
-def _distances(aligned: Alignment) -> Float64[np.ndarray, " points"]:
-    """How far a suspect is from each point of the original, as far as that is known, in diagonals."""
-    if aligned.normals is not None:
-        return np.abs(np.sum(aligned.normals * aligned.displacement, axis=1))
-    return np.linalg.norm(aligned.displacement, axis=1)
+def _distances(alignment: Alignment) -> Float64[np.ndarray, " points"]:
+    """Compute the known distance of a suspect from each point of the original, in diagonals."""
+    if alignment.normals is not None:
+        return np.abs(np.sum(alignment.normals * alignment.displacement, axis=1))
+    return np.linalg.norm(alignment.displacement, axis=1)

@@ -1,4 +1,4 @@
-"""The mesh files of a folder, worked on one after another, or by several processes at once."""
+"""Process all mesh files of a folder, one after another or by several processes."""
 
 import multiprocessing
 import os
@@ -18,38 +18,38 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.cells import processes
 from jaxmark.files import SUFFIXES
 
-_MOST_TOGETHER = 16  # files that a worker takes at once
-_TURNS = 4  # that each worker has at least, if there are enough files, so that all end at about the same time
+_MOST_TOGETHER = 16  # most files in a batch, which a worker takes at once
+_TURNS = 4  # least batches per worker, if there are enough files, so that all workers end at about the same time
 
 Work = Callable[[Path], FileOutcome]
 
 
 def mesh_files(folder: Path) -> list[Path]:
-    """List the files of a folder that have a mesh format's suffix, by name; hidden files are left out.
+    """List the files of a folder with the suffix of a mesh format, sorted by name, without hidden files.
 
     Raises:
         JaxmarkError: if there is no such file.
     """
-    found = sorted(
+    files = sorted(
         path
         for path in folder.iterdir()
         if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")
     )
-    if not found:
+    if not files:
         raise JaxmarkError(f"The folder {folder} has no mesh file ({', '.join(SUFFIXES)}).")
-    return found
+    return files
 
 
 def each(files: Sequence[Path], work: Work, workers: int = 1) -> Generator[tuple[Path, FileOutcome], None, None]:
-    """Work on files, and tell of each; a file that is refused stops none of the others.
+    """Call a function for each file, and yield the outcomes; a refused file does not stop the others.
 
-    Meshes of like size share compiled programs: the first of a size takes seconds, the next ones a fraction of one. So
-    several workers take files of like size together, and what they have done comes in no order.
-    Close the iterator if it is left before its end, so that its processes end, too.
+    Meshes of similar size share compiled programs: the first mesh of a size takes seconds, later ones a fraction of a
+    second. Therefore each worker takes batches of files of similar size, and outcomes of several workers come in no
+    particular order. Close the iterator if you leave it before its end, so that its processes end.
 
     Args:
         files: the files.
-        work: what to do; if there are several workers, each has a copy of its own, which it keeps.
+        work: function that processes one file; each of several workers has its own copy of it, and keeps the copy.
         workers: number of processes.
 
     Raises:
@@ -60,19 +60,19 @@ def each(files: Sequence[Path], work: Work, workers: int = 1) -> Generator[tuple
         return
     largest_first = sorted(files, key=lambda file: -file.stat().st_size)
     count = min(_MOST_TOGETHER, -(-len(files) // (_TURNS * workers)))
-    together = [largest_first[start : start + count] for start in range(0, len(files), count)]
-    pool = processes(min(workers, len(together)), begin_worker)()
-    held = pickle.dumps(work)
+    batches = [largest_first[start : start + count] for start in range(0, len(files), count)]
+    pool = processes(min(workers, len(batches)), begin_worker)()
+    pickled = pickle.dumps(work)
     try:
-        for done in as_completed([pool.submit(_work_on, held, some) for some in together]):
-            yield from done.result()
+        for future in as_completed([pool.submit(_work_on, pickled, batch) for batch in batches]):
+            yield from future.result()
     except BaseException as error:
         for process in multiprocessing.active_children():
             process.terminate()
         pool.shutdown(wait=False, cancel_futures=True)
         if isinstance(error, BrokenProcessPool):
             raise JaxmarkError(
-                "A worker was killed, perhaps because memory ran out; what is finished is kept. Use fewer --workers."
+                "A worker was killed, perhaps because memory ran out; finished files are kept. Use fewer --workers."
             ) from None
         raise
     pool.shutdown()
@@ -82,28 +82,31 @@ def _run(work: Work, file: Path) -> FileOutcome:
     try:
         return work(file)
     except Exception as error:
-        said = error_text(error)
-        return FileOutcome({"refused": said}, f"refused. {said}", done=False, refused=True)
+        text = error_text(error)
+        return FileOutcome({"refused": text}, f"refused. {text}", done=False, refused=True)
     finally:
         release_programs()
 
 
 @lru_cache(maxsize=1)
-def _kept(work: bytes) -> Work:
-    """The work, which keeps from file to file what it has prepared."""
+def _unpickled(work: bytes) -> Work:
+    """Unpickle the work; it is cached, so that an original it has prepared serves all files of this worker."""
     return pickle.loads(work)
 
 
 def _work_on(work: bytes, files: Sequence[Path]) -> list[tuple[Path, FileOutcome]]:
-    """Tell of files, in a worker, which is ended while it works by ending the process: the pool would go on."""
+    """Process a batch of files in a worker.
+
+    SystemExit ends the whole worker process, because the pool would catch the exception and continue.
+    """
     try:
-        return [(file, _run(_kept(work), file)) for file in files]
+        return [(file, _run(_unpickled(work), file)) for file in files]
     except SystemExit as end:
         os._exit(end.code if isinstance(end.code, int) else 1)
 
 
 def begin_worker() -> None:
-    """Set a worker up: whoever started it decides when it ends, and so does that process's own end."""
+    """Set up a worker process: it ignores Ctrl+C, and ends when its parent process asks it to or ends itself."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_by_exception()
     keep_programs()

@@ -1,4 +1,4 @@
-"""Mark mesh files: of one mesh, or of several."""
+"""Mark files of one mesh or of several meshes."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -25,14 +25,14 @@ from jaxmark.watermark.schemes.passband import ADAPTIVE
 from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, AnyScheme, name_of
 from jaxmark.watermark.tracing.tracer import make_tracer
 
-_MOST_NAMED = 5  # meshes that are named in a sentence
+_MOST_NAMED = 5  # most meshes that a message lists by name
 
 
 def pick(scene: Scene, names: Sequence[str], path: Path) -> Scene:
-    """The meshes of these names; all of them if there are none.
+    """Select the meshes with the given names; all meshes if no names are given.
 
     Raises:
-        JaxmarkError: if the file has no mesh of such a name, or it cannot be used.
+        JaxmarkError: if the file has no mesh with one of the names, or this mesh cannot be used.
     """
     for name in names:
         if name in scene.skipped:
@@ -42,7 +42,7 @@ def pick(scene: Scene, names: Sequence[str], path: Path) -> Scene:
             raise JaxmarkError(f"{path} has no mesh {name!r}; there are {len(scene.meshes)}, such as {known}.")
     if not names:
         return scene
-    others = {name: "it was not picked" for name in scene.meshes if name not in names}
+    others = {name: "it was not selected" for name in scene.meshes if name not in names}
     return Scene({name: scene.meshes[name] for name in names}, {**scene.skipped, **others})
 
 
@@ -59,7 +59,7 @@ def mark_file(
     meshes: Sequence[str] = (),
     doing: Doing = quietly,
 ) -> FileOutcome:
-    """Mark a mesh file, and write the marked file and its record, both or neither.
+    """Mark a mesh file, and write the marked file and its record; if an error occurs, neither is written.
 
     Args:
         original: the mesh file to mark.
@@ -70,11 +70,11 @@ def mark_file(
         recipient: identifier of the recipient of this copy; None if `message` is given.
         budget: see `embed`.
         scheme: see `embed`.
-        meshes: names of the meshes to mark, of several in the file; by default all that can carry the message.
-        doing: is told what begins.
+        meshes: names of the meshes to mark, in a file of several meshes; by default all that can carry the message.
+        doing: progress callback, called with a description of each step that begins.
 
     Raises:
-        JaxmarkError: see `embed`; also if the mark does not read from the written file, whose numbers are rounded.
+        JaxmarkError: see `embed`; also if the mark cannot be read from the written file, whose numbers are rounded.
     """
     if (message is None) == (recipient is None):
         raise JaxmarkError("Give --message, --presence or --recipient, one of them.")
@@ -82,47 +82,52 @@ def mark_file(
     scene = pick(load_scene(original), meshes, original)
     if len(scene.meshes) + len(scene.skipped) > 1:
         if message is None:
-            raise JaxmarkError("Fingerprints are for files of one mesh; save the meshes of this one apart.")
+            raise JaxmarkError(
+                f"A fingerprint needs a file of one mesh, and {original} has several; save each mesh in its own file."
+            )
         try:
             return _mark_scene(original, marked, record, scene, message, key, budget, scheme, doing)
         except JaxmarkError:
-            # The objects of an OBJ file lie in the same coordinates, and together they may carry what none can alone.
+            # All objects of an OBJ file share one coordinate system. Marked as one mesh, they may carry a message that
+            # is too long for each of them.
             if original.suffix.lower() != ".obj" or meshes:
                 raise
     mesh = load_mesh(original)
     doing(f"preparing {original}")
-    tries: Callable[[Mesh], Survival | bool | None]
+    read_back: Callable[[Mesh], Survival | bool | None]
     if message is not None:
         marker = prepare(mesh, key, 8 * len(message), scheme, adapt_to=budget)
         doing(f"embedding {original}")
         result, info = marker.embed(message, budget, read_back=False)
         marker = marker.with_record(info.record)
-        prepared, said = marker.original, payload_text(info.record.bits)
-        tries = partial(marker.measure_survival, message=message, predicted=info.survives)
+        prepared, payload = marker.original, payload_text(info.record.bits)
+        read_back = partial(marker.measure_survival, message=message, predicted=info.survives)
         check = partial(marker.check, result, message)
     else:
         if scheme != DEFAULT_SCHEME:
-            raise JaxmarkError(f"Fingerprints are carried by the scheme {DEFAULT_SCHEME!r}, not {scheme!r}.")
+            raise JaxmarkError(
+                f"The scheme {scheme!r} cannot carry fingerprints; leave out --scheme, or give {DEFAULT_SCHEME!r}."
+            )
         tracer, name = make_tracer(mesh, key), str(recipient)
         doing(f"embedding {original}")
         result, info = tracer.fingerprint(name, budget)
-        prepared, said = tracer.mark.original, f"fingerprint of {recipient}"
-        tries, check = partial(tracer.finds, recipient=name), None
+        prepared, payload = tracer.mark.original, f"fingerprint of {recipient}"
+        read_back, check = partial(tracer.finds, recipient=name), None
     with replacing(marked) as draft, replacing(record) as record_draft:
-        doing(f"writing {marked}, and trying what the mark survives")
+        doing(f"writing {marked}, and measuring the noise that the mark survives")
         save_mesh(result, draft, like=original)
-        # The mark must read from the written file, whose numbers are rounded.
+        # The mark must be readable from the written file, whose numbers are rounded.
         written = load_mesh(draft)
-        survives = tries(written)
+        survives = read_back(written)
         if not survives:
             if check is not None:
                 check()
             raise JaxmarkError(
-                f"Rounded to the numbers of {original}, the mark no longer reads; use a larger budget, or a file with"
-                " more digits."
+                f"The mark cannot be read after rounding to the precision of {original}; use a larger budget, or a file"
+                " with more digits."
             )
         write_atomically(record_draft, info.record.to_json().encode())
-    doing("measuring what was moved")
+    doing("measuring the displacement")
     texture = load_texture(original)
     drift = None if texture is None else distortion.texture_drift(mesh, written, texture)
     moved = _moved(prepared, written)
@@ -137,13 +142,13 @@ def mark_file(
         "record": str(record),
         "marked": str(marked),
     }
-    text = f"{said} → {marked}, {_moved_text(moved)} of the diagonal; record → {record}"
+    text = f"{payload} → {marked}, {_moved_text(moved)} of the diagonal; record → {record}"
     if isinstance(survives, Survival):
         text += f"; it survives {survival_text(survives)}"
     if (band := info.record.parameters.get("passband")) in ADAPTIVE[1:]:
-        text += f"; so faint a mark is written in the pass band {band!r}, which the record says"
+        text += f"; because the mark is weak, it is written in the pass band {band!r}, which is in the record"
     if drift is not None:
-        text += f"; a texture of 2,048 x 2,048 drifts by {drift:.2g} texels"
+        text += f"; the texture drifts by {drift:.2g} texels, if it has 2,048 x 2,048"
     return FileOutcome(values, text)
 
 
@@ -158,7 +163,7 @@ def _mark_scene(
     scheme: AnyScheme,
     doing: Doing,
 ) -> FileOutcome:
-    """Mark the meshes of a file that can carry a message, and write the file and its record, both or neither.
+    """Mark all meshes of a file that can carry a message; if an error occurs, neither file nor record is written.
 
     Raises:
         JaxmarkError: if no mesh can carry the message; see `embed_scene`.
@@ -167,11 +172,11 @@ def _mark_scene(
     fine_enough = number_check(original)
 
     def check(name: str, marker: Marker, result: Mesh, info: EmbedInfo) -> EmbedInfo:
-        """Check that the file's numbers are fine enough for a mark."""
+        """Check that the numbers of the file are precise enough for a mark."""
         release_programs()
         doing(f"{len(markers) + 1} of {len(scene.meshes)} meshes: checking {name!r}")
         fine_enough(name, result)
-        # What a marker has computed to read is dropped: that of all meshes would not fit.
+        # The caches of the marker are dropped: the caches of all meshes together would not fit into memory.
         markers[name] = _without_caches(marker.with_record(info.record))
         return info
 
@@ -181,24 +186,24 @@ def _mark_scene(
     with replacing(marked) as draft, replacing(record) as record_draft:
         doing(f"writing {marked}, and reading it back")
         notes = save_scene(meshes, draft, like=original)
-        # The marks must read from the written file, whose numbers are rounded.
+        # The marks must be readable from the written file, whose numbers are rounded.
         written = load_scene(draft).meshes
         for name, marker in markers.items():
             predicted = info.meshes[name].survives
-            found = _without_caches(marker).measure_survival(written[name], message, predicted)
-            if found is None:
+            survival = _without_caches(marker).measure_survival(written[name], message, predicted)
+            if survival is None:
                 raise JaxmarkError(
-                    f"Rounded to the numbers of {original}, the mark of the mesh {name!r} no longer reads; pick the"
-                    " others by --mesh."
+                    f"The mark of the mesh {name!r} cannot be read after rounding to the precision of {original};"
+                    " select the other meshes by --mesh."
                 )
-            survives[name] = found
+            survives[name] = survival
         write_atomically(record_draft, info.record.to_json().encode())
     each = {
         name: {**_moved(markers[name].original, written[name]), "survives": survives[name]._asdict()}
         for name in info.meshes
     }
     skipped = {**scene.skipped, **info.skipped}
-    most = {size: max(one[size] for one in each.values()) for size in ("rms", "max")}
+    most = {size: max(values[size] for values in each.values()) for size in ("rms", "max")}
     values = {
         **most,
         "bits": info.record.bits,
@@ -210,25 +215,25 @@ def _mark_scene(
         "record": str(record),
         "marked": str(marked),
     }
-    least = Survival(*(min(found) for found in zip(*survives.values(), strict=True)))
+    least = Survival(*(min(noises) for noises in zip(*survives.values(), strict=True)))
     text = (
         f"{payload_text(info.record.bits)} in {len(each)} of {len(each) + len(skipped)} meshes → {marked},"
-        f" {_moved_text(most)} of their diagonals; record → {record}; the weakest survives {survival_text(least)}"
+        f" {_moved_text(most)} of their diagonals; record → {record}; the weakest mark survives {survival_text(least)}"
     )
     for name, reason in list(skipped.items())[:_MOST_NAMED]:
-        text += f"\nleft alone: {name!r}: {reason}"
+        text += f"\nleft unchanged: {name!r}: {reason}"
     if len(skipped) > _MOST_NAMED:
-        text += f"\nleft alone: {len(skipped) - _MOST_NAMED} more, see --json"
+        text += f"\nleft unchanged: {len(skipped) - _MOST_NAMED} more, see --json"
     return FileOutcome(values, "\n".join([text, *notes]))
 
 
 def _without_caches(marker: Any) -> Any:
-    """A copy of a marker, a dataclass, without what it has computed."""
+    """Copy a marker, which is a dataclass, without its cached values."""
     return replace(marker)
 
 
 def _moved(original: Original, written: Mesh) -> dict[str, float]:
-    """How far a mesh was moved, in its diagonals."""
+    """Measure the RMS and the largest displacement of a marked mesh, as fractions of its diagonal."""
     change = distortion.DisplacementSize.of(shift_of(original, written)[original.used])
     return {"rms": change.rms, "max": change.max}
 

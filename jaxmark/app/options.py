@@ -21,17 +21,20 @@ FILE = click.Path(path_type=Path)
 JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON on standard output.")
 KEY = click.option("--key", "key_file", type=FILE, required=True, help="Key file, from `jaxmark keygen`.")
 KEYS = click.option(
-    "--key", "key_files", type=FILE, multiple=True, required=True, help="Key file; may be repeated, for several keys."
+    "--key", "key_files", type=FILE, multiple=True, required=True, help="Key file. Repeat the option for several keys."
 )
 MESHES = click.option(
-    "--mesh", "meshes", multiple=True, help="Of a file of several meshes, one to use, by name; may be repeated."
+    "--mesh",
+    "meshes",
+    multiple=True,
+    help="Name of a mesh to use, in a file of several meshes. Repeat the option for several meshes.  [default: all]",
 )
 WORKERS = click.option(
     "--workers",
     type=click.IntRange(1),
     default=1,
     show_default=True,
-    help="For a folder: number of processes at once, each with memory of its own.",
+    help="For a folder: number of parallel processes; each needs its own memory.",
 )
 ALPHA = click.option(
     "--alpha",
@@ -45,12 +48,13 @@ ALIGN = click.option(
     type=click.Choice(get_args(Align)),
     default="auto",
     show_default=True,
-    help="same: vertex by vertex in order; similarity, affine: by surface, up to such a map; auto: first that fits.",
+    help="How SUSPECT is registered. same: the vertices have the same order; similarity, affine: by the surface, up to"
+    " such a map; auto: the first way that fits.",
 )
 
 
 def _begin_progress(context: click.Context, quiet: bool) -> None:
-    """Let a command tell people at a terminal what it is doing, until it ends."""
+    """Show the progress of a command on standard error, if that is a terminal, until the command ends."""
     context.obj = Progress(None if quiet or not sys.stderr.isatty() else sys.stderr)
     context.call_on_close(context.obj.clear)
 
@@ -60,22 +64,22 @@ QUIET = click.option(
     is_flag=True,
     expose_value=False,
     callback=lambda context, _, quiet: _begin_progress(context, quiet),
-    help="Say nothing of what is being done; nothing is said anyway where standard error is no terminal.",
+    help="Do not show progress. Progress is only shown if standard error is a terminal.",
 )
 
 
 class Schemes(click.ParamType):
-    """The name of a scheme, or of one that is read with the original and blind ones, with commas between."""
+    """The name of a scheme, or several names separated by commas: a non-blind scheme and blind ones."""
 
     name = "scheme"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
-        """Convert names to a tuple."""
+        """Convert comma-separated names to a tuple."""
         names: tuple[str, ...] = value if isinstance(value, tuple) else tuple(value.split(","))
         if unknown := [name for name in names if name not in NAMES]:
             self.fail(f"{unknown[0]!r} is not one of {', '.join(map(repr, NAMES))}.", param, ctx)
         if len(names) > 1:
-            split(names)  # refuses what cannot mark one mesh together
+            split(names)  # raises an error if these schemes cannot be combined
         return names
 
 
@@ -103,7 +107,7 @@ class _Text(click.ParamType):
         if isinstance(value, bytes):
             return value
         if not value:
-            self.fail("an empty text is no message; for a mark that says nothing use --presence.", param, ctx)
+            self.fail("the message is empty; for a mark without a message use --presence.", param, ctx)
         return value.encode()
 
 
@@ -117,11 +121,13 @@ class _Limit(click.ParamType):
         try:
             return name, float(number)
         except ValueError:
-            self.fail(f"{value!r} is no limit: give a metric and a number, e.g. dame=0.008.", param, ctx)
+            self.fail(f"{value!r} is not a limit: give a metric and a number, e.g. dame=0.008.", param, ctx)
 
 
 def message_options(message: str, text: str, presence: str) -> Callable[[Callable], Callable]:
-    """Options for a message in either form, or none; the command gets `message`, bytes or None, and `presence`.
+    """Make the options --message, --text and --presence.
+
+    The command gets the message as `message`, which is bytes or None, and the flag as `presence`.
 
     Args:
         message: help for the message as hexadecimal digits.
@@ -145,12 +151,12 @@ def message_options(message: str, text: str, presence: str) -> Callable[[Callabl
 
 
 def budget_options(*, limits: bool = True, noise: float | None = None, noise_help: str = "") -> Callable:
-    """Options for a budget; the command gets it as `budget`.
+    """Make the options for a distortion budget; the command gets it as `budget`.
 
     Args:
-        limits: whether metrics may be limited.
-        noise: the default noise to survive.
-        noise_help: help for the noise; without it there is no such option.
+        limits: whether there is the option --limit, for limits on metrics.
+        noise: the default of --noise, the noise that the message must survive.
+        noise_help: help for --noise; without it there is no such option.
     """
 
     def decorate(command: Callable) -> Callable:
@@ -165,42 +171,41 @@ def budget_options(*, limits: bool = True, noise: float | None = None, noise_hel
         ) -> Any:
             return command(*args, budget=Budget(rms, visibility, dict(limits) or None, noise), **options)
 
-        found = wrapped
+        decorated = wrapped
         if noise_help:
-            found = click.option("--noise", type=float, default=noise, show_default=noise is not None, help=noise_help)(
-                found
-            )
+            option = click.option("--noise", type=float, default=noise, show_default=noise is not None, help=noise_help)
+            decorated = option(decorated)
         default = "without --budget and --limit" if limits else "without --budget"
-        found = click.option(
+        decorated = click.option(
             "--visibility",
             type=click.Choice(list(VISIBILITY)),
-            help=f"How well people may see the mark.  [default, {default}: hidden]",
-        )(found)
+            help=f"How visible the mark may be.  [default, {default}: hidden]",
+        )(decorated)
         if limits:
-            found = click.option(
+            decorated = click.option(
                 "--limit",
                 "limits",
                 type=_Limit(),
                 multiple=True,
-                help="Upper limit on a metric of `jaxmark compare`; may be repeated.",
-            )(found)
+                help="Upper limit on a metric of `jaxmark compare`, such as dame=0.008. Repeat the option for several.",
+            )(decorated)
         return click.option(
             "--budget",
             "rms",
             type=float,
             help="RMS displacement of the vertices, relative to the diagonal of the bounding box.",
-        )(found)
+        )(decorated)
 
     return decorate
 
 
 def read_key(path: Path) -> Key:
-    """Load a key, and say so if others may read it.
+    """Load a key, and print a warning if other users may read its file.
 
     Raises:
         JaxmarkError: see `load_key`.
     """
     key = load_key(path)
     if os.name == "posix" and path.stat().st_mode & 0o077:
-        say(f"jaxmark: the key file {path} may be read by others; chmod 600 {path} keeps it yours.")
+        say(f"jaxmark: other users may read the key file {path}; prevent this by: chmod 600 {path}")
     return key

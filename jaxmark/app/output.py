@@ -1,4 +1,4 @@
-"""What commands print, in words for people and as JSON for programs, and the names of files that they write."""
+"""The output of commands: sentences for people, JSON for programs, and checks of the paths that are written."""
 
 import json
 import math
@@ -27,7 +27,7 @@ class FileOutcome(NamedTuple):
 
 
 def say(line: str, err: bool = True) -> None:
-    """Say something beside the answer, mostly on standard error."""
+    """Print a line that is not part of the answer; by default on standard error."""
     current().clear()
     click.echo(line, err=err)
 
@@ -39,12 +39,12 @@ def answer(as_json: bool, values: Mapping[str, Any], text: str) -> None:
         click.echo(json.dumps(_finite(values), allow_nan=False) if as_json else text)
         sys.stdout.flush()
     except BrokenPipeError:
-        # The reader of our output has gone. The work is done, and the exit status still tells its outcome.
+        # The program that reads our output has ended. The work is done, and the exit status still reports the result.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _finite(value: Any) -> Any:
-    """Replace numbers that JSON does not have by None."""
+    """Replace numbers that are not finite, which JSON does not have, by None."""
     if isinstance(value, Mapping):
         return {name: _finite(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
@@ -53,31 +53,31 @@ def _finite(value: Any) -> Any:
 
 
 def error_text(error: Exception) -> str:
-    """What an exception says, in one line."""
+    """Return the message of an exception in one line."""
     match error:
         case click.ClickException():
-            said = error.format_message()
+            text = error.format_message()
         case JaxmarkError():
-            said = str(error)
+            text = str(error)
         case OSError():
-            said = f"{error.filename or 'A file'} cannot be used: {error.strerror or error}."
+            text = f"{error.filename or 'A file'} cannot be used: {error.strerror or error}."
         case _:
-            said = f"Unexpected {type(error).__name__}: {error}. Please report it, with the command and the files."
-    return " ".join(said.split())
+            text = f"Unexpected {type(error).__name__}: {error}. Please report it, with the command and the files."
+    return " ".join(text.split())
 
 
 def power(log10_p: float) -> str:
-    """A bound as a power of ten, which rounding makes no smaller."""
+    """Format a bound as a power of ten, rounded up."""
     return f"10^{math.ceil(10 * log10_p - 1e-9) / 10 + 0.0:.1f}"
 
 
 def payload_text(bits: int) -> str:
-    """What a mark carries."""
+    """Describe the payload of a mark."""
     return f"{bits} bits" if bits else "presence"
 
 
 def message_text(message: bytes) -> str:
-    """A message in hexadecimal digits, and as text if it is one."""
+    """Format a message in hexadecimal digits, followed by its text if it is printable UTF-8."""
     try:
         text = message.decode()
     except UnicodeDecodeError:
@@ -86,43 +86,43 @@ def message_text(message: bytes) -> str:
 
 
 def survival_text(survives: Survival) -> str:
-    """What a mark survives, in words."""
+    """Describe the noise that a mark survives."""
     if math.isinf(survives.whole):
-        return "an unknown noise, as this scheme has no model of it"
+        return "an unknown amount of noise, because this scheme has no noise model"
     whole, half = (f"{100 * noise:.2g} %" if noise else "none" for noise in survives)
     if not survives.whole:
-        return "no noise to speak of, only what leaves vertices in their places"
+        return "hardly any noise, only attacks that do not displace vertices"
     return f"noise of {whole} of the mean distance to the centre, {half} with half of the vertices lost"
 
 
 def detection_text(detection: Detection, alpha: float, timestamped: float | None, *, charges: bool = False) -> str:
-    """What was detected, in words.
+    """Describe a detection in words.
 
     Args:
         detection: the detection.
         alpha: largest false-positive probability of a detection.
-        timestamped: log10 of the bound if the commitment is older than the suspect; None without one.
-        charges: whether to say what each choice of the reading cost.
+        timestamped: log10 of the bound if the commitment is older than the suspect; None without a commitment.
+        charges: whether to list how much each choice of the reader cost.
     """
     evidence = detection.evidence
     read = f"message {message_text(detection.message)}" if detection.message is not None else "no message could be read"
-    said = f"{'detected' if detection.detected(alpha, allow_estimate=True) else 'nothing detected'}: {read}; "
+    text = f"{'detected' if detection.detected(alpha, allow_estimate=True) else 'nothing detected'}: {read}; "
     if evidence.caveats:
-        said += (
+        text += (
             f"false-positive probability about {power(detection.log10_p)}, an estimate: {'; '.join(evidence.caveats)}"
         )
     else:
-        said += (
+        text += (
             f"false-positive probability at most {power(detection.log10_p)} if {detection.premises} were fixed"
-            f" before the suspect existed, {power(evidence.log10_p_uncommitted)} if nothing dates them"
+            f" before the suspect existed, {power(evidence.log10_p_uncommitted)} even if they were chosen afterwards"
         )
         if timestamped is not None:
-            said += f", {power(timestamped)} if the commitment is older than the suspect"
-    said = " ".join([f"{said} (--alpha {alpha:g})", *detection.notes])
+            text += f", {power(timestamped)} if the commitment is older than the suspect"
+    text = " ".join([f"{text} (--alpha {alpha:g})", *detection.notes])
     if charges:
-        charged = [f"{one.choice}: {one.taken} {one.log10:.2f}" for one in evidence.charges]
-        said += f"\ncharged in log10 p: {', '.join(charged) or 'nothing'}"
-    return said
+        charged = [f"{charge.choice}: {charge.taken} {charge.log10:.2f}" for charge in evidence.charges]
+        text += f"\ncharged in log10 p: {', '.join(charged) or 'nothing'}"
+    return text
 
 
 def detection_values(
@@ -133,21 +133,21 @@ def detection_values(
     timestamped: float | None,
     record_digest: str | None,
 ) -> dict[str, Any]:
-    """What was detected, as values for JSON.
+    """Describe a detection as values for JSON.
 
     Args:
         detection: the detection.
         alpha: see `detection_text`.
-        suspect: its file.
-        obtained: when and where it was got.
+        suspect: the suspect's file.
+        obtained: when and where the suspect was obtained.
         timestamped: see `detection_text`.
-        record_digest: digest of the record that was read with.
+        record_digest: digest of the record; None without a record.
     """
     values = {
         **_figures(detection, alpha),
         "proof": not detection.evidence.caveats,
         "caveats": list(detection.evidence.caveats),
-        "charges": [one._asdict() for one in detection.evidence.charges],
+        "charges": [charge._asdict() for charge in detection.evidence.charges],
         "notes": list(detection.notes),
         "scheme": detection.scheme,
         "version": detection.version,
@@ -159,8 +159,8 @@ def detection_values(
     }
     if detection.parts:
         values["parts"] = {
-            name: {**_figures(one, alpha), "coverage": one.coverage, "registration": one.registration.facts()}
-            for name, one in detection.parts.items()
+            name: {**_figures(part, alpha), "coverage": part.coverage, "registration": part.registration.facts()}
+            for name, part in detection.parts.items()
         }
         values["skipped"] = dict(detection.skipped)
     if record_digest is not None:
@@ -183,28 +183,28 @@ def _figures(detection: Detection, alpha: float) -> dict[str, Any]:
 
 
 def check_suffix(source: Path, target: Path) -> None:
-    """Refuse an output of another format than its source."""
+    """Raise an error if an output file has another format than its source."""
     if source.suffix.lower() != target.suffix.lower():
-        raise JaxmarkError(f"{target} must have the suffix of {source}, whose bytes it takes over.")
+        raise JaxmarkError(f"{target} must have the suffix of {source}, because it keeps the format of that file.")
 
 
 def check_distinct(**files: Path) -> None:
-    """Refuse two names for one file, which would write over an input."""
-    seen: dict[str, str] = {}
+    """Raise an error if two arguments name the same file, because an input would be overwritten."""
+    names: dict[str, str] = {}
     for name, path in files.items():
-        other = seen.setdefault(os.path.realpath(path), name)
+        other = names.setdefault(os.path.realpath(path), name)
         if other != name:
             raise JaxmarkError(f"{other} and {name} are the same file, {path}; give another name.")
 
 
 def make_folder(folder: Path) -> Path:
-    """Make a folder, if it does not exist.
+    """Create a folder, if it does not exist.
 
     Raises:
-        JaxmarkError: if it cannot be made.
+        JaxmarkError: if it cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise JaxmarkError(f"{folder} cannot be made a folder: {error.strerror}.") from None
+        raise JaxmarkError(f"The folder {folder} cannot be created: {error.strerror}.") from None
     return folder

@@ -1,4 +1,4 @@
-"""What a command is doing, for people who wait: one line on a terminal, which the next one replaces."""
+"""The progress of a command: one line on the terminal, which the next line replaces."""
 
 import shutil
 from collections.abc import Callable
@@ -7,50 +7,50 @@ from typing import TextIO
 import click
 import jax
 
-Doing = Callable[[str], None]  # is told what begins now
+Doing = Callable[[str], None]  # progress callback, called with a description of each step that begins
 
-# JAX says so when a program is about to be compiled, and when it was found among the kept ones instead.
-_COMPILING, _FOUND = "/jax/compilation_cache/compile_requests_use_cache", "/jax/compilation_cache/cache_hits"
+# Events of JAX: a program is requested, and it was found in the cache, so that it need not be compiled.
+_REQUESTED, _FOUND = "/jax/compilation_cache/compile_requests_use_cache", "/jax/compilation_cache/cache_hits"
 _START_OF_LINE, _ERASE = "\r", "\x1b[K"
 
 
 def quietly(what: str) -> None:
-    """Say nothing."""
+    """Ignore the description of a step: a progress callback that shows nothing."""
 
 
 class Progress:
-    """A line that says what is being done, and how many programs were compiled for it; nothing without a stream."""
+    """A line that shows the current step and how many programs were compiled in it; without a stream, nothing."""
 
     def __init__(self, stream: TextIO | None) -> None:
-        """Begin without a line.
+        """Begin with an empty line.
 
         Args:
-            stream: a terminal; None to say nothing.
+            stream: a terminal; None to show nothing.
         """
-        self._stream, self._what, self._compiled = stream, "", 0
+        self._stream, self._step, self._compiled = stream, "", 0
         if stream is not None:
             jax.monitoring.register_event_listener(self._on_event)
 
     def doing(self, what: str) -> None:
-        """Say what begins now."""
-        self._what, self._compiled = what, 0
+        """Show the description of the step that begins now."""
+        self._step, self._compiled = what, 0
         self._draw(what)
 
     def clear(self) -> None:
-        """Remove the line, before something else is printed or when the work ends."""
-        if self._what:
+        """Remove the line, before other output or at the end of the command."""
+        if self._step:
             self.doing("")
 
     def _on_event(self, event: str, **details: str | int) -> None:
-        """Hear from JAX."""
-        if not self._what:
+        """Count the programs that JAX compiles."""
+        if not self._step:
             return
-        if event == _COMPILING:
+        if event == _REQUESTED:
             self._compiled += 1
-            self._draw(f"{self._what}: compiling program {self._compiled}")
+            self._draw(f"{self._step}: compiling program {self._compiled}")
         elif event == _FOUND:
             self._compiled -= 1
-            self._draw(self._what)
+            self._draw(self._step)
 
     def _draw(self, line: str) -> None:
         if self._stream is not None:
@@ -60,6 +60,6 @@ class Progress:
 
 
 def current() -> Progress:
-    """The progress of the command that is running; one that says nothing for a command that takes no time."""
+    """Return the progress of the running command; commands without the option --quiet show no progress."""
     context = click.get_current_context(silent=True)
     return (context and context.obj) or Progress(None)

@@ -1,7 +1,8 @@
-"""A page to look at a catalogue, and to find by dropping a file; for this machine only. Needs the extra `serve`.
+"""A local web page that shows a catalogue and finds the originals of uploaded files. Needs the extra `serve`.
 
-Nothing is written unless it is asked for, no answer has a key, and no name that comes from outside becomes a path. Two
-files are worked on at most, one after the other; a third is turned away.
+The server answers only this machine. It writes nothing unless --keep is given, its answers contain no key, and no name
+from a request becomes a path. It holds at most two uploaded files, which it reads one after the other, and rejects a
+third.
 """
 
 import asyncio
@@ -31,11 +32,11 @@ from jaxmark.watermark.coding.keys import Key
 
 _PATH = click.Path(path_type=Path)
 _HOST = "127.0.0.1"
-_MOST_JOBS = 2  # that wait or are worked on
+_MOST_JOBS = 2  # most uploaded files that wait or are being read
 _UPLOAD_SECONDS = 120.0
-_MOST_DOSSIERS = 16  # that are kept in memory
-_MOST_LISTED = 200  # originals that are shown at a time
-_UPLOADED = tuple(suffix for suffix in SUFFIXES if suffix != ".gltf")  # which refers to other files
+_MOST_DOSSIERS = 16  # most dossiers in memory
+_MOST_LISTED = 200  # most originals in one answer
+_UPLOADED = tuple(suffix for suffix in SUFFIXES if suffix != ".gltf")  # .gltf files refer to other files
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; img-src 'self' data:; style-src 'unsafe-inline'; script-src 'self';"
     " connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -43,22 +44,40 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-#: What the page sends with a file; pages of other places cannot without being asked, and are not answered.
-_OURS = "x-jaxmark"
+# Header that the page sends with an uploaded file. Browsers do not let pages of other sites send it without permission
+# of this server, so that their requests are rejected.
+_OUR_HEADER = "x-jaxmark"
 
 
 @click.command(name="serve")
 @CATALOGUE
-@click.option("--key", "key_files", type=_PATH, multiple=True, required=True, help="Key file; may be repeated.")
-@click.option("--port", type=click.IntRange(0, 65535), default=8737, show_default=True, help="0 for any that is free.")
 @click.option(
-    "--most-megabytes", type=click.IntRange(1, 4096), default=64, show_default=True, help="Largest file that is taken."
+    "--key",
+    "key_files",
+    type=_PATH,
+    multiple=True,
+    required=True,
+    help="Key file. Repeat the option for several keys.",
 )
-@click.option("--keep", "keeps", is_flag=True, help="Keep verdicts in the catalogue, which is only read otherwise.")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=8737, show_default=True, help="Port; 0 selects a free one."
+)
+@click.option(
+    "--most-megabytes",
+    type=click.IntRange(1, 4096),
+    default=64,
+    show_default=True,
+    help="Largest size of an uploaded file, in megabytes.",
+)
+@click.option("--keep", "keeps", is_flag=True, help="Store verdicts in the catalogue; otherwise, it is only read.")
 def serve_command(
     catalogue_file: Path, key_files: tuple[Path, ...], port: int, most_megabytes: int, keeps: bool
 ) -> None:
-    """Show the catalogue as a page on this machine, where a file that is dropped is sought; until interrupted."""
+    """Serve a web page that shows the catalogue, and names the original of a mesh file that is dropped on it.
+
+    Only this machine can open the page. Needs the extra `serve`. Writes nothing, except verdicts with --keep. Runs
+    until it is interrupted by Ctrl+C.
+    """
     uvicorn = require("uvicorn", "serve")
     require("starlette", "serve")
     Catalogue(catalogue_file, read_only=True).close()
@@ -73,11 +92,11 @@ def serve_command(
 
 @dataclass
 class Desk:
-    """Finds the originals of files, one at a time, and keeps the dossiers of the last."""
+    """The state of the server: it finds the originals of files, one at a time, and keeps the latest dossiers."""
 
     catalogue: Path
     keys: Sequence[Key]
-    keeps: bool = False  # whether verdicts are kept in the catalogue
+    keeps: bool = False  # whether verdicts are stored in the catalogue
     dossiers: OrderedDict[str, bytes] = field(default_factory=OrderedDict)
     _finder: Finder | None = None
 
@@ -95,18 +114,21 @@ class Desk:
             verdict = self._finder.find(suspect)
             if self.keeps:
                 keep(self._finder.catalogue, Path("uploaded"), verdict)
-            found = verdict.as_json()
+            values = verdict.as_json()
             for match in verdict.named[:1]:
-                found["dossier"] = self._dossier(suspect, match, Path(folder))
+                values["dossier"] = self._dossier(suspect, match, Path(folder))
         release_programs()
         numbers = {entry.path: entry.id for entry in self._finder.catalogue.originals()}
-        for one in (found, *found["matches"]):
-            if one["original"] is not None:
-                one["id"], one["original"] = numbers.get(one["original"]), Path(one["original"]).name
-        return found
+        for entry in (values, *values["matches"]):
+            if entry["original"] is not None:
+                entry["id"], entry["original"] = numbers.get(entry["original"]), Path(entry["original"]).name
+        return values
 
     def _dossier(self, suspect: Path, match: Match, folder: Path) -> str | None:
-        """Make the dossier of a message that was read in a file of one mesh; None if there is none."""
+        """Make the dossier of a message that was read from a file of one mesh; returns its token in the address.
+
+        Returns None if no message was read, if the file has several meshes or pieces, or if a dossier cannot be made.
+        """
         if not match.message or match.mesh or match.piece or self._finder is None:
             return None
         key = next(key for name, key in self._finder.keys.items() if name == match.key)
@@ -127,11 +149,11 @@ class Desk:
 
 
 def make_app(desk: Desk, most_bytes: int) -> Any:
-    """The ASGI application (Starlette).
+    """Make the ASGI application (Starlette).
 
     Args:
-        desk: what finds.
-        most_bytes: the largest file that is taken.
+        desk: the state of the server.
+        most_bytes: largest size of an uploaded file, in bytes.
 
     Raises:
         JaxmarkError: if the extra `serve` is missing.
@@ -177,22 +199,24 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
     async def thumbnail(request: Request) -> Response:
         number = request.path_params["number"]
         if number >= 2**63:
-            return refuse("There is no such original.", 404)
+            return refuse("The catalogue has no original with this number.", 404)
         return await run_in_threadpool(read, lambda catalogue: reply(catalogue.thumbnail(number), "image/png"))
 
     async def dossier(request: Request) -> Response:
-        found = desk.dossiers.get(request.path_params["token"])
-        return refuse("There is no such dossier.", 404) if found is None else reply(found, "text/html; charset=utf-8")
+        content = desk.dossiers.get(request.path_params["token"])
+        if content is None:
+            return refuse("There is no such dossier; drop the file again.", 404)
+        return reply(content, "text/html; charset=utf-8")
 
     async def find(request: Request) -> Response:
         nonlocal waiting
-        if _OURS not in request.headers or request.headers.get("sec-fetch-site", "same-origin") != "same-origin":
-            return refuse("Files are taken from this page only.", 403)
+        if _OUR_HEADER not in request.headers or request.headers.get("sec-fetch-site", "same-origin") != "same-origin":
+            return refuse("Files can only be uploaded from the catalogue's page.", 403)
         suffix = Path(request.query_params.get("name", "")).suffix.lower()
         if suffix not in _UPLOADED:
-            return refuse(f"Drop a mesh file: {', '.join(_UPLOADED)}.", 415)
+            return refuse(f"This is not a mesh file; drop one of {', '.join(_UPLOADED)}.", 415)
         if waiting >= _MOST_JOBS:
-            return refuse("Two files are being worked on; come back when one is done.", 503)
+            return refuse("Two files are being processed; try again when one is done.", 503)
         waiting += 1
         try:
             async with asyncio.timeout(_UPLOAD_SECONDS):
@@ -200,13 +224,14 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
                 async for chunk in request.stream():
                     data += chunk
                     if len(data) > most_bytes:
-                        return refuse(f"The file is larger than {most_bytes // 2**20} megabytes.", 413)
+                        sentence = f"The file is larger than {most_bytes // 2**20} megabytes, the limit of this server."
+                        return refuse(sentence, 413)
             async with turn:
                 return respond(await run_in_threadpool(desk.find, bytes(data), suffix))
         except TimeoutError:
-            return refuse("The file did not come in time.", 408)
+            return refuse(f"The upload took longer than {_UPLOAD_SECONDS:g} seconds.", 408)
         except ClientDisconnect:
-            return refuse("Nobody is there any more.", 400)
+            return refuse("The browser has closed the connection.", 400)
         except Exception as error:
             return refuse(error_text(error), 422 if isinstance(error, JaxmarkError) else 500)
         finally:
@@ -221,22 +246,22 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
             Route("/dossiers/{token:str}", dossier),
             Route("/find", find, methods=["POST"]),
         ],
-        # Another place's name for this machine does not open the page to it.
+        # Requests under another host name are rejected, so that no other site can reach the page by DNS rebinding.
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])],
     )
 
 
 def _listed(catalogue: Catalogue, start: int) -> dict[str, Any]:
-    """Some originals, as the page shows them."""
+    """List some originals, as values for JSON."""
     every = catalogue.originals()
-    shown = every[start : start + _MOST_LISTED]
+    entries = every[start : start + _MOST_LISTED]
     rows = [
         {
             "id": entry.id,
             "name": Path(entry.path).name,
             **{name: getattr(entry, name) for name in ("vertices", "records", "recipients", "added")},
         }
-        for entry in shown
+        for entry in entries
     ]
     return {"count": len(every), "start": start, "originals": rows}
 

@@ -1,4 +1,4 @@
-"""The command `jaxmark`, which may be interrupted while the library is still being imported."""
+"""The entry point of the command `jaxmark`; it handles Ctrl+C while the library is still being imported."""
 
 import os
 import sys
@@ -6,7 +6,7 @@ import sys
 
 def main() -> None:
     """Run the command line."""
-    # OpenBLAS's threads cost more than they save: NumPy is asked for many small things here, and few large ones.
+    # The threads of OpenBLAS cost more time than they save, because most NumPy operations here are small.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         from jaxmark.app.cli import main as run

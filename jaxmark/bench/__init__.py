@@ -1,6 +1,6 @@
-"""The benchmark of watermarking methods: as strong as one set of limits allows, attacked, and calibrated.
+"""The benchmark of watermarking methods: all mark under the same distortion limits, are attacked, and are calibrated.
 
-`run` runs or resumes it; `make_corpus` makes the meshes; a `Method` of one's own takes part as any other.
+`run` runs or resumes a benchmark, `make_corpus` makes the meshes, and a `Method` of your own can take part.
 """
 
 from jaxmark.bench._equal_visibility import equal_visibility as equal_visibility

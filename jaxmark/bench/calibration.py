@@ -1,7 +1,8 @@
-"""False positives of readers, counted: thresholds, rates, and tests of proven bounds.
+"""Calibration of readers by counted false positives: thresholds, rates, and tests of proven bounds.
 
-Nulls are scores of suspects without a mark of the key: unmarked meshes, attacked or not, marks of other methods, and of
-other keys. Every null has a key of its own, so that given the suspects they are independent, and intervals exact.
+A null is the score of a suspect without a mark of the key: of an unmarked mesh, attacked or not, of a mark of another
+method, or of a mark of another key. Every null has its own key. Therefore nulls are independent, given the suspects,
+and intervals are exact.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,9 +15,9 @@ from scipy.special import betaincinv
 from jaxmark.bench.method import Method
 from jaxmark.confidence import clopper_pearson
 
-RATE = 0.01  # of false positives, at which methods are compared by default
-_LEVELS = (-0.5, -1.0, -1.5, -2.0, -3.0, -4.0, -5.0, -6.0, -8.0, -10.0)  # log10, at which a bound is tested
-_CONFIDENCE = 0.999  # one-sided, over all levels, before a bound or a stated rate is called violated
+RATE = 0.01  # default false-positive rate at which methods are compared
+_LEVELS = (-0.5, -1.0, -1.5, -2.0, -3.0, -4.0, -5.0, -6.0, -8.0, -10.0)  # log10 of probabilities to test a bound at
+_CONFIDENCE = 0.999  # one-sided, for all levels together: confidence at which a bound or a stated rate is violated
 Scores = Float64[np.ndarray, " _"]
 
 
@@ -27,11 +28,11 @@ class Threshold(NamedTuple):
     rate: float
     low: float  # 95 % interval of the rate
     high: float
-    reached: bool  # whether there are enough nulls for the rate that was asked for
+    reached: bool  # whether there are enough nulls for the requested rate
 
 
 class Count(NamedTuple):
-    """Suspects that a rule accepts, with the exact 95 % interval of its rate."""
+    """The number of suspects that a rule accepts, with the exact 95 % interval of the rate."""
 
     hits: int
     trials: int
@@ -40,7 +41,7 @@ class Count(NamedTuple):
 
 
 class Level(NamedTuple):
-    """A bound at one level: how many nulls it calls less probable than that."""
+    """The test of a bound at one level: the number of nulls whose stated probability is at most that level."""
 
     log10_p: float
     hits: int
@@ -49,11 +50,11 @@ class Level(NamedTuple):
 
 
 def threshold(nulls: Scores, rate: float = RATE) -> Threshold:
-    """Choose the threshold whose expected false-positive rate is at most `rate`, from nulls alone.
+    """Choose a threshold from nulls so that the expected false-positive rate is at most `rate`.
 
-    The share of further scores above the k-th largest of n nulls, all exchangeable, has the distribution
-    Beta(k, n + 1 - k), for any distribution of the scores (Wilks, "Determination of sample sizes for setting tolerance
-    limits", 1941). Its mean is k/(n + 1). Ties make the rate smaller.
+    If scores are exchangeable, the fraction of further scores above the k-th largest of n nulls has the distribution
+    Beta(k, n + 1 - k), for any continuous distribution of the scores (Wilks, "Determination of sample sizes for setting
+    tolerance limits", 1941). Its mean is k/(n + 1). Ties make the rate smaller.
     """
     ordered, count = np.sort(nulls)[::-1], len(nulls)
     place = max(int(np.floor(rate * (count + 1) + 1e-9)), 1)
@@ -84,7 +85,7 @@ def area_under(points: Sequence[tuple[float, float]]) -> float:
 
 
 def check_bound(nulls: Scores) -> list[Level]:
-    """Compare a proven bound, log10 of probabilities of nulls, with how often it is passed."""
+    """Test a proven bound: compare the stated probabilities of nulls (log10) with their counted frequency."""
     levels, confidence = [], 1 - 2 * (1 - _CONFIDENCE) / len(_LEVELS)
     for level in _LEVELS:
         hits = int(np.sum(nulls <= level))
@@ -94,30 +95,30 @@ def check_bound(nulls: Scores) -> list[Level]:
 
 
 class Calibration(NamedTuple):
-    """The counted false positives of a reader."""
+    """The calibration of a reader by its false positives."""
 
     threshold: Threshold
     kinds: Mapping[str, Count]  # nulls above the threshold, by kind
-    points: Sequence[tuple[float, float]]  # the ROC against its own marks after all attacks
-    area: float
-    own: Count | None  # nulls at the method's own threshold, where it has one
-    stated: float  # the rate that the method states for that
-    bound: Sequence[Level]  # empty where the method proves nothing
+    points: Sequence[tuple[float, float]]  # the ROC of nulls and of the method's marks after all attacks
+    area: float  # the area under the ROC
+    own: Count | None  # nulls at the method's own threshold; None if it has none
+    stated: float  # the false-positive rate that the method states for its own threshold
+    bound: Sequence[Level]  # the tests of the method's bound; empty if it proves none
 
     @property
     def verdicts(self) -> list[str]:
-        """Sentences on what does not hold."""
-        said, own = [], self.own
+        """The problems of the reader, one sentence each."""
+        sentences, own = [], self.own
         if not self.threshold.reached:
-            said.append("Too few nulls for the rate that was asked for: the threshold is above all of them.")
+            sentences.append("There are too few nulls for the requested rate: the threshold is above all of them.")
         if own and own.trials and clopper_pearson(own.hits, own.trials, 2 * _CONFIDENCE - 1).low > self.stated:
-            said.append(
-                f"ITS OWN THRESHOLD IS TOO LOW: {own.hits} of {own.trials} nulls pass, where a rate of"
-                f" {self.stated:g} is stated."
+            sentences.append(
+                f"ITS OWN THRESHOLD IS TOO LOW: {own.hits} of {own.trials} nulls exceed it, but the stated rate is"
+                f" {self.stated:g}."
             )
-        return said + [
-            f"THE PROVEN BOUND IS VIOLATED: {level.hits} of {level.trials} nulls are said to be less probable"
-            f" than 10^{level.log10_p:g}."
+        return sentences + [
+            f"THE PROVEN BOUND IS VIOLATED: {level.hits} of {level.trials} nulls have a stated probability of at most"
+            f" 10^{level.log10_p:g}."
             for level in self.bound
             if level.violated
         ]
@@ -126,17 +127,24 @@ class Calibration(NamedTuple):
 def calibrate(
     method: Method, nulls: Mapping[str, Sequence[tuple[float, float | None]]], marks: Scores, rate: float = RATE
 ) -> Calibration:
-    """Calibrate a reader by nulls, which are pairs of a score and log10 p by kind, and by scores of its own marks."""
+    """Calibrate a reader by nulls and by the scores of its own marks.
+
+    Args:
+        method: the method.
+        nulls: pairs of score and log10 p, by kind of null.
+        marks: scores of the method's own marks.
+        rate: false-positive rate of the threshold.
+    """
     scores = {kind: np.array([score for score, _ in some], float) for kind, some in nulls.items()}
     every = np.concatenate(list(scores.values()))
-    # A reader that proves something returns None, or refuses, where it proves nothing.
+    # A reader with a proven bound may return None, or refuse a suspect; this counts as a probability of 1.
     stated = [p for some in nulls.values() for _, p in some]
     proves = any(p is not None for p in stated)
-    found = threshold(every, rate)
+    chosen = threshold(every, rate)
     points = roc(every, marks) if len(marks) else [(0.0, 0.0), (1.0, 1.0)]
     return Calibration(
-        found,
-        {kind: count(some > found.value) for kind, some in scores.items()},
+        chosen,
+        {kind: count(some > chosen.value) for kind, some in scores.items()},
         points,
         area_under(points),
         None if method.threshold is None else count(every >= method.threshold),

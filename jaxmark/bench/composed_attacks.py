@@ -1,4 +1,4 @@
-"""Attacks of the track `2026` that are composed of several of the library's; on the host."""
+"""Attacks of the track `2026` that are composed of several attacks of the library; on the host."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -15,11 +15,11 @@ from jaxmark.errors import JaxmarkError, require
 from jaxmark.geometry import asteroid
 from jaxmark.geometry.mesh import Mesh, compact, diagonal, face_normals
 
-_SIZE = 100.0  # mm, the longest side of an object that is printed
-_SCAN_NOISE, _SCAN_LENGTH = 0.05, 2.0  # mm: its standard deviation, and its correlation length
+_SIZE = 100.0  # longest side of a printed object, in mm
+_SCAN_NOISE, _SCAN_LENGTH = 0.05, 2.0  # standard deviation and correlation length of the scan's noise, in mm
 _SCAN_COVERAGE, _SCAN_POINTS, _SCAN_DEPTH = 0.8, 200_000, 8
-_SCAN_REACH = 1.5  # mm from a scanned point up to which a surface is kept
-_WAVES = 256  # in the sum that approximates correlated noise
+_SCAN_REACH = 1.5  # largest distance of the reconstructed surface from a scanned point, in mm
+_WAVES = 256  # number of waves that approximate correlated noise
 
 Points = Float64[np.ndarray, "points 3"]
 
@@ -33,7 +33,7 @@ def _remesh_smooth_remesh(mesh: Mesh, strength: float, random: np.random.Generat
 
 
 def _mirror(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """Reflect and rotate, and flip a share of the edges."""
+    """Reflect and rotate a mesh, and flip a fraction of its edges."""
     vertices = Rotation.random(rng=random).apply(np.asarray(mesh.vertices) * [-1, 1, 1])
     mirrored = Mesh(vertices, np.asarray(mesh.faces)[:, ::-1].copy())
     return attack(mirrored, "edge-flips", strength, seed=_seed(random)) if strength else mirrored
@@ -44,13 +44,13 @@ def _mirror_remeshed(mesh: Mesh, strength: float, random: np.random.Generator) -
 
 
 def _decimate_loop(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """Simplify, and subdivide until there are nearly as many vertices again."""
+    """Simplify a mesh, and subdivide it until it has about as many vertices as before."""
     steps = max(round(-np.log(1 - strength) / np.log(4)), 1)
     return chain(mesh, [("simplification", strength), ("loop", steps)], seed=_seed(random))
 
 
 def _print_scan(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """Print in layers of `strength` mm at 10 cm, and scan: noise, a fifth unseen, and a surface of the points."""
+    """Simulate a print of 10 cm with layers of `strength` mm, and a noisy scan that misses a fifth of the surface."""
     import trimesh  # takes long to import
 
     mesh = compact(mesh)
@@ -62,17 +62,17 @@ def _print_scan(mesh: Mesh, strength: float, random: np.random.Generator) -> Mes
     points = np.array(points)
     points[:, 2] = strength * np.round(points[:, 2] / strength)
     points += normals * _SCAN_NOISE * _correlated(points, _SCAN_LENGTH, random)[:, None]
-    away = np.linalg.norm(points - points[random.integers(len(points))], axis=1)
-    seen = away >= np.quantile(away, 1 - _SCAN_COVERAGE)
+    distance = np.linalg.norm(points - points[random.integers(len(points))], axis=1)
+    covered = distance >= np.quantile(distance, 1 - _SCAN_COVERAGE)
     name = "generate_surface_reconstruction_screened_poisson"
-    scanned = apply_filter(name, Mesh(points[seen], mesh.faces), normals[seen], depth=_SCAN_DEPTH, threads=1)
-    near = KDTree(points[seen]).query(np.asarray(scanned.vertices))[0] <= _SCAN_REACH
+    scanned = apply_filter(name, Mesh(points[covered], mesh.faces), normals[covered], depth=_SCAN_DEPTH, threads=1)
+    near = KDTree(points[covered]).query(np.asarray(scanned.vertices))[0] <= _SCAN_REACH
     faces = np.asarray(scanned.faces)
     return compact(Mesh(np.asarray(scanned.vertices), faces[near[faces].all(axis=1)]))
 
 
 def _correlated(points: Points, length: float, random: np.random.Generator) -> Float64[np.ndarray, " points"]:
-    """Draw noise of unit variance at points, of Gaussian covariance exp(-d²/2 length²): a sum of random waves."""
+    """Draw noise of unit variance at points, with the covariance exp(-d²/2 length²), as a sum of random waves."""
     waves, phases = random.normal(size=(3, _WAVES)) / length, random.uniform(0, 2 * np.pi, _WAVES)
     total = np.zeros(len(points))
     for wave, phase in zip(waves.T, phases, strict=True):
@@ -81,7 +81,7 @@ def _correlated(points: Points, length: float, random: np.random.Generator) -> F
 
 
 def _slicer(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """Export from a slicer: rotated, in mm, as STL, then as text with `strength` digits, in another order."""
+    """Simulate the export of a slicer: rotated, in mm, as STL, then as text with `strength` digits, and reordered."""
     vertices = Rotation.random(rng=random).apply(np.asarray(mesh.vertices, np.float64))
     vertices *= _SIZE / np.ptp(vertices, axis=0).max()
     placed = Mesh(vertices - [*vertices.mean(axis=0)[:2], vertices[:, 2].min()], mesh.faces)
@@ -91,27 +91,28 @@ def _slicer(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
 def _draco(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
     draco = require("DracoPy", "files")
     points, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32)
-    found = draco.decode(draco.encode(points, faces, quantization_bits=int(strength)))
-    return Mesh(np.asarray(found.points, np.float64).reshape(-1, 3), np.asarray(found.faces, np.int64).reshape(-1, 3))
+    decoded = draco.decode(draco.encode(points, faces, quantization_bits=int(strength)))
+    vertices, corners = np.asarray(decoded.points, np.float64), np.asarray(decoded.faces, np.int64)
+    return Mesh(vertices.reshape(-1, 3), corners.reshape(-1, 3))
 
 
 def _gltf(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """Quantise coordinates in single precision and reorder, as tools for `KHR_mesh_quantization` do."""
+    """Quantise coordinates, convert them to single precision, and reorder, as tools for `KHR_mesh_quantization` do."""
     return chain(mesh, [("quantisation", strength), ("float-bits", 32), ("reordering", 1)], seed=_seed(random))
 
 
 def _graft(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """Cut off a part by a plane, and put another model in its place."""
-    kept = attack(mesh, "cropping", strength, seed=_seed(random))
-    whole, left = np.asarray(mesh.vertices), np.asarray(kept.vertices)
-    lost = (whole.sum(axis=0) - left.sum(axis=0)) / max(len(whole) - len(left), 1)
+    """Cut off a part of a mesh by a plane, and put another model in its place."""
+    cropped = attack(mesh, "cropping", strength, seed=_seed(random))
+    vertices, rest = np.asarray(mesh.vertices), np.asarray(cropped.vertices)
+    removed_centre = (vertices.sum(axis=0) - rest.sum(axis=0)) / max(len(vertices) - len(rest), 1)
     other = asteroid(max(len(mesh.vertices) // 2, 500), seed=_seed(random))
     scale = 0.6 * diagonal(mesh) / diagonal(other)
-    placed = lost + scale * Rotation.random(rng=random).apply(np.asarray(other.vertices))
-    return Mesh(np.concatenate([left, placed]), np.concatenate([kept.faces, len(left) + np.asarray(other.faces)]))
+    placed = removed_centre + scale * Rotation.random(rng=random).apply(np.asarray(other.vertices))
+    return Mesh(np.concatenate([rest, placed]), np.concatenate([cropped.faces, len(rest) + np.asarray(other.faces)]))
 
 
-#: The attacks of an attacker with a budget, each with strengths of rising severity.
+#: The attacks of an attacker with a distortion budget, each with strengths of rising severity.
 CHOICES: Mapping[str, Sequence[float]] = {
     "noise": tuple(np.geomspace(1e-5, 0.1, 64)),
     "smoothing": tuple(np.unique(np.geomspace(1, 1000, 48).astype(int))),
@@ -122,7 +123,7 @@ CHOICES: Mapping[str, Sequence[float]] = {
 
 
 def last_within(count: int, within: Callable[[int], bool]) -> int:
-    """Bisect for the last of `count` places of rising severity that is within a limit; -1 if none is."""
+    """Find the last of `count` places of rising severity that is within a limit, by bisection; -1 if none is."""
     low, high = -1, count
     while high - low > 1:
         middle = (low + high) // 2
@@ -135,7 +136,7 @@ def _host(apply: Callable[[Mesh, float, np.random.Generator], Mesh], unit: str, 
 
 
 def to_budget(kind: str) -> Attack:
-    """Make an attack as strong as its MSDM2 allows, found by bisection of the strengths in `CHOICES`."""
+    """Make an attack whose strength is an MSDM2; bisection finds the strongest of `CHOICES` within this MSDM2."""
 
     def attacked(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
         reference, seed = Reference(mesh), _seed(random)

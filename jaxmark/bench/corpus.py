@@ -1,4 +1,4 @@
-"""The corpus: meshes by formula, and some that other packages ship; made by one command, and verified by hashes."""
+"""The benchmark's corpus: meshes by formula, and meshes from other packages, verified by hashes."""
 
 import json
 import os
@@ -20,14 +20,14 @@ from jaxmark.geometry import asteroid
 from jaxmark.geometry.canonical import geometry_hash
 from jaxmark.geometry.mesh import Mesh, make_mesh
 
-_DIGITS = 6  # decimals of coordinates: what processors compute differently is cut off
+_DIGITS = 6  # decimals of coordinates; rounding removes the differences between processors
 
 
 class Member(NamedTuple):
     """A mesh of the corpus."""
 
     kind: str  # scan, CAD, organic, symmetric, noisy or components
-    vertices: int  # about how many
+    vertices: int  # approximate number of vertices
     make: Callable[[], Mesh]
 
 
@@ -65,7 +65,7 @@ def _by_formula() -> Iterator[tuple[str, Member]]:
     yield member("torus-1m", "symmetric", shapes.torus, 1_000_000)
 
 
-#: Files in the wheel of pymeshlab, of the extra `attacks`.
+#: Files in the package pymeshlab, which the extra `attacks` installs.
 _SHIPPED = {
     "cow": ("organic", 2_900, "cow.obj"),
     "airplane": ("CAD", 7_000, "airplane.obj"),
@@ -76,7 +76,7 @@ _SHIPPED = {
 
 
 def corpus() -> dict[str, Member]:
-    """Return the meshes of the corpus by their names: those by formula, and those whose packages are installed."""
+    """Return the meshes of the corpus by their names: all by formula, and those of installed packages."""
     members, spec = dict(_by_formula()), find_spec("pymeshlab")
     if spec is not None and spec.origin is not None:
         for name, (kind, size, file) in _SHIPPED.items():
@@ -87,10 +87,10 @@ def corpus() -> dict[str, Member]:
 
 
 def make_member(member: Member) -> Mesh:
-    """Make a mesh of the corpus, the same on every machine: rounded, and with its faces in a canonical order."""
+    """Make a mesh of the corpus, with rounded coordinates and faces in a canonical order: equal on every machine."""
     mesh = member.make()
     faces = np.asarray(mesh.faces, np.int64)
-    least = np.argmin(faces, axis=1)  # each face begins with its least vertex
+    least = np.argmin(faces, axis=1)  # each face begins with its vertex of least index
     faces = np.take_along_axis(faces, (least[:, None] + np.arange(3)) % 3, axis=1)
     vertices = np.round(np.asarray(mesh.vertices, np.float64), _DIGITS) + 0.0
     return make_mesh(vertices, faces[np.lexsort(faces.T[::-1])])
@@ -105,14 +105,14 @@ def make_corpus(
     folder: str | os.PathLike[str],
     *,
     most_vertices: int = 1_000_000,
-    say: Callable[[str], None] = lambda line: None,
+    log: Callable[[str], None] = lambda line: None,
 ) -> dict[str, str]:
-    """Write the meshes of the corpus as PLY files, with `hashes.json`.
+    """Write the meshes of the corpus as PLY files, and their hashes as `hashes.json`.
 
     Args:
-        folder: where to; it is made if it does not exist.
-        most_vertices: larger meshes are left out.
-        say: function that is called with a line for each mesh.
+        folder: folder for the files, which is created if it does not exist.
+        most_vertices: meshes with more vertices are left out.
+        log: callback, called with a line for each mesh.
 
     Returns:
         The hash of each mesh's geometry, by its name.
@@ -120,18 +120,21 @@ def make_corpus(
     Raises:
         JaxmarkError: if the folder cannot be written.
     """
-    target, known, found = Path(folder), known_hashes(), {}
+    target, expected, hashes = Path(folder), known_hashes(), {}
     try:
         target.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise JaxmarkError(f"The folder {target} cannot be made: {error.strerror}.") from None
+        raise JaxmarkError(f"The folder {target} cannot be created: {error.strerror}.") from None
     for name, member in corpus().items():
         if member.vertices > most_vertices:
             continue
         mesh = make_member(member)
         save_mesh(mesh, target / f"{name}.ply")
-        found[name] = geometry_hash(mesh).hex()
-        same = "as known" if known.get(name) == found[name] else "ANOTHER HASH THAN KNOWN" if name in known else "new"
-        say(f"{name}: {len(mesh.vertices)} vertices, {member.kind}, {same}")
-    (target / "hashes.json").write_text(json.dumps(found, indent=1) + "\n")
-    return found
+        hashes[name] = geometry_hash(mesh).hex()
+        if expected.get(name) == hashes[name]:
+            check = "expected hash"
+        else:
+            check = "UNEXPECTED HASH" if name in expected else "new"
+        log(f"{name}: {len(mesh.vertices)} vertices, {member.kind}, {check}")
+    (target / "hashes.json").write_text(json.dumps(hashes, indent=1) + "\n")
+    return hashes

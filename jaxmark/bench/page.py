@@ -1,6 +1,6 @@
-"""One page of a benchmark: curves over the attacks' cost, ROCs, and all tables; it loads nothing."""
+"""The page of a benchmark: robustness curves, ROCs and all tables in one HTML file without external resources."""
 
-from __future__ import annotations  # so that `help` shows names of types instead of what they stand for
+from __future__ import annotations  # so that `help` shows the names of type aliases, not their definitions
 
 import os
 from collections.abc import Iterator
@@ -27,42 +27,43 @@ def save_page(results: BenchResults, path: str | os.PathLike[str], title: str, a
     Args:
         results: the results of a benchmark.
         path: file for the page.
-        title: its title.
-        about: a sentence on how it was made.
+        title: title of the page.
+        about: a sentence on how the results were made.
 
     Raises:
         JaxmarkError: if matplotlib or Jinja2 is missing, or the page cannot be written.
     """
     require("jinja2", "plot")
     tracks = dict.fromkeys(task.track for task, _ in results.tasks)
-    drawn = {f"{track}: detected, over what the attack costs": _survival(results, track) for track in tracks}
-    drawn["Marks found over false positives, after all attacks"] = _rocs(results)
-    write_page(path, title, drawn, about=about, tables=tables(results))
+    pictures = {f"{track}: marks detected, by the attack's distortion": _survival(results, track) for track in tracks}
+    pictures["Marks detected, by the false-positive rate, after all attacks"] = _rocs(results)
+    write_page(path, title, pictures, about=about, tables=tables(results))
 
 
 def _survival(results: BenchResults, track: str) -> Picture:
-    """Draw a panel for each metric of cost, with a line for each method."""
+    """Draw a panel for each metric of distortion, with a line for each method."""
     figure, (first, *others) = panels(len(RANGES), 4.2, 3.8)
     for panel, metric in zip((first, *others), RANGES, strict=True):
         for name, style in _styles(results):
-            some = [one for one in results.suspects if (one.task.method, one.task.track) == (name, track)]
-            if (found := curve(points(results, some), metric)) is not None:
-                panel.plot(axis(metric), found, label=results.methods[name].name, **style)
+            of_method = [suspect for suspect in results.suspects if suspect.task.method == name]
+            of_track = [suspect for suspect in of_method if suspect.task.track == track]
+            if (survival := curve(points(results, of_track), metric)) is not None:
+                panel.plot(axis(metric), survival, label=results.methods[name].name, **style)
         panel.set(xscale="log", xlabel=metric.upper(), ylim=(-0.03, 1.03))
         panel.tick_params(axis="x", which="minor", labelbottom=False)
-    first.set_ylabel("share detected")
+    first.set_ylabel("fraction detected")
     return _with_legend(figure, first)
 
 
 def _rocs(results: BenchResults) -> Picture:
-    """Draw true over false positives of every method."""
+    """Draw the ROC of every method."""
     figure, (panel,) = panels(1, 5.5, 4.6)
     for name, style in _styles(results):
-        for (method, payload), found in results.calibrations.items():
+        for (method, payload), calibration in results.calibrations.items():
             if method == name:
                 label = f"{results.methods[name].name}, {payload} bits"
-                panel.step(*zip(*found.points, strict=True), where="post", label=label, **style)
-    panel.set(xlabel="false-positive rate, counted", ylabel="share detected, after all attacks", xlim=(-0.02, 1.02))
+                panel.step(*zip(*calibration.points, strict=True), where="post", label=label, **style)
+    panel.set(xlabel="false-positive rate, counted", ylabel="fraction detected, after all attacks", xlim=(-0.02, 1.02))
     return _with_legend(figure, panel)
 
 

@@ -1,6 +1,6 @@
-"""Readings of a benchmark: calibrated detection, paired methods, and comparison with readings that were published."""
+"""The results of a benchmark: calibrated detection, paired comparisons, and comparison with published readings."""
 
-from __future__ import annotations  # so that `help` shows names of types instead of what they stand for
+from __future__ import annotations  # so that `help` shows the names of type aliases, not their definitions
 
 import csv
 import io
@@ -22,7 +22,7 @@ from jaxmark.bench.tracks import get_track
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import read_file, write_atomically
 
-_MAX_BIT_ERROR_DIFFERENCE = 0.1  # share of wrong bits by which two readings of a message may differ and still agree
+_MAX_BIT_ERROR_DIFFERENCE = 0.1  # largest difference of the fractions of wrong bits of two readings that agree
 _CELL, _RULES = (*Task._fields, "copy"), ("read", "bit_errors", "detected")
 Reading = Mapping[str, Any]
 Published = Mapping[tuple[str, ...], Mapping[str, str]]  # readings, by cell and copy
@@ -38,18 +38,18 @@ class Suspect:
 
     @property
     def score(self) -> float:
-        """The reader's score; minus infinity where it refused."""
+        """The reader's score; minus infinity if the reader refused the suspect."""
         return _score(self.reading)
 
 
 @dataclass(frozen=True, eq=False)
 class BenchResults:
-    """The rows of a benchmark, as `jaxmark.bench.benchmark.run` returns them."""
+    """The results of a benchmark, as `jaxmark.bench.benchmark.run` returns them."""
 
     methods: Mapping[str, Method]  # by their names in cells
     rows: tuple[dict[str, Any], ...]
-    skipped: Mapping[str, str]  # attacks that need what is not installed, and why
-    rate: float = RATE  # of false positives, at which a mark counts as detected
+    skipped: Mapping[str, str]  # skipped attacks, and the packages that they need
+    rate: float = RATE  # false-positive rate at which a mark counts as detected
 
     @cached_property
     def tasks(self) -> list[tuple[Task, dict[str, Any]]]:
@@ -58,30 +58,33 @@ class BenchResults:
 
     @property
     def seconds(self) -> float:
-        """The time of all tasks, one after the other."""
+        """The total time of all tasks, in seconds of one process."""
         return sum(row.get("seconds", 0.0) for row in self.rows)
 
     def projected(self, meshes: int, samples: int) -> float:
-        """Project the seconds of numbers of meshes like these and of samples, one task after the other."""
+        """Project the total time, in seconds of one process, to other numbers of similar meshes and of samples."""
         return self.seconds * meshes * samples / len({(task.mesh, task.seed) for task, _ in self.tasks})
 
     @cached_property
     def suspects(self) -> list[Suspect]:
-        """The marked suspects read with their own key; a mesh that could not be marked or attacked counts as one."""
+        """The marked suspects, read with their own key.
+
+        A mesh that could not be marked or attacked counts as a suspect in which nothing was detected.
+        """
         suspects = []
         for task, row in self.tasks:
             if task.attack == MARK or task.source != task.method:
                 continue
-            own = [one for one in row["readings"] if one["own"]]
+            own = [reading for reading in row["readings"] if reading["own"]]
             if not own:
                 nothing = {"read": False, "bit_errors": 0.5, "score": None, "log10_p": 0.0, "note": row.get("note", "")}
                 own = [{**nothing, "copy": copy} for copy in range(get_track(task.track).lines[task.attack].copies)]
-            suspects += [Suspect(task, row.get("costs", {}), one) for one in own]
+            suspects += [Suspect(task, row.get("costs", {}), reading) for reading in own]
         return suspects
 
     @cached_property
     def marks(self) -> set[Task]:
-        """The marks that could be made within their limits."""
+        """The tasks of all marks that could be made within their limits."""
         return {task for task, row in self.tasks if task.attack == MARK and "strength" in row}
 
     @cached_property
@@ -91,19 +94,19 @@ class BenchResults:
             lambda: defaultdict(list)
         )
         for task, row in self.tasks:
-            for one in row.get("readings", []):
-                if not one["own"]:
-                    nulls[task.method, task.payload][self._kind(task)].append((_score(one), one["log10_p"]))
+            for reading in row.get("readings", []):
+                if not reading["own"]:
+                    nulls[task.method, task.payload][self._kind(task)].append((_score(reading), reading["log10_p"]))
         marks: dict[tuple[str, int], list[float]] = defaultdict(list)
-        for one in self.suspects:
-            marks[one.task.method, one.task.payload].append(one.score)
+        for suspect in self.suspects:
+            marks[suspect.task.method, suspect.task.payload].append(suspect.score)
         return {
             key: calibrate(self.methods[key[0]], kinds, np.array(marks[key], float), self.rate)
             for key, kinds in nulls.items()
         }
 
     def _kind(self, task: Task) -> str:
-        """The kind of null that a suspect is for keys that did not mark it."""
+        """Return the kind of null of a suspect, for keys that did not mark it."""
         if task.source == UNMARKED:
             if task.limits:
                 return "unmarked, with the mark's key"
@@ -113,44 +116,46 @@ class BenchResults:
         return "another method's mark" if task.source in self.methods else "another mesh"
 
     def succeeds(self, one: Suspect, rule: str = "detected") -> bool:
-        """Whether a suspect's score is above its reader's calibrated threshold, or by `"read"` its message exact."""
+        """Whether a suspect's score exceeds the calibrated threshold; by the rule `"read"`, whether it is read exactly."""
         if rule == "read":
             return one.reading["read"]
-        found = self.calibrations.get((one.task.method, one.task.payload))
-        return found is not None and one.score > found.threshold.value
+        calibration = self.calibrations.get((one.task.method, one.task.payload))
+        return calibration is not None and one.score > calibration.threshold.value
 
     def paired(
         self, first: str, second: str, track: str, rule: str = "detected", attacks: Sequence[str] = ()
     ) -> Paired:
-        """Compare two methods on all meshes, samples, limits and attacks of a track that both have.
+        """Compare two methods on the meshes, samples, limits and attacks of a track that both have in common.
 
-        Interval and p assume independent suspects. After one attack, of many meshes, they are; after many attacks of
-        few meshes they describe these suspects only.
+        Interval and p-value assume independent suspects. Many meshes after one attack are independent. For few meshes
+        after many attacks, interval and p-value only describe these suspects.
 
         Args:
-            first: a method's name, or its name in cells, where two have the same.
-            second: another one.
+            first: a method's name; or its name in cells, if two methods have the same name.
+            second: the name of the other method.
             track: the track.
             rule: `"detected"` at the calibrated threshold, or `"read"`, the exact message.
-            attacks: after these; by default after all.
+            attacks: the attacks to compare after; by default all.
 
         Raises:
-            JaxmarkError: if they share none, or a name is not that of one method.
+            JaxmarkError: if the methods have no suspect in common, or a name does not determine one method.
         """
         first, second = self._label(first), self._label(second)
-        won: dict[str, dict[tuple[Any, ...], bool]] = {first: {}, second: {}}
-        for one in self.suspects:
-            wanted = one.task.track == track and (not attacks or one.task.attack in attacks)
-            if one.task.method in won and wanted:
-                place = (*one.task._replace(method="", source=""), one.reading.get("copy", 0))
-                won[one.task.method][place] = self.succeeds(one, rule)
-        shared = sorted(won[first].keys() & won[second].keys())
+        successes: dict[str, dict[tuple[Any, ...], bool]] = {first: {}, second: {}}
+        for suspect in self.suspects:
+            task = suspect.task
+            if task.method in successes and task.track == track and (not attacks or task.attack in attacks):
+                place = (*task._replace(method="", source=""), suspect.reading.get("copy", 0))
+                successes[task.method][place] = self.succeeds(suspect, rule)
+        shared = sorted(successes[first].keys() & successes[second].keys())
         if not shared:
             raise JaxmarkError(f"{first!r} and {second!r} have no suspect in common in the track {track}.")
-        return compare_paired([won[first][one] for one in shared], [won[second][one] for one in shared])
+        return compare_paired(
+            [successes[first][place] for place in shared], [successes[second][place] for place in shared]
+        )
 
     def _label(self, name: str) -> str:
-        """The name in cells of a method."""
+        """Return a method's name in cells."""
         labels = [label for label, method in self.methods.items() if name in (label, method.name)]
         if len(labels) != 1:
             count = "more than one" if labels else "no"
@@ -158,13 +163,13 @@ class BenchResults:
         return labels[0]
 
     def save_csv(self, path: str | os.PathLike[str]) -> None:
-        """Write every reading as comma-separated values.
+        """Write all readings as comma-separated values.
 
         Raises:
-            JaxmarkError: if it cannot be written.
+            JaxmarkError: if the file cannot be written.
         """
         fields = [*_CELL, "own", "read", "bit_errors", "score", "log10_p", "seconds", "note"]
-        rows = ({**task._asdict(), **one} for task, row in self.tasks for one in row.get("readings", []))
+        rows = ({**task._asdict(), **reading} for task, row in self.tasks for reading in row.get("readings", []))
         _write_csv(path, fields, rows, "\r\n")
 
 
@@ -183,17 +188,17 @@ def _write_csv(
 
 
 class Repetition(NamedTuple):
-    """The readings that a run shares with a published one."""
+    """The comparison of a run with a published run."""
 
-    shared: int  # readings that both have
-    differences: tuple[str, ...]  # a line for each that disagrees
+    shared: int  # number of readings that both runs have
+    differences: tuple[str, ...]  # a line for each reading that differs
 
 
 def save_readings(results: BenchResults, path: str | os.PathLike[str]) -> None:
-    """Write the readings of marked suspects with their own keys as comma-separated values, to publish them.
+    """Write the readings of marked suspects with their own keys as comma-separated values, for publication.
 
     Raises:
-        JaxmarkError: if it cannot be written.
+        JaxmarkError: if the file cannot be written.
     """
     _write_csv(path, [*_CELL, *_RULES], _published(results), "\n")
 
@@ -202,7 +207,7 @@ def load_published(path: str | os.PathLike[str]) -> Published:
     """Load readings that `save_readings` wrote.
 
     Raises:
-        JaxmarkError: if the file cannot be read, or is of another form.
+        JaxmarkError: if the file cannot be read, or has another format.
     """
     try:
         rows = list(csv.DictReader(io.StringIO(read_file(path).decode())))
@@ -210,7 +215,7 @@ def load_published(path: str | os.PathLike[str]) -> Published:
         if (
             published
             and len(published) == len(rows)
-            and all(0 <= float(one["bit_errors"]) <= 1 for one in published.values())
+            and all(0 <= float(reading["bit_errors"]) <= 1 for reading in published.values())
         ):
             return published
     except OSError as error:
@@ -218,16 +223,15 @@ def load_published(path: str | os.PathLike[str]) -> Published:
     except (ValueError, KeyError, TypeError, csv.Error):
         pass
     raise JaxmarkError(
-        f"{os.fspath(path)} holds no readings of a benchmark, one a line, with a share of wrong bits: give the"
-        " readings.csv of one."
+        f"{os.fspath(path)} holds no readings of a benchmark; give a file readings.csv that a run has written."
     )
 
 
 def hold_against(results: BenchResults, published: Published) -> Repetition:
-    """Compare a run with a published one of any other extent, reading by reading.
+    """Compare a run with a published run, reading by reading; the runs may have different meshes and methods.
 
-    Readings disagree where the exact message is read in one of them only, or the shares of wrong bits differ by more
-    than 0.1; of methods without a message, where a mark is detected in one of them only.
+    Two readings differ if the exact message is read in one of them only, or if the fractions of wrong bits differ by
+    more than 0.1. For methods without a message, they differ if a mark is detected in one of them only.
 
     Args:
         results: the run.
@@ -239,22 +243,22 @@ def hold_against(results: BenchResults, published: Published) -> Repetition:
             continue
         shared += 1
         rule = "read" if results.methods[row["method"]].bits else "detected"
-        apart = abs(float(row["bit_errors"]) - float(other["bit_errors"]))
-        if row[rule] != other[rule] or apart > _MAX_BIT_ERROR_DIFFERENCE:
+        difference = abs(float(row["bit_errors"]) - float(other["bit_errors"]))
+        if row[rule] != other[rule] or difference > _MAX_BIT_ERROR_DIFFERENCE:
             place = ", ".join(row[name] for name in ("method", "payload", "track", "limits", "mesh", "seed", "attack"))
             differences.append(
-                f"{place}: {rule} {row[rule]} here, {other[rule]} there; wrong bits {row['bit_errors']} here,"
-                f" {other['bit_errors']} there"
+                f"{place}: {rule} {row[rule]}, published {other[rule]}; wrong bits {row['bit_errors']}, published"
+                f" {other['bit_errors']}"
             )
     return Repetition(shared, tuple(differences))
 
 
 def _published(results: BenchResults) -> Iterator[dict[str, str]]:
-    for one in results.suspects:
+    for suspect in results.suspects:
         yield {
-            **{name: str(value) for name, value in one.task._asdict().items()},
-            "copy": str(one.reading.get("copy", 0)),
-            "read": str(int(one.reading["read"])),
-            "bit_errors": f"{one.reading['bit_errors']:.3g}",
-            "detected": str(int(results.succeeds(one))),
+            **{name: str(value) for name, value in suspect.task._asdict().items()},
+            "copy": str(suspect.reading.get("copy", 0)),
+            "read": str(int(suspect.reading["read"])),
+            "bit_errors": f"{suspect.reading['bit_errors']:.3g}",
+            "detected": str(int(results.succeeds(suspect))),
         }

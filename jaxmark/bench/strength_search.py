@@ -1,4 +1,4 @@
-"""The strength of a mark under limits of distortion, the same search for every method."""
+"""Search for the largest strength of a mark within distortion limits; it is the same for every method."""
 
 import math
 from collections.abc import Mapping
@@ -13,35 +13,36 @@ from jaxmark.geometry.mesh import Mesh, Weld, diagonal, weld
 from jaxmark.geometry.pose import similarity
 from jaxmark.watermark.perception.budget import largest_within
 
-_REFUSED = 2.0  # the distortion over the limits that a refused strength counts as
-_TORN = 1e-9  # of the diagonal: rounding
-SHARE = 0.95  # of the limits that a mark must reach: each further trial is an embedding
+_REFUSED = 2.0  # ratio of distortion to limit that is assumed for a strength that the method refuses
+_TORN = 1e-9  # largest distance of vertices of one point after embedding, over the diagonal; it allows for rounding
+SHARE = 0.95  # least fraction of a limit that a mark must reach; the search then ends, as each trial is an embedding
 
 
 class Fitted(NamedTuple):
-    """A mark as strong as limits allow."""
+    """A mark as strong as the limits allow."""
 
     mesh: Mesh
     strength: float  # in the method's own unit
-    reached: Mapping[str, float]  # the limited metrics
-    tries: int
+    reached: Mapping[str, float]  # values of the limited metrics
+    tries: int  # number of embeddings
 
 
 def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[str, float]) -> Fitted:
-    """Embed with the largest strength that keeps limits.
+    """Embed with the largest strength that is within the distortion limits.
 
-    The similarity that fits best is undone: a message in the pose would cost nothing that a metric measures.
+    Each marked mesh is aligned with the original by a similarity before its distortion is measured. Otherwise, a method
+    could hide a message in the pose, which the metrics do not count as distortion.
 
     Args:
         method: the method; its `strengths` bound the search.
         mesh: the original.
-        message: what is embedded.
+        message: the message to embed.
         key: 32 bytes.
-        limits: the largest values of metrics of `jaxmark.distortion.METRICS`.
+        limits: largest values of metrics of `jaxmark.distortion.METRICS`.
 
     Raises:
-        JaxmarkError: if not even the weakest mark keeps the limits, the method changes the connectivity that a metric
-            needs, tears copies of a vertex apart, or refuses the mesh.
+        JaxmarkError: if even the weakest mark exceeds the limits, or the method refuses the mesh, changes a
+            connectivity that a metric needs, or separates vertices that share a position.
     """
     reference, welded, (weakest, strongest) = Reference(mesh), weld(mesh.vertices), method.strengths
     fitted: list[Fitted] = []
@@ -54,7 +55,7 @@ def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[s
         tries += 1
         try:
             marked = _in_pose_of(mesh, method.embed(mesh, message, key, strength), welded)
-        except JaxmarkError as error:  # too strong for this mesh, or else the weakest is refused, too
+        except JaxmarkError as error:  # perhaps the mark is too strong; if not, the weakest one is refused, too
             refusal = str(error)
             return _REFUSED
         reached = {}
@@ -70,18 +71,18 @@ def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[s
     try:
         largest_within(ratio, strongest, math.sqrt(weakest * strongest), SHARE)
     except JaxmarkError:
-        # The search stops above a strength that is not within the limits, but the weakest may be.
+        # The search may end before the weakest mark is tested, which may be within the limits.
         if not fitted and ratio(weakest) > 1:
             raise
-    return max(fitted, key=lambda one: one.strength)._replace(tries=tries)
+    return max(fitted, key=lambda mark: mark.strength)._replace(tries=tries)
 
 
 def _in_pose_of(mesh: Mesh, marked: Mesh, welded: Weld) -> Mesh:
-    """Register a marked mesh to its original; refuse one whose copies of a vertex are no longer at one place."""
+    """Register a marked mesh to its original; refuse it if vertices of one point are no longer at one position."""
     if len(marked.vertices) != len(mesh.vertices):
         return marked  # metrics refuse it
-    before, after = (np.asarray(one.vertices, np.float64) for one in (mesh, marked))
+    before, after = (np.asarray(each.vertices, np.float64) for each in (mesh, marked))
     points = after[welded.first]
     if np.abs(points[welded.point] - after).max() > _TORN * diagonal(mesh):
-        raise JaxmarkError("The mark tears vertices apart that are copies of one point.")
+        raise JaxmarkError("The mark tears vertices apart that share a position in the original.")
     return Mesh(similarity(after, before)(points)[welded.point], marked.faces)

@@ -1,6 +1,6 @@
-"""Tables of a benchmark as text, for a page or for Markdown."""
+"""The tables of a benchmark as text, for HTML pages and Markdown."""
 
-from __future__ import annotations  # so that `help` shows names of types instead of what they stand for
+from __future__ import annotations  # so that `help` shows the names of type aliases, not their definitions
 
 import re
 from collections import defaultdict
@@ -37,47 +37,48 @@ def tables(results: BenchResults) -> list[Table]:
     every = entries(results)
     groups = _groups(every)
     several = len({payload for payload, _, _ in groups}) > 1
-    found = [
+    made = [
         _table(
             "Scores",
             _scores(every),
-            "Area under the share of marks that survive, over what the attack itself costs the shape (0 to 1), with"
-            " 95 % intervals over meshes and seeds; the columns of metrics are its parts, of `detected`.",
+            "Area under the curve of the fraction of marks that survive, as a function of the attack's distortion (0 to"
+            " 1), with 95 % intervals over meshes and seeds. The columns of metrics are the areas of `detected`, by"
+            " metric of distortion.",
         ),
         _table(
             "Calibration",
             _calibrations(every),
-            "Suspects without the key's mark, read by each reader. A mark counts as detected above the threshold whose"
-            f" expected false-positive rate is at most {results.rate:g}; the interval is exact for nulls of one"
-            " distribution.",
+            "Nulls are suspects without a mark of the key, which each reader reads. A mark counts as detected if its"
+            " score exceeds the threshold; the threshold is chosen so that the expected false-positive rate is at most"
+            f" {results.rate:g}. The interval of the rate is exact if all nulls have one distribution.",
         ),
     ]
     for (payload, track, limits), parts in groups.items():
         title = f"{track}, {limits} limits{f', {payload} bits' if several else ''}"
-        found += [
+        made += [
             _table(f"{title}: the marks", _marks(parts, every)),
-            _attacks(f"{title}: what survives", parts, every),
-            _table(f"{title}: what attacks do to the shape", _costs(parts)),
+            _attacks(f"{title}: robustness", parts, every),
+            _table(f"{title}: distortion by the attacks", _costs(parts)),
         ]
-    paired_remark = (
-        "Detected, on the same meshes, seeds, limits and attacks. Interval and p describe these suspects: many attacks"
-        " of one mark are not independent of each other."
+    paired_note = (
+        "Marks detected by both methods, or by one of them, on the same meshes, seeds, limits and attacks. Interval and"
+        " p only describe these suspects, because suspects from one mark are not independent of each other."
     )
-    skipped = ({"attack": name, "why": why} for name, why in results.skipped.items())
+    skipped = ({"attack": name, "reason": reason} for name, reason in results.skipped.items())
     rest = [
         _table("Refused", _refused(groups, every)),
-        _table("Pairs", _paired(results, every), paired_remark),
+        _table("Paired comparison", _paired(results, every), paired_note),
         _table("Skipped", skipped),
     ]
-    return found + [table for table in rest if table.lines]
+    return made + [table for table in rest if table.lines]
 
 
 Row = Mapping[str, str]  # cells by the heads of their columns
 
 
 def _table(title: str, rows: Iterable[Row], note: str = "") -> Table:
-    listed = list(rows)
-    return Table(title, list(listed[0]) if listed else [], [list(row.values()) for row in listed], note)
+    lines = list(rows)
+    return Table(title, list(lines[0]) if lines else [], [list(row.values()) for row in lines], note)
 
 
 def _groups(entries: Entries) -> dict[tuple[str, str, str], dict[str, Any]]:
@@ -85,19 +86,19 @@ def _groups(entries: Entries) -> dict[tuple[str, str, str], dict[str, Any]]:
     groups: dict[tuple[str, str, str], dict[str, Any]] = defaultdict(dict)
     for payload in sorted({payload for entry in entries.values() for payload in entry["payloads"]}, key=int):
         for name, entry in entries.items():
-            for track, found in entry["payloads"].get(payload, {"tracks": {}})["tracks"].items():
-                for limits, part in found["limits"].items():
+            for track, summary in entry["payloads"].get(payload, {"tracks": {}})["tracks"].items():
+                for limits, part in summary["limits"].items():
                     groups[payload, track, limits][name] = part
     return groups
 
 
 def _label(name: str, entry: Mapping[str, Any]) -> str:
-    """A method's name, marked in every table if the method is not validated."""
+    """Return a method's name, with a remark if the method is not validated."""
     return f"{name} ({NOT_VALIDATED})" if entry["validated"] == NOT_VALIDATED else name
 
 
 def _payloads(entries: Entries) -> Iterator[tuple[str, str, Mapping[str, Any], Mapping[str, Any]]]:
-    """Yield label, bits, entry and part of each method at each payload; a method may have bits of its own, or none."""
+    """Yield label, payload, entry and part of each method and payload; a method may have a fixed payload, or none."""
     for name, entry in entries.items():
         for payload, part in entry["payloads"].items():
             bits = payload if len(entry["payloads"]) > 1 else str(entry["bits"])
@@ -112,39 +113,39 @@ def _interval(value: float, low: float, high: float, form: str) -> str:
     return f"{value:{form}} ({low:{form}} - {high:{form}})"
 
 
-def _share(found: Mapping[str, Any], of: str = "hits") -> str:
-    return f"{found[of]}/{found['trials']}"
+def _share(counts: Mapping[str, Any], of: str = "hits") -> str:
+    return f"{counts[of]}/{counts['trials']}"
 
 
 def _scores(entries: Entries) -> Iterator[Row]:
     for label, bits, entry, part in _payloads(entries):
-        for track, found in part["tracks"].items():
-            row = {"method": label, "reader": "blind" if entry["blind"] else "informed", "bits": bits, "track": track}
-            for rule, one in found["scores"].items():
+        for track, summary in part["tracks"].items():
+            row = {"method": label, "reader": "blind" if entry["blind"] else "non-blind", "bits": bits, "track": track}
+            for rule, score in summary["scores"].items():
                 row[rule] = "-"
-                if one is not None and (rule == "detected" or entry["bits"]):
-                    row[rule] = _interval(one["value"], one["low"], one["high"], ".2f")
-            areas = (found["scores"]["detected"] or {"areas": {}})["areas"]
+                if score is not None and (rule == "detected" or entry["bits"]):
+                    row[rule] = _interval(score["value"], score["low"], score["high"], ".2f")
+            areas = (summary["scores"]["detected"] or {"areas": {}})["areas"]
             row |= {metric.upper(): _number(areas.get(metric), ".2g") for metric in COSTS}
             yield {**row, "validated by": entry["validated"]}
 
 
 def _calibrations(entries: Entries) -> Iterator[Row]:
     for label, bits, _, part in _payloads(entries):
-        if (found := part["calibration"]) is None:
+        if (calibration := part["calibration"]) is None:
             continue
-        own, bound = found["own_threshold"], found["bound"]
-        passed = ", ".join(f"10^{one['log10_p']:g}: {_share(one)}" for one in bound if one["hits"])
+        own, bound, nulls = calibration["own_threshold"], calibration["bound"], calibration["nulls"]
+        passed = ", ".join(f"10^{level['log10_p']:g}: {_share(level)}" for level in bound if level["hits"])
         yield {
             "method": label,
             "bits": bits,
-            "nulls above the threshold": ", ".join(f"{kind}: {_share(one)}" for kind, one in found["nulls"].items()),
-            "threshold": _number(found["threshold"]),
-            "rate (95 %)": _interval(found["rate"], found["rate_low"], found["rate_high"], ".2g"),
+            "nulls above the threshold": ", ".join(f"{kind}: {_share(counts)}" for kind, counts in nulls.items()),
+            "threshold": _number(calibration["threshold"]),
+            "rate (95 %)": _interval(calibration["rate"], calibration["rate_low"], calibration["rate_high"], ".2g"),
             "nulls at its own threshold": f"{_share(own)}, stated {own['stated']:g}" if own else "-",
-            "nulls that pass its bound": (passed or f"never passed in {bound[0]['trials']}") if bound else "-",
-            "ROC": f"{found['roc_area']:.3f}",
-            "verdict": " ".join(found["verdicts"]) or "holds",
+            "nulls within its bound": (passed or f"none of {bound[0]['trials']}") if bound else "-",
+            "ROC area": f"{calibration['roc_area']:.3f}",
+            "verdict": " ".join(calibration["verdicts"]) or "holds",
         }
 
 
@@ -157,56 +158,56 @@ def _marks(parts: Mapping[str, Any], entries: Entries) -> Iterator[Row]:
 
 
 def _attacks(title: str, parts: Mapping[str, Any], entries: Entries) -> Table:
-    def cell(name: str, one: Mapping[str, Any] | None) -> str:
-        if one is None:
+    def cell(name: str, rates: Mapping[str, Any] | None) -> str:
+        if rates is None:
             return "-"
-        said = [f"{_share(one, 'read')}, BER {one['bit_errors']:.2f}"] if entries[name]["bits"] else []
-        said += [f"detected {_share(one, 'detected')}"]
-        return ", ".join(said if one["log10_p"] is None else [*said, f"p 10^{one['log10_p']:.1f}"])
+        texts = [f"{_share(rates, 'read')}, BER {rates['bit_errors']:.2f}"] if entries[name]["bits"] else []
+        texts += [f"detected {_share(rates, 'detected')}"]
+        return ", ".join(texts if rates["log10_p"] is None else [*texts, f"p 10^{rates['log10_p']:.1f}"])
 
     lines = []
     for attack in dict.fromkeys(attack for part in parts.values() for attack in part["attacks"]):
-        found = {name: part["attacks"].get(attack) for name, part in parts.items()}
-        published = next((p for one in found.values() if one and (p := one.get("published_bit_errors"))), {})
-        line = [attack, *(cell(name, one) for name, one in found.items())]
+        of_attack = {name: part["attacks"].get(attack) for name, part in parts.items()}
+        published = next((p for rates in of_attack.values() if rates and (p := rates.get("published_bit_errors"))), {})
+        line = [attack, *(cell(name, rates) for name, rates in of_attack.items())]
         lines.append([*line, *(_number(published.get(name), ".2f") for name in ("cho", "wang"))])
     heads = ["attack", *(_label(name, entries[name]) for name in parts), "Cho, published", "Wang, published"]
-    if all(line[-2:] == ["-", "-"] for line in lines):  # this track is younger than they are
+    if all(line[-2:] == ["-", "-"] for line in lines):  # no rates were published for this track
         heads, lines = heads[:-2], [line[:-2] for line in lines]
     note = (
-        "How often the exact message is read; wrong bits of the best guess (BER), the mean; false-positive probability"
-        " (p), the median, of methods that bound it."
+        "Number of suspects from which the exact message is read; mean bit error rate of the best guess (BER); number"
+        " of detections; median false-positive probability (p) of methods that bound it."
     )
     return Table(title, heads, lines, note)
 
 
 def _costs(parts: Mapping[str, Any]) -> Iterator[Row]:
-    """Tabulate the distortion of the mesh that the first method marked, the mean over meshes and samples."""
-    for attack, one in next(iter(parts.values()))["attacks"].items():
-        yield {"attack": attack, **{name.upper(): _number(one["costs"][name]) for name in COSTS}}
+    """Tabulate the mean distortion of the attacks, over the meshes and samples that the first method marked."""
+    for attack, rates in next(iter(parts.values()))["attacks"].items():
+        yield {"attack": attack, **{name.upper(): _number(rates["costs"][name]) for name in COSTS}}
 
 
 def _refused(groups: Mapping[tuple[str, str, str], Mapping[str, Any]], entries: Entries) -> Iterator[Row]:
-    """Tabulate refusals by methods and attacks, and their number."""
+    """Tabulate the refusals of methods and attacks, and their number."""
     places: dict[tuple[str, str], list[str]] = defaultdict(list)
     for name, entry in entries.items():
         for (_, track, limits), parts in groups.items():
-            for attack, one in parts.get(name, {"attacks": {}})["attacks"].items():
-                for note in one["notes"]:
+            for attack, rates in parts.get(name, {"attacks": {}})["attacks"].items():
+                for note in rates["notes"]:
                     places[_label(name, entry), note].append(f"{track}, {limits}: {attack}")
-    for (label, note), where in places.items():
-        yield {"method": label, "what was said": note, "after attacks": str(len(where)), "the first": where[0]}
+    for (label, note), attacks in places.items():
+        yield {"method": label, "reason": note, "attacks": str(len(attacks)), "first attack": attacks[0]}
 
 
 def _paired(results: BenchResults, entries: Entries) -> Iterator[Row]:
-    """Compare the first method with each other one, on the same suspects."""
+    """Tabulate the paired comparisons of the first method with each other method."""
     (first, label), *others = zip(results.methods, (_label(*entry) for entry in entries.items()), strict=True)
     for track, (other, other_label) in product(dict.fromkeys(task.track for task, _ in results.tasks), others):
-        found = results.paired(first, other, track)
+        pairs = results.paired(first, other, track)
         yield {
             "track": track,
             "methods": f"{label} - {other_label}",
-            "difference (95 %)": _interval(found.difference, found.low, found.high, "+.3f"),
-            "only one of them": f"{found.first} : {found.second}",
-            "McNemar's p": f"{found.p:.2g}",
+            "difference (95 %)": _interval(pairs.difference, pairs.low, pairs.high, "+.3f"),
+            "only one detected": f"{pairs.first} : {pairs.second}",
+            "McNemar's p": f"{pairs.p:.2g}",
         }

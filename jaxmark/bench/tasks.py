@@ -1,4 +1,4 @@
-"""Tasks of the benchmark: make a mark as strong as limits allow, or attack a mesh and read the suspects."""
+"""The tasks of the benchmark: make a mark as strong as the limits allow, or attack a mesh and read the suspects."""
 
 import hashlib
 import io
@@ -26,10 +26,10 @@ from jaxmark.files.atomic import write_atomically
 from jaxmark.geometry.canonical import geometry_hash
 from jaxmark.geometry.mesh import Mesh
 
-UNMARKED = "unmarked"  # in place of the method whose mark a suspect has
-MARK = "mark"  # in place of an attack: the mark itself is made
-COSTS = ("mrms", "dame", "msdm2")  # the distortion by an attack, measured against the marked mesh
-_OWN, _SECOND = "own", "second"  # keys: of the mark, and of one that is written over it
+UNMARKED = "unmarked"  # value of `Task.source` for a suspect without a mark
+MARK = "mark"  # value of `Task.attack` for a task that makes a mark
+COSTS = ("mrms", "dame", "msdm2")  # metrics of the distortion by an attack, compared with the marked mesh
+_OWN, _SECOND = "own", "second"  # names of keys: of the mark, and of a second mark that overwrites it
 
 Meshes = Sequence[str | os.PathLike[str]] | Mapping[str, Mesh]  # files, or meshes by their names
 
@@ -38,14 +38,14 @@ class Task(NamedTuple):
     """A cell of the benchmark: a method reads an attacked mesh, which is marked or not."""
 
     method: str
-    payload: int  # bits of a message that are asked for; a method may have its own number
+    payload: int  # requested payload in bits; a method may have a fixed payload
     track: str
-    limits: str  # empty where nothing is marked
+    limits: str  # name of the set of limits; empty if nothing is marked
     mesh: str
     seed: int  # number of the sample, from which key, message and attacks derive
-    source: str  # the method whose mark the suspect has, or `UNMARKED`, or an unmarked mesh in place of this one
-    attack: str  # of the track, or `MARK`
-    number: int = 0  # of the key, where several that wrote nothing are tried
+    source: str  # the method whose mark the suspect has; or `UNMARKED`; or another, unmarked mesh as the suspect
+    attack: str  # name of the attack in the track, or `MARK`
+    number: int = 0  # number of the key, if an unmarked suspect is read with several keys
 
     @property
     def sample(self) -> tuple[str, int, str, int]:
@@ -62,20 +62,20 @@ class Task(NamedTuple):
 class Bench:
     """The meshes and methods of a benchmark, as workers need them."""
 
-    folder: Path  # of marked meshes
+    folder: Path  # folder of marked meshes
     meshes: Mapping[str, Path]
     methods: Mapping[str, Given]
-    after: Callable[[], object] | None = None  # called after each task; at the top level of a module
+    after: Callable[[], object] | None = None  # function at the top level of a module, called after each task
 
     def file(self, task: Task, copy: int = 0) -> Path:
-        """The file of a mesh that a task makes."""
+        """Return the path of a mesh that a task makes."""
         return self.folder / f"{hashlib.sha256(repr((*task, copy)).encode()).hexdigest()[:24]}.npz"
 
 
 def make_bench(
     output: str | os.PathLike[str], meshes: Meshes, methods: Sequence[Given], after: Callable[[], object] | None = None
 ) -> Bench:
-    """Name meshes and methods by their contents; meshes that have no file are written to the folder."""
+    """Make a `Bench`, with names of meshes and methods that depend on their content; write meshes without a file."""
     folder, files = Path(output) / "meshes", {}
     folder.mkdir(parents=True, exist_ok=True)
     if isinstance(meshes, Mapping):
@@ -87,7 +87,9 @@ def make_bench(
     else:
         for given in meshes:
             if not isinstance(given, str | os.PathLike):
-                raise JaxmarkError(f"Meshes are files, or a mapping of names to meshes; got {type(given).__name__}.")
+                raise JaxmarkError(
+                    f"Meshes must be files, or a mapping of names to meshes; got {type(given).__name__}."
+                )
             path = Path(given)
             files[f"{path.stem}-{geometry_hash(load_mesh(path)).hex()[:8]}"] = path.resolve()
     return Bench(folder, files, {_name_of(given): given for given in methods}, after)
@@ -101,8 +103,8 @@ def _name_of(given: Given) -> str:
 
 
 def run_task(bench: Bench, cell: Cell) -> dict[str, Any]:
-    """Run a task; at the top level of a module, so that processes can import it."""
-    task = Task(*cell)  # pyright: ignore[reportArgumentType] (a cell's values are those of its fields)
+    """Run a task; this function is at the top level of the module, so that worker processes can import it."""
+    task = Task(*cell)  # pyright: ignore[reportArgumentType] (the values of a cell have the types of the fields)
     try:
         return _mark(bench, task) if task.attack == MARK else _attack_and_read(bench, task)
     finally:
@@ -111,12 +113,12 @@ def run_task(bench: Bench, cell: Cell) -> dict[str, Any]:
 
 
 def draw(size: int, *place: object) -> bytes:
-    """Derive bytes from a place in the benchmark, always the same."""
+    """Derive bytes from a place in the benchmark; equal places give equal bytes."""
     return hashlib.shake_256("/".join(("jaxmark/bench", *map(str, place))).encode()).digest(size)
 
 
 def draw_mark(bits: int, *place: object) -> tuple[bytes, Bits]:
-    """Derive a key, and a message of a number of bits."""
+    """Derive a key and a message with a number of bits from a place in the benchmark."""
     message = np.unpackbits(np.frombuffer(draw(bits, "message", *place), np.uint8))[:bits]
     return draw(32, "key", *place), message.astype(bool)
 
@@ -126,16 +128,16 @@ def _mark(bench: Bench, task: Task) -> dict[str, Any]:
     start = time.perf_counter()
     try:
         mesh = load(bench.meshes[task.mesh])
-        found = _fit(bench, task, mesh, _OWN)
-        _save(bench.file(task), found.mesh)
-        row = {"strength": found.strength, "tries": found.tries, "reached": found.reached, "moved": moved(mesh, found)}
-    except (Exception, SystemExit) as error:  # a foreign method may raise anything, which ends only its task
+        mark = _fit(bench, task, mesh, _OWN)
+        _save(bench.file(task), mark.mesh)
+        row = {"strength": mark.strength, "tries": mark.tries, "reached": mark.reached, "moved": moved(mesh, mark)}
+    except (Exception, SystemExit) as error:  # a method of the user may raise any exception, which ends only its task
         row = {"note": f"Not marked: {_sentence(error)}"}
     return {**row, "seconds": time.perf_counter() - start}
 
 
 def _fit(bench: Bench, task: Task, mesh: Mesh, name: str) -> Fitted:
-    """Mark a mesh as strongly as the limits of a task allow, or the first limits of its track."""
+    """Mark a mesh as strongly as the limits of a task allow; a task without limits uses the first of its track."""
     method, track = load_method(bench.methods[task.method], task.payload), get_track(task.track)
     key, message = draw_mark(method.bits, name, *task.sample)
     return fit(method, mesh, message, key, track.bounds(task.limits or next(iter(track.limits)), mesh))
@@ -155,13 +157,15 @@ def _attack_and_read(bench: Bench, task: Task) -> dict[str, Any]:
     line = get_track(task.track).lines[task.attack]
     try:
         suspects = _suspects(bench, task, line, before)
-    except (Exception, SystemExit) as error:  # also of a foreign method, which writes over its mark
+    except (Exception, SystemExit) as error:  # also exceptions of a method that overwrites its own mark
         return {"note": f"Not attacked: {_sentence(error)}", "readings": []}
     seconds, costs, own = time.perf_counter() - start, {}, task.source == task.method
     if own and line.in_place:
-        with suppress(JaxmarkError):  # of a suspect without an area
+        with suppress(JaxmarkError):  # raised for a suspect whose area is 0
             costs = Reference(before).measure(suspects[0], COSTS)
-    readings = [one for copy, suspect in enumerate(suspects) for one in _read(bench, task, original, suspect, copy)]
+    readings = [
+        reading for copy, suspect in enumerate(suspects) for reading in _read(bench, task, original, suspect, copy)
+    ]
     return {"attack_seconds": seconds, "seconds": time.perf_counter() - start, "costs": costs, "readings": readings}
 
 
@@ -181,7 +185,7 @@ def _suspects(bench: Bench, task: Task, line: Line, before: Mesh) -> list[Mesh]:
 
 def _read(bench: Bench, task: Task, original: Mesh, suspect: Mesh, copy: int) -> Iterator[dict[str, Any]]:
     """Read a suspect with the keys of a task."""
-    # Keys that wrote nothing are used once, so that false positives are independent of each other.
+    # A key without a mark is used for one reading only, so that false positives are independent of each other.
     fresh = "/".join((task.track, task.limits, task.source, task.attack, str(copy), str(task.number)))
     own = task.source == task.method
     names = [_OWN] if task.limits and task.source == UNMARKED else [_OWN, fresh] if own else [fresh]
@@ -191,22 +195,22 @@ def _read(bench: Bench, task: Task, original: Mesh, suspect: Mesh, copy: int) ->
         start = time.perf_counter()
         row = {"copy": copy, "own": own and name == _OWN}
         try:
-            found = method.read(suspect, draw_mark(0, name, *task.sample)[0], None if method.blind else original)
-            row |= _compare(found, message)
+            reading = method.read(suspect, draw_mark(0, name, *task.sample)[0], None if method.blind else original)
+            row |= _compare(reading, message)
         except (Exception, SystemExit) as error:  # see `_mark`
             row |= {"read": False, "bit_errors": 0.5, "score": None, "log10_p": None, "note": _sentence(error)}
         yield {**row, "seconds": time.perf_counter() - start}
 
 
-def _compare(found: Reading, message: Bits) -> dict[str, Any]:
-    """Compare a reading with the message, as JSON can hold it: a probability of 0 becomes the least float."""
-    guess, errors = found.message, 0.5  # half of the bits are wrong where nothing is guessed
+def _compare(reading: Reading, message: Bits) -> dict[str, Any]:
+    """Compare a reading with the message; returns JSON values, in which infinite numbers are clipped to finite ones."""
+    guess, errors = reading.message, 0.5  # without a guess, half of the bits count as wrong
     if guess is not None and len(message):
         if np.shape(guess) != message.shape:
             raise JaxmarkError(f"A reading has {np.size(guess)} bits, but the message {len(message)}.")
         errors = float(np.mean(np.asarray(guess, bool) != message))
-    most, score = sys.float_info.max, float(found.score)
-    log10_p = None if found.log10_p is None else float(found.log10_p)
+    most, score = sys.float_info.max, float(reading.score)
+    log10_p = None if reading.log10_p is None else float(reading.log10_p)
     if math.isnan(score) or (log10_p is not None and math.isnan(log10_p)):
         raise JaxmarkError("The reader's score, or its log10_p, is not a number.")
     return {
@@ -229,7 +233,7 @@ def _save(path: Path, mesh: Mesh) -> None:
 
 
 def load(path: Path) -> Mesh:
-    """Load a mesh from a file of any format, or of arrays; the same arrays each time."""
+    """Load a mesh from a mesh file or a file of arrays; repeated calls return the same arrays from a cache."""
     status = path.stat()
     return _load(path, (status.st_mtime_ns, status.st_size, status.st_ino))
 
@@ -238,12 +242,12 @@ def load(path: Path) -> Mesh:
 def _load(path: Path, version: tuple[int, ...]) -> Mesh:
     if path.suffix != ".npz":
         return _read_only(load_mesh(path))
-    with np.load(path) as found:
-        return _read_only(Mesh(found["vertices"], found["faces"]))
+    with np.load(path) as arrays:
+        return _read_only(Mesh(arrays["vertices"], arrays["faces"]))
 
 
 def _read_only(mesh: Mesh) -> Mesh:
-    """Make the arrays of a mesh read-only: a method that changed them would change what it is compared with."""
+    """Make the arrays of a mesh read-only, so that a method cannot change the mesh with which it is compared."""
     parts = [np.asarray(part) for part in mesh]
     parts = [part.copy() if part.flags.writeable else part for part in parts]
     for part in parts:

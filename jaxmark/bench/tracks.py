@@ -1,7 +1,7 @@
-"""Tracks: attacks that marks must survive, and the limits of distortion that every method keeps.
+"""The tracks of the benchmark: sets of attacks, and of distortion limits for the marks of all methods.
 
-`smi2010` is the field's protocol: Wang, Lavoué, Denis, Baskurt, He, "A benchmark for 3D mesh watermarking", SMI 2010.
-`2026` adds remeshing, deformation, file formats, and attackers who choose.
+`smi2010` is the established protocol: Wang, Lavoué, Denis, Baskurt, He, "A benchmark for 3D mesh watermarking", SMI
+2010. `2026` adds remeshing, deformation, file formats, and attackers who choose among several attacks.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,47 +18,47 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.perception.budget import visibility_of
 
-CROPS = 3  # of one mesh, whose readings are averaged
-OVERWRITTEN = "overwritten"  # by a second mark of the same method, with another key, as strong as the limits
-_MAX_DISPLACEMENT = 0.02  # of the diagonal, of any vertex by a hidden mark: metrics are means, and overlook single ones
-_EXTRAS = {"igl": "align", "DracoPy": "files"}  # of packages; else `attacks`
+CROPS = 3  # number of crops of one mesh, whose readings are averaged
+OVERWRITTEN = "overwritten"  # re-watermarking by the same method with another key, as strongly as the limits allow
+_MAX_DISPLACEMENT = 0.02  # largest displacement of a vertex by a hidden mark, over the diagonal; other limits are means
+_EXTRAS = {"igl": "align", "DracoPy": "files"}  # extras that install packages; `attacks` installs all others
 
 
 class Line(NamedTuple):
-    """One attack of a track; of the protocol also the bit error rates published for it, under both sets of limits."""
+    """One attack of a track, with the bit error rates that were published for it under both sets of limits."""
 
     kind: str | Attack
     strength: float
     cho: tuple[float, float] | None = None  # Cho, Prost, Jung 2007, on Venus, blind
     wang: tuple[float, float] | None = None  # Wang, Lavoué, Denis, Baskurt 2011 (volume moments), on Venus, blind
-    copies: int = 1  # suspects that are made, each by another seed
-    in_place: bool = True  # whether its distortion can be measured: it leaves the pose and the whole
-    needs: tuple[str, ...] = ()  # packages that are optional
-    family: str = ""  # of an attacker with one budget, who takes the best for each mark
+    copies: int = 1  # number of suspects, each with its own seed
+    in_place: bool = True  # whether distortion can be measured: the attack changes no pose and removes no parts
+    needs: tuple[str, ...] = ()  # optional packages that the attack needs
+    family: str = ""  # the attacker with a distortion budget, who chooses the best attack of this family for each mark
 
     def suspects(self, mesh: Mesh, seed: int) -> list[Mesh]:
         """Attack a mesh, or refuse it; `OVERWRITTEN` needs the method itself and is not made here."""
         return [attack(mesh, self.kind, self.strength, seed=self.copies * seed + copy) for copy in range(self.copies)]
 
     def missing(self) -> str:
-        """Name a package that is not installed in a sentence, which is empty if none is missing."""
-        gone = [name for name in self.needs if find_spec(name) is None]
-        return f"{gone[0]} is missing: pip install 'jaxmark[{_EXTRAS.get(gone[0], 'attacks')}]'" if gone else ""
+        """Return a message that names a missing package; it is empty if all packages are installed."""
+        absent = [name for name in self.needs if find_spec(name) is None]
+        return f"{absent[0]} is missing: pip install 'jaxmark[{_EXTRAS.get(absent[0], 'attacks')}]'" if absent else ""
 
 
 class Track(NamedTuple):
-    """Attacks, and sets of limits on the distortion by a mark."""
+    """A set of attacks, and sets of limits on the distortion by a mark."""
 
-    limits: Mapping[str, Mapping[str, float]]  # by metric; an empty one is that of hidden marks on each mesh
+    limits: Mapping[str, Mapping[str, float]]  # limits by metric; an empty set means the limits of hidden marks
     lines: Mapping[str, Line]
 
     def bounds(self, limits: str, mesh: Mesh) -> Mapping[str, float]:
-        """The limits of one name for a mesh."""
+        """Return a set of limits for a mesh, by its name."""
         return self.limits[limits] or {**visibility_of(mesh)["hidden"], "max": _MAX_DISPLACEMENT}
 
 
 def posed(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
-    """Apply the protocol's similarity: shifts of up to 5 mean radii along each axis, any turn, scales of 0.1 to 10."""
+    """Apply the protocol's similarity: a shift of up to 5 mean radii per axis, any rotation, a scale from 0.1 to 10."""
     vertices = np.asarray(mesh.vertices)
     radius = np.linalg.norm(vertices - vertices.mean(axis=0), axis=1).mean()
     axis = random.normal(size=3)
@@ -67,9 +67,9 @@ def posed(mesh: Mesh, strength: float, random: np.random.Generator) -> Mesh:
 
 
 def _lines(kind: str, strengths: Sequence[float], *published: str, **options: Any) -> dict[str, Line]:
-    """Make lines of one kind; rates published for a method are lists of numbers, perceptual / geometric."""
+    """Make lines of one kind; published rates of a method are lists of numbers: perceptual / geometric."""
     columns = [
-        [tuple(map(float, pair)) for pair in zip(*map(str.split, one.split("/")), strict=True)] for one in published
+        [tuple(map(float, pair)) for pair in zip(*map(str.split, text.split("/")), strict=True)] for text in published
     ]
     rates = zip(*columns, strict=True) if columns else [()] * len(strengths)
     return {
@@ -80,7 +80,7 @@ def _lines(kind: str, strengths: Sequence[float], *published: str, **options: An
 
 _MESHLAB, _ISO, _EDGES = ("pymeshlab",), ("skimage", "igl"), ("fast_simplification",)
 
-# Published rates: the protocol's result page, for the model Venus.
+# The published rates are from the result page of the protocol, for the model Venus.
 PROTOCOL: Mapping[str, Line] = {
     "none": Line("noise", 0),
     "file": Line("reordering", 1),

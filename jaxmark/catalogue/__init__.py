@@ -1,7 +1,7 @@
-"""The catalogue: which of many originals a suspect is, under which key and record it was marked, and for whom.
+"""The catalogue: identify the original, the key, the record and the recipient of a suspect, among many originals.
 
-`Catalogue` is a file with originals, records and recipients. `Finder` names the originals that a suspect was made of;
-`find_each` does so for many suspects, by any number of workers.
+A `Catalogue` is a file with originals, records and recipients. A `Finder` names the originals that a suspect was made
+from; `find_each` does so for many suspects, with any number of workers.
 """
 
 from jaxmark.catalogue.catalogue import Added as Added

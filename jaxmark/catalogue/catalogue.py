@@ -1,4 +1,4 @@
-"""The catalogue: originals, and their records, recipients and verdicts, in one file."""
+"""`Catalogue`: originals, records, recipients and verdicts in one file."""
 
 import json
 import os
@@ -25,47 +25,47 @@ class Entry(NamedTuple):
     """An original in the catalogue."""
 
     id: int
-    path: str  # where its file was when it was added
+    path: str  # path of its file when it was added
     content: str  # SHA-256 of the file, hexadecimal
-    bytes: int
-    copied: bool  # whether the catalogue holds the file itself
-    meshes: int
-    vertices: int
-    records: int
-    recipients: int
-    added: str  # time in UTC, ISO 8601
+    bytes: int  # size of the file
+    copied: bool  # whether the catalogue contains a copy of the file
+    meshes: int  # number of meshes
+    vertices: int  # number of vertices of all meshes
+    records: int  # number of records
+    recipients: int  # number of recipients
+    added: str  # time at which it was added, in UTC, ISO 8601
 
 
 class Added(NamedTuple):
-    """The outcome of adding a file."""
+    """The result of adding a file."""
 
     id: int
     path: str
-    status: str  # "added", "known", or "moved" if it was known, but not where it was
+    status: str  # "added"; "known" if it was in the catalogue; "moved" if it was, and its file is at a new path now
     meshes: int
-    skipped: Mapping[str, str]  # meshes that cannot be used, and why
+    skipped: Mapping[str, str]  # meshes that cannot be used, and the reasons
 
 
 class Kept(NamedTuple):
     """A record in the catalogue, and the mesh of an original that it belongs to."""
 
     record: Record
-    shape: int
-    status: str  # "added" or "known"
+    shape: int  # number of the mesh
+    status: str  # "added", or "known" if it was in the catalogue
 
 
 class Catalogue:
-    """Originals, records, recipients and verdicts, in one SQLite file; it holds no key, only commitments to keys.
+    """A catalogue: an SQLite file with originals, records, recipients, verdicts and commitments to keys, but no keys.
 
-    Use it as a context manager, or close it. Several processes may use the same file, each by a connection of its own;
-    one connection serves one thread at a time.
+    Use it as a context manager, or close it. Several processes may use the same file, each with its own `Catalogue`. A
+    `Catalogue` serves one thread at a time.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, read_only: bool = False) -> None:
-        """Open a catalogue; a new one is made unless it is only read.
+        """Open a catalogue; if it does not exist, create it, unless it is opened for reading only.
 
         Raises:
-            JaxmarkError: if the file cannot be opened, is no catalogue, or was made by a later jaxmark.
+            JaxmarkError: if the file cannot be opened, is no catalogue, or was made by a later version of jaxmark.
         """
         self.database = Database(path, read_only=read_only)
 
@@ -81,23 +81,27 @@ class Catalogue:
 
     @property
     def path(self) -> Path:
-        """The catalogue's file."""
+        """The path of the catalogue's file."""
         return self.database.path
 
     def add(self, path: str | os.PathLike[str], *, copy: bool = False) -> Added:
-        """Add an original; one that is known changes nothing, unless its file is no longer where it was.
+        """Add an original.
+
+        If the original is in the catalogue already, only its path is updated, and only if its file has moved.
 
         Args:
             path: a mesh file; meshes that are too small to carry a mark are added, too.
-            copy: whether to keep the file itself in the catalogue.
+            copy: whether to store a copy of the file in the catalogue.
 
         Raises:
-            JaxmarkError: if the file cannot be read, holds no mesh with an extent, or is a copy that was made for a
-                recipient.
+            JaxmarkError: if the file cannot be read, if all its meshes have size 0, or if it is a copy that was made
+                for a recipient.
         """
         content = file_hash(path)
         if copies := self.database.rows("SELECT recipient FROM copies WHERE file = ?", content):
-            raise JaxmarkError(f"{path} is no original, but the copy for {copies[0]['recipient']}.")
+            raise JaxmarkError(
+                f"{path} is the copy for {copies[0]['recipient']}, not an original; add the file it was made from."
+            )
         if (known := self._known(content, path)) is not None:
             return known
         prepared = prepare_file(path, copy=copy)
@@ -107,55 +111,56 @@ class Catalogue:
         return Added(number, prepared.file["path"], status, len(prepared.shapes), prepared.skipped)
 
     def _known(self, content: str, path: str | os.PathLike[str]) -> Added | None:
-        """Look for a known file, and describe it again if its descriptors are of another jaxmark."""
+        """Look for a file in the catalogue; update its descriptors if they are of another version, and its path."""
         query = (
             "SELECT o.id, o.path, count(*) AS meshes, min(s.described) AS described FROM originals o"
             " JOIN shapes s ON s.original = o.id WHERE content = ? GROUP BY o.id"
         )
-        found = self.database.rows(query, content)
-        if not found:
+        rows = self.database.rows(query, content)
+        if not rows:
             return None
-        (row,) = found
+        (row,) = rows
         if row["described"] != descriptors.VERSION:
             prepared, names = prepare_file(path), ("described", "whole", "parts", "points", "landmarks")
             update = f"UPDATE shapes SET {', '.join(f'{name} = ?' for name in names)} WHERE original = ? AND name = ?"
             with self.database.writing():
                 for shape in prepared.shapes:
                     self.database.run(update, *(shape[name] for name in names), row["id"], shape["name"])
-        status, here = "known", os.path.realpath(path)
-        if row["path"] != here and not Path(row["path"]).is_file():
+        status, new_path = "known", os.path.realpath(path)
+        if row["path"] != new_path and not Path(row["path"]).is_file():
             with self.database.writing():
-                self.database.run("UPDATE originals SET path = ? WHERE id = ?", here, row["id"])
+                self.database.run("UPDATE originals SET path = ? WHERE id = ?", new_path, row["id"])
             status = "moved"
-        return Added(row["id"], here if status == "moved" else row["path"], status, row["meshes"], {})
+        return Added(row["id"], new_path if status == "moved" else row["path"], status, row["meshes"], {})
 
     def add_record(self, record: Record | SceneRecord) -> list[Kept]:
-        """Add the record of a mark, or those of a file of several meshes, to the originals that they belong to.
+        """Add the record of a mark, or the records of a file of several meshes, to their originals.
 
         Raises:
-            JaxmarkError: if the original of a record is not in the catalogue, or a mark is read without its original.
+            JaxmarkError: if the original of a record is not in the catalogue, or the scheme is blind, so that its
+                records have no original.
         """
         records = [record] if isinstance(record, Record) else list(record.meshes.values())
         with self.database.writing():
-            return [self._keep(one, self._shape_of(one)) for one in records]
+            return [self._store(entry, self._shape_of(entry)) for entry in records]
 
     def add_copy(self, record: Record, recipient: str, file: str) -> Kept:
-        """Add the copy that a recipient is given.
+        """Add a recipient's copy.
 
         Args:
-            record: of the fingerprint.
-            recipient: identifier.
+            record: record of the fingerprint.
+            recipient: the recipient's identifier.
             file: SHA-256 of the copy's file, hexadecimal.
 
         Raises:
-            JaxmarkError: see `add_record`; also if the record is of no fingerprint, or the identifier is empty.
+            JaxmarkError: see `add_record`; also if the record is not of a fingerprint, or the identifier is empty.
         """
         if record.content != "fingerprint":
-            raise JaxmarkError(f"The record is of a {record.content}, not of a recipient's copy.")
+            raise JaxmarkError(f"The record is of a {record.content}, not of a recipient's copy; add it as a record.")
         if not recipient:
-            raise JaxmarkError("A recipient's identifier is empty: give every recipient one.")
+            raise JaxmarkError("A recipient's identifier must not be empty.")
         with self.database.writing():
-            kept = self._keep(record, self._shape_of(record))
+            kept = self._store(record, self._shape_of(record))
             self.database.run(
                 "INSERT INTO copies (shape, key, recipient, record, file, added) VALUES (?, ?, ?, ?, ?, ?)"
                 " ON CONFLICT (shape, key, recipient) DO UPDATE SET record = excluded.record, file = excluded.file",
@@ -172,15 +177,16 @@ class Catalogue:
         """Find the mesh that a record was made for."""
         if not record.original:
             raise JaxmarkError(
-                f"Marks of the scheme {record.scheme!r} belong to no original; `jaxmark detect` reads them without."
+                f"Records of the blind scheme {record.scheme!r} have no original; read such marks by `jaxmark detect`,"
+                " which needs no catalogue."
             )
         column = "exact" if record.version == 1 else "geometry"
-        found = self.database.rows(f"SELECT id FROM shapes WHERE {column} = ? ORDER BY id", record.original)
-        if not found:
-            raise JaxmarkError("The record's original is not in the catalogue; add its file as it was marked.")
-        return found[0]["id"]
+        rows = self.database.rows(f"SELECT id FROM shapes WHERE {column} = ? ORDER BY id", record.original)
+        if not rows:
+            raise JaxmarkError("The record's original is not in the catalogue; add the file that was marked.")
+        return rows[0]["id"]
 
-    def _keep(self, record: Record, shape: int) -> Kept:
+    def _store(self, record: Record, shape: int) -> Kept:
         self.database.insert("keys", {"commitment": record.key, "added": _now()})
         row = {"digest": record.digest(), "shape": shape, "key": record.key, "content": record.content}
         new = self.database.insert("records", {**row, "json": record.to_json(), "added": _now()})
@@ -198,28 +204,28 @@ class Catalogue:
         return [Entry(*row)._replace(copied=bool(row["copied"])) for row in self.database.rows(query)]
 
     def find_original(self, name: str) -> Entry:
-        """Return the original of this number, path, or beginning of its hash (eight digits at least).
+        """Return an original by its number, its path, or the beginning of its hash (at least eight digits).
 
         Raises:
-            JaxmarkError: if there is none, or several.
+            JaxmarkError: if there is no such original, or several.
         """
-        here = os.path.realpath(name)
-        found = [
+        real_path = os.path.realpath(name)
+        matching = [
             entry
             for entry in self.originals()
             if str(entry.id) == name
-            or entry.path in (name, here)
+            or entry.path in (name, real_path)
             or (len(name) >= 8 and entry.content.startswith(name.lower()))
         ]
-        if not found:
+        if not matching:
             raise JaxmarkError(f"The catalogue has no original {name}; `jaxmark catalogue list` shows all of them.")
-        if len(found) > 1:
-            numbers = ", ".join(str(entry.id) for entry in found)
-            raise JaxmarkError(f"{name} is several originals, {numbers}; name one by its number.")
-        return found[0]
+        if len(matching) > 1:
+            numbers = ", ".join(str(entry.id) for entry in matching)
+            raise JaxmarkError(f"{name} matches several originals, {numbers}; give one by its number.")
+        return matching[0]
 
     def show(self, name: str) -> dict[str, Any]:
-        """Return all that is known of an original, as values for JSON; see `find_original`."""
+        """Return an original with its meshes, records and copies, as values for JSON; see `find_original`."""
         entry = self.find_original(name)
         shapes = "SELECT id, name, geometry, vertices, faces FROM shapes WHERE original = ? ORDER BY id"
         records = "SELECT digest, key, content, added FROM records WHERE shape = ? ORDER BY added, digest"
@@ -228,59 +234,59 @@ class Catalogue:
             "shapes": [
                 {
                     **{name: row[name] for name in ("name", "geometry", "vertices", "faces")},
-                    "records": [dict(one) for one in self.database.rows(records, row["id"])],
-                    "copies": [dict(one) for one in self.database.rows(copies, row["id"])],
+                    "records": [dict(record) for record in self.database.rows(records, row["id"])],
+                    "copies": [dict(copy) for copy in self.database.rows(copies, row["id"])],
                 }
                 for row in self.database.rows(shapes, entry.id)
             ]
         }
 
     def thumbnail(self, original: int) -> bytes:
-        """Return the small picture of an original, PNG.
+        """Return the thumbnail of an original, as PNG.
 
         Raises:
-            JaxmarkError: if there is no original of this number.
+            JaxmarkError: if there is no original with this number.
         """
-        found = self.database.rows("SELECT thumbnail FROM originals WHERE id = ?", original)
-        if not found:
+        rows = self.database.rows("SELECT thumbnail FROM originals WHERE id = ?", original)
+        if not rows:
             raise JaxmarkError(f"The catalogue has no original {original}.")
-        return found[0]["thumbnail"]
+        return rows[0]["thumbnail"]
 
     def remove(self, name: str, *, records: bool = False) -> Entry:
         """Remove an original.
 
         Args:
             name: see `find_original`.
-            records: whether its records and recipients may go with it.
+            records: whether its records and recipients may be removed, too.
 
         Raises:
-            JaxmarkError: if there is none, or it has records and they may not go.
+            JaxmarkError: if there is no such original, or it has records or recipients that may not be removed.
         """
         with self.database.writing():
             entry = self.find_original(name)
             if (entry.records or entry.recipients) and not records:
                 raise JaxmarkError(
-                    f"{entry.path} has {entry.records} records and {entry.recipients} recipients, without which no copy"
-                    " is traced; export them first, and give --with-records if they are to go, too."
+                    f"{entry.path} has {entry.records} records and {entry.recipients} recipients, without which its"
+                    " copies cannot be traced; export the catalogue first, and then remove them by --with-records."
                 )
             self.database.run("DELETE FROM originals WHERE id = ?", entry.id)
         return entry
 
     def check(self) -> Iterator[tuple[Entry, str | None]]:
-        """Yield each original with its file's problem: missing or changed; None if it is there as it was added."""
+        """Yield each original with a problem of its file, which is missing or changed; None if there is no problem."""
         for entry in self.originals():
             problem, path = None, Path(entry.path)
             if not path.is_file():
                 problem = "its file is missing"
             elif path.stat().st_size != entry.bytes or file_hash(path) != entry.content:
                 problem = "its file has changed"
-            yield entry, f"{problem}, the catalogue holds a copy" if problem and entry.copied else problem
+            yield entry, f"{problem}, but the catalogue has a copy" if problem and entry.copied else problem
 
     def load(self, shape: int) -> Mesh:
-        """Read the mesh of an original again, from its file if that is unchanged, else from the copy that was kept.
+        """Read the mesh of an original, from its file if that is unchanged, else from the copy in the catalogue.
 
         Raises:
-            JaxmarkError: if there is neither.
+            JaxmarkError: if the file is missing or changed, and there is no copy.
         """
         query = (
             "SELECT s.name, o.path, o.content, o.bytes, o.copy FROM shapes s JOIN originals o ON o.id = s.original"
@@ -292,7 +298,7 @@ class Catalogue:
             return meshes_of(path).meshes[row["name"]]
         if row["copy"] is None:
             raise JaxmarkError(
-                f"The original {path} is missing or has changed; bring it back, or add it from where it is."
+                f"The original {path} is missing or has changed; restore it, or add it again from its new path."
             )
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / f"original{path.suffix}"
@@ -300,7 +306,9 @@ class Catalogue:
             return meshes_of(file).meshes[row["name"]]
 
     def find(self, suspect: str | os.PathLike[str] | Mesh, keys: Sequence[bytes], **options: Any) -> Verdict:
-        """Find the originals that a suspect was made of; for many suspects make a `Finder`, which takes these options.
+        """Find the originals that a suspect was made from.
+
+        The options are those of `Finder`, which is faster for several suspects.
 
         Raises:
             JaxmarkError: see `Finder`.
@@ -321,7 +329,7 @@ class Catalogue:
             self.database.insert("verdicts", row)
 
     def verdicts(self) -> Iterator[dict[str, Any]]:
-        """Yield all verdicts that were given, the oldest first."""
+        """Yield all stored verdicts, the oldest first."""
         for row in self.database.each("SELECT suspect, path, given, versions, result FROM verdicts ORDER BY id"):
             yield dict(row) | {name: json.loads(row[name]) for name in ("versions", "result")}
 

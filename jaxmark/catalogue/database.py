@@ -1,7 +1,7 @@
 """The SQLite file of a catalogue: its tables, and access to them.
 
-Several processes may use it at once: writers wait for each other, and readers see only what was finished (write-ahead
-logging). A process that is killed leaves nothing half done.
+Several processes may use the file at once. Writers wait for each other, and readers only see finished changes
+(write-ahead logging). If a process is killed, its unfinished changes are undone.
 """
 
 import os
@@ -14,11 +14,11 @@ from typing import Any
 
 from jaxmark.errors import JaxmarkError
 
-_APPLICATION = 0x6A786D63  # marks the file as a catalogue, "jxmc"
-_WAIT = 60.0  # seconds that a writer waits for another one
-_PAUSE = 0.05  # seconds
+_APPLICATION = 0x6A786D63  # the number in the file's header that marks it as a catalogue, "jxmc"
+_WAIT = 60.0  # largest number of seconds that a writer waits for another one
+_PAUSE = 0.05  # seconds between attempts
 
-# Each brings a file from the version before to the next; files remember their version. Never change one.
+# Each migration changes a file from one version to the next; files store their version. Never change a migration.
 _MIGRATIONS = (
     """
     CREATE TABLE originals (
@@ -85,20 +85,20 @@ VERSION = len(_MIGRATIONS)
 
 
 class Database:
-    """A connection to a catalogue's file; to be used by one thread at a time."""
+    """A connection to a catalogue's file, for use by one thread at a time."""
 
     def __init__(self, path: str | os.PathLike[str], *, read_only: bool = False) -> None:
-        """Open the file, and make it if it is to be written and does not exist.
+        """Open the file; if it does not exist, create it, unless it is opened for reading only.
 
         Raises:
-            JaxmarkError: if it cannot be opened, is no catalogue, or is of a later version.
+            JaxmarkError: if the file cannot be opened, is no catalogue, or has a later version.
         """
         self.path = Path(os.path.realpath(path))
         self.read_only = read_only
         if read_only and not self.path.is_file():
-            raise JaxmarkError(f"There is no catalogue {path}; `jaxmark catalogue add` makes one.")
+            raise JaxmarkError(f"There is no catalogue {path}; create one by `jaxmark catalogue add`.")
         if not self.path.parent.is_dir():
-            raise JaxmarkError(f"The folder {self.path.parent} of the catalogue does not exist.")
+            raise JaxmarkError(f"The folder {self.path.parent} of the catalogue does not exist; create it first.")
         with self._clear_errors():
             self._connection = self._connect()
             try:
@@ -108,36 +108,36 @@ class Database:
                 raise
 
     def close(self) -> None:
-        """Close the connection; what was not finished is undone."""
+        """Close the connection; unfinished changes are undone."""
         with suppress(sqlite3.Error):
             self._connection.close()
 
     def rows(self, statement: str, *values: object) -> list[sqlite3.Row]:
-        """Return the rows that a query finds.
+        """Return the rows of a query.
 
         Raises:
-            JaxmarkError: if the file is damaged, or was busy for a minute.
+            JaxmarkError: if the file is damaged, or another process locks it for a minute.
         """
         return list(self.each(statement, *values))
 
     def each(self, statement: str, *values: object) -> Iterator[sqlite3.Row]:
-        """Yield the rows that a query finds, one after the other, for large ones; see `rows`."""
+        """Yield the rows of a query one after the other, which saves memory for large results; see `rows`."""
         with self._clear_errors():
             yield from self._connection.execute(statement, values)
 
     def run(self, statement: str, *values: object) -> int:
-        """Change rows, within `writing`, and return how many changed; see `rows`."""
+        """Change rows, within `writing`, and return the number of changed rows; see `rows`."""
         with self._clear_errors():
             return self._connection.execute(statement, values).rowcount
 
     def insert(self, table: str, values: Mapping[str, object]) -> bool:
-        """Insert a row, within `writing`; returns whether it was not there; see `rows`."""
+        """Insert a row, within `writing`, unless it exists; returns whether it is new; see `rows`."""
         places = ", ".join("?" * len(values))
         statement = f"INSERT INTO {table} ({', '.join(values)}) VALUES ({places}) ON CONFLICT DO NOTHING"
         return self.run(statement, *values.values()) == 1
 
     def insert_original(self, file: Mapping[str, Any], shapes: Iterable[Mapping[str, Any]]) -> tuple[int, bool]:
-        """Insert an original and its meshes; returns its number, and whether it was not there."""
+        """Insert an original and its meshes, unless they exist; returns its number, and whether it is new."""
         new = self.insert("originals", file)
         (row,) = self.rows("SELECT id FROM originals WHERE content = ?", file["content"])
         for shape in shapes if new else ():
@@ -146,13 +146,13 @@ class Database:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Make all changes of the block, or none; other writers wait.
+        """Run a block as a transaction: make all its changes or none, while other writers wait.
 
         Raises:
             JaxmarkError: if the catalogue is opened for reading only; see `rows`.
         """
         if self.read_only:
-            raise JaxmarkError(f"The catalogue {self.path} was opened for reading only.")
+            raise JaxmarkError(f"The catalogue {self.path} was opened for reading only; open it without `read_only`.")
         with self._transaction("IMMEDIATE"):
             yield
 
@@ -170,14 +170,16 @@ class Database:
             raise
 
     def problems(self) -> list[str]:
-        """Return the damages that SQLite finds in the file."""
-        found = [row[0] for row in self.rows("PRAGMA integrity_check(5)") if row[0] != "ok"]
-        return found + [f"a row of {row[0]} refers to a missing one" for row in self.rows("PRAGMA foreign_key_check")]
+        """Return the problems that SQLite's checks report for the file."""
+        damages = [row[0] for row in self.rows("PRAGMA integrity_check(5)") if row[0] != "ok"]
+        keys = self.rows("PRAGMA foreign_key_check")
+        return damages + [f"a row of {row[0]} refers to a row that does not exist" for row in keys]
 
     def _connect(self) -> sqlite3.Connection:
         if not self.read_only:
             return self._open(str(self.path))
-        # A folder that cannot be written to has no room for the log's index; then nobody writes the file either.
+        # SQLite cannot create the index of the log in a folder that is not writable. In this case no process writes the
+        # file, so that it can be opened as immutable.
         connection = self._open(f"{self.path.as_uri()}?mode=ro")
         try:
             connection.execute("SELECT * FROM sqlite_master").fetchone()
@@ -200,37 +202,39 @@ class Database:
         return connection
 
     def _prepare(self) -> None:
-        """Check the file, and bring it to the newest version."""
+        """Check the file, and migrate it to the newest version."""
         version = self._version()
         if version == VERSION:
             return
         if self.read_only:
-            raise JaxmarkError(f"{self.path} is of version {version}; open it once for writing, which brings it up.")
+            raise JaxmarkError(
+                f"{self.path} has the old version {version}; open it once for writing, which migrates it."
+            )
         self._use_log()
         with self._transaction("EXCLUSIVE"):
-            for migration in _MIGRATIONS[self._version() :]:  # another process may have been faster
+            for migration in _MIGRATIONS[self._version() :]:  # another process may have migrated it meanwhile
                 for statement in migration.split(";"):
                     self._connection.execute(statement)
             self._connection.execute(f"PRAGMA application_id = {_APPLICATION}")
             self._connection.execute(f"PRAGMA user_version = {VERSION}")
 
     def _version(self) -> int:
-        """Return the version of the file, 0 if it is new; a later version or another program's file is refused."""
+        """Return the version of the file, 0 if it is new; refuse later versions and files of other programs."""
         version, application, tables = (
             self._connection.execute(query).fetchone()[0]
             for query in ("PRAGMA user_version", "PRAGMA application_id", "SELECT count(*) FROM sqlite_master")
         )
         if tables and application != _APPLICATION:
-            raise JaxmarkError(f"{self.path} is another program's database, no catalogue of jaxmark.")
+            raise JaxmarkError(f"{self.path} is the database of another program, not a catalogue; give another file.")
         if version > VERSION:
             raise JaxmarkError(
-                f"The catalogue {self.path} is of version {version}; this jaxmark reads up to {VERSION}, so use a later"
-                " one."
+                f"The catalogue {self.path} has the version {version}, but this jaxmark reads versions up to {VERSION};"
+                " use a later jaxmark."
             )
         return version if tables else 0
 
     def _use_log(self) -> None:
-        """Turn on write-ahead logging, for which SQLite does not wait itself."""
+        """Turn on write-ahead logging; retry while the file is locked, because SQLite does not wait in this case."""
         until = time.monotonic() + _WAIT
         while True:
             try:
@@ -243,14 +247,15 @@ class Database:
 
     @contextmanager
     def _clear_errors(self) -> Iterator[None]:
-        """Say in a sentence what SQLite refuses."""
+        """Convert exceptions of SQLite to `JaxmarkError`."""
         try:
             yield
         except UnicodeEncodeError as error:
-            raise JaxmarkError(f"{error.object!a} is no text in UTF-8, which a catalogue holds; rename it.") from None
+            raise JaxmarkError(f"The name {error.object!a} is not text in UTF-8; rename the file.") from None
         except sqlite3.OperationalError as error:
             raise JaxmarkError(f"The catalogue {self.path} cannot be used: {error}.") from None
         except sqlite3.DatabaseError as error:
             raise JaxmarkError(
-                f"{self.path} is no catalogue, or is damaged: {error}; take a copy, or import an export into a new one."
+                f"{self.path} is no catalogue, or is damaged: {error}; use a backup, or import an export into a new"
+                " catalogue."
             ) from None

@@ -1,13 +1,13 @@
-"""Descriptors of shape, by which originals that look like a suspect are found among many; on the host, without a key.
+"""Shape descriptors for the retrieval of similar originals; on the host, without a key.
 
-A shape is described by how its surface lies about a centre: points are spread over it, expanded in spherical harmonics
-on concentric shells, and the energy of each degree is taken, and what neighbouring shells have in common (Kazhdan,
-Funkhouser, Rusinkiewicz, "Rotation invariant spherical harmonic representation of 3D shape descriptors", SGP 2003).
-These numbers do not change when the shape is turned or mirrored. As noise crumples a surface and adds to its area,
-points count less the more of them are near.
+A descriptor describes the distribution of a surface about a centre. Points are spread over the surface, and expanded in
+spherical harmonics on concentric shells. The descriptor consists of the energy of each degree, and of the products of
+neighbouring shells (Kazhdan, Funkhouser, Rusinkiewicz, "Rotation invariant spherical harmonic representation of 3D
+shape descriptors", SGP 2003). It does not change under rotations and reflections. Noise roughens a surface and
+increases its area; therefore the weight of a point decreases with the number of points near it.
 
-`whole` describes a shape about its centre of mass, in units of its own size. `local` describes balls about points of
-it, for suspects of which only a part is there.
+`whole` describes a shape about its centre of mass, in units of its size. `local` describes balls about points of the
+shape, for suspects that are parts of an original.
 """
 
 import math
@@ -20,17 +20,17 @@ from scipy.spatial import KDTree
 from jaxmark.geometry.mesh import Mesh, boundary_vertices, cross_product, unit, used_vertices
 from jaxmark.geometry.pose import Points
 
-VERSION = 2  # of all that originals are known by: those of other versions are not comparable
+VERSION = 2  # version of all descriptors and landmarks; different versions cannot be compared
 _SAMPLES = 8192
-_DEGREES, _SHELLS, _APART = 12, 12, 2  # largest degree and distance of shells that are compared, of whole shapes
-_REACH = 2.2  # radius of the outermost shell over the root mean square distance to the centre
-_THINNED = 0.08  # radius within which points count together, over that distance
-_LOCAL_DEGREES, _LOCAL_SHELLS, _LOCAL_APART = 6, 6, 1
+_DEGREES, _SHELLS, _APART = 12, 12, 2  # for whole shapes: largest degree, shells, largest distance of compared shells
+_REACH = 2.2  # radius of the outermost shell, over the RMS distance to the centre
+_THINNED = 0.08  # radius in which the points share their weight, over the RMS distance to the centre
+_LOCAL_DEGREES, _LOCAL_SHELLS, _LOCAL_APART = 6, 6, 1  # the same for balls
 _LOCAL_SAMPLES = 4096
-LOCAL_RADIUS = 0.2  # of balls over the root of the surface's area
-_LOCAL_THINNED = 0.03  # as _THINNED, over the root of the area
-CENTRES = 48  # balls of each original
-POINTS = 1024  # that are kept of each original
+LOCAL_RADIUS = 0.2  # radius of balls, over the square root of the surface's area
+_LOCAL_THINNED = 0.03  # as _THINNED, over the square root of the area
+CENTRES = 48  # number of balls of each original
+POINTS = 1024  # number of points that are stored for each original
 
 
 def _count(degrees: int, shells: int, apart: int) -> int:
@@ -46,14 +46,14 @@ class Spread:
     """Points spread evenly over a shape."""
 
     points: Points
-    normals: Points  # of the faces they lie on; zeros for point clouds
-    area: float  # of the surface, as its file has it; of a cloud, what its points would cover
+    normals: Points  # normals of the faces that they lie on; zeros for point clouds
+    area: float  # area of the mesh; for a cloud, an estimate from its extent
 
 
 def spread(mesh: Mesh, count: int = _SAMPLES) -> Spread | None:
-    """Spread points over a surface evenly by area, the same at every call; None if the mesh has no extent.
+    """Spread points evenly over the area of a surface, deterministically; returns None if the mesh has size 0.
 
-    Faces are visited along a curve through space, so that each region gets its share of the points to within one.
+    Faces are visited along a space-filling curve, so that each region gets its share of the points, up to one point.
     """
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
     used = vertices[used_vertices(mesh)]
@@ -74,7 +74,7 @@ def spread(mesh: Mesh, count: int = _SAMPLES) -> Spread | None:
     order = np.argsort(_along((a + b + c) / 3), kind="stable")
     at = np.searchsorted(np.cumsum(twice[order]), (np.arange(count) + 0.5) / count * total)
     face = order[np.minimum(at, len(order) - 1)]
-    # A sequence of low discrepancy in each face (Roberts 2018): the plastic number takes the golden ratio's place.
+    # A low-discrepancy sequence in each face (Roberts 2018), which uses the plastic number instead of the golden ratio.
     plastic, number = 1.32471795724474602596, np.arange(1, count + 1)
     root, other = np.sqrt((0.5 + number / plastic) % 1), (0.5 + number / plastic**2) % 1
     shares = np.stack([1 - root, root * (1 - other), root * other], axis=1)
@@ -83,58 +83,62 @@ def spread(mesh: Mesh, count: int = _SAMPLES) -> Spread | None:
 
 
 def whole(shape: Spread) -> Float[np.ndarray, " numbers"]:
-    """Describe a whole shape, in any pose and scale, `[WHOLE_SIZE]`; the distance of two is the sum of differences."""
+    """Describe a whole shape, in any pose and scale, `[WHOLE_SIZE]`.
+
+    The distance of two shapes is the sum of the absolute differences of their descriptors.
+    """
     points = shape.points
     centre, size = _centre(points, np.full(len(points), 1 / len(points)))
     weights = _weights(points, _THINNED * size)
     centre, size = _centre(points, weights)
-    found = _describe((points - centre) / (_REACH * size), weights, _DEGREES, _SHELLS, _APART)
-    return found.astype(np.float32)
+    numbers = _describe((points - centre) / (_REACH * size), weights, _DEGREES, _SHELLS, _APART)
+    return numbers.astype(np.float32)
 
 
 def centred(mesh: Mesh) -> tuple[Points, Float64[np.ndarray, "3"], float]:
-    """Spread points over a shape that has an extent, about their centre, in units of their mean distance to it.
+    """Spread points over a shape whose size is not 0, relative to their centre, in units of their RMS distance to it.
 
     Returns:
-        The points `[POINTS, 3]`, and the centre and the mean distance in the mesh's units.
+        The points `[POINTS, 3]`, and the centre and the RMS distance in the mesh's units.
     """
     shape = spread(mesh, POINTS)
     assert shape is not None
-    points = shape.points[np.arange(POINTS) % len(shape.points)]  # a cloud may have fewer
+    points = shape.points[np.arange(POINTS) % len(shape.points)]  # a cloud may have fewer points
     centre, size = _centre(points, np.full(POINTS, 1 / POINTS))
     return (points - centre) / size, centre, size
 
 
 @dataclass(frozen=True)
 class Locals:
-    """The surroundings of some points of a shape."""
+    """The neighbourhoods of some points of a shape."""
 
     points: Points
     weights: Float64[np.ndarray, " points"]
     centres: Int64[np.ndarray, " centres"]  # indices of the points that are described
-    area: float  # of the surface without what noise adds
+    area: float  # area of the surface, without the increase by noise
 
     def describe(self, share: float = 1.0) -> Float[np.ndarray, "centres numbers"]:
         """Describe the balls about the centres, `[centres, LOCAL_SIZE]`.
 
-        `share` is the share of its original's area that this shape is taken to have, which gives the balls' radius.
+        Args:
+            share: assumed ratio of this shape's area to that of its original, which determines the radius of the balls.
         """
         radius, tree = LOCAL_RADIUS * math.sqrt(self.area / share), KDTree(self.points)
-        found = np.zeros((len(self.centres), LOCAL_SIZE), np.float32)
+        numbers = np.zeros((len(self.centres), LOCAL_SIZE), np.float32)
         for row, near in enumerate(tree.query_ball_point(self.points[self.centres], radius)):
-            away = (self.points[near] - self.points[self.centres[row]]) / radius
+            offsets = (self.points[near] - self.points[self.centres[row]]) / radius
             weights = self.weights[near] / self.weights[near].sum()
-            found[row] = _describe(away, weights, _LOCAL_DEGREES, _LOCAL_SHELLS, _LOCAL_APART)
-        return found
+            numbers[row] = _describe(offsets, weights, _LOCAL_DEGREES, _LOCAL_SHELLS, _LOCAL_APART)
+        return numbers
 
 
 def local(mesh: Mesh, count: int = CENTRES) -> Locals | None:
-    """Choose points of a shape, far from each other and from where it was cut; None if the mesh has no extent."""
+    """Choose points of a shape that are far from each other and from its boundary; returns None for a mesh of size 0."""
     shape = spread(mesh, _LOCAL_SAMPLES)
     if shape is None:
         return None
     points, area, weights = shape.points, shape.area, np.ones(len(shape.points))
-    for _ in range(2):  # the area that points cover, counted by discs
+    for _ in range(2):  # estimate the area by the number of discs that cover the points
         radius = _LOCAL_THINNED * math.sqrt(area)
         weights = 1 / np.asarray(KDTree(points).query_ball_point(points, radius, return_length=True))
         area = float(weights.sum()) * math.pi * radius**2
@@ -146,7 +150,7 @@ def local(mesh: Mesh, count: int = CENTRES) -> Locals | None:
 
 
 def _scattered(points: Points, far: Float64[np.ndarray, " points"], count: int) -> Int64[np.ndarray, " chosen"]:
-    """Choose points, each as far as possible from those before it, and from the place that `far` counts from."""
+    """Choose points, each as far as possible from the points before it; `far` are distances from the boundary."""
     first = far if np.isfinite(far).all() else np.linalg.norm(points - points.mean(axis=0), axis=1)
     chosen = [int(np.argmax(first))]
     distance = far
@@ -163,33 +167,33 @@ def _centre(points: Points, weights: Float64[np.ndarray, " points"]) -> tuple[Fl
 
 
 def _weights(points: Points, radius: float) -> Float64[np.ndarray, " points"]:
-    """Weight points so that each region counts by its area, however many points are in it; the sum is 1."""
-    about = np.asarray(KDTree(points).query_ball_point(points, radius, return_length=True), np.float64)
-    return (1 / about) / (1 / about).sum()
+    """Weight points so that the weight of a region is its area, independent of the number of points; the sum is 1."""
+    neighbours = np.asarray(KDTree(points).query_ball_point(points, radius, return_length=True), np.float64)
+    return (1 / neighbours) / (1 / neighbours).sum()
 
 
 def _describe(
-    away: Points, weights: Float64[np.ndarray, " points"], degrees: int, shells: int, apart: int
+    offsets: Points, weights: Float64[np.ndarray, " points"], degrees: int, shells: int, apart: int
 ) -> Float64[np.ndarray, " numbers"]:
-    """Compute energies of harmonics on shells of the unit ball, and of products of shells up to `apart` apart."""
-    radius = np.sqrt(np.einsum("pc,pc->p", away, away))
-    harmonics = real_harmonics(away / np.maximum(radius, np.finfo(float).tiny)[:, None], degrees)
+    """Compute energies of harmonics on shells of the unit ball, and products of shells that differ by up to `apart`."""
+    radius = np.sqrt(np.einsum("pc,pc->p", offsets, offsets))
+    harmonics = real_harmonics(offsets / np.maximum(radius, np.finfo(float).tiny)[:, None], degrees)
     place = np.minimum(radius, 1.0) * (shells - 1)
     on = np.maximum(1 - np.abs(place[:, None] - np.arange(shells)), 0)
     parts = (on * weights[:, None]).T @ harmonics
     starts = np.arange(degrees + 1) ** 2
-    found = []
+    numbers = []
     for step in range(apart + 1):
         product = np.add.reduceat(parts[: shells - step] * parts[step:], starts, axis=1)
-        found.append((np.sign(product) * np.sqrt(np.abs(product))).ravel())
-    return np.concatenate(found)
+        numbers.append((np.sign(product) * np.sqrt(np.abs(product))).ravel())
+    return np.concatenate(numbers)
 
 
 def real_harmonics(directions: Points, degrees: int) -> Float64[np.ndarray, "points harmonics"]:
     """Evaluate orthonormal real spherical harmonics up to a degree L at unit vectors, by their recurrences.
 
     Returns:
-        `[points, (L + 1)²]`; in a degree, orders from 0 up, each but 0 by its cosine and its sine.
+        `[points, (L + 1)²]`; within a degree, order 0 is followed by the cosine and the sine of each higher order.
     """
     x, y, z = directions.T
     cosines, sines = [np.ones(len(z))], [np.zeros(len(z))]
@@ -198,7 +202,7 @@ def real_harmonics(directions: Points, degrees: int) -> Float64[np.ndarray, "poi
         cosines.append(x * cosine - y * sine)
         sines.append(x * sine + y * cosine)
     rows: list[list[np.ndarray]] = [[] for _ in range(degrees + 1)]
-    first = np.full(len(z), math.sqrt(1 / (4 * math.pi)))  # the normalised Legendre function over its power of sin
+    first = np.full(len(z), math.sqrt(1 / (4 * math.pi)))  # the normalised Legendre function without its power of sin
     for order in range(degrees + 1):
         if order:
             first = first * math.sqrt((2 * order + 1) / (2 * order))
@@ -215,7 +219,7 @@ def real_harmonics(directions: Points, degrees: int) -> Float64[np.ndarray, "poi
 
 
 def _along(points: Points) -> Int64[np.ndarray, " points"]:
-    """Compute places on a curve that passes near points one after the other (Morton 1966), of points of size 1."""
+    """Compute the positions of points, of extent 1, along a space-filling curve (Morton 1966)."""
     low = points.min(axis=0)
     cells = np.clip((points - low) / max(float(np.ptp(points, axis=0).max()), 1e-300) * 1023, 0, 1023).astype(np.int64)
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):

@@ -1,4 +1,4 @@
-"""A catalogue as JSON Lines, one line a row, to be kept elsewhere, merged or read by other programs."""
+"""Export and import of catalogues as JSON Lines, with one line per row."""
 
 import base64
 import json
@@ -20,7 +20,8 @@ from jaxmark.watermark.record import Record
 _FORMAT, _FORMAT_VERSION = "jaxmark-catalogue", 1
 _MAX_LINE_BYTES = 2**30
 _TABLES = {"original": "originals", "key": "keys", "record": "records", "copy": "copies", "verdict": "verdicts"}
-# Fields of each kind of row; `original` and `shape` of records and copies name a mesh, which has a number in the file.
+# The fields of each kind of row. In records and copies, `original` and `shape` identify a mesh by the hash of its file
+# and its name, because the numbers of meshes differ between catalogues.
 _FIELDS: dict[str, dict[str, Any]] = {
     "original": {
         **dict.fromkeys(("content", "path"), str),
@@ -41,7 +42,7 @@ _SHAPE: dict[str, Any] = {
 
 
 class Counted(NamedTuple):
-    """Numbers of rows that were exported, or were new when they were imported."""
+    """The numbers of rows that were exported; or of rows that were imported and new."""
 
     originals: int
     records: int
@@ -50,7 +51,7 @@ class Counted(NamedTuple):
 
 
 def export_catalogue(catalogue: Catalogue, path: str | os.PathLike[str]) -> Counted:
-    """Write everything that a catalogue holds to a file, which appears whole or not at all.
+    """Write the whole content of a catalogue to a file, atomically.
 
     Raises:
         JaxmarkError: if the file cannot be written.
@@ -75,12 +76,13 @@ def _counted(counts: Mapping[str, int]) -> Counted:
 
 
 def _rows(database: Database) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the rows of a catalogue with their kinds, those first that others refer to."""
+    """Yield the rows of a catalogue with their kinds; each row follows the rows that it refers to."""
     of = "JOIN shapes s ON s.id = t.shape JOIN originals o ON o.id = s.original"
     columns = {kind: ", ".join(fields) for kind, fields in _FIELDS.items()}
     for row in database.each(f"SELECT {columns['original']}, id FROM originals ORDER BY id"):
         shapes = database.rows(f"SELECT {', '.join(_SHAPE)} FROM shapes WHERE original = ? ORDER BY id", row["id"])
-        yield "original", {name: row[name] for name in _FIELDS["original"]} | {"shapes": [dict(one) for one in shapes]}
+        values = {name: row[name] for name in _FIELDS["original"]}
+        yield "original", values | {"shapes": [dict(shape) for shape in shapes]}
     queries = {"key": f"SELECT {columns['key']} FROM keys ORDER BY commitment"}
     for kind in ("record", "copy"):
         own = ", ".join(f"t.{name}" for name in _FIELDS[kind] if name not in ("original", "shape"))
@@ -94,10 +96,10 @@ def _rows(database: Database) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def import_catalogue(catalogue: Catalogue, path: str | os.PathLike[str]) -> Counted:
-    """Merge an exported file into a catalogue, all of it or nothing; known rows stay as they are.
+    """Merge an exported file into a catalogue; existing rows do not change.
 
     Raises:
-        JaxmarkError: if the file cannot be read, or is no export, or a line of it is damaged.
+        JaxmarkError: if the file cannot be read, or is no export, or a line of it is damaged; then nothing is imported.
     """
     counts = dict.fromkeys(_TABLES, 0)
     with catalogue.database.writing():
@@ -106,36 +108,36 @@ def import_catalogue(catalogue: Catalogue, path: str | os.PathLike[str]) -> Coun
                 data = json.loads(line)
                 if number == 1:
                     if data.get("format") != _FORMAT:
-                        raise JaxmarkError("it is no export of a catalogue")
+                        raise JaxmarkError("it is not the export of a catalogue")
                     if data.get("version") != _FORMAT_VERSION:
-                        raise JaxmarkError(f"its version {data.get('version')} is not one that this jaxmark reads")
+                        raise JaxmarkError(f"this jaxmark cannot read the version {data.get('version')} of the export")
                     continue
                 ((kind, row),) = data.items()
                 counts[kind] += _take(catalogue.database, kind, row)
             except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-                said = str(error).rstrip(".") if isinstance(error, JaxmarkError) else "it is damaged"
-                raise JaxmarkError(f"{path} cannot be imported: line {number}: {said}.") from None
+                reason = str(error).rstrip(".") if isinstance(error, JaxmarkError) else "it is damaged"
+                raise JaxmarkError(f"{path} cannot be imported: line {number}: {reason}.") from None
     return _counted(counts)
 
 
 def _lines(path: str | os.PathLike[str]) -> Iterator[str]:
     try:
         if not Path(path).is_file():
-            raise JaxmarkError(f"{path} is no file that could be imported.")
+            raise JaxmarkError(f"{path} is not a file; give one that `jaxmark catalogue export` wrote.")
         with Path(path).open(encoding="utf-8") as file:
             if not (line := file.readline(_MAX_LINE_BYTES)):
-                raise JaxmarkError(f"{path} is empty, no export of a catalogue.")
+                raise JaxmarkError(f"{path} is empty; give a file that `jaxmark catalogue export` wrote.")
             while line:
                 yield line
                 line = file.readline(_MAX_LINE_BYTES)
     except JaxmarkError:
         raise
     except (OSError, ValueError) as error:
-        raise JaxmarkError(f"Cannot read {path}: {getattr(error, 'strerror', None) or 'it is no text'}.") from None
+        raise JaxmarkError(f"Cannot read {path}: {getattr(error, 'strerror', None) or 'it is not text'}.") from None
 
 
 def _take(database: Database, kind: str, row: Mapping[str, Any]) -> bool:
-    """Insert a row unless it is there; returns whether it was not."""
+    """Insert a row unless it exists; returns whether it is new."""
     values = _checked(row, _FIELDS[kind])
     match kind:
         case "original":
@@ -154,17 +156,17 @@ def _take(database: Database, kind: str, row: Mapping[str, Any]) -> bool:
                 return False
     if "shape" in values:
         query = "SELECT s.id FROM shapes s JOIN originals o ON o.id = s.original WHERE o.content = ? AND s.name = ?"
-        found = database.rows(query, values.pop("original"), values["shape"])
-        if not found:
-            raise JaxmarkError("it belongs to an original that is in neither catalogue")
-        values["shape"] = found[0]["id"]
+        shapes = database.rows(query, values.pop("original"), values["shape"])
+        if not shapes:
+            raise JaxmarkError("its original is neither in the export nor in the catalogue")
+        values["shape"] = shapes[0]["id"]
     return database.insert(_TABLES[kind], values)
 
 
 def _take_original(database: Database, values: Mapping[str, Any], rows: list[Mapping[str, Any]]) -> bool:
-    """Insert an original and its shapes unless it is there; returns whether it was not."""
+    """Insert an original and its meshes unless it exists; returns whether it is new."""
     bytes.fromhex(values["content"])
-    shapes = [_checked({"landmarks": "", **row}, _SHAPE) for row in rows]  # older exports have none
+    shapes = [_checked({"landmarks": "", **row}, _SHAPE) for row in rows]  # older exports have no landmarks
     sizes = {"whole": 2 * WHOLE_SIZE, "parts": 2 * CENTRES * LOCAL_SIZE, "points": 2 * 3 * POINTS}
     for shape in shapes:
         if shape["described"] == VERSION and not (
@@ -179,13 +181,13 @@ def _take_original(database: Database, values: Mapping[str, Any], rows: list[Map
 
 
 def _checked(row: Mapping[str, Any], types: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of a row; refused if one is missing, or of another type."""
-    found: dict[str, Any] = {}
+    """Return the fields of a row; raise KeyError for a missing field, and TypeError or ValueError for a wrong value."""
+    fields: dict[str, Any] = {}
     for name, kind in types.items():
         value = row[name]
         if kind in (bytes, bytes | None) and isinstance(value, str):
             value = base64.b64decode(value, validate=True)
         if not isinstance(value, kind) or isinstance(value, bool):
             raise TypeError
-        found[name] = value
-    return found
+        fields[name] = value
+    return fields

@@ -1,8 +1,8 @@
-"""Watermarks in meshes: how messages and fingerprints are written under a key, read again, and what a reading proves.
+"""Watermarking of meshes: embed messages and fingerprints with a key, read them again, and compute the evidence.
 
-`embed`, `detect`, `capacity`, `fingerprint` and `identify` each do one job on a mesh; `make_marker` and `make_tracer`
-prepare an original once for many. A `Scheme` fixes how marks are written and read, a `Budget` how strong they are.
-`embed_bits`, `detect_bits` and `log_evidence` are the same as pure functions of arrays.
+`embed`, `detect`, `capacity`, `fingerprint` and `identify` each do one job on a mesh. `make_marker` and `make_tracer`
+prepare an original once for many such jobs. A `Scheme` determines how marks are written and read, a `Budget` how strong
+they are. `embed_bits`, `detect_bits` and `log_evidence` are the corresponding pure functions of arrays.
 """
 
 from jaxmark.watermark.bits import detect_bits as detect_bits

@@ -1,7 +1,7 @@
 """Embedding, detection and evidence as three pure functions of arrays.
 
-`embed_bits`, `detect_bits` and `log_evidence` take carriers as arguments, and work under every transformation of JAX.
-`jaxmark.watermark.markers` does the same for meshes, messages and keys.
+`embed_bits`, `detect_bits` and `log_evidence` take carriers as arguments and work under all transformations of JAX.
+`jaxmark.watermark.markers` provides the same operations for meshes, messages and keys.
 """
 
 import math
@@ -25,15 +25,15 @@ def embed_bits(
         x: the original's coordinates `[N, 3]`.
         bits: -1 or +1, `[k]`; any real amplitudes are allowed.
         carrier: see `jaxmark.watermark.carriers`.
-        beta: strength: a scalar, or one number per band, or one per band and coordinate. For components of unit norm it
-            is the D-norm that one bit writes in one band, in the units of `x`; for components as printed, it is
+        beta: strength: a scalar, one number per band, or one per band and coordinate. For components of unit norm, it
+            is the D-norm of one bit in one band, in the units of `x`. For components as printed in the paper, it is
             relative to the host's own component.
 
     Returns:
         Marked coordinates `[N, 3]`.
 
     Raises:
-        JaxmarkError: if bits or β have another shape.
+        JaxmarkError: if bits or β have a wrong shape.
     """
     _check_bits(bits, carrier)
     return x + carrier.displacement(bits, beta)
@@ -49,22 +49,22 @@ def detect_bits(
     weights: Float[Array, " vertices"] | None = None,
     normals: Float[Array, "vertices 3"] | None = None,
 ) -> Float[Array, " bits"]:
-    """Compute soft values of the bits in a suspect, given the original; their signs are the bits (Sohn et al., 2.2.2).
+    """Compute soft decisions of a suspect's bits, given the original; their signs are the bits (Sohn et al., 2.2.2).
 
     Args:
         suspect: coordinates `[N, 3]` in the original's vertex order.
         x: the original's coordinates `[N, 3]`.
         carrier: the carrier that the bits were embedded with.
         detector: see `jaxmark.watermark.reading.detectors`.
-        beta: the strengths' profile over the bands, as embedded; a common factor only rescales the result.
-        weights: relative inverse variance of each vertex `[N]`, 0 where nothing is known; by default all are equal.
-        normals: unit vectors `[N, 3]`, if only the displacement along them is known; by default all of it is.
+        beta: relative strengths of the bands, as embedded; a common factor only rescales the result.
+        weights: relative inverse variance of each vertex `[N]`, 0 where nothing is known; by default, all are equal.
+        normals: unit vectors `[N, 3]`, if the displacement is known only along them; by default, all of it is known.
 
     Returns:
-        Soft values, `[k]`.
+        Soft decisions, `[k]`.
 
     Raises:
-        JaxmarkError: if an argument has another shape.
+        JaxmarkError: if an argument has a wrong shape.
     """
     _check_suspect(suspect, x, weights, normals)
     reader = carrier.reader()
@@ -80,26 +80,26 @@ def log_evidence(
     weights: Float[Array, " vertices"] | None = None,
     normals: Float[Array, "vertices 3"] | None = None,
 ) -> Float[Array, ""]:
-    """Compute -ln p of a claimed codeword, for p the bound on the probability of a false detection, in nats.
+    """Compute -ln p of a claimed codeword in nats, where p bounds the probability of a false detection.
 
-    It is what gradient attacks lower and defences raise: a function of the suspect and, through the carrier, of the
-    bands and their strengths. Keyed signs and codeword are made once on the host (`Marker.reader.carrier`,
-    `Marker.codeword`), and gradients hold them fixed.
+    Gradient attacks decrease this value, and defences increase it. It is a differentiable function of the suspect and,
+    through the carrier, of the bands and their strengths. Keyed signs and codeword are made once on the host
+    (`Marker.reader.carrier`, `Marker.codeword`), and gradients treat them as constants.
 
     Args:
         suspect: see `detect_bits`.
         x: see `detect_bits`.
-        carrier: see `detect_bits`; `KeyedCarrier.with_bands` puts other bands and strengths in.
+        carrier: see `detect_bits`; `KeyedCarrier.with_bands` replaces its bands and strengths.
         codeword: ±1, `[code bits]`, fixed before the suspect was seen.
         weights: see `detect_bits`.
         normals: see `detect_bits`.
 
     Returns:
-        max t²/2 - ln(ways) over the ways of weighting the suspect, for t = S/‖a‖ (Hoeffding's bound, and Bonferroni's);
-        negative where nothing is proven.
+        max t²/2 - ln(ways) over the ways of weighting the suspect, with t = S/‖a‖ (Hoeffding's bound with a Bonferroni
+        correction); negative if nothing is proven.
 
     Raises:
-        JaxmarkError: if the suspect is neither float32 nor float64, or an argument has another shape.
+        JaxmarkError: if the suspect is neither float32 nor float64, or an argument has a wrong shape.
     """
     _check_suspect(suspect, x, weights, normals)
     _check_bits(codeword, carrier)
@@ -123,5 +123,5 @@ def _check_suspect(suspect: Array, x: Array, weights: Array | None, normals: Arr
         if given is not None and jnp.shape(given) != shape:
             raise JaxmarkError(
                 f"The original has {len(x)} rows in its order, and so must {name}; got the shape {jnp.shape(given)}."
-                " jaxmark.detect brings any mesh back to its original."
+                " jaxmark.detect aligns any mesh with its original."
             )

@@ -1,11 +1,11 @@
-"""The everyday verbs: embed and detect a mark, in one mesh or in a scene of several, and ask what a mesh can carry.
+"""The functions for everyday use: embed and detect a mark in a mesh or a scene of meshes, and compute the capacity.
 
-Schemes are read with the original, or blind, without it; see `jaxmark.watermark.schemes.registry`. Keyed choices are
+Some schemes are read with the original, others are blind; see `jaxmark.watermark.schemes.registry`. Keyed choices are
 bound to each mesh's geometry, so that the marks of different meshes of a scene are independent. Equal meshes carry
-equal marks, and count once.
+equal marks and count once.
 """
 
-from __future__ import annotations  # so that `help` shows names of types instead of what they stand for
+from __future__ import annotations  # so that `help` shows the names of type aliases
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -50,30 +50,34 @@ def embed(
 ) -> tuple[Mesh, EmbedInfo]:
     """Embed a message in the vertex positions of a mesh.
 
-    The mark is as strong as the budget allows; by default it is so weak that people do not notice it. The message is
-    read back before the mesh is returned, and a mesh that cannot carry it is refused. What noise it survives
-    (`EmbedInfo.survives`) depends on the mesh: much on scans, little on models of some hundred points.
+    The mark is as strong as the budget allows; by default, people do not notice it. The message is read back before the
+    mesh is returned, and a mesh that cannot carry it is refused. The noise that the mark survives
+    (`EmbedInfo.survives`) depends on the mesh: it is large for scans, and small for models of a few hundred points.
 
     Args:
         mesh: the original.
-        message: any bytes; none for a presence mark, which says nothing but that it is there, and fits where messages
-            do not.
+        message: any bytes; b"" for a presence mark, which carries no message, and fits where messages do not.
         key: 32 bytes, from `new_key`.
-        budget: how strong the mark may be, and what it must survive: a `Budget`; or an RMS displacement relative to the
-            diagonal, the name of a visibility, or limits on metrics, which stand for one. By default it is hidden.
-        scheme: a name or a scheme, see `make_marker`; the default, by its name, takes the pass band that suits the
-            budget (`jaxmark.watermark.schemes.passband`), a scheme the one it has. Or `"field"` or `"local"`, whose
-            marks are read without the original, after any remeshing or from any part; or several names, as
-            `("keyed", "field")`, for marks within one budget, of which the first is read with the original and has the
-            record.
+        budget: how strong the mark may be, and what it must survive: a `Budget`; or, as short forms of one, an RMS
+            displacement relative to the diagonal, the name of a visibility, or limits on metrics. By default, the mark
+            is hidden.
+        scheme: one of these:
+
+            - a name or a scheme that is read with the original, see `make_marker`. If the default scheme is given by
+              name, its pass band is adapted to the budget (`jaxmark.watermark.schemes.passband`); a scheme keeps its
+              own pass band.
+            - `"field"` or `"local"`, whose marks are blind: they are read after any remeshing or from any part,
+              respectively.
+            - several names, such as `("keyed", "field")`, for several marks within one budget. The first is read with
+              the original and has the record, the others are blind.
 
     Returns:
-        The marked mesh (float64 vertices, same faces) and how it was marked.
+        The marked mesh (float64 vertices, same faces), and the strength, record and predicted survival of the mark.
 
     Raises:
-        JaxmarkError: if the mesh, key, budget or payload is unusable, or the message does not read back; or if what the
-            budget demands cannot be met: the error then states the largest payload, and the least budget if there is
-            one.
+        JaxmarkError: if the mesh, key, budget or payload is unusable, if the message does not read back, or if the
+            demands of the budget cannot be met. In the last case, the error states the largest payload, and the least
+            budget if there is one.
     """
     if not isinstance(message, bytes):
         raise JaxmarkError(f"A message is bytes, got {type(message).__name__}.")
@@ -88,20 +92,20 @@ def capacity(
     coverage: float = COVERAGE,
     scheme: str | Scheme | BlindScheme = DEFAULT_SCHEME,
 ) -> int:
-    """Compute how many bits a mesh can carry, by the energy and the dimensions of a mark that projection leaves.
+    """Compute how many bits a mesh can carry, from the dimensions and the energy of a mark after projection.
 
     For schemes whose readers have no model of noise, such as `host` and `eigen`, only the number of code bits counts.
-    Marks of `field` do not survive the loss of parts, so that coverage has no meaning for them.
+    Marks of `field` do not survive cropping, so that `coverage` has no effect on them.
 
     Args:
         mesh: the original.
-        budget: see `embed`; how much displacement limits allow is tried for each payload size. Without a demand, the
-            noise to survive is the strongest of the SMI 2010 protocol (Wang et al.), 0.5 %.
+        budget: see `embed`; if it has limits, the displacement that they allow is measured for each payload size. If it
+            demands no noise, the noise to survive is the strongest of the SMI 2010 protocol (Wang et al.), 0.5 %.
         coverage: share of the vertices that may be left.
         scheme: a name or a scheme, see `make_marker`.
 
     Returns:
-        The largest payload in bits, a multiple of 8; 0 if not even 8.
+        The largest payload in bits, a multiple of 8; 0 if the mesh cannot carry 8 bits.
 
     Raises:
         JaxmarkError: if the mesh is unusable or a number is out of range.
@@ -130,19 +134,19 @@ def detect(
     weights: ArrayLike | None = None,
     align: Align = "auto",
 ) -> Detection:
-    """Read a mark from a suspect, and compute what the reading proves.
+    """Read a mark from a suspect, and compute the evidence of the reading.
 
-    With `original`, the suspect is first aligned with it (`jaxmark.alignment.attempts.align`); without it, marks of
-    the blind schemes are read (`jaxmark.watermark.blind.reading`). Without `message`, what is read counts only if its
-    keyed tag fits. With it, a mark is proven whose message can no longer be read; if another message is read, the claim
-    is refuted, not the mark: the evidence is that for the message that was read, and a note says so. Every choice that
-    was open is charged (`jaxmark.watermark.evidence.ledger`).
+    With `original`, the suspect is first aligned with it (`jaxmark.alignment.attempts.align`). Without it, marks of the
+    blind schemes are read (`jaxmark.watermark.blind.reading`). Without `message`, a decoded message counts only if its
+    keyed tag matches. With `message`, a mark is proven even if its message can no longer be decoded. If another message
+    is decoded, the claim is refuted, but not the mark: the evidence is that for the decoded message, and a note reports
+    it. Every choice that was open is charged (`jaxmark.watermark.evidence.ledger`).
 
-    **The bounds hold for any suspect independent of the key**, provided that key, original, message and record were
-    fixed before it existed; if nothing shows that, `evidence.log10_p_uncommitted` counts. A mesh marked under the same
-    key is not independent of it: once its message can no longer be read, a claim of one that has many bits in common
-    with it may pass. Where the program cannot vouch for a condition, `evidence.caveats` says why, and the figures are
-    estimates.
+    **The bounds hold for any suspect that is independent of the key**, provided that key, original, message and record
+    were fixed before it existed. If nothing shows that, use `evidence.log10_p_uncommitted`. A mesh that is marked with
+    the same key is not independent of it: when its message can no longer be decoded, a claimed message that has many
+    bits in common with it may be detected. If the program cannot verify a condition, `evidence.caveats` states the
+    reason, and the figures are estimates.
 
     Args:
         suspect: any mesh: moved, reordered, cropped, remeshed.
@@ -153,15 +157,15 @@ def detect(
         message: the message that is claimed to be in the suspect; None to read without a claim.
         record: the record of the mark, see `make_marker`.
         scheme: the scheme that the mark was embedded with, if there is no record; by default `"keyed"` with an
-            original, any blind one without it. Several names for marks that were embedded together: what they prove is
-            united.
+            original, and any blind scheme without it. Several names stand for marks that were embedded together, whose
+            evidence is united.
         detector: a detector, see `make_marker`.
-        weights: one number for each vertex of the original, not negative: how far to trust what the suspect shows of
-            it, 0 for not at all; **must not depend on the key**.
+        weights: one number of at least 0 for each vertex of the original: how far to trust the suspect there, 0 for not
+            at all; **must not depend on the key**.
         align: how the suspect is aligned: `"auto"`, `"same"`, `"similarity"` or `"affine"`.
 
     Returns:
-        The result of the reading; a suspect identical to the original gives log10_p = 0.
+        The result of the reading; a suspect identical to the original gives `log10_p` = 0.
 
     Raises:
         JaxmarkError: see `make_marker`; also if the suspect cannot be aligned, or the claimed message has another size
@@ -180,25 +184,27 @@ def detect(
         schemes = () if blind is None else (blind,)
         return read_blind(suspect, key, bits=bits, message=message, record=record, schemes=schemes)
     if original is None:
-        raise JaxmarkError(f"The scheme {named!r} is read with the original; give it, or mark with 'field'.")
+        raise JaxmarkError(
+            f"The scheme {named!r} is read with the original, which is missing. Give it, or embed with 'field'."
+        )
     scheme = scheme or DEFAULT_SCHEME
     usual = make_marker(original, key, bits=bits, record=record, scheme=scheme, detector=detector)
-    found, mark = alternatives(usual, scheme).read(suspect, message, weights, align)
-    return with_blind(found, together, suspect, key, mark.bits, message)
+    detection, mark = alternatives(usual, scheme).read(suspect, message, weights, align)
+    return with_blind(detection, together, suspect, key, mark.bits, message)
 
 
 def alternatives(usual: NonBlindMarker, scheme: str | Scheme | BlindScheme = DEFAULT_SCHEME) -> Alternatives:
-    """List all marks that may be meant, the likeliest first.
+    """List all marks that the suspect may carry, the likeliest first.
 
-    Without a record, marks of the default scheme, which was asked for by its name, have any pass band that is chosen by
-    a budget. Else there is one.
+    Without a record, marks of the default scheme by its name may have any of the adaptive pass bands. In all other
+    cases there is one mark.
     """
     if usual.record is not None or scheme != DEFAULT_SCHEME:
         return Alternatives([((), lambda: usual)])
     return Alternatives(
         [
-            ((ledger.PASS_BAND.charge(name),), cache(partial(usual.with_scheme, one)))
-            for name, one in zip(ADAPTIVE, candidates(usual.scheme), strict=True)
+            ((ledger.PASS_BAND.charge(name),), cache(partial(usual.with_scheme, candidate)))
+            for name, candidate in zip(ADAPTIVE, candidates(usual.scheme), strict=True)
         ]
     )
 
@@ -212,7 +218,7 @@ def read_blind(
     record: Record | None = None,
     schemes: Sequence[BlindScheme] = (),
 ) -> Detection:
-    """Read a mark without the original, of a scheme or else of any of `BLIND_SCHEMES`; see `detect`.
+    """Read a blind mark of the given schemes, or else of any of `BLIND_SCHEMES`; see `detect`.
 
     Raises:
         JaxmarkError: see `detect`.
@@ -232,20 +238,20 @@ def read_blind(
         if record is not None:
             record.check_claim(message, blind_reading.context(Key(key), payload, record.scheme))
     suspect, secret = blind_reading.register(suspect), Key(key)
-    found: list[Detection] = []
-    for one in blind_reading.try_each(
+    detections: list[Detection] = []
+    for detection in blind_reading.try_each(
         partial(blind_reading.read, suspect, secret, payload, scheme, message, record) for scheme in candidates
     ):
-        found.append(one)
-        if blind_reading.is_sure(one):
+        detections.append(detection)
+        if blind_reading.is_sure(detection):
             break
-    return blind_reading.best_of(found, ledger.BLIND_SCHEME, len(candidates))
+    return blind_reading.best_of(detections, ledger.BLIND_SCHEME, len(candidates))
 
 
 def with_blind(
     found: Detection, schemes: Sequence[BlindScheme], suspect: Mesh, key: bytes, bits: int, message: bytes | None
 ) -> Detection:
-    """Read blind marks of the same message, too, if there are any, and unite what all of them prove.
+    """Read further, blind marks of the same message, if there are any, and unite the evidence of all marks.
 
     Raises:
         JaxmarkError: see `detect`.
@@ -255,10 +261,10 @@ def with_blind(
 
 
 class SceneInfo(NamedTuple):
-    """How the meshes of a scene were marked."""
+    """The marks of the meshes of a scene."""
 
-    meshes: Mapping[str, EmbedInfo]  # of those that were marked, by name
-    skipped: Mapping[str, str]  # the others, and why they were left alone
+    meshes: Mapping[str, EmbedInfo]  # the marks of the marked meshes, by name
+    skipped: Mapping[str, str]  # the meshes that were not marked, and the reasons
     record: SceneRecord
 
 
@@ -278,15 +284,15 @@ def embed_scene(
         message: see `embed`.
         key: see `embed`.
         budget: see `embed`; relative to each mesh's own diagonal.
-        scheme: see `embed`; the usual pass band is taken for each mesh.
-        after: is called with each mesh's name, marker, marked mesh and info; returns the info to keep, or raises a
-            `JaxmarkError` if the mesh must be left alone after all.
+        scheme: see `embed`; each mesh gets the usual pass band.
+        after: a function that is called with each mesh's name, marker, marked mesh and info. It returns the info to
+            keep, or raises a `JaxmarkError` if the mesh must not be marked after all.
 
     Returns:
-        The marked meshes, and how they were marked.
+        The marked meshes, and the strength, records and predicted survival of their marks.
 
     Raises:
-        JaxmarkError: if no mesh can carry the message; see `embed`.
+        JaxmarkError: if no mesh can carry the message; see also `embed`.
     """
     marked: dict[str, Mesh] = {}
     infos: dict[str, EmbedInfo] = {}
@@ -317,107 +323,111 @@ def detect_scene(
     align: Align = "auto",
     after: Callable[[], None] = lambda: None,
 ) -> Detection:
-    """Read the meshes of a scene, and unite what they prove.
+    """Read the meshes of a scene, and unite their evidence.
 
-    Each original mesh is compared with the suspect mesh that looks like it, see `jaxmark.alignment.pairing.pair`. What
-    each mesh proves alone counts, and so does the weighted sum of all scores for one message.
+    Each original mesh is compared with the suspect mesh that resembles it, see `jaxmark.alignment.pairing.pair`. Two
+    kinds of evidence are computed: from each mesh alone, and from the weighted sum of all scores for one message.
 
     Args:
         suspects: meshes by name, from `jaxmark.files.load_scene`.
         originals: the unmarked meshes by name.
         key: see `detect`.
-        record: the record of the file, which says which meshes were marked; by default all may have been.
+        record: the record of the file, which contains the names of the marked meshes; by default, all may be marked.
         bits: see `detect`.
         message: see `detect`.
         scheme: see `detect`.
         align: see `detect`.
-        after: is called after each mesh.
+        after: a function that is called after each mesh.
 
     Returns:
-        What all meshes prove together; `parts` has the detection of each original mesh, `skipped` those that could not
-        be compared, and why. What belongs to one mesh is that of the mesh with most evidence.
+        The united detection. `parts` has the detection of each original mesh, and `skipped` the meshes that could not
+        be compared, with reasons. Fields that belong to one mesh are those of the mesh with most evidence.
 
     Raises:
-        JaxmarkError: if no mesh can be compared; see `detect`.
+        JaxmarkError: if no mesh can be compared; see also `detect`.
     """
     chosen = dict(originals)
     if record is not None:
         if missing := record.meshes.keys() - originals.keys():
-            raise JaxmarkError(f"The original has no mesh {min(missing)!r}, which the record says was marked.")
+            raise JaxmarkError(f"The original has no mesh {min(missing)!r}, which is marked according to the record.")
         chosen = {name: originals[name] for name in record.meshes}
     if bits is None and record is None and message is not None:
         bits = 8 * len(message)
     readings: dict[str, _MeshReading] = {}
     skipped: dict[str, str] = {}
-    known: set[tuple[bytes, bytes]] = set()
-    found = pair(chosen, suspects)
+    identities: set[tuple[bytes, bytes]] = set()
+    suspect_names = pair(chosen, suspects)
     for name, original in chosen.items():
         try:
-            if name not in found:
-                raise JaxmarkError("Nothing in the suspect looks like it.")
-            own = None if record is None else record.meshes[name]
-            marker = make_marker(original, key, bits=bits, record=own, scheme=get_nonblind(scheme))
-            mark = marker.original.geometry, marker.original.order
-            if mark in known:
-                raise JaxmarkError("It equals another mesh, and counts once.")
-            aligned = marker.register(suspects[found[name]], align)
-            # What a marker has computed to read is dropped: that of all meshes would not fit.
+            if name not in suspect_names:
+                raise JaxmarkError("No mesh of the suspect resembles it.")
+            mesh_record = None if record is None else record.meshes[name]
+            marker = make_marker(original, key, bits=bits, record=mesh_record, scheme=get_nonblind(scheme))
+            identity = marker.original.geometry, marker.original.order
+            if identity in identities:
+                raise JaxmarkError("It equals another mesh, which counts once.")
+            aligned = marker.register(suspects[suspect_names[name]], align)
+            # The marker's cached results are dropped here, because those of all meshes would not fit into memory.
             readings[name] = _MeshReading(replace(marker), aligned, marker.read(aligned, message))
-            known.add(mark)
+            identities.add(identity)
         except JaxmarkError as error:
             skipped[name] = str(error).rstrip(".")
         after()
     if not readings:
         raise JaxmarkError(f"None of the {len(chosen)} meshes could be compared: {_reasons(skipped)}.")
-    parts = {name: one.found for name, one in readings.items()}
+    parts = {name: reading.found for name, reading in readings.items()}
     return _unite_meshes(list(readings.values()), message)._replace(parts=parts, skipped=skipped)
 
 
 class _MeshReading(NamedTuple):
-    """A mesh of a scene that was read, in a pose in which the key had no part."""
+    """The reading of one mesh of a scene; its pose does not depend on the key."""
 
     marker: NonBlindMarker
     aligned: Alignment
     found: Detection
 
     def claim(self, message: bytes) -> tuple[np.ndarray, np.ndarray]:
-        """Score and norm of a message, by the first way of weighting points, which is no choice of the key."""
+        """Compute score and norm of a message with the first way of weighting, which does not depend on the key."""
         received = self.marker.receive(self.aligned)
         score, norm = claims_of(self.marker, received, message)[0]
         return np.asarray(score), np.asarray(norm)
 
 
 def _unite_meshes(readings: Sequence[_MeshReading], claimed: bytes | None) -> Detection:
-    """Unite what meshes of a scene prove: one of them alone, or the sum of their scores for one message."""
-    alone = [one.found for one in readings]
-    best = min(alone, key=lambda one: one.rank)
-    if len(alone) == 1:
+    """Unite the evidence of the meshes of a scene: that of one of them, or of the sum of scores for one message."""
+    detections = [reading.found for reading in readings]
+    best = min(detections, key=lambda detection: detection.rank)
+    if len(detections) == 1:
         return best
-    charges = ledger.SCENE.charge("one mesh"), ledger.MESHES.charge("each", len(alone))
-    evidence = Evidence.least(*(one.evidence.charged(*charges) for one in alone))
+    charges = ledger.SCENE.charge("one mesh"), ledger.MESHES.charge("each", len(detections))
+    evidence = Evidence.least(*(detection.evidence.charged(*charges) for detection in detections))
     read, bits = best.message, readings[0].marker.bits
     if not bits:
         claimed = b""
-    messages = {claimed} if claimed is not None else {one.message for one in alone if one.message is not None}
+    messages = (
+        {claimed}
+        if claimed is not None
+        else {detection.message for detection in detections if detection.message is not None}
+    )
     for message in messages:
-        if any(8 * len(message) != one.marker.bits for one in readings):
+        if any(8 * len(message) != reading.marker.bits for reading in readings):
             continue
-        recorded = [is_recorded(one.marker.record, message, one.marker.choices) for one in readings]
+        recorded = [is_recorded(reading.marker.record, message, reading.marker.choices) for reading in readings]
         fixed = claimed is not None or all(recorded)
         charges = [ledger.SCENE.charge("sum over meshes"), ledger.SUM_ALIGNMENT.charge(readings[0].aligned.align)]
-        if fixed or any(one is not None for one in recorded):
+        if fixed or any(flag is not None for flag in recorded):
             charges.append(ledger.MESSAGE.charge("claimed or recorded" if fixed else "another"))
-        scores, norms = zip(*(one.claim(message) for one in readings), strict=True)
-        # Meshes are weighted by the numbers of their points that the suspect shows.
-        score = united_score(scores, norms, [float(np.sum(one.aligned.weights > 0)) for one in readings])
+        scores, norms = zip(*(reading.claim(message) for reading in readings), strict=True)
+        # The weight of a mesh is the number of its points that the suspect shows.
+        score = united_score(scores, norms, [float(np.sum(reading.aligned.weights > 0)) for reading in readings])
         united = weigh([(score, 1.0)], bits=bits, fixed=fixed, charges=charges)
         if united.log10_p < evidence.log10_p:
-            read = message if any(one.message == message for one in alone) else None
+            read = message if any(detection.message == message for detection in detections) else None
         evidence = Evidence.least(evidence, united)
     return best._replace(message=read, evidence=evidence)
 
 
 def _reasons(skipped: Mapping[str, str]) -> str:
-    """Why meshes were skipped, the first three of them."""
-    said = "; ".join(f"{name!r}: {reason}" for name, reason in list(skipped.items())[:3])
-    return said + "; …" * (len(skipped) > 3)
+    """List the reasons why meshes were skipped, at most three of them."""
+    listed = "; ".join(f"{name!r}: {reason}" for name, reason in list(skipped.items())[:3])
+    return listed + "; …" * (len(skipped) > 3)

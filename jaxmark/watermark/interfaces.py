@@ -1,4 +1,4 @@
-"""The interfaces of carriers and of their readers: what a carrier of your own implements.
+"""The interfaces of carriers, their readers and schemes, which carriers and schemes of your own implement.
 
 D is the diagonal matrix of the vertex degrees of the original's Laplacian, and ⟨x, y⟩_D = xᵀDy (see
 `jaxmark.spectral.laplacian`). N is the number of vertices, k the number of code bits.
@@ -35,15 +35,15 @@ def check_strength(beta: Array, bands: int) -> Array:
     return beta
 
 
-#: A function of a reader, what it received from a suspect, and the strengths' profile as embedded; returns one soft
-#: value per bit.
+#: A function that computes one soft decision per bit, from a reader, the `Received` of a suspect, and the relative
+#: strengths of the bands as embedded.
 Detector = Callable[[Any, Any, Strength], Float[Array, " bits"]]
 
 
 class Claim(NamedTuple):
     """The evidence for a claimed codeword: a score S = Σ s·a over the keyed signs s, and the norm ‖a‖.
 
-    The vector a must be independent of the signs: the bounds in `jaxmark.watermark.evidence.bounds` need that.
+    The vector a must be independent of the signs, as the bounds in `jaxmark.watermark.evidence.bounds` require.
     """
 
     score: Float[Array, ""]  # S
@@ -51,19 +51,22 @@ class Claim(NamedTuple):
 
 
 class FreeDimensions(NamedTuple):
-    """What a reader leaves of a carrier's mark in each band; the capacity is computed from it."""
+    """The part of a carrier's mark that is left in each band when a reader has projected off the nuisance.
 
-    dimensions: Float64[np.ndarray, " bands"]  # number of dimensions left in each band; 0 if the mark is not in it
+    The capacity is computed from it.
+    """
+
+    dimensions: Float64[np.ndarray, " bands"]  # number of dimensions left in each band; 0 if the mark does not use it
     energy: Float64[np.ndarray, " bands"]  # energy of each of these dimensions if the mean square displacement is 1
 
 
 @runtime_checkable
 class Received(Protocol):
-    """What a reader learns from a suspect without the key; an `Observation` is the simplest one."""
+    """The data that a reader extracts from a suspect without using the key; `Observation` is the simplest type."""
 
     @property
     def observed(self) -> Observation:
-        """The suspect as it was given to the reader."""
+        """The observation that the reader was given."""
         ...
 
 
@@ -106,14 +109,18 @@ class Carrier(Protocol):
         ...
 
     def gram(self, beta: Strength = 1.0) -> Float[Array, "bits bits"]:
-        """D inner products of the displacements of single bits, `[k, k]`: column j is adjoint(displacement(e_j))."""
+        """Compute the D inner products of the displacements of single bits.
+
+        Returns:
+            The matrix `[k, k]` whose column j is adjoint(displacement(e_j)).
+        """
         ...
 
     def claim(self, observation: Observation, bits: Float[Array, " bits"]) -> Claim:
         """Compute the score and the norm of a claimed codeword.
 
         Args:
-            observation: what a suspect shows of each vertex's displacement.
+            observation: the observed displacement of each vertex of a suspect.
             bits: the codeword, ±1, `[k]`.
         """
         ...
@@ -121,21 +128,21 @@ class Carrier(Protocol):
     def redraw(self, seed: Seed) -> "Carrier":
         """Replace the keyed signs by random ones.
 
-        An attacker without the key computes expectations over such carriers.
+        A keyless attacker computes expectations over such carriers.
 
         Args:
-            seed: a whole number or a JAX random key.
+            seed: an integer or a JAX random key.
         """
         ...
 
     def reader(self) -> "Reader":
-        """Make the reader of this carrier; it computes once what reading any number of suspects needs."""
+        """Make the reader of this carrier; it computes once everything that does not depend on the suspect."""
         ...
 
 
 @runtime_checkable
 class ChipCarrier(Carrier, Protocol):
-    """A carrier that spreads bits over chips, several a vertex, which band filters shape into a displacement."""
+    """A carrier that spreads bits over chips, which band filters turn into a displacement; a vertex has several."""
 
     @property
     def host(self) -> Any:
@@ -144,19 +151,19 @@ class ChipCarrier(Carrier, Protocol):
 
     @property
     def chips(self) -> Any:
-        """The keyed signs of the chips and the bits that they belong to."""
+        """The keyed signs of the chips, and the bit that each chip belongs to."""
         ...
 
     def coefficients(self, beta: Strength, weight: Float[Array, " bands"] | None = None) -> Float[Array, "..."]:
-        """Chebyshev coefficients of the filter: Σ_j weight_j β_j f_j."""
+        """Compute the Chebyshev coefficients of the filter Σ_j weight_j β_j f_j."""
         ...
 
     def modulate(self, bits: Float[Array, " bits"], coefficients: Float[Array, "..."]) -> Displacement:
-        """Spread the bits over their chips, and filter these into a displacement."""
+        """Spread the bits over their chips, and filter the chips into a displacement."""
         ...
 
     def correlate(self, residual: Displacement, coefficients: Float[Array, "..."]) -> Float[Array, " bits"]:
-        """Apply the plain adjoint of `modulate`: Σ_v ⟨modulate(a)_v, r_v⟩ is the dot product of a and this."""
+        """Apply the adjoint of `modulate` for inner products without D, Σ_v ⟨modulate(a)_v, r_v⟩."""
         ...
 
     def filter_chips(self, chips: Float[Array, "vertices channels"], coefficients: Float[Array, "..."]) -> Displacement:
@@ -166,15 +173,15 @@ class ChipCarrier(Carrier, Protocol):
     def match_chips(
         self, residual: Displacement, coefficients: Float[Array, "..."]
     ) -> Float[Array, "vertices channels"]:
-        """Apply the plain adjoint of `filter_chips`, which is a matched filter."""
+        """Apply the adjoint of `filter_chips` for inner products without D, which is a matched filter."""
         ...
 
 
 @runtime_checkable
 class Reader(Protocol):
-    """Reads the bits of a carrier from suspects; a pytree whose methods can be traced.
+    """A reader of the bits of a carrier from suspects; a pytree whose methods can be traced.
 
-    `PlainReader` can read any carrier. What `receive` and `ways` return must not depend on the key.
+    `PlainReader` can read any carrier. The results of `receive` and `ways` must not depend on the key.
     """
 
     @property
@@ -183,7 +190,7 @@ class Reader(Protocol):
         ...
 
     def receive(self, observation: Observation) -> Any:
-        """Learn all that can be learned from a suspect without the key.
+        """Extract from a suspect all data that do not depend on the key.
 
         Returns:
             A `Received`, in a type of the reader's own, which the other methods take.
@@ -193,7 +200,8 @@ class Reader(Protocol):
     def ways(self, received: Any) -> Sequence[Any]:
         """Return one version of `received` for each way of weighting the suspect.
 
-        Each version gives a claim of its own, which is charged in `jaxmark.watermark.evidence.ledger`.
+        Each version gives a claim of its own, and the number of versions is charged in
+        `jaxmark.watermark.evidence.ledger`.
         """
         ...
 
@@ -207,11 +215,11 @@ class Reader(Protocol):
         ...
 
     def linear_score(self, received: Any, residual: Displacement, bits: Float[Array, " bits"]) -> Float[Array, ""]:
-        """Compute the score of a claim for another residual, with all that was learned from the suspect held fixed.
+        """Compute the score of a claim for another residual; weights and filters stay those of the suspect.
 
         Args:
-            received: what was learned from the suspect.
-            residual: the displacement that takes the place of the suspect's, `[N, 3]`.
+            received: the data extracted from the suspect.
+            residual: the displacement that replaces that of the suspect, `[N, 3]`.
             bits: the codeword, ±1, `[k]`.
 
         Returns:
@@ -220,24 +228,24 @@ class Reader(Protocol):
         ...
 
     def read_quickly(self, observation: Observation, beta: Strength = 1.0) -> Float[Array, " bits"] | None:
-        """Estimate soft values with little computation, well enough to read a suspect that was not attacked.
+        """Estimate soft decisions with little computation; they suffice for a suspect that was not attacked.
 
         Returns:
-            One soft value per bit, `[k]`; None if the reader has no such shortcut.
+            One soft decision per bit, `[k]`; None if the reader has no such shortcut.
         """
         ...
 
     def correlate(self, received: Any) -> Float[Array, " bits"] | None:
-        """Correlate what was received with each bit's displacement, band by band as the suspect left them.
+        """Correlate the suspect's residual with the displacement of each bit, with the bands weighted for the suspect.
 
         Returns:
-            One soft value per bit, `[k]`, in which the bits are noise to each other; None if the scheme's detector does
+            One soft decision per bit, `[k]`, in which the other bits act as noise; None if the scheme's detector does
             no more than that.
         """
         ...
 
     def free_dimensions(self, moving: Float[Array, " vertices"]) -> FreeDimensions | None:
-        """Measure what the reader leaves of the mark in each band.
+        """Measure the dimensions and the energy of the mark that remain in each band.
 
         Args:
             moving: 1 for each vertex that may move, else 0, `[N]`.
@@ -248,16 +256,16 @@ class Reader(Protocol):
         ...
 
     def with_carrier(self, carrier: Any) -> "Reader":
-        """Return the reader for a carrier of the same scheme and original, but another key; nothing is recomputed."""
+        """Return the reader for a carrier of the same scheme and original with another key; nothing is recomputed."""
         ...
 
 
 @runtime_checkable
 class Scheme(Protocol):
-    """A dataclass that makes a carrier for an original, a key and a payload; the record of a mark stores its fields.
+    """A scheme: a dataclass that makes a carrier for an original, a key and a payload size.
 
-    A scheme of your own inherits from this class and defines `name`, `detector`, `code_length` and `carrier`; `layout`,
-    `dimensions` and `tunable` have defaults.
+    The record of a mark stores the fields of its scheme. A scheme of your own inherits from this class and defines
+    `name`, `detector`, `code_length` and `carrier`; `layout`, `dimensions` and `tunable` have defaults.
     """
 
     name: ClassVar[str]  # the scheme's name in records and on the command line
@@ -265,7 +273,7 @@ class Scheme(Protocol):
 
     @property
     def detector(self) -> Detector:
-        """The detector that reads marks of this scheme, unless another one is chosen."""
+        """The detector for marks of this scheme, unless the caller chooses another one."""
         ...
 
     def code_length(self, original: Original, bits: int) -> int:
@@ -276,8 +284,8 @@ class Scheme(Protocol):
             bits: size of the payload in bits.
 
         Raises:
-            JaxmarkError: if the payload is too large for this original, which `capacity` relies on, or is no positive
-                multiple of 8.
+            JaxmarkError: if the payload is too large for this original (`capacity` relies on this error), or is no
+                positive multiple of 8.
         """
         ...
 
@@ -293,14 +301,14 @@ class Scheme(Protocol):
         ...
 
     def layout(self, original: Original, bits: int) -> Hashable:
-        """Return a key for what the free dimensions depend on: payloads of equal layout have the same ones.
+        """Return a hashable key; payloads with equal keys have equal free dimensions, which are then measured once.
 
-        They (see `Reader.free_dimensions`) are then measured only once for all of these payloads.
+        See `Reader.free_dimensions`.
         """
         return None
 
     def dimensions(self, original: Original, bits: int) -> int:
-        """Number of dimensions of the pass band for a payload; 0 if the scheme has none and carries no fingerprints."""
+        """Count the dimensions of the pass band for a payload; 0 if the scheme has none and carries no fingerprints."""
         return 0
 
     def tunable(self) -> Any:

@@ -1,4 +1,4 @@
-"""One mark that is read with the original: all that is fixed about it, and what writing and reading it compute."""
+"""A mark that is read with the original: its original, key, payload and scheme, and how it is written and read."""
 
 import math
 from dataclasses import dataclass, replace
@@ -26,21 +26,21 @@ from jaxmark.watermark.perception.capacity import Capacity, Survival
 from jaxmark.watermark.record import Content, Record, commit, seal_imprint
 from jaxmark.watermark.schemes.registry import SCHEMES, parameters_of
 
-_MIN_ORIGINAL_SHARE = 0.5  # share of an original's points from which on an edited copy is read with, as an estimate
-_SAME_SHAPE = 0.01  # distance of shapes, over their size, below which an original looks like a marked or edited copy
+_MIN_ORIGINAL_SHARE = 0.5  # least share of an original's points with which an edited copy is used, for an estimate
+_SAME_SHAPE = 0.01  # distance of shapes over their size; with a smaller one the mesh looks like a marked or edited copy
 
 
 _AnyMark = TypeVar("_AnyMark", bound="Mark")
 
 
 class EmbedInfo(NamedTuple):
-    """How a mesh was marked."""
+    """The strength, the record and the predicted survival of a mark that was embedded."""
 
-    rms: float  # RMS displacement of the welded vertices that faces use, unweighted, over the bounding-box diagonal
+    rms: float  # unweighted RMS displacement of the welded vertices of faces, over the bounding-box diagonal
     max: float  # the largest such displacement
     beta: float  # strength: the factor on the carrier's unit displacement, in diagonals
-    record: Record  # what the owner needs to read the mark again
-    survives: Survival = Survival(0.0, 0.0)  # as predicted; `Marker.measure_survival` tries it
+    record: Record  # the record, which the owner needs to read the mark again
+    survives: Survival = Survival(0.0, 0.0)  # as predicted; `Marker.measure_survival` measures it
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,15 +48,15 @@ class Mark:
     """A mark: its original, key, payload and scheme, prepared once for writing it and for reading suspects."""
 
     original: Original
-    choices: Choices  # what derives from the key
+    choices: Choices  # the keyed choices
     bits: int  # size of the payload in bits
     scheme: Scheme
     carrier: Carrier
     code_bits: int  # number of code bits that are carried
     detector: Detector
-    content: Content = "message"  # what the code bits say
+    content: Content = "message"  # the kind of content of the code bits
     record: Record | None = None  # the record of the mark that is read
-    caveats: tuple[str, ...] = ()  # why what is read is no proof
+    caveats: tuple[str, ...] = ()  # the reasons why readings are no proof
 
     @classmethod
     def make(
@@ -70,7 +70,7 @@ class Mark:
         detector: Detector | None = None,
         caveats: tuple[str, ...] = (),
     ) -> "_AnyMark":
-        """Make a mark that carries a message, or without a payload nothing but its presence.
+        """Make a mark that carries a message, or a presence mark if there is no payload.
 
         Raises:
             JaxmarkError: if the payload does not fit.
@@ -83,8 +83,8 @@ class Mark:
             caveats += (f"the scheme {scheme.name!r} is not one of this library",)
         if detector not in (None, scheme.detector):
             caveats += ("the detector is not the scheme's own",)
-        used = detector or scheme.detector
-        return cls(original, choices, bits, scheme, carrier, code_bits, used, content, record, caveats)
+        chosen = detector or scheme.detector
+        return cls(original, choices, bits, scheme, carrier, code_bits, chosen, content, record, caveats)
 
     @property
     def key(self) -> Key:
@@ -93,25 +93,25 @@ class Mark:
 
     @cached_property
     def reader(self) -> Reader:
-        """The reader of the carrier; made when it is first needed."""
+        """The reader of the carrier; made at its first use."""
         return self.carrier.reader()
 
     @cached_property
     def capacity(self) -> Capacity:
-        """What the original can carry with the scheme."""
+        """The capacity of the original with the scheme."""
         return Capacity(self.original, self.scheme, {self.bits: lambda: self.reader})
 
     @property
     def uses_own_detector(self) -> bool:
-        """Whether the detector is the scheme's own, for which the reader's shortcuts stand."""
+        """Whether the detector is the scheme's own; only then do the reader's shortcuts give equivalent results."""
         return self.detector is self.scheme.detector
 
     def choices_of(self, key: bytes) -> Choices:
-        """The keyed choices of the same mark under another key."""
+        """Return the keyed choices of the same mark under another key."""
         return replace(self.choices, key=Key(key))
 
     def codeword(self, message: bytes) -> Float64[np.ndarray, " code"]:
-        """The code bits of a message and its keyed tag, each -1 or +1."""
+        """Encode a message and its keyed tag as code bits, each -1 or +1."""
         return encode(message, self.choices, self.code_bits)
 
     def write(
@@ -122,17 +122,17 @@ class Mark:
         Args:
             amplitudes: one number for each code bit, up to a common factor.
             budget: see `embed`.
-            content: the message or the recipient of these amplitudes, which the record commits to; b"" for none.
+            content: the message or the recipient that the record commits to; b"" for none.
 
         Raises:
-            JaxmarkError: if the carrier does not displace this mesh at all; or see `displace_within`.
+            JaxmarkError: if the carrier does not displace this mesh at all; see also `displace_within`.
         """
         original, bounds = self.original, Budget.of(budget).bounds(self.original.mesh)
         unit = original.to_host(self.carrier.displacement(jnp.asarray(amplitudes, original.signal.dtype)))
         size = float(distortion.rms(unit[original.used]))
         if not (math.isfinite(size) and size > 0):
             raise JaxmarkError(
-                f"The {len(unit)} points of this mesh leave the scheme {self.scheme.name!r} nothing to write in."
+                f"This mesh ({len(unit)} points) cannot be marked with the scheme {self.scheme.name!r}: no point moves."
             )
         written = displace_within(original, unit, bounds, self.capacity.reference if bounds.limits else None)
         canonical = Canonical(original.points, original.weld, original.geometry, original.order)
@@ -150,7 +150,7 @@ class Mark:
         return written.mesh, EmbedInfo(written.moved.rms, written.moved.max, written.scale, record)
 
     def observe(self, aligned: Alignment, weights: ArrayLike | None = None) -> Observation:
-        """Find what a suspect shows of each point's displacement, in diagonals; independent of the key.
+        """Compute the observed displacement of each point of the original, in diagonals; independent of the key.
 
         Args:
             aligned: the suspect's alignment with the original.
@@ -161,7 +161,7 @@ class Mark:
         return aligned.observation(self.original)
 
     def receive(self, aligned: Alignment, weights: ArrayLike | None = None) -> Received:
-        """Find what the reader learns from a suspect, independently of the key; see `Reader.receive`."""
+        """Extract the data that the reader needs from a suspect, independently of the key; see `Reader.receive`."""
         return self.reader.receive(self.observe(aligned, weights))
 
     def soft_decisions(self, received: Received) -> Float64[np.ndarray, " code"]:
@@ -169,21 +169,21 @@ class Mark:
         return np.asarray(self.detector(self.reader, received, 1.0), np.float64)
 
     def decode(self, soft: ArrayLike, candidates: int = CANDIDATES) -> Decoded | None:
-        """Decode the message in soft decisions; None if the keyed tag of none among so many candidates fits."""
+        """Decode the message from soft decisions; None if the keyed tag of no candidate matches."""
         return decode(np.asarray(soft, np.float64), self.bits, self.choices, candidates)
 
     def read_quickly(self, observation: Observation) -> bytes | None:
-        """Decode a lightly attacked suspect at low cost, see `Reader.read_quickly`; None if that decodes nothing."""
+        """Decode a lightly attacked suspect at low cost, see `Reader.read_quickly`; None if no message is decoded."""
         quick = self.reader.read_quickly(observation)
-        found = self.decode(quick if quick is not None else self.soft_decisions(self.reader.receive(observation)))
-        return None if found is None else found.message
+        decoded = self.decode(quick if quick is not None else self.soft_decisions(self.reader.receive(observation)))
+        return None if decoded is None else decoded.message
 
     def coverage(self, observed: Observation) -> float:
-        """Share of the original's points that a suspect gives evidence for."""
+        """Compute the share of the original's points that a suspect gives evidence for."""
         return float(np.mean(self.original.to_host(observed.weights)[self.original.used] > 0))
 
     def with_scheme(self: "_AnyMark", scheme: Scheme, bits: int | None = None) -> "_AnyMark":
-        """Return the same mark, which has no record, with another scheme of this library, or another payload size.
+        """Return the same mark with another scheme of this library or another payload size; it must have no record.
 
         Raises:
             JaxmarkError: if the payload does not fit.
@@ -195,19 +195,19 @@ class Mark:
         return self.make(self.original, self.key, scheme, bits, detector=detector)
 
     def _per_point(self, weights: ArrayLike) -> Float64[np.ndarray, " points"]:
-        """Convert weights of vertices to weights of points, each the mean over the vertices at the point."""
-        given, point = np.asarray(weights, np.float64), self.original.weld.point
-        if given.shape != point.shape or not (np.isfinite(given) & (given >= 0)).all():
-            raise JaxmarkError(f"weights must be {len(point)} finite numbers, not negative, one for each vertex.")
-        return np.bincount(point, given) / np.bincount(point)
+        """Convert weights of vertices to weights of points: the mean over all vertices at the point."""
+        values, point = np.asarray(weights, np.float64), self.original.weld.point
+        if values.shape != point.shape or not (np.isfinite(values) & (values >= 0)).all():
+            raise JaxmarkError(f"weights must be {len(point)} finite numbers of at least 0, one for each vertex.")
+        return np.bincount(point, values) / np.bincount(point)
 
 
 def bind_mark(
     key: bytes, original: Original, scheme: Scheme, bits: int, content: Content, record: Record | None = None
 ) -> Choices:
-    """Bind the keyed choices of a mark to its original and to all that reading it uses.
+    """Bind the keyed choices of a mark to its original and to everything else that reading the mark uses.
 
-    The fields of the scheme are those in the record, if there is one: a later jaxmark may know more fields.
+    With a record, the fields of the scheme are those in the record, because a later version of jaxmark may have more.
     """
     parameters = parameters_of(scheme) if record is None else record.parameters
     fixed = {"content": content, "scheme": scheme.name, "parameters": parameters, "bits": bits}
@@ -219,15 +219,15 @@ def recall(original: Mesh, key: bytes, record: Record | None) -> tuple[Original,
     """Prepare the original of a mark exactly as it was when the mark was made.
 
     Args:
-        original: the unmarked mesh as its owner has it now.
+        original: the unmarked mesh in its present form.
         key: 32 bytes.
         record: the record of the mark, if there is one.
 
     Returns:
-        The original; and why what is read with it is no proof, which is if it was edited since.
+        The original, and the caveats of reading with it: there is one if it was edited since.
 
     Raises:
-        JaxmarkError: if the mesh is unusable, or not the one that the record was made for.
+        JaxmarkError: if the mesh is unusable, or is not the one that the record was made for.
     """
     if record is None:
         return make_original(original), ()
@@ -240,14 +240,14 @@ def recall(original: Mesh, key: bytes, record: Record | None) -> tuple[Original,
     if copy.exact:
         return _in_order_of(ready, imprint), ()
     if copy.share < _MIN_ORIGINAL_SHARE:
-        said = f"{100 * copy.share:.0f} % of that mesh's points are in it"
+        share = f"it has {100 * copy.share:.0f} % of that mesh's points"
         if copy.distance < _SAME_SHAPE:
             raise JaxmarkError(
-                f"The original is not the mesh that the record was made for: {said}, though their shapes differ by only"
+                f"The original is not the mesh that the record was made for: {share}, and their shapes differ by only"
                 f" {100 * copy.distance:.2g} % of their size. It looks like the marked file, or another edited copy."
             )
         raise JaxmarkError(
-            f"The original is not the mesh that the record was made for: {said}, and their shapes differ by"
+            f"The original is not the mesh that the record was made for: {share}, and their shapes differ by"
             f" {100 * copy.distance:.2g} % of their size."
         )
     places = np.full(len(ready.used), -1)
@@ -257,5 +257,5 @@ def recall(original: Mesh, key: bytes, record: Record | None) -> tuple[Original,
 
 
 def _in_order_of(original: Original, imprint: Imprint) -> Original:
-    """The original, bound to the order that was marked, which its file may have no longer."""
+    """Bind an original to the vertex order that was marked, which its file may no longer have."""
     return replace(original, order=imprint.order, in_order=original.order == imprint.order)

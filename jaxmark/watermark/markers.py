@@ -1,7 +1,7 @@
-"""Markers: each marks one original with one key and payload size, and reads the mark again; they prepare only once.
+"""Markers: each one marks one original with one key and payload size, and reads the mark again.
 
-`NonBlindMarker` makes marks that are read with the original, `BlindMarker` marks that are read without it, and
-`CombinedMarker` both in one mesh. All of them are a `Marker`.
+A marker prepares its original only once. `NonBlindMarker` makes marks that are read with the original, `BlindMarker`
+marks that are read without it, and `CombinedMarker` both in one mesh. All of them are a `Marker`.
 """
 
 import math
@@ -44,18 +44,18 @@ from jaxmark.watermark.schemes.registry import (
     split,
 )
 
-_MAX_TRIED_NOISE = 0.05  # beyond which no shape is left
-_SHARES_OF_NOISE = (1.0, 0.7, 0.5, 0.3, 0.1)  # of a predicted noise that are tried, by blind marks all but the last
-_LEAST_SHARE, _MOST_SHARE = 0.3, 0.9  # of what is allowed, for a mark that is not the last
+_MAX_TRIED_NOISE = 0.05  # larger noise, which destroys the shape, is not tried
+_SHARES_OF_NOISE = (1.0, 0.7, 0.5, 0.3, 0.1)  # shares of the predicted noise to try; blind marks omit the last
+_LEAST_SHARE, _MOST_SHARE = 0.3, 0.9  # limits on the share of the budget for a mark that is not the last
 
 
 @runtime_checkable
 class Marker(Protocol):
-    """Marks one original, and reads any number of suspects."""
+    """An object that marks one original, and reads any number of suspects."""
 
     @property
     def original(self) -> Original:
-        """The mesh that is marked."""
+        """The mesh to mark."""
         ...
 
     def embed(self, message: bytes, budget: BudgetLike = None, *, read_back: bool = True) -> tuple[Mesh, EmbedInfo]:
@@ -66,7 +66,7 @@ class Marker(Protocol):
         ...
 
     def with_record(self, record: Record) -> "Marker":
-        """Return the marker that reads the mark of a record: one that this marker made."""
+        """Return a marker that reads with a record; this marker must have made the record."""
         ...
 
     def check(self, marked: Mesh, message: bytes) -> None:
@@ -78,34 +78,34 @@ class Marker(Protocol):
         ...
 
     def measure_survival(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival | None:
-        """Try what a mark survives: add noise, lose half of the points, and read; the prediction where it reads.
+        """Measure the noise that a mark survives, with all points and with half of them, up to the predicted noise.
 
-        Where it does not, less noise is tried; 0 if not even a fraction of what was predicted.
+        Random noise of the predicted strength is added. If the mark cannot be read, smaller shares of it are tried.
 
         Args:
-            marked: the marked mesh, in the original's order.
+            marked: the marked mesh, in the original's vertex order.
             message: its message.
-            predicted: from `EmbedInfo`.
+            predicted: the prediction, from `EmbedInfo`.
 
         Returns:
-            The noise; None if the message does not even read without any.
+            The largest noise with which the mark was read, 0 if with none; None if it cannot be read without noise.
         """
         ...
 
     def register(self, suspect: Mesh) -> Any:
-        """Find out about a suspect what does not depend on the key: once for any number of keys, see `read`."""
+        """Prepare a suspect for `read`, independently of the key: once for any number of keys."""
         ...
 
     def read(self, registered: Any, message: bytes | None = None) -> Detection:
-        """Read what `register` returned, with a claimed message or without."""
+        """Read a suspect that `register` prepared, with or without a claimed message."""
         ...
 
     def detect(self, suspect: Mesh, message: bytes | None = None) -> Detection:
-        """Read a suspect, with a claimed message or without; see `jaxmark.watermark.everyday.detect`."""
+        """Read a suspect, with or without a claimed message; see `jaxmark.watermark.everyday.detect`."""
         ...
 
     def guess(self, found: Detection) -> bytes | None:
-        """Decode the most plausible message of a detection, whatever its tag, as a receiver without tags would."""
+        """Decode the most plausible message of a detection without checking its tag."""
         ...
 
 
@@ -118,20 +118,21 @@ class NonBlindMarker(Mark):
         budget = Budget.of(budget)
         bounds = budget.bounds(self.original.mesh)
         marked, info = self.write(self.codeword(message), budget, content=message)
-        # A budget without limits is met up to rounding, so its own number is used.
+        # A budget without limits is reached up to rounding, so its own number is used.
         reached = info.rms if bounds.limits else bounds.rms or 0.0
         if budget.noise is not None:
             self._check_capacity(reached, Conditions(bounds, budget.noise, COVERAGE))
         conditions = (Conditions(bounds, 1.0, share) for share in (1.0, COVERAGE))
-        info = info._replace(survives=Survival(*(self.capacity.noise(self.bits, reached, one) for one in conditions)))
+        info = info._replace(survives=Survival(*(self.capacity.noise(self.bits, reached, case) for case in conditions)))
         if read_back:
             self.check(marked, message)
         return marked, info
 
     def adapted(self, budget: BudgetLike = None) -> "NonBlindMarker":
-        """Return the marker with the pass band that suits a budget, if its scheme is the default.
+        """Return the marker with the adaptive pass band for a budget, if its scheme is the default one.
 
-        Without a demand, it suits the noise of `capacity.NOISE`; see `jaxmark.watermark.schemes.passband`.
+        If the budget demands no noise, the pass band is chosen for `capacity.NOISE`; see
+        `jaxmark.watermark.schemes.passband`.
         """
         budget = Budget.of(budget)
         bounds = budget.bounds(self.original.mesh)
@@ -139,9 +140,9 @@ class NonBlindMarker(Mark):
 
     def with_record(self, record: Record) -> "NonBlindMarker":
         """See `Marker`; claims are then checked against the record."""
-        same = replace(self, record=record)
-        same.__dict__.update({name: self.__dict__[name] for name in ("reader", "capacity") if name in self.__dict__})
-        return same
+        marker = replace(self, record=record)
+        marker.__dict__.update({name: self.__dict__[name] for name in ("reader", "capacity") if name in self.__dict__})
+        return marker
 
     def check(self, marked: Mesh, message: bytes) -> None:
         """See `Marker`."""
@@ -152,43 +153,45 @@ class NonBlindMarker(Mark):
     def reads(self, marked: Mesh, message: bytes) -> bool:
         """Whether a message can be read from a mesh that has the original's vertex order.
 
-        Plain correlations nearly always read a keyed mark that was not attacked. They are tried first, because
+        Plain correlations nearly always decode a keyed mark that was not attacked. They are tried first, because
         weighting the bands and joint decoding are most of the work of `detect`.
         """
         return self._reads_in_order(attempts.align(self.original, marked, "same"), message)
 
     def _reads_in_order(self, aligned: Alignment, message: bytes) -> bool:
-        # The reader's shortcut stands for the scheme's own detector, not for any other.
+        # The reader's shortcut is equivalent only to the scheme's own detector.
         if message and self.uses_own_detector and self.read_quickly(self.observe(aligned)) == message:
             return True
         return self._reads(aligned, message)
 
     def _reads(self, aligned: Alignment, message: bytes) -> bool:
-        """Whether a message is read, or without one a presence proven, from a suspect as it was aligned."""
+        """Whether an aligned suspect's message is decoded, or, for a presence mark, its presence is proven."""
         if not self.bits:
             return self.read(aligned, b"").detected(allow_estimate=True)
-        found = self.decode(self.soft_decisions(self.receive(aligned)))
-        return found is not None and found.message == message
+        decoded = self.decode(self.soft_decisions(self.receive(aligned)))
+        return decoded is not None and decoded.message == message
 
     def measure_survival(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival | None:
-        """See `Marker`; messages are read by plain correlations: joint decoding may read in still more noise."""
+        """See `Marker`; messages are decoded by plain correlations, although joint decoding may survive more noise."""
         aligned, rng = attempts.align(self.original, marked, "same"), np.random.default_rng(0)
         if not self._reads_in_order(aligned, message):
             return None
         points, used = self.original.positions, self.original.used
         unit = self.original.radius * rng.uniform(-1, 1, points.shape)
-        near = points[:, 0] <= np.median(points[used, 0])  # half of the mesh, as if it was cut
+        near = points[:, 0] <= np.median(points[used, 0])  # half of the mesh, as after a cut
 
         def survives(noise: float, visible: np.ndarray) -> bool:
-            one = aligned._replace(displacement=aligned.displacement + noise * unit, weights=aligned.weights * visible)
-            return self.read_quickly(self.observe(one)) == message if message else self._reads(one, message)
+            noisy = aligned._replace(
+                displacement=aligned.displacement + noise * unit, weights=aligned.weights * visible
+            )
+            return self.read_quickly(self.observe(noisy)) == message if message else self._reads(noisy, message)
 
-        found = []
+        survived = []
         for noise, visible in zip(predicted, (np.ones_like(near), near), strict=True):
             strengths = (share * min(noise, _MAX_TRIED_NOISE) for share in _SHARES_OF_NOISE)
             reads = (strength for strength in strengths if survives(strength, visible))
-            found.append(next(reads, 0.0) if 0 < noise < math.inf else noise)
-        return Survival(*found)
+            survived.append(next(reads, 0.0) if 0 < noise < math.inf else noise)
+        return Survival(*survived)
 
     def register(self, suspect: Mesh, align: Align = "auto") -> Alignment:
         """Align a suspect with the original; see `jaxmark.alignment.attempts.align`."""
@@ -205,7 +208,7 @@ class NonBlindMarker(Mark):
         weights: ArrayLike | None = None,
         align: Align = "auto",
     ) -> Detection:
-        """See `Marker`; of a surface, both reflections are read, which `read` does not do."""
+        """See `Marker`; if the suspect is registered by its surface, both reflections are read, unlike in `read`."""
         return Alternatives([((), lambda: self)]).read(suspect, message, weights, align)[0]
 
     def guess(self, found: Detection) -> bytes | None:
@@ -220,26 +223,26 @@ class NonBlindMarker(Mark):
             return
         most = capacity.bits(conditions) if self.bits else 0
         present = capacity.least_budget(0, conditions) <= reached
-        mend = ["a shorter message"] if most else ["a presence mark"] if present else []
+        advice = ["a shorter message"] if most else ["a presence mark"] if present else []
         if math.isfinite(least):
-            enough = _rounded_up(least)
-            mend.append(f"a budget of at least {enough:g}{self._distortion_at(enough, conditions.bounds)}")
-        carried = f"carries at most {most} bits" if most else "carries no message" if self.bits else "carries nothing"
-        wanted = f", not {self.bits}" if most else ""
+            budget = _rounded_up(least)
+            advice.append(f"a budget of at least {budget:g}{self._distortion_at(budget, conditions.bounds)}")
+        carries = f"carries at most {most} bits" if most else "carries no message" if self.bits else "carries no mark"
+        payload = f"; the payload is {self.bits} bits" if most else ""
         raise JaxmarkError(
-            f"This mesh ({int(self.original.used.sum())} points) {carried} at {conditions.bounds}, with noise of"
-            f" {conditions.noise:g} and half of it lost{wanted}. Use {', or '.join(mend or ['less noise'])}."
+            f"This mesh ({int(self.original.used.sum())} points) {carries} at {conditions.bounds}, with noise of"
+            f" {conditions.noise:g} and half of its points lost{payload}. Use {', or '.join(advice or ['less noise'])}."
         )
 
     def _distortion_at(self, rms: float, bounds: Bounds) -> str:
-        """How far a mark of a size would exceed the limits, as half a sentence."""
+        """Describe the distortion by a mark of a given size, in the metrics that are limited, as half a sentence."""
         if not bounds.limits:
             return ""
         word = np.random.default_rng(0).choice([-1.0, 1.0], self.code_bits)
         marked, _ = self.write(word, min(rms, 0.5))
         values = distortion.measure(self.original.mesh, marked, bounds.limits.keys())
-        said = ", ".join(f"{name} would be {value or 0:.2g}" for name, value in values.items())
-        return f" (at which {said})"
+        described = ", ".join(f"{name} would be {value or 0:.2g}" for name, value in values.items())
+        return f" (at which {described})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +258,7 @@ class BlindMarker:
     @classmethod
     def make(cls, original: Original, key: Key, bits: int, scheme: BlindScheme) -> "BlindMarker":
         """Prepare an original; see `make_blind_marker`."""
-        blind_reading.code_length(bits)  # refuses a payload that is not a multiple of 8 bits
+        blind_reading.code_length(bits)  # raises an error unless the payload is a multiple of 8 bits
         check_faces("A mark that is read without the original", original.mesh)
         choices = blind_reading.context(key, bits, scheme.name)
         return cls(original, key, bits, scheme, Writer(original, scheme, choices))
@@ -266,7 +269,7 @@ class BlindMarker:
         marked, info = self.write(message, budget)
         if budget.noise is not None and info.survives.whole < budget.noise:
             raise JaxmarkError(
-                f"This mark would survive noise of {info.survives.whole:.2g}, not {budget.noise:g}; use a larger"
+                f"This mark would survive noise of {info.survives.whole:.2g}, less than {budget.noise:g}; use a larger"
                 " budget, a shorter message or another scheme."
             )
         if read_back:
@@ -276,7 +279,7 @@ class BlindMarker:
     def write(
         self, message: bytes, budget: BudgetLike = None, reference: distortion.Reference | None = None
     ) -> tuple[Mesh, EmbedInfo]:
-        """Write a message as far as a budget allows, against another mesh than the original if `reference` is given."""
+        """Write a message as far as a budget allows; limits are measured against `reference`, if given."""
         choices, bounds = self.writer.choices, Budget.of(budget).bounds(self.original.mesh)
         written = self.writer.write(blind_reading.codeword(message, choices), bounds, self.bits, reference)
         record = Record(
@@ -293,7 +296,7 @@ class BlindMarker:
         return written.mesh, EmbedInfo(written.moved.rms, written.moved.max, record.beta, record, survives)
 
     def with_record(self, record: Record) -> "BlindMarker":
-        """See `Marker`; only the width and the step that were written are then read."""
+        """See `Marker`; only the width and the quantisation step of the record are then read."""
         return replace(self, scheme=make_blind_scheme(record.scheme, record.parameters))
 
     def check(self, marked: Mesh, message: bytes) -> None:
@@ -302,9 +305,9 @@ class BlindMarker:
             raise _does_not_read(self, f"a larger budget, a shorter message or the scheme {DEFAULT_SCHEME!r}")
 
     def reads(self, marked: Mesh, message: bytes) -> bool:
-        """Whether a message is read, or without one a presence proven."""
-        found = self.detect(marked)
-        return found.message == message if message else found.detected()
+        """Whether a message is decoded, or, for a presence mark, its presence is proven."""
+        detection = self.detect(marked)
+        return detection.message == message if message else detection.detected()
 
     def measure_survival(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival | None:
         """See `Marker`."""
@@ -315,16 +318,16 @@ class BlindMarker:
         unit = size * rng.uniform(-1, 1, self.original.positions.shape)[self.original.weld.point]
         faces = np.asarray(marked.faces)
         near = (points[faces, 0] <= np.median(points[faces, 0])).all(axis=1)
-        found = []
-        for most, part in zip(predicted, (faces, faces[near]), strict=True):
-            strengths = [share * most for share in _SHARES_OF_NOISE[:-1] if most > 0]
+        survived = []
+        for strongest, part in zip(predicted, (faces, faces[near]), strict=True):
+            strengths = [share * strongest for share in _SHARES_OF_NOISE[:-1] if strongest > 0]
             suspects = (Mesh(points + noise * unit, part) for noise in strengths)
-            reads = (noise for noise, one in zip(strengths, suspects, strict=True) if self.reads(one, message))
-            found.append(next(reads, 0.0))
-        return Survival(*found)
+            reads = (noise for noise, suspect in zip(strengths, suspects, strict=True) if self.reads(suspect, message))
+            survived.append(next(reads, 0.0))
+        return Survival(*survived)
 
     def register(self, suspect: Mesh) -> Mesh:
-        """Weld a suspect, and drop what no face uses: all of it is read in a pose of its own."""
+        """Weld a suspect, and drop vertices that no face uses; all of it is read in its own pose."""
         return blind_reading.register(suspect)
 
     def read(self, registered: Mesh, message: bytes | None = None) -> Detection:
@@ -342,14 +345,15 @@ class BlindMarker:
 
 @dataclass(frozen=True, eq=False)
 class CombinedMarker:
-    """A `Marker` of several marks in one mesh, within one budget: one read with the original, and blind ones.
+    """A `Marker` of several marks in one mesh within one budget: one non-blind mark, and blind ones.
 
-    What each mark alone survives within the bounds says how to share these: so that all survive as much noise. Marks
-    are written one after another, the blind ones last, and the last has what the others left.
+    The budget is shared so that all marks survive the same noise, as predicted from the noise that each mark survives
+    if it uses the whole budget. The marks are written one after another, the blind ones last. The last mark gets the
+    part of the budget that the others left.
     """
 
     nonblind: NonBlindMarker
-    schemes: tuple[BlindScheme, ...]  # of the blind marks
+    schemes: tuple[BlindScheme, ...]  # the schemes of the blind marks
 
     @property
     def original(self) -> Original:
@@ -357,7 +361,7 @@ class CombinedMarker:
         return self.nonblind.original
 
     def embed(self, message: bytes, budget: BudgetLike = None, *, read_back: bool = True) -> tuple[Mesh, EmbedInfo]:
-        """See `Marker`; the record is that of the mark that is read with the original."""
+        """See `Marker`; the record is that of the non-blind mark."""
         budget = Budget.of(budget)
         mesh = self.original.mesh
         bounds = budget.bounds(mesh)
@@ -376,14 +380,14 @@ class CombinedMarker:
         survives = [info.survives]
         limits = {**bounds.limits, **({} if bounds.rms is None else {"rms": bounds.rms})}
         for place, scheme in enumerate(self.schemes, 1):
-            own = None if place == len(self.schemes) else shares[place] * sizes[place]
+            rms = None if place == len(self.schemes) else shares[place] * sizes[place]
             marker = self._make_blind(make_original(marked), scheme)
-            marked, other = marker.write(message, Budget(rms=own, limits=limits), reference)
-            survives.append(other.survives)
+            marked, blind_info = marker.write(message, Budget(rms=rms, limits=limits), reference)
+            survives.append(blind_info.survives)
         if read_back:
             self.check(marked, message)
         change = distortion.displacement_size(mesh, marked)
-        least = Survival(min(one.whole for one in survives), max(one.half for one in survives))
+        least = Survival(min(survival.whole for survival in survives), max(survival.half for survival in survives))
         return marked, info._replace(rms=change.rms, max=change.max, survives=least)
 
     def with_record(self, record: Record) -> "CombinedMarker":
@@ -391,35 +395,35 @@ class CombinedMarker:
         return replace(self, nonblind=self.nonblind.with_record(record))
 
     def check(self, marked: Mesh, message: bytes) -> None:
-        """See `Marker`: each mark must read."""
-        for one in self._all:
-            one.check(marked, message)
+        """See `Marker`: each mark must be readable."""
+        for marker in self._all:
+            marker.check(marked, message)
 
     def measure_survival(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival | None:
-        """See `Marker`: what all marks survive, or with half of the points lost, one of them."""
-        found: list[Survival] = []
-        for one in self._all:
-            if (survived := one.measure_survival(marked, message, predicted)) is None:
+        """See `Marker`: the noise that all marks survive, or, with half of the points lost, the best of them."""
+        survivals: list[Survival] = []
+        for marker in self._all:
+            if (survived := marker.measure_survival(marked, message, predicted)) is None:
                 return None
-            found.append(survived)
-        return Survival(min(one.whole for one in found), max(one.half for one in found))
+            survivals.append(survived)
+        return Survival(min(noise.whole for noise in survivals), max(noise.half for noise in survivals))
 
     def register(self, suspect: Mesh) -> list[Any]:
         """See `Marker`: once for each mark."""
-        return [one.register(suspect) for one in self._all]
+        return [marker.register(suspect) for marker in self._all]
 
     def read(self, registered: Sequence[Any], message: bytes | None = None) -> Detection:
-        """See `Marker`: what all marks prove together."""
-        found = [one.read(part, message) for one, part in zip(self._all, registered, strict=True)]
-        return unite(found[0], found[1:])
+        """See `Marker`: the evidence of all marks is united."""
+        detections = [marker.read(part, message) for marker, part in zip(self._all, registered, strict=True)]
+        return unite(detections[0], detections[1:])
 
     def detect(self, suspect: Mesh, message: bytes | None = None) -> Detection:
-        """See `Marker`: what all marks prove together."""
-        found = [one.detect(suspect, message) for one in self._all]
-        return unite(found[0], found[1:])
+        """See `Marker`: the evidence of all marks is united."""
+        detections = [marker.detect(suspect, message) for marker in self._all]
+        return unite(detections[0], detections[1:])
 
     def guess(self, found: Detection) -> bytes | None:
-        """See `Marker`: of the mark that is read with the original."""
+        """See `Marker`: decodes the non-blind mark."""
         return self.nonblind.guess(found)
 
     @cached_property
@@ -447,16 +451,16 @@ def make_marker(
     """Prepare an original for marking, or for reading many suspects.
 
     Args:
-        original: the unmarked mesh. Vertices at the same position, or so near to each other that they round to the same
-            point (see `jaxmark.geometry.canonical`), move together; a vertex that no face uses stays where it is. With
-            a record, a copy that was saved again will do: rounded, reordered, moved or scaled.
+        original: the unmarked mesh. Vertices at the same position, or so close that they round to the same point (see
+            `jaxmark.geometry.canonical`), move together. Vertices that no face uses do not move. With a record, a copy
+            that was saved again can be used: rounded, reordered, moved or scaled.
         key: 32 bytes, from `new_key`.
-        bits: size of the payload in bits, a multiple of 8; by default the record's, else 64. With 0, the mark says
-            nothing but that it is there.
-        record: the record of an earlier mark, which fixes scheme and payload size; original and key must be those that
-            it was made with.
+        bits: size of the payload in bits, a multiple of 8; by default the record's, else 64. With 0, the mark is a
+            presence mark, which carries no message.
+        record: the record of an earlier mark, which determines scheme and payload size; original and key must be those
+            that it was made with.
         scheme: a name (`"keyed"`, `"host"`, `"eigen"`), which a record overrides; or a scheme of
-            `jaxmark.watermark.schemes` or your own.
+            `jaxmark.watermark.schemes`, or one of your own.
         detector: a detector of `jaxmark.watermark.reading.detectors`; by default the scheme's own.
 
     Returns:
@@ -483,7 +487,7 @@ def make_marker(
 
 
 def make_blind_marker(original: Mesh, key: bytes, *, bits: int = DEFAULT_BITS, scheme: BlindScheme) -> BlindMarker:
-    """Prepare an original for marks that are read without it.
+    """Prepare an original for blind marks.
 
     Raises:
         JaxmarkError: if the mesh or the key is unusable, or the payload is not a multiple of 8 bits.
@@ -492,15 +496,15 @@ def make_blind_marker(original: Mesh, key: bytes, *, bits: int = DEFAULT_BITS, s
 
 
 def prepare(mesh: Mesh, key: bytes, bits: int, scheme: AnyScheme, *, adapt_to: Budget | None = None) -> Marker:
-    """Prepare an original for marking with any scheme, or with several.
+    """Prepare an original for marking with one or several schemes.
 
     Args:
         mesh: the original.
         key: 32 bytes.
         bits: size of the payload in bits.
         scheme: a scheme, its name, or several names.
-        adapt_to: the budget that the pass band of the default scheme suits, if it is meant by its name; None for the
-            usual pass band.
+        adapt_to: the budget for which the pass band of the default scheme is chosen, if `scheme` is a name; None for
+            the usual pass band.
 
     Raises:
         JaxmarkError: see `make_marker` and `split`.
@@ -516,42 +520,42 @@ def prepare(mesh: Mesh, key: bytes, bits: int, scheme: AnyScheme, *, adapt_to: B
 
 
 def unite(nonblind: Detection, blind: Sequence[Detection]) -> Detection:
-    """Unite what all marks of a mesh prove, whose signs are independent, as a detection with the original."""
-    every = (nonblind, *blind)
-    notes = tuple(f"The mark of {one.scheme!r} alone proves 10^{one.log10_p:.1f}." for one in blind)
+    """Unite the detections of all marks of a mesh, whose signs are independent, into one non-blind detection."""
+    detections = (nonblind, *blind)
+    notes = tuple(f"The mark of {detection.scheme!r} alone proves 10^{detection.log10_p:.1f}." for detection in blind)
     return nonblind._replace(
-        message=next((one.message for one in every if one.message is not None), None),
-        evidence=Evidence.product(*(one.evidence for one in every)),
+        message=next((detection.message for detection in detections if detection.message is not None), None),
+        evidence=Evidence.product(*(detection.evidence for detection in detections)),
         notes=(*nonblind.notes, *notes),
-        parts={one.scheme: one for one in every},
+        parts={detection.scheme: detection for detection in detections},
     )
 
 
-def _does_not_read(marker: NonBlindMarker | BlindMarker, mend: str) -> JaxmarkError:
-    """The error for a mark that does not read, and what to use."""
+def _does_not_read(marker: NonBlindMarker | BlindMarker, remedy: str) -> JaxmarkError:
+    """Make the error for a mark that cannot be read back, with advice."""
     payload = f"a message of {marker.bits} bits" if marker.bits else "a presence mark"
     return JaxmarkError(
         f"This mesh ({int(marker.original.used.sum())} points) cannot carry {payload} with the scheme"
-        f" {marker.scheme.name!r}: it does not read back, even unattacked. Use {mend}."
+        f" {marker.scheme.name!r}: it does not read back, even unattacked. Use {remedy}."
     )
 
 
 def _matches_record(scheme: Scheme, record: Record) -> bool:
-    """Whether a record names this scheme, which may be one of the caller's own, with these fields."""
+    """Whether a record is of this scheme with these fields; the scheme may be one of the caller's own."""
     if scheme.name in SCHEMES:
         return scheme == make_scheme(record.scheme, record.parameters)
     return (scheme.name, parameters_of(scheme)) == (record.scheme, dict(record.parameters))
 
 
 def _share(survived: Sequence[float]) -> list[float]:
-    """Share the bounds so that all marks survive as much, which grows with a mark's size; squares add up to 1."""
-    if not all(0 < one < math.inf for one in survived):
+    """Share the budget so that all marks survive the same noise; the squares of the shares add up to 1."""
+    if not all(0 < noise < math.inf for noise in survived):
         return [math.sqrt(1 / len(survived))] * len(survived)
-    norm = math.sqrt(sum(one**-2 for one in survived))
-    return [min(max(1 / one / norm, _LEAST_SHARE), _MOST_SHARE) for one in survived]
+    norm = math.sqrt(sum(noise**-2 for noise in survived))
+    return [min(max(1 / noise / norm, _LEAST_SHARE), _MOST_SHARE) for noise in survived]
 
 
 def _rounded_up(value: float) -> float:
-    """A number to four digits, none of which makes it smaller."""
+    """Round a number up to four digits."""
     unit = 10.0 ** (math.floor(math.log10(value)) - 3)
     return math.ceil(value / unit * (1 + 1e-9)) * unit

@@ -1,9 +1,10 @@
-"""The record of a mark, which its owner needs to read the mark again, and which binds the claim to key and original.
+"""The record of a mark, which its owner needs to read the mark again, and which binds a claim to key and original.
 
-It holds neither the key nor the message, but commitments to both, and an imprint of the original by which a copy of it
-that was saved again will do (`jaxmark.geometry.imprint`). A code by a subkey covers all of it, so that nobody else can
-edit it. Its owner can make any record: only a commitment to its digest that was timestamped before the suspect existed
-rules that out.
+A record contains neither the key nor the message, but commitments to both. It also contains an imprint of the
+original, so that a copy of the original that was saved again can be used (`jaxmark.geometry.imprint`). An
+authentication code with a subkey covers all fields, so that only the key holder can edit the record. The key holder can
+make any record at any time. Only a commitment to the record's digest that was timestamped before the suspect existed
+excludes this.
 """
 
 import base64
@@ -25,12 +26,12 @@ from jaxmark.watermark.coding.keys import KEY_BYTES, SCHEME_VERSION, Choices, Ke
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.ledger import Charge
 
-_MAX_FILE_BYTES = 2**30  # of a record of some hundred million points, or as many digests
+_MAX_FILE_BYTES = 2**30  # a record of some hundred million points, or as many digests
 _FORMAT = "jaxmark-record"
 _SCENE_FORMAT, _SCENE_VERSION = "jaxmark-scene", 1
-_COMMITMENT = "jaxmark-deposit"  # the format of its file, which keeps its first name
+_COMMITMENT = "jaxmark-deposit"  # the format of a commitment's file, which keeps its first name
 
-# TimeStampReq of RFC 3161, in DER: version 1, a SHA-256 imprint of 32 bytes, and the wish for the authority's
+# TimeStampReq of RFC 3161, in DER: version 1, a SHA-256 imprint of 32 bytes, and the request for the authority's
 # certificate.
 _REQUEST_HEAD = bytes.fromhex("30390201013031300d060960864801650304020105000420")
 _REQUEST_TAIL = bytes.fromhex("0101ff")
@@ -38,12 +39,12 @@ _READERS = {
     "message": "detect",
     "presence": "detect",
     "fingerprint": "identify",
-}  # the function that reads each content
-RECORD_SUFFIX = ".jaxmark.json"  # is appended to the name of the marked file
+}  # the function that reads each kind of content
+RECORD_SUFFIX = ".jaxmark.json"  # appended to the name of the marked file
 
 Content = Literal["message", "presence", "fingerprint"]
 
-_FIELDS = {  # of a file, where "told" is the commitment to the message
+_FIELDS = {  # the fields of a file, in which "told" is the commitment to the message
     "scheme": str,
     "bits": int,
     "beta": float,
@@ -63,64 +64,67 @@ class Record:
     """The record of a mark; a file stores it as JSON."""
 
     scheme: str  # name of the scheme
-    bits: int  # size of the payload in bits, without the tag; of a fingerprint, its number of slots
+    bits: int  # size of the payload in bits, without the tag; number of slots for a fingerprint
     beta: float  # strength: the factor on the carrier's displacement, relative to the diagonal; reading does not use it
     original: str  # hash of the original's canonical geometry, hexadecimal
     key: str  # commitment to the key, hexadecimal
     parameters: Mapping[str, Any] = field(default_factory=dict)  # fields of the scheme
-    content: Content = "message"  # what the mark carries
+    content: Content = "message"  # the kind of content that the mark carries
     version: int = SCHEME_VERSION  # version of the keyed choices and of the record
-    message_commitment: str = ""  # to the message or the recipient, see `commit`, hexadecimal; empty for presence
-    imprint: Mapping[str, Any] = field(default_factory=dict)  # of the original, its tags sealed; a blind mark has none
-    code: str = ""  # authentication code by the key, over all other fields, hexadecimal
+    message_commitment: str = ""  # commitment to message or recipient, see `commit`; empty for presence
+    imprint: Mapping[str, Any] = field(default_factory=dict)  # of the original, with encrypted tags; empty if blind
+    code: str = ""  # authentication code with the key over all other fields, hexadecimal
 
     @property
     def meshes(self) -> Mapping[str, "Record"]:
-        """The record itself, as that of a file of one mesh, which has no name."""
+        """The record by the name of its mesh, as in `SceneRecord`; the mesh has no name."""
         return {"": self}
 
     def to_json(self) -> str:
-        """The record as JSON text."""
+        """Return the record as JSON text."""
         return json.dumps({"format": _FORMAT, **self._stored()}, indent=2) + "\n"
 
     def digest(self) -> str:
-        """SHA-256 of the record, hexadecimal, which anybody can compute: publish or date this, not the record."""
+        """Compute SHA-256 of the record, hexadecimal; publish or timestamp this digest instead of the record.
+
+        The key is not needed for it.
+        """
         return hashlib.sha256(b"jaxmark/record" + canonical_json(self._stored())).hexdigest()
 
     def sealed(self, key: bytes) -> "Record":
-        """The record with the authentication code of its owner."""
+        """Return the record with the authentication code of its owner."""
         return replace(self, code=self._code(key))
 
     def check(self, content: Content, key: bytes) -> None:
-        """Check that the record is for this content and key, and that nobody without the key has edited it.
+        """Check that the record is for this content and key, and that it was not edited without the key.
 
         Args:
-            content: what is to be read.
+            content: the kind of content to read.
             key: 32 bytes.
 
         Raises:
-            JaxmarkError: if it is not.
+            JaxmarkError: if a check fails.
         """
         if self.content != content:
             raise JaxmarkError(f"The record is of a {self.content}; {_READERS[self.content]} reads it.")
         if self.key != commitment(key):
             raise JaxmarkError("The key is not the one that the record commits to.")
         if not hmac.compare_digest(self.code, self._code(key)):
-            raise JaxmarkError("The record was edited: its code is not that of its fields. Use an unedited copy.")
+            raise JaxmarkError("The record was edited: its code does not match its fields. Use an unedited copy.")
 
     def payload(self, key: bytes, bits: int | None = None) -> int:
         """Check the record of a message or a presence mark, and return its payload size.
 
         Args:
             key: 32 bytes.
-            bits: the payload that is expected; None if any.
+            bits: the expected payload size; None if any.
 
         Raises:
-            JaxmarkError: see `check`; or if it has another payload.
+            JaxmarkError: see `check`; also if the record has another payload size.
         """
         self.check("message" if self.bits else "presence", key)
         if bits not in (None, self.bits):
-            raise JaxmarkError(f"The payload is {self.bits} bits by the record, not {bits}.")
+            raise JaxmarkError(f"The payload is {self.bits} bits according to the record, not {bits}.")
         return self.bits
 
     def commits_to(self, content: bytes, choices: Choices) -> bool:
@@ -128,19 +132,19 @@ class Record:
         return hmac.compare_digest(self.message_commitment, commit(content, choices))
 
     def check_claim(self, message: bytes, choices: Choices) -> None:
-        """Check that the record does not commit to another message than the one claimed.
+        """Check that the record does not commit to another message than the claimed one.
 
         Raises:
-            JaxmarkError: if it does.
+            JaxmarkError: if it commits to another message.
         """
         if is_recorded(self, message, choices) is False:
-            raise JaxmarkError("The record commits to another message than the one claimed; claim that, or none.")
+            raise JaxmarkError("The record commits to another message than the claimed one. Claim that one, or none.")
 
     def open_imprint(self, key: bytes) -> Imprint:
-        """The imprint of the original.
+        """Decrypt the imprint of the original.
 
         Raises:
-            JaxmarkError: if the record has none that is whole.
+            JaxmarkError: if the record has no complete imprint.
         """
         try:
             tags = np.frombuffer(base64.b64decode(self.imprint["tags"], validate=True), "<u4")
@@ -153,12 +157,13 @@ class Record:
                 bytes.fromhex(self.imprint["order"]),
             )
         except (KeyError, ValueError, TypeError):
-            raise JaxmarkError("The record is damaged: its imprint of the original is not whole.") from None
+            raise JaxmarkError("The record is damaged: its imprint of the original is incomplete.") from None
 
     def _stored(self) -> dict[str, Any]:
-        """Return the fields under the names that they have in a file."""
+        """Return the fields by their names in a file."""
         fields = asdict(self)
-        return {**fields, "told": fields.pop("message_commitment")}
+        told = fields.pop("message_commitment")
+        return {**fields, "told": told}
 
     def _code(self, key: bytes) -> str:
         fields = canonical_json({name: value for name, value in self._stored().items() if name != "code"})
@@ -175,7 +180,7 @@ class Record:
 
     @classmethod
     def of(cls, data: Any, where: str | os.PathLike[str]) -> "Record":
-        """Make a record of a file's JSON.
+        """Make a record from the JSON of a file.
 
         Raises:
             JaxmarkError: see `load`.
@@ -196,7 +201,7 @@ class Record:
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """The records of a file's meshes, by name; each of them reads its mesh alone, too."""
+    """The records of a file's meshes, by name; each of them can also be used to read its mesh alone."""
 
     meshes: Mapping[str, Record]
 
@@ -212,22 +217,22 @@ class SceneRecord:
 
     @property
     def message_commitment(self) -> str:
-        """The commitments of all records, joined; empty if none commits to a message."""
+        """The commitments of all records, concatenated; empty if none commits to a message."""
         return "".join(record.message_commitment for record in self.meshes.values())
 
     def to_json(self) -> str:
-        """The records as JSON text."""
+        """Return the records as JSON text."""
         meshes = {name: json.loads(record.to_json()) for name, record in self.meshes.items()}
         return json.dumps({"format": _SCENE_FORMAT, "version": _SCENE_VERSION, "meshes": meshes}, indent=2) + "\n"
 
     def digest(self) -> str:
-        """SHA-256 over all records, hexadecimal, which anybody can compute."""
+        """Compute SHA-256 over all records, hexadecimal; the key is not needed for it."""
         digests = {name: record.digest() for name, record in self.meshes.items()}
         return hashlib.sha256(b"jaxmark/scene" + canonical_json(digests)).hexdigest()
 
 
 def load_record(path: str | os.PathLike[str]) -> Record | SceneRecord:
-    """Read a record file, of one mesh or of several.
+    """Read a record file of one mesh or of several.
 
     Raises:
         JaxmarkError: see `Record.load`.
@@ -246,7 +251,7 @@ def load_record(path: str | os.PathLike[str]) -> Record | SceneRecord:
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
-    """Read the JSON of a record file; None if it holds none.
+    """Read the JSON of a record file; None if it contains no JSON.
 
     Raises:
         JaxmarkError: if the file cannot be read.
@@ -260,21 +265,21 @@ def read_json(path: str | os.PathLike[str]) -> Any:
 
 
 def is_recorded(record: Record | None, content: bytes, choices: Choices) -> bool | None:
-    """Whether a record commits to this message or recipient; None if there is no record, or it commits to nothing."""
+    """Whether a record commits to this message or recipient; None without a record, or if it has no commitment."""
     return record.commits_to(content, choices) if record is not None and record.message_commitment else None
 
 
 def commit(content: bytes, choices: Choices) -> str:
-    """Commit to a message or a recipient, hexadecimal, without revealing it.
+    """Commit to a message or a recipient without revealing it, hexadecimal.
 
-    It is SHA-256 of a salt of 32 bytes, which derives from the key, and of what is committed to: whoever is shown both
-    can check it, and without the salt no guess can be tried.
+    The commitment is SHA-256 of a salt of 32 bytes, which is derived from the key, and of the content. Anyone who is
+    given both can verify it. Without the salt, guesses cannot be tested.
     """
     return hashlib.sha256(b"jaxmark/2/told" + choices.derive("told/salt", KEY_BYTES) + content).hexdigest()
 
 
 def seal_imprint(imprint: Imprint, key: bytes) -> dict[str, Any]:
-    """An imprint as a record stores it: its tags are encrypted, as who has them could tell an original's points."""
+    """Convert an imprint to the form of a record, with its tags encrypted: they would reveal points of the original."""
     tags = imprint.tags ^ _stream(key, imprint.hash.hex(), len(imprint.tags))
     return {
         "grid": imprint.grid,
@@ -286,24 +291,24 @@ def seal_imprint(imprint: Imprint, key: bytes) -> dict[str, Any]:
 
 
 def _stream(key: bytes, original: str, count: int) -> np.ndarray:
-    """The key stream for an original's tags, which is never used for anything else."""
+    """Derive the key stream that encrypts an original's tags; it is never used for anything else."""
     return np.frombuffer(Choices(Key(key), bytes.fromhex(original)).derive("imprint", 4 * count), "<u4")
 
 
 @dataclass(frozen=True)
 class TimestampedCommitment:
-    """A set of records by their digests, to be timestamped as one; make one with `make_commitment`.
+    """A commitment to a set of records by their digests, to be timestamped as one; make one with `make_commitment`.
 
-    Anybody can make any record after the fact. A record whose digest was public, or signed by a timestamping authority,
-    before the suspect existed cannot have been made for it. The root shows nothing of what the records say. It commits
-    to their number, and a claim by one of K records is charged for K.
+    A record can be made at any time, also after the suspect. A record whose digest was published, or signed by a
+    timestamping authority, before the suspect existed cannot have been made for it. The root reveals nothing about the
+    content of the records. It commits to their number K, and a claim by one of them is charged for K records.
     """
 
     digests: tuple[str, ...]  # `Record.digest` of each, hexadecimal, in ascending order
 
     @property
     def root(self) -> str:
-        """What to publish: SHA-256 over the number of records and their Merkle tree (RFC 6962, 2.1), hexadecimal."""
+        """The hash to publish: SHA-256 over the number of records and their Merkle tree (RFC 6962, 2.1)."""
         level = [hashlib.sha256(b"\0" + bytes.fromhex(digest)).digest() for digest in self.digests]
         while len(level) > 1:
             pairs = [level[place : place + 2] for place in range(0, len(level), 2)]
@@ -311,14 +316,15 @@ class TimestampedCommitment:
         return hashlib.sha256(f"jaxmark/deposit/{len(self.digests)}/".encode() + level[0]).hexdigest()
 
     def charges(self, record: Record | SceneRecord, *, claimed: bool) -> tuple[Charge, ...]:
-        """What a claim by one of these records is charged, if the commitment is older than the suspect.
+        """Return the charges for a claim by one of these records, if the commitment is older than the suspect.
 
         Args:
-            record: the record that was read with.
-            claimed: whether the message was claimed, not read; all messages are charged if the record fixes none.
+            record: the record that the suspect was read with.
+            claimed: whether the message was claimed instead of decoded. If the record does not commit to a message, all
+                messages are then charged.
 
         Raises:
-            JaxmarkError: if the record is not one of these.
+            JaxmarkError: if the commitment does not contain the record.
         """
         if record.digest() not in self.digests:
             raise JaxmarkError(
@@ -328,11 +334,11 @@ class TimestampedCommitment:
         return (ledger.COMMITMENT.charge("each", len(self.digests), bits=free),)
 
     def timestamp_request(self) -> bytes:
-        """A request to a timestamping authority for the root (RFC 3161), as `curl` or `openssl ts` send it."""
+        """Make a request to a timestamping authority for the root (RFC 3161), which `curl` or `openssl ts` can send."""
         return _REQUEST_HEAD + bytes.fromhex(self.root) + _REQUEST_TAIL
 
     def to_json(self) -> str:
-        """The commitment as JSON text, with its root for those who only look."""
+        """Return the commitment as JSON text, including its root for readers."""
         return json.dumps({"format": _COMMITMENT, "root": self.root, "digests": list(self.digests)}, indent=2) + "\n"
 
     @classmethod
@@ -340,29 +346,29 @@ class TimestampedCommitment:
         """Read a file that `to_json` wrote.
 
         Raises:
-            JaxmarkError: if the file cannot be read, is none, or its root is not that of its digests.
+            JaxmarkError: if the file cannot be read, is no commitment, or its root does not match its digests.
         """
         try:
             data = json.loads(read_file(path, _MAX_FILE_BYTES))
-            found = make_commitment(data["digests"])
-            if data["format"] == _COMMITMENT and data["root"] == found.root:
-                return found
+            loaded = make_commitment(data["digests"])
+            if data["format"] == _COMMITMENT and data["root"] == loaded.root:
+                return loaded
         except OSError as error:
             raise JaxmarkError(f"The commitment {path} cannot be read: {error.strerror}.") from None
         except (ValueError, TypeError, KeyError, RecursionError):
             pass
         raise JaxmarkError(
-            f"{path} is not a commitment of jaxmark, or was edited: its root is not that of its digests."
+            f"{path} is not a commitment of jaxmark, or was edited: its root does not match its digests."
         )
 
 
 def make_commitment(digests: Iterable[str]) -> TimestampedCommitment:
-    """Commit to records by their digests; one that is given twice counts once.
+    """Commit to records by their digests; a digest that is given twice counts once.
 
     Raises:
-        JaxmarkError: if there is none, or one is not 64 hexadecimal digits.
+        JaxmarkError: if no digest is given, or one is not 64 hexadecimal digits.
     """
     distinct = tuple(sorted(set(digests)))
     if not distinct or not all(re.fullmatch("[0-9a-f]{64}", digest) for digest in distinct):
-        raise JaxmarkError("A commitment is made of at least one record's digest, 64 hexadecimal digits each.")
+        raise JaxmarkError("A commitment needs at least one record digest, each of 64 hexadecimal digits.")
     return TimestampedCommitment(distinct)

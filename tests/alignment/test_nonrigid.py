@@ -119,7 +119,7 @@ def test_a_message_is_read_in_another_pose_without_a_skeleton(mesh, key: jm.Key)
     assert found.detected()
     # Whether bends were undone depends on the key, and what unites several meshes must not.
     assert found.registration is aligned
-    assert "map of its own" in found.notes[0]
+    assert "non-rigid registration" in found.notes[0]
 
 
 @pytest.mark.long

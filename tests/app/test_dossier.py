@@ -111,7 +111,7 @@ def test_a_dossier_shows_all_but_the_secret(workshop: Workshop):
 
     _, said, _ = workshop(*detect, "--commitment", "all.json")
     assert f"{power(told['log10_p'])} if key, original, message and record were fixed" in said
-    assert f"{power(told['log10_p_uncommitted'])} if nothing dates them" in said
+    assert f"{power(told['log10_p_uncommitted'])} even if they were chosen afterwards" in said
     assert f"{power(told['log10_p_timestamped'])} if the commitment is older than the suspect" in said
 
 
@@ -143,7 +143,7 @@ def test_a_claim_against_the_record_is_refused(workshop: Workshop):
     assert facts["notes"] == told["notes"]
     assert "in place of CLAIMED" in Path("case/dossier.html").read_text()
     assert told["message"] == b"ok".hex()
-    assert "Another message of this key reads" in told["notes"][0]
+    assert "Another message of this key was decoded" in told["notes"][0]
     assert told["log10_p"] > workshop.json(*claim, b"ok".hex(), *RECORD)["log10_p"]
 
 
@@ -154,7 +154,7 @@ def test_mistakes_are_said(workshop: Workshop):
     assert "exchange the two files" in workshop.refused(*exchanged, *RECORD)
     code, said, _ = workshop("detect", "marked.ply", *DETECT, "--bits", "24")
     assert code == 1
-    assert "A message of 16 bits reads with the scheme 'keyed'" in said
+    assert "A message of 16 bits is readable with the scheme 'keyed'" in said
     itself = workshop.json("detect", "millimetres.stl", *DETECT, "--bits", "16", status=1)
     assert itself["notes"] == ["The suspect is the original itself, without a mark."]
 

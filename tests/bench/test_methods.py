@@ -166,7 +166,7 @@ def test_presence_alone_is_proved_by_spheres(mesh, key, monkeypatch):
     assert method.read(marked, bytes(32), mesh).log10_p > -4
     monkeypatch.setattr(spheres, "align", nothing_there)
     assert method.read(marked, key, mesh).log10_p == 0
-    with pytest.raises(jm.JaxmarkError, match="beside the original"):
+    with pytest.raises(jm.JaxmarkError, match="is not blind"):
         method.read(marked, key, None)
 
 

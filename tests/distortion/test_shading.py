@@ -151,6 +151,6 @@ def test_means_around_vertices(x64):
 def test_limits_are_kept(x64):
     """It bounds a mark as other metrics do."""
     mesh = make_mesh(*sheet(24))
-    marker = jm.make_marker(mesh, bytes(32), bits=8, scheme=KeyedScheme(masking=False))
+    marker = jm.make_marker(mesh, bytes(32), bits=8, scheme=KeyedScheme(hiding=False))
     marked, _ = marker.write(marker.codeword(b"c"), {"shading": 1.0})
     assert 0.98 < jm.compare(mesh, marked, ["shading"]).shading <= 1

@@ -23,9 +23,9 @@ RECIPIENTS = ("alice", "bob")
 BUDGET = 2e-3
 MARKS: dict[str, Scheme] = {
     "hidden": KeyedScheme(),
-    "keyed": KeyedScheme(masking=False),
+    "keyed": KeyedScheme(hiding=False),
     "normals": KeyedScheme(direction="normals"),
-    "narrow": KeyedScheme(passband="narrow", masking=False),
+    "narrow": KeyedScheme(passband="narrow", hiding=False),
     "host": HostScheme(),
     "eigen": EigenScheme(),
 }

@@ -26,7 +26,7 @@ from tests.samples import bumpy_sphere
 
 PAGES = {
     str(path.relative_to(ROOT)): path.read_text()
-    for folder in (ROOT, ROOT / "docs", ROOT / "docs" / "how-to", ROOT / "docs" / "reference")
+    for folder in (ROOT, *(ROOT / "docs" / name for name in ("", "how-to", "reference", "results")))
     for path in sorted(folder.glob("*.md"))
 }
 README = PAGES["README.md"]
@@ -36,9 +36,8 @@ MARKS = dict.fromkeys(
     pytest.mark.slow,
 )
 MARKS |= dict.fromkeys(("docs/blind.md", "docs/how-to/strength.md"), pytest.mark.long)  # which tune
-FRONTS = ("README.md", "docs/index.md")
 # These have tests of their own.
-APART = (*FRONTS, "docs/robustness.md", "docs/how-to/arrays.md", "docs/how-to/recipients.md", "docs/how-to/study.md")
+APART = ("README.md", "docs/robustness.md", "docs/how-to/arrays.md", "docs/how-to/recipients.md", "docs/how-to/study.md")
 COMMANDS = {"README.md": 4, "docs/reference/command_line.md": 19}
 SAMPLED = re.compile(r"^ *```python\n(.*?)^ *```\n(?:\n```text\n(.*?)^```)?", re.DOTALL | re.MULTILINE)
 NUMBER = re.compile(r"-?\d+(\.\d+)?")
@@ -78,11 +77,10 @@ def run(page: str) -> dict:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", FRONTS)
-def test_both_halves_of_a_front_page_run(page: str, folder: Path, unchecked, capsys):
-    assert len(blocks(page, "python")) >= 2
-    names = run(page)
-    assert names["found"].message == b"jaxmark!"
+def test_both_halves_of_the_readme_run(folder: Path, unchecked, capsys):
+    assert len(blocks("README.md", "python")) >= 2
+    names = run("README.md")
+    assert names["detection"].message == b"jaxmark!"
     assert str(b"jaxmark!") in capsys.readouterr().out
     # The energy is a quadratic form of the gains: its gradient at some gains, times these, is twice the energy there.
     gains = np.ones(16, np.float32)
@@ -260,11 +258,11 @@ def test_no_relative_link_is_dead():
 
 
 def test_a_dead_link_is_seen():
-    text = "# A b, c\n[a](nowhere.md) [b](#a-b-c) [c](#other) [d](README.md#honest-limits) [e](https://x.y)"
+    text = "# A b, c\n[a](nowhere.md) [b](#a-b-c) [c](#other) [d](README.md#limits) [e](https://x.y)"
     assert dead_links({**PAGES, "docs/x.md": text}) == [
-        f"docs/x.md: {at}" for at in ("nowhere.md", "#other", "README.md#honest-limits")
+        f"docs/x.md: {at}" for at in ("nowhere.md", "#other", "README.md#limits")
     ]
-    assert not dead_links({**PAGES, "docs/x.md": "[d](../README.md#honest-limits)"})
+    assert not dead_links({**PAGES, "docs/x.md": "[d](../README.md#limits)"})
 
 
 def reference(heading: str) -> set[str]:
@@ -284,7 +282,7 @@ def test_the_reference_lists_all_names(heading: str, shown: list):
 
 def test_the_reference_has_all_rooms():
     rooms = {f"jaxmark.{room.name}" for room in pkgutil.iter_modules(jm.__path__) if room.name[0] != "_"}
-    assert reference("Rooms") == rooms
+    assert reference("Subpackages") == rooms
 
 
 def test_published_rates_are_those_of_the_protocol():

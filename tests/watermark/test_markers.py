@@ -114,7 +114,7 @@ def test_golden_displacement(key: jm.Key):
     mesh = exact_sheet(20)
     for scheme, message, golden in [
         (
-            KeyedScheme(masking=False),
+            KeyedScheme(hiding=False),
             b"\xc0",
             [[35.54, 5.6, -13.101], [-9.46, 3.277, -7.756], [3.14, 19.241, -12.517], [18.833, 11.017, -13.563]],
         ),
@@ -124,7 +124,7 @@ def test_golden_displacement(key: jm.Key):
             [[8.556, 7.762, -18.164], [0.802, 0.624, 4.384], [-0.182, -1.225, -3.372], [6.89, 1.826, 25.776]],
         ),
         (
-            KeyedScheme(passband="narrow", masking=False),
+            KeyedScheme(passband="narrow", hiding=False),
             b"\xc0",
             [[29.006, -8.459, -15.871], [-3.116, -7.197, 7.82], [23.682, 3.948, 19.709], [0.086, 4.778, 2.17]],
         ),
@@ -238,7 +238,7 @@ def test_a_claim_is_refuted_by_another_message(sphere: Mesh, key: jm.Key):
     # That the key's mark is there stays proven, by the message that reads.
     read = jm.detect(marked, original=sphere, key=key)
     assert read.log10_p < found.log10_p < -6
-    assert "Another message of this key reads than the one claimed" in found.notes[0]
+    assert "Another message of this key was decoded than the one claimed" in found.notes[0]
 
 
 def test_the_mean_of_two_copies_shows_both(sphere: Mesh, key: jm.Key):
@@ -277,7 +277,7 @@ def test_record_binds_and_remembers(sphere: Mesh, key: jm.Key, tmp_path):
     for change, sentence in [
         ({"key": jm.new_key()}, "key is not the one"),
         ({"original": marked}, "not the mesh that the record"),
-        ({"bits": 64}, "48 bits by the record"),
+        ({"bits": 64}, "48 bits according to the record"),
         ({"message": b"longer than that"}, "the payload is 48"),
         ({"scheme": EigenScheme()}, "record is of the scheme 'host'"),
     ]:
@@ -354,8 +354,8 @@ def test_schemes_are_data():
         again = make_scheme(scheme.name, dataclasses.asdict(scheme))
         assert again == scheme
     # Records from before pass bands were tapered do not say so.
-    assert make_scheme("keyed", {"bands": 64}) == KeyedScheme(passband="narrow", masking=False)
-    assert get_nonblind("keyed") == KeyedScheme(passband="tapered", masking=True)
+    assert make_scheme("keyed", {"bands": 64}) == KeyedScheme(passband="narrow", hiding=False)
+    assert get_nonblind("keyed") == KeyedScheme(passband="tapered", hiding=True)
     for parameters in ({"bands": "many"}, {"colour": 1}):
         with pytest.raises(jm.JaxmarkError, match="takes the parameters bands"):
             make_scheme("host", parameters)

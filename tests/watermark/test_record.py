@@ -44,7 +44,7 @@ def edits(record: jm.Record) -> dict[str, jm.Record]:
         "original": "00" * 32,
         "parameters": {**record.parameters, "profile": (*PROFILE[:-1], np.nextafter(0.5, 1))},
         "version": 3,
-        "told": "00" * 32,
+        "message_commitment": "00" * 32,
         "imprint": {**record.imprint, "grid": 2 * record.imprint["grid"]},
         "code": "00" * 32,
     }
@@ -57,7 +57,7 @@ def edits(record: jm.Record) -> dict[str, jm.Record]:
     return changed
 
 
-FIELDS = ["scheme", "bits", "beta", "original", "parameters", "version", "told", "imprint", "code"]
+FIELDS = ["scheme", "bits", "beta", "original", "parameters", "version", "message_commitment", "imprint", "code"]
 FIELDS += ["imprint/centre", "imprint/covariance", "imprint/order", "imprint/tags", "parameters/unknown"]
 
 
@@ -234,7 +234,7 @@ def test_deposits_date_records(marked, original: Mesh, key: jm.Key, tmp_path: Pa
     with pytest.raises(jm.JaxmarkError, match="cannot be read"):
         TimestampedCommitment.load(tmp_path / "absent")
     for bad in ([], ["xy"], ["0" * 63]):
-        with pytest.raises(jm.JaxmarkError, match="at least one record's digest"):
+        with pytest.raises(jm.JaxmarkError, match="at least one record digest"):
             make_commitment(bad)
 
 

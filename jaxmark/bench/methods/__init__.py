@@ -1,1 +1,1 @@
-"""Methods of the literature and of this library, one publication a module; see `jaxmark.bench.method.METHODS`."""
+"""The built-in methods, of the literature and of this library; see `jaxmark.bench.method.METHODS`."""

@@ -1,8 +1,8 @@
-"""The schemes of this library as methods, two historical ones among them, and the mark of a public tool.
+"""The schemes of this library as methods of the benchmark, including two historical schemes, and a public tool's mark.
 
-The informed schemes are read from one alignment of the suspect with the original, which all keys share. The message is
-the best guess, whether or not its tag fits. The score is the evidence, -log10 of the bound without its floor, plus,
-where a message is guessed, the correlation of the soft decisions with its codeword, from -1 to 1.
+Non-blind schemes are read from one alignment of the suspect with the original, which all keys share. The message is the
+best guess, whether its tag matches or not. The score is the evidence, -log10 of the bound without its floor. If a
+message is guessed, the score also includes the correlation of the soft decisions with its codeword, from -1 to 1.
 """
 
 from collections.abc import Callable, Iterator
@@ -33,7 +33,7 @@ from jaxmark.watermark.schemes.keyed import KeyedScheme
 from jaxmark.watermark.schemes.modulated import EigenScheme, HostScheme
 from jaxmark.watermark.schemes.registry import BLIND_SCHEMES
 
-_RMS = (2e-6, 1e-2)  # displacements over the diagonal
+_RMS = (2e-6, 1e-2)  # range of strengths: RMS displacements over the diagonal
 _OURS = "the scheme is defined by this code"
 _OHBUCHI = "Ohbuchi, Takahashi, Miyazawa, Mukaiyama, Watermarking 3D polygonal meshes in the mesh spectral domain, 2001"
 _SOHN = "Sohn et al., A Digital Watermarking Scheme for Polygonal Meshes using Modified Spectral Decomposition"
@@ -41,7 +41,7 @@ _SOHN = "Sohn et al., A Digital Watermarking Scheme for Polygonal Meshes using M
 
 @dataclass(frozen=True, eq=False)
 class _Identified:
-    """A mesh as a key of a cache, which is identified by its arrays and keeps them alive."""
+    """A mesh as the key of a cache: it is identified by its arrays, and keeps them alive."""
 
     mesh: Mesh
 
@@ -52,27 +52,27 @@ class _Identified:
         return isinstance(other, _Identified) and all(a is b for a, b in zip(self.mesh, other.mesh, strict=True))
 
 
-def _once(make: Callable[..., Any], *given: Any, **options: Any) -> Any:
-    """Call a function, or return what it returned for the same arguments; meshes are the same by their arrays."""
-    return _cached(make, *(_Identified(one) if isinstance(one, Mesh) else one for one in given), **options)
+def _once(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """Call a function with a cache; meshes are equal if their arrays are identical."""
+    return _cached(make, *(_Identified(value) if isinstance(value, Mesh) else value for value in arguments), **options)
 
 
 @lru_cache(maxsize=12)
-def _cached(make: Callable[..., Any], *given: Any, **options: Any) -> Any:
-    return make(*(one.mesh if isinstance(one, _Identified) else one for one in given), **options)
+def _cached(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    return make(*(value.mesh if isinstance(value, _Identified) else value for value in arguments), **options)
 
 
 @dataclass(frozen=True)
 class SharedField(FieldScheme):
-    """The scheme `field`, which looks at a suspect once for all keys that read it, as no key decides what it sees."""
+    """The scheme `field` with views of a suspect that are computed once for all keys, because they depend on no key."""
 
     def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:
-        """See `BlindScheme`."""
+        """Return the views of a suspect, see `BlindScheme`."""
         return copy(_once(_views, self, suspect))
 
 
 def _views(scheme: FieldScheme, suspect: Mesh) -> Iterator[Look]:
-    """Look at a suspect lazily; copies start from the beginning, and a refusal is raised at once, never cached."""
+    """Compute the views of a suspect lazily; copies start from the beginning. Errors are raised at once, uncached."""
     looks = FieldScheme.views(scheme, suspect, Choices(Key(bytes(32)), b""))
     return tee(chain([next(looks)], looks), 1)[0]
 
@@ -93,23 +93,23 @@ def _embed_blind(scheme: BlindScheme, mesh: Mesh, message: Bits, key: bytes, str
 
 def _read(scheme: Scheme, bits: int, suspect: Mesh, key: bytes, original: Mesh | None) -> Reading:
     marker = _once(make_marker, original, key, bits=bits, scheme=scheme)
-    found = marker.read(_once(_align, original, suspect))
-    return _reading(found, marker.guess(found) if bits else None, marker.codeword)
+    detection = marker.read(_once(_align, original, suspect))
+    return _reading(detection, marker.guess(detection) if bits else None, marker.codeword)
 
 
 def _read_blind(scheme: BlindScheme, bits: int, suspect: Mesh, key: bytes, original: Mesh | None) -> Reading:
     choices = context(Key(key), bits, scheme.name)
-    found = read(_once(register, suspect), Key(key), bits, scheme)
-    message = found.message or (guess(found.scores, bits, TAG_BITS) if bits else None)
-    return _reading(found, message, partial(codeword, choices=choices))
+    detection = read(_once(register, suspect), Key(key), bits, scheme)
+    message = detection.message or (guess(detection.scores, bits, TAG_BITS) if bits else None)
+    return _reading(detection, message, partial(codeword, choices=choices))
 
 
-def _reading(found: Detection, message: bytes | None, encode: Callable[[bytes], np.ndarray]) -> Reading:
-    evidence = found.evidence
+def _reading(detection: Detection, message: bytes | None, encode: Callable[[bytes], np.ndarray]) -> Reading:
+    evidence = detection.evidence
     if message is None:
         return Reading(None, 0.0 - evidence.log10_p_unfloored, evidence.log10_p)
     word = encode(message)
-    correlation = float(found.scores @ word / np.linalg.norm(found.scores) / np.linalg.norm(word))
+    correlation = float(detection.scores @ word / np.linalg.norm(detection.scores) / np.linalg.norm(word))
     bits = np.unpackbits(np.frombuffer(message, np.uint8)).astype(bool)
     return Reading(bits, correlation - evidence.log10_p_unfloored, evidence.log10_p)
 
@@ -120,7 +120,7 @@ def _method(scheme: Scheme | BlindScheme, source: str, anchor: str, bits: int) -
     return Method(scheme.name, partial(embed, scheme), partial(read, scheme, bits), blind, bits, _RMS, source, anchor)
 
 
-# Each makes a method from the size of its message. `paper` is Sohn's scheme as printed, `host` the form that works.
+# Each function makes a method for a payload in bits. `paper` is Sohn's scheme as printed, `host` a variant that works.
 keyed = partial(_method, KeyedScheme(), "jaxmark, docs/how_it_works.md", _OURS)
 eigen = partial(_method, EigenScheme(), _OHBUCHI, "")
 host = partial(_method, HostScheme(), _SOHN, "")
@@ -130,17 +130,17 @@ local = partial(_method, BLIND_SCHEMES["local"], "jaxmark, docs/blind.md", _OURS
 
 
 def harmonics(bits: int) -> Method:
-    """The mark of a public tool, which shows presence only, whatever message is asked for.
+    """Make the method of a public tool, which shows presence only and ignores the requested payload.
 
-    Its reader is not given the size of the mark, and so accepts differences of any size.
+    The reader does not know the size of the mark; therefore it accepts differences of any size.
     """
 
     def embed(mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
         return _once(make_mark, mesh, key).embed(Bounds(strength, {}))
 
     def read(suspect: Mesh, key: bytes, original: Mesh | None) -> Reading:
-        found = _once(make_mark, original, key).correlation(suspect, 0.0)
-        return Reading(None, float(np.nan_to_num(found)))
+        correlation = _once(make_mark, original, key).correlation(suspect, 0.0)
+        return Reading(None, float(np.nan_to_num(correlation)))
 
     source = "Forensic 3D Watermarking Suite, archtecgr"
     return Method("harmonics", embed, read, False, 0, _RMS, source, threshold=THRESHOLD)

@@ -1,9 +1,9 @@
-"""An informed mark in the 20 lowest harmonics of a surface, as a public tool has it (Forensic 3D Watermarking Suite).
+"""A non-blind mark in the 20 lowest harmonics of a surface, after a public tool (Forensic 3D Watermarking Suite).
 
-A keyed pattern in the lowest eigenvectors of the cotangent Laplacian is added as displacement along normals. The reader
-registers the original to the suspect by principal axes and closest vertices, and confirms the mark where the
-coefficients of the differences between nearest vertices correlate with the pattern by 0.15 or more. Reimplemented
-as a carrier and a detector of jaxmark; there is no message. The tool is by archtecgr.
+The mark is a displacement along normals by a keyed pattern in the lowest eigenvectors of the cotangent Laplacian. The
+reader registers the original to the suspect by principal axes and closest vertices. It analyses the differences between
+nearest vertices, and confirms the mark if their coefficients have a correlation of at least 0.15 with the pattern.
+There is no message. The tool is by archtecgr; it is reimplemented here as a carrier and a detector of jaxmark.
 """
 
 from collections.abc import Iterable
@@ -28,37 +28,37 @@ from jaxmark.watermark.perception.budget import Bounds, displace_within
 from jaxmark.watermark.reading.detectors import correlate
 
 HARMONICS = 20
-THRESHOLD = 0.15  # of the correlation
-_MAX_VARIANCE_RATIO = 0.7  # of the extreme principal axes, up to which they are evened out
-_MAX_DISTANCE = 0.05  # mean distance of nearest vertices beyond which the suspect is another shape
-_MIN_SHARE = 0.1  # of the mark's displacement that must be there
-_MAX_ROUNDS, _TOLERANCE = 100, 1e-6  # of closest points
+THRESHOLD = 0.15  # least correlation of a detected mark
+_MAX_VARIANCE_RATIO = 0.7  # largest ratio of the extreme principal variances at which all variances are equalised
+_MAX_DISTANCE = 0.05  # largest mean distance of nearest vertices; other suspects are assumed to be another shape
+_MIN_SHARE = 0.1  # least RMS difference of a suspect, as a fraction of the mark's largest displacement
+_MAX_ROUNDS, _TOLERANCE = 100, 1e-6  # rounds of closest points, and change of their mean distance at which they end
 
 Points = Float64[np.ndarray, "points 3"]
 
 
 class Harmonics(NamedTuple):
-    """Eigenvectors along normals as `jaxmark.watermark.carriers.components.Components`, with D = 1."""
+    """Displacements along normals by eigenvectors: `jaxmark.watermark.carriers.components.Components` with D = 1."""
 
     vectors: Float[Array, "vertices bands"]
     normals: Float[Array, "vertices 3"]
 
     @property
     def gram(self) -> Float[Array, "3 bands bands"]:
-        """The inner products of bands, by coordinate."""
+        """The inner products of bands, for each coordinate."""
         return einsum("vj,vc,vk->cjk", self.vectors, self.normals**2, self.vectors)
 
     def synthesise(self, amplitudes: Float[Array, "bands 3"]) -> Float[Array, "vertices 3"]:
-        """The displacement of amplitudes."""
+        """Compute the displacement for amplitudes."""
         return self.normals * matmul(self.vectors, amplitudes)
 
     def analyse(self, residual: Float[Array, "vertices 3"]) -> Float[Array, "bands 3"]:
-        """The adjoint of `synthesise`."""
+        """Apply the adjoint of `synthesise`."""
         return matmul(self.vectors.T, self.normals * residual)
 
 
 def harmonics(mesh: Mesh, count: int = HARMONICS) -> Float64[np.ndarray, "points bands"]:
-    """Compute the lowest eigenvectors of the cotangent matrix, without the constant."""
+    """Compute the lowest eigenvectors of the cotangent matrix, except the constant one."""
     matrix = -sparse.csc_array(require("igl", "align").cotmatrix(*mesh))
     start = np.cos(np.arange(len(mesh.vertices), dtype=float))
     values, vectors = linalg.eigsh(matrix, count + 1, sigma=-1e-8, v0=start)
@@ -66,7 +66,7 @@ def harmonics(mesh: Mesh, count: int = HARMONICS) -> Float64[np.ndarray, "points
 
 
 def carrier(vectors: Float[np.ndarray, "points bands"], mesh: Mesh) -> ModulatedCarrier:
-    """Make a carrier whose "bits" are amplitudes of eigenvectors."""
+    """Make a carrier whose code bits are amplitudes of eigenvectors."""
     components = Harmonics(jnp.asarray(vectors), jnp.asarray(vertex_normals(mesh), vectors.dtype))
     return ModulatedCarrier(components, np.eye(vectors.shape[1], dtype=np.int8)[:, :, None])
 
@@ -76,42 +76,42 @@ class HarmonicMark:
     """A pattern in the harmonics of an original."""
 
     original: Original
-    points: Mesh  # the original's, in its units
+    points: Mesh  # the original's welded points, in its units
     vectors: Float64[np.ndarray, "points bands"]
-    pattern: Float64[np.ndarray, " bands"]  # of length 1
+    pattern: Float64[np.ndarray, " bands"]  # unit vector
 
     def embed(self, bounds: Bounds) -> Mesh:
-        """Embed as strongly as bounds allow; the tool itself takes a 200th of the mean edge length at most."""
+        """Embed as strongly as bounds allow; the tool itself embeds with at most 1/200 of the mean edge length."""
         shift = self._carrier(self.points).displacement(jnp.asarray(self.pattern, jnp.float32))
         return displace_within(self.original, np.asarray(shift, np.float64), bounds).mesh
 
     def correlation(self, suspect: Mesh, expected: float) -> float:
-        """Correlate the differences of a suspect with the pattern; 0 where it is another shape.
+        """Correlate the differences of a suspect with the pattern; returns 0 if the suspect is another shape.
 
         Args:
             suspect: any mesh.
-            expected: the mark's largest displacement, over the original's diagonal.
+            expected: the mark's largest displacement, as a fraction of the original's diagonal.
         """
         target = normalised(np.asarray(weld_mesh(suspect, weld(suspect.vertices)).vertices))
         points, distance = register(normalised(np.asarray(self.points.vertices)), target)
         if distance > _MAX_DISTANCE:
             return 0.0
-        # Nearest vertices, as the tool compares them, not nearest points of the surface.
+        # The tool compares nearest vertices, not nearest points of the surface.
         difference = target[KDTree(target).query(points)[1]] - points
         aligned = Mesh(points, self.points.faces)
         along = np.sum(difference * vertex_normals(aligned), axis=1)
         scale = self.original.diagonal / _rms_radius(np.asarray(self.points.vertices))
         if np.sqrt(np.mean(along**2)) < _MIN_SHARE * expected * scale:
             return 0.0
-        found = correlate(self._carrier(aligned).reader(), observe(jnp.asarray(difference, jnp.float32)))
-        return float(np.corrcoef(np.asarray(found, np.float64), self.pattern)[0, 1])
+        amplitudes = correlate(self._carrier(aligned).reader(), observe(jnp.asarray(difference, jnp.float32)))
+        return float(np.corrcoef(np.asarray(amplitudes, np.float64), self.pattern)[0, 1])
 
     def _carrier(self, points: Mesh) -> ModulatedCarrier:
         return carrier(self.vectors.astype(np.float32), points)
 
 
 def make_mark(mesh: Mesh, key: Iterable[int]) -> HarmonicMark:
-    """Draw a random pattern for an original; the bytes of the key seed NumPy's generator."""
+    """Draw a random pattern for an original; the bytes of the key are the seed of NumPy's generator."""
     original = make_original(mesh)
     points = weld_mesh(mesh, original.weld)
     pattern = np.random.default_rng(list(key)).normal(size=HARMONICS)
@@ -119,7 +119,7 @@ def make_mark(mesh: Mesh, key: Iterable[int]) -> HarmonicMark:
 
 
 def normalised(points: Points) -> Points:
-    """Centre points and scale them to unit RMS radius; even out principal axes that differ much."""
+    """Centre points and scale them to unit RMS radius; if principal variances differ much, make them equal."""
     centred = points - points.mean(axis=0)
     variance, axes = np.linalg.eigh(np.cov(centred.T))
     if variance[0] <= _MAX_VARIANCE_RATIO * variance[2]:
@@ -128,7 +128,7 @@ def normalised(points: Points) -> Points:
 
 
 def register(points: Points, target: Points) -> tuple[Points, float]:
-    """Turn and shift points by iterative closest vertices, and return them with their mean distance."""
+    """Rotate and shift points by iterative closest vertices; returns the points and their mean distance."""
     tree, before = KDTree(target), np.inf
     for _ in range(_MAX_ROUNDS):
         distance, nearest = tree.query(points)

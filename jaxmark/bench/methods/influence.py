@@ -1,17 +1,21 @@
 """Praun, Hoppe, Finkelstein, "Robust mesh watermarking", SIGGRAPH 1999, 69-76.
 
-A vector of normal random numbers is added to the shape, each along one direction and under a basis function of its own
-on a sphere of influence of the surface: few large ones and many small ones. The reader registers a suspect to the
-original, resamples it at the original's vertices, fits the vector by least squares, and correlates it with the key's.
-As the key's numbers are normal and independent of the suspect, the p-value of a correlation is exact.
+The mark is a vector of normal random numbers. Each number is the height of a basis function, which displaces a sphere
+of influence of the surface along one direction; few spheres are large, and many are small. The reader registers a
+suspect to the original, resamples it at the original's vertices, fits the vector by least squares, and correlates it
+with the vector of the key. The p-value of the correlation is exact, because the key's numbers are normal and
+independent of the suspect.
 
-Chosen here, where the publication leaves it open or needs what is not here. Centres and radii of the spheres are those
-of farthest points along the edges, each as far from all before it as its radius, instead of the vertex splits of a
-progressive mesh. Basis functions are the publication's hat, a raised cosine, along the normal at the centre, all
-equally high. Registration and resampling are the library's; an affine map, which they may have fitted to the mark
-itself, is fitted together with the vector. The publication shows presence; a message divides the vector into a part
-for each bit, which turns its sign, and the squares of the parts' correlations, a sum of independent squares of normal
-numbers where there is no mark, give the p-value.
+This implementation differs from the publication, or fills gaps of it, as follows.
+
+- The centres of the spheres are farthest points along edges, instead of the vertex splits of a progressive mesh. The
+  radius of a sphere is the distance of its centre from all centres before it.
+- The basis functions are the publication's hat, a raised cosine, along the normal at the centre, all of equal height.
+- Registration and resampling are those of this library. Because registration may have fitted an affine map to the mark
+  itself, an affine map is fitted together with the vector.
+- The publication's mark shows presence only. Here a message divides the vector into one part per bit, and the bit is
+  the sign of its part. The p-value is that of the sum of the parts' squared correlations, which without a mark are
+  squares of independent normal numbers.
 """
 
 import math
@@ -30,21 +34,21 @@ from jaxmark.geometry.mesh import Mesh, compact, edges, vertex_normals
 
 SOURCE = "Praun, Hoppe, Finkelstein, SIGGRAPH 1999"
 _MIN_SPHERES, _SPHERES_PER_BIT = 128, 4
-_RIDGE = 1e-9  # on the diagonal of the normal equations, over its mean
+_RIDGE = 1e-9  # ridge of the normal equations, as a fraction of the mean of their diagonal
 
-Basis = sparse.csr_array  # `[3 · points, spheres]`, the coordinates of each point together
+Basis = sparse.csr_array  # `[3 · points, spheres]`; the three coordinates of a point are adjacent
 
 
 def influence(bits: int) -> Method:
-    """Spheres of influence; strengths are the standard deviation of a basis function's height, over the diagonal.
+    """Make the method; its strength is the standard deviation of a basis function's height, over the diagonal.
 
     Args:
-        bits: of a message, or 0 to show presence alone, as published.
+        bits: payload in bits; 0 shows presence only, as in the publication.
     """
     count, parts = max(_MIN_SPHERES, _SPHERES_PER_BIT * bits), max(bits, 1)
 
     def vector(key: bytes) -> tuple[Float64[np.ndarray, " spheres"], Int64[np.ndarray, " spheres"]]:
-        """The key's numbers, and the bit that each belongs to."""
+        """Return the key's numbers, and the bit that each number belongs to."""
         part = choices(key, "influence").permutation("parts", count) % parts
         return normal(key, "influence", "vector", count), part
 
@@ -59,19 +63,19 @@ def influence(bits: int) -> Method:
 
     def read(suspect: Mesh, key: bytes, original: Mesh | None = None) -> Reading:
         if original is None:
-            raise JaxmarkError("The method influence reads beside the original; give it.")
+            raise JaxmarkError("The method influence is not blind; give the original.")
         prepared = make_original(original)
         try:
-            found = align(prepared, suspect)
-        except JaxmarkError:  # the suspect shows nothing of the original
+            alignment = align(prepared, suspect)
+        except JaxmarkError:  # the suspect cannot be registered to the original
             return Reading(None, 0.0, 0.0)
         used = prepared.used
         affine = np.column_stack([prepared.positions[used], np.ones(used.sum())])  # displacements by affine maps
         columns = [basis(compact(prepared.points), count), sparse.kron(sparse.csr_array(affine), np.eye(3))]
-        known = None if found.normals is None else found.normals[used]
+        directions = None if alignment.normals is None else alignment.normals[used]
         drawn, part = vector(key)
         bumps = sparse.csr_array(sparse.hstack(columns))
-        fitted = _fit(bumps, found.displacement[used], found.weights[used], known)[:count]
+        fitted = _fit(bumps, alignment.displacement[used], alignment.weights[used], directions)[:count]
         length = np.sqrt(np.bincount(part, fitted**2, parts))
         correlation = np.bincount(part, fitted * drawn, parts) / np.where(length > 0, length, 1)
         if not bits:
@@ -83,9 +87,9 @@ def influence(bits: int) -> Method:
 
 
 def basis(mesh: Mesh, count: int) -> Basis:
-    """Compute the displacements by basis functions of height 1 on spheres of influence; refuse a mesh of fewer points.
+    """Compute the displacements by basis functions of height 1; refuse a mesh with fewer points than spheres.
 
-    The first centre is the farthest point from the first vertex; no part of the mesh is left without one.
+    The first centre is the farthest point from the first vertex. Every component of the mesh gets a centre.
     """
     points, pairs = np.asarray(mesh.vertices), edges(mesh.faces)
     if len(points) < count:
@@ -116,13 +120,13 @@ def _fit(
     bumps: Basis,
     residual: Float64[np.ndarray, "points 3"],
     weight: Float64[np.ndarray, " points"],
-    known: Float64[np.ndarray, "points 3"] | None,
+    directions: Float64[np.ndarray, "points 3"] | None,
 ) -> Float64[np.ndarray, " spheres"]:
-    """Fit the vector to displacements by weighted least squares; only along the known directions, if given."""
-    if known is not None:
-        place = np.arange(known.size)
-        along = sparse.csr_array((known.ravel(), (place // 3, place)))
-        bumps, residual = sparse.csr_array(along @ bumps), (known * residual).sum(axis=1, keepdims=True)
+    """Fit the vector to displacements by weighted least squares; with directions, only to components along them."""
+    if directions is not None:
+        place = np.arange(directions.size)
+        along = sparse.csr_array((directions.ravel(), (place // 3, place)))
+        bumps, residual = sparse.csr_array(along @ bumps), (directions * residual).sum(axis=1, keepdims=True)
     weights = np.repeat(weight, residual.shape[1])
     matrix = sparse.csr_array(bumps.T @ sparse.diags_array(weights) @ bumps).toarray()
     matrix += _RIDGE * np.trace(matrix) / len(matrix) * np.eye(len(matrix))

@@ -1,18 +1,24 @@
 """Wang, Lavoué, Denis, Baskurt, "Robust and blind mesh watermarking based on volume moments", 2011.
 
-Computers & Graphics 35 (1), 1-19. A closed surface is brought into a pose by its volume moments and cut into patches of
-a cylinder about its longest axis. The largest patches carry a bit each: the volume between patch and axis (its moment
-of order zero) is quantised by a keyed scalar Costa scheme, by a smooth deformation of the patch that leaves the pose as
-it is. All moments are integrals over triangles, cut where patches meet, and do not depend on how the surface is meshed.
+Computers & Graphics 35 (1), 1-19. The volume moments of a closed surface determine a pose, in which the surface is cut
+into patches by a cylindrical grid about its longest axis. Each of the largest patches carries a bit: the volume between
+patch and axis (the moment of order zero) is quantised by a keyed scalar Costa scheme. A smooth deformation of the patch
+changes the volume, but not the pose. All moments are integrals over triangles, which are cut at the borders of patches.
+Therefore they do not depend on how the surface is meshed.
 
-Chosen here, where the publication is silent or was not at hand. The quantised value is the logarithm of the volume, in
-units of the whole. The grid divides the axis evenly between the surface's ends, and the circle about it. The two axes
-of the most skewness point where that is positive, the third one is right-handed. Points move along their normals, under
-a mask that falls to zero at the patch's rim and two odd ones that compensate the pose; of all deformations with the
-wanted moments that is the least, by squares over the surface, found by Newton's method for the surface that results.
-Patches that are nearly large enough to carry a bit are kept smaller. The strength is the quantisation step. As in the
-publication, the reader may know it; otherwise it tries all that the writer may choose from. The score is the agreement
-of the moments with the quantiser's cells, whose places the key draws at random, in standard deviations over other keys.
+This implementation fills gaps of the publication as follows.
+
+- The quantised value is the logarithm of the volume, relative to the volume of the whole surface. - The grid divides
+the axis into equal parts between the ends of the surface, and the circle about it into equal angles. - The two axes of
+largest skewness point in the direction of positive skewness; the third completes a right-handed frame. - Points move
+along their normals. The displacement is a sum of three modes per patch: a mask that falls to zero at the
+  rim of the patch, and two odd modes that compensate the change of pose. Among all deformations with the desired
+  moments, it is the one of least squares over the surface. Newton's method finds it for the resulting surface.
+- Patches that are nearly large enough to carry a bit are kept smaller than those that carry bits.
+- The strength is the quantisation step. As in the publication, the reader may know it; otherwise the reader tries all
+  steps that the writer may choose.
+- The score is the agreement of the moments with the cells of the quantiser, whose positions the key draws at random. It
+  is measured in standard deviations over other keys.
 """
 
 import math
@@ -35,31 +41,31 @@ ANCHOR = (
     " at its geometric ones (benchmarks/robustness/anchors.py)"
 )
 SOURCE = "Wang, Lavoué, Denis, Baskurt, Computers & Graphics 35 (1), 2011"
-STEPS = tuple(0.128 * 2 ** (-place / 4) for place in range(25))  # of the quantiser, in logarithms of volume
-_SECTORS = 8  # around the axis; even, so that planes through the axis cut them
+STEPS = tuple(0.128 * 2 ** (-place / 4) for place in range(25))  # quantisation steps, in logarithms of volume
+_SECTORS = 8  # number of sectors around the axis; even, so that planes through the axis are their borders
 _PATCHES_PER_BIT = 1.4
-_MIN_GAP = 0.01  # between the logarithms of the volumes that carry a bit and the others
-_NEARLY_LARGE = 0.8  # of the smallest volume that carries a bit: patches from here on keep theirs
-_COSTA = 0.8  # share of the way to the quantiser's value
-_RIM = 0.35  # share of a patch's width, on either side, where the mask rises
-_AXIS = 0.1  # distance from the axis, in units of the volume's cube root, where the mask is a half
-_MAX_ROUNDS, _TOLERANCE = 15, 1e-3  # of Newton's method; a share of the quantisation step
+_MIN_GAP = 0.01  # least difference of the logarithms of volumes that carry bits and of those that do not
+_NEARLY_LARGE = 0.8  # fraction of the smallest volume with a bit, above which volumes without a bit are controlled, too
+_COSTA = 0.8  # fraction of the distance to the quantised value by which a value is moved (Costa's α)
+_RIM = 0.35  # fraction of a patch's width, on either side, in which the mask rises
+_AXIS = 0.1  # distance from the axis, in units of the volume's cube root, at which the mask is a half
+_MAX_ROUNDS, _TOLERANCE = 15, 1e-3  # rounds of Newton's method; error of a moment, as a fraction of the step
 
 Cells = Float64[np.ndarray, " cells"]
 Values = Float64[np.ndarray, " points"]
 
 
 class Posed(NamedTuple):
-    """A closed surface in the pose and at the size of its volume moments."""
+    """A closed surface in the pose, and with the size, that its volume moments determine."""
 
-    mesh: Mesh  # with normals outwards, along the axis, of volume 1
-    size: float  # the length of one unit, in the units of the mesh as it was
-    frame: Float64[np.ndarray, "3 3"]  # the pose's axes there, in columns
-    ends: tuple[float, float]  # of the surface along the axis
-    slabs: int
+    mesh: Mesh  # the surface with outward normals and volume 1, whose axis is the first coordinate
+    size: float  # the length of one unit, in the original units
+    frame: Float64[np.ndarray, "3 3"]  # the axes of the pose in original coordinates, as columns
+    ends: tuple[float, float]  # extent of the surface along the axis
+    slabs: int  # number of slabs along the axis
 
     def cells(self, points: Points) -> tuple[Int64[np.ndarray, " points"], Values, Values]:
-        """The patch of each point, and its place there along and around the axis, both from 0 to 1."""
+        """Return the patch of each point, and its position in the patch, along and around the axis, from 0 to 1."""
         along = (points[:, 0] - self.ends[0]) * self.slabs / (self.ends[1] - self.ends[0])
         around = (np.arctan2(points[:, 2], points[:, 1]) / (2 * np.pi) + 0.5) * _SECTORS
         slab = np.clip(np.floor(along), 0, self.slabs - 1).astype(np.int64)
@@ -68,18 +74,18 @@ class Posed(NamedTuple):
 
 
 def moments(bits: int, steps: Sequence[float] = STEPS) -> Method:
-    """Quantised volumes of patches; strengths are the quantisation step, rounded down to one of `steps`.
+    """Make the method; its strength is the quantisation step, rounded down to one of `steps`.
 
     Args:
-        bits: of a message.
-        steps: what the writer may choose from and the reader tries, descending; one alone where they agree on it.
+        bits: payload in bits.
+        steps: the steps that the writer may choose and the reader tries, descending; a single one if both agree on it.
     """
-    slabs, tried = math.ceil(_PATCHES_PER_BIT * bits / _SECTORS), np.asarray(steps, float)
+    slabs, candidates = math.ceil(_PATCHES_PER_BIT * bits / _SECTORS), np.asarray(steps, float)
 
     def embed(mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
         surface = make_surface(mesh)
         points = np.asarray(surface.mesh.vertices)
-        step = float(np.append(tried[tried <= strength * (1 + 1e-9)], tried[-1])[0])
+        step = float(np.append(candidates[candidates <= strength * (1 + 1e-9)], candidates[-1])[0])
         target: Cells | None = None
         for _ in range(_MAX_ROUNDS):
             posed = _posed(surface.mesh._replace(vertices=points), slabs)
@@ -97,45 +103,49 @@ def moments(bits: int, steps: Sequence[float] = STEPS) -> Method:
     def read(suspect: Mesh, key: bytes, original: Mesh | None = None) -> Reading:
         volumes = _volumes(_posed(make_surface(suspect).mesh, slabs))
         chosen = _largest(volumes, bits)
-        known = volumes[chosen] > 0
-        value = np.log(np.where(known, volumes[chosen], 1))
+        positive = volumes[chosen] > 0
+        value = np.log(np.where(positive, volumes[chosen], 1))
         dither = uniform(key, "moments", "dither", len(volumes))[chosen]
-        phase = 2 * np.pi * (value / tried[:, None] - dither)
-        agreement = (np.cos(2 * phase) * known).sum(axis=1)
+        phase = 2 * np.pi * (value / candidates[:, None] - dither)
+        agreement = (np.cos(2 * phase) * positive).sum(axis=1)
         best = int(np.argmax(agreement))
-        bound = _log10_tail(float(agreement[best]), int(known.sum())) + math.log10(len(tried))
-        score = float(agreement[best] / math.sqrt(max(known.sum(), 1) / 2))
+        bound = _log10_tail(float(agreement[best]), int(positive.sum())) + math.log10(len(candidates))
+        score = float(agreement[best] / math.sqrt(max(positive.sum(), 1) / 2))
         return Reading(gather(np.cos(phase[best]) < 0, key, "moments"), score, min(bound, 0.0))
 
-    return Method("moments", embed, read, True, bits, (float(tried[-1]), float(tried[0])), SOURCE, ANCHOR)
+    strengths = float(candidates[-1]), float(candidates[0])
+    return Method("moments", embed, read, True, bits, strengths, SOURCE, ANCHOR)
 
 
 def _posed(mesh: Mesh, slabs: int) -> Posed:
-    """Bring a surface into the pose of its volume moments; refuse one that has no faces or encloses nothing."""
+    """Transform a surface into the pose of its volume moments; refuse a mesh without faces, or without a volume."""
     check_faces("The method moments", mesh)
     points, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     length = float(np.ptp(points, axis=0).max())
     points = (points - points.mean(axis=0)) / length
-    found = volume_moments(points[faces])
-    if not abs(found.mass) > 1e-9 or not np.linalg.eigvalsh(found.covariance).min() > 0:
-        raise JaxmarkError("This surface encloses no volume, and moments of volume are what the method writes in.")
-    variance, axes = np.linalg.eigh(found.covariance)
-    points, axes = points - found.centre, axes[:, ::-1]
+    whole = volume_moments(points[faces])
+    if not abs(whole.mass) > 1e-9 or not np.linalg.eigvalsh(whole.covariance).min() > 0:
+        raise JaxmarkError("This surface encloses no volume, but the method marks volumes; give a closed surface.")
+    variance, axes = np.linalg.eigh(whole.covariance)
+    points, axes = points - whole.centre, axes[:, ::-1]
     # The third moment of a tetrahedron at the origin is its volume over 20, times h3 of its corners.
     corners = (points @ axes)[faces]
     volume = (corners[:, 0] * cross_product(corners[:, 1], corners[:, 2])).sum(axis=1) / 6
     one, two, three = (np.sum(corners**power, axis=1) for power in (1, 2, 3))
-    skewness = volume @ ((one**3 + 3 * one * two + 2 * three) / 120) / found.mass / variance[::-1] ** 1.5
+    skewness = volume @ ((one**3 + 3 * one * two + 2 * three) / 120) / whole.mass / variance[::-1] ** 1.5
     sign = np.where(skewness < 0, -1.0, 1.0)
     sign[np.argmin(np.abs(skewness))] *= np.sign(np.linalg.det(axes * sign))
-    size, frame = abs(found.mass) ** (1 / 3), axes * sign
+    size, frame = abs(whole.mass) ** (1 / 3), axes * sign
     turned = points @ frame / size
     ends = float(turned[:, 0].min()), float(turned[:, 0].max())
-    return Posed(Mesh(turned, faces if found.mass > 0 else faces[:, ::-1]), size * length, frame, ends, slabs)
+    return Posed(Mesh(turned, faces if whole.mass > 0 else faces[:, ::-1]), size * length, frame, ends, slabs)
 
 
 def _volumes(posed: Posed) -> Cells:
-    """Compute the volume between each patch and the axis: the flux of (0, y, z)/2, which no cut between patches has."""
+    """Compute the volume between each patch and the axis.
+
+    It is the flux of (0, y, z)/2 through the patch, because the planes between patches have no flux of this field.
+    """
     triangles = np.asarray(posed.mesh.vertices)[np.asarray(posed.mesh.faces)]
     for turn in np.pi * 2 * np.arange(_SECTORS // 2) / _SECTORS:
         triangles = _cut(triangles, np.array([0, -np.sin(turn), np.cos(turn)]), 0.0)
@@ -150,7 +160,7 @@ def _volumes(posed: Posed) -> Cells:
 def _cut(
     triangles: Float64[np.ndarray, "faces 3 3"], normal: Float64[np.ndarray, " 3"], height: float
 ) -> Float64[np.ndarray, "more 3 3"]:
-    """Cut the triangles that a plane crosses into three, so that each lies on one side."""
+    """Cut each triangle that a plane crosses into three triangles, so that all triangles are on one side."""
     side = triangles @ normal - height
     crossed = (side > 0).any(axis=1) & (side < 0).any(axis=1)
     part, side = triangles[crossed], side[crossed]
@@ -161,17 +171,17 @@ def _cut(
     share = side[:, :1] / (side[:, :1] - side[:, 1:])
     a, b, c = part.swapaxes(0, 1)
     on_b, on_c = a + share[:, :1] * (b - a), a + share[:, 1:] * (c - a)
-    made = [np.stack(corners, axis=1) for corners in ((a, on_b, on_c), (on_b, b, c), (on_b, c, on_c))]
-    return np.concatenate([triangles[~crossed], *made])
+    parts = [np.stack(corners, axis=1) for corners in ((a, on_b, on_c), (on_b, b, c), (on_b, c, on_c))]
+    return np.concatenate([triangles[~crossed], *parts])
 
 
 def _largest(volumes: Cells, bits: int) -> Int64[np.ndarray, " bits"]:
-    """Return the patches that carry bits, in the order of their places."""
+    """Return the indices of the patches that carry bits, in ascending order."""
     return np.sort(np.argsort(-volumes, kind="stable")[:bits])
 
 
 def _target(volumes: Cells, written: Bits, key: bytes, step: float) -> Cells:
-    """Compute target logarithms of volumes, NaN where any will do; refuse a surface of too few patches."""
+    """Compute target logarithms of volumes, NaN for arbitrary volumes; refuse a surface with too few patches."""
     chosen = _largest(volumes, len(written))
     if not volumes[chosen].min() > 0:
         raise JaxmarkError(
@@ -182,7 +192,8 @@ def _target(volumes: Cells, written: Bits, key: bytes, step: float) -> Cells:
     offset = uniform(key, "moments", "dither", len(volumes))[chosen] + written / 2
     nearest = step * (np.round(value / step - offset) + offset)
     target[chosen] = value + _COSTA * (nearest - value)
-    # Patches that are not chosen stay below, so that the reader chooses the same; small ones are free.
+    # Patches without a bit stay smaller than those with bits, so that the reader chooses the same patches. Much smaller
+    # patches need no target.
     most = target[chosen].min() - max(step / 2, _MIN_GAP)
     rest = np.isnan(target) & (volumes > _NEARLY_LARGE * math.exp(most))
     target[rest] = np.minimum(np.log(volumes[rest]), most)
@@ -190,7 +201,7 @@ def _target(volumes: Cells, written: Bits, key: bytes, step: float) -> Cells:
 
 
 def _deformation(posed: Posed, volumes: Cells, change: Cells, fixed: np.ndarray) -> Values:
-    """Compute the least motion along normals that changes logarithms of volumes, and not the pose."""
+    """Compute the least displacement along normals that changes logarithms of volumes, but not the pose."""
     points, area = np.asarray(posed.mesh.vertices), per_point(posed.mesh, face_areas(posed.mesh))
     cell, along, around = posed.cells(points)
     radius = np.hypot(points[:, 1], points[:, 2]) ** 2
@@ -208,17 +219,17 @@ def _deformation(posed: Posed, volumes: Cells, change: Cells, fixed: np.ndarray)
     rows = np.concatenate([relative, [sums(row).ravel() for row in pose]])
     cost = np.concatenate([np.bincount(cell, area * mode**2, len(volumes)) for mode in modes.T])
     inverse = np.where(cost > 0, 1 / np.maximum(cost, 1e-300), 0)
-    wanted = np.append(change[fixed], np.zeros(len(pose)))
-    amplitude = inverse * (rows.T @ np.linalg.lstsq((rows * inverse) @ rows.T, wanted, rcond=1e-12)[0])
+    target = np.append(change[fixed], np.zeros(len(pose)))
+    amplitude = inverse * (rows.T @ np.linalg.lstsq((rows * inverse) @ rows.T, target, rcond=1e-12)[0])
     return (modes * amplitude.reshape(3, -1).T[cell]).sum(axis=1)
 
 
 def _rise(place: Values) -> Values:
-    """Compute the mask across a patch: from 0 at its rims smoothly to 1."""
+    """Compute the mask across a patch: it rises smoothly from 0 at the rims to 1."""
     return (1 - np.cos(np.pi * np.minimum(np.minimum(place, 1 - place) / _RIM, 1))) / 2
 
 
 def _log10_tail(agreement: float, count: int) -> float:
-    """Bound the probability that cosines of random angles add up to this, by Chernoff: E exp(λ cos) is I₀."""
+    """Bound the probability that the sum of cosines of random angles reaches a value (Chernoff; E exp(λ cos) = I₀)."""
     rate = np.append(0.0, np.geomspace(1e-3, 1e4, 200))
     return float(np.min(count * (np.log(ive(0, rate)) + rate) - rate * agreement)) / math.log(10)

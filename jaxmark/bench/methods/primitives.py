@@ -1,7 +1,7 @@
-"""Primitives of published methods: keyed bits and noise, and the welded surface that is marked.
+"""Primitives of published methods: keyed bits, keyed random numbers, and the welded surface that is marked.
 
-Most publications assume a key, or have none. Here every method permutes and flips the bits of its message by a key, so
-that a wrong key decodes a message that is independent of the right one.
+Most publications do not say how a key is used, or have no key. Here, every method permutes and flips the bits of its
+message by a key, so that a wrong key decodes a message that is independent of the right one.
 """
 
 from typing import NamedTuple
@@ -15,11 +15,11 @@ from jaxmark.geometry.mesh import Mesh, Weld, compact, host_mesh, used_vertices,
 from jaxmark.geometry.pose import Points
 from jaxmark.watermark.coding.keys import Choices, Key
 
-_CONFIDENT_QUANTILE = 0.25  # three bits in four have a larger margin
+_CONFIDENT_QUANTILE = 0.25  # quantile of the margins that is the score; three bits in four have a larger margin
 
 
 def choices(key: bytes, method: str) -> Choices:
-    """Bind the keyed choices of one method."""
+    """Make the keyed random choices of a method."""
     return Choices(Key(key), f"bench/{method}".encode())
 
 
@@ -41,7 +41,7 @@ def _placement(key: bytes, method: str, count: int) -> tuple[Int64[np.ndarray, "
 
 
 def decode_margins(margin: Float64[np.ndarray, " bits"], key: bytes, method: str) -> Reading:
-    """Decode bits by the signs of their margins, scored by the margin that three bits in four exceed."""
+    """Decode bits by the signs of their margins; the score is the margin that three bits in four exceed."""
     return Reading(gather(margin > 0, key, method), float(np.quantile(np.abs(margin), _CONFIDENT_QUANTILE)))
 
 
@@ -57,14 +57,14 @@ def normal(key: bytes, method: str, label: str, count: int) -> Float64[np.ndarra
 
 
 class DistinctPoints(NamedTuple):
-    """The distinct points of a mesh that faces use; all points of a cloud."""
+    """The distinct points of a mesh that faces use; for a cloud, all its points."""
 
-    mesh: Mesh  # the points, and faces between them
+    mesh: Mesh  # the points, and the faces between them
     given: Mesh  # the mesh before welding
     welded: Weld
 
     def moved(self, points: Points) -> Mesh:
-        """Return the given mesh with the points of the surface moved; copies of a point move together."""
+        """Return the given mesh with its points moved; vertices of one point move together."""
         used = used_vertices(weld_mesh(self.given, self.welded))
         everywhere = np.array(self.given.vertices, np.float64)[self.welded.first]
         everywhere[used] = points
@@ -79,5 +79,5 @@ def make_surface(mesh: Mesh) -> DistinctPoints:
 
 
 def per_point(mesh: Mesh, values: Float64[np.ndarray, " faces"]) -> Float64[np.ndarray, " points"]:
-    """Distribute values of faces to their corners, a third to each."""
+    """Distribute the values of faces to their corners, a third to each."""
     return np.bincount(np.ravel(mesh.faces), np.repeat(values / 3, 3), len(mesh.vertices))

@@ -1,1 +1,1 @@
-"""Marks that are read without the original: by the key and the suspect alone."""
+"""Blind marks, which are read without the original, from the key and the suspect alone."""

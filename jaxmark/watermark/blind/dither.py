@@ -1,8 +1,8 @@
-"""Keyed choices of a blind mark, by the names of its anchors; on the host.
+"""Keyed choices of a blind mark, derived from the names of its anchors; computed on the host.
 
-An anchor's value is compared with a lattice of numbers that its dither shifts. The dither is δ + b/2, δ uniform on
-[0, ½) and b a fair bit of another subkey: whatever is chosen by a suspect and by δ knows nothing of b, so that a
-claimed score is a sum of independent signs (see `jaxmark.watermark.blind.reading`).
+The value of an anchor is compared with a lattice of numbers, which is shifted by the anchor's dither δ + b/2. Here δ is
+uniform on [0, ½), and b is a fair bit from another subkey. Anything that depends on the suspect and on δ is independent
+of b, so that the score of a claim is a sum of independent signs (see `jaxmark.watermark.blind.reading`).
 """
 
 from typing import NamedTuple
@@ -14,11 +14,11 @@ from jaxmark.watermark.coding.keys import Choices
 
 
 class Dither(NamedTuple):
-    """What the key says of some anchors."""
+    """The keyed choices of some anchors."""
 
     offset: Float64[np.ndarray, " anchors"]  # δ, in steps, in [0, ½)
     sign: Float64[np.ndarray, " anchors"]  # (-1)^b
-    slot: Int64[np.ndarray, " anchors"]  # number of the code bit that an anchor carries
+    slot: Int64[np.ndarray, " anchors"]  # index of the code bit that an anchor carries
 
 
 def make_dither(choices: Choices, scheme: str, names: Int64[np.ndarray, "anchors parts"], code_bits: int) -> Dither:
@@ -27,7 +27,7 @@ def make_dither(choices: Choices, scheme: str, names: Int64[np.ndarray, "anchors
     Args:
         choices: the keyed choices of the mark.
         scheme: name of the scheme.
-        names: of the anchors, such as indices in a lattice.
+        names: names of the anchors, such as indices in a lattice.
         code_bits: number of code bits.
     """
 
@@ -41,5 +41,5 @@ def make_words(
     choices: Choices, label: str, names: Int64[np.ndarray, "anchors parts"]
 ) -> Int64[np.ndarray, " anchors"]:
     """Derive an integer of 62 bits for each anchor, from its name alone."""
-    found = b"".join(choices.derive(label, 8, name.tobytes()) for name in np.asarray(names, "<i8"))
-    return (np.frombuffer(found, "<u8") >> np.uint64(2)).astype(np.int64)
+    stream = b"".join(choices.derive(label, 8, name.tobytes()) for name in np.asarray(names, "<i8"))
+    return (np.frombuffer(stream, "<u8") >> np.uint64(2)).astype(np.int64)

@@ -1,7 +1,7 @@
-"""The scheme `field`: values at the anchors of a lattice, in the shape's own pose, which any meshing of it shows.
+"""The blind scheme `field`: values at the anchors of a lattice, in the shape's own pose, which remeshing preserves.
 
-A suspect that was smoothed is looked at as if some smoothing was undone; one that was meshed anew, as if some blur was
-there already. The pose that it shows is nearly the one that was marked, up to the ways of looking along its axes.
+A suspect is read in several views: as it is, with some blur that remeshing may have caused, and with several numbers
+of smoothing steps undone. Its pose is nearly that of the marked mesh, up to half turns and reflections along its axes.
 """
 
 import math
@@ -26,20 +26,20 @@ from jaxmark.watermark.blind.anchors import Anchors, Pieces, changes, encloses, 
 from jaxmark.watermark.blind.scheme import AnchoredHost, BlindScheme, Look, measure
 from jaxmark.watermark.coding.keys import Choices
 
-_LEAST_AREA = 0.2  # of the mean: what vertices of smaller area count as
-_FIRST_STEP = 0.05  # of the lattice of values, in widths, that is tried first
-_MIN_GAP = 0.02  # difference of the variances along two axes, over the largest, from which on they are told apart
-_UNDONE_STEPS = (0, 10, 30, 50)  # of smoothing, by a tenth of the way to the neighbours' mean each
-_BLURS = (0.0, 0.2)  # of a suspect as it is, in shares of the narrow Gaussian's variance
-_DEGREE = 64  # of the polynomial that undoes smoothing
+_LEAST_AREA = 0.2  # lower limit on the area of a vertex, relative to the mean
+_FIRST_STEP = 0.05  # quantisation step that is tried first, in widths
+_MIN_GAP = 0.02  # least difference of the variances along two axes, over the largest, with which axes are distinct
+_UNDONE_STEPS = (0, 10, 30, 50)  # numbers of smoothing steps to undo; each step is a tenth of the way to the mean
+_BLURS = (0.0, 0.2)  # blurs of a suspect that was not smoothed, in shares of the narrow Gaussian's variance
+_DEGREE = 64  # degree of the polynomial that undoes smoothing
 _SMOOTHING = 0.5  # share of the narrow Gaussian's width by which displacements are smoothed
-_LONGEST = 100.0  # steps of diffusion for that at most
+_LONGEST = 100.0  # largest number of diffusion steps for that
 _TERMS = 3.7  # terms of a series over the root of the time of diffusion
-_REFINEMENTS = 8  # of the fixed point that it is
+_REFINEMENTS = 8  # iterations of the fixed-point iteration that undoes smoothing
 _STEP_SIZE = 0.1
-#: Spread of small changes of pose that are tried: turns in radians, shifts and growth in sizes.
+#: Standard deviations of the small changes of pose that are tried: turns in radians, shifts and growth in sizes.
 _SPREAD = (*(3.5e-3,) * 3, *(4e-4,) * 3, 2.5e-3)
-#: The ways in which a shape may look along its axes; the last four are of its mirror image.
+#: The half turns of a shape about its axes; the last four are of its mirror image.
 TURNS = np.array(
     [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1], [-1, -1, -1]], np.int64
 )
@@ -47,77 +47,80 @@ TURNS = np.array(
 
 @dataclass(frozen=True)
 class FieldScheme(BlindScheme):
-    """Writes values at anchors in the shape's own pose; read without the original, and after any remeshing.
+    """A blind scheme that writes values at anchors in the shape's own pose; read after any remeshing.
 
-    Widths and steps are public ladders: of the steps, the largest that keeps the limits is written, and of the widths
-    the one that is predicted to survive noise best. Whoever reads without a record tries all of them.
+    Widths and steps are public lists. The largest step that keeps the limits is written, with the width that is
+    predicted to survive noise best. Readers without a record try all of them.
     """
 
     name: ClassVar[str] = "field"
     in_parts: ClassVar[bool] = False
     looks: ClassVar[int] = (len(_UNDONE_STEPS) - 1 + len(_BLURS)) * len(TURNS)
-    widths: tuple[float, ...] = (0.018, 0.0125, 0.025)  # of the narrow Gaussian, about in diagonals
-    steps: tuple[float, ...] = tuple(1e-4 * 2 ** (rung / 2) for rung in range(11))  # of the lattice, in the same unit
-    hiding: bool = False  # whether points move where and as it is hidden; see `jaxmark.watermark.perception.masking`
+    widths: tuple[float, ...] = (0.018, 0.0125, 0.025)  # widths of the narrow Gaussian, approximately in diagonals
+    steps: tuple[float, ...] = tuple(1e-4 * 2 ** (rung / 2) for rung in range(11))  # quantisation steps, in this unit
+    hiding: bool = False  # whether displacements are masked perceptually; see `jaxmark.watermark.perception.masking`
 
     def hosts(self, original: Original, choices: Choices) -> dict[float, AnchoredHost]:
         """See `BlindScheme`.
 
         Raises:
-            JaxmarkError: if the shape's pose cannot be told.
+            JaxmarkError: if the shape's pose is not unique.
         """
         faces = np.asarray(original.points.faces)
-        placed = place(Mesh(original.positions, faces))
-        variances = np.diag(placed.moments.covariance)
+        placement = place(Mesh(original.positions, faces))
+        variances = np.diag(placement.moments.covariance)
         if (-np.diff(variances) < _MIN_GAP * variances[0]).any():
             raise JaxmarkError(
-                "This shape is as wide in one direction as in another, or nearly, so that its pose cannot be told"
-                " without the original; use the scheme 'keyed'."
+                "This shape is (nearly) equally wide in two directions, so that its pose cannot be found without the"
+                " original; use the scheme 'keyed'."
             )
         dtype, rows = original.signal.dtype, original.to_traced(original.positions)
-        faces = turned(faces) if placed.inside_out else faces
-        matrix, shift = jnp.asarray(placed.pose.matrix, dtype), jnp.asarray(placed.pose.shift, dtype)
-        closed, free, found = encloses(original.points), _inverse_areas(original), {}
-        views = see(Mesh(placed.pose(original.positions), faces), self.widths, dtype)
+        faces = turned(faces) if placement.inside_out else faces
+        matrix, shift = jnp.asarray(placement.pose.matrix, dtype), jnp.asarray(placement.pose.shift, dtype)
+        closed, free, hosts = encloses(original.points), _inverse_areas(original), {}
+        views = see(Mesh(placement.pose(original.positions), faces), self.widths, dtype)
         for width, (pieces, surface, anchors) in views.items():
             size = jnp.asarray(width, dtype)
             shape = Shape(matrix, shift, faces, pieces, anchors, size, closed)
-            shown = look(surface, anchors, jnp.zeros(anchors.places.shape, dtype), size, jnp.zeros((), dtype))
-            good = np.asarray(shown.good, np.float64)
+            measured = look(surface, anchors, jnp.zeros(anchors.places.shape, dtype), size, jnp.zeros((), dtype))
+            good = np.asarray(measured.good, np.float64)
             _, pose = measure(shape, rows)
-            values = np.asarray(shown.values, np.float64)
+            values = np.asarray(measured.values, np.float64)
             smoothing = _smoothing(original, width)
-            found[width] = AnchoredHost(shape, anchors.cells, values, pose, good, free, smoothing, _FIRST_STEP * width)
-        return found
+            hosts[width] = AnchoredHost(shape, anchors.cells, values, pose, good, free, smoothing, _FIRST_STEP * width)
+        return hosts
 
     def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:
         """See `BlindScheme`.
 
         Raises:
-            JaxmarkError: see `place` and `see`, of the suspect as it is.
+            JaxmarkError: see `place` and `see`, for the suspect as it is.
         """
         dtype = jnp.result_type(float)
         for steps in _UNDONE_STEPS:
             try:
-                placed = place(unsmoothed(suspect, steps))
-                views = see(placed.mesh, self.widths, dtype)
+                placement = place(unsmoothed(suspect, steps))
+                views = see(placement.mesh, self.widths, dtype)
             except JaxmarkError:
                 if steps == 0:
                     raise
-                continue  # it was noise, not smoothing, and is too rough now to be looked at
+                continue  # the suspect has noise and was not smoothed, and is too rough now for this view
             for width, (_, surface, anchors) in views.items():
                 for blur in _BLURS if steps == 0 else _BLURS[:1]:
-                    found = changes(surface, anchors, jnp.asarray(width, dtype), jnp.asarray(blur, dtype))
-                    at = jnp.asarray(anchors.places, dtype)
-                    by = jnp.concatenate([jnp.cross(at, found.slope), found.slope, found.growth[:, None]], axis=1)
+                    view = changes(surface, anchors, jnp.asarray(width, dtype), jnp.asarray(blur, dtype))
+                    positions = jnp.asarray(anchors.places, dtype)
+                    by_pose = jnp.concatenate(
+                        [jnp.cross(positions, view.slope), view.slope, view.growth[:, None]],
+                        axis=1,
+                    )
                     yield Look(
                         anchors.cells * TURNS[:, None],
-                        found.shown.values,
-                        np.asarray(found.shown.good),
-                        by,
+                        view.shown.values,
+                        np.asarray(view.shown.good),
+                        by_pose,
                         _SPREAD,
                         width,
-                        placed.pose,
+                        placement.pose,
                         steps,
                         TURNS.prod(axis=1) < 0,
                     )
@@ -126,40 +129,40 @@ class FieldScheme(BlindScheme):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Shape:
-    """What the values of a mesh are computed from, but its vertices; a pytree."""
+    """A mesh prepared for measuring the values of its anchors as a function of its vertices; a pytree."""
 
-    matrix: Float[Array, "3 3"]  # to the mesh's own pose
+    matrix: Float[Array, "3 3"]  # linear part of the map to the mesh's own pose
     shift: Float[Array, " 3"]
     faces: Int[Array | np.ndarray, "faces 3"]
     pieces: Pieces
     anchors: Anchors
-    width: Float[Array, ""]  # of the narrow Gaussian
+    width: Float[Array, ""]  # width of the narrow Gaussian
     closed: bool = field(metadata={"static": True})  # whether the mesh encloses a volume
 
     def measure(self, vertices: Float[Array, "rows 3"]) -> tuple[Float[Array, " anchors"], Float[Array, " nine"]]:
-        """Values of the anchors, and the centre and covariance of the mesh, in its own pose as it was."""
+        """Measure the anchors' values, and the centre and covariance of the mesh in its original pose."""
         placed = matmul(vertices, self.matrix.T) + self.shift
-        nowhere = jnp.zeros(self.anchors.places.shape, vertices.dtype)
-        values = look(self.pieces.of(placed), self.anchors, nowhere, self.width, jnp.zeros_like(self.width)).values
-        found: Moments = (volume_moments if self.closed else surface_moments)(placed[self.faces])
+        no_shift = jnp.zeros(self.anchors.places.shape, vertices.dtype)
+        values = look(self.pieces.of(placed), self.anchors, no_shift, self.width, jnp.zeros_like(self.width)).values
+        moments: Moments = (volume_moments if self.closed else surface_moments)(placed[self.faces])
         upper = jnp.triu_indices(3)
-        return values, jnp.concatenate([found.centre, found.covariance[upper]])
+        return values, jnp.concatenate([moments.centre, moments.covariance[upper]])
 
 
 def _inverse_areas(original: Original) -> Float[Array, " rows"]:
-    """The inverse of the area around each point, relative to the mean."""
+    """Compute the inverse of the area around each point, relative to the mean."""
     points, faces = original.positions, np.asarray(original.points.faces)
     a, b, c = (points[faces[:, corner]] for corner in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    around = np.bincount(faces.ravel(), np.repeat(area, 3), len(points))
-    mean = around[original.used].mean()
-    return original.to_traced(np.where(original.used, mean / np.maximum(around, _LEAST_AREA * mean), 0))
+    areas = np.bincount(faces.ravel(), np.repeat(area, 3), len(points))
+    mean = areas[original.used].mean()
+    return original.to_traced(np.where(original.used, mean / np.maximum(areas, _LEAST_AREA * mean), 0))
 
 
 def _smoothing(original: Original, width: float) -> Float64[np.ndarray, " terms"]:
-    """The series of diffusion by a share of a width, by which pieces of the surface do not show in displacements.
+    """Compute the series of a diffusion by a share of the width, which hides the surface's pieces in displacements.
 
-    Diffusion exp(-tΔ) takes a step along an edge t times on average: a point goes √(t/2) edges along each direction.
+    Diffusion exp(-tΔ) takes t steps along edges on average, which moves a point by √(t/2) edges along each direction.
     """
     ends = original.positions[edges(np.asarray(original.points.faces))]
     edge = float(np.median(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)))
@@ -168,21 +171,21 @@ def _smoothing(original: Original, width: float) -> Float64[np.ndarray, " terms"
 
 
 def unsmoothed(mesh: Mesh, steps: int) -> Mesh:
-    """Undo steps of smoothing as far as it goes: with one step s(λ) = 1 - λ/10, filter by (1 - (1 - s^n)^9)/s^n.
+    """Undo smoothing steps as far as possible: filter by (1 - (1 - s^n)^9)/s^n, where s(λ) = 1 - λ/10 is one step.
 
-    That is what eight rounds of x ← x + (y - s^n x) give for the smoothed y. It enlarges nothing more than nine times.
+    The filter is equivalent to eight iterations of x ← x + (y - s^n x) for the smoothed mesh y. Its gain is at most 9.
     """
     if steps == 0:
         return mesh
 
     def gain(place: np.ndarray) -> np.ndarray:
-        left = (1 - _STEP_SIZE * (place + 1)) ** steps
-        return (1 - (1 - left) ** (_REFINEMENTS + 1)) / left
+        remaining = (1 - _STEP_SIZE * (place + 1)) ** steps
+        return (1 - (1 - remaining) ** (_REFINEMENTS + 1)) / remaining
 
     places = np.cos(np.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1))
     series = np.polynomial.chebyshev.chebfit(places, gain(places), _DEGREE)
     operator = common_laplacian(mesh)
-    middle = np.asarray(mesh.vertices).mean(axis=0)
-    rows = jnp.asarray(pad_rows(np.asarray(mesh.vertices) - middle, len(operator.degree)), jnp.result_type(float))
-    found = np.asarray(filter(operator, series, rows), np.float64)[: len(mesh.vertices)]
-    return Mesh(found + middle, mesh.faces)
+    centre = np.asarray(mesh.vertices).mean(axis=0)
+    rows = jnp.asarray(pad_rows(np.asarray(mesh.vertices) - centre, len(operator.degree)), jnp.result_type(float))
+    filtered = np.asarray(filter(operator, series, rows), np.float64)[: len(mesh.vertices)]
+    return Mesh(filtered + centre, mesh.faces)

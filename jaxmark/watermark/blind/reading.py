@@ -1,14 +1,14 @@
-"""Phases without the original, and what it proves.
+"""Reading of phases without the original, and the bound on the probability of a score.
 
-**The bound.** An anchor's phase is its value over the step, less its offset δ; c is the cosine of a whole turn of it.
-With the key's sign (-1)^b, of another subkey, and the code bit a of the anchor's slot, the score is S = Σ a (-1)^b c.
-Whatever is chosen by the suspect and the offsets (the pose, the step, which anchors count) knows nothing of the signs:
-given all of it, S is a sum of independent signs times c, and P(S ≥ t) ≤ exp(-t²/(2 Σ c²)) (Hoeffding 1963). The
-denominator is that of the pose at hand: a search that makes all c² large pays for it there. Readings whose scores are
-compared are paid for one by one, whether they were looked at or not.
+**The bound.** The phase of an anchor is its value divided by the quantisation step, minus its offset δ; c is the cosine
+of 2π times the phase. With the key's sign (-1)^b, from another subkey, and the code bit a of the anchor's slot, the
+score is S = Σ a (-1)^b c. Everything that depends only on the suspect and the offsets is independent of the signs: the
+pose, the step, and the choice of anchors. Given these, S is a sum of independent signs times c, and
+P(S ≥ t) ≤ exp(-t²/(2 Σ c²)) (Hoeffding 1963). The denominator is that of the chosen pose, so that a search which makes
+all c² large also increases it. Each reading whose score is compared is charged, whether it was made or not.
 
-That holds for any suspect independent of the key. Every work that was marked under the key is not: there is no hash of
-a geometry in the key's choices, as their reader has no original.
+The bound holds for any suspect that is independent of the key. A work that was marked under the same key is not
+independent of it, because the keyed choices do not depend on the geometry: their reader has no original.
 """
 
 import math
@@ -34,38 +34,38 @@ from jaxmark.watermark.evidence.ledger import Choice
 from jaxmark.watermark.record import Record, is_recorded
 
 TAG_BITS = 40
-_CODE_SPREAD = 4  # code bits for each bit of message and tag, at least: of few anchors, few share one then
-_CHANGES = 2  # changes of pose that are read: none, and the best by the offsets
-_CANDIDATES = 32  # messages of each reading whose tags are tried
-# log10 of a probability from which on no other way of looking is tried, where a message reads and where none does.
+_CODE_SPREAD = 4  # least number of code bits per bit of message and tag: few anchors then share a code bit
+_CHANGES = 2  # changes of pose that are read: none, and the one that fits the offsets best
+_CANDIDATES = 32  # number of candidate messages of each reading whose tags are compared
+# log10 p from which on no other view is tried, with and without a decoded message.
 _SURE, _SURE_UNREAD = -12.0, -40.0
 
 
 class Phases(NamedTuple):
-    """The phases of anchors in one way of reading a suspect: a view, a turn, a step and a change of pose."""
+    """The phases of anchors in one reading: with a view, a turn, a quantisation step and a change of pose."""
 
     view: Look
     turn: int
     step: float
-    pilot: float  # how well the offsets fit, see `Found`
-    soft: Float64[np.ndarray, " code"]  # soft values of the code bits
+    pilot: float  # fit of the offsets, see `Found`
+    soft: Float64[np.ndarray, " code"]  # soft decisions of the code bits
     square: float  # Σ c²
-    anchors: int  # that count
+    anchors: int  # number of anchors that count
 
     @property
     def anchored(self) -> "Anchored":
-        """Where it is read."""
+        """The registration of this reading."""
         return Anchored(self.view.pose, self.view.width, self.step, self.anchors)
 
 
 class Anchored(NamedTuple):
-    """Where a blind reading found its anchors: the `Registration` of a blind detection."""
+    """The registration of a blind reading, which is a `Registration`: its pose and anchors."""
 
-    pose: Pose  # from the suspect's file to where it was read
-    width: float = 0.0  # of the averages, in the scheme's unit
+    pose: Pose  # the map from the coordinates of the suspect's file to those in which it was read
+    width: float = 0.0  # width of the averages, in the scheme's unit
     step: float = 0.0  # quantisation step of the values, in the scheme's unit
     anchors: int = 0  # number of values that were read
-    agreement: float = 0.0  # mean cosine of their phases, 1 if all are exactly where the mark put them
+    agreement: float = 0.0  # mean cosine of their phases; 1 if all have exactly the values of the mark
 
     def facts(self) -> dict[str, Any]:
         """See `Registration`."""
@@ -73,13 +73,13 @@ class Anchored(NamedTuple):
 
 
 def context(key: bytes, bits: int, scheme: str) -> Choices:
-    """The keyed choices of a mark: they are bound to no original, as its reader has none."""
+    """Derive the keyed choices of a mark, which are bound to no original, because the reader has none."""
     content = "message" if bits else "presence"
     return bind(key, b"", {"scheme": scheme, "content": content, "bits": bits})
 
 
 def code_length(bits: int) -> int:
-    """Number of code bits for a payload: the least power of two that is four times as long as message and tag.
+    """Compute the number of code bits for a payload: the least power of two of at least four times message and tag.
 
     Raises:
         JaxmarkError: if the payload is not a multiple of 8 bits, or negative.
@@ -90,12 +90,12 @@ def code_length(bits: int) -> int:
 
 
 def codeword(message: bytes, choices: Choices) -> Float64[np.ndarray, " code"]:
-    """The code bits of a message and its keyed tag, each -1 or +1."""
+    """Encode a message and its keyed tag as code bits, each -1 or +1."""
     return encode(message, choices, code_length(8 * len(message)), TAG_BITS)
 
 
 def register(suspect: Mesh) -> Mesh:
-    """Weld a suspect and drop what no face uses, as `read` expects it; independent of the key.
+    """Weld a suspect and drop vertices that no face uses, as `read` expects it; independent of the key.
 
     Raises:
         JaxmarkError: if it is a point cloud.
@@ -118,9 +118,9 @@ def read(
         suspect: from `register`.
         key: 32 bytes.
         bits: size of the payload in bits.
-        scheme: the widths and steps to try.
-        message: the message that is claimed to be in it; None to read without a claim.
-        record: the record of the mark, which was checked; it fixes the message, if it commits to one.
+        scheme: the scheme, with the widths and steps to try.
+        message: the claimed message; None to read without a claim.
+        record: the record of the mark, which was checked. If it commits to a message, this message is fixed.
 
     Raises:
         JaxmarkError: if the suspect has no extent.
@@ -129,65 +129,71 @@ def read(
     claim = _Claim(choices, bits, b"" if message is None and not bits else message, record)
     looks = len(scheme.widths) * scheme.looks * len(scheme.steps) * _CHANGES
     best = _nothing(scheme, np.zeros(length), Anchored(Pose(np.eye(3), np.zeros(3))))
-    before = 0  # messages whose tags were tried already
+    tags_compared = 0  # number of messages whose tags were already compared
     for _, group in groupby(scheme.views(suspect, choices), key=lambda view: view.undone):
-        readings = [one for view in group for one in _readings(view, scheme, choices, length)]
+        readings = [reading for view in group for reading in _readings(view, scheme, choices, length)]
         if not readings:
             continue
-        found = _weigh(readings, scheme, claim, looks, before)
-        before += len(readings) * _CANDIDATES
-        best = min(best, found, key=lambda one: (one.message is None, one.log10_p, -one.registration.anchors))
+        detection = _weigh(readings, scheme, claim, looks, tags_compared)
+        tags_compared += len(readings) * _CANDIDATES
+        best = min(
+            best,
+            detection,
+            key=lambda found: (found.message is None, found.log10_p, -found.registration.anchors),
+        )
         if is_sure(best):
             break
     return best
 
 
 def try_each(reads: Iterable[Callable[[], Detection]]) -> Iterator[Detection]:
-    """Read in several ways. One that refuses proves nothing: else who adds a part that is refused would hide a mark.
+    """Read in several ways, and skip those that raise an error.
+
+    An error is no evidence: otherwise an adversary could hide a mark by adding a part that cannot be read.
 
     Raises:
-        JaxmarkError: if all refuse.
+        JaxmarkError: if all readings raise it.
     """
-    refusals, refused = [], True
-    for read in reads:
+    refusals, is_refused = [], True
+    for attempt in reads:
         try:
-            found = read()
+            detection = attempt()
         except JaxmarkError as refusal:
             refusals.append(refusal)
             continue
-        refused = False
-        yield found
-    if refused and refusals:
+        is_refused = False
+        yield detection
+    if is_refused and refusals:
         raise refusals[0]
 
 
 def best_of(found: Sequence[Detection], choice: Choice, tries: int) -> Detection:
-    """Return the detection whose message reads, and then the one that proves most, after a choice among `tries`."""
-    best = min(found, key=lambda one: (one.message is None, one.log10_p))
+    """Return the best detection, those with a message first, after a charge for the choice among `tries`."""
+    best = min(found, key=lambda detection: (detection.message is None, detection.log10_p))
     return best._replace(evidence=best.evidence.charged(choice.charge("each", tries)))
 
 
 def is_sure(found: Detection) -> bool:
-    """Whether so much is proven that nothing else needs to be tried."""
+    """Whether the evidence is so strong that nothing else needs to be tried."""
     return found.log10_p <= (_SURE if found.message is not None else _SURE_UNREAD)
 
 
 def _readings(view: Look, scheme: BlindScheme, choices: Choices, length: int) -> list[Phases]:
-    """All ways of reading a view.
+    """Read a view in all ways.
 
-    Anchors of one name have one sign: the mean of their cosines is one term of the score.
+    Anchors of one name have one sign, so that the mean of their cosines is one term of the score.
     """
-    good = np.flatnonzero(view.good)
-    if not len(good):
+    counted = np.flatnonzero(view.good)
+    if not len(counted):
         return []
     dtype, steps = view.values.dtype, np.asarray(scheme.steps)
-    offsets, lists = np.zeros(view.names.shape[:2]), []
+    offsets, choices_per_turn = np.zeros(view.names.shape[:2]), []
     for turn, names in enumerate(view.names):
-        names, place = np.unique(names[good], axis=0, return_inverse=True)
+        names, group = np.unique(names[counted], axis=0, return_inverse=True)
         dither = make_dither(choices, scheme.name, names, length)
-        offsets[turn, good] = dither.offset[place.ravel()]
-        lists.append((dither, place.ravel()))
-    found = search(
+        offsets[turn, counted] = dither.offset[group.ravel()]
+        choices_per_turn.append((dither, group.ravel()))
+    fit = search(
         view.values,
         view.changes,
         jnp.asarray(view.good, dtype),
@@ -195,31 +201,31 @@ def _readings(view: Look, scheme: BlindScheme, choices: Choices, length: int) ->
         jnp.asarray(steps, dtype),
         jnp.asarray(view.spread, dtype),
     )
-    changes, pilots = np.asarray(found.change, np.float64), np.asarray(found.pilot, np.float64)
+    changes, pilots = np.asarray(fit.change, np.float64), np.asarray(fit.pilot, np.float64)
     readings = []
-    for turn, (dither, place) in enumerate(lists):
+    for turn, (dither, group) in enumerate(choices_per_turn):
         for rung, step in enumerate(steps):
             for change, pilot in ((np.zeros(len(view.spread)), 0.0), (changes[turn, rung], float(pilots[turn, rung]))):
-                cosines = np.cos(2 * np.pi * (moved(view, change)[good] / step - offsets[turn, good]))
-                cosine = np.bincount(place, cosines) / np.bincount(place)
+                cosines = np.cos(2 * np.pi * (moved(view, change)[counted] / step - offsets[turn, counted]))
+                cosine = np.bincount(group, cosines) / np.bincount(group)
                 soft = np.bincount(dither.slot, dither.sign * cosine, length)
                 readings.append(Phases(view, turn, float(step), pilot, soft, float(cosine @ cosine), len(cosine)))
     return readings
 
 
 class _Claim(NamedTuple):
-    """What is looked for."""
+    """The mark that is looked for, and the claim."""
 
     choices: Choices
     bits: int  # size of the payload
-    message: bytes | None  # that is claimed
+    message: bytes | None  # the claimed message
     record: Record | None
 
 
 def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks: int, before: int) -> Detection:
-    """Weigh readings, of so many that might have been tried, after the tags of so many messages were tried."""
-    readings = sorted(readings, key=lambda one: -one.pilot)
-    soft = np.stack([one.soft for one in readings])
+    """Compute the evidence of readings, among `looks` possible ones, after `before` tags were compared."""
+    readings = sorted(readings, key=lambda reading: -reading.pilot)
+    soft = np.stack([reading.soft for reading in readings])
     choices, bits, claimed, record = claim
     decoded = None if claimed == b"" else decode_any(soft, bits, choices, TAG_BITS, _CANDIDATES)
     recorded = record is not None and bool(record.message_commitment)
@@ -232,8 +238,8 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
     if message is None:
         message = decoded.message if decoded is not None else b""
     word = codeword(message, choices)
-    # Readings are compared by what their scores prove.
-    score, norm = soft @ word, np.sqrt([one.square for one in readings])
+    # Readings are compared by the evidence of their scores.
+    score, norm = soft @ word, np.sqrt([reading.square for reading in readings])
     chosen = int(np.argmax(np.maximum(score, 0) / np.maximum(norm, 1e-300)))
     charges = ()
     if claimed or recorded:
@@ -245,11 +251,13 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
     reading = readings[chosen]
     notes = []
     if not fixed and (claimed or recorded):
-        notes.append(f"Another message of this key reads than the one {'claimed' if claimed else 'in the record'}.")
+        notes.append(
+            f"Another message of this key was decoded than the one {'claimed' if claimed else 'in the record'}."
+        )
     if reading.view.undone:
-        notes.append(f"It was read after {reading.view.undone} steps of smoothing were undone.")
+        notes.append(f"The suspect was read after undoing {reading.view.undone} steps of smoothing.")
     if reading.view.mirrored[reading.turn]:
-        notes.append("It is the mirror image of what was marked.")
+        notes.append("The suspect is the mirror image of the marked mesh.")
     agreement = float(score[chosen] / reading.anchors)
     return _nothing(scheme, reading.soft, reading.anchored._replace(agreement=agreement))._replace(
         message=None if decoded is None else decoded.message,
@@ -259,6 +267,6 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
 
 
 def _nothing(scheme: BlindScheme, soft: Float64[np.ndarray, " code"], anchored: Anchored) -> Detection:
-    """Make a detection that proves nothing."""
+    """Make a detection without evidence."""
     scores = soft / (np.sqrt(np.mean(soft**2)) or 1.0)
     return Detection(None, Evidence(), anchored, scores, None, scheme.name, premises="key, message and record")

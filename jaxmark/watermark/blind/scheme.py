@@ -1,4 +1,8 @@
-"""What a blind scheme is: what it shows of an original to write in, and of a suspect to read."""
+"""The interface of blind schemes: the anchors of an original to write in, and the views of a suspect to read.
+
+An *anchor* is a place on the surface that a reader finds again without the original. A *value* is measured at each
+anchor, and the mark changes the values. Keyed choices depend on the anchor's *name*. See `docs/blind.md`.
+"""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -16,10 +20,10 @@ from jaxmark.watermark.coding.keys import Choices
 
 @runtime_checkable
 class Measured(Protocol):
-    """What values are computed from, but the vertices; a pytree."""
+    """A mesh prepared for measuring the values of its anchors as a function of its vertices; a pytree."""
 
     def measure(self, vertices: Float[Array, "rows 3"]) -> tuple[Float[Array, " anchors"], Float[Array, " held"]]:
-        """The anchors' values, and what a mark must leave as it is."""
+        """Measure the anchors' values, and the quantities that a mark must not change."""
         ...
 
 
@@ -32,68 +36,71 @@ def measure(
 
 
 class AnchoredHost(NamedTuple):
-    """An original as its anchors of one width show it."""
+    """The anchors of an original for one width, with their values."""
 
     shape: Measured
-    names: Int64[np.ndarray, "anchors parts"]  # what the key's choices of each anchor depend on
+    names: Int64[np.ndarray, "anchors parts"]  # the names of anchors, from which their keyed choices are derived
     values: Float64[np.ndarray, " anchors"]
-    held: Float[Array, " held"]  # what a mark leaves as it is
+    held: Float[Array, " held"]  # quantities that a mark does not change
     good: Float64[np.ndarray, " anchors"]  # 1 for each anchor that is written, else 0
-    free: Float[Array, " rows"]  # how far each vertex moves for its part in a value
-    smoothing: Float64[np.ndarray, " terms"]  # Chebyshev series of the filter that displacements go through
-    step: float  # of the lattice of values, which is tried first
+    free: Float[Array, " rows"]  # weight of each vertex's displacement for its contribution to a value
+    smoothing: Float64[np.ndarray, " terms"]  # Chebyshev series of the filter for displacements
+    step: float  # the quantisation step that is tried first
 
     @property
     def size(self) -> int:
-        """Number of anchors that are written; those of one name count once."""
+        """The number of anchors that are written; anchors of the same name count once."""
         return len(np.unique(self.names[self.good > 0], axis=0))
 
 
 class Look(NamedTuple):
-    """One way of looking at a suspect; independent of the key's signs."""
+    """A view of a suspect: its anchors and their values; independent of the key's signs.
 
-    names: Int64[np.ndarray, "turns anchors parts"]  # of the anchors, for each way in which the suspect may lie
+    A view is read in several turns, which are half turns and reflections about the axes of its pose.
+    """
+
+    names: Int64[np.ndarray, "turns anchors parts"]  # the names of the anchors in each turn
     values: Float[Array, " anchors"]
     good: Bool[np.ndarray, " anchors"]  # whether an anchor counts; padding does not
-    changes: Float[Array, "anchors changes"]  # of the values, as the suspect lies a little otherwise
-    spread: tuple[float, ...]  # how large such changes are
-    width: float  # of the averages
-    pose: Pose  # from the suspect's file to where it was looked at
-    undone: int  # steps of smoothing that were undone
-    mirrored: Bool[np.ndarray, " turns"]  # whether it is then the mirror image of what was marked
+    changes: Float[Array, "anchors changes"]  # derivatives of the values with respect to small changes of the pose
+    spread: tuple[float, ...]  # standard deviations of such changes
+    width: float  # width of the averages
+    pose: Pose  # the map from the coordinates of the suspect's file to those of the view
+    undone: int  # number of smoothing steps that were undone
+    mirrored: Bool[np.ndarray, " turns"]  # whether the suspect is a mirror image in this turn
 
 
 @runtime_checkable
 class BlindScheme(Protocol):
-    """A frozen dataclass of public ladders: whoever reads without a record tries all of them.
+    """A blind scheme: a frozen dataclass with public lists of widths and quantisation steps.
 
-    A scheme inherits from this class.
+    Readers without a record try all widths and steps. A scheme inherits from this class.
     """
 
-    name: ClassVar[str]  # in records and on the command line
-    in_parts: ClassVar[bool]  # whether a part of the shape is read as the whole is
-    looks: ClassVar[int]  # number of ways of looking at a suspect with one width, and of its lying there
+    name: ClassVar[str]  # the scheme's name in records and on the command line
+    in_parts: ClassVar[bool]  # whether a part of the shape can be read alone
+    looks: ClassVar[int]  # number of views of a suspect with one width, times the number of turns
     __dataclass_fields__: ClassVar[dict[str, Any]]
-    widths: tuple[float, ...]  # of the averages that values are differences of
-    steps: tuple[float, ...]  # of the lattice that values are written to
-    hiding: bool  # whether points move where and as it is hidden; see `jaxmark.watermark.perception.masking`
+    widths: tuple[float, ...]  # widths of the averages whose differences are the values
+    steps: tuple[float, ...]  # quantisation steps of the values
+    hiding: bool  # whether displacements are masked perceptually; see `jaxmark.watermark.perception.masking`
 
     def fixed(self, width: float, step: float) -> "BlindScheme":
         """Return the scheme with one width and step."""
         return replace(self, widths=(width,), steps=(step,))
 
     def hosts(self, original: Original, choices: Choices) -> dict[float, AnchoredHost]:
-        """Look at an original by anchors of each width; all have arrays of the same shapes."""
+        """Find the anchors of an original for each width; their arrays have the same shapes for all widths."""
         ...
 
     def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:
-        """Look at a suspect in all ways, the likeliest first.
+        """Iterate over all views of a suspect, the likeliest first.
 
         Args:
             suspect: from `jaxmark.watermark.blind.reading.register`.
             choices: the keyed choices of the mark.
 
         Raises:
-            JaxmarkError: if it cannot be looked at.
+            JaxmarkError: if the suspect has no views.
         """
         ...

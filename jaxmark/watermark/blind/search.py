@@ -1,7 +1,7 @@
-"""Small changes of a suspect's values, as by its pose, that the key's offsets speak for.
+"""The search for small changes of a suspect's values, for example by its pose, that fit the key's offsets.
 
-What a suspect shows is nearly what was marked: the search for the rest is by the key's offsets, which say nothing of
-what is claimed (see `jaxmark.watermark.blind.dither`).
+A view of a suspect is nearly the same as that of the marked mesh. The remaining change is found from the key's offsets,
+which are independent of the claimed message (see `jaxmark.watermark.blind.dither`).
 """
 
 from typing import NamedTuple
@@ -14,14 +14,14 @@ from jaxtyping import Array, Float, Float64
 from jaxmark.spectral.precision import matmul
 from jaxmark.watermark.blind.scheme import Look
 
-_STARTS, _CLIMBS, _STEPS = 256, 4, 6  # random changes; how many climb, and how far
+_STARTS, _CLIMBS, _STEPS = 256, 4, 6  # random changes; how many of them are refined, and by how many steps
 
 
 class Found(NamedTuple):
-    """The best small change for each turn and step, by the key's offsets."""
+    """The small change for each turn and step that fits the key's offsets best."""
 
     change: Float[Array, "turns steps changes"]
-    pilot: Float[Array, "turns steps"]  # how well the offsets fit, in standard deviations of what chance gives
+    pilot: Float[Array, "turns steps"]  # fit of the offsets, in standard deviations of the fit by chance
 
 
 @jax.jit
@@ -33,17 +33,17 @@ def search(
     steps: Float[Array, " steps"],
     spread: Float[Array, " changes"],
 ) -> Found:
-    """Find small changes by which values lie half a step apart as the offsets say: largest Σ cos 4π(y/step - δ).
+    """Find the small changes for which values fit the offsets best, modulo half a step: max Σ cos 4π(y/step - δ).
 
-    Random changes are tried; the best climb by steps of Gauss and Newton.
+    Random changes are tried, and the best ones are refined by Gauss-Newton steps.
 
     Args:
-        values: of a view.
-        changes: of its values, in the order of `Look`.
+        values: the values y of a view.
+        changes: derivatives of the values with respect to small changes, see `Look`.
         good: 1 for each anchor that counts, else 0.
         offsets: δ of each anchor, for each turn.
-        steps: of the lattice of values.
-        spread: of small changes.
+        steps: quantisation steps of the values.
+        spread: standard deviations of the small changes.
     """
     starts = jnp.asarray(np.random.default_rng(0).normal(size=(_STARTS, len(spread))), values.dtype).at[0].set(0)
     scaled = changes * spread
@@ -51,28 +51,28 @@ def search(
     def fit(step: Float[Array, ""], offset: Float[Array, " anchors"]) -> tuple[Array, Array]:
         base, slope = values / step - offset, scaled / step * good[:, None]
 
-        def pilot(change: Float[Array, "tried changes"]) -> Float[Array, " tried"]:
+        def pilot(change: Float[Array, "batch changes"]) -> Float[Array, " batch"]:
             return jnp.cos(4 * jnp.pi * (base + matmul(change, slope.T))) @ good
 
-        def climb(change: Float[Array, "tried changes"], _: None) -> tuple[Float[Array, "tried changes"], None]:
+        def refine(change: Float[Array, "batch changes"], _: None) -> tuple[Float[Array, "batch changes"], None]:
             phase = base + matmul(change, slope.T)
-            off = phase - jnp.round(2 * phase) / 2
-            weight = good * jnp.maximum(jnp.cos(4 * jnp.pi * off), 0)
+            residual = phase - jnp.round(2 * phase) / 2
+            weight = good * jnp.maximum(jnp.cos(4 * jnp.pi * residual), 0)
             gram = jnp.einsum("ac,ta,ad->tcd", slope, weight, slope) + jnp.eye(len(spread), dtype=values.dtype)
-            towards = jnp.einsum("ac,ta->tc", slope, weight * off)
-            return change - jnp.linalg.solve(gram, towards[..., None])[..., 0], None
+            gradient = jnp.einsum("ac,ta->tc", slope, weight * residual)
+            return change - jnp.linalg.solve(gram, gradient[..., None])[..., 0], None
 
         best = starts[jax.lax.top_k(pilot(starts), _CLIMBS)[1]]
-        best = jnp.concatenate([starts[:1], best, jax.lax.scan(climb, best, None, length=_STEPS)[0]])
-        # Large changes are unlikely, and among many some fit by chance.
-        worth = pilot(best) / jnp.sqrt(jnp.maximum(good.sum(), 1) / 2)
-        chosen = jnp.argmax(worth - jnp.sum(best**2, axis=1) / 8)
-        return best[chosen] * spread, worth[chosen]
+        best = jnp.concatenate([starts[:1], best, jax.lax.scan(refine, best, None, length=_STEPS)[0]])
+        # Large changes are unlikely, and some of many changes fit by chance.
+        fit_score = pilot(best) / jnp.sqrt(jnp.maximum(good.sum(), 1) / 2)
+        chosen = jnp.argmax(fit_score - jnp.sum(best**2, axis=1) / 8)
+        return best[chosen] * spread, fit_score[chosen]
 
     change, pilot = jax.lax.map(lambda step: jax.vmap(lambda offset: fit(step, offset))(offsets), steps)
     return Found(jnp.swapaxes(change, 0, 1), pilot.T)
 
 
 def moved(view: Look, change: Float64[np.ndarray, " changes"]) -> Float64[np.ndarray, " anchors"]:
-    """Values of a view after a small change."""
+    """Compute the values of a view after a small change."""
     return np.asarray(view.values, np.float64) + np.asarray(view.changes, np.float64) @ change

@@ -1,8 +1,9 @@
-"""The least displacement that gives anchors their values, as far as a budget allows.
+"""Writing of blind marks: the least displacement that gives anchors their values, as far as a budget allows.
 
-Each anchor's value is brought to a lattice of numbers that its keyed dither and its code bit shift (dither modulation:
-Chen, Wornell, "Quantization index modulation", IEEE Trans. Inf. Theory 47, 2001, with distortion compensation: only a
-part of the way). The host itself is no noise then, so the original is not needed for reading.
+Each anchor's value is moved towards a lattice of numbers, which is shifted by its keyed dither and its code bit. This
+is dither modulation with distortion compensation: values go only a fraction α of the way (Chen, Wornell, "Quantization
+index modulation", IEEE Trans. Inf. Theory 47, 2001). The host then causes no noise, so that the original is not needed
+for reading.
 """
 
 import math
@@ -32,14 +33,14 @@ from jaxmark.watermark.perception.budget import Bounds, displace_within
 from jaxmark.watermark.perception.capacity import NOISE, Survival
 from jaxmark.watermark.perception.masking import apply_mask, masking_directions
 
-_RIDGE = 3e-3  # of the mean square of a row: values that contradict each other are met halfway
-_HELD_RIDGE = 1e-4  # of the rows of what is held, which are scaled to the others' size
-_STEPS, _TOLERANCE = 60, 1e-2  # of conjugate gradients
-_LEAST_ALPHA = 0.6  # part of the way to the lattice that is gone at least; up to √2 of it, as steps are so far apart
-_ROUNDS = 2  # of Gauss and Newton
-_ENOUGH = 0.9  # share of the limits that is enough to choose a width and a step by
-_SURE, _READS = 3.0, 1.0  # standard deviations by which a payload should read, and by which it is said to
-_CODE_GAP = 1.12  # half a decibel: from 180 values, 152 bits read, and 160 do not
+_RIDGE = 3e-3  # relative to the mean square of a row; values that contradict each other are met halfway
+_HELD_RIDGE = 1e-4  # the same for the held quantities, whose rows are scaled to the size of the others
+_STEPS, _TOLERANCE = 60, 1e-2  # of the conjugate gradients
+_LEAST_ALPHA = 0.6  # least fraction α of the way to the lattice; steps differ by √2, so α is at most √2 times this
+_ROUNDS = 2  # number of Gauss-Newton steps
+_ENOUGH = 0.9  # share of the limits that must be reached for choosing a width and a step
+_SURE, _READS = 3.0, 1.0  # margins in standard deviations: for choosing a payload, and for predicting that it is read
+_CODE_GAP = 1.12  # half a decibel: of 180 values, 152 bits were decoded, and 160 were not
 
 
 @jax.jit
@@ -54,77 +55,77 @@ def improve(
     targets: tuple[Float[Array, " anchors"], Float[Array, " held"]],
     counted: Float[Array, " anchors"],
 ) -> Float[Array, "rows 3"]:
-    """One step of Gauss and Newton towards the least displacement whose values are `targets`.
+    """Take one Gauss-Newton step towards the least displacement with the values `targets`.
 
     Args:
-        shape: of the mesh.
-        vertices: its vertices where they were.
-        moved: their displacement so far.
+        shape: the mesh, prepared for measuring values.
+        vertices: its original vertices.
+        moved: their present displacement.
         operator: the mesh's Laplacian.
-        smoothing: Chebyshev series of the filter that displacements go through, see `filter`.
-        free: how far each vertex moves for its part in a value: the inverse of its area.
-        mask: of displacements, see `apply_mask`.
-        targets: the values, and what is held, to reach.
+        smoothing: Chebyshev series of the filter for displacements, see `filter`.
+        free: weight of each vertex's displacement for its contribution to a value: the inverse of its area.
+        mask: mask of displacements, see `apply_mask`.
+        targets: the values and held quantities to reach.
         counted: 1 for each anchor whose value is to be reached, else 0.
     """
     (values, held), push = jax.linearize(shape.measure, vertices + moved)
     pull = jax.linear_transpose(push, vertices)
 
-    def rows(of: tuple[Float[Array, " anchors"], Float[Array, " held"]]) -> Float[Array, "rows 3"]:
-        (back,) = pull((counted * of[0], of[1]))
-        wanted = free[:, None] * transpose(operator, smoothing, apply_mask(mask, back))
+    def adjoint(dual: tuple[Float[Array, " anchors"], Float[Array, " held"]]) -> Float[Array, "rows 3"]:
+        (pulled,) = pull((counted * dual[0], dual[1]))
+        wanted = free[:, None] * transpose(operator, smoothing, apply_mask(mask, pulled))
         return apply_mask(mask, filter(operator, smoothing, wanted))
 
-    # Rows of what is held are made as long as the others are on average, by which conjugate gradients converge soon.
+    # Rows of held quantities are scaled to the mean length of the others, so that conjugate gradients converge fast.
     signs = jnp.where(jnp.arange(len(values)) * 7919 % 13 % 2 == 0, 1.0, -1.0).astype(values.dtype)
     firsts = jnp.zeros((1 + len(held), len(values)), values.dtype).at[0].set(counted * signs)
     seconds = jnp.eye(1 + len(held), dtype=values.dtype)[:, 1:]
-    squares = jax.lax.map(lambda of: sum(map(jnp.vdot, of, push(rows(of)))), (firsts, seconds))
+    squares = jax.lax.map(lambda dual: sum(map(jnp.vdot, dual, push(adjoint(dual)))), (firsts, seconds))
     energy = squares[0] / counted.sum()
     factor = jnp.sqrt(energy / squares[1:])
 
-    def gram(of: tuple[Float[Array, " anchors"], Float[Array, " held"]]) -> tuple[Array, Array]:
-        there = push(rows((of[0], factor * of[1])))
-        return counted * there[0] + _RIDGE * energy * of[0], factor * there[1] + _HELD_RIDGE * energy * of[1]
+    def gram(dual: tuple[Float[Array, " anchors"], Float[Array, " held"]]) -> tuple[Array, Array]:
+        products = push(adjoint((dual[0], factor * dual[1])))
+        return counted * products[0] + _RIDGE * energy * dual[0], factor * products[1] + _HELD_RIDGE * energy * dual[1]
 
-    before = push(moved)
-    wanted = (counted * (targets[0] - values + before[0]), factor * (targets[1] - held + before[1]))
-    found, _ = cg(gram, wanted, tol=_TOLERANCE, maxiter=_STEPS)
-    return rows((found[0], factor * found[1]))
+    linear = push(moved)
+    wanted = (counted * (targets[0] - values + linear[0]), factor * (targets[1] - held + linear[1]))
+    solution, _ = cg(gram, wanted, tol=_TOLERANCE, maxiter=_STEPS)
+    return adjoint((solution[0], factor * solution[1]))
 
 
 class Plan(NamedTuple):
-    """How a mark is written in one original."""
+    """The parameters of a mark in one original."""
 
-    width: float  # of the narrow Gaussian
-    step: float  # of the lattice of values
-    alpha: float  # part of the way to the lattice that is gone
+    width: float  # width of the narrow Gaussian
+    step: float  # quantisation step of the values
+    alpha: float  # fraction of the way to the lattice
     size: float  # RMS of the displacement, in diagonals
     host: AnchoredHost
     dither: Dither
 
     def margin(self, spread: float, bits: int) -> Margin:
-        """By how much the information that is left after something that spreads values exceeds what is needed."""
+        """Compute the margin of information after an attack that changes values by `spread` (root mean square)."""
         return margin(self.host.size, mean_cosine(spread, self.step, self.alpha), carried(bits))
 
 
 class Allowance(NamedTuple):
-    """How much a budget allows to be written with anchors of one width."""
+    """The strength that a budget allows with anchors of one width."""
 
-    width: float  # of the narrow Gaussian
-    allowed: float  # the largest α · step
-    size: float  # RMS of the displacement then, in diagonals
+    width: float  # width of the narrow Gaussian
+    allowed: float  # the largest allowed α · step
+    size: float  # RMS displacement with it, in diagonals
     host: AnchoredHost
     dither: Dither
 
     def plan(self, step: float) -> Plan:
-        """As far to the lattice of a step as is allowed."""
+        """Plan a mark with a quantisation step, with the largest α that is allowed."""
         alpha = min(self.allowed / step, 1.0)
         return Plan(self.width, step, alpha, self.size * alpha * step / self.allowed, self.host, self.dither)
 
 
 class Written(NamedTuple):
-    """A displacement that writes a codeword, as far as a budget allows."""
+    """A mesh with a codeword, written as far as a budget allows."""
 
     mesh: Mesh
     moved: distortion.DisplacementSize
@@ -132,24 +133,24 @@ class Written(NamedTuple):
 
 
 def carried(bits: int) -> float:
-    """Bits that values must have room for: the payload and its tag, and what the code needs more; a presence is one."""
+    """Compute the information in bits that values must carry: payload and tag times the code's gap; 1 for presence."""
     return _CODE_GAP * (bits + TAG_BITS) if bits else 1.0
 
 
 def sureness(plan: Plan, bits: int) -> float:
-    """The margin without any attack, as far as it matters: what is sure is no better if it is surer."""
+    """Compute the margin without any attack, up to the limit above which more is of no use."""
     return min(plan.margin(0.0, bits).sure, _SURE)
 
 
 class Writer:
-    """Writes codewords with the keyed choices of one mark in one original; looks at it once."""
+    """A writer of codewords in one original, with the keyed choices of one mark; it finds anchors once."""
 
     def __init__(self, original: Original, scheme: BlindScheme, choices: Choices) -> None:
         self.original, self.scheme, self.choices = original, scheme, choices
 
     @cached_property
     def hosts(self) -> dict[float, AnchoredHost]:
-        """The original as its anchors of each width show it."""
+        """The anchors of the original for each width."""
         return self.scheme.hosts(self.original, self.choices)
 
     @cached_property
@@ -160,7 +161,7 @@ class Writer:
         return original.to_traced(np.tile(np.eye(3), (len(original.used), 1, 1)))
 
     def off(self, host: AnchoredHost, dither: Dither, word: Float64[np.ndarray, " code"], step: float) -> np.ndarray:
-        """How far each value is from the nearest number that its dither and code bit allow, in steps."""
+        """Compute the distance of each value to the nearest number that its dither and code bit allow, in steps."""
         sign = dither.sign * word[dither.slot]
         away = host.values / step - dither.offset - np.where(sign < 0, 0.5, 0)
         return away - np.round(away)
@@ -168,7 +169,7 @@ class Writer:
     def shift(
         self, host: AnchoredHost, targets: Float64[np.ndarray, " anchors"], rounds: int
     ) -> Float64[np.ndarray, "points 3"]:
-        """The least displacement by which anchors show these values, in diagonals."""
+        """Compute the least displacement, in diagonals, that gives anchors their target values."""
         original = self.original
         vertices, dtype = original.to_traced(original.positions), original.signal.dtype
         moved = jnp.zeros_like(vertices)
@@ -187,13 +188,13 @@ class Writer:
         reference: distortion.Reference,
         bits: int,
     ) -> Plan:
-        """Choose the width that is predicted to be read best, and how strong a budget allows the mark to be.
+        """Choose the width that is predicted to be read best, and the largest strength that a budget allows.
 
-        Of the widths with which the payload surely reads, the one that noise leaves most of is taken; readers undo
-        smoothing.
+        Among the widths with which the payload is certainly read without an attack, the one with the largest margin
+        in noise is taken. Smoothing does not count, because readers undo it.
 
         Raises:
-            JaxmarkError: if there is nothing to write in, or the budget allows not even the least step.
+            JaxmarkError: if the mesh has no anchors, or the budget does not allow the smallest step.
         """
         fitting = []
         for allowance in self.allowances(word, bounds, reference):
@@ -204,7 +205,7 @@ class Writer:
                 f"This mesh, or the budget for it, leaves the scheme {self.scheme.name!r} nothing to write in; use a"
                 " larger budget or the scheme 'keyed'."
             )
-        return max(fitting, key=lambda one: (sureness(one, bits), one.margin(self._spread(one.host), bits).surplus))
+        return max(fitting, key=lambda plan: (sureness(plan, bits), plan.margin(self._spread(plan.host), bits).surplus))
 
     def write(
         self,
@@ -217,9 +218,9 @@ class Writer:
 
         Args:
             word: the code bits, ±1.
-            bounds: the bounds to keep.
+            bounds: the bounds on the distortion.
             bits: size of the payload in bits.
-            reference: what limits are measured against, if not the original.
+            reference: the mesh that limits are measured against; by default the original.
 
         Raises:
             JaxmarkError: see `plan`.
@@ -230,7 +231,7 @@ class Writer:
         shift = self.shift(plan.host, targets, _ROUNDS)
         written = displace_within(self.original, shift, bounds, reference, first=plan.size)
         mesh, moved, alpha = written.mesh, written.moved, plan.alpha * written.scale
-        if alpha > 1:  # beyond the lattice, values would be off again
+        if alpha > 1:  # beyond the lattice, values would have errors again
             mesh, alpha = displace(self.original, shift / plan.alpha), 1.0
             moved = distortion.DisplacementSize.of(shift_of(self.original, mesh)[self.original.used])
         return Written(mesh, moved, plan._replace(alpha=alpha))
@@ -238,31 +239,31 @@ class Writer:
     def allowances(
         self, word: Float64[np.ndarray, " code"], bounds: Bounds, reference: distortion.Reference
     ) -> list[Allowance]:
-        """How much a budget allows with each width that there is anything to write with."""
-        found: list[Allowance] = []
+        """Measure the strength that a budget allows, for each width that has anchors."""
+        allowances: list[Allowance] = []
         for width, host in self.hosts.items():
             if not host.size:
                 continue
             dither = make_dither(self.choices, self.scheme.name, host.names, len(word))
-            # How far a mark of one step displaces is how far any does, times its step: what is off is uniform.
+            # The displacement is proportional to the step, because distances to the lattice are uniformly distributed.
             shift = self.shift(host, host.values - host.step * self.off(host, dither, word, host.step), 1)
             size = float(distortion.rms(shift[self.original.used]))
             if math.isfinite(size) and size > 0:
-                first = found[-1].size if found else None
+                first = allowances[-1].size if allowances else None
                 scale = displace_within(self.original, shift, bounds, reference, first=first, share=_ENOUGH).scale
-                found.append(Allowance(width, host.step * scale, size * scale, host, dither))
-        return found
+                allowances.append(Allowance(width, host.step * scale, size * scale, host, dither))
+        return allowances
 
     def steps(self, allowance: Allowance) -> list[float]:
-        """The steps that may be written with: all but those to which a budget does not allow to go far enough."""
+        """List the quantisation steps with which the budget allows at least the least α."""
         return [step for step in self.scheme.steps if allowance.allowed / step >= _LEAST_ALPHA]
 
     def survives(self, plan: Plan, bits: int) -> Survival:
-        """Predict the strongest noise in which a payload reads.
+        """Predict the strongest noise in which a payload is read.
 
-        Half of the vertices have half of the anchors, or none if the scheme needs the whole shape.
+        If half of the vertices are lost, half of the anchors are left, or none if the scheme needs the whole shape.
         """
-        spread = self._spread(plan.host) / NOISE  # for each unit of noise
+        spread = self._spread(plan.host) / NOISE  # per unit of noise
 
         def strongest(share: float) -> float:
             def spare(noise: float) -> float:
@@ -276,10 +277,10 @@ class Writer:
         return Survival(strongest(1.0), strongest(0.5 if self.scheme.in_parts else 0.0))
 
     def capacity(self, bounds: Bounds, noise: float) -> int:
-        """The largest payload in bits, a multiple of 8, that is predicted to read in noise; 0 if not even 8.
+        """Compute the largest payload in bits, a multiple of 8, that is predicted to be read in noise; 0 if below 8.
 
         Args:
-            bounds: on the distortion by the mark.
+            bounds: the bounds on the distortion.
             noise: half width of uniform noise over the mean distance of the vertices to their centre.
         """
         word = codeword(bytes(DEFAULT_BITS // 8), self.choices)
@@ -293,10 +294,10 @@ class Writer:
         return bits
 
     def _spread(self, host: AnchoredHost) -> float:
-        """Spread of the anchors' values by noise of `NOISE` in the original."""
+        """Measure the root mean square change of the anchors' values by noise of `NOISE` in the original."""
         values, _ = measure(host.shape, self._noisy)
-        counted = host.good > 0
-        return float(np.sqrt(np.mean((np.asarray(values, np.float64) - host.values)[counted] ** 2)))
+        written = host.good > 0
+        return float(np.sqrt(np.mean((np.asarray(values, np.float64) - host.values)[written] ** 2)))
 
     @cached_property
     def _noisy(self) -> Float[Array, "rows 3"]:

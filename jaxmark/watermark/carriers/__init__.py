@@ -1,7 +1,7 @@
-"""Carriers, which map bits linearly to a displacement of the vertices, with explicit adjoints, and their readers.
+"""Carriers, which map bits linearly to displacements of the vertices, and their readers.
 
-`Carrier` and `Reader` are the interfaces; `KeyedCarrier` spreads bits over all vertices by keyed signs,
-`ModulatedCarrier` writes them on components of the host such as `host_bands` and `eigenspaces`.
+`Carrier` and `Reader` are the interfaces. `KeyedCarrier` spreads bits over all vertices by keyed signs.
+`ModulatedCarrier` writes bits on components of the host, such as `host_bands` and `eigenspaces`.
 """
 
 from jaxmark.watermark.carriers.chips import Chips as Chips

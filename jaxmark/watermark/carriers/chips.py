@@ -1,8 +1,8 @@
 """Keyed carriers: a keyed sign for every vertex and coordinate, shaped by band filters (direct-sequence spreading).
 
-w = Σ_j β_j f_j(Δ) r with r[v, c] = s[v, c] · bit[slot(v, c)], where the signs s and the slots come from the key.
-Writing any number of bits takes one filter, and reading them one filter and one segment-sum: time and memory do not
-grow with the payload.
+The displacement is w = Σ_j β_j f_j(Δ) r with r[v, c] = s[v, c] · bit[slot(v, c)]; the signs s and the slots are derived
+from the key. Writing needs one filter, and reading one filter and one segment sum, whatever the number of bits: time
+and memory do not grow with the payload.
 """
 
 from collections.abc import Sequence
@@ -50,36 +50,36 @@ def make_chips(
     channels: int = 3,
     count: int | None = None,
 ) -> Chips:
-    """Draw the signs, and assign the chips of all moving points to the bits, in numbers that differ by at most one.
+    """Draw the signs, and assign the chips of all moving points to the bits; the numbers per bit differ by at most one.
 
     Args:
         choices: the keyed choices of the mark.
-        places: number of each vertex among the points that may move, or -1 if it is none of them, `[N]`.
+        places: index of each vertex among the points that may move, or -1 for a vertex that may not move, `[N]`.
         bits: number of bits to carry.
         channels: chips per vertex: 3, or 1 along normals.
-        count: number of these points; by default, all of them are among the vertices.
+        count: number of points that may move; by default, the number of indices in `places` that are not -1.
     """
-    here = places >= 0
-    total = channels * (int(here.sum()) if count is None else count)
+    moving = places >= 0
+    total = channels * (int(moving.sum()) if count is None else count)
     sign = np.zeros((len(places), channels), np.int8)
     slot = np.zeros((len(places), channels), np.int32)
-    sign[here] = choices.signs(f"keyed/{bits}/{channels}/signs", total).reshape(-1, channels)[places[here]]
+    sign[moving] = choices.signs(f"keyed/{bits}/{channels}/signs", total).reshape(-1, channels)[places[moving]]
     order = choices.permutation(f"keyed/{bits}/{channels}/slots", total)
-    slot[here] = (order % bits).reshape(-1, channels)[places[here]]
+    slot[moving] = (order % bits).reshape(-1, channels)[places[moving]]
     return Chips(sign, slot, np.bincount(order % bits, minlength=bits).astype(np.int32))
 
 
 class KeyedCarrier(NamedTuple):
-    """Carries bits by keyed chips that band filters shape; see `Carrier`.
+    """A carrier whose bits are spread over keyed chips, which band filters turn into a displacement; see `Carrier`.
 
     β is the root mean square of the chips before the filter, one per band.
     """
 
     host: Host
     chips: Chips
-    normals: Float[Array, "vertices 3"] | None = None  # with one chip per vertex, the direction in which it moves
+    normals: Float[Array, "vertices 3"] | None = None  # direction in which each vertex moves, if it has one chip
     profile: Float[Array | np.ndarray, " bands"] | None = None  # factor on β for each band
-    masking: Float[Array | np.ndarray, " vertices *axes"] | None = None  # factor on a displacement, or matrix `[3, 3]`
+    masking: Float[Array | np.ndarray, " vertices *axes"] | None = None  # factor or matrix `[3, 3]` on displacements
 
     @property
     def code_bits(self) -> int:
@@ -88,7 +88,7 @@ class KeyedCarrier(NamedTuple):
 
     @jax.jit
     def displacement(self, bits: Float[Array, " bits"], beta: Strength = 1.0) -> Displacement:
-        """See `Carrier`; takes one filter, whatever the number of bits."""
+        """See `Carrier`; needs one filter, whatever the number of bits."""
         return self.modulate(bits, self.coefficients(beta))
 
     def adjoint(self, residual: Displacement, beta: Strength = 1.0) -> Float[Array, " bits"]:
@@ -97,7 +97,7 @@ class KeyedCarrier(NamedTuple):
 
     @jax.jit
     def gram(self, beta: Strength = 1.0) -> Float[Array, "bits bits"]:
-        """See `Carrier`; takes one filter per bit, so it is for tests and small codes."""
+        """See `Carrier`; needs one filter per bit, hence is meant for tests and small codes."""
         unit = jnp.eye(self.code_bits, dtype=self._signs.dtype)
         return jax.lax.map(lambda bits: self.adjoint(self.displacement(bits, beta), beta), unit)
 
@@ -107,7 +107,7 @@ class KeyedCarrier(NamedTuple):
         return reader.claim(reader.receive(observation), bits)
 
     def redraw(self, seed: Seed) -> "KeyedCarrier":
-        """See `Carrier`; the slots stay as they are, and so do signs of 0, on vertices that do not move."""
+        """See `Carrier`; the slots are unchanged, and signs of 0, on vertices that do not move, stay 0."""
         moving = jnp.abs(jnp.asarray(self.chips.signs)).astype(jnp.int8)
         signs = moving * jax.random.rademacher(random_key(seed), moving.shape, jnp.int8)
         return self._replace(chips=self.chips._replace(signs=signs))
@@ -115,11 +115,11 @@ class KeyedCarrier(NamedTuple):
     def with_bands(
         self, strengths: Float[Array, " bands"], bands: Float[Array, "bands terms"] | None = None
     ) -> "KeyedCarrier":
-        """The same chips with other relative strengths of the bands, and other bands, as a pure function.
+        """Return the same chips with other relative strengths of the bands, or with other bands; a pure function.
 
         Args:
             strengths: factor on β for each band, `[bands]`.
-            bands: Chebyshev coefficients, one band a row; by default the carrier's own.
+            bands: Chebyshev coefficients, one band per row; by default the carrier's own.
         """
         host = self.host if bands is None else self.host._replace(coefficients=bands)
         if strengths.shape != (len(host.coefficients),):
@@ -135,7 +135,7 @@ class KeyedCarrier(NamedTuple):
     def coefficients(
         self, beta: Strength, weight: Float[Array, " bands"] | None = None
     ) -> Float[Array, "*channels terms"]:
-        """Chebyshev coefficients of Σ_j weight_j β_j f_j, including the profile."""
+        """Compute the Chebyshev coefficients of Σ_j weight_j β_j f_j, including the profile."""
         strength = check_strength(jnp.asarray(beta), len(self.host.coefficients)).astype(self._signs.dtype)
         if strength.ndim == 0:
             strength = jnp.broadcast_to(strength, len(self.host.coefficients))
@@ -145,11 +145,11 @@ class KeyedCarrier(NamedTuple):
         return matmul(self.host.coefficients.T, strength).T
 
     def modulate(self, bits: Float[Array, " bits"], coefficients: Float[Array, "*channels terms"]) -> Displacement:
-        """Spread the bits over their chips, and filter these into a displacement."""
+        """Spread the bits over their chips, and filter the chips into a displacement."""
         return self.filter_chips(self.spread(bits), coefficients)
 
     def correlate(self, residual: Displacement, coefficients: Float[Array, "*channels terms"]) -> Float[Array, " bits"]:
-        """Apply the plain adjoint of `modulate`: Σ_v ⟨modulate(a)_v, r_v⟩ is the dot product of a and this."""
+        """Apply the adjoint of `modulate` for inner products without D, Σ_v ⟨modulate(a)_v, r_v⟩."""
         products = self._signs * self.match_chips(residual, coefficients)
         return jax.ops.segment_sum(products.ravel(), self.chips.slots.ravel(), self.code_bits)
 
@@ -163,17 +163,17 @@ class KeyedCarrier(NamedTuple):
     def match_chips(
         self, residual: Displacement, coefficients: Float[Array, "*channels terms"]
     ) -> Float[Array, "vertices channels"]:
-        """Apply the plain adjoint of `filter_chips`, which is a matched filter."""
-        hidden = apply_mask(self.masking, residual)
-        along = hidden if self.normals is None else jnp.sum(self.normals * hidden, axis=1, keepdims=True)
+        """Apply the adjoint of `filter_chips` for inner products without D, which is a matched filter."""
+        masked = apply_mask(self.masking, residual)
+        along = masked if self.normals is None else jnp.sum(self.normals * masked, axis=1, keepdims=True)
         return transpose(self.host.operator, coefficients, along)
 
     def spread(self, bits: Float[Array, " bits"]) -> Float[Array, "vertices channels"]:
-        """Give each chip its value: its sign times the bit in its slot."""
+        """Compute the value of each chip: its sign times the bit of its slot."""
         return self._signs * jnp.asarray(bits).astype(self._signs.dtype)[self.chips.slots]
 
     def masked_share(self) -> float:
-        """Share of the dimensions that the masking leaves: (Σ λ)² / (n Σ λ²) over the energies λ that it gives to n."""
+        """Compute the effective share of dimensions under masking: (Σ λ)² / (n Σ λ²) for energies λ of n dimensions."""
         if self.masking is None:
             return 1.0
         root = np.asarray(self.masking, np.float64)
@@ -188,10 +188,10 @@ class KeyedCarrier(NamedTuple):
 
 
 class KeyedReader(NamedTuple):
-    """Reads keyed carriers: projects off the part of the host and weights the bands; see `Reader`."""
+    """The reader of keyed carriers, which projects off the nuisance and weights the bands; see `Reader`."""
 
     carrier: KeyedCarrier
-    nuisance: Float[Array, "vertices columns"]  # nearly orthonormal basis of what is projected off each coordinate
+    nuisance: Float[Array, "vertices columns"]  # nearly orthonormal basis that is projected off each coordinate
 
     @property
     def receiver(self) -> Receiver:
@@ -204,73 +204,73 @@ class KeyedReader(NamedTuple):
         return receive(self.receiver, observation)
 
     def ways(self, received: Reception) -> Sequence[Reception]:
-        """See `Reader`; the bands are weighted by what the suspect shows of them, and then all alike.
+        """See `Reader`; first the bands are weighted by their gain and noise in the suspect, then they weigh the same.
 
-        The first way gives the most evidence, the second is the hardest to attack.
+        The first way gives the most evidence; the second is the hardest to attack.
         """
         return received, weigh_evenly(received)
 
     @jax.jit
     def claim(self, received: Reception, bits: Float[Array, " bits"]) -> Claim:
-        """See `Reader`; a is what `matched_residual` returns, up to the signs of the bits.
+        """See `Reader`; up to the signs of the bits, the vector a is the result of `matched_residual`.
 
-        As it is computed, including rounding, a does not depend on the keyed signs: only the two sums can be wrong, see
-        `jaxmark.spectral.precision.sum_and_norm`.
+        The computed a, including rounding errors, does not depend on the keyed signs. Only the two sums have errors
+        that do, see `jaxmark.spectral.precision.sum_and_norm`.
         """
         return Claim(*sum_and_norm(self.carrier.spread(bits) * self.matched_residual(received)))
 
     def matched_residual(self, received: Reception) -> Float[Array, "vertices channels"]:
-        """The vector that the keyed signs multiply: the residual after the filter matched to gain and power."""
+        """Filter the residual with the filter matched to gain and power; the keyed signs multiply the result."""
         return self.carrier.match_chips(matmul(received.residual, received.axes), self._matched_coefficients(received))
 
     def linear_score(
         self, received: Reception, residual: Displacement, bits: Float[Array, " bits"]
     ) -> Float[Array, ""]:
         """See `Reader`; weights, gain, power and axes are held fixed."""
-        left = matmul(clean(received.receiver, received.observation, received.factor, residual), received.axes)
-        return jnp.sum(bits * self.carrier.correlate(matmul(left, received.axes), self._matched_coefficients(received)))
+        rest = matmul(clean(received.receiver, received.observation, received.factor, residual), received.axes)
+        return jnp.sum(bits * self.carrier.correlate(matmul(rest, received.axes), self._matched_coefficients(received)))
 
     @jax.jit
     def read_quickly(self, observation: Observation, beta: Strength = 1.0) -> Float[Array, " bits"]:
-        """See `Reader`; plain correlations without the nuisance, in which the bits are noise to each other."""
+        """See `Reader`; plain correlations without the nuisance, in which the other bits act as noise."""
         receiver = self.receiver
         residual = clean(receiver, observation, normal_factor(receiver, observation), observation.residual)
         return self.carrier.correlate(residual, self.carrier.coefficients(beta))
 
     @jax.jit
     def correlate(self, received: Reception) -> Float[Array, " bits"]:
-        """See `Reader`; the score of a claim is the sum of these values with the signs of its codeword."""
+        """See `Reader`; the score of a claim is the sum of these values times the signs of its codeword."""
         residual = matmul(received.residual, received.axes)
         return self.carrier.correlate(residual, self._matched_coefficients(received))
 
     def free_dimensions(self, moving: Float[Array, " vertices"]) -> FreeDimensions:
-        """See `Reader`; measured with one probe, which has random signs in place of the keyed ones."""
-        whole, left = np.asarray(self._probe(moving), np.float64).clip(0)
+        """See `Reader`; measured with one probe, which has random signs instead of the keyed ones."""
+        whole, remaining = np.asarray(self._probe(moving), np.float64).clip(0)
         profile = self.carrier.profile
         strength = np.ones(len(whole)) if profile is None else np.asarray(profile, np.float64)
-        # A whole band sums over three coordinates of each vertex, or over one along its normal.
+        # The energy of a whole band is summed over the three coordinates of each vertex, or over one along its normal.
         displaced = whole @ strength**2 / np.count_nonzero(moving)
         energy = strength**2 / displaced if displaced > 0 else strength**2
-        # Masked, the same energy is in fewer dimensions.
+        # With masking, the same energy is concentrated in fewer dimensions.
         share = self.carrier.masked_share()
-        return FreeDimensions(share * left * (strength > 0), energy / share)
+        return FreeDimensions(share * remaining * (strength > 0), energy / share)
 
     def with_carrier(self, carrier: KeyedCarrier) -> "KeyedReader":
         """See `Reader`."""
         return self._replace(carrier=carrier)
 
     def _matched_coefficients(self, received: Reception) -> Float[Array, "*channels terms"]:
-        """Chebyshev coefficients of the filter matched to gain and power."""
+        """Compute the Chebyshev coefficients of the filter matched to gain and power."""
         return self.carrier.coefficients(1.0, received.gain / received.power)
 
     @jax.jit
     def _probe(self, moving: Float[Array, " vertices"]) -> Float[Array, "2 bands"]:
-        """Energy of random signs in each band, before and after the nuisance is projected off."""
+        """Measure the energy of random signs in each band, before and after the nuisance is projected off."""
         receiver, normals = self.receiver, self.carrier.normals
         (signs,) = probe_signs("capacity", self.carrier.chips.signs.shape, dtype=moving.dtype)
         signs = signs * moving[:, None]
-        everything = observe(jnp.zeros_like(receiver.signal), moving)
-        factor = normal_factor(receiver, everything)
+        observation = observe(jnp.zeros_like(receiver.signal), moving)
+        factor = normal_factor(receiver, observation)
         white = signs if normals is None else normals * signs
-        left = clean(receiver, everything, factor, white)
-        return jnp.stack([band_energies(receiver.operator, receiver.coefficients, x, x) for x in (white, left)])
+        remaining = clean(receiver, observation, factor, white)
+        return jnp.stack([band_energies(receiver.operator, receiver.coefficients, x, x) for x in (white, remaining)])

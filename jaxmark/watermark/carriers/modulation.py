@@ -1,4 +1,4 @@
-"""Carriers that modulate components, which are fixed displacements of the vertices, by keyed sequences of signs."""
+"""Carriers that multiply components, which are fixed displacements of the vertices, by keyed sequences of signs."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -17,16 +17,16 @@ from jaxmark.watermark.interfaces import Claim, Displacement, Strength, check_st
 
 
 class PlainReader(NamedTuple):
-    """The reader of a carrier that does not know its host: it takes suspects as they are; see `Reader`."""
+    """The reader of a carrier that does not use its host: it reads suspects without preprocessing; see `Reader`."""
 
     carrier: Any  # a `Carrier`
 
     def receive(self, observation: Observation) -> Observation:
-        """See `Reader`; returns the suspect itself."""
+        """See `Reader`; returns the observation itself."""
         return observation
 
     def ways(self, received: Observation) -> Sequence[Observation]:
-        """See `Reader`; the only way is to take the suspect as it is."""
+        """See `Reader`; the only way is the observation itself."""
         return (received,)
 
     def claim(self, received: Observation, bits: Float[Array, " bits"]) -> Claim:
@@ -36,19 +36,19 @@ class PlainReader(NamedTuple):
     def linear_score(
         self, received: Observation, residual: Displacement, bits: Float[Array, " bits"]
     ) -> Float[Array, ""]:
-        """See `Reader`; a plain correlation is linear already."""
+        """See `Reader`; a plain correlation is already linear."""
         return self.carrier.claim(received._replace(residual=residual), bits).score
 
     def read_quickly(self, observation: Observation, beta: Strength = 1.0) -> None:
-        """See `Reader`; there is no shortcut, because reading is fast anyway."""
+        """See `Reader`; there is no shortcut, because the detectors of plain carriers are fast."""
         return None
 
     def correlate(self, received: Observation) -> None:
-        """See `Reader`; detectors of plain carriers are fast."""
+        """See `Reader`; there is no shortcut, because the detectors of plain carriers are fast."""
         return None
 
     def free_dimensions(self, moving: Float[Array, " vertices"]) -> None:
-        """See `Reader`; there is no model of noise."""
+        """See `Reader`; there is no noise model."""
         return None
 
     def with_carrier(self, carrier: Any) -> "PlainReader":
@@ -57,10 +57,11 @@ class PlainReader(NamedTuple):
 
 
 class ModulatedCarrier(NamedTuple):
-    """Writes bits on components x_j of the host by sequences p: w = Σ_i bit_i Σ_j β_j p_j^(i) x_j (Sohn et al., 2.2).
+    """A carrier that writes bits on components x_j of the host: w = Σ_i bit_i Σ_j β_j p_j^(i) x_j (Sohn et al., 2.2).
 
-    Each bit has a sign per band and coordinate, or one per band that the three coordinates share. With polynomial bands
-    as components this is the paper's scheme, with eigenspaces Ohbuchi's. It computes in the dtype of the components.
+    Each bit i has a sequence p^(i), with a sign per band and coordinate, or a sign per band for all three coordinates.
+    With polynomial bands as components this is the paper's scheme, with eigenspaces Ohbuchi's. Results have the dtype
+    of the components.
     """
 
     components: Components
@@ -78,8 +79,8 @@ class ModulatedCarrier(NamedTuple):
 
     def adjoint(self, residual: Displacement, beta: Strength = 1.0) -> Float[Array, " bits"]:
         """See `Carrier`."""
-        found = self._per_band(beta) * self.components.analyse(self._as_real(residual))
-        return einsum("kjc,jc->k", self._sequences, found)
+        products = self._per_band(beta) * self.components.analyse(self._as_real(residual))
+        return einsum("kjc,jc->k", self._sequences, products)
 
     def gram(self, beta: Strength = 1.0) -> Float[Array, "bits bits"]:
         """See `Carrier`."""
@@ -87,11 +88,11 @@ class ModulatedCarrier(NamedTuple):
         return einsum("ajc,cjl,blc->ab", weighted, self.components.gram, weighted)
 
     def claim(self, observation: Observation, bits: Float[Array, " bits"]) -> Claim:
-        """See `Carrier`; the keyed signs are one per band and coordinate, or one per band if coordinates share them."""
-        found = self.components.analyse(self._as_real(observation.weigh(observation.residual)))
+        """See `Carrier`; there is one keyed sign per band and coordinate, or one per band if coordinates share them."""
+        products = self.components.analyse(self._as_real(observation.weigh(observation.residual)))
         if self.sequences.shape[-1] == 1:
-            found = found.sum(axis=1, keepdims=True)
-        return Claim(*sum_and_norm(einsum("k,kjc->jc", self._as_real(bits), self._as_real(self.sequences)) * found))
+            products = products.sum(axis=1, keepdims=True)
+        return Claim(*sum_and_norm(einsum("k,kjc->jc", self._as_real(bits), self._as_real(self.sequences)) * products))
 
     def redraw(self, seed: Seed) -> "ModulatedCarrier":
         """See `Carrier`."""
@@ -107,7 +108,7 @@ class ModulatedCarrier(NamedTuple):
         return jnp.broadcast_to(signs, (*signs.shape[:2], 3))
 
     def _per_band(self, beta: Strength) -> Array:
-        """β in a shape that broadcasts against `[bands, 3]`."""
+        """Give β a shape that broadcasts against `[bands, 3]`."""
         strength = check_strength(self._as_real(beta), self.sequences.shape[1])
         return strength[:, None] if strength.ndim == 1 else strength
 

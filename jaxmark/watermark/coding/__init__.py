@@ -1,4 +1,4 @@
-"""Keyed signs and permutations, and codes: from messages to code bits and back.
+"""Keyed signs and permutations, and the code that maps messages to code bits and back.
 
-Everything runs on the host, and its results never change, so that old marks stay readable.
+Everything runs on the host. The results never change between versions, so that old marks stay readable.
 """

@@ -1,8 +1,8 @@
-"""Keys, and the integer sequences that derive from a key, a context and a label; on the host.
+"""Keys, and integer sequences that are derived from a key, a context and a label; computed on the host.
 
-Every keyed choice is SHAKE-256(key ‖ context ‖ "jaxmark/2/label"): two meshes marked under one key share nothing,
-and no choice tells anything about another. The results are plain integer arrays, which traced code gets as data,
-because JAX does not promise that its random streams stay the same.
+Every keyed choice is SHAKE-256(key ‖ context ‖ "jaxmark/2/label"). The choices of two meshes that are marked under one
+key are therefore independent, and no choice reveals anything about another. The results are plain integer arrays, which
+traced code receives as data, because JAX does not guarantee that its random streams stay the same.
 """
 
 import hashlib
@@ -21,17 +21,17 @@ from jaxmark.files.atomic import read_file
 
 SCHEME_VERSION = 2  # version of the keyed choices and of records
 KEY_BYTES = 32
-_MAX_FILE_BYTES = 4096  # of a key file, which has 65
+_MAX_FILE_BYTES = 4096  # largest size of a key file that is read; a key file has 65 bytes
 
 
 class Key(bytes):
-    """A secret key of 256 bits, which is not shown when printed."""
+    """A secret key of 256 bits; its `repr` does not show the bytes."""
 
     def __new__(cls, secret: bytes) -> "Key":
         """Wrap exactly 32 bytes.
 
         Raises:
-            JaxmarkError: if there are not 32 bytes.
+            JaxmarkError: if `secret` is not 32 bytes.
         """
         if not isinstance(secret, bytes) or len(secret) != KEY_BYTES:
             raise JaxmarkError(f"A key is {KEY_BYTES} bytes (jaxmark.new_key() makes one).")
@@ -70,7 +70,7 @@ def save_key(key: bytes, path: str | os.PathLike[str]) -> None:
             file.write(secret.hex() + "\n")
             file.flush()
             os.fsync(file.fileno())
-    except OSError as error:  # an empty file would stand in the way of the next try
+    except OSError as error:  # an empty file would make the next attempt fail
         os.unlink(path)  # noqa: PTH108
         raise JaxmarkError(f"The key file {path} cannot be written: {error.strerror}.") from None
 
@@ -79,7 +79,7 @@ def load_key(path: str | os.PathLike[str]) -> Key:
     """Read a key file that `save_key` wrote.
 
     Raises:
-        JaxmarkError: if the file cannot be read or does not hold 64 hexadecimal digits (the error does not show them).
+        JaxmarkError: if the file cannot be read or does not contain 64 hexadecimal digits; the message hides them.
     """
     try:
         text = read_file(path, _MAX_FILE_BYTES).decode("ascii")
@@ -90,18 +90,18 @@ def load_key(path: str | os.PathLike[str]) -> Key:
     try:
         return Key(bytes.fromhex(text.strip()))
     except ValueError:
-        raise JaxmarkError(f"{path} is no key file: it should hold {2 * KEY_BYTES} hexadecimal digits.") from None
+        raise JaxmarkError(f"{path} is no key file: a key file contains {2 * KEY_BYTES} hexadecimal digits.") from None
 
 
 @dataclass(frozen=True)
 class Choices:
-    """All keyed choices of one mark: what derives from its key, and from all that reading it uses, see `bind`.
+    """All keyed choices of one mark, derived from its key and from everything that reading the mark uses; see `bind`.
 
-    Whoever changes any of that gets other choices, which are independent of these.
+    A change of the key or of any of these inputs gives other choices, which are independent of the first ones.
     """
 
     key: Key
-    context: bytes  # what the choices are bound to
+    context: bytes  # hash of everything that the choices are bound to
 
     def derive(self, label: str, size: int, data: bytes = b"") -> bytes:
         """Derive bytes: SHAKE-256(key ‖ context ‖ "jaxmark/2/label"), with ‖ 0 ‖ data appended if given.
@@ -109,7 +109,7 @@ class Choices:
         Args:
             label: the purpose of the bytes.
             size: number of bytes.
-            data: what else the bytes depend on.
+            data: further input that the bytes depend on.
         """
         message = self.key + self.context + f"jaxmark/{SCHEME_VERSION}/{label}".encode()
         return hashlib.shake_256(message + b"\0" + data if data else message).digest(size)
@@ -126,15 +126,15 @@ class Choices:
 
 
 def bind(key: bytes, geometry: bytes, fixed: Mapping[str, Any]) -> Choices:
-    """Bind the keyed choices of a mark to its original, and to everything else that reading uses.
+    """Bind the keyed choices of a mark to its original and to everything else that reading the mark uses.
 
     Args:
         key: 32 bytes.
         geometry: hash of the original's geometry.
-        fixed: all else that reading uses, such as scheme and payload: values that JSON has.
+        fixed: everything else that reading uses, such as scheme and payload size, as JSON values.
 
     Raises:
-        JaxmarkError: if there is a value that JSON does not have, or the key is not 32 bytes.
+        JaxmarkError: if a value cannot be written as JSON, or the key is not 32 bytes.
     """
     state = hashlib.sha256(f"jaxmark/{SCHEME_VERSION}/context".encode())
     state.update(geometry)
@@ -143,19 +143,19 @@ def bind(key: bytes, geometry: bytes, fixed: Mapping[str, Any]) -> Choices:
 
 
 def canonical_json(value: Mapping[str, Any]) -> bytes:
-    """Write a value as JSON in the one way that hashes are taken of: keys in order, no spaces, shortest numbers.
+    """Write a value as canonical JSON, the input of hashes: keys in order, no spaces, shortest numbers.
 
     Raises:
-        JaxmarkError: if there is a value that JSON does not have.
+        JaxmarkError: if a value cannot be written as JSON.
     """
     try:
         return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
     except (TypeError, ValueError) as error:
         raise JaxmarkError(
-            f"What a mark is bound to must be finite numbers, texts and lists of them: {error}."
+            f"The parameters that a mark is bound to must be finite numbers, strings or lists of them: {error}."
         ) from None
 
 
 def commitment(key: bytes) -> str:
-    """Compute a hash that commits to a key without revealing it, hexadecimal."""
+    """Compute the hash that commits to a key without revealing it, in hexadecimal."""
     return hashlib.shake_256(Key(key) + b"jaxmark/1/commitment").hexdigest(32)

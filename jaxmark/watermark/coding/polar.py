@@ -1,9 +1,10 @@
-"""Polar codes: from information bits to code bits, and back from soft values to a list of candidates.
+"""Polar codes: encoding of information bits, and list decoding of soft decisions.
 
-Arıkan, "Channel Polarization", IEEE Trans. Inf. Theory 55 (2009); successive cancellation list decoding by Tal and
-Vardy, "List Decoding of Polar Codes", ibid. 61 (2015). Information goes to the positions of largest polarization weight
-(He et al., "β-expansion: A Theoretical Framework for Fast and Recursive Construction of Polar Codes", GLOBECOM 2017,
-with β = 2^¼): these positions are the same for every channel, and nested. Everything runs on the host, in NumPy.
+The code is that of Arıkan, "Channel Polarization", IEEE Trans. Inf. Theory 55 (2009). It is decoded by successive
+cancellation with lists (Tal and Vardy, "List Decoding of Polar Codes", ibid. 61, 2015). Information bits are assigned
+to the positions of largest polarization weight with β = 2^¼ (He et al., "β-expansion: A Theoretical Framework for Fast
+and Recursive Construction of Polar Codes", GLOBECOM 2017). These positions are the same for every channel, and nested.
+Everything runs on the host, in NumPy.
 """
 
 from functools import lru_cache
@@ -14,25 +15,25 @@ from jaxtyping import Bool, Float, Float32, Int, Int8, Integer
 
 @lru_cache(maxsize=16)
 def frozen_inputs(length: int, information: int) -> Bool[np.ndarray, " length"]:
-    """Choose which inputs of the transform are fixed to 0; the others take the information bits in order.
+    """Select the inputs of the transform that are fixed to 0; the others take the information bits in order.
 
     Args:
         length: length of the code, a power of two.
         information: number of information bits, at most `length`.
 
     Returns:
-        True for each input that is fixed, `[length]`; not to be written to.
+        True for each input that is fixed, `[length]`; the array is read-only.
     """
     position = np.arange(length)
     weight = sum(((position >> j) & 1) * 2 ** (j / 4) for j in range(length.bit_length() - 1)) + np.zeros(length)
     fixed = np.ones(length, bool)
     fixed[np.argsort(weight)[length - information :]] = False
-    fixed.flags.writeable = False  # shared by all who ask
+    fixed.flags.writeable = False  # the cached array is shared by all callers
     return fixed
 
 
 def encode(bits: Integer[np.ndarray, "*batch information"], length: int) -> Int8[np.ndarray, "*batch length"]:
-    """Encode information bits 0 or 1 as `length` code bits 0 or 1."""
+    """Encode information bits (0 or 1) as `length` code bits (0 or 1)."""
     inputs = np.zeros((*bits.shape[:-1], length), np.int8)
     inputs[..., ~frozen_inputs(length, bits.shape[-1])] = bits
     return _transform(inputs)
@@ -41,18 +42,19 @@ def encode(bits: Integer[np.ndarray, "*batch information"], length: int) -> Int8
 def decode(
     soft: Float[np.ndarray, "batch length"], information: int, paths: int
 ) -> Int8[np.ndarray, "batch paths information"]:
-    """Decode soft values of code bits to the most plausible information words, best first.
+    """Decode soft decisions of code bits into the most plausible information words, the best one first.
 
-    Check nodes take the smaller magnitude, and a path pays |soft| for every bit that contradicts the sign of its soft
-    value, so that a common factor of the soft values, and with it the noise level, need not be known.
+    Check nodes take the smaller magnitude (min-sum decoding). The cost of a path grows by |soft| for every bit that
+    contradicts the sign of its soft decision. A common factor of the soft decisions therefore changes nothing, and the
+    noise level need not be known.
 
     Args:
         soft: positive where a code bit is likely 0, negative where it is likely 1, 0 where nothing is known.
         information: number of information bits that the code carries.
-        paths: number of candidates to keep; fewer are returned if there are fewer words.
+        paths: largest number of candidates; fewer are returned if there are fewer words.
 
     Returns:
-        Information bits 0 or 1.
+        Information bits, 0 or 1.
     """
     fixed = frozen_inputs(soft.shape[1], information)
     start = soft[:, None].astype(np.float32)
@@ -85,7 +87,7 @@ def _decode(
     fixed: Bool[np.ndarray, " length"],
     paths: int,
 ) -> _Survivors:
-    """Decode one subtree; return the surviving paths' code bits and costs, and the path that each continues."""
+    """Decode one subtree; return code bits and costs of the surviving paths, and the index of each path's parent."""
     count = soft.shape[1]
     if fixed.all():
         origin = np.broadcast_to(np.arange(count), cost.shape)
@@ -107,5 +109,5 @@ def _decode(
 
 
 def _select(values: np.ndarray, path: Int[np.ndarray, "batch survivors"]) -> np.ndarray:
-    """Take the rows of the given paths."""
+    """Take the rows of the given path indices."""
     return np.take_along_axis(values, path[..., None], 1)

@@ -1,7 +1,7 @@
-"""Mutually orthogonal sequences of signs, by which several bits share the same bands (Sohn et al., section 2.2).
+"""Mutually orthogonal sequences of signs, which let several bits share the same bands (Sohn et al., section 2.2).
 
-The paper asks for k orthogonal sequences of any length n. No two exist at an odd length above 1, and three or more need
-a length that is a multiple of 4: they are rows of a Hadamard matrix.
+The paper asks for k orthogonal sequences of any length n. Two such sequences do not exist at an odd length above 1, and
+three or more need a length that is a multiple of 4: they are rows of a Hadamard matrix.
 """
 
 import numpy as np
@@ -16,8 +16,8 @@ def orthogonal_sequences(
 ) -> Int8[np.ndarray, "count length"]:
     """Derive mutually orthogonal ±1 sequences: rows of a Hadamard matrix, chosen, permuted and signed by the key.
 
-    The signs of the columns are independent of the choice of rows and columns, so a false-positive probability may rest
-    on the signs alone. Sequences of different labels or lengths share nothing.
+    The signs of the columns are independent of the choice of rows and columns, so that a false-positive probability may
+    rest on the signs alone. Sequences with different labels or lengths are independent.
 
     Args:
         choices: the keyed choices of the mark.
@@ -30,7 +30,7 @@ def orthogonal_sequences(
         `[count, length]` with values -1 and 1.
 
     Raises:
-        JaxmarkError: if there are not that many sequences of that length, or `hadamard` refuses the length.
+        JaxmarkError: if fewer sequences of that length exist, or `hadamard` cannot construct the length.
     """
     matrix = hadamard(length)
     if not 0 < count <= length:
@@ -41,23 +41,24 @@ def orthogonal_sequences(
 
 
 def hadamard(order: int) -> Int8[np.ndarray, "order order"]:
-    """Construct a matrix of ±1 with orthogonal rows, by Sylvester's doubling of Paley's first construction.
+    """Construct a matrix of ±1 with orthogonal rows, by Sylvester's doubling and Paley's first construction.
 
     Raises:
-        JaxmarkError: if no such matrix exists (order 3, or above 2 no multiple of 4), or these constructions miss it.
+        JaxmarkError: if no such matrix exists, because the order is above 2 and no multiple of 4, or if these
+            constructions do not provide it.
     """
     if order < 1 or (order > 2 and order % 4):
         raise JaxmarkError(f"No {order} mutually orthogonal ±1 sequences of length {order} exist; use a multiple of 4.")
     matrix = _construct(order)
     if matrix is None:
         raise JaxmarkError(
-            f"No construction here for {order} mutually orthogonal sequences; use a power of two, or three times one."
+            f"{order} mutually orthogonal sequences cannot be constructed here; use a power of two, or three times one."
         )
     return matrix
 
 
 def _construct(order: int) -> Int8[np.ndarray, "order order"] | None:
-    """Construct the matrix; None if these constructions miss it."""
+    """Construct the matrix; None if these constructions do not provide it."""
     if order == 1:
         return np.ones((1, 1), np.int8)
     if order % 4 == 0 and _is_prime(order - 1):

@@ -1,1 +1,1 @@
-"""What a reading proves: `bounds` has formulas, `ledger` what each choice costs, `detection` the result."""
+"""The evidence of a reading: `bounds` has the formulas, `ledger` the costs of choices, `detection` the results."""

@@ -1,9 +1,9 @@
-"""Formulas: bounds on the probability that a score is reached by a mesh that is independent of the key.
+"""Bounds on the probability that a mesh which is independent of the key reaches a score.
 
-All results but that of `log10_p_gaussian` are log10 of an upper bound on the probability, at most 0, without a floor:
-`jaxmark.watermark.evidence.ledger` adds the cost of every choice, and the floor of a 256-bit key. Pass scores and norms
-in the dtype that they were summed in: the largest error that `precision.sum_and_norm` can make in it is subtracted from
-the score, so that rounding makes no probability too small.
+All functions except `log10_p_gaussian` return log10 of an upper bound on a probability, at most 0 and without a floor;
+`jaxmark.watermark.evidence.ledger` adds the cost of every choice and the floor of a 256-bit key. Pass scores and norms
+in the dtype in which they were summed: the largest error that `precision.sum_and_norm` can make in this dtype is
+subtracted from the score, so that rounding cannot make a probability too small.
 """
 
 import math
@@ -17,20 +17,22 @@ from scipy.special import log_ndtr  # scipy.stats takes long to import
 
 from jaxmark.spectral.precision import matmul
 
-_CHERNOFF_THETAS = np.geomspace(1e-2, 1e3, 512)  # so dense that log10 p loses only a few ten-thousandths
+_CHERNOFF_THETAS = np.geomspace(1e-2, 1e3, 512)  # so dense that the grid costs only a few ten-thousandths of log10 p
 
 
 def log10_p_score(score: ArrayLike, norm: ArrayLike) -> float:
     """Bound P(S ≥ score) for a codeword that was fixed beforehand (Hoeffding 1963, Theorem 2), as log10.
 
-    For S = Σ s·a over keyed independent signs s, P(S ≥ t‖a‖) ≤ exp(-t²/2). This holds for any suspect, provided that
-    the suspect, and with it a, is independent of the signs (a mesh marked under the same key is not); that weights,
-    masks and pose never depend on the key or the score; and that key, original and message were fixed before the
-    suspect was seen.
+    For S = Σ s·a with independent keyed signs s, P(S ≥ t‖a‖) ≤ exp(-t²/2). The bound holds for any suspect under three
+    conditions:
+
+    - The suspect, and therefore a, is independent of the signs. A mesh marked under the same key is not.
+    - Weights, masks and pose do not depend on the key or the score.
+    - Key, original and message were fixed before the suspect was seen.
 
     Args:
         score: S, the plain linear correlation of the codeword.
-        norm: ‖a‖ of the same vector a that the signs multiply.
+        norm: ‖a‖, the norm of the vector a that the signs multiply.
 
     Returns:
         A number of at most 0; 0 if score or norm is not positive or not finite.
@@ -43,9 +45,9 @@ def log10_p_score(score: ArrayLike, norm: ArrayLike) -> float:
 
 
 def log10_p_tag(bits: int) -> float:
-    """Return log10 of the probability that one message fits its keyed tag by chance.
+    """Return log10 of the probability that a message matches its keyed tag by chance, which is 2^-bits.
 
-    The tag's subkey is independent of everything that chose the message, so it is 2^-bits.
+    The subkey of the tag is independent of everything that the message was chosen by.
 
     Args:
         bits: size of the tag in bits.
@@ -54,7 +56,7 @@ def log10_p_tag(bits: int) -> float:
 
 
 def log10_p_gaussian(score: ArrayLike, norm: ArrayLike) -> float:
-    """Return log10 P(S ≥ score) if S were Gaussian with standard deviation ‖a‖: close to the true one, but no bound."""
+    """Return log10 P(S ≥ score) for a Gaussian S with standard deviation ‖a‖: close to the true value, but no bound."""
     s, a = _as_floats(score, norm)
     if not (a > 0 and math.isfinite(s) and math.isfinite(a)):
         return 0.0
@@ -62,9 +64,9 @@ def log10_p_gaussian(score: ArrayLike, norm: ArrayLike) -> float:
 
 
 def log10_p_product(log10_p: Sequence[float]) -> float:
-    """Return log10 of the probability that a product of independent p-values is as small as it is.
+    """Return log10 of the probability that the product of independent p-values is at most the given product.
 
-    A product of n such is at most q with probability q Σ (-ln q)^i/i! over i < n (Fisher 1932).
+    A product of n independent p-values is at most q with probability q Σ (-ln q)^i/i! over i < n (Fisher 1932).
     """
     nats = -sum(log10_p) * math.log(10)
     return sum(log10_p) + math.log10(sum(nats**power / math.factorial(power) for power in range(len(log10_p))))
@@ -73,14 +75,15 @@ def log10_p_product(log10_p: Sequence[float]) -> float:
 def log10_p_fingerprint(
     score: Float[np.ndarray, " scores"], values: Float[np.ndarray, " slots"], biases: Float[np.ndarray, " slots"]
 ) -> Float64[np.ndarray, " scores"]:
-    """Bound the probability that an innocent recipient has such a score (Chernoff 1952), as log10.
+    """Bound the probability that an innocent recipient reaches a score (Chernoff 1952), as log10.
 
-    P(S ≥ s) ≤ E exp(θS) / exp(θs) for every θ ≥ 0; the terms of S are independent and two-valued, which gives E
-    exactly. The least of these bounds over a grid of θ is a bound, too, and the grid serves all scores at once.
+    P(S ≥ s) ≤ E exp(θS) / exp(θs) for every θ ≥ 0. The terms of S are independent and take two values each, so that the
+    expectation is computed exactly. The minimum of these bounds over a grid of θ is also a bound, and one grid serves
+    all scores.
 
     Args:
-        score: s from `jaxmark.watermark.tracing.tardos.scores`, `[scores]`.
-        values: y, **independent of the recipient's codeword**, `[slots]`.
+        score: scores s from `jaxmark.watermark.tracing.tardos.scores`, `[scores]`.
+        values: slot values y, **independent of the recipient's codeword**, `[slots]`.
         biases: p of each slot, `[slots]`.
 
     Returns:
@@ -104,11 +107,11 @@ def correlation_bound(
     coherence: Float[Array, ""] | float,
     beta: Float[Array, ""] | float,
 ) -> Float[Array, " bits"]:
-    """Compute the paper's lower bound (3) on |W_i|, the plain correlation, completed by the terms that it leaves out.
+    """Compute the paper's lower bound (3) on |W_i|, the plain correlation, including the terms that the paper omits.
 
-    For unit components with |⟨x_i, x_j⟩_D| ≤ ε, n bands, k bits of strength β, and an attack Σ_j a_j x_j inside the
-    span of the components, |W_i| ≥ βn - |Σ_j p_j a_j| - ε(n - 1)(βkn + Σ_j |a_j|). The paper omits β and the other
-    bits. At the ε of real meshes under its own kernel (about 0.9) the bound is negative and says nothing: do not rely
+    Assume unit components with |⟨x_i, x_j⟩_D| ≤ ε, n bands, k bits of strength β, and an attack Σ_j a_j x_j in the span
+    of the components. Then |W_i| ≥ βn - |Σ_j p_j a_j| - ε(n - 1)(βkn + Σ_j |a_j|). The paper omits β and the other
+    bits. For the ε of real meshes with the paper's kernel (about 0.9) the bound is negative, hence vacuous: do not rely
     on it.
 
     Args:

@@ -1,6 +1,7 @@
-"""Detections: what was read from a suspect, and the evidence for it.
+"""Detections: the results of reading suspects, and their evidence.
 
-Evidence is weighed in one way for all readings: the least of several proofs counts, after all that the ledger charges.
+The evidence of all readings is computed by one function, `weigh`: the smallest p-value of several tests, after all
+charges of the ledger.
 """
 
 import math
@@ -19,17 +20,19 @@ from jaxmark.watermark.evidence.ledger import MIN_LOG10_P, UNFLOORED, Charge, fi
 
 
 class Evidence(NamedTuple):
-    """What a reading proves, as log10 of probabilities.
+    """The evidence of a reading, as log10 of probabilities.
 
     Attributes:
-        log10_p: a bound on the false-positive probability, in [-77, 0], if all that is claimed was fixed, by a
-            timestamped commitment for example, before the suspect existed.
-        log10_p_uncommitted: the same if nothing was: for the best message of any of 2^64 keys, originals and records.
-        log10_p_gaussian: the probability if the score were Gaussian: an estimate, which decides nothing.
-        log10_p_unfloored: log10_p without the floor at -77: orders attacks and schemes, proves and decides nothing.
-        charges: what each choice of the reading cost; `log10_p` includes all of them. Of several marks that were
-            united, what uniting them cost: `Detection.parts` has the charges of each.
-        caveats: why the probabilities are estimates, not proofs; empty if they are proofs.
+        log10_p: the committed p-value: a bound on the false-positive probability, in [-77, 0], if everything that is
+            claimed was fixed before the suspect existed, for example by a timestamped commitment.
+        log10_p_uncommitted: the uncommitted p-value: the bound if nothing was fixed beforehand, for the best message of
+            any of 2^64 keys, originals and records.
+        log10_p_gaussian: an estimate of the probability that assumes a Gaussian score; no decision uses it.
+        log10_p_unfloored: `log10_p` without the floor at -77. It orders attacks and schemes, but proves nothing, and no
+            decision uses it.
+        charges: the cost of each choice of the reading; `log10_p` includes all of them. If several marks were united,
+            this is the cost of uniting them, and `Detection.parts` has the charges of each mark.
+        caveats: the reasons why the probabilities are estimates instead of proofs; empty if they are proofs.
     """
 
     log10_p: float = 0.0
@@ -40,7 +43,7 @@ class Evidence(NamedTuple):
     caveats: tuple[str, ...] = ()
 
     def charged(self, *charges: Charge) -> "Evidence":
-        """Charge further choices, which came before those that were charged already."""
+        """Charge further choices, which precede the choices that are already charged."""
         return self._replace(
             log10_p=figure(self.log10_p, charges, UNFLOORED),
             log10_p_uncommitted=figure(self.log10_p_uncommitted, charges, UNFLOORED),
@@ -50,42 +53,42 @@ class Evidence(NamedTuple):
 
     @classmethod
     def least(cls, *alternatives: "Evidence") -> "Evidence":
-        """Unite alternatives that were charged: each figure is the least of theirs, and all caveats hold."""
-        best = min(alternatives, key=lambda one: one.log10_p)
+        """Unite alternatives whose charges are included: take the smallest of each figure, and all caveats."""
+        best = min(alternatives, key=lambda evidence: evidence.log10_p)
         return best._replace(
-            log10_p_uncommitted=min(one.log10_p_uncommitted for one in alternatives),
-            log10_p_unfloored=min(one.log10_p_unfloored for one in alternatives),
+            log10_p_uncommitted=min(evidence.log10_p_uncommitted for evidence in alternatives),
+            log10_p_unfloored=min(evidence.log10_p_unfloored for evidence in alternatives),
             caveats=_all_caveats(alternatives),
         )
 
     @classmethod
     def product(cls, *marks: "Evidence") -> "Evidence":
-        """Unite what independent marks of one mesh prove: by Fisher's product, uncommitted by the least of them."""
+        """Unite the evidence of independent marks of one mesh by Fisher's product; uncommitted, take the smallest."""
 
-        def united(log10_p: Sequence[float], floor: float) -> float:
+        def combine(log10_p: Sequence[float], floor: float) -> float:
             return min(0.0, max(floor, bounds.log10_p_product(log10_p)))
 
-        log10_p = [one.log10_p for one in marks]
+        log10_p = [evidence.log10_p for evidence in marks]
         factor = bounds.log10_p_product(log10_p) - sum(log10_p)
         one_mark = ledger.MARKS.charge("one mark", len(marks))
         return marks[0]._replace(
-            log10_p=united(log10_p, MIN_LOG10_P),
-            log10_p_uncommitted=figure(min(one.log10_p_uncommitted for one in marks), [one_mark], UNFLOORED),
-            log10_p_unfloored=united([one.log10_p_unfloored for one in marks], UNFLOORED),
+            log10_p=combine(log10_p, MIN_LOG10_P),
+            log10_p_uncommitted=figure(min(evidence.log10_p_uncommitted for evidence in marks), [one_mark], UNFLOORED),
+            log10_p_unfloored=combine([evidence.log10_p_unfloored for evidence in marks], UNFLOORED),
             charges=(ledger.MARKS.charge("product", 10**factor),),
             caveats=_all_caveats(marks),
         )
 
 
 def _all_caveats(evidence: Sequence[Evidence]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(caveat for one in evidence for caveat in one.caveats))
+    return tuple(dict.fromkeys(caveat for part in evidence for caveat in part.caveats))
 
 
 class Tag(NamedTuple):
-    """A message whose keyed tag fits, as evidence."""
+    """The evidence of a decoded message whose keyed tag matches."""
 
     bits: int  # size of the tag
-    charges: tuple[Charge, ...]  # what finding the message cost
+    charges: tuple[Charge, ...]  # the cost of finding the message
 
 
 def weigh(
@@ -98,65 +101,67 @@ def weigh(
     looks: float = 1.0,
     caveats: tuple[str, ...] = (),
 ) -> Evidence:
-    """Weigh the evidence for one message: the best of its scores, and of its tag, after all charges.
+    """Compute the evidence for one message: the smallest p-value of its scores and its tag, after all charges.
 
     Args:
         ways: score and norm of the message's codeword for each way of weighting the suspect, see `log10_p_score`.
-        bits: size of the payload in bits, without the tag, which the message determines.
-        fixed: whether the message was claimed or recorded before the suspect was seen; else all are charged.
-        tag: the message's tag, if it may count: of a claimed message there may be none to look at.
-        charges: what was chosen before.
-        looks: number of looks at the suspect whose scores were compared, which blind readings charge.
-        caveats: why the result is an estimate.
+        bits: size of the payload in bits, without the tag.
+        fixed: whether the message was claimed or recorded before the suspect was seen; otherwise all messages of the
+            payload's size are charged.
+        tag: the message's tag, if it is evidence; None if the message was claimed and not decoded.
+        charges: charges for earlier choices.
+        looks: number of views of the suspect whose scores were compared; blind readings are charged for them.
+        caveats: the reasons why the result is an estimate.
     """
     proof = ledger.PROOF if looks == 1 else ledger.BLIND_PROOF
-    looked = () if looks == 1 else (ledger.LOOKS.charge("each", looks),)
-    every = (*looked, ledger.PAYLOAD.charge("each", bits=bits))
-    searched = looked if fixed else every
+    view_charges = () if looks == 1 else (ledger.LOOKS.charge("each", looks),)
+    message_charges = (*view_charges, ledger.PAYLOAD.charge("each", bits=bits))
+    score_charges = view_charges if fixed else message_charges
     scores = [bounds.log10_p_score(*way) for way in ways]
     count = len(ways) + (tag is not None)
-    proofs = [(score, (proof.charge("score", count), *searched)) for score in scores]
+    proofs = [(score, (proof.charge("score", count), *score_charges)) for score in scores]
     if tag is not None:
         proofs.append((bounds.log10_p_tag(tag.bits), (proof.charge("tag", count), *tag.charges)))
-    log10_p, paid = min(proofs, key=lambda one: figure(*one, UNFLOORED))
-    paid = (*charges, *paid)
-    # The best message is not searched for but decoded, so that without a commitment all messages are charged.
-    late = (ledger.FORGERIES, *charges, proof.charge("score", len(ways)), *every)
+    log10_p, spent = min(proofs, key=lambda candidate: figure(*candidate, UNFLOORED))
+    spent = (*charges, *spent)
+    # Without a commitment, the payload is always charged: the message may have been chosen to suit the suspect.
+    uncommitted = (ledger.FORGERIES, *charges, proof.charge("score", len(ways)), *message_charges)
     gaussian = min(bounds.log10_p_gaussian(*way) for way in ways)
     return Evidence(
-        log10_p=figure(log10_p, paid),
-        log10_p_uncommitted=figure(min(scores), late),
-        log10_p_gaussian=figure(gaussian, [proof.charge("score", len(ways)), *searched]),
-        log10_p_unfloored=figure(log10_p, paid, UNFLOORED),
-        charges=paid,
+        log10_p=figure(log10_p, spent),
+        log10_p_uncommitted=figure(min(scores), uncommitted),
+        log10_p_gaussian=figure(gaussian, [proof.charge("score", len(ways)), *score_charges]),
+        log10_p_unfloored=figure(log10_p, spent, UNFLOORED),
+        charges=spent,
         caveats=caveats,
     )
 
 
 def estimate_beside(claimed: tuple[ArrayLike, ArrayLike], read: tuple[ArrayLike, ArrayLike], shared: float) -> float:
-    """Estimate log10 p of a claimed message beside another one that was read, of what their codewords do not share.
+    """Estimate log10 p of a claimed message beside a decoded one, from the code bits in which their codewords differ.
 
-    There is no bound without a model: the mean of two copies shows nothing where their codewords differ.
+    No bound exists without a model: the mean of two marked copies carries no signal where their codewords differ.
 
     Args:
         claimed: score and norm of the claimed message.
-        read: score and norm of the message that was read.
-        shared: correlation of their codewords, in [-1, 1].
+        read: score and norm of the decoded message.
+        shared: correlation of the two codewords, in [-1, 1].
     """
-    (score, norm), (other, _) = (np.asarray(one, np.float64) for one in (claimed, read))
+    (score, norm), (other, _) = (np.asarray(pair, np.float64) for pair in (claimed, read))
     return min(0.0, bounds.log10_p_gaussian(score - shared * other, norm * math.sqrt(max(1 - shared**2, 1e-12))))
 
 
 def united_score(scores: Sequence[ArrayLike], norms: Sequence[ArrayLike], weights: Sequence[float]) -> float:
-    """Unite the scores of meshes that carry one message under one key, as a score of norm 1, less rounding.
+    """Unite the scores of meshes that carry one message under one key, as a score of norm 1, less rounding errors.
 
-    A score over its norm is a sum of independent signs with factors whose squares add up to 1. So is the weighted sum
-    over meshes, over the root of the sum of the squared weights, because the signs of different meshes are independent.
+    A score divided by its norm is a sum of independent signs times factors whose squares add up to 1. The signs of
+    different meshes are independent. A weighted sum over meshes, divided by the root of the sum of the squared weights,
+    is therefore also such a sum.
 
     Args:
-        scores: of the message's codeword in each mesh.
-        norms: of the vectors that the signs multiply.
-        weights: of the meshes, squared; **independent of the key**.
+        scores: score of the message's codeword in each mesh.
+        norms: norm of the vector that the signs multiply, for each mesh.
+        weights: squared weight of each mesh; **independent of the key**.
     """
     total = rounding = 0.0
     for score, norm, weight in zip(map(np.asarray, scores), map(np.asarray, norms), weights, strict=True):
@@ -172,29 +177,29 @@ def accuse(
     biases: Float[np.ndarray, " slots"],
     candidates: int,
 ) -> Float64[np.ndarray, " recipients"]:
-    """Return log10 of a bound on the probability that any innocent of those who were tried has such a score.
+    """Bound the probability that any innocent recipient among the tested ones reaches each score, as log10.
 
     Args:
-        scores: of the recipients who are accused, see `jaxmark.watermark.tracing.tardos.scores`.
-        values: of the slots, **independent of the codewords of innocents**.
-        biases: of the slots.
-        candidates: number of all recipients who were tried.
+        scores: scores of the accused recipients, see `jaxmark.watermark.tracing.tardos.scores`.
+        values: values of the slots, **independent of the codewords of innocents**.
+        biases: biases of the slots.
+        candidates: number of all recipients who were tested.
     """
     charge = ledger.RECIPIENTS.charge("each", max(candidates, 1))
-    return np.array([figure(one, [charge]) for one in bounds.log10_p_fingerprint(scores, values, biases)])
+    return np.array([figure(log10_p, [charge]) for log10_p in bounds.log10_p_fingerprint(scores, values, biases)])
 
 
 @runtime_checkable
 class Registration(Protocol):
-    """How a suspect was brought to where it was read: an `Alignment`, or the pose of a blind reading."""
+    """The registration of a suspect: an `Alignment`, or the pose of a blind reading."""
 
     @property
     def pose(self) -> Pose:
-        """From the suspect's file to where it was read."""
+        """The map from the coordinates of the suspect's file to those in which it was read."""
         ...
 
     def facts(self) -> dict[str, Any]:
-        """What a report says of it, as values for JSON."""
+        """Return the facts that a report states about the registration, as values for JSON."""
         ...
 
 
@@ -202,18 +207,18 @@ class Detection(NamedTuple):
     """The result of reading a suspect.
 
     Attributes:
-        message: the message that was read; None unless its keyed tag fits.
-        evidence: what the reading proves.
-        registration: how the suspect was brought to where it was read, a `Registration`: an `Alignment` with the
-            original, or of a blind reading an `Anchored`.
+        message: the message that was decoded; None unless its keyed tag matches.
+        evidence: the evidence of the reading.
+        registration: the registration of the suspect, a `Registration`: an `Alignment` with the original, or the
+            `Anchored` of a blind reading.
         scores: soft decisions of the code bits that the message was decoded from, scaled to root mean square 1.
-        coverage: share of the original's points that the suspect gave evidence for; None for a blind reading.
-        scheme: name of the scheme that was read.
-        premises: what must have been fixed before the suspect existed.
-        notes: what else the suspect looks like.
+        coverage: share of the original's points that the suspect gives evidence for; None for a blind reading.
+        scheme: name of the scheme of the mark.
+        premises: everything that must have been fixed before the suspect existed.
+        notes: further observations about the suspect.
         parts: the detections that are united here, by the names of meshes or schemes.
-        skipped: original meshes that could not be compared, and why.
-        version: version of the keyed choices that were read with.
+        skipped: original meshes that could not be compared, and the reasons.
+        version: version of the keyed choices that the mark was read with.
     """
 
     message: bytes | None
@@ -230,20 +235,20 @@ class Detection(NamedTuple):
 
     @property
     def log10_p(self) -> float:
-        """The head figure, `evidence.log10_p`."""
+        """The committed p-value as log10, `evidence.log10_p`."""
         return self.evidence.log10_p
 
     @property
     def rank(self) -> tuple[float, bool]:
-        """A key that sorts detections: what proves more comes first, and of equals what reads a message."""
+        """A sort key of detections: smaller p-values first, and among equal ones those with a message first."""
         return self.log10_p, self.message is None
 
     def detected(self, alpha: float = 1e-6, *, allow_estimate: bool = False) -> bool:
-        """Whether the false-positive probability is proven to be at most `alpha`, if all that is claimed was fixed.
+        """Whether the false-positive probability is proven to be at most `alpha`, if all claims were fixed before.
 
         Args:
             alpha: a probability.
-            allow_estimate: whether an estimate, which has caveats, will do.
+            allow_estimate: whether an estimate, which has caveats, also counts.
 
         Raises:
             JaxmarkError: if `alpha` is not in (0, 1).

@@ -1,13 +1,14 @@
-"""The ledger: every choice that a reading may make after it saw the suspect, and what each alternative costs.
+"""The ledger: all choices that a reader may make after seeing the suspect, and the share of each alternative.
 
-A bound of `jaxmark.watermark.evidence.bounds` holds for one proof that was fixed before the suspect was seen. Whoever
-reads may choose among several: how to align, which message, which of many originals. Each alternative has a share of
-the significance budget. The shares of a choice add up to at most 1, so that the best of all alternatives, with its
-probability divided by its share, is a bound again (the weighted Bonferroni correction). A share s costs -log10 s.
+A bound of `jaxmark.watermark.evidence.bounds` holds for a single test that was fixed before the suspect was seen. A
+reader may choose among several tests: how to align the suspect, which message to test, which of many originals to read
+with. The ledger gives each alternative a share of the significance budget, and the shares of a choice add up to at most
+1. The smallest p-value of all alternatives, divided by the share of its alternative, is then a valid bound (weighted
+Bonferroni correction). An alternative with the share s adds -log10 s to log10 p.
 
-Choices are a tree: what remains to be chosen after an alternative is its `then`. A reading is charged along one path
-from a root; a choice that was not open to it is left out, and costs nothing. Nothing else in the package spends a
-share.
+Choices form a tree: `Alternative.then` is the choice that follows an alternative. A reading is charged along one path
+that starts at a root. A choice that was not open to the reading is skipped and costs nothing. No other module of the
+package divides the significance budget.
 """
 
 import math
@@ -19,36 +20,36 @@ UNFLOORED = -math.inf
 
 
 class Charge(NamedTuple):
-    """What one choice cost a reading."""
+    """The cost of one choice of a reading."""
 
     choice: str  # the name of the choice
-    taken: str  # the alternative that was taken
-    log10: float  # what it adds to log10 p, at least 0
-    in_bound: bool  # whether it is part of a union bound, so that the floor of the key holds after it
+    taken: str  # the name of the alternative that was taken
+    log10: float  # the term that the choice adds to log10 p, at least 0
+    in_bound: bool  # whether the term belongs to a union bound: the floor of the key is then applied after it
 
 
 class Alternative(NamedTuple):
     """One alternative of a choice."""
 
     name: str
-    share: float | None  # of the significance budget; None for an equal share of a number that the reading counts
-    then: "Choice | None" = None  # what remains to be chosen
+    share: float | None  # of the significance budget; None if counted alternatives have equal shares
+    then: "Choice | None" = None  # the choice that follows
 
 
 class Choice(NamedTuple):
-    """A choice that is made after the suspect was seen."""
+    """A choice that the reader makes after seeing the suspect."""
 
     name: str
     alternatives: tuple[Alternative, ...]
-    counted: str = ""  # what is counted, if shares are equal
+    counted: str = ""  # the things that are counted, if shares are equal
     in_bound: bool = False  # see `Charge`
 
     def charge(self, taken: str, count: float = 1.0, *, bits: float = 0.0) -> Charge:
-        """Return what an alternative costs.
+        """Return the charge for an alternative.
 
         Args:
             taken: name of the alternative.
-            count: number of alternatives that share alike, if they are counted.
+            count: number of alternatives with equal shares, if they are counted.
             bits: base-2 logarithm of a further factor of that number.
         """
         share = next(one.share for one in self.alternatives if one.name == taken)
@@ -60,10 +61,10 @@ def figure(log10_p: float, charges: Sequence[Charge], floor: float = MIN_LOG10_P
     """Return log10 of the bound after all charges, at most 0.
 
     Args:
-        log10_p: of one proof, without a floor.
-        charges: of the reading that found it.
-        floor: of the key, before charges that are no part of the bound. `UNFLOORED` goes on below it: such figures
-            order attacks and schemes, but no claim rests on them.
+        log10_p: log10 of the bound of a single test, without a floor.
+        charges: the charges of the reading.
+        floor: the floor of the key. It is applied before the charges that belong to no union bound. With `UNFLOORED`,
+            figures below the floor are returned; they order attacks and schemes, but support no claim.
     """
     inside = sum(charge.log10 for charge in charges if charge.in_bound)
     outside = sum(charge.log10 for charge in charges if not charge.in_bound)
@@ -71,12 +72,12 @@ def figure(log10_p: float, charges: Sequence[Charge], floor: float = MIN_LOG10_P
 
 
 def uncommitted(log10_p: float) -> float:
-    """Return log10 of the bound if nothing was fixed beforehand, but all that was tried was charged."""
+    """Return log10 of the bound if nothing was fixed beforehand; `log10_p` must include all other charges."""
     return figure(log10_p, [FORGERIES], UNFLOORED)
 
 
 def _each(name: str, counted: str, then: Choice | None = None, *, in_bound: bool = False) -> Choice:
-    """A choice among alternatives that are counted, and share alike."""
+    """Make a choice among alternatives that are counted and have equal shares."""
     return Choice(name, (Alternative("each", None, then),), counted, in_bound)
 
 
@@ -92,29 +93,29 @@ def _alignment(then: Choice) -> Choice:
     )
 
 
-# From the leaves to the roots. The tag's rank is no Bonferroni correction: the r-th message to be tried is the first
-# that fits with a probability of at most r times that of one.
-RANK = _each("tag rank", "messages whose tags were tried, the one that fits included", in_bound=True)
+# Choices are defined from the leaves to the roots. The charge for the rank of a tag is a union bound, not a Bonferroni
+# correction: the probability that one of the first r candidates has the right tag is at most r times that of one.
+RANK = _each("tag rank", "candidate messages whose tags were compared, up to the one that matched", in_bound=True)
 DECODER = Choice(
     "decoder", (Alternative("correlations", 0.03, RANK), Alternative("joint decoding", 0.97, RANK)), in_bound=True
 )
-PAYLOAD = _each("payload", "messages that the payload can hold, if none was fixed beforehand", in_bound=True)
+PAYLOAD = _each("payload", "messages that the payload can hold, unless the message was fixed beforehand", in_bound=True)
 PROOF = Choice(
     "proof",
     (Alternative("score", None, PAYLOAD), Alternative("tag", None, DECODER)),
-    "ways of weighting the suspect, and the tag of a message that was read",
+    "the ways of weighting the suspect, plus one for the tag if a message was decoded",
 )
 MESSAGE = Choice("message", (Alternative("claimed or recorded", 0.97, PROOF), Alternative("another", 0.03, PROOF)))
 READING = Choice(
-    "reading", (Alternative("all points", 0.95, MESSAGE), Alternative("coarse or non-rigid", 0.05, MESSAGE))
+    "reading method", (Alternative("standard", 0.95, MESSAGE), Alternative("coarse or non-rigid", 0.05, MESSAGE))
 )
 ALIGNMENT = _alignment(READING)
 REFLECTION = Choice(
-    "reflection of a surface",
-    (Alternative("the one that fits better", 0.97, ALIGNMENT), Alternative("the other", 0.03, ALIGNMENT)),
+    "reflection",
+    (Alternative("better fit", 0.97, ALIGNMENT), Alternative("worse fit", 0.03, ALIGNMENT)),
 )
 PASS_BAND = Choice(
-    "pass band, without a record",
+    "pass band (no record)",
     (
         Alternative("tapered", 0.9, REFLECTION),
         Alternative("low", 0.05, REFLECTION),
@@ -122,96 +123,96 @@ PASS_BAND = Choice(
     ),
 )
 
-# Scenes: the sum over meshes, in the poses that the readings of single meshes chose, or one mesh.
+# Scenes: either the sum of scores over meshes, in the poses that the readings of single meshes chose, or one mesh.
 SUM_ALIGNMENT = _alignment(MESSAGE)
-MESHES = _each("mesh", "meshes of the original that were compared", REFLECTION)
+MESHES = _each("mesh", "meshes of the original scene that were compared", REFLECTION)
 SCENE = Choice("scene", (Alternative("sum over meshes", 0.5, SUM_ALIGNMENT), Alternative("one mesh", 0.5, MESHES)))
 
-# Blind reading. Tags are tried reading by reading, so that their rank counts those of all readings.
-LOOKS = _each("look", "widths, views, quantisation steps and poses of the suspect", PAYLOAD, in_bound=True)
+# Blind reading. The rank of a tag counts the candidates of all readings, because tags are compared reading by reading.
+LOOKS = _each("view", "combinations of width, view, quantisation step and pose", PAYLOAD, in_bound=True)
 BLIND_PROOF = Choice(
-    "proof", (Alternative("score", None, LOOKS), Alternative("tag", None, RANK)), "the score, and the tag"
+    "proof", (Alternative("score", None, LOOKS), Alternative("tag", None, RANK)), "the score and the tag"
 )
 BLIND_MESSAGE = Choice(
     "message", (Alternative("claimed or recorded", 0.97, BLIND_PROOF), Alternative("another", 0.03, BLIND_PROOF))
 )
-BLIND_SCHEME = _each("scheme, without a record", "blind schemes", BLIND_MESSAGE)
-PARTS = _each("part of a file", "meshes of the suspect times records", BLIND_SCHEME)
+BLIND_SCHEME = _each("scheme (no record)", "blind schemes", BLIND_MESSAGE)
+PARTS = _each("part of a file", "meshes of the suspect, times the number of records", BLIND_SCHEME)
 
-# Several marks in one mesh: their probabilities are independent, so that Fisher's product of them counts, which has a
-# factor and no share; where nothing is committed, the least of them counts.
+# Several marks in one mesh: their p-values are independent, so they are united by Fisher's product, which has a factor
+# instead of a share. The uncommitted p-value is the smallest of the marks' own, charged for their number.
 MARKS = Choice(
     "marks in one mesh",
     (Alternative("product", None), Alternative("one mark", None, REFLECTION)),
-    "the factor of Fisher's product of independent probabilities; the marks, if one of them counts",
+    "the factor of Fisher's product of independent p-values; for one mark, the number of marks",
 )
 
 # Copies for recipients.
-RECIPIENTS = _each("recipient", "recipients who were tried")
+RECIPIENTS = _each("recipient", "recipients who were tested")
 COPY_ALIGNMENT = _alignment(RECIPIENTS)
 
-# Catalogues: all that could have been named in place of what is.
+# Catalogues: everything that could have been identified instead.
 ORIGINALS = Choice(
     "catalogue",
     (Alternative("original", None, PASS_BAND), Alternative("copy", None, COPY_ALIGNMENT)),
-    "pieces of the suspect times keys times originals without a record, records and lists of recipients",
+    "pieces of the suspect, times keys, times the number of originals without a record, records and recipient lists",
 )
 
-# What was fixed beforehand, and by what.
-COMMITMENT = _each("timestamped commitment", "records under it", PASS_BAND)
-UNCOMMITTED = _each("forgery", "2^64 keys, originals and records, as many as can be paid for", PASS_BAND)
+# The commitment under which everything else was fixed beforehand, if any.
+COMMITMENT = _each("timestamped commitment", "records in the commitment", PASS_BAND)
+UNCOMMITTED = _each("forgery", "2^64 keys, originals and records, the most that anyone can afford to try", PASS_BAND)
 
 FORGERIES = UNCOMMITTED.charge("each", bits=64)
 
-#: The paths of readings, by what is read.
+#: The roots of the tree, by the kind of reading.
 ROOTS: dict[str, Choice] = {
-    "One mesh, with the original": PASS_BAND,
+    "One mesh, non-blind": PASS_BAND,
     "A scene of several meshes": SCENE,
-    "Blind, without the original": PARTS,
+    "Blind": PARTS,
     "Several marks in one mesh": MARKS,
     "Copies for recipients": COPY_ALIGNMENT,
     "A catalogue of originals": ORIGINALS,
-    "A record of a timestamped commitment": COMMITMENT,
-    "Nothing committed": UNCOMMITTED,
+    "A record with a timestamped commitment": COMMITMENT,
+    "Without a commitment": UNCOMMITTED,
 }
 
 
 def choices(root: Choice) -> Iterator[Choice]:
-    """Iterate over a choice and all that may remain to be chosen after it, each once."""
-    found: list[Choice] = [root]
-    for choice in found:
-        found += [one.then for one in choice.alternatives if one.then is not None and one.then not in found]
-    return iter(found)
+    """Iterate over a choice and all choices that can follow it, each once."""
+    reachable: list[Choice] = [root]
+    for choice in reachable:
+        reachable += [one.then for one in choice.alternatives if one.then is not None and one.then not in reachable]
+    return iter(reachable)
 
 
 def is_charged_along_a_path(charges: Sequence[Charge]) -> bool:
-    """Whether charges follow one path from a root, in this order, with choices left out that were not open."""
+    """Whether charges follow one path from a root, in this order; choices that were not open may be missing."""
 
-    def follows(choice: Choice | None, left: Sequence[Charge]) -> bool:
-        if not left or choice is None:
-            return not left
-        head, *rest = left
-        taken = [one for one in choice.alternatives if (choice.name, one.name) == (head.choice, head.taken)]
-        return any(follows(one.then, rest) for one in taken) or any(
-            follows(one.then, left) for one in choice.alternatives
+    def follows(choice: Choice | None, remaining: Sequence[Charge]) -> bool:
+        if not remaining or choice is None:
+            return not remaining
+        head, *rest = remaining
+        matching = [one for one in choice.alternatives if (choice.name, one.name) == (head.choice, head.taken)]
+        return any(follows(one.then, rest) for one in matching) or any(
+            follows(one.then, remaining) for one in choice.alternatives
         )
 
     return any(follows(root, list(charges)) for root in ROOTS.values())
 
 
 def table() -> str:
-    """Return the ledger as a Markdown table: for each path its choices and the shares of their alternatives."""
-    lines = ["| path | choice | alternatives, and their shares |", "|---|---|---|"]
-    known: list[Choice] = []
+    """Return the ledger as a Markdown table: for each path, its choices and the shares of their alternatives."""
+    lines = ["| path | choice | alternatives and their shares of the significance budget |", "|---|---|---|"]
+    listed: list[Choice] = []
     for path, root in ROOTS.items():
         for choice in choices(root):
-            if choice in known:
+            if choice in listed:
                 continue
-            known.append(choice)
+            listed.append(choice)
             shares = "; ".join(
                 one.name if one.share is None else f"{one.name} {100 * one.share:g} %" for one in choice.alternatives
             )
             if choice.counted:
-                shares = f"{shares}: equal shares, counted: {choice.counted}".removeprefix("each: ")
+                shares = f"{shares}: equal shares; counted: {choice.counted}".removeprefix("each: ")
             lines.append(f"| {path} | {choice.name} | {shares} |")
     return "\n".join(lines) + "\n"

@@ -1,1 +1,1 @@
-"""What people see of a mark: budgets, masking, visibility by frequency, and what a mesh can carry within them."""
+"""The visibility of marks: budgets, masking, visibility by frequency, and the capacity within them."""

@@ -1,4 +1,4 @@
-"""How strong a mark may be: an RMS displacement, limits on any metrics of distortion, or both."""
+"""Budgets for the strength of a mark: an RMS displacement, limits on any metrics of distortion, or both."""
 
 import math
 from collections.abc import Callable, Collection, Mapping
@@ -18,41 +18,45 @@ from jaxmark.geometry.mesh import Mesh, diagonal, edges
 
 Visibility = Literal["hidden", "careful look", "visible"]
 
-#: Limits by what people see. Hidden: nowhere, on 99 % of the surface, does shading change by what is just noticed, less
-#: a notch; and in the Geo-metric study (2022), people notice noise in a face three times in four from a DAME of 0.0092
-#: on, at the spatial frequency at which they see it best, at other frequencies from up to 0.035 on. Edges, which only
-#: wireframes and textures show, change by no more than a tenth. On a careful look: two to three times that is seen by
-#: who compares with the original. Visible: five times and more.
+#: Limits by visibility. `hidden`: on 99 % of the surface, the change of shading is below the just noticeable
+#: difference, with a margin. DAME stays below 0.0092: from this value on, people notice noise three times in four on
+#: models of human faces (Geo-metric study, 2022), at the spatial frequency that they see best. At other frequencies,
+#: they notice it from values of up to 0.035. Edges, which only wireframes and textures show, change their lengths by at
+#: most a tenth. `careful look`: two to three times as much, which is seen in a comparison with the original.
+#: `visible`: at least five times as much.
 VISIBILITY: Mapping[Visibility, Mapping[str, float]] = {
     "hidden": {"shading": 0.85, "dame": 0.008, "stretch": 0.1},
     "careful look": {"shading": 2.5, "dame": 0.02, "stretch": 0.15},
     "visible": {"shading": 6.0, "dame": 0.05, "stretch": 0.25},
 }
-#: The same for point clouds, which have no faces that shade: hidden is an RMS displacement of 0.02 % of the diagonal,
-#: or less where points are so dense that 5 % of them would move across their surface by more than 0.15 of the distance
-#: between nearest points.
+#: The same for point clouds, which have no faces that shade. `hidden` is an RMS displacement of 0.02 % of the diagonal.
+#: It is less where points are so dense that 5 % of them would move across their surface by more than 0.15 of the
+#: distance between nearest points.
 CLOUD_VISIBILITY: Mapping[Visibility, Mapping[str, float]] = {
     "hidden": {"rms": 2e-4, "point_to_plane": 0.15},
     "careful look": {"rms": 5e-4, "point_to_plane": 0.4},
     "visible": {"rms": 1e-3, "point_to_plane": 1.0},
 }
-_FACET, _MOST_OF_FACETS = 0.02, 2.5  # mean edge over the diagonal beyond which a model is one of facets
-_MAX_RMS = 0.01  # displacement in diagonals, if only limits are given; a larger one is no watermark
-_FIRST_OF_EDGES = 0.04  # displacement over the mean edge that is tried first: limits mostly allow about as much
-_FIRST_OF_CLOUDS = 2e-4  # the same of point clouds, in diagonals
-_MIN_LIMIT_SHARE = 0.99  # share of a limit that is as good as all of it
-_SECANT_STEPS = 10  # then bisection, which cannot fail
+_FACET, _MOST_OF_FACETS = (
+    0.02,
+    2.5,
+)  # mean edge over the diagonal from which the limit of DAME grows; its largest factor
+_MAX_RMS = 0.01  # largest displacement in diagonals if only limits are given; a larger one is no watermark
+_FIRST_OF_EDGES = 0.04  # displacement over the mean edge that is tried first: limits usually allow about as much
+_FIRST_OF_CLOUDS = 2e-4  # displacement of point clouds that is tried first, in diagonals
+_MIN_LIMIT_SHARE = 0.99  # share of a limit that must be reached
+_SECANT_STEPS = 10  # number of secant steps, after which bisection follows, which cannot fail
 
 
-#: The largest values of metrics, by their names in `distortion.METRICS` or by functions of your own.
+#: The largest allowed values of metrics, by their names in `distortion.METRICS` or by functions of your own.
 Limits = Mapping[str, float] | Mapping[Metric, float]
 
 
 class Bounds(NamedTuple):
     """Upper bounds on the distortion of one mesh, from `Budget.bounds`."""
 
-    rms: float | None  # RMS displacement of the welded vertices that faces use, unweighted, over the diagonal
-    limits: Mapping[Metric, float]  # on metrics, by their names in `distortion.METRICS`, or on functions of your own
+    rms: float | None  # unweighted RMS displacement of the welded vertices of faces, over the diagonal
+    limits: Mapping[Metric, float]  # limits on metrics, by their names in `distortion.METRICS` or by your own functions
 
     def __str__(self) -> str:
         parts = [] if self.rms is None else [f"a budget of {self.rms:g}"]
@@ -63,21 +67,21 @@ class Bounds(NamedTuple):
 
 @dataclass(frozen=True)
 class Budget:
-    """How strong a mark may be, and what it must survive. Without `rms`, `visibility` and `limits`, it is hidden.
+    """How strong a mark may be, and what it must survive; hidden without `rms`, `visibility` and `limits`.
 
-    Where a budget is expected, a number stands for `Budget(rms=...)`, a name for `Budget(visibility=...)`, a mapping
-    for `Budget(limits=...)`, and None for `Budget()`.
+    Functions that take a budget also accept a number for `Budget(rms=...)`, a name for `Budget(visibility=...)`, a
+    mapping for `Budget(limits=...)`, and None for `Budget()`.
 
     Attributes:
-        rms: RMS displacement of the welded vertices that faces use, unweighted, relative to the diagonal of their
-            axis-aligned bounding box, in (0, 1): 0.0008 is 0.08 % of it. Met exactly, unless a limit is reached first.
-        visibility: how well people may see the mark: `"hidden"`, `"careful look"` (seen beside the original) or
-            `"visible"`; see `visibility_of` for the limits that these stand for.
-        limits: the largest values that metrics of `distortion.METRICS` may reach, by name, in the units of
-            `distortion.Comparison`; or that metrics of your own may, by function (see `distortion.measure`).
-        noise: the noise that the message must survive when half of the vertices are lost, as half width over the mean
-            distance of the vertices to their centre; 0 requires only that there are enough dimensions, None nothing
-            but that the message reads. It has no effect for schemes whose readers have no model of noise.
+        rms: unweighted RMS displacement of the welded vertices of faces, relative to the diagonal of their axis-aligned
+            bounding box, in (0, 1): 0.0008 is 0.08 % of it. It is reached exactly, unless a limit is reached first.
+        visibility: how well people may see the mark: `"hidden"`, `"careful look"` (seen next to the original) or
+            `"visible"`; see `visibility_of` for the corresponding limits.
+        limits: the largest allowed values of metrics: of metrics in `distortion.METRICS` by name, in the units of
+            `distortion.Comparison`, or of your own metrics by function (see `distortion.measure`).
+        noise: the noise that the message must survive if half of the vertices are lost, as half width over the mean
+            distance of the vertices to their centre. With 0, only the number of dimensions must suffice; with None, the
+            message must only be readable. It has no effect for schemes whose readers have no model of noise.
     """
 
     rms: float | None = None
@@ -100,7 +104,7 @@ class Budget:
         for metric, limit in (self.limits or {}).items():
             if isinstance(metric, str) and metric not in distortion.METRICS:
                 known = ", ".join(distortion.METRICS)
-                raise JaxmarkError(f"There is no metric {metric!r} to limit; there are {known}.")
+                raise JaxmarkError(f"There is no metric {metric!r} to limit; the metrics are {known}.")
             if not 0 < limit < math.inf:
                 raise JaxmarkError(f"The limit of {name_of(metric)} must be a positive number, got {limit}.")
         if self.rms is None and self.visibility is None and self.limits is not None and not self.limits:
@@ -108,7 +112,7 @@ class Budget:
 
     @classmethod
     def of(cls, given: "BudgetLike") -> "Budget":
-        """Make a budget from a number, a name, limits or None; a budget is returned as it is.
+        """Make a budget from a number, a name, limits or None; a budget is returned unchanged.
 
         Raises:
             JaxmarkError: see `Budget`.
@@ -124,16 +128,16 @@ class Budget:
                 return cls(rms=given)
 
     def bounds(self, mesh: Mesh) -> Bounds:
-        """Return the bounds for a mesh: the least of the limits that are given and those of the visibility."""
+        """Return the bounds for a mesh; each limit is the smaller one of the given one and that of the visibility."""
         is_hidden = self.rms is None and self.limits is None and self.visibility is None
         name = "hidden" if is_hidden else self.visibility
-        wanted: dict[Metric, float] = {} if name is None else {**visibility_of(mesh)[name]}
+        limits: dict[Metric, float] = {} if name is None else {**visibility_of(mesh)[name]}
         for metric, limit in (self.limits or {}).items():
-            wanted[metric] = min(limit, wanted.get(metric, math.inf))
-        return Bounds(self.rms, wanted)
+            limits[metric] = min(limit, limits.get(metric, math.inf))
+        return Bounds(self.rms, limits)
 
     def __str__(self) -> str:
-        """The name by which a study calls the budget: `0.0008`, `hidden` or `dame=0.008`, or several of these."""
+        """Return the name of the budget in studies: `0.0008`, `hidden` or `dame=0.008`, or several of these."""
         parts = [] if self.rms is None else [str(self.rms)]
         parts += [] if self.visibility is None else [self.visibility]
         parts += [f"{name_of(metric)}={limit}" for metric, limit in (self.limits or {}).items()]
@@ -141,7 +145,7 @@ class Budget:
         return " ".join(parts) or "hidden"
 
 
-#: What stands for a budget: see `Budget`.
+#: A budget, or a short form of one: see `Budget`.
 BudgetLike = Budget | float | Visibility | Limits | None
 
 
@@ -154,11 +158,12 @@ class Written(NamedTuple):
 
 
 def visibility_of(mesh: Mesh) -> Mapping[Visibility, Mapping[str, float]]:
-    """The limits by what people see of such a mesh: `VISIBILITY`, or of a point cloud `CLOUD_VISIBILITY`.
+    """Return the limits of each visibility for a mesh: `VISIBILITY`, or `CLOUD_VISIBILITY` for a point cloud.
 
     On a model of large facets, a change of angles is a change of few and large areas, which people see less well than
-    of many small ones: the limit of DAME grows with the mean edge where that is longer than 2 % of the diagonal, up to
-    two and a half times, 0.02 for what is hidden. What shading allows stays; `docs/visibility.md` has pictures.
+    changes of many small areas. The limit of DAME therefore grows with the mean edge if that is longer than 2 % of the
+    diagonal, by a factor of at most 2.5, to 0.02 for `hidden`. The limit of shading does not change.
+    `docs/visibility.md` has pictures.
     """
     if not len(mesh.faces):
         return CLOUD_VISIBILITY
@@ -167,12 +172,12 @@ def visibility_of(mesh: Mesh) -> Mapping[Visibility, Mapping[str, float]]:
 
 
 def first_rms(mesh: Mesh) -> float:
-    """The RMS displacement in diagonals that is tried first, where limits say how far a mesh may be displaced."""
+    """Return the RMS displacement, in diagonals, that is tried first if limits determine the displacement."""
     return _FIRST_OF_EDGES * _mean_edge(mesh) if len(mesh.faces) else _FIRST_OF_CLOUDS
 
 
 def _mean_edge(mesh: Mesh) -> float:
-    """Mean length of an edge over the diagonal."""
+    """Compute the mean length of an edge over the diagonal."""
     points, pairs = np.asarray(mesh.vertices, np.float64), edges(mesh.faces)
     return float(np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1).mean()) / diagonal(mesh)
 
@@ -191,35 +196,37 @@ def displace_within(
     Args:
         original: the mesh to displace.
         shift: displacement of each point, in diagonals, up to a common factor; not all zero.
-        bounds: the bounds to keep.
-        reference: of the original's mesh, if there is one already: limits are measured against it.
-        first: RMS displacement in diagonals that is tried first, if there are limits; by default see `first_rms`.
-        share: of the limits, as good as all of them: with less, fewer displacements are tried.
+        bounds: the bounds on the distortion.
+        reference: the mesh that limits are measured against, prepared for metrics; by default the original's.
+        first: RMS displacement in diagonals that is tried first, if there are limits; by default `first_rms`.
+        share: share of the limits that must be reached; with a smaller one, fewer displacements are tried.
 
     Raises:
-        JaxmarkError: if the displacement is lost in rounding; if limits alone allow an RMS displacement of 0.01; or see
-            `distortion.measure`.
+        JaxmarkError: if the displacement is lost in rounding; if limits alone allow an RMS displacement of 0.01; see
+            also `distortion.measure`.
     """
-    # Budgets are relative to the file's diagonal; the original's points may be rounded.
+    # Budgets are relative to the diagonal of the file's mesh; the original's points may be rounded.
     size = float(distortion.rms(shift[original.used])) * original.diagonal / diagonal(original.mesh)
 
     compared = reference or distortion.Reference(original.mesh)
 
     def limit_ratio(metrics: Collection[Metric], rms: float) -> float:
-        """The largest ratio of a metric to its limit."""
-        found = compared.measure(displace(original, rms / size * shift), metrics)
-        return max((found[metric] or 0.0) / bounds.limits[metric] for metric in metrics)
+        """Compute the largest ratio of a metric to its limit."""
+        values = compared.measure(displace(original, rms / size * shift), metrics)
+        return max((values[metric] or 0.0) / bounds.limits[metric] for metric in metrics)
 
-    rms = most = bounds.rms or _MAX_RMS
+    rms = largest = bounds.rms or _MAX_RMS
     if bounds.limits:
         first = first or first_rms(original.mesh)
-        # What single edges tell is quickly found; mostly it is as little as all limits allow, and they are tried once.
-        for metrics in dict.fromkeys((tuple(one for one in bounds.limits if one in LOCAL), tuple(bounds.limits))):
+        # Metrics of single edges are fast. Usually they determine the displacement, and the others are measured once.
+        for metrics in dict.fromkeys(
+            (tuple(metric for metric in bounds.limits if metric in LOCAL), tuple(bounds.limits))
+        ):
             if metrics:
-                rms = largest_within(partial(limit_ratio, metrics), rms, first if rms == most else rms, share)
+                rms = largest_within(partial(limit_ratio, metrics), rms, first if rms == largest else rms, share)
         if bounds.rms is None and rms == _MAX_RMS:
             raise JaxmarkError(
-                f"Moved by {_MAX_RMS:g} of its diagonal, this mesh still keeps {bounds}; give a budget, too."
+                f"A displacement of {_MAX_RMS:g} of the diagonal still keeps {bounds}; give a budget, too."
             )
     marked = displace(original, rms / size * shift)
     reached = distortion.DisplacementSize.of(shift_of(original, marked)[original.used])
@@ -231,14 +238,14 @@ def displace_within(
 def largest_within(
     within: Callable[[float], float], most: float, first: float, share: float = _MIN_LIMIT_SHARE
 ) -> float:
-    """Find the largest size, up to `most`, at which a rising function is at most 1; `share` of that will do.
+    """Find the largest size, up to `most`, at which an increasing function is at most 1.
 
-    Secant steps in logarithms, because metrics are nearly powers of the size; each step stays between a size that fits
-    and one that does not.
+    The search stops when the function is at least `share`. It takes secant steps in logarithms, because metrics are
+    nearly powers of the size; each step stays between a size that fits and one that does not.
     """
     low, high = 0.0, math.inf
-    size, slope, before = min(first, most), 1.0, None
-    for tries in count():
+    size, slope, previous = min(first, most), 1.0, None
+    for step in count():
         value = within(size)
         if value <= 1:
             low = size
@@ -248,12 +255,12 @@ def largest_within(
             high = size
         if high <= low * (2 - share):
             return low
-        if before is not None and value > 0 and before[1] > 0 and size != before[0] and value != before[1]:
-            slope = math.log(value / before[1]) / math.log(size / before[0])
-        before = size, value
-        aim = (1 + share) / 2
-        guess = size * (aim / value) ** (1 / slope) if value > 0 and slope > 0.2 else most
-        if tries >= _SECANT_STEPS or not low < guess < high:
+        if previous is not None and value > 0 and previous[1] > 0 and size != previous[0] and value != previous[1]:
+            slope = math.log(value / previous[1]) / math.log(size / previous[0])
+        previous = size, value
+        target = (1 + share) / 2
+        guess = size * (target / value) ** (1 / slope) if value > 0 and slope > 0.2 else most
+        if step >= _SECANT_STEPS or not low < guess < high:
             guess = math.sqrt(low * high) if low > 0 and high < math.inf else 2 * low if low else high / 4
         size = min(guess, most)
         if size < 1e-12:

@@ -1,4 +1,4 @@
-"""How many bits a mesh can carry, by the room for them in the pass band and by their energy in noise."""
+"""The capacity of a mesh: the bits that it can carry, by the dimensions of the pass band and their energy in noise."""
 
 import math
 from collections.abc import Callable, Hashable, Mapping
@@ -19,25 +19,26 @@ from jaxmark.watermark.coding.message import TAG_BITS
 from jaxmark.watermark.interfaces import Carrier, FreeDimensions, Reader, Scheme
 from jaxmark.watermark.perception.budget import Bounds, displace_within
 
-_MAX_PAYLOAD_BYTES = 2**20  # if nothing else bounds the payload
+_MAX_PAYLOAD_BYTES = 2**20  # the limit if nothing else limits the payload
 
-# Energy in decibels that the polar code needs beyond the least, at a message error rate of 1e-3;
-# `benchmarks/theory/limit.py --code-only` measures it.
+# Energy in decibels that the polar code needs above the theoretical minimum, at a message error rate of 1e-3, as
+# measured by `benchmarks/theory/limit.py --code-only`.
 _CODE_GAP_DB = 1.0
 
 NOISE = 0.005  # half width over the mean distance to the centre: the strongest noise of the SMI 2010 protocol
 COVERAGE = 0.5  # share of the vertices that may be left
 
-_ROUGH = 0.8  # share of a limit that is as good as all of it for an estimate
-_PROBES = 5  # marks that are tried to see how strong limits allow them to be
-_SPREADS, _MIN_SPREAD = 3, 0.007  # standard deviations of their logarithms that are subtracted, and the least of these
+_ROUGH = 0.8  # share of a limit that must be reached for an estimate
+_PROBES = 5  # number of marks from which the strength that limits allow is measured
+_SPREADS, _MIN_SPREAD = 3, 0.007  # standard deviations of the log strengths to subtract, and their lower limit
 
 
 def least_energy(bits: int, error: float = 1e-3) -> float:
-    """Least E/N0 with which any code can carry bits in white noise at a message error rate.
+    """Compute the least E/N0 with which any code can carry bits in white noise at a message error rate.
 
-    It is given by the converse 2^-bits = Q(√(2E/N0) + Q⁻¹(1 - error)) of Polyanskiy, Poor, Verdú, "Minimum energy to
-    send k bits through the Gaussian channel with and without feedback", IEEE Trans. Inf. Theory 57, 2011, Theorem 2.
+    It is the solution of the converse 2^-bits = Q(√(2E/N0) + Q⁻¹(1 - error)) of Polyanskiy, Poor, Verdú, "Minimum
+    energy to send k bits through the Gaussian channel with and without feedback", IEEE Trans. Inf. Theory 57, 2011,
+    Theorem 2.
 
     Args:
         bits: number of bits.
@@ -52,10 +53,10 @@ def least_energy(bits: int, error: float = 1e-3) -> float:
 
 
 def needed_energy(bits: int) -> float:
-    """E/N0 with which a payload of `bits` bits is read in noise alone, except for about one message in a thousand.
+    """Compute the E/N0 with which a payload is read in noise alone, at a message error rate of about 1e-3.
 
-    The code needs `_CODE_GAP_DB` more than the least energy for message and tag. Without a payload, presence is to be
-    proven at 1e-6 by a score that noise lowers by three standard deviations.
+    The code needs `_CODE_GAP_DB` more than the least energy for message and tag. A presence mark is to be detected at
+    1e-6 by a score that noise reduces by three standard deviations.
     """
     if bits == 0:
         return (math.sqrt(2 * math.log(1e6)) + 3) ** 2 / 2
@@ -63,7 +64,7 @@ def needed_energy(bits: int) -> float:
 
 
 def worth(ratio: Float64[np.ndarray, " bands"], dimensions: Float64[np.ndarray, " bands"]) -> float:
-    """Effective E/N0 where the other bits are noise to each bit: Σ_j n_j x_j/(1 + x_j).
+    """Compute the effective E/N0 if the other bits act as noise on each bit: Σ_j n_j x_j/(1 + x_j).
 
     Joint decoding removes half of that noise.
 
@@ -75,11 +76,11 @@ def worth(ratio: Float64[np.ndarray, " bands"], dimensions: Float64[np.ndarray, 
 
 
 def needed_dimensions(bits: int) -> float:
-    """Number of dimensions that a payload needs, to prove its message without a tag and to tell its code bits apart.
+    """Compute the number of dimensions that a payload needs for proving its message without a tag, and for decoding it.
 
-    Without noise the squared score over its squared norm is about the number of dimensions n, so that the union bound
-    2^bits exp(-n/2) is at most 1e-6 for n = 1.39 bits + 28. The code needs two dimensions for each bit of message and
-    tag.
+    Without noise, the squared score over its squared norm is about the number of dimensions n. The union bound
+    2^bits exp(-n/2) is then at most 1e-6 for n = 1.39 bits + 28. The code needs two dimensions for each bit of message
+    and tag.
     """
     return max(2 * math.log(2) * bits + 28, 2.0 * (bits + TAG_BITS) if bits else 0.0)
 
@@ -90,20 +91,20 @@ class Survival(NamedTuple):
     It is infinite for schemes whose readers have no model of noise.
     """
 
-    whole: float  # if all vertices are left
-    half: float  # if half of them are lost
+    whole: float  # the noise if all vertices are left
+    half: float  # the noise if half of them are lost
 
 
 class Conditions(NamedTuple):
     """The conditions under which a message must still be readable."""
 
-    bounds: Bounds  # on the distortion by the mark
+    bounds: Bounds  # bounds on the distortion by the mark
     noise: float  # half width of uniform noise over the mean distance of the vertices to their centre
     coverage: float  # share of the vertices that are left
 
 
 class Capacity:
-    """Computes how many bits an original can carry with a scheme; measures each layout only once.
+    """The capacity of an original with a scheme; each layout of the pass band is measured only once.
 
     If the scheme's reader has no model of noise (see `Reader.free_dimensions`), only the number of code bits limits
     the payload.
@@ -116,13 +117,13 @@ class Capacity:
         known: Mapping[int, Callable[[], Reader]] | None = None,
         reference: distortion.Reference | None = None,
     ) -> None:
-        """Prepare for an original and a scheme.
+        """Prepare to measure the capacity of an original with a scheme.
 
         Args:
             original: the mesh to mark.
             scheme: the scheme to mark it with.
-            known: what makes the readers that are needed besides, or has them already, by the size of their payload.
-            reference: of the original's mesh, if there is one already.
+            known: functions that return available readers, by the size of their payload; other readers are made.
+            reference: the original's mesh, prepared for metrics, if it is available.
         """
         self.original, self.scheme = original, scheme
         self._known = {scheme.layout(original, bits): make for bits, make in (known or {}).items()}
@@ -133,12 +134,12 @@ class Capacity:
     def least_budget(self, bits: int, conditions: Conditions) -> float:
         """Compute the least RMS displacement, in diagonals, with which a payload is readable.
 
-        N0/2 is the variance ν²/3 of uniform noise of half width ν = noise · radius. The energy is what coverage and
-        projection leave of the mark's energy.
+        N0/2 is the variance ν²/3 of uniform noise of half width ν = noise · radius. The energy is that of the mark
+        after cropping and projection.
 
         Args:
             bits: size of the payload in bits.
-            conditions: the noise and the coverage; the budget does not matter.
+            conditions: the noise and the coverage; the bounds have no effect.
 
         Returns:
             The displacement; 0 if there is no noise or no model of it, infinite if there are too few dimensions.
@@ -147,15 +148,15 @@ class Capacity:
             self.scheme.code_length(self.original, bits)
         except JaxmarkError:
             return math.inf
-        left, needed = self._left(bits), needed_energy(bits)
-        if left is None:
+        free, needed = self._free_dimensions(bits), needed_energy(bits)
+        if free is None:
             return 0.0
-        dimensions = conditions.coverage * left.dimensions
+        dimensions = conditions.coverage * free.dimensions
         if dimensions.sum() <= max(needed_dimensions(bits), needed):
             return math.inf
         if conditions.noise == 0:
             return 0.0
-        ratio = left.energy / (2 * (conditions.noise * self.original.radius) ** 2 / 3)
+        ratio = free.energy / (2 * (conditions.noise * self.original.radius) ** 2 / 3)
 
         def excess(logarithm: float) -> float:
             return worth(math.exp(2 * logarithm) * ratio, dimensions) - needed
@@ -163,17 +164,17 @@ class Capacity:
         return math.exp(optimize.root_scalar(excess, bracket=(-100.0, 100.0)).root)
 
     def noise(self, bits: int, reached: float, conditions: Conditions) -> float:
-        """Predict the strongest noise in which a payload is readable at an RMS displacement, as in `Conditions`.
+        """Predict the strongest noise, in the unit of `Conditions`, that a payload survives at an RMS displacement.
 
         Args:
             bits: size of the payload in bits.
             reached: the displacement, in diagonals.
-            conditions: the coverage; neither budget nor noise matters.
+            conditions: the coverage; bounds and noise have no effect.
 
         Returns:
             The noise; 0 if the payload needs more dimensions, infinite without a model of noise.
         """
-        least = self.least_budget(bits, conditions._replace(noise=1.0))  # which grows as the noise does
+        least = self.least_budget(bits, conditions._replace(noise=1.0))  # proportional to the noise
         return reached / least if least > 0 else math.inf
 
     def evidence(self, bits: int, reached: float, noise: float) -> float:
@@ -189,14 +190,14 @@ class Capacity:
         Returns:
             The evidence; 0 if the reader has no model of noise.
         """
-        left = self._left(bits)
-        if left is None:
+        free = self._free_dimensions(bits)
+        if free is None:
             return 0.0
-        ratio = reached**2 * left.energy / ((noise * self.original.radius) ** 2 / 3)
-        return float(np.sum(left.dimensions * ratio / (1 + ratio))) / 2
+        ratio = reached**2 * free.energy / ((noise * self.original.radius) ** 2 / 3)
+        return float(np.sum(free.dimensions * ratio / (1 + ratio))) / 2
 
     def needed(self, bits: int, evidence: float, noise: float) -> float:
-        """The RMS displacement, in diagonals, at which so much evidence is predicted; infinite if it never is."""
+        """Compute the RMS displacement, in diagonals, predicted to give this evidence; infinite if none does."""
         if self.evidence(bits, 1.0, noise) <= evidence:
             return math.inf
 
@@ -205,7 +206,7 @@ class Capacity:
 
         return math.exp(optimize.root_scalar(excess, bracket=(-100.0, 0.0)).root)
 
-    def _left(self, bits: int) -> FreeDimensions | None:
+    def _free_dimensions(self, bits: int) -> FreeDimensions | None:
         """Return the free dimensions for a payload."""
         layout = self.scheme.layout(self.original, bits)
         if layout not in self._free:
@@ -214,40 +215,40 @@ class Capacity:
         return self._free[layout]
 
     def reach(self, bits: int, bounds: Bounds) -> float:
-        """RMS displacement, in diagonals, that bounds surely allow a mark with a payload of `bits` bits."""
+        """Compute the RMS displacement, in diagonals, that bounds certainly allow for a mark with a payload."""
         if bounds.rms is not None and not bounds.limits:
             return bounds.rms
         layout = self.scheme.layout(self.original, bits)
         if layout not in self._reached:
             carrier = self._carrier(bits)
             reached = [self._write(carrier, word, bounds) for word in range(_PROBES)]
-            # Marks under the same limits differ: by a percent where a limit is a mean, by ten where it is a percentile.
+            # Marks under the same limits differ: by 1 % if a limit is a mean, and by 10 % if it is a percentile.
             logs = np.log(reached)
             spread = max(float(logs.std(ddof=1)), _MIN_SPREAD)
             self._reached[layout] = math.exp(logs.mean() - _SPREADS * spread)
         return self._reached[layout]
 
     def estimate_reach(self, bits: int, bounds: Bounds, enough: float = math.inf) -> float:
-        """Estimate the RMS displacement, in diagonals, that bounds allow a mark, from few displacements.
+        """Estimate the RMS displacement, in diagonals, that bounds allow for a mark, from few displacements.
 
         Args:
             bits: size of the payload in bits.
-            bounds: the bounds to keep.
-            enough: what need not be exceeded.
+            bounds: the bounds on the distortion.
+            enough: a displacement that need not be exceeded.
         """
         most = min(enough, bounds.rms or math.inf)
         bounds = bounds._replace(rms=most if most < 1 else None)
         return self._write(self._carrier(bits), 0, bounds, share=_ROUGH) if bounds.limits else most
 
     def _write(self, carrier: Carrier, word: int, bounds: Bounds, **options: float) -> float:
-        """RMS displacement of a mark with one of several codewords."""
+        """Measure the RMS displacement of a mark with one of several codewords."""
         signs = np.random.default_rng(word).choice([-1.0, 1.0], carrier.code_bits)
         probe = self.original.to_host(carrier.displacement(jnp.asarray(signs, self.original.signal.dtype)))
         return displace_within(self.original, probe, bounds, self.reference, **options).moved.rms
 
     @cached_property
     def reference(self) -> distortion.Reference:
-        """The original's mesh, prepared for metrics to be measured."""
+        """The original's mesh, prepared for measuring metrics."""
         return self._reference or distortion.Reference(self.original.mesh)
 
     def _carrier(self, bits: int) -> Carrier:
@@ -255,7 +256,7 @@ class Capacity:
         return self.scheme.carrier(self.original, Choices(Key(bytes(KEY_BYTES)), b""), bits, code)
 
     def bits(self, conditions: Conditions) -> int:
-        """The largest payload, a multiple of 8 bits; 0 if not even 8."""
+        """Compute the largest payload in bits, a multiple of 8; 0 if the mesh cannot carry 8 bits."""
 
         def fits(size: int) -> bool:
             least = self.least_budget(8 * size, conditions)

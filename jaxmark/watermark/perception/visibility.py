@@ -1,4 +1,4 @@
-"""How visible a displacement is in each band of frequencies, by metrics of distortion."""
+"""The visibility of displacements in each band of frequencies, by metrics of distortion."""
 
 from collections.abc import Sequence
 
@@ -23,15 +23,15 @@ def band_visibility(
     metrics: Sequence[Metric],
     mask: Float[Array, " rows *axes"] | None = None,
 ) -> Float64[np.ndarray, "metrics bands"]:
-    """Measure how much metrics rise per unit of RMS displacement (in diagonals) in each band, with random signs.
+    """Measure how much metrics increase per unit of RMS displacement (in diagonals) in each band, with random signs.
 
-    They are measured in 16 bands, denser at low frequencies, and interpolated between them.
+    The metrics are measured in 16 bands, which are denser at low frequencies, and interpolated between them.
 
     Args:
         original: the mesh that is displaced.
         coefficients: Chebyshev coefficients of the bands.
         metrics: names in `distortion.METRICS`, or functions of your own.
-        mask: of the displacements, see `apply_mask`.
+        mask: mask of the displacements, see `apply_mask`.
 
     Returns:
         `[metrics, bands]`, in the units of each metric per diagonal.
@@ -48,25 +48,25 @@ def band_visibility(
         shift = original.to_host(apply_mask(mask, filter(original.operator, coefficients[band], signs)))
         size = float(distortion.rms(shift[original.used]))
         # A band beyond the mesh's spectrum is empty.
-        found = _per_rms(original, shift / size, metrics) if size > 1e-6 else [np.inf] * len(metrics)
-        values.append(found)
-    known = np.array(values).T
+        column = _per_rms(original, shift / size, metrics) if size > 1e-6 else [np.inf] * len(metrics)
+        values.append(column)
+    table = np.array(values).T
     logs = [
         np.interp(
             np.log(np.arange(count) + 1.0), np.log(candidates[np.isfinite(row)] + 1.0), np.log(row[np.isfinite(row)])
         )
-        for row in np.maximum(known, 1e-12)
+        for row in np.maximum(table, 1e-12)
     ]
     return np.exp(np.array(logs))
 
 
 def _per_rms(original: Original, shift: Float64[np.ndarray, "points 3"], metrics: Sequence[Metric]) -> list[float]:
-    """Metrics per unit of RMS displacement, at a displacement so small that they are proportional to it."""
+    """Measure metrics per unit of RMS displacement, at so small a displacement that they are proportional to it."""
     reference = distortion.Reference(original.mesh)
 
     def measure_at(names: Sequence[Metric], size: float) -> dict[Metric, float]:
-        found = reference.measure(displace(original, size * shift), names)
-        return {name: (value or 0.0) / size for name, value in found.items()}
+        measured = reference.measure(displace(original, size * shift), names)
+        return {name: (value or 0.0) / size for name, value in measured.items()}
 
     values = measure_at(metrics, _FIRST_RMS)
     for name, value in values.items():

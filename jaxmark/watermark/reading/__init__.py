@@ -1,1 +1,1 @@
-"""From what a suspect shows to soft decisions and claims: reception without the key, detectors, coarse suspects."""
+"""Reading of aligned suspects: reception without the key, detectors of bits, and the reading of coarse suspects."""

@@ -1,6 +1,6 @@
-"""Detectors, which compute one soft value per bit from what a reader received from a suspect.
+"""Detectors, which compute one soft decision per bit from the data that a reader extracted from a suspect.
 
-`correlate` and `decorrelate` work with any carrier; `joint` needs the reader of a keyed carrier, which knows its host.
+`correlate` and `decorrelate` work with any carrier; `joint` needs the reader of a keyed carrier, which uses the host.
 """
 
 from functools import partial
@@ -19,14 +19,14 @@ from jaxmark.spectral.precision import matmul
 from jaxmark.watermark.interfaces import ChipCarrier, Reader, Received, Strength
 from jaxmark.watermark.reading.reception import Reception, clean, whitening
 
-# The conjugate gradients of joint decoding stop here: what remains to be gained is below the noise of the soft values.
+# The conjugate gradients of joint decoding stop here: further gains are below the noise of the soft decisions.
 _MAX_ITERATIONS = 12
 _TOLERANCE = 1e-2  # relative residual
 _NOISE_RANGE = (0.02, 1e3)  # bounds on the estimated noise, relative to the energy of a bit
 
 
 def correlate(reader: Reader, received: Received, beta: Strength = 1.0) -> Float[Array, " bits"]:
-    """Compute the paper's detection value, W_i = ⟨residual, Σ_j p_j^(i) x_j⟩_D (2.2.2, with the D that it leaves out).
+    """Compute the paper's detection value, W_i = ⟨residual, Σ_j p_j^(i) x_j⟩_D (2.2.2, with the D that it omits).
 
     Its sign is the bit if the components are nearly orthogonal.
     """
@@ -37,8 +37,8 @@ def correlate(reader: Reader, received: Received, beta: Strength = 1.0) -> Float
 def decorrelate(reader: Reader, received: Received, beta: Strength = 1.0) -> Float[Array, " bits"]:
     """Compute least-squares amplitudes of the bits: correlations without the interference between the bits.
 
-    With the embedding's β they are ±1 for a mark that was not attacked. Directions that the carrier does not span
-    within rounding are held at zero by a ridge of 16 eps times the energy of all bits.
+    With the β of the embedding, they are ±1 for a mark that was not attacked. In directions that the carrier does not
+    span within rounding, a ridge of 16 eps times the energy of all bits holds them at zero.
     """
     products = reader.carrier.gram(beta)
     ridge = 16 * jnp.finfo(products.dtype).eps * jnp.trace(products)
@@ -51,32 +51,32 @@ def decorrelate(reader: Reader, received: Received, beta: Strength = 1.0) -> Flo
 def claims(
     reader: Reader, received: Received, codeword: Float[Array, " code"]
 ) -> tuple[Float[Array, " ways"], Float[Array, " ways"]]:
-    """Score S and norm ‖a‖ of a claimed codeword for each way of weighting a suspect; see `Reader.ways`.
+    """Compute score S and norm ‖a‖ of a claimed codeword for each way of weighting a suspect; see `Reader.ways`.
 
-    Each way is a proof of its own; to take the best of them is charged (`jaxmark.watermark.evidence.ledger`).
+    Each way is a test of its own; taking the best one is charged (`jaxmark.watermark.evidence.ledger`).
     """
     scores, norms = zip(*(reader.claim(way, codeword) for way in reader.ways(received)), strict=True)
     return jnp.stack(scores), jnp.stack(norms)
 
 
 def joint(reader: Reader, received: Any, beta: Strength = 1.0) -> Float[Array, " bits"]:
-    """Estimate all bits jointly with least mean square error, by conjugate gradients; no matrix bits x bits is formed.
+    """Estimate all bits jointly, with least mean square error, by conjugate gradients and without a matrix of the bits.
 
     The nuisance is projected off and each band is weighted by its power (`jaxmark.watermark.reading.reception`). The
-    mark is then modelled as the carrier's displacement with each band at the gain that the host has in it. The balance
-    between noise and the interference of the bits is estimated from the energy before and after matched filtering.
+    mark is modelled as the carrier's displacement, with each band attenuated as that of the host. The ratio of noise to
+    the interference of the bits is estimated from the energy before and after matched filtering.
 
     Args:
         reader: the reader of a keyed carrier.
-        received: what the reader received from the suspect.
-        beta: the strengths' profile over the bands, as embedded.
+        received: the data that the reader extracted from the suspect.
+        beta: the relative strengths of the bands, as embedded.
 
     Returns:
-        Soft values `[k]`, ±1 on average if the mark was not attacked and β is the embedding's; their signs are the
-        bits.
+        Soft decisions `[k]`, whose signs are the bits; ±1 on average if the mark was not attacked and β is that
+        of the embedding.
 
     Raises:
-        JaxmarkError: if it is not the reader of a keyed carrier.
+        JaxmarkError: if the reader is not that of a keyed carrier.
     """
     if not isinstance(received, Reception):
         raise JaxmarkError(f"The joint detector reads keyed carriers, not {type(reader.carrier).__name__}.")
@@ -103,12 +103,12 @@ def _decode_jointly(
         return filter(receiver.operator, equaliser, x)
 
     observed = whiten(received.residual)
-    # Probes of random signs estimate what one bit of unit amplitude, and noise of unit strength with the residual's
-    # spectrum, contribute to the energy before and after matched filtering.
+    # Probes with random signs estimate the energy before and after matched filtering of one bit of unit amplitude, and
+    # of noise of unit strength with the residual's spectrum.
     bits, signs = probe_signs("detection", (carrier.code_bits,), observed.shape, dtype=observed.dtype)
     coloured = filter(receiver.operator, matmul(receiver.coefficients.T, jnp.sqrt(received.power)), signs)
     noise = whiten(clean(receiver, received.observation, received.factor, coloured))
-    # The three run one after the other, so that there is less to compile.
+    # The three are filtered one after the other, so that there is less to compile.
     matched, response, after = jax.lax.map(backward, jnp.stack([observed, forward(bits), noise]))
     ridge = _noise_to_signal(
         jnp.stack([jnp.sum(observed**2), jnp.sum(matched**2)]),

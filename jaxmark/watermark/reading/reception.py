@@ -1,8 +1,9 @@
-"""What a receiver learns from a suspect without the key: it projects off the host's part, and weights the bands.
+"""Reception: the data that a receiver extracts from a suspect without using the key.
 
-Whatever acts on the *host* as a spectral filter, an affine map or a smooth warp leaves a residual in the span of a few
-diffusion scales of the host and polynomials of the position. Projecting that nuisance off leaves the mark and noise.
-How much of the mark each band still holds is estimated from what the attack did to the host in that band.
+The receiver projects the nuisance off and weights the bands. Spectral filters, affine maps and smooth warps of the
+*host* leave a residual in the span of a few diffusion scales of the host and polynomials of the position, which is the
+nuisance. After it is projected off, the mark and noise remain. The gain of the mark in each band is estimated from the
+attack's effect on the host in that band.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,26 +23,26 @@ from jaxmark.spectral.chebyshev import band_components, filter, gram, over_bands
 from jaxmark.spectral.laplacian import Laplacian, per_row
 from jaxmark.spectral.precision import check_precision, einsum, matmul
 
-# Sixteen steps halfway to the neighbours' mean: over about a hundred points.
+# A filter that averages over about a hundred points: sixteen steps, each of which goes halfway to the neighbours' mean.
 _AROUND = (np.polynomial.chebyshev.Chebyshev([0.5, -0.5]) ** 16).coef
-_LEAST_AROUND = 1e-3  # share of a point's surroundings that is seen, for a mean over it
-_LEAST_ENERGY = 0.25  # of the median, which is added: who makes single places quiet gains little weight there
+_LEAST_AROUND = 1e-3  # lower limit on the observed share of a point's surroundings, by which an average is divided
+_LEAST_ENERGY = 0.25  # of the median, added to every energy: making single places quiet gains an attacker little weight
 _PRECISION_ROUNDS = 3
-_BLOCK_VERTICES = 2**14  # vertices whose nuisance is formed at a time
-_SAMPLE_VERTICES = 2**13  # vertices that are enough to make a basis nearly orthonormal
+_BLOCK_VERTICES = 2**14  # number of vertices whose nuisance is formed at a time
+_SAMPLE_VERTICES = 2**13  # number of vertices that suffice to make a basis nearly orthonormal
 
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Extent:
-    """The extent of the nuisance, which is projected off."""
+    """The size of the nuisance that is projected off."""
 
     scales: int  # number of diffusion scales of each coordinate, from one smoothing step on
     degree: int  # total degree of the polynomials of the position, at least 1 (affine maps)
 
 
 class Host(NamedTuple):
-    """An original prepared for writing marks, with the extent of its nuisance; independent of the key."""
+    """An original prepared for writing marks, with the size of its nuisance; independent of the key."""
 
     operator: Laplacian
     signal: Float[Array, "vertices 3"]  # the original's coordinates, centred per connected component
@@ -60,16 +61,16 @@ class Receiver(NamedTuple):
 
 
 class Reception(NamedTuple):
-    """What the receiver learns from a suspect; independent of the key."""
+    """The data that the receiver extracts from a suspect; independent of the key."""
 
-    receiver: Receiver  # its nuisance includes what the suspect shows to have happened to the host
-    observed: Observation  # the suspect as it was given
+    receiver: Receiver  # its nuisance includes that of the observation
+    observed: Observation  # the observation as it was given
     residual: Float[Array, "vertices 3"]  # weighted, without nuisance, and equally strong along all directions
-    gain: Float[Array, " bands"]  # share of the host's amplitude, and so of the mark's, that the attack left
+    gain: Float[Array, " bands"]  # share of the host's amplitude, hence of the mark's, that the attack left in the band
     power: Float[Array, " bands"]  # residual energy per dimension, relative to the largest
     axes: Float[Array, "3 3"]  # the symmetric matrix that made the residual equally strong along all directions
-    observation: Observation  # the suspect with lower weights for points that were edited or lost
-    factor: Float[Array, "unknowns unknowns"]  # Cholesky factor of the nuisance's normal equations, with these weights
+    observation: Observation  # the observation with lower weights for points that were edited or lost
+    factor: Float[Array, "unknowns unknowns"]  # Cholesky factor of the nuisance's normal equations with these weights
 
 
 def make_host(
@@ -96,13 +97,13 @@ def make_host(
 
 def make_receiver(host: Host) -> Receiver:
     """Prepare a host for reading, with a basis of its nuisance; can be traced and differentiated with respect to it."""
-    # This is not compiled, because a compiled function would return copies of the other arrays.
+    # This function is not compiled, because a compiled function would return copies of the other arrays.
     return Receiver(host.operator, host.signal, host.coefficients, nuisance_basis(host))
 
 
 @jax.jit
 def nuisance_basis(host: Host) -> Float[Array, "vertices columns"]:
-    """Form a nearly orthonormal basis of what is projected off each coordinate: polynomials and diffusion scales."""
+    """Form a nearly orthonormal basis of the nuisance of each coordinate: polynomials and diffusion scales."""
     low, high = jax.lax.stop_gradient((host.positions.min(axis=0), host.positions.max(axis=0)))
     inside = (2 * host.positions - (high + low)) / jnp.where(high > low, high - low, 1)
     smooth = (
@@ -119,7 +120,7 @@ def nuisance_basis(host: Host) -> Float[Array, "vertices columns"]:
 
 
 def extend(receiver: Receiver, observation: Observation) -> Receiver:
-    """Add to the receiver's nuisance what the suspect shows to have happened to the host."""
+    """Add the nuisance of an observation, if it has one, to that of the receiver."""
     if observation.nuisance is None:
         return receiver
     return receiver._replace(nuisance=_join_bases(receiver.nuisance, observation.nuisance))
@@ -131,52 +132,52 @@ def _join_bases(first: Array, second: Array) -> Float[Array, "vertices columns"]
 
 
 def _basis(columns: Callable[..., Array], *rows: Array) -> Float[Array, "vertices columns"]:
-    """A nearly orthonormal basis of the span of columns(*rows), which are formed block by block, never as a whole."""
+    """Form a nearly orthonormal basis of the span of columns(*rows), which is evaluated block by block."""
     count = len(rows[0])
     # Only the span matters, so the change of basis is not differentiated. A QR decomposition of a sample gives a nearly
-    # orthonormal basis, and the normal equations of all rows correct it. A column that depends on those before it is
-    # rounding noise and is dropped.
-    still = jax.lax.stop_gradient(rows)
-    some = np.sort(np.random.default_rng(0).permutation(count)[:_SAMPLE_VERTICES])
-    raw = columns(*(part[some] for part in still))
-    norm = jnp.linalg.norm(raw, axis=0)
+    # orthonormal basis, which the normal equations of all rows then correct. A column that depends linearly on earlier
+    # columns is rounding noise and is dropped.
+    constant = jax.lax.stop_gradient(rows)
+    sample = np.sort(np.random.default_rng(0).permutation(count)[:_SAMPLE_VERTICES])
+    sampled = columns(*(part[sample] for part in constant))
+    norm = jnp.linalg.norm(sampled, axis=0)
     scale = 1 / jnp.where(norm > 0, norm, 1)
-    triangle = jnp.linalg.qr(raw * scale, mode="r")
-    eye = jnp.eye(len(norm), dtype=raw.dtype)
+    triangle = jnp.linalg.qr(sampled * scale, mode="r")
+    eye = jnp.eye(len(norm), dtype=sampled.dtype)
     pivot = jnp.zeros_like(norm).at[: len(triangle)].set(jnp.abs(jnp.diagonal(triangle)))
-    sound = pivot > 10 * jnp.finfo(raw.dtype).eps
-    square = jnp.where(sound[:, None], eye.at[: len(triangle)].set(triangle), eye)
-    nearly = scale[:, None] * jsl.solve_triangular(square, jnp.diag(sound.astype(raw.dtype)))
+    independent = pivot > 10 * jnp.finfo(sampled.dtype).eps
+    square = jnp.where(independent[:, None], eye.at[: len(triangle)].set(triangle), eye)
+    change = scale[:, None] * jsl.solve_triangular(square, jnp.diag(independent.astype(sampled.dtype)))
 
     def products(fresh: Array, *block: Array) -> Array:
-        part = matmul(columns(*block), nearly)
+        part = matmul(columns(*block), change)
         return matmul(part.T, fresh[:, None] * part)
 
-    normal = jnp.where(sound[:, None] & sound, _sum_over_blocks(products, *still), eye)
-    change = jsl.solve_triangular(jnp.linalg.cholesky(normal), nearly.T, lower=True).T
+    normal = jnp.where(independent[:, None] & independent, _sum_over_blocks(products, *constant), eye)
+    correction = jsl.solve_triangular(jnp.linalg.cholesky(normal), change.T, lower=True).T
 
     def write(basis: Array, start: Array) -> tuple[Array, None]:
         place, block = _block(start, rows)
-        part = jax.checkpoint(lambda *block: matmul(columns(*block), change))(*block)
+        part = jax.checkpoint(lambda *block: matmul(columns(*block), correction))(*block)
         return jax.lax.dynamic_update_slice_in_dim(basis, part, place, 0), None
 
-    return jax.lax.scan(write, jnp.zeros((count, len(norm)), raw.dtype), _starts(count))[0]
+    return jax.lax.scan(write, jnp.zeros((count, len(norm)), sampled.dtype), _starts(count))[0]
 
 
 def _starts(count: int) -> Int[Array, " blocks"]:
-    """First row of each block, before the last block is moved back."""
+    """Return the first row of each block; the last block may extend beyond the end, see `_block`."""
     return jnp.arange(0, count, min(count, _BLOCK_VERTICES))
 
 
 def _block(start: Array, rows: Sequence[Array]) -> tuple[Array, list[Array]]:
-    """The block of rows from `start` on, and its first row: the last block begins earlier, so that it is full."""
+    """Return the first row and the rows of a block; the last block begins earlier, so that it is full."""
     size = min(len(rows[0]), _BLOCK_VERTICES)
     place = jnp.minimum(start, len(rows[0]) - size)
     return place, [jax.lax.dynamic_slice_in_dim(part, place, size) for part in rows]
 
 
 def _sum_over_blocks(function: Callable[..., Array], *rows: Array) -> Array:
-    """Σ function(fresh, *block) over blocks of rows; fresh is 0 where a row was in the block before, else 1."""
+    """Sum function(fresh, *block) over blocks of rows; fresh is 0 for rows of the previous block, else 1."""
 
     def block_sum(start: Array) -> Array:
         place, block = _block(start, rows)
@@ -193,24 +194,24 @@ def receive(receiver: Receiver, observation: Observation) -> Reception:
 
     Args:
         receiver: the original, from `make_receiver`.
-        observation: what the suspect shows of the displacement, in the units of the host.
+        observation: the observed displacement of the suspect, in the units of the host.
 
     Raises:
         JaxmarkError: if the residual is neither float32 nor float64.
     """
     check_precision("receive", observation.residual)
-    wider = extend(receiver, observation)
+    extended = extend(receiver, observation)
     # Only `_receive` is compiled, because a compiled function would return copies of its arguments.
-    return Reception(wider, observation, *_receive(wider, observation))
+    return Reception(extended, observation, *_receive(extended, observation))
 
 
 @jax.jit
 def _receive(receiver: Receiver, observation: Observation) -> tuple[Array, Array, Array, Array, Observation, Array]:
-    # Points that are still far off without the nuisance were edited or lost, so they get lower weights.
-    strange = _huber_weights if observation.normals is None else _precision
-    observation = observation._replace(weights=observation.weights * strange(receiver, observation))
+    # Points whose residual is still large without the nuisance were edited or lost; they get lower weights.
+    point_weights = _huber_weights if observation.normals is None else _precision
+    observation = observation._replace(weights=observation.weights * point_weights(receiver, observation))
     factor = normal_factor(receiver, observation)
-    # The nuisance is projected off twice, because the ridge leaves a little of a large nuisance behind.
+    # The nuisance is projected off twice, because the ridge leaves a small part of a large nuisance.
     nuisance = _fit_nuisance(receiver, observation, factor, observation.residual)
     residual = clean(receiver, observation, factor, observation.residual - nuisance)
     # White noise is the reference for the power of each band.
@@ -219,13 +220,13 @@ def _receive(receiver: Receiver, observation: Observation) -> tuple[Array, Array
     squares = gram(receiver.operator, receiver.coefficients, pair, method="moments")
     # Rounding may make the energy of a band negative.
     bands, reference = jnp.maximum(einsum("pcjj->pj", squares.reshape(2, 3, *squares.shape[1:])), 0)
-    tiny = 1e-6
-    power = (bands + tiny * bands.sum()) / (reference + tiny * reference.sum() + jnp.finfo(bands.dtype).tiny)
+    floor = 1e-6
+    power = (bands + floor * bands.sum()) / (reference + floor * reference.sum() + jnp.finfo(bands.dtype).tiny)
     largest = power.max()
     power = jnp.where(largest > 0, jnp.maximum(power / jnp.where(largest > 0, largest, 1), 1e-9), 1)
 
-    # Where nothing is seen, the host is assumed to have moved with the nuisance, because a hole would leak into every
-    # band. Bands of the host differ by orders of magnitude, which moments cannot resolve, so each band is filtered.
+    # Unobserved points of the host are assumed to have moved with the nuisance, because a hole would leak into every
+    # band. The host's bands differ by orders of magnitude, which moments cannot resolve, so each band is filtered.
     mass = per_row(receiver.operator.mass, residual)
 
     def products(pair: Float[Array, "vertices 6"]) -> tuple[Array, Array]:
@@ -239,35 +240,35 @@ def _receive(receiver: Receiver, observation: Observation) -> tuple[Array, Array
 
 
 def weigh_evenly(received: Reception) -> Reception:
-    """Weight all bands and directions alike.
+    """Give all bands and directions the same weight.
 
-    The usual weights grow as the power of a band falls. An attacker who empties a band, and turns what is left of the
-    mark in it, can so make this band outweigh all others. With equal weights nobody can.
+    The usual weights grow as the power of a band falls. An attacker who has the key can therefore empty a band and
+    reverse the mark in it, so that this band outweighs all others. Equal weights exclude this attack.
     """
     flat = jnp.ones_like(received.power)
     return received._replace(gain=flat, power=flat, axes=jnp.eye(3, dtype=received.axes.dtype))
 
 
 def whitening(receiver: Receiver, power: Float[Array, " bands"]) -> Float[Array, " terms"]:
-    """Chebyshev coefficients of the filter that makes all bands equally strong."""
+    """Compute the Chebyshev coefficients of the filter that makes all bands equally strong."""
     return matmul(receiver.coefficients.T, 1 / jnp.sqrt(power))
 
 
 def _axes(white: Float[Array, "vertices 3"], observation: Observation) -> Float[Array, "3 3"]:
-    """C^-1/2 of the coordinates' covariance C, which an inverted stretch leaves unequal; of mean eigenvalue 1."""
+    """Compute C^-1/2 with mean eigenvalue 1; undoing a stretch makes the covariance C of coordinates anisotropic."""
     if observation.normals is not None:
         return jnp.eye(3, dtype=white.dtype)
     products = matmul(white.T, white)
     total = jnp.trace(products)
     covariance = products / jnp.where(total > jnp.finfo(white.dtype).tiny, total, 1)
-    # The ridge keeps a direction in which nothing moved from outweighing the others.
+    # Without the ridge, a direction without any displacement would outweigh the others.
     axes = _inverse_root(covariance + 1e-4 * jnp.eye(3, dtype=white.dtype))
     return axes / (jnp.trace(axes) / 3)
 
 
 @jax.custom_jvp
 def _inverse_root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """A^-1/2 of a symmetric positive matrix; its derivative (Daleckii, Krein 1965) exists for repeated eigenvalues."""
+    """Compute A^-1/2 of a symmetric positive matrix; the derivative (Daleckii, Krein 1965) allows equal eigenvalues."""
     values, vectors = jnp.linalg.eigh(matrix)
     return matmul(vectors / jnp.sqrt(values), vectors.T)
 
@@ -282,7 +283,7 @@ def _inverse_root_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Ar
 
 
 def _huber_weights(receiver: Receiver, observation: Observation) -> Float[Array, " vertices"]:
-    """Huber weights on squared lengths: 1 up to four times their median, which Gaussian noise rarely exceeds."""
+    """Compute Huber weights of squared lengths: 1 up to four times the median, which Gaussian noise rarely exceeds."""
     residual = clean(receiver, observation, normal_factor(receiver, observation), observation.residual)
     square = jnp.sum(residual**2, axis=1)
     limit = 4 * _median_where(observation.weights > 0, square)
@@ -290,32 +291,32 @@ def _huber_weights(receiver: Receiver, observation: Observation) -> Float[Array,
 
 
 def _precision(receiver: Receiver, observation: Observation) -> Float[Array, " vertices"]:
-    """Inverse energy of the residual around each point, at most four times that at the median.
+    """Compute the inverse energy of the residual around each point, at most five times that at the median.
 
-    A surface that was meshed anew is right on planes and wrong along edges, by orders of magnitude on machine parts,
-    and S/‖b‖ is largest with these weights. Each projection with better weights leaves less of the nuisance of the bad
-    parts in the good ones, so that energies are found anew.
+    The residuals of a remeshed surface are small on planar regions and large along edges, by orders of magnitude on
+    machine parts, and S/‖b‖ is largest with these weights. Each projection with better weights leaves less of the
+    nuisance of the bad regions in the good ones, so that energies are computed again.
     """
     known = (observation.weights > 0).astype(observation.residual.dtype)
 
-    def again(weights: Array, _: None) -> tuple[Array, None]:
-        now = observation._replace(weights=observation.weights * weights)
-        rest = clean(receiver, now, normal_factor(receiver, now), observation.residual)
-        square = jnp.sum(rest**2, axis=1) / jnp.where(now.weights > 0, now.weights, 1) ** 2
+    def refine(weights: Array, _: None) -> tuple[Array, None]:
+        weighted = observation._replace(weights=observation.weights * weights)
+        rest = clean(receiver, weighted, normal_factor(receiver, weighted), observation.residual)
+        square = jnp.sum(rest**2, axis=1) / jnp.where(weighted.weights > 0, weighted.weights, 1) ** 2
         pair = filter(receiver.operator, jnp.asarray(_AROUND, rest.dtype), jnp.stack([known * square, known], axis=1))
         energy = jnp.maximum(pair[:, 0], 0) / jnp.maximum(pair[:, 1], _LEAST_AROUND)
         middle = _median_where(known > 0, energy)
         return 1 / (energy / jnp.where(middle > 0, middle, 1) + _LEAST_ENERGY), None
 
-    return jax.lax.scan(again, known, None, length=_PRECISION_ROUNDS)[0]
+    return jax.lax.scan(refine, known, None, length=_PRECISION_ROUNDS)[0]
 
 
-def _median_where(some: Bool[Array, " vertices"], values: Float[Array, " vertices"]) -> Float[Array, ""]:
-    return jnp.nanmedian(jnp.where(some, values, jnp.nan))
+def _median_where(mask: Bool[Array, " vertices"], values: Float[Array, " vertices"]) -> Float[Array, ""]:
+    return jnp.nanmedian(jnp.where(mask, values, jnp.nan))
 
 
 def normal_factor(receiver: Receiver, observation: Observation) -> Float[Array, "unknowns unknowns"]:
-    """Cholesky factor of the nuisance's normal equations, with a ridge for columns that coincide where seen."""
+    """Compute the Cholesky factor of the nuisance's normal equations, with a ridge for linearly dependent columns."""
 
     def products(weights: Array) -> Array:
         return _sum_over_blocks(
@@ -325,8 +326,8 @@ def normal_factor(receiver: Receiver, observation: Observation) -> Float[Array, 
     if observation.normals is None:
         normal = products(observation.weights)
     else:
-        # The unknowns are each column along each coordinate. Each pair of coordinates has a block of the matrix, which
-        # is the same for a pair and its reverse.
+        # There is an unknown for each column and coordinate. Each pair of coordinates has a block of the matrix; it is
+        # the same for a pair and its reverse.
         pairs, which = np.triu_indices(3), np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
         along = observation.normals.T
         blocks = jax.lax.map(products, observation.weights * along[pairs[0]] * along[pairs[1]])[which]
@@ -341,7 +342,7 @@ def clean(
     factor: Float[Array, "unknowns unknowns"],
     x: Float[Array, "vertices 3"],
 ) -> Float[Array, "vertices 3"]:
-    """ΩPx: project the nuisance off a displacement, and weight the rest; symmetric in the plain inner product."""
+    """Compute ΩPx: project the nuisance off a displacement, and weight the rest; symmetric without D."""
     return observation.weigh(x - _fit_nuisance(receiver, observation, factor, x))
 
 
@@ -354,7 +355,7 @@ def _fit_nuisance(receiver: Receiver, observation: Observation, factor: Array, x
 
 
 def _polynomials(inside: Float[Array, "vertices 3"], degree: int) -> Float[Array, "vertices columns"]:
-    """Products of Chebyshev polynomials of the position in its bounding box, up to a total degree."""
+    """Compute products of Chebyshev polynomials of the position in its bounding box, up to a total degree."""
     powers = [jnp.ones_like(inside), inside]
     while len(powers) <= degree:
         powers.append(2 * inside * powers[-1] - powers[-2])

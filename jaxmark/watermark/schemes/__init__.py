@@ -1,1 +1,1 @@
-"""Schemes, which fix everything about a mark except its key, message and strength."""
+"""Schemes, which determine everything about a mark except its key, message and strength."""

@@ -21,9 +21,9 @@ from jaxmark.watermark.reading.detectors import joint
 from jaxmark.watermark.reading.reception import Host, Receiver, make_host, make_receiver
 
 # Relative strengths of the lowest 20 of 64 bands: the mean over meshes that were tuned to noise, smoothing and
-# quantisation at the default budget. `benchmarks/robustness/tuning.py --limit dame=0.008 --train blub_7106.obj
-# fertility_12448.obj armadillo_14587.obj kitten.obj` prints them. Marks are read with the same strengths, so other
-# strengths would need a pass band of another name.
+# quantisation at the default budget, as printed by `benchmarks/robustness/tuning.py --limit dame=0.008 --train
+# blub_7106.obj fertility_12448.obj armadillo_14587.obj kitten.obj`. Marks are read with the same strengths, so other
+# strengths would need another name of the pass band.
 DERIVED = (
     *(0, 1, 0.93, 0.84, 0.77, 0.7, 0.63, 0.54, 0.47, 0.41),
     *(0.37, 0.32, 0.28, 0.24, 0.21, 0.18, 0.15, 0.11, 0.07, 0.03),
@@ -31,12 +31,12 @@ DERIVED = (
 
 
 class PassBand(NamedTuple):
-    """How the bands are chosen that a mark is written in, and the nuisance that is projected off."""
+    """The rules by which the bands of a mark, and the nuisance that is projected off, are chosen."""
 
-    share: float  # of all bands, the lowest ones: as many are written in, or more if the payload needs them
+    share: float  # share of the lowest bands that the mark is written in; more are used if the payload needs them
     spread: int  # number of dimensions that each bit of message and tag needs
-    per_nuisance: int  # least number of dimensions for each one of the nuisance, apart from affine maps
-    degree: int  # the largest total degree of the polynomials among the nuisance
+    per_nuisance: int  # least number of dimensions for each column of the nuisance, apart from affine maps
+    degree: int  # largest total degree of the polynomials in the nuisance
 
 
 PASS_BANDS: Mapping[str, PassBand] = {
@@ -50,41 +50,46 @@ PASS_BANDS: Mapping[str, PassBand] = {
 class Layout(NamedTuple):
     """The pass band of a keyed carrier, and the nuisance that its receiver projects off."""
 
-    passing: int  # number of bands in the pass band, from the lowest on
+    passing: int  # number of bands in the pass band, counted from the lowest
     scales: int  # number of diffusion scales of the host
     degree: int  # total degree of the polynomials of the position
 
 
 @dataclass(frozen=True)
 class KeyedScheme(Scheme):
-    """Writes keyed chips in a pass band of low frequencies; the host's part is projected off when reading.
+    """A scheme that writes keyed chips in a pass band of low frequencies; its reader projects off the nuisance.
 
-    The default pass band is tapered. It reaches to λ = 0.44 with the strengths of `DERIVED`, but leaves out the lowest
-    bands, of which the nuisance takes most. It is stretched if the payload needs more: 12 dimensions for each bit of
-    message and tag. A narrow pass band is flat, and as narrow as the payload allows: it has 1,024 dimensions and 12
-    more for each bit of message and tag, but ends at λ = 0.44 unless the payload needs more. Low pass bands are flat
-    and end at λ = 0.17 and 0.08 unless the payload needs more than 6 dimensions a bit: for marks so weak that few
-    dimensions with more energy each prove more (see `jaxmark.watermark.schemes.passband`). With a profile, the mark is
-    written in the bands to which the profile gives strengths, whatever the payload.
+    There are four pass bands:
 
-    Dimensions are counted as on a regular triangle mesh, √3/2π · λ for each coordinate of each vertex; on point clouds,
-    by the number of neighbours. The nuisance that is projected off has at most a twelfth of them, apart from affine
-    maps; with a narrow pass band, a sixth.
+    - `"tapered"`, the default, reaches to λ = 0.44 with the strengths of `DERIVED`, but omits the lowest bands, which
+      consist mostly of nuisance. It is stretched if the payload needs more: 12 dimensions for each bit of message and
+      tag.
+    - `"narrow"` is flat, and as narrow as the payload allows. It has 1,024 dimensions and 12 more for each bit of
+      message and tag, but ends at λ = 0.44 unless the payload needs more.
+    - `"low"` and `"lowest"` are flat and end at λ = 0.17 and 0.08, unless the payload needs more than 6 dimensions per
+      bit. They are meant for marks that are so weak that fewer dimensions with more energy each give more evidence (see
+      `jaxmark.watermark.schemes.passband`).
+
+    With a profile, the mark is written in the bands that have strengths in the profile, whatever the payload.
+
+    Dimensions are counted as on a regular triangle mesh, √3/2π · λ for each coordinate of each vertex, and on point
+    clouds by the number of neighbours. The nuisance that is projected off, without affine maps, has at most a twelfth
+    of them, or a sixth with the narrow pass band.
     """
 
     name: ClassVar[str] = "keyed"
-    bands: int = 64  # number of Jackson-damped scaling functions over the whole spectrum; the lowest pass
-    direction: Literal["coordinates", "normals"] = "coordinates"  # along which vertices are displaced
+    bands: int = 64  # number of Jackson-damped scaling functions over the whole spectrum; the lowest are used
+    direction: Literal["coordinates", "normals"] = "coordinates"  # directions in which vertices are displaced
     profile: tuple[float, ...] = ()  # relative strengths of the lowest bands, from `tune`; by default by `passband`
-    passband: Literal["tapered", "narrow", "low", "lowest"] = "tapered"  # how bands and nuisance are chosen
-    hiding: bool = True  # whether points move where and as it is hidden; see `jaxmark.watermark.perception.masking`
+    passband: Literal["tapered", "narrow", "low", "lowest"] = "tapered"  # the choice of bands and nuisance
+    hiding: bool = True  # whether displacements are masked perceptually; see `jaxmark.watermark.perception.masking`
 
     def __post_init__(self) -> None:
         """Check the fields.
 
         Raises:
-            JaxmarkError: if the profile is longer than the bands or no profile, or there is no such direction or pass
-                band.
+            JaxmarkError: if the profile has more numbers than there are bands, a negative number or only zeros, or if
+                the direction or the pass band is unknown.
         """
         if self.profile and not (
             len(self.profile) <= self.bands and min(self.profile) >= 0 < max(self.profile) < math.inf
@@ -92,9 +97,9 @@ class KeyedScheme(Scheme):
             raise JaxmarkError(
                 f"A profile is up to {self.bands} numbers, none negative and not all 0; got {len(self.profile)}."
             )
-        for name, known in (("direction", ("coordinates", "normals")), ("passband", tuple(PASS_BANDS))):
-            if getattr(self, name) not in known:
-                *others, last = map(repr, known)
+        for name, allowed in (("direction", ("coordinates", "normals")), ("passband", tuple(PASS_BANDS))):
+            if getattr(self, name) not in allowed:
+                *others, last = map(repr, allowed)
                 raise JaxmarkError(f"{name} must be {', '.join(others)} or {last}, got {getattr(self, name)!r}.")
 
     @property
@@ -107,30 +112,30 @@ class KeyedScheme(Scheme):
         return code_length(bits, self.dimensions(original, bits), 12)
 
     def dimensions(self, original: Original, bits: int) -> int:
-        """Number of dimensions of the pass band for a payload, counted as the class says."""
+        """Count the dimensions of the pass band for a payload, as described in the class."""
         return int(self._written_dimensions(original, self.strengths(original, bits)))
 
     def layout(self, original: Original, bits: int) -> Layout:
         """Choose the pass band and the nuisance for a payload, independently of the key."""
         strengths = self._strengths(original, bits)
         columns = self._written_dimensions(original, strengths) / self._channels
-        # Affine maps are 4 columns; each diffusion scale has one column for each coordinate.
+        # Affine maps have 4 columns; each diffusion scale has one column for each coordinate.
         scales = min(9, max(0, int(columns / 3 - 4) // 3))
-        degree, chosen = 1, PASS_BANDS[self.passband]
-        while degree < chosen.degree and math.comb(degree + 4, 3) + 3 * scales <= columns / chosen.per_nuisance:
+        degree, passband = 1, PASS_BANDS[self.passband]
+        while degree < passband.degree and math.comb(degree + 4, 3) + 3 * scales <= columns / passband.per_nuisance:
             degree += 1
         return Layout(len(strengths), scales, degree)
 
     def strengths(self, original: Original, bits: int) -> Float64[np.ndarray, " passing"]:
-        """Relative strengths of the bands of the pass band for a payload."""
+        """Compute the relative strengths of the bands of the pass band for a payload."""
         strengths = self._strengths(original, bits)
         if self.profile or self.passband != "tapered":
             return strengths
         # In a band that is mostly nuisance, a mark is visible but can hardly be read.
         layout = self.layout(original, bits)
         nuisance = math.comb(layout.degree + 3, 3) + 3 * layout.scales
-        held = np.array([self._dimensions(original, band + 1) for band in range(len(strengths))]) / self._channels
-        return np.where(held > min(nuisance, held[-1]) / 2, strengths, 0)
+        cumulative = np.array([self._dimensions(original, band + 1) for band in range(len(strengths))]) / self._channels
+        return np.where(cumulative > min(nuisance, cumulative[-1]) / 2, strengths, 0)
 
     def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> KeyedCarrier:
         """See `Scheme`."""
@@ -147,21 +152,21 @@ class KeyedScheme(Scheme):
     def tunable(self) -> "KeyedScheme":
         """See `Scheme`."""
         if self.direction != "coordinates":
-            raise JaxmarkError(f"tune knows marks along coordinates, not along {self.direction}.")
+            raise JaxmarkError(f"tune needs marks along coordinates, not along {self.direction}.")
         return self
 
     def family(self) -> Float64[np.ndarray, "bands terms"]:
-        """Chebyshev coefficients of all bands, which are non-negative and add up to 1 over the spectrum."""
+        """Compute the Chebyshev coefficients of all bands, which are non-negative and add up to 1 on the spectrum."""
         return scaling(self.bands, damping="jackson")
 
     def mask(self, original: Original) -> Float[Array, "rows 3 3"] | None:
-        """Symmetric matrix `[3, 3]` on each vertex's displacement; None if it is 1 everywhere."""
+        """Compute a symmetric matrix `[3, 3]` on each vertex's displacement; None if it is 1 everywhere."""
         if not self.hiding or self.direction != "coordinates":
             return None
         return original.to_traced(masking_directions(original))
 
     def receiver(self, original: Original, bits: int) -> Receiver:
-        """Make the receiver of marks with a payload, with all bands of `family`."""
+        """Make the receiver of marks with a payload size, with all bands of `family`."""
         return make_receiver(self._host(original, self.layout(original, bits), self.family()))
 
     def with_profile(self, profile: tuple[float, ...]) -> "KeyedScheme":
@@ -169,7 +174,7 @@ class KeyedScheme(Scheme):
         return replace(self, profile=profile)
 
     def _host(self, original: Original, layout: Layout, coefficients: Float64[np.ndarray, "bands terms"]) -> Host:
-        """Prepare the original with bands to write or read in, and with a layout's nuisance."""
+        """Prepare the original with the bands to write or read in, and with the nuisance of a layout."""
         return make_host(
             original.operator,
             original.signal,
@@ -185,34 +190,34 @@ class KeyedScheme(Scheme):
         return 3 if self.direction == "coordinates" else 1
 
     def _strengths(self, original: Original, bits: int) -> Float64[np.ndarray, " passing"]:
-        """Relative strengths as in `strengths`, but also in bands that are mostly nuisance."""
+        """Compute relative strengths as in `strengths`, but also in bands that are mostly nuisance."""
         if self.profile:
             return np.array(self.profile)
-        chosen = PASS_BANDS[self.passband]
-        usual, needed = round(self.bands * chosen.share), chosen.spread * (bits + TAG_BITS)
+        passband = PASS_BANDS[self.passband]
+        default, needed = round(self.bands * passband.share), passband.spread * (bits + TAG_BITS)
         if self.passband == "narrow":
-            wanted = min(1024 + 2 * needed, self._dimensions(original, usual))
-            return np.ones(self._count_bands(original, max(wanted, needed), 0))
-        passing = self._count_bands(original, needed, usual)
+            target = min(1024 + 2 * needed, self._dimensions(original, default))
+            return np.ones(self._count_bands(original, max(target, needed), 0))
+        passing = self._count_bands(original, needed, default)
         if self.passband != "tapered":
             return np.ones(passing)
         places = (np.arange(passing) + 0.5) / passing
         return np.interp(places, (np.arange(len(DERIVED)) + 0.5) / len(DERIVED), DERIVED)
 
     def _count_bands(self, original: Original, dimensions: float, least: int) -> int:
-        """Number of lowest bands that reach `dimensions`; at least six, because narrower pass bands leak too much."""
+        """Count the lowest bands that reach `dimensions`; at least six, because narrower pass bands leak too much."""
         passing = max(least, min(6, self.bands))
         while passing < self.bands and self._dimensions(original, passing) < dimensions:
             passing += 1
         return passing
 
     def _written_dimensions(self, original: Original, strengths: Float64[np.ndarray, " passing"]) -> float:
-        """Number of dimensions of the bands that are written in."""
+        """Count the dimensions of the bands that are written in."""
         each = np.diff([self._dimensions(original, band) for band in range(len(strengths) + 1)])
         return float(np.sum(each[strengths > 0]))
 
     def _dimensions(self, original: Original, passing: int) -> float:
-        """Number of dimensions of the lowest `passing` bands."""
+        """Count the dimensions of the lowest `passing` bands."""
         edge = 1 - math.cos(math.pi * passing / self.bands)
         share = min(1.0, original.density * edge)
         return self._channels * share * int(original.used.sum())

@@ -1,4 +1,4 @@
-"""Schemes that modulate components of the original: the paper's, and Ohbuchi's."""
+"""Schemes that modulate components of the original: the paper's and Ohbuchi's."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -18,11 +18,11 @@ from jaxmark.watermark.reading.detectors import decorrelate
 
 
 class ModulatedScheme(Scheme):
-    """A scheme that writes on components of the host, one keyed sign for each of them, coordinate and code bit."""
+    """A scheme that writes on components of the host, with a keyed sign for each component, coordinate and code bit."""
 
     @property
     def count(self) -> int:
-        """Number of components that the scheme asks for; a small mesh may have fewer."""
+        """The number of components that the scheme uses; a small mesh may have fewer."""
         raise NotImplementedError
 
     def components(self, original: Original) -> Components:
@@ -39,7 +39,7 @@ class ModulatedScheme(Scheme):
         return code_length(bits, 3 * self.count, 2)
 
     def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> Carrier:
-        """See `Scheme`; one keyed sequence per bit runs over all pairs of a component and a coordinate."""
+        """See `Scheme`; each bit has a keyed sequence over all pairs of a component and a coordinate."""
         components = self.components(original)
         sequences = orthogonal_sequences(choices, code_bits, 3 * self.count, label=self.name)
         sequences = sequences.reshape(code_bits, self.count, 3)
@@ -48,12 +48,12 @@ class ModulatedScheme(Scheme):
 
 @dataclass(frozen=True)
 class HostScheme(ModulatedScheme):
-    """The paper's scheme: it writes on polynomial bands of the host, with a keyed sign for each band and coordinate.
+    """The paper's scheme, which writes on polynomial bands of the host, with a keyed sign for each band and coordinate.
 
-    The defaults are the form of it that works: Jackson-damped bands at unit norm. `kernel="printed", damping="none",
-    unit_norm=False` is the form that the paper prints, in which the components of natural meshes are nearly collinear.
-    The signs need a Hadamard matrix of order 3 · bands, which exists if `bands` is a power of two from 4 on, and for
-    some other numbers.
+    The defaults are the variant that works: Jackson-damped bands at unit norm. `kernel="printed", damping="none",
+    unit_norm=False` is the variant that the paper prints; with it, the components of natural meshes are nearly
+    collinear. The signs need a Hadamard matrix of order 3 · bands, which exists if `bands` is a power of two from 4
+    on, and for some other numbers.
     """
 
     name: ClassVar[str] = "host"
@@ -75,9 +75,9 @@ class HostScheme(ModulatedScheme):
 
 @dataclass(frozen=True)
 class EigenScheme(ModulatedScheme):
-    """Ohbuchi's scheme: it writes on the lowest eigenpairs of the Laplacian, with a keyed sign for each and coordinate.
+    """Ohbuchi's scheme, which writes on the lowest eigenpairs of the Laplacian, with a keyed sign per coordinate.
 
-    The numbers that `pairs` may be are those of `HostScheme.bands`.
+    `pairs` can be the same numbers as `HostScheme.bands`.
     """
 
     name: ClassVar[str] = "eigen"

@@ -1,7 +1,7 @@
-"""The schemes by their names, and schemes as records store them.
+"""The schemes by name, and the conversion of schemes to and from records.
 
-The name of a scheme stands for its default fields. The record of a mark stores the fields, so that a mark that was made
-with other fields stays readable.
+The name of a scheme stands for its default fields. The record of a mark stores the fields, so that marks with other
+fields stay readable.
 """
 
 from collections.abc import Mapping
@@ -20,39 +20,39 @@ from jaxmark.watermark.schemes.modulated import EigenScheme, HostScheme
 SCHEMES: Mapping[str, type[KeyedScheme] | type[HostScheme] | type[EigenScheme]] = {
     scheme.name: scheme for scheme in (KeyedScheme, HostScheme, EigenScheme)
 }
-#: The schemes that are read without the original, the fastest first.
+#: The blind schemes, the fastest first.
 BLIND_SCHEMES: Mapping[str, BlindScheme] = {LocalScheme.name: LocalScheme(), FieldScheme.name: FieldScheme()}
-NAMES = (*SCHEMES, *BLIND_SCHEMES)  # of all schemes
+NAMES = (*SCHEMES, *BLIND_SCHEMES)  # the names of all schemes
 DEFAULT_SCHEME = KeyedScheme.name
 
-#: A scheme, its name, or the names of one that is read with the original and of blind ones, which mark a mesh together.
+#: A scheme, its name, or names for several marks in one mesh: one that is read with the original, then blind ones.
 AnyScheme = str | Scheme | BlindScheme | tuple[str, ...]
 
-_MAX_COMPONENTS = 512  # bands or eigenpairs that a record may ask for: no file decides how much time is spent
+_MAX_COMPONENTS = 512  # the most bands or eigenpairs that a record may ask for, which limits the time of reading
 
-# Values of the fields that are missing from a record because it was written before they existed; by scheme.
+# The values, by scheme, of fields that are missing from records that were written before the fields existed.
 _FIELDS_OF_OLD_RECORDS: Mapping[str, Mapping[str, Any]] = {"keyed": {"passband": "narrow", "hiding": False}}
-# Fields that schemes had, and the one value of each that is still read; keyed choices stay bound to them.
+# Former fields of schemes, and the only value of each that can still be read; keyed choices stay bound to them.
 _RETIRED_FIELDS: Mapping[str, Mapping[str, Any]] = {"keyed": {"masking": False}}
 
 
 @runtime_checkable
 class Named(Protocol):
-    """A dataclass with a name, such as a scheme of either kind."""
+    """A dataclass with a name, such as a blind or non-blind scheme."""
 
     name: ClassVar[str]
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
 
 def find_blind(scheme: str | Scheme | BlindScheme) -> BlindScheme | None:
-    """Return the blind scheme of a name; a blind scheme as it is, and None for any other."""
+    """Return the blind scheme of a name; a blind scheme is returned unchanged, and anything else gives None."""
     if isinstance(scheme, str):
         return BLIND_SCHEMES.get(scheme)
     return scheme if isinstance(scheme, BlindScheme) else None
 
 
 def get_nonblind(scheme: str | Scheme | BlindScheme) -> Scheme:
-    """Return the scheme of a name that is read with the original; such a scheme is returned as it is.
+    """Return the scheme of a name that is read with the original; such a scheme is returned unchanged.
 
     Raises:
         JaxmarkError: if there is no scheme of that name, or it is blind.
@@ -67,45 +67,45 @@ def get_nonblind(scheme: str | Scheme | BlindScheme) -> Scheme:
 
 
 def make_scheme(name: str, parameters: Mapping[str, Any]) -> Scheme:
-    """Make a scheme of the library that is read with the original from its fields in a record.
+    """Make a scheme that is read with the original from its fields in a record.
 
     Args:
         name: one of `SCHEMES`.
         parameters: the fields, as `parameters_of` returns them.
 
     Raises:
-        JaxmarkError: if there is no such scheme, or it has no such fields.
+        JaxmarkError: if there is no such scheme, or it does not have these fields.
     """
-    get_nonblind(name)  # refuses other names
-    known = {field.name: type(field.default) for field in fields(SCHEMES[name])}
+    get_nonblind(name)  # raises an error for other names
+    types = {field.name: type(field.default) for field in fields(SCHEMES[name])}
     # JSON stores tuples as lists.
-    given: dict[str, Any] = {
+    values: dict[str, Any] = {
         field: tuple(value) if isinstance(value, list) else value for field, value in parameters.items()
     }
     for field, value in _RETIRED_FIELDS.get(name, {}).items():
-        if given.pop(field, value) != value:
+        if values.pop(field, value) != value:
             raise JaxmarkError(f"Marks of the scheme {name!r} with {field} other than {value} are no longer read.")
     if any(
-        field not in known
-        or type(value) is not known[field]
+        field not in types
+        or type(value) is not types[field]
         or (isinstance(value, tuple) and not all(isinstance(item, float) for item in value))
-        for field, value in given.items()
+        for field, value in values.items()
     ):
-        raise JaxmarkError(f"The scheme {name!r} takes the parameters {', '.join(known)}, not {given}.")
-    if any(not 0 < given.get(field, 1) <= _MAX_COMPONENTS for field in ("bands", "pairs")):
-        raise JaxmarkError(f"A record's scheme has 1 to {_MAX_COMPONENTS} bands or pairs, not {given}.")
-    return SCHEMES[name](**{**_FIELDS_OF_OLD_RECORDS.get(name, {}), **given})
+        raise JaxmarkError(f"The scheme {name!r} takes the parameters {', '.join(types)}, not {values}.")
+    if any(not 0 < values.get(field, 1) <= _MAX_COMPONENTS for field in ("bands", "pairs")):
+        raise JaxmarkError(f"The scheme in a record has 1 to {_MAX_COMPONENTS} bands or pairs, not {values}.")
+    return SCHEMES[name](**{**_FIELDS_OF_OLD_RECORDS.get(name, {}), **values})
 
 
 def make_blind_scheme(name: str, parameters: Mapping[str, Any]) -> BlindScheme:
-    """Make a blind scheme with the width and the step that a record names.
+    """Make a blind scheme with the width and the quantisation step of a record.
 
     Raises:
-        JaxmarkError: if there is no such scheme, or they are not among those that it may have.
+        JaxmarkError: if there is no such scheme, or it does not have this width and step.
     """
     scheme, width, step = BLIND_SCHEMES.get(name), parameters.get("width"), parameters.get("step")
     if scheme is None or width not in scheme.widths or step not in scheme.steps:
-        raise JaxmarkError(f"The record is not one of the scheme {name!r} that this jaxmark reads.")
+        raise JaxmarkError(f"This jaxmark cannot read the record: no scheme {name!r} has its width and step.")
     return scheme.fixed(width, step)
 
 
@@ -115,10 +115,14 @@ def parameters_of(scheme: Named) -> dict[str, Any]:
 
 
 def split(scheme: AnyScheme) -> tuple[str | Scheme | None, tuple[BlindScheme, ...]]:
-    """Split what marks one mesh: the scheme that is read with the original, or its name, if any; and the blind ones.
+    """Split the schemes of one mesh into the one that is read with the original, if any, and the blind ones.
+
+    Returns:
+        The scheme that is read with the original, or its name; None if there is none. Then the blind schemes.
 
     Raises:
-        JaxmarkError: unless of several names the first is read with the original and the others are blind, each once.
+        JaxmarkError: if several names are not one scheme that is read with the original, followed by different blind
+            schemes.
     """
     if not isinstance(scheme, tuple):
         if (blind := find_blind(scheme)) is not None:
@@ -126,16 +130,16 @@ def split(scheme: AnyScheme) -> tuple[str | Scheme | None, tuple[BlindScheme, ..
         return scheme if isinstance(scheme, str) else get_nonblind(scheme), ()
     if len(scheme) < 2 or scheme[0] not in SCHEMES or any(name not in BLIND_SCHEMES for name in scheme[1:]):
         raise JaxmarkError(
-            f"Several marks in one mesh are one that is read with the original ({', '.join(SCHEMES)}) and then blind"
-            f" ones ({', '.join(BLIND_SCHEMES)}), not {', '.join(scheme)}."
+            f"Several marks in one mesh need one scheme that is read with the original ({', '.join(SCHEMES)}), followed"
+            f" by blind schemes ({', '.join(BLIND_SCHEMES)}), not {', '.join(scheme)}."
         )
     if len(set(scheme)) < len(scheme):
-        raise JaxmarkError(f"Each scheme marks a mesh once, but one is twice among {', '.join(scheme)}.")
+        raise JaxmarkError(f"Each scheme can mark a mesh once, but one is named twice: {', '.join(scheme)}.")
     return scheme[0], tuple(BLIND_SCHEMES[name] for name in scheme[1:])
 
 
 def name_of(scheme: AnyScheme) -> str:
-    """Return the name of a scheme, or of several with commas between."""
+    """Return the name of a scheme, or the names of several, separated by commas."""
     if isinstance(scheme, tuple):
         return ",".join(scheme)
     return scheme if isinstance(scheme, str) else scheme.name

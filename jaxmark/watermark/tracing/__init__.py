@@ -1,1 +1,1 @@
-"""Copies for recipients: fingerprints that resist collusion, and whom a suspect accuses."""
+"""Fingerprinted copies for recipients: collusion-resistant codes, and the identification of leaked copies."""

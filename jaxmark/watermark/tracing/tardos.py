@@ -1,9 +1,10 @@
-"""A fingerprint code that survives collusion: from one soft value per slot, it tells who contributed to a copy.
+"""A collusion-resistant fingerprint code: it finds contributors to a copy from one soft decision per slot.
 
 This is Tardos's code (STOC 2003) with the symmetric score of Škorić, Katzenbeisser and Celik (2008). Each slot has a
-keyed bias p. Every recipient's codeword X is +1 there with probability p, independently, and its score is Σ y g(X),
-where g standardises X: g(+1) = √((1 - p)/p) and g(-1) = -√(p/(1 - p)). The values y may come from any collusion: the
-probability of a false accusation rests on the innocent recipient's own codeword alone, given p and y.
+keyed bias p. The codeword X of every recipient is +1 there with probability p, independently of the others. The score
+of a recipient is Σ y g(X), where y are the soft decisions and g standardises X: g(+1) = √((1 - p)/p) and
+g(-1) = -√(p/(1 - p)). The values y may come from any collusion: given p and y, the probability of a false accusation
+depends only on the innocent recipient's own codeword.
 """
 
 import math
@@ -20,27 +21,27 @@ from jaxmark.watermark.evidence.ledger import UNFLOORED, Charge, figure
 
 Slots = Float[np.ndarray, " slots"]
 
-# The smallest bias, in units of 1/256: that of the optimal discrete biases against 10 colluders (Nuida et al. 2009),
-# which are the zeros of the shifted Legendre polynomial of degree 5. Tardos's 1/(300c) serves a proof at large c: such
-# extreme biases tell little from soft values under noise, and give the scores of innocents a heavy tail.
+# The smallest bias, in units of 1/256. It is that of the optimal discrete biases against 10 colluders (Nuida et al.
+# 2009), the zeros of the shifted Legendre polynomial of degree 5. Tardos's 1/(300c) is for a proof at large c: such
+# extreme biases gain little from noisy soft decisions, and give the scores of innocents a heavy tail.
 MIN_BIAS_LEVEL = 12
 
-# The values of the arcsine distribution function, in units of 2⁻³², at which a bias passes from one multiple of 1/256
-# to the next. Mathematical libraries may differ in the last digits and biases must not, so keyed words are compared
-# with integers: none of these is within 10⁻⁴ of being rounded otherwise, fifty times what the last digits make.
+# The values of the arcsine distribution function, in units of 2⁻³², at which a bias changes from one multiple of 1/256
+# to the next. Biases must not depend on the last digits, in which mathematical libraries may differ, so keyed words are
+# compared with integers. No value is within 10⁻⁴ of a rounding boundary, fifty times the effect of the last digits.
 _ANGLES = [math.asin(math.sqrt((level - 0.5) / 256)) for level in range(MIN_BIAS_LEVEL, 258 - MIN_BIAS_LEVEL)]
 _THRESHOLDS = np.array([round(2**32 * (a - _ANGLES[0]) / (_ANGLES[-1] - _ANGLES[0])) for a in _ANGLES[1:-1]], np.uint32)
 
-_CHUNK_RECIPIENTS = 1024  # whose codewords are in memory at a time
+_CHUNK_RECIPIENTS = 1024  # number of recipients whose codewords are in memory at a time
 
 
 class Accusation(NamedTuple):
     """The evidence against one recipient."""
 
     recipient: str  # identifier
-    score: float  # of mean 0 and variance 1 for innocents
-    log10_p: float  # log10 of a bound on the probability that any innocent among those tried has such a score
-    caveats: tuple[str, ...] = ()  # why the probability is an estimate, not a proof; empty if it is a proof
+    score: float  # score, of mean 0 and variance 1 for innocents
+    log10_p: float  # log10 of a bound on the probability that any innocent among those tested reaches this score
+    caveats: tuple[str, ...] = ()  # the reasons why the probability is an estimate; empty if it is a proof
 
     def charged(self, *charges: Charge) -> "Accusation":
         """Charge further choices, see `jaxmark.watermark.evidence.ledger`."""
@@ -48,11 +49,11 @@ class Accusation(NamedTuple):
 
 
 def biases(choices: Choices, length: int) -> Float64[np.ndarray, " slots"]:
-    """Derive each slot's probability of +1 from the key, by the arcsine law with a cut-off, in multiples of 1/256.
+    """Derive the probability of +1 in each slot from the key: arcsine law with a cut-off, in multiples of 1/256.
 
     Args:
         choices: the keyed choices of the mark.
-        length: number of slots; codes of different lengths share nothing.
+        length: number of slots; codes of different lengths are independent.
 
     Returns:
         `[length]`, from `MIN_BIAS_LEVEL`/256 to 1 - `MIN_BIAS_LEVEL`/256.
@@ -67,7 +68,7 @@ def biases(choices: Choices, length: int) -> Float64[np.ndarray, " slots"]:
 
 
 def codewords(recipients: Sequence[str], choices: Choices, biases_: Slots) -> Int8[np.ndarray, "recipients slots"]:
-    """Derive the recipients' codewords ±1 from the key: each slot has a keyed byte, and is +1 if that is below 256 p.
+    """Derive the codewords (±1) of recipients from the key: a slot is +1 if its keyed byte is below 256 p.
 
     Args:
         recipients: identifiers.
@@ -81,11 +82,11 @@ def codewords(recipients: Sequence[str], choices: Choices, biases_: Slots) -> In
         JaxmarkError: if an identifier is empty.
     """
     if not all(recipients):
-        raise JaxmarkError("A recipient's identifier is empty: give every recipient one.")
+        raise JaxmarkError("A recipient's identifier is empty. Give every recipient an identifier.")
     label = f"fingerprint/{len(biases_)}/codeword"
     stream = b"".join(choices.derive(label, len(biases_), recipient.encode()) for recipient in recipients)
-    drawn = np.frombuffer(stream, np.uint8).reshape(len(recipients), len(biases_))
-    return 2 * (drawn < (256 * biases_).astype(np.uint8)).view(np.int8) - 1
+    keyed_bytes = np.frombuffer(stream, np.uint8).reshape(len(recipients), len(biases_))
+    return 2 * (keyed_bytes < (256 * biases_).astype(np.uint8)).view(np.int8) - 1
 
 
 def scores(
@@ -106,40 +107,40 @@ def scores(
 
 
 def rank(values: Slots, recipients: Iterable[str], choices: Choices, *, top: int = 10) -> list[Accusation]:
-    """Find the recipients with the highest scores, and how surely they are not innocent.
+    """Find the recipients with the highest scores, with bounds on the probability that an innocent reaches these.
 
     Args:
         values: y at any scale, `[slots]`; **independent of the codewords of innocents**.
-        recipients: identifiers; one that occurs twice is tried once.
+        recipients: identifiers; an identifier that occurs twice is tested once.
         choices: the keyed choices of the mark.
         top: largest number of recipients to return.
 
     Returns:
-        At most `top` recipients, the highest score first; the probabilities are for all that were tried together (union
-        bound).
+        At most `top` recipients, the highest score first. Their probabilities hold for all tested recipients together
+        (union bound).
 
     Raises:
         JaxmarkError: if a value is not finite, there is no slot, or an identifier is empty.
     """
     if not np.isfinite(values).all():
-        raise JaxmarkError("A slot's value is not finite: give 0 where nothing is known.")
+        raise JaxmarkError("The value of a slot is not finite. Use 0 for unknown values.")
     p = biases(choices, len(values))
     y = _remove_trend(np.asarray(values, np.float64), p)
     candidates = list(dict.fromkeys(recipients))
-    found = np.empty(len(candidates))
+    totals = np.empty(len(candidates))
     for i in range(0, len(candidates), _CHUNK_RECIPIENTS):
-        found[i : i + _CHUNK_RECIPIENTS] = scores(y, p, codewords(candidates[i : i + _CHUNK_RECIPIENTS], choices, p))
-    best = np.argsort(-found, kind="stable")[:top]
-    log10_p = accuse(found[best], y, p, len(candidates))
-    return [Accusation(candidates[i], float(found[i]), float(bound)) for i, bound in zip(best, log10_p, strict=True)]
+        totals[i : i + _CHUNK_RECIPIENTS] = scores(y, p, codewords(candidates[i : i + _CHUNK_RECIPIENTS], choices, p))
+    best = np.argsort(-totals, kind="stable")[:top]
+    log10_p = accuse(totals[best], y, p, len(candidates))
+    return [Accusation(candidates[i], float(totals[i]), float(bound)) for i, bound in zip(best, log10_p, strict=True)]
 
 
 def _remove_trend(y: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Subtract from y its least-squares fit by a cubic in p, and scale the rest to unit norm; zero if nothing is left.
+    """Subtract from y its least-squares fit by a cubic in p, and scale the rest to unit norm; zero if there is no rest.
 
-    The copy of any coalition follows p (the average of its codewords is 2p - 1 in expectation). As g(X) has mean 0
-    given p, subtracting this trend takes nothing from a member's expected score, but much from the norm: the scores of
-    8 recipients who average their copies rise by half or more.
+    The copy of any coalition follows p: the expected average of its codewords is 2p - 1. Because g(X) has mean 0 given
+    p, subtracting this trend does not change a member's expected score, but reduces the norm. The scores of 8
+    recipients who average their copies increase by half or more.
     """
     y = y / max(np.abs(y).max(), np.finfo(float).tiny)
     powers = np.vander(p, 4)

@@ -1,8 +1,8 @@
-"""Tracing copies: each recipient's copy carries a fingerprint, which tells whose copies a suspect was made of.
+"""Tracing of copies: the copy of each recipient carries a fingerprint, which identifies the copies in a suspect.
 
-The carrier is the same as for messages, with keyed choices of its own; its code bits are the slots of a code that
-resists collusion (`jaxmark.watermark.tracing.tardos`). Accusations rest on the randomness of the recipients' codewords,
-never on that of the chips: another recipient's copy under the same key is not independent of the chips.
+The carrier is the same as for messages, with keyed choices of its own. Its code bits are the slots of a
+collusion-resistant code (`jaxmark.watermark.tracing.tardos`). The bounds on accusations use only the randomness of the
+recipients' codewords, not that of the chips, because the copies of other recipients depend on the same chips.
 """
 
 from collections.abc import Iterable
@@ -21,21 +21,21 @@ from jaxmark.watermark.schemes.keyed import KeyedScheme
 from jaxmark.watermark.schemes.registry import get_nonblind, make_scheme
 from jaxmark.watermark.tracing.tardos import Accusation, biases, codewords, rank
 
-# Fingerprints use the pass band for a message of this size: wide enough for 2,048 slots on a mesh of 10,000 vertices.
+# Fingerprints use the pass band for a message of this size, which has 2,048 slots on a mesh of 10,000 vertices.
 _PASSBAND_MESSAGE_BITS = 232
 _MAX_SLOTS = 2048
-_MIN_SLOTS = 8  # fewer prove nothing
-_MAX_LOG10_P = -6.0  # of an accusation
+_MIN_SLOTS = 8  # with fewer slots nothing can be proven
+_MAX_LOG10_P = -6.0  # largest log10 p of an accusation
 
 
 @dataclass(frozen=True, eq=False)
 class Tracer:
-    """Makes copies of one original for recipients, and accuses recipients by a suspect.
+    """A tracer, which makes copies of one original for recipients, and identifies recipients from suspects.
 
     Make one with `make_tracer`.
     """
 
-    mark: Mark  # writes and reads fingerprints
+    mark: Mark  # the mark that writes and reads fingerprints
 
     def fingerprint(self, recipient: str, budget: BudgetLike = None) -> tuple[Mesh, EmbedInfo]:
         """Make the copy for one recipient; see `fingerprint`."""
@@ -47,11 +47,11 @@ class Tracer:
                 return marked, info
         raise JaxmarkError(
             f"This mesh ({int(original.used.sum())} points) cannot carry a fingerprint: its own recipient would not be"
-            " found, even unattacked. Use a finer or less regular mesh."
+            " identified, even unattacked. Use a finer or less regular mesh."
         )
 
     def finds(self, suspect: Mesh, recipient: str) -> bool:
-        """Whether a suspect would accuse a recipient who is the only one tried, at a probability of 1e-6."""
+        """Whether a suspect accuses a recipient with a probability of at most 1e-6, if no other recipient is tested."""
         return self.identify(suspect, [recipient])[0].log10_p <= _MAX_LOG10_P
 
     def register(self, suspect: Mesh, align: Align = "auto") -> Alignment:
@@ -65,11 +65,11 @@ class Tracer:
         return self.read(self.register(suspect, align), recipients, top)
 
     def read(self, aligned: Alignment, recipients: Iterable[str], top: int = 10) -> list[Accusation]:
-        """Rank recipients by their scores in a suspect that was aligned; see `identify`."""
+        """Rank recipients by their scores in an aligned suspect; see `identify`."""
         soft = self.mark.soft_decisions(self.mark.receive(aligned))
         charge = ledger.COPY_ALIGNMENT.charge(aligned.align)
         ranking = rank(soft, recipients, self.mark.choices, top=top)
-        return [one.charged(charge)._replace(caveats=self.mark.caveats) for one in ranking]
+        return [accusation.charged(charge)._replace(caveats=self.mark.caveats) for accusation in ranking]
 
 
 def make_tracer(original: Mesh, key: bytes, *, record: Record | None = None) -> Tracer:
@@ -78,8 +78,8 @@ def make_tracer(original: Mesh, key: bytes, *, record: Record | None = None) -> 
     Args:
         original: the unmarked mesh; see `make_marker`.
         key: 32 bytes, from `new_key`.
-        record: the record of an earlier copy, which fixes the scheme; original and key must be those that it was made
-            with.
+        record: the record of an earlier copy, which determines the scheme; original and key must be those that it was
+            made with.
 
     Raises:
         JaxmarkError: if the mesh or key is unusable, or the record is not of a fingerprint, was edited, or is for
@@ -92,8 +92,8 @@ def make_tracer(original: Mesh, key: bytes, *, record: Record | None = None) -> 
     ready, caveats = recall(original, key, record)
     dimensions = scheme.dimensions(ready, _PASSBAND_MESSAGE_BITS)
     if not dimensions:
-        raise JaxmarkError(f"Fingerprints are carried by the scheme 'keyed', not {scheme.name!r}.")
-    # There are at most half as many slots as dimensions, so that slots can be told apart.
+        raise JaxmarkError(f"Fingerprints need the scheme 'keyed', not {scheme.name!r}.")
+    # There are at most half as many slots as dimensions, so that slots can be distinguished.
     slots = min(_MAX_SLOTS, 1 << (max(2, dimensions) // 2).bit_length() - 1)
     choices = bind_mark(key, ready, scheme, slots, "fingerprint", record)
     carrier = scheme.carrier(ready, choices, _PASSBAND_MESSAGE_BITS, slots)
@@ -111,7 +111,7 @@ def fingerprint(mesh: Mesh, recipient: str, key: bytes, *, budget: BudgetLike = 
         budget: how strong the mark may be, see `embed`.
 
     Returns:
-        The copy (float64 vertices, same faces) and what was done to it.
+        The copy (float64 vertices, same faces), and the strength and the record of its mark.
 
     Raises:
         JaxmarkError: if the mesh, key, budget or identifier is unusable, or the mesh is too small.
@@ -129,11 +129,11 @@ def identify(
     top: int = 10,
     align: Align = "auto",
 ) -> list[Accusation]:
-    """Find whose copies a suspect was made of, and how surely.
+    """Identify the recipients whose copies a suspect was made of, with bounds on the probability of a false accusation.
 
     Args:
         suspect: any mesh.
-        recipients: the identifiers of all who were given a copy.
+        recipients: the identifiers of all recipients of a copy.
         original: the unmarked mesh.
         key: 32 bytes.
         record: the record of an earlier copy, see `make_tracer`.
@@ -141,8 +141,8 @@ def identify(
         align: how the suspect is aligned, see `detect`.
 
     Returns:
-        The recipients with the highest scores, the highest first. log10_p bounds the probability that any of the
-        recipients tried who had no part in the suspect scores so high, whatever the others did; it rests on the
+        The recipients with the highest scores, the highest first. `log10_p` bounds the probability that any tested
+        recipient who had no part in the suspect reaches this score, whatever the others did. The bound rests on the
         codewords alone (see `jaxmark.watermark.tracing.tardos`).
 
     Raises:

@@ -174,9 +174,9 @@ def test_united_probabilities_hold():
 
 
 def test_refusals(shape: Mesh, key: jm.Key):
-    with pytest.raises(jm.JaxmarkError, match="Several marks in one mesh are one that is read with the original"):
+    with pytest.raises(jm.JaxmarkError, match="Several marks in one mesh need one scheme"):
         jm.embed(shape, MESSAGE, key, scheme=("field", "local"))
-    with pytest.raises(jm.JaxmarkError, match="marks a mesh once"):
+    with pytest.raises(jm.JaxmarkError, match="can mark a mesh once"):
         jm.embed(shape, MESSAGE, key, scheme=("keyed", "local", "local"))
     with pytest.raises(jm.JaxmarkError, match="nothing to write in"):
         jm.embed(shape, MESSAGE, key, budget=1e-7, scheme="local")
@@ -195,4 +195,4 @@ def test_commands_for_several_marks(shape: Mesh, tmp_path: Path, monkeypatch, ca
     assert both["message"] == CLI_MESSAGE
     assert any("'local' alone" in note for note in both["notes"])
     assert "not one of" in workshop.refused("embed", "model.ply", "x.ply", *key, "--scheme", "keyed,nothing")
-    assert "an informed one" in workshop.refused("embed", "model.ply", "x.ply", *key, "--scheme", "field,keyed")
+    assert "read with the original" in workshop.refused("embed", "model.ply", "x.ply", *key, "--scheme", "field,keyed")

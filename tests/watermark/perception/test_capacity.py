@@ -99,7 +99,7 @@ def test_bits_are_noise_to_each_other():
 @pytest.mark.parametrize("passband", ["tapered", "narrow"])
 def test_room_is_what_the_projection_leaves(direction, passband, x64):
     """By dense matrices: of white displacements in each band, and the energy of a mark of unit mean square."""
-    original, scheme = make_original(bumpy_sphere(2)), KeyedScheme(32, direction, passband=passband, masking=False)
+    original, scheme = make_original(bumpy_sphere(2)), KeyedScheme(32, direction, passband=passband, hiding=False)
     carrier = scheme.carrier(original, Choices(jm.Key(bytes(32)), b""), 8, 32)
     passing = scheme.layout(original, 8).passing
     count = len(original.used)

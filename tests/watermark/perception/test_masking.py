@@ -144,7 +144,7 @@ def test_the_adjoint_and_gram(key: jm.Key, dtype):
     np.testing.assert_allclose(gram, gram.T, atol=exact * np.abs(gram).max())
     assert float(bits @ gram @ bits) == pytest.approx(float(jnp.sum(mass * carrier.displacement(bits) ** 2)), rel=1e-3)
     # A direction that hides little is one that little is written in.
-    plain = KeyedScheme(masking=False).carrier(original, Choices(key, b""), 8, 64)
+    plain = KeyedScheme(hiding=False).carrier(original, Choices(key, b""), 8, 64)
     expected = np.einsum("nij,nj->ni", masking_directions(original), original.to_host(plain.displacement(bits)))
     np.testing.assert_allclose(original.to_host(carrier.displacement(bits)), expected, atol=10 * exact)
 
@@ -178,7 +178,7 @@ def test_planes_stay_plane(key: jm.Key):
     assert jm.detect(suspect, original=mesh, key=key, record=info.record).message == b"plane"
     # Without a record, as the scheme's defaults are.
     assert jm.detect(suspect, original=mesh, key=key, bits=40).message == b"plane"
-    plain = jm.make_marker(mesh, key, bits=40, scheme=KeyedScheme(masking=False))
+    plain = jm.make_marker(mesh, key, bits=40, scheme=KeyedScheme(hiding=False))
     isotropic, isotropic_info = plain.write(plain.codeword(b"plane"), None)
     assert isotropic_info.rms < info.rms / 3
     assert plain.read_quickly(plain.observe(plain.register(isotropic))) == b"plane"
@@ -187,7 +187,7 @@ def test_planes_stay_plane(key: jm.Key):
 def test_capacity_counts_the_dimensions_that_are_left(key: jm.Key):
     """Half of what is hidden in one coordinate alone is hidden in a third of the dimensions."""
     original = make_original(rough_sphere(200))
-    carrier = KeyedScheme(masking=False).carrier(original, Choices(key, b""), 8, 64)
+    carrier = KeyedScheme(hiding=False).carrier(original, Choices(key, b""), 8, 64)
     assert isinstance(carrier, KeyedCarrier)
     assert carrier.masked_share() == 1
     rows = len(original.signal)
@@ -229,7 +229,7 @@ def test_records_keep_how_a_mark_was_hidden():
     assert parameters_of(KeyedScheme())["hiding"] is True
     assert make_scheme("keyed", parameters_of(KeyedScheme())) == KeyedScheme()
     before = {name: value for name, value in parameters_of(KeyedScheme()).items() if name != "hiding"}
-    assert make_scheme("keyed", before) == KeyedScheme(masking=False)
+    assert make_scheme("keyed", before) == KeyedScheme(hiding=False)
 
 
 def test_a_texture_drifts_as_far_as_its_surface_moves():

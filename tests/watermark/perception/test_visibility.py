@@ -59,7 +59,7 @@ def test_masking_by_roughness_is_no_longer_read():
 
 
 def test_a_profile_is_what_is_written(half_rough: Mesh, key: jm.Key, dtype):
-    scheme = KeyedScheme(bands=32, profile=(0.0, 1.0, 0.5, 0.0, 0.25), masking=False)
+    scheme = KeyedScheme(bands=32, profile=(0.0, 1.0, 0.5, 0.0, 0.25), hiding=False)
     original = make_original(half_rough)
     carrier = scheme.carrier(original, Choices(key, b""), 16, 88)
     assert isinstance(carrier, KeyedCarrier)

@@ -70,7 +70,7 @@ def test_the_usual_band_stays_where_marks_are_strong():
     assert usual.adapted(1e-5) is usual  # all bands cost the same
 
 
-@pytest.mark.parametrize("scheme", [KeyedScheme(masking=False), KeyedScheme(profile=(1.0,) * 9), "host"])
+@pytest.mark.parametrize("scheme", [KeyedScheme(hiding=False), KeyedScheme(profile=(1.0,) * 9), "host"])
 def test_other_schemes_stay_as_they_are(scheme):
     marker = jm.make_marker(SHAPE, jm.Key(bytes(32)), bits=16, scheme=scheme)
     assert marker.adapted(FAINT) is marker
