@@ -41,7 +41,7 @@ study = jm.Study(
     attacks={"noise": [0.002, 0.005, 0.02], "quantisation": [9, 7]},
     samples=3,
 )
-results = study.run(FOLDER / "results.jsonl", say=print)
+results = study.run(FOLDER / "results.jsonl", log=print)
 
 # %% [markdown]
 # Each line of `results.jsonl` is a finished cell of the grid. If you run the code again, it ends at once, because no

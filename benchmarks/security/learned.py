@@ -57,7 +57,7 @@ def learn(folder: Path, goal: enemies.Goal, steps: int, size: int) -> enemies.Ne
         meshes, others = (
             meshes_by_formula(*part, size) for part in ((100, LEARNED_FROM), (100 + LEARNED_FROM, HELD_OUT))
         )
-        found = enemies.learn(meshes, others, seed=0, goal=goal, bits=BITS, steps=steps, say=say)
+        found = enemies.learn(meshes, others, seed=0, goal=goal, bits=BITS, steps=steps, log=say)
         say(f"{goal}: held-out loss {found.before:.4f} of the Wiener estimate, {found.after:.4f} of the network")
         numbers = np.asarray(ravel_pytree(found.network)[0])
         np.savez(file, before=found.before, after=found.after, losses=found.losses, network=numbers)
@@ -74,7 +74,7 @@ def search(folder: Path, generations: int, size: int) -> list[enemies.Gene]:
             target = make_target(mesh, "keyed")
             pairs.append((target.marker, target.marked, MESSAGE))
         judge = enemies.projected_cost(pairs, "msdm2")
-        found = enemies.search_chain(judge, generations=generations, say=say)
+        found = enemies.search_chain(judge, generations=generations, log=say)
         file.write_text(json.dumps({"cost": found.cost, "genes": found.genes}))
     return [enemies.Gene(*gene) for gene in json.loads(file.read_text())["genes"]]
 

@@ -1,7 +1,8 @@
-"""Attacks on a watermark by adversaries, one module for each kind of knowledge that they have.
+"""Attacks on a watermark by adversaries, with one module for each kind of adversary's knowledge.
 
-Those of `jaxmark.attacks` happen to any mesh; these are made against a watermark. Each attack on a mesh is an `Attack`,
-which can stand wherever a name in `ATTACKS` can; `ambiguity` attacks what a detection proves.
+The attacks of `jaxmark.attacks` may happen to any mesh; the attacks here are directed against a watermark. Each attack
+on a mesh is an `Attack`, which can be used in place of a name in `ATTACKS`. The module `ambiguity` attacks the proof of
+a detection instead of the mark.
 """
 
 from jaxmark.adversaries.ambiguity import Search as Search

@@ -22,10 +22,10 @@ from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, get_nonblind
 
 
 class Search(NamedTuple):
-    """The result of trying random keys."""
+    """The result of a search over random keys."""
 
     key: Key  # the key with the strongest claim
-    log10_p: Float64[np.ndarray, " keys"]  # of the claim with each key, see `Evidence`
+    log10_p: Float64[np.ndarray, " keys"]  # log10 p of the claim with each key, see `Evidence`
 
 
 def forge_original(
@@ -90,6 +90,6 @@ def transplant(marked: Mesh, estimate: Mesh, target: Mesh) -> Mesh:
     """
     marked, estimate, target = map(host_mesh, (marked, estimate, target))
     if not all(same_connectivity(one, target) for one in (marked, estimate)):
-        raise JaxmarkError("A mark is moved between meshes of one connectivity; these differ in theirs.")
+        raise JaxmarkError("A mark can only be copied between meshes of one connectivity; these meshes differ in it.")
     shift = np.asarray(marked.vertices) - np.asarray(estimate.vertices)
     return Mesh(np.asarray(target.vertices) + shift, target.faces)

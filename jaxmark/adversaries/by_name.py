@@ -28,7 +28,7 @@ from jaxmark.watermark.schemes.keyed import DERIVED, KeyedScheme
 
 _CHEBYSHEV_TERMS = 65
 _MAX_LAMBDA = 2.0  # upper end of the spectrum
-_SHAPE_LAMBDA = 0.02  # below it lies the shape of a mesh, and next to nothing of a mark
+_SHAPE_LAMBDA = 0.02  # lower frequencies carry the shape of a mesh, and hardly anything of a mark
 
 
 def low_pass(mesh: Mesh, strength: float, seed: Seed | None = None) -> Mesh:
@@ -53,11 +53,12 @@ def band_stop(mesh: Mesh, strength: float, seed: Seed | None = None) -> Mesh:
 
 
 def jamming(mesh: Mesh, strength: Strength, seed: Seed) -> Mesh:
-    """Add noise that looks like a mark of the default scheme under a key of the attacker's own.
+    """Add noise with the spectrum of a mark of the default scheme.
 
-    White normal noise is filtered by the bands of the scheme, each with its strength. No other noise of its size hides
-    a mark better from a reader who knows no more than the attacker does. The strength is the RMS displacement of the
-    vertices, relative to the diagonal of the bounding box, and is met exactly; differentiable in it, too.
+    White normal noise is filtered by the bands of the scheme, each with its strength. Against a reader that knows no
+    more than the attacker, no other noise of the same size hides a mark better. The strength is the RMS displacement of
+    the vertices, relative to the diagonal of the bounding box, and is met exactly. The attack is also differentiable
+    with respect to the strength.
     """
     vertices = jnp.asarray(mesh.vertices)
     noise = jax.random.normal(random_key(seed), vertices.shape, vertices.dtype)
@@ -65,9 +66,9 @@ def jamming(mesh: Mesh, strength: Strength, seed: Seed) -> Mesh:
 
 
 def through_bands(operator: Operator, noise: Float[Array, "vertices columns"]) -> Float[Array, "vertices columns"]:
-    """Filter noise by the bands of the default scheme, each with its strength, as a mark looks without the key.
+    """Filter noise by the bands of the default scheme, each with its strength.
 
-    White noise becomes noise with the covariance of a mark, up to a factor.
+    White noise becomes noise with the covariance of marks of random keys, up to a factor.
     """
     # Chebyshev coefficients of the bands' sum, each band times its strength.
     coefficients = np.array(DERIVED) @ scaling(KeyedScheme.bands, damping="jackson")[: len(DERIVED)]

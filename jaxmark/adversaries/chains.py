@@ -1,6 +1,7 @@
-"""Chains of tools, found by evolution on marks of the attacker's own: no gradient, and any program may be a step.
+"""Chains of attacks that remove marks, found by an evolutionary search without gradients.
 
-Chains are judged on marks that the attacker makes. A step is a name in `ATTACKS` and a strength.
+A step of a chain is a name in `ATTACKS` and a strength; every program can be a step, because no gradients are needed.
+Chains are judged on marks that the attacker makes.
 """
 
 import math
@@ -35,24 +36,24 @@ TOOLS: Tools = {
     "simplification": (0.05, 0.95),
     "loop": (1, 1),
 }
-_REFUSED = 1e9  # what a chain costs that a mesh refuses
-_MOST_GROWTH = 4  # of the number of vertices
-_STEP = 0.25  # of strengths in one change, over the way from the weakest to the strongest
-_FACTOR = 16.0  # by which strengths change over that way in the unit of `chain_attack`
+_REFUSED = 1e9  # the cost of a chain that cannot be applied
+_MOST_GROWTH = 4  # largest growth of the number of vertices
+_STEP = 0.25  # standard deviation of a change of `Gene.place`
+_FACTOR = 16.0  # factor of the strength of `chain_attack` that corresponds to a change of `Gene.place` by 1
 
 
 class Gene(NamedTuple):
     """A step of a chain."""
 
     kind: str
-    place: float  # between the weakest strength of its kind, 0, and the strongest, 1
+    place: float  # position between the weakest strength of its kind (0) and the strongest (1)
 
 
 class Chain(NamedTuple):
-    """A chain that was tried."""
+    """A chain, with its cost."""
 
     genes: tuple[Gene, ...]
-    cost: float  # by the judge
+    cost: float  # the cost that the judge returned
 
 
 def search_chain(
@@ -63,12 +64,13 @@ def search_chain(
     population: int = 12,
     generations: int = 8,
     seed: int = 0,
-    say: Callable[[str], None] = lambda line: None,
+    log: Callable[[str], None] = lambda line: None,
 ) -> Chain:
-    """Search for the chain of tools that costs least, by evolution: the best third lives on and has changed copies.
+    """Search for the chain of tools with the least cost, by evolution.
 
-    The first generation has one chain of a single step for each tool. A changed copy has one strength moved, one step
-    replaced, added, left out or put elsewhere, or the head of one parent and the tail of another.
+    The first generation has one chain of a single step for each tool. Each later generation consists of mutations of
+    the best chains found so far, a third of `population`. A mutation changes one strength; replaces, adds, removes or
+    moves one step; or combines the head of one chain with the tail of another.
 
     Args:
         judge: function that returns the cost of a chain, such as `projected_cost`; a chain that is refused by a
@@ -78,7 +80,7 @@ def search_chain(
         population: number of chains in a generation after the first.
         generations: number of generations that are judged.
         seed: seed of all random choices.
-        say: function that is called with a line after each generation.
+        log: callback, called with a line after each generation.
 
     Raises:
         JaxmarkError: if there is no tool, an attack is unknown, a strength is not positive, or a number is below 1; or
@@ -104,9 +106,9 @@ def search_chain(
                 except JaxmarkError:
                     known[decoded] = Chain(one, _REFUSED)
                 if math.isnan(known[decoded].cost):
-                    raise JaxmarkError(f"The judge says that the chain {decoded} costs no number.")
+                    raise JaxmarkError(f"The judge returned NaN for the chain {decoded}; it must return a number.")
         best = sorted(known.values(), key=lambda one: one.cost)[: max(population // 3, 1)]
-        say(f"generation {generation + 1}: {best[0].cost:.4g} by {decode(best[0].genes, tools)}")
+        log(f"generation {generation + 1}: {best[0].cost:.4g} by {decode(best[0].genes, tools)}")
         some = [_changed([one.genes for one in best], kinds, steps, random) for _ in range(population)]
     return min(known.values(), key=lambda one: one.cost)
 
@@ -129,11 +131,12 @@ def projected_cost(
     log10_alpha: float = -6.0,
     seed: int = 0,
 ) -> Judge:
-    """Judge chains by the cost of bringing marks below detection with them: the mean over meshes.
+    """Make a judge that estimates the distortion by which a chain makes marks undetectable: the mean over meshes.
 
-    The cost of a chain is the distortion of the marked mesh over that of the mark. If the claim of the message is
-    still proven, it grows as noise would have to: noise of n times the mark's size leaves E = E₀/(1 + n²/c) of the
-    evidence E₀ = -log10 p, so that n must be √((E₀/E₁ - 1)/(E₀/E - 1)) times as large to leave E₁ = -log10 α.
+    The cost of a chain is its distortion of the marked mesh, divided by the distortion by the mark. If a claim of the
+    message is still proven after the chain, the cost is extrapolated as if the chain were noise. Noise of n times the
+    mark's size reduces the evidence E₀ = -log10 p to E = E₀/(1 + n²/c). To reduce it to E₁ = -log10 α, n must be
+    √((E₀/E₁ - 1)/(E₀/E - 1)) times as large.
 
     Args:
         pairs: markers of the attacker's own meshes, with meshes that they marked and the messages.
@@ -142,16 +145,16 @@ def projected_cost(
         seed: seed of the attacks.
 
     Raises:
-        JaxmarkError: if there is no such metric, no mark, or one that is not proven before any attack.
+        JaxmarkError: if there is no such metric, no mark, or a mark that is not proven before any attack.
     """
     if metric not in METRICS:
         raise JaxmarkError(f"There is no metric {metric!r}; there are {', '.join(METRICS)}.")
     if not pairs:
-        raise JaxmarkError("A search for chains needs marks of the attacker's own to judge them by.")
+        raise JaxmarkError("A search for chains needs at least one mark of the attacker to judge chains by.")
     references = [Reference(marked) for _, marked, _ in pairs]
     proven = [-_log10_p(*pair) for pair in pairs]
     if min(proven) <= -log10_alpha:
-        raise JaxmarkError("A mark that is not proven before any attack says nothing about attacks; make it stronger.")
+        raise JaxmarkError("A mark is not proven before any attack, so that it cannot judge attacks; make it stronger.")
     own = [Reference(marker.original.mesh).measure(marked, [metric])[metric] for marker, marked, _ in pairs]
 
     def judge(steps: Steps) -> float:
@@ -169,7 +172,7 @@ def projected_cost(
 
 
 def run_chain(mesh: Mesh, steps: Steps, *, seed: int) -> Mesh:
-    """Apply the steps of a chain; refuse one that makes more than four times as many vertices."""
+    """Apply the steps of a chain; raise an error if the number of vertices grows by more than a factor of four."""
     most = _MOST_GROWTH * len(mesh.vertices)
     for place, (kind, strength) in enumerate(steps):
         mesh = attack(mesh, kind, strength, seed=seed + place)
@@ -179,27 +182,31 @@ def run_chain(mesh: Mesh, steps: Steps, *, seed: int) -> Mesh:
 
 
 def chain_attack(genes: Sequence[Gene], tools: Tools = TOOLS) -> Attack:
-    """Make a chain an attack: all strengths grow together by a factor of 16 from the weakest to the strongest."""
+    """Convert a chain to an attack, whose strength 1 is the chain as it is.
+
+    The strengths of all steps change together: a factor of 16 in the attack's strength corresponds to the whole range
+    of each step's strength.
+    """
 
     def apply(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
         shift = math.log(max(strength, 1e-300)) / math.log(_FACTOR)
         moved = [gene._replace(place=gene.place + shift) for gene in genes]
         return run_chain(mesh, decode(moved, tools), seed=int(generator(seed).integers(2**31)))
 
-    return Attack(apply, "strengths over those that were found", (1 / _FACTOR, 1, _FACTOR), host=True, faces=True)
+    return Attack(apply, "strength relative to the chain as found", (1 / _FACTOR, 1, _FACTOR), host=True, faces=True)
 
 
 def _log10_p(marker: NonBlindMarker, suspect: Mesh, message: bytes) -> float:
     try:
         return marker.detect(suspect, message).evidence.log10_p_unfloored
-    except JaxmarkError:  # what cannot be aligned is not detected
+    except JaxmarkError:  # a suspect that cannot be aligned is not detected
         return 0.0
 
 
 def _changed(
     parents: Sequence[tuple[Gene, ...]], kinds: Sequence[str], longest: int, random: np.random.Generator
 ) -> tuple[Gene, ...]:
-    """Make a changed copy of one of the parents, or a child of two."""
+    """Mutate one of the parents, or combine two of them."""
 
     def below(count: int) -> int:
         return int(random.integers(count))

@@ -50,14 +50,14 @@ def combine(copies: Sequence[Mesh], rule: Rule, seed: Randomness) -> Mesh:
     """
     _check(rule)
     if not copies or not all(same_connectivity(one, copies[0]) for one in copies):
-        raise JaxmarkError(f"Copies are put together if they share their connectivity; these {len(copies)} do not.")
+        raise JaxmarkError(f"Only copies of one connectivity can be combined; these {len(copies)} copies differ in it.")
     stack = np.stack([np.asarray(one.vertices, np.float64) for one in copies])
     return Mesh(_RULES[rule](stack, generator(seed)), np.asarray(copies[0].faces))
 
 
 def _check(rule: str) -> None:
     if rule not in get_args(Rule):
-        raise JaxmarkError(f"Copies are put together by {', '.join(get_args(Rule))}, not {rule!r}.")
+        raise JaxmarkError(f"There is no rule {rule!r} for combining copies; there are {', '.join(get_args(Rule))}.")
 
 
 def _mix(copies: Positions, random: np.random.Generator) -> np.ndarray:
@@ -68,7 +68,7 @@ def _mix(copies: Positions, random: np.random.Generator) -> np.ndarray:
 
 def _circumcentre(copies: Positions, random: np.random.Generator) -> np.ndarray:
     sides = (copies[1:] - copies[0]).reshape(len(copies) - 1, -1)
-    # As far from each copy as from the first: ⟨e_i, Σ b_j e_j⟩ = ‖e_i‖²/2 for the sides e_i from the first.
+    # The point has the same distance to all copies if ⟨e_i, Σ b_j e_j⟩ = ‖e_i‖²/2 for the differences e_i to the first.
     products = sides @ sides.T
     shares = np.linalg.lstsq(products, np.diagonal(products) / 2, rcond=1e-9)[0]
     return copies[0] + (shares @ sides).reshape(copies[0].shape)

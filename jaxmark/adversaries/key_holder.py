@@ -1,10 +1,10 @@
 """Attacks by the key holder, with original and message: the least displacement that defeats a claim of the message.
 
-They bound from below the distortion that any attack needs, and show whether attackers who know less fail for lack of
-knowledge or of skill. Pose and correspondence are computed on the host; given them, the claim is a differentiable
-function of the displacement. Strengths are RMS displacements of the vertices that faces use, relative to the diagonal
-of the original's bounding box. The attacked mesh has the original's connectivity, and its payload and scheme are those
-of the marker.
+These attacks estimate the least distortion that any attack needs. Compared with attackers who know less, they show
+whether those fail because they lack knowledge, or because their method is weak. Pose and correspondence are computed on
+the host; given them, the claim is a differentiable function of the displacement. Strengths are RMS displacements of the
+vertices that faces use, relative to the diagonal of the original's bounding box. The attacked mesh must have the
+original's connectivity, and a mark with the payload and the scheme of the marker.
 """
 
 from collections.abc import Callable

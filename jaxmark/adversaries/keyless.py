@@ -167,7 +167,7 @@ def make_attack(
         moved = rescale(surrogate, way(surrogate, wanted, random_key(seed)), wanted)
         return displace(original, original.to_host(moved))
 
-    unit = "RMS over the diagonal" if metric == "rms" else f"{metric}, as small displacements make it"
+    unit = "RMS over the diagonal" if metric == "rms" else f"{metric}, extrapolated from small displacements"
     return Attack(apply, unit, _STRENGTHS, host=True)
 
 

@@ -1,8 +1,9 @@
-"""Networks that learn to remove marks: from meshes of the attacker's own, which this library marks with random keys.
+"""Neural networks that learn to remove marks, from meshes of the attacker that are marked with random keys.
 
-A network sees a mesh by its parts in eight bands of the graph Laplacian. Chebyshev convolutions of the parts' energies
-give each vertex a share of each part that is taken away, and a strength of noise that is put in its place, so that the
-displacement turns with the mesh. Before it has learned anything, the network subtracts the Wiener estimate of the mark.
+A network decomposes a mesh into parts in eight bands of the graph Laplacian. From the energies of the parts, Chebyshev
+convolutions compute for each vertex and band which share of the part is subtracted, and the strength of noise that is
+added. The displacement therefore rotates with the mesh. Before training, the network subtracts the Wiener estimate of
+the mark.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,13 +42,13 @@ _CHECKS = 4  # random keys for each mesh by which a network is judged
 
 
 class Learned(NamedTuple):
-    """A network, and what it has learned; losses are those of the goal, see `learn`."""
+    """A trained network, with its losses, which are those of the goal, see `learn`."""
 
     network: Network
     goal: Goal
-    losses: Float64[np.ndarray, " steps"]  # on the meshes it learned from, step by step
-    before: float  # on meshes that were held out, of the Wiener estimate
-    after: float  # on the same, of the network
+    losses: Float64[np.ndarray, " steps"]  # training losses, one per step
+    before: float  # loss of the Wiener estimate on the held-out meshes
+    after: float  # loss of the trained network on the held-out meshes
 
 
 def init_network(seed: Seed) -> Network:
@@ -69,7 +70,7 @@ def estimate(network: Network, surrogate: Surrogate, signal: Displacement) -> Di
 
 
 def removal(network: Network, surrogate: Surrogate, signal: Displacement, seed: Seed) -> Displacement:
-    """Compute the displacement that removes a mark from a signal: less its estimate, and random noise in its place."""
+    """Compute the displacement that removes a mark from a signal: minus the estimate of the mark, plus random noise."""
     parts = _parts(surrogate, signal)
     shares, strengths = _decide(network, surrogate, parts)
     noise = _parts(surrogate, jax.random.normal(random_key(seed), signal.shape, signal.dtype))
@@ -86,31 +87,31 @@ def learn(
     bits: int = 64,
     mark: float = MARK,
     steps: int = 400,
-    say: Callable[[str], None] = lambda line: None,
+    log: Callable[[str], None] = lambda line: None,
 ) -> Learned:
     """Train a network on meshes, each marked with another random key in every step (Adam).
 
     Args:
-        meshes: meshes to learn from; nothing of what is attacked later.
-        held_out: meshes by which is measured what was learned.
+        meshes: training meshes; they should not include the meshes that are attacked later.
+        held_out: meshes on which the trained network is evaluated.
         seed: a whole number or a JAX random key.
-        goal: `"estimate"`, the loss is the energy of mark less estimate, over that of the mark; `"removal"`, the
-            expected evidence S/‖a‖ after a displacement four times as large as the mark.
+        goal: for `"estimate"`, the loss is the energy of the estimation error, over that of the mark; for `"removal"`,
+            it is the expected evidence S/‖a‖ after a displacement four times as large as the mark.
         scheme: the scheme that meshes are marked with, see `make_marker`.
         bits: size of the payload in bits.
         mark: RMS displacement of marks, relative to the diagonal.
         steps: number of gradient steps, each on one mesh, in turn.
-        say: function that is called with a line after every hundredth step.
+        log: callback, called with a line after every hundredth step.
 
     Raises:
         JaxmarkError: if there is no such goal, no mesh, no mark or no step, or a mesh cannot be marked.
     """
     _check_goal(goal)
     if not mark > 0:
-        raise JaxmarkError(f"The RMS displacement of a mark is positive, got {mark:g}.")
+        raise JaxmarkError(f"The RMS displacement of a mark must be positive, got {mark:g}.")
     if not meshes or not held_out or steps < 1:
         raise JaxmarkError(
-            f"Learning needs meshes, meshes that are held out, and steps; got {len(meshes)}, {len(held_out)}, {steps}."
+            f"Learning needs meshes, held-out meshes and steps; got {len(meshes)}, {len(held_out)} and {steps}."
         )
     surrogates = [make_surrogate(mesh, scheme, bits, mark)[0] for mesh in meshes]
     others = [make_surrogate(mesh, scheme, bits, mark)[0] for mesh in held_out]
@@ -135,19 +136,22 @@ def learn(
         state, found = step(number, state, surrogates[count % len(surrogates)], jax.random.fold_in(drawn, count))
         losses.append(float(found))
         if (count + 1) % 100 == 0:
-            say(f"{count + 1} of {steps} steps, loss {np.mean(losses[-100:]):.4g}")
+            log(f"{count + 1} of {steps} steps, loss {np.mean(losses[-100:]):.4g}")
     return Learned(get(state), goal, np.array(losses), before, judge(get(state)))
 
 
 def learned_attack(network: Network, goal: Goal, **assumptions: Unpack[_Assumptions]) -> Attack:
-    """Attack by the `network` of a `Learned`: subtract its estimate of the mark, or do what it has learned to do.
+    """Make an attack with the `network` of a `Learned`.
+
+    For the goal `"estimate"`, the attack subtracts the network's estimate of the mark; for `"removal"`, it applies the
+    network's displacement.
 
     Raises:
-        JaxmarkError: if there is no such goal, or the network is none.
+        JaxmarkError: if there is no such goal, or a `Learned` is passed instead of its network.
     """
     _check_goal(goal)
     if isinstance(network, Learned):
-        raise JaxmarkError("An attack is made of the network that has learned: pass its `network`, and its `goal`.")
+        raise JaxmarkError("This is a `Learned`, not a network; pass its attributes `network` and `goal`.")
 
     def way(surrogate: Surrogate, strength: Array, seed: PRNGKeyArray) -> Displacement:
         if goal == "estimate":
@@ -168,10 +172,10 @@ def _parts(surrogate: Surrogate, signal: Displacement) -> Parts:
 
 
 def _decide(network: Network, surrogate: Surrogate, parts: Parts) -> tuple[Weights, Weights]:
-    """Return the share of each part that is taken away at each vertex, and the strength of noise in its band.
+    """Compute the share of each part that is subtracted at each vertex, and the strength of noise in its band.
 
-    The network sees the energies of the parts over that of the mark, and their correlations with the next band: neither
-    changes when the mesh is rotated.
+    The inputs of the network are the energies of the parts, relative to that of the mark, and their correlations with
+    the next band. Neither changes if the mesh is rotated.
     """
     mark, bands = surrogate.mark**2, len(parts)
     square = jnp.sum(parts**2, axis=-1)

@@ -1,7 +1,7 @@
-"""Attacks by an adversary who may query a detector with any meshes: for its score, or only its decision.
+"""Attacks by an adversary who may query a detector with arbitrary meshes, for its score or only for its decision.
 
-The adversary knows the algorithm, but neither key nor original. Directions are drawn with the spectrum of marks, by the
-public filter, because a detector reveals little along others.
+The adversary knows the algorithm, but neither key nor original. Search directions are random displacements with the
+spectrum of marks, because a detector hardly reacts to other displacements.
 """
 
 import math
@@ -103,7 +103,7 @@ def decision_oracle(marker: NonBlindMarker, message: bytes, alpha: float = 1e-6)
 
 
 def decide_by_score(oracle: Score, alpha: float = 1e-6) -> Decision:
-    """Make a decision from a score: with `randomise_scores`, one whose threshold nobody can predict.
+    """Make a decision oracle from a score oracle; with `randomise_scores`, its threshold cannot be predicted.
 
     Raises:
         JaxmarkError: if `alpha`, as in `decision_oracle`, is out of range.
@@ -119,14 +119,14 @@ def quantise_scores(oracle: Score, step: float) -> Score:
         JaxmarkError: if the step is not positive.
     """
     if not step > 0:
-        raise JaxmarkError(f"Scores are rounded to multiples of a positive step, not {step:g}.")
+        raise JaxmarkError(f"The step to which scores are rounded must be positive, got {step:g}.")
     return lambda mesh: step * round(oracle(mesh) / step)
 
 
 def randomise_scores(oracle: Score, spread: float, key: bytes) -> Score:
-    """Add normal noise to scores, so that repeated queries average nothing out.
+    """Add normal noise to scores; repeated queries of a mesh get the same noise, so that they cannot average it out.
 
-    A key of the detector's, 32 bytes, determines the noise for each mesh; `spread` is its standard deviation.
+    The key of the detector, 32 bytes, determines the noise for each mesh; `spread` is its standard deviation.
     """
 
     def score(mesh: Mesh) -> float:

@@ -22,7 +22,7 @@ from jaxmark.watermark.everyday import alternatives, detect_scene, read_blind, w
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Detection
 from jaxmark.watermark.markers import make_marker
-from jaxmark.watermark.nonblind import Alternatives
+from jaxmark.watermark.nonblind import Alternatives, Charges
 from jaxmark.watermark.record import Record, SceneRecord, TimestampedCommitment, load_record
 from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, DEFAULT_SCHEME
 
@@ -40,6 +40,7 @@ class FileReader:
     commitment: TimestampedCommitment | None = None  # commitment that contains the records' digests
     obtained: str = ""  # when and where the suspects were obtained
     diagnoses: bool = True  # whether to diagnose suspects without a detection, which takes several times as long
+    charges: Charges = ()  # for choices that were made before, such as that of the original from a catalogue
     meshes: Sequence[str] = ()  # names of the meshes to read: of the original, or of a suspect read blind; default all
     shows_charges: bool = False  # whether the text lists what each choice cost
     doing: Doing = quietly  # progress callback, called with a description of each step that begins
@@ -88,6 +89,7 @@ class FileReader:
         detection, mark = marks.read(mesh, self.message, align=self.align)
         blind_schemes = [BLIND_SCHEMES[name] for name in self.schemes[1:]]
         detection = with_blind(detection, blind_schemes, mesh, self.key, mark.bits, self.message)
+        detection = detection._replace(evidence=detection.evidence.charged(*self.charges))
         if report is not None:
             self.doing("drawing the report")
             save_report(report, mark.original, mesh, detection.registration)

@@ -29,6 +29,7 @@ from jaxmark.errors import JaxmarkError, require
 from jaxmark.files import SUFFIXES
 from jaxmark.files.atomic import write_atomically
 from jaxmark.watermark.coding.keys import Key
+from jaxmark.watermark.evidence import ledger
 
 _PATH = click.Path(path_type=Path)
 _HOST = "127.0.0.1"
@@ -116,7 +117,7 @@ class Desk:
                 keep(self._finder.catalogue, Path("uploaded"), verdict)
             values = verdict.as_json()
             for match in verdict.named[:1]:
-                values["dossier"] = self._dossier(suspect, match, Path(folder))
+                values["dossier"] = self._dossier(suspect, match, verdict.readings, Path(folder))
         release_programs()
         numbers = {entry.path: entry.id for entry in self._finder.catalogue.originals()}
         for entry in (values, *values["matches"]):
@@ -124,8 +125,10 @@ class Desk:
                 entry["id"], entry["original"] = numbers.get(entry["original"]), Path(entry["original"]).name
         return values
 
-    def _dossier(self, suspect: Path, match: Match, folder: Path) -> str | None:
+    def _dossier(self, suspect: Path, match: Match, readings: int, folder: Path) -> str | None:
         """Make the dossier of a message that was read from a file of one mesh; returns its token in the address.
+
+        It is charged for all readings by which the catalogue could have named an original, as the verdict is.
 
         Returns None if no message was read, if the file has several meshes or pieces, or if a dossier cannot be made.
         """
@@ -137,7 +140,8 @@ class Desk:
             record = folder / "record.json"
             write_atomically(record, row["json"].encode())
         bits = None if record is not None else 4 * len(match.message)
-        reader = FileReader(key, bits, None, diagnoses=False)
+        charge = ledger.ORIGINALS.charge("original", readings)
+        reader = FileReader(key, bits, None, diagnoses=False, charges=(charge,))
         with suppress(JaxmarkError):  # without the extra `plot` there is a verdict, but no dossier
             reader.read(suspect, Path(match.original), record, dossier=folder / "dossier")
             token = secrets.token_urlsafe(16)

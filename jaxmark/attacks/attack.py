@@ -261,7 +261,7 @@ def _restore_copies(mesh: Mesh, welded: Weld, points: Mesh, found: Mesh) -> Mesh
 
 
 def _normalise(points: Mesh) -> tuple[Mesh, Callable[[Mesh], Mesh]]:
-    """Centre a mesh and scale it to unit diagonal, where float32 keeps its digits; also return the map back."""
+    """Compute the centre a mesh and scale it to unit diagonal, where float32 keeps its digits; also return the map back."""
     centre, length = np.asarray(points.vertices)[used_vertices(points)].mean(axis=0), diagonal(points)
     start = (points.vertices - centre) / length
 

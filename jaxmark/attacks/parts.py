@@ -132,7 +132,7 @@ def _resolve_share(mesh: Mesh, share: float) -> tuple[Int64[np.ndarray, " used"]
 
 
 def _nearest(mesh: Mesh, among: Int64[np.ndarray, " among"], centre: int, count: int) -> Int64[np.ndarray, " nearest"]:
-    """The vertices nearest to a centre along edges (Dijkstra, 1959), then the unreachable ones, nearest in space."""
+    """Return the vertices nearest to a centre along edges (Dijkstra, 1959), then the unreachable ones, nearest in space."""
     vertices, size = np.asarray(mesh.vertices), len(mesh.vertices)
     i, j = edges(mesh.faces).T
     graph = sparse.csr_array((np.linalg.norm(vertices[i] - vertices[j], axis=1), (i, j)), (size, size))
@@ -155,7 +155,7 @@ def _remove(mesh: Mesh, lost: Int64[np.ndarray, " lost"]) -> Mesh:
 
 
 def _octants(mesh: Mesh, random: np.random.Generator) -> Int64[np.ndarray, " faces"]:
-    """The octant, 0 to 7, that contains each face's centroid."""
+    """Return the octant, 0 to 7, that contains each face's centroid."""
     vertices = np.asarray(mesh.vertices, np.float64)
     surface = vertices[used_vertices(mesh)]
     middle = (surface.min(axis=0) + surface.max(axis=0)) / 2

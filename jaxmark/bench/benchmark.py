@@ -104,9 +104,7 @@ def run(
     ]
     marks = [task._replace(limits=limit) for task in templates for limit in parts[task.track].limits]
     suspects = [
-        suspect
-        for task in templates
-        for suspect in _suspects(task, parts[task.track], list(given_methods), keys)
+        suspect for task in templates for suspect in _suspects(task, parts[task.track], list(given_methods), keys)
     ]
     suspects += [
         task._replace(source=other, attack="none", number=number)

@@ -116,7 +116,7 @@ class BenchResults:
         return "another method's mark" if task.source in self.methods else "another mesh"
 
     def succeeds(self, one: Suspect, rule: str = "detected") -> bool:
-        """Whether a suspect's score exceeds the calibrated threshold; by the rule `"read"`, whether it is read exactly."""
+        """Whether a suspect's score exceeds the threshold; by the rule `"read"`, whether its exact message is read."""
         if rule == "read":
             return one.reading["read"]
         calibration = self.calibrations.get((one.task.method, one.task.payload))

@@ -45,8 +45,12 @@ def points(results: BenchResults, some: Iterable[Suspect], rule: str = "detected
     """Convert suspects to points of a robustness curve; success is by the rule `"detected"` or `"read"`."""
     return [
         Point(
-            task.mesh, task.seed, task.attack, suspect.costs, results.succeeds(suspect, rule), task.mark in
-            results.marks
+            task.mesh,
+            task.seed,
+            task.attack,
+            suspect.costs,
+            results.succeeds(suspect, rule),
+            task.mark in results.marks,
         )
         for suspect in some
         for task in [suspect.task]

@@ -43,7 +43,7 @@ def tables(results: BenchResults) -> list[Table]:
             _scores(every),
             "Area under the curve of the fraction of marks that survive, as a function of the attack's distortion (0 to"
             " 1), with 95 % intervals over meshes and seeds. The columns of metrics are the areas of `detected`, by"
-            " metric of distortion.",
+            " metric of distortion. †: this code of the method was not validated against a published figure.",
         ),
         _table(
             "Calibration",
@@ -93,8 +93,8 @@ def _groups(entries: Entries) -> dict[tuple[str, str, str], dict[str, Any]]:
 
 
 def _label(name: str, entry: Mapping[str, Any]) -> str:
-    """Return a method's name, with a remark if the method is not validated."""
-    return f"{name} ({NOT_VALIDATED})" if entry["validated"] == NOT_VALIDATED else name
+    """Return a method's name, with a dagger if the method is not validated."""
+    return f"{name}†" if entry["validated"] == NOT_VALIDATED else name
 
 
 def _payloads(entries: Entries) -> Iterator[tuple[str, str, Mapping[str, Any], Mapping[str, Any]]]:
@@ -161,9 +161,9 @@ def _attacks(title: str, parts: Mapping[str, Any], entries: Entries) -> Table:
     def cell(name: str, rates: Mapping[str, Any] | None) -> str:
         if rates is None:
             return "-"
-        texts = [f"{_share(rates, 'read')}, BER {rates['bit_errors']:.2f}"] if entries[name]["bits"] else []
-        texts += [f"detected {_share(rates, 'detected')}"]
-        return ", ".join(texts if rates["log10_p"] is None else [*texts, f"p 10^{rates['log10_p']:.1f}"])
+        read = f"{_share(rates, 'read')} {rates['bit_errors']:.2f}" if entries[name]["bits"] else "- -"
+        bound = "" if rates["log10_p"] is None else f" {rates['log10_p']:.1f}"
+        return f"{read} {_share(rates, 'detected')}{bound}"
 
     lines = []
     for attack in dict.fromkeys(attack for part in parts.values() for attack in part["attacks"]):
@@ -175,8 +175,8 @@ def _attacks(title: str, parts: Mapping[str, Any], entries: Entries) -> Table:
     if all(line[-2:] == ["-", "-"] for line in lines):  # no rates were published for this track
         heads, lines = heads[:-2], [line[:-2] for line in lines]
     note = (
-        "Number of suspects from which the exact message is read; mean bit error rate of the best guess (BER); number"
-        " of detections; median false-positive probability (p) of methods that bound it."
+        "Values in each cell: the suspects from which the exact message is read; the mean bit error rate of the"
+        " best guess; the suspects that are detected; and, if the method bounds it, the median log10 p. -: no value."
     )
     return Table(title, heads, lines, note)
 
@@ -188,15 +188,17 @@ def _costs(parts: Mapping[str, Any]) -> Iterator[Row]:
 
 
 def _refused(groups: Mapping[tuple[str, str, str], Mapping[str, Any]], entries: Entries) -> Iterator[Row]:
-    """Tabulate the refusals of methods and attacks, and their number."""
+    """Tabulate the refusals of methods and attacks, and their number; reasons that differ in numbers count as one."""
+    reasons: dict[str, str] = {}  # the first reason of each form
     places: dict[tuple[str, str], list[str]] = defaultdict(list)
     for name, entry in entries.items():
         for (_, track, limits), parts in groups.items():
             for attack, rates in parts.get(name, {"attacks": {}})["attacks"].items():
                 for note in rates["notes"]:
-                    places[_label(name, entry), note].append(f"{track}, {limits}: {attack}")
-    for (label, note), attacks in places.items():
-        yield {"method": label, "reason": note, "attacks": str(len(attacks)), "first attack": attacks[0]}
+                    reason = reasons.setdefault(re.sub(r"\d+(\.\d+)?", "#", note), note)
+                    places[_label(name, entry), reason].append(f"{track}, {limits}: {attack}")
+    for (label, reason), attacks in places.items():
+        yield {"method": label, "reason": reason, "attacks": str(len(attacks)), "first attack": attacks[0]}
 
 
 def _paired(results: BenchResults, entries: Entries) -> Iterator[Row]:

@@ -94,8 +94,8 @@ class Catalogue:
             copy: whether to store a copy of the file in the catalogue.
 
         Raises:
-            JaxmarkError: if the file cannot be read, if all its meshes have size 0, or if it is a copy that was made
-                for a recipient.
+            JaxmarkError: if the file cannot be read, if the size or area of all its meshes is 0, or if it is a copy
+                that was made for a recipient.
         """
         content = file_hash(path)
         if copies := self.database.rows("SELECT recipient FROM copies WHERE file = ?", content):

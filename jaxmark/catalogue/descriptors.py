@@ -51,7 +51,7 @@ class Spread:
 
 
 def spread(mesh: Mesh, count: int = _SAMPLES) -> Spread | None:
-    """Spread points evenly over the area of a surface, deterministically; returns None if the mesh has size 0.
+    """Spread points evenly over the area of a surface, deterministically; returns None if its size or area is 0.
 
     Faces are visited along a space-filling curve, so that each region gets its share of the points, up to one point.
     """
@@ -96,7 +96,9 @@ def whole(shape: Spread) -> Float[np.ndarray, " numbers"]:
 
 
 def centred(mesh: Mesh) -> tuple[Points, Float64[np.ndarray, "3"], float]:
-    """Spread points over a shape whose size is not 0, relative to their centre, in units of their RMS distance to it.
+    """Spread points over a shape, and normalise their centre to 0, and their RMS distance to it to 1.
+
+    The size and the area of the mesh must not be 0.
 
     Returns:
         The points `[POINTS, 3]`, and the centre and the RMS distance in the mesh's units.
@@ -133,7 +135,7 @@ class Locals:
 
 
 def local(mesh: Mesh, count: int = CENTRES) -> Locals | None:
-    """Choose points of a shape that are far from each other and from its boundary; returns None for a mesh of size 0."""
+    """Choose points of a shape that are far from each other and from its boundary; None if its size or area is 0."""
     shape = spread(mesh, _LOCAL_SAMPLES)
     if shape is None:
         return None

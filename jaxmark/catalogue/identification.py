@@ -1,7 +1,7 @@
-"""Identify the originals that a suspect was made of, under which keys and for whom, and how surely.
+"""Identification of the originals, keys and recipients of a suspect, with a bound on the false-positive probability.
 
-The originals that look most like the suspect are found without any key. Only these are aligned and read, but the
-significance budget covers every original of the catalogue with every key, record and list of recipients.
+The originals that are most similar to the suspect are retrieved without a key. Only these are aligned and read. The
+significance budget nevertheless covers every original of the catalogue, with every key, record and list of recipients.
 """
 
 import json
@@ -33,74 +33,80 @@ from jaxmark.watermark.markers import make_marker
 from jaxmark.watermark.record import Record, is_recorded
 from jaxmark.watermark.tracing.tracer import make_tracer
 
-DEPTH = 3  # originals that are aligned and read for each piece, for each way of retrieval
-_ALIKE = 100  # originals that a whole is fitted to
-_LIKELY = 2000  # originals of which a part may look like a piece
-_REFERENCES = 6  # of these, of different shapes, by which its pose is found
-_KIN = 200  # originals like a reference that a part is fitted to
-_DEEP_PIECES = 3  # of a suspect; of all others, the likeliest original alone is looked at
-_WHOLE = 0.95  # share of an original from which on a piece is taken for all of it
-_MOST_PIECES = 32  # of a suspect, the largest ones
-_MOST_COMPONENTS = 8  # of a mesh
-_LEAST_SHARE = 0.02  # of a mesh's area, below which a component is no piece of its own
-_LEAST_FACES = 50  # of a component
-_NEAR = 0.01  # distance from an original, over its size, up to which a piece is explained by it
+DEPTH = 3  # default number of originals that are read for each piece, for each way of retrieval
+_ALIKE = 100  # originals to which a whole shape is fitted
+_LIKELY = 2000  # originals that are retrieved as candidates for a part
+_REFERENCES = 6  # candidates of different shapes by which the poses of a part are found
+_KIN = 200  # originals similar to a reference to which a part is fitted
+_DEEP_PIECES = 3  # pieces of a suspect that are compared with DEPTH originals; other pieces are compared with one
+_WHOLE = 0.95  # coverage from which on a piece counts as a whole original
+_MOST_PIECES = 32  # most pieces of a suspect, the largest ones
+_MOST_COMPONENTS = 8  # most components of a mesh
+_LEAST_SHARE = 0.02  # least area of a component, as a fraction of the mesh's area
+_LEAST_FACES = 50  # least number of faces of a component
+_NEAR = 0.01  # largest distance of a piece from an original, over its size, if the original explains the piece
 
 
 class Match(NamedTuple):
-    """An original that a piece of a suspect was compared with."""
+    """The comparison of a piece of a suspect with an original."""
 
-    original: str  # path of its file
-    mesh: str  # name of its mesh in the file; empty if it is the only one
+    original: str  # path of the original's file
+    mesh: str  # name of the original's mesh in the file; empty if it is the only one
     piece: str  # name of the suspect's piece; empty if it is the whole file
-    by: str  # the way of retrieval: by its "landmarks", as a "whole" or as a "part"
-    rank: int  # among the originals that look like the piece, from 1
-    distance: float  # of descriptors for wholes; else the residual, in mean distances to the centre
+    by: str  # the way of retrieval: by "landmarks", as a "whole" or as a "part"
+    rank: int  # rank among the originals that are similar to the piece, from 1
+    distance: float  # distance of descriptors for wholes; else the residual, in RMS distances to the centre
     named: bool = False  # whether the probability is at most alpha
     message: str | None = None  # hexadecimal
     recipient: str | None = None
-    accused: tuple[str, ...] = ()  # all recipients that are named
-    log10_p: float = 0.0  # log10 of a bound on the probability of any such naming, of all that could have been named
-    log10_p_uncommitted: float = 0.0  # the same if nothing fixes keys, originals and records beforehand
-    key: str | None = None  # commitment to the key that was read with
-    record: str | None = None  # its digest
-    coverage: float = 0.0  # share of the original that the piece shows
-    residual: float | None = None  # of the alignment, in diagonals
+    accused: tuple[str, ...] = ()  # all recipients that are accused
+    log10_p: float = 0.0  # log10 of a bound on the probability that any original, key or recipient is named by chance
+    log10_p_uncommitted: float = 0.0  # the bound if keys, originals and records may have been chosen afterwards
+    key: str | None = None  # commitment to the key that was used
+    record: str | None = None  # digest of the record that was used
+    coverage: float = 0.0  # fraction of the original that is registered to the piece
+    residual: float | None = None  # RMS residual of the registration, in diagonals
     caveats: tuple[str, ...] = ()  # reasons why the probabilities are estimates
     notes: tuple[str, ...] = ()
-    refused: str | None = None  # the reason if it could not be read
+    refused: str | None = None  # the reason why the piece could not be read
 
     @property
     def order(self) -> tuple[bool, float, bool, float]:
-        """The key by which likelier matches are sorted first."""
+        """The sort key by which likelier matches come first."""
         return not self.named, self.log10_p, self.refused is not None, self.rank
 
 
 class Verdict(NamedTuple):
-    """The originals that a suspect was identified with."""
+    """The result of identifying a suspect."""
 
-    suspect: str  # SHA-256 of its file, hexadecimal; empty for a mesh that is no file
+    suspect: str  # SHA-256 of its file, hexadecimal; empty for a mesh without a file
     matches: tuple[Match, ...]  # all comparisons, the likeliest first
-    readings: int  # readings that could have been made, by whose number all probabilities are corrected
+    readings: int  # number of readings that could have been made, by which all probabilities are corrected
 
     @property
     def named(self) -> tuple[Match, ...]:
-        """The originals that are named, each once."""
-        found: dict[tuple[str, str], Match] = {}
+        """The matches of the originals that are named, one per original."""
+        likeliest: dict[tuple[str, str], Match] = {}
         for match in self.matches:
             if match.named:
-                found.setdefault((match.original, match.mesh), match)
-        return tuple(found.values())
+                likeliest.setdefault((match.original, match.mesh), match)
+        return tuple(likeliest.values())
 
     def as_json(self) -> dict[str, Any]:
-        """Return the verdict as values for JSON; its head is the likeliest match, if any is named."""
-        best = self.named[0] if self.named else None
-        head = {name: getattr(best, name, None) for name in ("original", "mesh", "message", "recipient")}
+        """Return the verdict as values for JSON.
+
+        The fields at the top are those of the likeliest named match. If none is named, its figures are those of the
+        match with the lowest bound, and its caveats say why that is only an estimate.
+        """
+        named = self.named[0] if self.named else None
+        head = {name: getattr(named, name, None) for name in ("original", "mesh", "message", "recipient")}
+        likeliest = named or min(self.matches, key=lambda match: match.log10_p, default=None)
         return {
-            "named": best is not None,
+            "named": named is not None,
             **head,
-            "log10_p": min((match.log10_p for match in self.matches), default=0.0),
-            "log10_p_uncommitted": min((match.log10_p_uncommitted for match in self.matches), default=0.0),
+            "log10_p": likeliest.log10_p if likeliest else 0.0,
+            "log10_p_uncommitted": likeliest.log10_p_uncommitted if likeliest else 0.0,
+            "caveats": likeliest.caveats if likeliest else (),
             "readings": self.readings,
             "suspect_sha256": self.suspect or None,
             "matches": [match._asdict() for match in self.matches],
@@ -108,22 +114,22 @@ class Verdict(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """A mesh that may be a copy, or a part of one."""
+    """A mesh that may be a copy of an original, or of a part of one."""
 
-    name: str  # of the mesh in the suspect's file, and the number of its component
+    name: str  # name of the mesh in the suspect's file, and number of its component
     mesh: Mesh
-    within: str  # the name of the piece that it is a component of; empty if it is a whole mesh
+    within: str  # name of the piece that it is a component of; empty if it is a whole mesh
 
 
 class _Comparison(NamedTuple):
-    """A piece of a suspect beside an original."""
+    """A piece of a suspect, an original, and the result of the comparison."""
 
-    match: Match  # with the result, once it is read
+    match: Match  # the result, after reading
     original: Mesh
     suspect: Mesh
     readings: int
-    pose: Pose | None = None  # of the suspect on the original
-    agrees: bool = True  # whether the record that was read with commits to the result
+    pose: Pose | None = None  # map from the suspect to the original
+    agrees: bool = True  # whether the record that was used commits to the result
 
 
 @runtime_checkable
@@ -145,13 +151,13 @@ class Finder(Generic[AnyOriginals]):
     """A search for the originals of many suspects in one catalogue, which keeps the descriptors in memory.
 
     Args:
-        catalogue: may be opened for reading only.
+        catalogue: the catalogue; it may be opened for reading only.
         keys: the keys that marks may have been made with.
         alpha: largest false-positive probability at which an original is named.
-        bits: payload of messages without a record; by default 64.
-        depth: how many originals are aligned and read for each piece of a suspect, for each way of retrieval.
+        bits: payload of messages without a record, in bits; by default 64.
+        depth: number of originals that are read for each piece of a suspect, for each way of retrieval.
         align: how suspects are aligned, see `detect`; other ways than "auto" are charged.
-        only_recipients: whether to look for recipients' copies only.
+        only_recipients: whether to identify recipients' copies only.
 
     Raises:
         JaxmarkError: if there is no key, or a number is out of range.
@@ -169,13 +175,13 @@ class Finder(Generic[AnyOriginals]):
         only_recipients: bool = False,
     ) -> None:
         if not keys:
-            raise JaxmarkError("Marks are read with a key; give one at least.")
+            raise JaxmarkError("Reading marks needs a key; give at least one.")
         if not 0 < alpha < 1:
             raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
         if depth < 1:
-            raise JaxmarkError(f"At least one original is looked at, not {depth}.")
+            raise JaxmarkError(f"The depth must be at least 1, got {depth}.")
         if align not in get_args(Align):
-            raise JaxmarkError(f"A suspect is aligned by {', '.join(get_args(Align))}, not {align!r}.")
+            raise JaxmarkError(f"There is no way to align {align!r}; there are {', '.join(get_args(Align))}.")
         self.catalogue, self.alpha, self.bits, self.depth = catalogue, alpha, bits, depth
         self.align: Align = align
         self.keys = {commitment(key): Key(key) for key in keys}
@@ -184,13 +190,13 @@ class Finder(Generic[AnyOriginals]):
 
     @property
     def index(self) -> Index:
-        """The descriptors of all originals, as the catalogue has them now."""
+        """The descriptors of all originals that are in the catalogue now."""
         if self._index is None or self._index.state != state_of(self.catalogue.database):
             self._index = Index(self.catalogue.database)
         return self._index
 
     def prepare(self) -> None:
-        """Read the descriptors now, not with the first suspect.
+        """Read the descriptors now; otherwise they are read with the first suspect.
 
         Raises:
             JaxmarkError: if the catalogue is empty or damaged.
@@ -198,10 +204,10 @@ class Finder(Generic[AnyOriginals]):
         self._index = Index(self.catalogue.database)
 
     def find(self, suspect: str | os.PathLike[str] | Mesh) -> Verdict:
-        """Find the originals that a suspect was made of.
+        """Find the originals that a suspect was made from.
 
         Args:
-            suspect: a mesh or a file, of one mesh or several; in any pose and scale, whole or in part.
+            suspect: a mesh, or a file of one or several meshes; in any pose and scale, whole or in part.
 
         Raises:
             JaxmarkError: if the suspect cannot be read, or the catalogue is empty or damaged.
@@ -215,16 +221,16 @@ class Finder(Generic[AnyOriginals]):
         for number, piece in enumerate(pieces):
             if piece.name in explained:
                 continue
-            for found in self._compare(piece, self.depth if number < _DEEP_PIECES else 1, readings):
-                matches.append(found.match)
-                if found.match.named and found.pose is not None:
-                    inside = [one for one in pieces if one.within == piece.name]
-                    explained |= {one.name for one in inside if _is_explained(one.mesh, found.pose, found.original)}
+            for pair in self._compare(piece, self.depth if number < _DEEP_PIECES else 1, readings):
+                matches.append(pair.match)
+                if pair.match.named and pair.pose is not None:
+                    inside = [part for part in pieces if part.within == piece.name]
+                    explained |= {part.name for part in inside if _is_explained(part.mesh, pair.pose, pair.original)}
                     break
         return Verdict(digest, tuple(sorted(matches, key=lambda match: match.order)), readings)
 
     def _readings(self) -> int:
-        """Count the readings of a piece that are possible, of which any could have named an original."""
+        """Count all possible readings of a piece, each of which could have named an original."""
         rows = self.catalogue.database.rows
         total, shapes = 0, rows("SELECT count(*) FROM shapes")[0][0]
         for key in self.keys:
@@ -236,92 +242,96 @@ class Finder(Generic[AnyOriginals]):
         return max(1, total)
 
     def meshed_alike(self, piece: Mesh, count: int) -> list[Near]:
-        """Retrieve the originals that have the meshing of a piece, the best fitting first."""
+        """Retrieve the originals that have the same connectivity as a piece, the best fit first."""
         return self.index.by_landmarks(landmarks(piece))[:count]
 
     def wholes(self, piece: Mesh, count: int) -> list[Near]:
-        """Retrieve the originals whose whole shape is most like that of a piece, the most similar first.
+        """Retrieve the originals whose whole shape is most similar to that of a piece, the most similar first.
 
-        Those with the nearest descriptors are each registered to the piece; the product of both distances counts.
+        The originals with the nearest descriptors are registered to the piece. They are sorted by the product of the
+        distance of descriptors and the distance after registration.
         """
-        seen = descriptors.spread(piece)
-        if seen is None:
+        points = descriptors.spread(piece)
+        if points is None:
             return []
-        near = self.index.by_whole(descriptors.whole(seen), _ALIKE)
-        off = fit_whole(piece, [self._points(one.shape) for one in near])
-        both = [one._replace(distance=one.distance * float(fit)) for one, fit in zip(near, off, strict=True)]
-        return sorted(both, key=lambda one: one.distance)[:count]
+        nearest = self.index.by_whole(descriptors.whole(points), _ALIKE)
+        fits = fit_whole(piece, [self._points(near.shape) for near in nearest])
+        both = [near._replace(distance=near.distance * float(fit)) for near, fit in zip(nearest, fits, strict=True)]
+        return sorted(both, key=lambda near: near.distance)[:count]
 
     def parts(self, piece: Mesh, count: int) -> list[Near]:
-        """Retrieve the originals that a piece is most likely a part of, the best fitting first."""
+        """Retrieve the originals that a piece is most likely a part of, the best fit first."""
         local = descriptors.local(piece)
         return [] if local is None else self.fitting(piece, self.index.by_parts(local, _LIKELY))[:count]
 
     def fitting(self, piece: Mesh, likely: Sequence[Near]) -> list[Near]:
-        """Retrieve the originals that a part fits, the best fitting first.
+        """Retrieve the originals that a part fits, the best fit first.
 
         Args:
             piece: the part.
-            likely: originals of which a part looks like this one: a few of different shapes are tried, and then those
-                that look like the ones it fits.
+            likely: candidates. The part is registered to some candidates of different shapes first, and then to the
+                originals that are similar to those that it fits best.
         """
         if not likely or not len(piece.faces):
             return []
         part = Part(piece)
         references: dict[int, Mesh] = {}
         for near in self.index.unlike(likely, _REFERENCES):
-            with suppress(JaxmarkError):  # its file is missing
+            with suppress(JaxmarkError):  # raised if the original's file is missing
                 references[near.shape] = self.catalogue.load(near.shape)
         poses: dict[int, list[Pose]] = {}
         for placed in part.place(references.values()):
             for shape in self.index.like([*references][placed.reference], _KIN):
                 poses.setdefault(shape, []).append(placed.pose)
-        off = part.fit({shape: self._points(shape) for shape in poses}, poses)
-        return [Near(shape, off[shape]) for shape in sorted(off, key=off.__getitem__)]
+        distances = part.fit({shape: self._points(shape) for shape in poses}, poses)
+        return [Near(shape, distances[shape]) for shape in sorted(distances, key=distances.__getitem__)]
 
     def _points(self, shape: int) -> Points:
-        """Return the points that are kept of an original."""
+        """Return the stored points of an original."""
         database = self.catalogue.database
         (row,) = database.rows("SELECT points FROM shapes WHERE id = ?", shape)
         if len(row["points"]) != 6 * descriptors.POINTS:
-            raise JaxmarkError(f"The catalogue {database.path} is damaged: the points of a shape are not whole.")
+            raise JaxmarkError(
+                f"The catalogue {database.path} is damaged: the points of a mesh are incomplete; use a backup, or"
+                " import an export into a new catalogue."
+            )
         return np.frombuffer(row["points"], "<f2").astype(np.float64).reshape(-1, 3)
 
     def _compare(self, piece: Piece, depth: int, readings: int) -> Iterator[_Comparison]:
-        """Compare a piece with the originals that look like it; a piece that is a whole original is no part of one."""
-        known: set[int] = set()
+        """Compare a piece with similar originals; once it covers a whole original, it is not compared as a part."""
+        compared: set[int] = set()
         is_whole = False
         for by, look in (("landmarks", self.meshed_alike), ("whole", self.wholes), ("part", self.parts)):
             for number, near in enumerate([] if is_whole else look(piece.mesh, depth), 1):
                 query = "SELECT o.path, s.name FROM shapes s JOIN originals o ON o.id = s.original WHERE s.id = ?"
-                found = self.catalogue.database.rows(query, near.shape)
-                if near.shape in known or not found:  # it may have been removed meanwhile
+                rows = self.catalogue.database.rows(query, near.shape)
+                if near.shape in compared or not rows:  # the original may have been removed meanwhile
                     continue
-                known.add(near.shape)
-                match = Match(found[0]["path"], found[0]["name"], piece.name, by, number, near.distance)
+                compared.add(near.shape)
+                match = Match(rows[0]["path"], rows[0]["name"], piece.name, by, number, near.distance)
                 best = self._best(_Comparison(match, piece.mesh, piece.mesh, readings), near.shape)
                 is_whole |= best.match.coverage >= _WHOLE
                 yield best
 
     def _best(self, pair: _Comparison, shape: int) -> _Comparison:
-        """Read a piece beside an original in all ways, and return the most significant reading."""
+        """Read a piece with an original in all ways, and return the most significant reading."""
         best = None
         try:
             pair = pair._replace(original=self.catalogue.load(shape))
-            for one in self._read(pair, shape):
-                # The record that commits to the result is the one that the suspect was made with.
-                if best is None or (not one.agrees, one.match.log10_p) < (not best.agrees, best.match.log10_p):
-                    best = one
-                if one.match.named and one.agrees:
+            for reading in self._read(pair, shape):
+                # Readings whose record commits to the result are preferred: the suspect was made with such a record.
+                if best is None or (not reading.agrees, reading.match.log10_p) < (not best.agrees, best.match.log10_p):
+                    best = reading
+                if reading.match.named and reading.agrees:
                     break
         except JaxmarkError as error:
             pair = pair._replace(match=pair.match._replace(refused=str(error)))
         return best or pair
 
     def _read(self, pair: _Comparison, shape: int) -> Iterator[_Comparison]:
-        """Read a piece beside an original with each key and record."""
+        """Read a piece with an original, by each key and record."""
         for name, key in self.keys.items():
-            records, traced = self._held(shape, name)
+            records, traced = self._stored(shape, name)
             for record, recipients in traced:
                 yield self._trace(pair._replace(readings=pair.readings * len(traced)), key, record, recipients)
             if self.only_recipients:
@@ -329,50 +339,55 @@ class Finder(Generic[AnyOriginals]):
             for record in records or [None]:
                 bits = self.bits if record is None else None
                 marker = make_marker(pair.original, key, bits=bits, record=record)
-                found, mark = alternatives(marker).read(pair.suspect, align=self.align)
-                evidence = found.evidence.charged(ledger.ORIGINALS.charge("original", pair.readings))
-                found = found._replace(evidence=evidence)
+                detection, mark = alternatives(marker).read(pair.suspect, align=self.align)
+                evidence = detection.evidence.charged(ledger.ORIGINALS.charge("original", pair.readings))
+                detection = detection._replace(evidence=evidence)
+                message, registration = detection.message, detection.registration
                 match = pair.match._replace(
-                    named=found.detected(self.alpha),
-                    message=None if found.message is None else found.message.hex(),
+                    named=detection.detected(self.alpha),
+                    message=None if message is None else message.hex(),
                     log10_p=evidence.log10_p,
                     log10_p_uncommitted=evidence.log10_p_uncommitted,
                     key=name,
                     record=None if record is None else record.digest(),
-                    coverage=found.coverage,
-                    residual=_finite(found.registration.residual),
+                    coverage=detection.coverage,
+                    residual=_finite(registration.residual),
                     caveats=evidence.caveats,
-                    notes=found.notes,
+                    notes=detection.notes,
                 )
-                agrees = found.message is None or is_recorded(record, found.message, mark.choices) is not False
-                yield pair._replace(match=match, pose=found.registration.pose, agrees=agrees)
+                agrees = message is None or is_recorded(record, message, mark.choices) is not False
+                yield pair._replace(match=match, pose=registration.pose, agrees=agrees)
 
-    def _held(self, shape: int, key: str) -> tuple[list[Record], list[tuple[Record, list[str]]]]:
-        """Return the records of messages and presence marks of an original under a key, and those of its copies.
+    def _stored(self, shape: int, key: str) -> tuple[list[Record], list[tuple[Record, list[str]]]]:
+        """Return the stored records of an original under a key.
 
-        There is one record for each way of marking copies, with its recipients.
+        Returns:
+            The records of messages and presence marks; and one record for each way of marking copies, with its
+            recipients.
         """
         rows = self.catalogue.database.rows
         query = "SELECT digest, json FROM records WHERE shape = ? AND key = ? ORDER BY added DESC, digest"
-        known = {row["digest"]: Record.of(_parsed(row["json"]), "in the catalogue") for row in rows(query, shape, key)}
+        records = {
+            row["digest"]: Record.of(_parsed(row["json"]), "in the catalogue") for row in rows(query, shape, key)
+        }
         ways: dict[tuple[Any, ...], tuple[Record, list[str]]] = {}
         query = "SELECT recipient, record FROM copies WHERE shape = ? AND key = ? ORDER BY id"
         for row in rows(query, shape, key):
-            record = known[row["record"]]
+            record = records[row["record"]]
             way = record.version, record.scheme, record.bits, repr(sorted(record.parameters.items()))
             ways.setdefault(way, (record, []))[1].append(row["recipient"])
-        return [one for one in known.values() if one.content != "fingerprint"], list(ways.values())
+        return [record for record in records.values() if record.content != "fingerprint"], list(ways.values())
 
     def _trace(self, pair: _Comparison, key: Key, record: Record, recipients: list[str]) -> _Comparison:
-        """Look for recipients' copies in a piece."""
+        """Test a piece for the copies of recipients."""
         tracer = make_tracer(pair.original, key, record=record)
         mark, aligned = tracer.mark, tracer.register(pair.suspect, self.align)
         charge = ledger.ORIGINALS.charge("copy", pair.readings)
-        bounds = {one.recipient: one.charged(charge).log10_p for one in tracer.read(aligned, recipients)}
+        bounds = {entry.recipient: entry.charged(charge).log10_p for entry in tracer.read(aligned, recipients)}
         accused = tuple(name for name, log10_p in bounds.items() if log10_p <= math.log10(self.alpha))
         accused = () if mark.caveats else accused
         best = min(bounds.values(), default=0.0)
-        seen = aligned.weights[mark.original.used] > 0
+        covered = aligned.weights[mark.original.used] > 0
         match = pair.match._replace(
             named=bool(accused),
             recipient=accused[0] if accused else None,
@@ -381,7 +396,7 @@ class Finder(Generic[AnyOriginals]):
             log10_p_uncommitted=ledger.uncommitted(best),
             key=commitment(key),
             record=record.digest(),
-            coverage=float(seen.mean()),
+            coverage=float(covered.mean()),
             residual=_finite(aligned.residual),
             caveats=mark.caveats,
         )
@@ -389,22 +404,22 @@ class Finder(Generic[AnyOriginals]):
 
 
 def split(meshes: Mapping[str, Mesh]) -> list[Piece]:
-    """Split a suspect: each distinct mesh, then the components of those that have several large ones."""
+    """Split a suspect into pieces: its distinct meshes, then the components of meshes with several large ones."""
     distinct: dict[bytes, Piece] = {}
     for name, mesh in meshes.items():
         distinct.setdefault(geometry_hash(mesh), Piece(name, mesh, ""))
     wholes = sorted(distinct.values(), key=lambda piece: -len(piece.mesh.faces))[:_MOST_PIECES]
-    found = [*wholes]
+    pieces = [*wholes]
     for piece in wholes:
         parts = _components(piece.mesh)
         if len(parts) > 1:
             names = (f"{piece.name}#{number}".lstrip() for number in range(1, len(parts) + 1))
-            found += [Piece(name, part, piece.name) for name, part in zip(names, parts, strict=True)]
-    return found[:_MOST_PIECES]
+            pieces += [Piece(name, part, piece.name) for name, part in zip(names, parts, strict=True)]
+    return pieces[:_MOST_PIECES]
 
 
 def _components(mesh: Mesh) -> list[Mesh]:
-    """Return the largest components of a surface, without small ones."""
+    """Return the largest components of a surface; small components are left out."""
     if not len(mesh.faces):
         return []
     welded = weld_mesh(mesh, weld(mesh.vertices))
@@ -414,22 +429,22 @@ def _components(mesh: Mesh) -> list[Mesh]:
 
 
 def _is_explained(piece: Mesh, pose: Pose, original: Mesh) -> bool:
-    """Whether a piece lies on an original that the suspect was aligned with by a pose."""
+    """Whether a piece, in the pose of the suspect, coincides with the original."""
     points = np.asarray(original.vertices, np.float64)
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     spacing = float(np.median(KDTree(points).query(points[:: max(1, len(points) // 1000)], k=2)[0][:, 1]))
     posed = pose(np.asarray(piece.vertices, np.float64))
-    off = KDTree(points).query(posed[:: max(1, len(posed) // 1000)])[0]
-    return float(np.median(off)) <= max(_NEAR * size, spacing)
+    distance = KDTree(points).query(posed[:: max(1, len(posed) // 1000)])[0]
+    return float(np.median(distance)) <= max(_NEAR * size, spacing)
 
 
 def _finite(residual: float) -> float | None:
-    """Return a number that JSON has; None if nothing was covered."""
+    """Return a finite residual, or None, because JSON has no infinity."""
     return residual if math.isfinite(residual) else None
 
 
 def _parsed(text: str) -> Any:
-    """Parse the JSON of a record; None if it is damaged, which `Record.of` refuses."""
+    """Parse the JSON of a record; returns None if it is damaged, so that `Record.of` refuses it."""
     try:
         return json.loads(text)
     except ValueError:

@@ -1,8 +1,8 @@
-"""Many suspects, one after the other, by any number of workers; results are in a file, from which a run resumes.
+"""Identification of many suspects by any number of workers, with results in a file from which a run resumes.
 
-Any `concurrent.futures` executor will do, as for studies (`jaxmark.evaluation.cells`): processes here, or the workers
-of a Dask cluster. Workers open the catalogue for reading only. Suspects come from an iterator, of which only as many
-are taken at a time as workers can do.
+Workers are those of any `concurrent.futures` executor, as for studies (`jaxmark.evaluation.cells`): local processes, or
+a Dask cluster. Workers open the catalogue for reading only. Suspects are taken from an iterator, only a few per worker
+at a time.
 """
 
 import hashlib
@@ -32,26 +32,26 @@ from jaxmark.evaluation.cells import Pool, append, processes
 from jaxmark.files import SUFFIXES
 from jaxmark.watermark.coding.keys import load_key
 
-DEAD_SUFFIX = ".dead.jsonl"  # of the file with what could not be read
-_AHEAD = 4  # suspects that are taken for each worker, so that none waits
-_MOST_BREAKS = 2  # times that a suspect may break a pool while it is alone in it
+DEAD_SUFFIX = ".dead.jsonl"  # suffix of the file that lists suspects that could not be read
+_AHEAD = 4  # number of suspects that are submitted per worker, so that no worker waits
+_MOST_BREAKS = 2  # number of times that a suspect may break a pool in which it is alone, before it is given up
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The work on each suspect; workers keep what they have prepared for it."""
+    """The work on each suspect: the catalogue, the keys and the options; workers cache the finder of a plan."""
 
     catalogue: Path
-    keys: tuple[bytes | Path, ...]  # keys, or files that each worker reads, so that no key is sent to it
-    options: tuple[tuple[str, Any], ...] = ()  # of `Finder`
-    after: Callable[[], object] | None = field(default=None, compare=False)  # called after each suspect; at top level
+    keys: tuple[bytes | Path, ...]  # keys; or files that each worker reads, so that no key is sent to it
+    options: tuple[tuple[str, Any], ...] = ()  # options of `Finder`
+    after: Callable[[], object] | None = field(default=None, compare=False)  # module-level function, called per suspect
 
 
 class Done(NamedTuple):
-    """The result of a run, counted."""
+    """The numbers of results of a run."""
 
-    named: int
-    nobodys: int
+    named: int  # suspects whose original is named
+    nobodys: int  # suspects for which no original is named
     dead: int  # suspects that could not be read, or killed their workers
 
 
@@ -60,30 +60,31 @@ def find_each(
     suspects: Iterable[str | os.PathLike[str]],
     output: str | os.PathLike[str],
     workers: int | Pool = 1,
-    say: Callable[[str], None] = lambda line: None,
+    log: Callable[[str], None] = lambda line: None,
 ) -> Generator[dict[str, Any], None, None]:
-    """Find the originals of suspects; yields each verdict once it is in the file, in no order.
+    """Find the originals of suspects; yields each verdict after it is in the file, in arbitrary order.
 
     Args:
-        plan: the catalogue, the keys, and how to look.
+        plan: the catalogue, the keys and the options.
         suspects: files.
-        output: file of JSON lines, one for each suspect, which grows. Suspects in it, or among the dead letters beside
-            it (`output` and ".dead.jsonl"), are not done again; delete the latter to have them tried again.
+        output: file to which a line of JSON is appended for each suspect. Suspects that could not be read are listed in
+            a second file, whose name is `output` followed by ".dead.jsonl". Suspects in either file are skipped; delete
+            the second file to try them again.
         workers: number of processes, where 1 is this process; or a function that makes an executor.
-        say: function that is called with a line about what goes wrong.
+        log: callback, called with a line about each problem.
 
     Raises:
         JaxmarkError: if the catalogue or a key cannot be read, or a file cannot be written.
     """
     target, dead = Path(output), Path(f"{os.fspath(output)}{DEAD_SUFFIX}")
-    known = _finished(target) | _finished(dead)
-    _finder(plan).prepare()  # refuses before any worker starts
+    finished = _finished(target) | _finished(dead)
+    _finder(plan).prepare()  # raises errors before any worker starts
     pool, ahead = _pool(workers)
     writable = os.access(plan.catalogue, os.W_OK) and os.access(plan.catalogue.resolve().parent, os.W_OK)
     if not writable:
-        say("The catalogue cannot be written; verdicts are not kept in it.")
+        log("The catalogue cannot be written; verdicts are not stored in it.")
     with Catalogue(plan.catalogue) if writable else nullcontext() as catalogue:
-        for path, row in _run(pool, ahead, plan, _fresh(suspects, known), say):
+        for path, row in _run(pool, ahead, plan, _unfinished(suspects, finished), log):
             line = {"suspect": path, "identity": _identity(path), **row}
             if catalogue is not None and "refused" not in row:
                 catalogue.record_verdict(row["suspect_sha256"], path, row)
@@ -92,13 +93,13 @@ def find_each(
 
 
 def count(rows: Iterable[Mapping[str, Any]]) -> Done:
-    """Count the results of `find_each`, which runs it."""
+    """Run `find_each` by consuming its results, and count them."""
     counts = Counter("dead" if "refused" in row else "named" if row["named"] else "nobodys" for row in rows)
     return Done(counts["named"], counts["nobodys"], counts["dead"])
 
 
 def mesh_files_below(folder: Path) -> Iterator[Path]:
-    """Yield the mesh files of a folder and of all below it, in order; links to folders are not followed."""
+    """Yield the mesh files of a folder and its subfolders, in order; links to folders are not followed."""
     for place, folders, files in os.walk(folder):
         folders.sort()
         yield from (
@@ -108,23 +109,23 @@ def mesh_files_below(folder: Path) -> Iterator[Path]:
         )
 
 
-def _fresh(suspects: Iterable[str | os.PathLike[str]], known: set[bytes]) -> Iterator[str]:
-    """Yield the suspects that are not done, each once."""
+def _unfinished(suspects: Iterable[str | os.PathLike[str]], finished: set[bytes]) -> Iterator[str]:
+    """Yield the suspects that are not finished, each once."""
     for suspect in suspects:
         path = os.path.realpath(suspect)
         digest = _digest(_identity(path))
-        if digest not in known:
-            known.add(digest)
+        if digest not in finished:
+            finished.add(digest)
             yield path
 
 
 def _identity(path: str) -> list[str | int]:
-    """Return values that distinguish a suspect from others without reading it."""
+    """Return values that identify a suspect without reading it: path, size and time of change."""
     try:
-        found = Path(path).stat()
+        status = Path(path).stat()
     except (OSError, ValueError):
         return [path]
-    return [path, found.st_size, found.st_mtime_ns]
+    return [path, status.st_size, status.st_mtime_ns]
 
 
 def _digest(identity: list[str | int]) -> bytes:
@@ -132,48 +133,48 @@ def _digest(identity: list[str | int]) -> bytes:
 
 
 def _finished(path: Path) -> set[bytes]:
-    """Read the identities in a file; a last line that a killed run left incomplete is cut off."""
-    found: set[bytes] = set()
+    """Read the digests of the finished suspects in a file; an incomplete last line of a killed run is removed."""
+    finished: set[bytes] = set()
     if not path.exists():
-        return found
-    whole = 0
+        return finished
+    complete = 0  # bytes of complete lines
     try:
         with path.open("rb") as file:
             for number, line in enumerate(file, 1):
                 if not line.endswith(b"\n"):
                     break
-                whole += len(line)
+                complete += len(line)
                 try:
-                    found.add(_digest(json.loads(line)["identity"]))
+                    finished.add(_digest(json.loads(line)["identity"]))
                 except (ValueError, KeyError, TypeError):
                     raise JaxmarkError(
-                        f"Line {number} of {path} is no verdict; delete that line to have it done again."
+                        f"Line {number} of {path} is no verdict; delete this line, and the suspect is read again."
                     ) from None
-        if whole != path.stat().st_size:
-            os.truncate(path, whole)
+        if complete != path.stat().st_size:
+            os.truncate(path, complete)
     except OSError as error:
         raise JaxmarkError(f"Cannot use {path}: {error.strerror or error}.") from None
-    return found
+    return finished
 
 
 def _pool(workers: int | Pool) -> tuple[Pool, int]:
-    """Return a maker of executors, and the number of suspects to give it at a time."""
+    """Return a function that makes executors, and the number of suspects to submit at a time."""
     if not isinstance(workers, int):
         return workers, _AHEAD * (os.cpu_count() or 1)
     if workers < 1:
-        raise JaxmarkError(f"Suspects need at least one worker, got {workers}.")
+        raise JaxmarkError(f"The number of workers must be at least 1, got {workers}.")
     pool = processes(workers) if workers > 1 else partial(ThreadPoolExecutor, 1)
     return pool, _AHEAD * workers
 
 
 def _run(
-    pool: Pool, ahead: int, plan: Plan, suspects: Iterator[str], say: Callable[[str], None]
+    pool: Pool, ahead: int, plan: Plan, suspects: Iterator[str], log: Callable[[str], None]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the results of suspects as they come: the path, and the verdict or a refusal.
+    """Yield the results of suspects as they are finished: the path, and the verdict or a refusal.
 
-    Whenever a pool breaks, the suspects in it are done again one at a time, so that the one that breaks it is known.
+    If a pool breaks, its suspects are read again one at a time, to find the one that breaks the pool.
     """
-    alone: deque[str] = deque()
+    singly: deque[str] = deque()  # suspects that are read one at a time
     breaks: Counter[str] = Counter()
     while True:
         running: dict[Future[dict[str, Any]], str] = {}
@@ -181,15 +182,15 @@ def _run(
             with pool() as executor:
                 try:
                     while True:
-                        most = 1 if alone else ahead
-                        while len(running) < most and (path := alone.popleft() if alone else next(suspects, None)):
-                            alone.appendleft(path)  # where it stays if the executor is broken already
+                        most = 1 if singly else ahead
+                        while len(running) < most and (path := singly.popleft() if singly else next(suspects, None)):
+                            singly.appendleft(path)  # it stays in the queue if the executor is broken already
                             running[executor.submit(work, plan, path)] = path
-                            alone.popleft()
+                            singly.popleft()
                         if not running:
                             return
                         done = wait(running, return_when=FIRST_COMPLETED).done
-                        for future in [one for one in running if one in done]:
+                        for future in [future for future in running if future in done]:
                             path, row = running[future], _outcome(future)
                             del running[future], breaks[path]
                             yield path, row
@@ -202,9 +203,9 @@ def _run(
                 breaks[lost[0]] += 1
             for path in [path for path in lost if breaks[path] >= _MOST_BREAKS]:
                 lost.remove(path)
-                yield path, {"refused": "It killed the worker that read it."}
-            alone.extend(lost)
-            say(f"{error or 'A pool broke.'} A new pool goes on, one suspect at a time for those that were in it.")
+                yield path, {"refused": "Reading it killed the worker."}
+            singly.extend(lost)
+            log(f"{error or 'A pool broke.'} A new pool continues; the suspects of the old one are read one at a time.")
 
 
 def _outcome(future: Future[dict[str, Any]]) -> dict[str, Any]:
@@ -217,16 +218,19 @@ def _outcome(future: Future[dict[str, Any]]) -> dict[str, Any]:
 
 
 def work(plan: Plan, path: str) -> dict[str, Any]:
-    """Find the originals of a suspect, in a worker; a refusal is a result. At the top level, where workers find it."""
+    """Find the originals of a suspect in a worker; a refusal is a result, too.
+
+    This function is at the top level of the module, so that worker processes can import it.
+    """
     start = time.perf_counter()
     try:
-        found = _finder(plan).find(path).as_json()
+        values = _finder(plan).find(path).as_json()
     except JaxmarkError as error:
         return {"refused": str(error)}
     finally:
         if plan.after is not None:
             plan.after()
-    return {**found, "seconds": round(time.perf_counter() - start, 2)}
+    return {**values, "seconds": round(time.perf_counter() - start, 2)}
 
 
 @lru_cache(maxsize=1)

@@ -1,4 +1,4 @@
-"""Metrics of how far a mesh was moved, and how visible that is.
+"""Metrics of distortion: how far vertices were displaced, and how visible the change is.
 
 `compare` computes all of them for two meshes on the host; most are also shown as functions of positions that JAX can
 differentiate.

@@ -46,16 +46,16 @@ class DisplacementSize(NamedTuple):
 
     @classmethod
     def of(cls, displacement: Float[np.ndarray, "points 3"]) -> "DisplacementSize":
-        """The size of a displacement of these vertices, given in diagonals."""
-        with np.errstate(over="ignore"):  # a vertex thrown to the end of the number range is infinitely far
+        """Return the size of a displacement of these vertices, given in diagonals."""
+        with np.errstate(over="ignore"):  # very large coordinates give an infinite displacement
             return cls(float(rms(displacement)), float(maximum(displacement)))
 
 
 class Comparison(NamedTuple):
     """Distortions of a mesh, by all metrics; lengths are over the original's bounding-box diagonal.
 
-    A metric is None if it was not asked for, or if it needs meshes of the same connectivity and these differ in it; of
-    point clouds, also if it needs faces.
+    A metric is None if it was not requested, if it needs meshes of the same connectivity and these differ in it, or if
+    it needs faces and the meshes are point clouds.
     """
 
     rms: float | None  # displacement of the welded vertices that faces use, root mean square, unweighted
@@ -199,19 +199,19 @@ _METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
     "flip": lambda pair: flip(*pair.meshes).high,
     "ssim": lambda pair: ssim(*pair.meshes).high,
 }
-#: Names of the metrics of pictures: many seconds each, and so only computed where they are asked for.
+#: Names of the metrics of rendered pictures; each takes many seconds, so that they are only computed on request.
 RENDERED = ("flip", "ssim")
 #: Names of the metrics of `compare`; limits of distortion are stated in them, too.
 METRICS = tuple(name for name in _METRICS if name not in RENDERED)
 #: Names of the metrics that need no faces: those of point clouds.
 OF_POINTS = ("rms", "max", "point_to_plane")
-#: Names of the metrics that look at single vertices and edges, and are quickly computed.
+#: Names of the metrics of single vertices and edges, which are fast.
 LOCAL = ("rms", "max", "gl", "dame", "stretch")
 _ANY_CONNECTIVITY = {"mrms", "hausdorff", "fmpd", "msdm2", *RENDERED}
 
 
 def metrics_of(original: Mesh, distorted: Mesh) -> tuple[str, ...]:
-    """The names in `METRICS` that two meshes can be compared by: if one is a point cloud, those in `OF_POINTS`."""
+    """Return the names in `METRICS` that two meshes can be compared by: if one is a point cloud, those in `OF_POINTS`."""
     for mesh in (original, distorted):
         check_mesh(mesh)
     return METRICS if len(original.faces) and len(distorted.faces) else OF_POINTS
@@ -242,7 +242,7 @@ def measure(original: Mesh, distorted: Mesh, metrics: Collection[Metric]) -> dic
 
 
 def name_of(metric: Metric) -> str:
-    """The name of a metric; for a metric of your own, the name of its function."""
+    """Return the name of a metric; for a metric of your own, the name of its function."""
     return metric if isinstance(metric, str) else getattr(metric, "__name__", repr(metric))
 
 
@@ -279,12 +279,12 @@ def shading_at_vertices(original: Mesh, distorted: Mesh) -> Float[np.ndarray, " 
     reference = Reference(original)
     pair, masking = _Pair(reference, distorted), reference.masking
     if not pair.same:
-        raise JaxmarkError("The turn of normals is known only between meshes of the same connectivity.")
+        raise JaxmarkError("The turn of normals needs two meshes of the same connectivity; these meshes differ in it.")
     points = np.zeros(len(reference.used), np.float32)
     points[reference.used] = vertex_means(visible_turn(pair.x, pair.y, masking), masking, len(pair.x))
     return points[reference.welded.point]
 
 
 def _distinct(mesh: Mesh, welded: Weld) -> Mesh:
-    """The mesh of the distinct points that faces use."""
+    """Return the mesh of the distinct points that faces use."""
     return host_mesh(compact(weld_mesh(mesh, welded)))

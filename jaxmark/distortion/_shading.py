@@ -1,7 +1,7 @@
 """Visible change of shading: the turn of normals over the turn that the original masks, face by face.
 
-A mean over edges cannot see a wave on a plane: most edges lie where the surface is curved or rough and masks more. Here
-each point is judged separately, and the result is a percentile of the area, in just noticeable differences.
+A mean over edges misses a wave on a plane, because most edges lie where the surface is curved or rough and masks more.
+Here each point is judged separately, and the result is a percentile of the area, in just noticeable differences.
 
 1. *Contrast.* Where a normal turns by δ, Lambertian shading changes by up to tan(i)·δ of itself, i being the incidence
    of the light. Lights come at 60°, from any side, so that no rotation changes the result: 0.33° is a contrast of 1 %.
@@ -45,23 +45,23 @@ from jaxmark.spectral.chebyshev import band_components, filter
 from jaxmark.spectral.laplacian import Laplacian, graph_laplacian
 from jaxmark.spectral.padding import common_size, pad_edges, pad_rows
 
-SHARE = 0.99  # share of the area on which less is seen than the metric says
+SHARE = 0.99  # fraction of the area on which the turn is less visible than the value of the metric
 _INCIDENCE = math.radians(60)  # angle between the light and the surroundings' mean normal
-_CREASE = math.radians(45)  # angle of the original's faces at which a link between them has lost all but 1/e
+_CREASE = math.radians(45)  # angle between faces of the original at which the weight of their link is 1/e
 _SCALES = (0, 2, 4, 6, 8, 10)  # binary logarithms of the steps of diffusion that divide the bands
 BANDS = len(_SCALES)
-_WAVELENGTHS = 3 * 2.0 ** np.arange(-1, len(_SCALES) - 1)  # of the bands' best waves, in lengths of edges
+_WAVELENGTHS = 3 * 2.0 ** np.arange(-1, len(_SCALES) - 1)  # of the waves that each band passes best, in edge lengths
 _GAINS = np.array([1, *[2] * (len(_SCALES) - 1)])  # inverse of the bands' responses to their best waves
 _SIZE = 40.0  # degrees of the field of view that the diagonal takes when people look closely
 _BEST_FREQUENCY = 3.0  # cycles per degree
 _LUMINANCE = 100.0  # cd/m²
-_LEAST_CONTRAST = 0.006  # that is just seen, at the best frequency
-_MIN_SENSITIVITY = 1e-3  # to the shortest waves, over that to the best
+_LEAST_CONTRAST = 0.006  # just noticeable contrast at the best frequency
+_MIN_SENSITIVITY = 1e-3  # sensitivity to the shortest waves, over the largest sensitivity
 _MASKING_SLOPE, _MASKING_BEND = 0.0078 * 88.29, 4.207
-_FEW_TERMS = 25  # of a series: as many as the first four bands need
+_FEW_TERMS = 25  # number of terms of a series that the first four bands need
 _POOLING = 4  # exponent by which bands are summed
-_MIN_HEIGHT = 1e-5  # of a face over its longest side; flatter ones have no normal
-_MIN_AREA = 1e-3  # of a face over the mean, in its links
+_MIN_HEIGHT = 1e-5  # least height of a face over its longest side; the normals of flatter faces are ignored
+_MIN_AREA = 1e-3  # least area of a face in its links, over the mean area
 
 
 class Masking(NamedTuple):
@@ -72,11 +72,11 @@ class Masking(NamedTuple):
     turned: Float[Array | np.ndarray, " faces"]  # -1 for faces that run against their neighbours, otherwise 1
     links: Laplacian  # of the graph of faces that share an edge that is no crease; padded, see `spectral.padding`
     threshold: Float[Array | np.ndarray, "bands faces"]  # normals' just noticeable turn in each band, in radians
-    bare: Float[Array | np.ndarray, "bands faces"]  # the same if the surface had nothing that hides
+    bare: Float[Array | np.ndarray, "bands faces"]  # the threshold without masking
     bend: Float[Array | np.ndarray, " faces"]  # second largest angle to a neighbour: 0 on planes and along their edges
 
     def padded(self) -> "Masking":
-        """The same with faces of no area besides, as many as `links` has, so that many meshes share its shapes."""
+        """Pad all arrays with faces of area 0 to the size of `links`, so that many meshes have the same shapes."""
         count = len(self.links.degree)
         if len(self.area) == count:
             return self
@@ -88,9 +88,9 @@ class Masking(NamedTuple):
 def make_masking(
     vertices: Float[Array | np.ndarray, "vertices 3"], faces: Int[Array | np.ndarray, "faces 3"], bands: int = BANDS
 ) -> Masking:
-    """Compute what an original masks, on the host, in `bands` bands from the shortest waves on.
+    """Compute the masking of an original in `bands` bands, starting with the shortest waves, on the host.
 
-    Edges of one face, or of three or more, link nothing.
+    Edges of one face, or of three or more faces, are no links.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     pairs, against = face_pairs(faces)
@@ -126,33 +126,33 @@ def visible_turn(original: Positions, distorted: Positions, masking: Masking) ->
     turn = root(energy) / jnp.asarray(masking.threshold).astype(change.dtype)
     largest = jax.lax.stop_gradient(jnp.max(turn, axis=0))
     largest = jnp.where(largest > 0, largest, 1)
-    # Powers are taken of ratios, which neither overflow nor vanish.
+    # Powers are computed of ratios, because those of the values themselves may overflow or underflow.
     total = jnp.sum((turn / largest) ** _POOLING, axis=0)
     return largest * jnp.where(total > 0, jnp.where(total > 0, total, 1) ** (1 / _POOLING), 0)
 
 
 @jax.jit
 def shading(original: Positions, distorted: Positions, masking: Masking, share: float | Scalar = SHARE) -> Scalar:
-    """The visible turn of normals that is exceeded on 1 % of the area (1 - `share`), in just noticeable differences.
+    """Compute the visible turn of normals that 1 % of the area (1 - `share`) exceeds, in just noticeable differences.
 
-    Normals are split into bands of spatial frequency; a turn in each is taken over the least that is seen there, which
-    the original's own contrast in the band raises (masking as by Daly, with the constants of Nader, Wang,
+    Normals are split into bands of spatial frequency. In each band, the turn is divided by the just noticeable turn,
+    which increases with the original's own contrast in the band (masking by Daly, with the constants of Nader, Wang,
     Hétroy-Wheeler, Dupont, "Just noticeable distortion profile for flat-shaded 3D mesh surfaces", IEEE TVCG 22(11),
-    2016; sensitivity as by Barten, JOSA A 7(10), 1990). On a plane 0.2° are just noticeable, by our calibration. The
-    gradient is that of the face at the percentile.
+    2016; sensitivity by Barten, JOSA A 7(10), 1990). On a plane, a turn of 0.2° is just noticeable, by our calibration.
+    The gradient is that of the face at the percentile.
     """
     return percentile(visible_turn(original, distorted, masking), jnp.asarray(masking.area), share)
 
 
 def vertex_means(values: Float[Array, " faces"], masking: Masking, count: int) -> Float[Array, " vertices"]:
-    """Means of faces' values around each of `count` vertices, weighted by area, for heat maps; 0 where no face is."""
+    """Average the values of the faces around each of `count` vertices by area, for heat maps; 0 without faces."""
     area = jnp.asarray(masking.area).astype(values.dtype)[:, None]
     zeros, corners = jnp.zeros(count, values.dtype), masking.faces
     return ratio(zeros.at[corners].add(area * values[:, None]), zeros.at[corners].add(area))
 
 
 def _areas_and_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Areas of faces and their unit normals, 0 for those that are too flat to have one."""
+    """Compute the areas of faces and their unit normals, 0 for those that are too flat to have one."""
     sides = [vertices[faces[:, k]] - vertices[faces[:, k - 1]] for k in range(3)]
     longest, normals = np.max([_squared(side) for side in sides], axis=0), cross_product(sides[1], sides[2])
     double = np.sqrt(_squared(normals))
@@ -161,12 +161,12 @@ def _areas_and_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndar
 
 
 def _squared(x: Float[np.ndarray, "rows 3"]) -> Float[np.ndarray, " rows"]:
-    """Squared lengths of vectors."""
+    """Compute the squared lengths of vectors."""
     return np.einsum("ri,ri->r", x, x)
 
 
 def _second_largest(pairs: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """The second largest of the values of the pairs that each of so many things is in; 0 where it is in but one."""
+    """Find the second largest value of the pairs that contain each index below a count; 0 if fewer than two do."""
     which, left = pairs.T.ravel(), np.tile(values, 2)
     largest = np.full(count, -np.inf)
     np.maximum.at(largest, which, left)
@@ -180,9 +180,9 @@ def _second_largest(pairs: np.ndarray, values: np.ndarray, count: int) -> np.nda
 
 
 def _orient(pairs: np.ndarray, against: np.ndarray, count: int) -> np.ndarray:
-    """Signs that make the faces of each piece run alike, +1 throughout where a piece has but one side.
+    """Compute signs that orient the faces of each component consistently; +1 for components that are one-sided.
 
-    Each face stands twice in a graph, once for each of its sides; sides that belong together are connected.
+    In a graph, each face has two nodes, one for each of its sides; nodes of adjoining sides are connected.
     """
     if not against.any():
         return np.ones(count)
@@ -194,7 +194,7 @@ def _orient(pairs: np.ndarray, against: np.ndarray, count: int) -> np.ndarray:
 
 
 def _normals(x: Array, masking: Masking) -> Array:
-    """Unit normals of the faces that have one."""
+    """Compute the unit normals of the faces that have one."""
     corners = x[masking.faces]
     cross = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     square = jnp.sum(cross**2, axis=1, keepdims=True)
@@ -205,7 +205,7 @@ def _normals(x: Array, masking: Masking) -> Array:
 
 @cache
 def _diffusions(count: int) -> Float[np.ndarray, "scales terms"]:
-    """Chebyshev coefficients of the diffusions that divide so many bands."""
+    """Compute the Chebyshev coefficients of the diffusions that separate a number of bands."""
     terms = [round(3 * 2 ** (scale / 2)) + 1 for scale in _SCALES[:count]]
     series = diffusion(_SCALES[count - 1] + 1, terms[-1])[list(_SCALES[:count])]
     # The rest of each series is below 3e-5.
@@ -213,23 +213,23 @@ def _diffusions(count: int) -> Float[np.ndarray, "scales terms"]:
 
 
 def _bands(links: Laplacian, x: Array, count: int) -> Array:
-    """Split signals of faces into bands, from the shortest waves on; what diffusion leaves is in none of them."""
+    """Split signals of faces into bands, starting with the shortest waves; the longest waves are in none of the bands."""
     passed = _diffusions(count)
     bands = _GAINS[:count, None] * (np.vstack([np.eye(1, passed.shape[1]), passed[:-1]]) - passed)
-    # Most bands need but few of the terms.
+    # Most bands need only few of the terms.
     parts = [band_components(links, jnp.asarray(some, x.dtype), x) for some in _by_length(bands)]
     return jnp.concatenate(parts)
 
 
 def _by_length(series: Float[np.ndarray, "series terms"]) -> list[Float[np.ndarray, "some fewer"]]:
-    """Split series, the shortest first, into those of few terms, which end there, and the others."""
+    """Split series, sorted by length, into short ones, whose terms beyond `_FEW_TERMS` are 0 and cut off, and others."""
     short = int((~series[:, _FEW_TERMS:].any(axis=1)).sum())
     return [some for some in (series[:short, :_FEW_TERMS], series[short:]) if len(some)]
 
 
 @partial(jax.jit, static_argnames="count")
 def _hidden(links: Laplacian, normals: Array, length: Array, count: int) -> tuple[Array, Array]:
-    """Just noticeable turns in each band, and what they were if nothing hid them, by the means around each face."""
+    """Compute the just noticeable turns in each band, with and without masking, from the means around each face."""
     energy, dtype = jnp.sum(_bands(links, normals, count) ** 2, axis=2), normals.dtype
     means, start = [], 0
     for some in _by_length(_diffusions(count)):
@@ -247,14 +247,14 @@ def _hidden(links: Laplacian, normals: Array, length: Array, count: int) -> tupl
 
 
 def _sensitivity(wavelength: Array) -> Array:
-    """Inverse of the contrast that is just seen, of waves whose lengths are given in diagonals."""
+    """Compute the contrast sensitivity to waves, whose lengths are given in diagonals."""
     cycles = jnp.maximum(1 / (wavelength * _SIZE), _BEST_FREQUENCY)
     values = _barten(cycles) / float(_barten(np.array(_BEST_FREQUENCY), np))
     return jnp.maximum(values, _MIN_SENSITIVITY) / _LEAST_CONTRAST
 
 
 def _barten(cycles: Any, xp: Any = jnp) -> Any:
-    """Barten's contrast sensitivity at so many cycles per degree, computed by JAX or by NumPy."""
+    """Compute Barten's contrast sensitivity at frequencies in cycles per degree, by JAX or by NumPy."""
     peak = 540 * (1 + 0.7 / _LUMINANCE) ** -0.2 / (1 + 12 / (_SIZE * (1 + cycles / 3) ** 2))
     kept = xp.exp(-0.3 * (1 + 100 / _LUMINANCE) ** 0.15 * cycles)
     return peak * cycles * xp.sqrt(kept**2 + 0.06 * kept)

@@ -45,7 +45,7 @@ def make_hinges(faces: Int[Array | np.ndarray, "faces 3"]) -> Hinges:
 
 
 def dihedral_sine_cosine(x: Positions, hinges: Hinges) -> tuple[Float[Array, " edges"], Float[Array, " edges"]]:
-    """Sine and cosine, up to a common factor, of the angle by which the surface turns at each edge.
+    """Compute the sine and cosine, up to a common factor, of the angle by which the surface turns at each edge.
 
     The angle is positive where a surface whose faces run counterclockwise is convex, and 0 where it is not defined.
     """
@@ -61,13 +61,13 @@ def dihedral_sine_cosine(x: Positions, hinges: Hinges) -> tuple[Float[Array, " e
 
 @jax.jit
 def dihedral_angles(x: Positions, hinges: Hinges) -> Float[Array, " edges"]:
-    """Angle by which the surface turns at each edge, in radians from -π to π; 0 if it is flat or there is no hinge."""
+    """Compute the angle by which the surface turns at each edge, in radians from -π to π; 0 if it is flat or there is no hinge."""
     return jnp.arctan2(*dihedral_sine_cosine(x, hinges))
 
 
 @jax.jit
 def dame(original: Positions, distorted: Positions, hinges: Hinges) -> Scalar:
-    """Dihedral angle mesh error: mean change of dihedral angles over inner edges, masked where the original is sharp.
+    """Compute the dihedral angle mesh error: mean change of dihedral angles over inner edges, masked where the original is sharp.
 
     The error is in radians, and independent of scale. It is the paper's sum with masking m = exp((kα)²), k² =
     ln(0.01)/π², by the original's angle α. The paper's visibility weights, which need rendered images, are 1 here.

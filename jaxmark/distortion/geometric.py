@@ -29,7 +29,7 @@ class SurfaceDistance(NamedTuple):
 
 
 def surface_distance(first: Mesh, second: Mesh) -> SurfaceDistance:
-    """Measure how far two surfaces are apart, from the vertices and 100,000 sampled points of each to the other.
+    """Measure the distance between two surfaces, from the vertices and 100,000 sampled points of each to the other.
 
     Distances to the surfaces are exact. Root mean squares are over the points, which are sampled uniformly by area; the
     largest distance is over points and vertices. Reference: Cignoni, Rocchini, Scopigno, "Metro: measuring error on
@@ -50,7 +50,7 @@ def surface_distance(first: Mesh, second: Mesh) -> SurfaceDistance:
 
 @jax.jit
 def geometric_laplacian(x: Positions, edges: Edges) -> Positions:
-    """The geometric Laplacian v - Σ_j v_j/l_j / Σ_j 1/l_j of each vertex, over neighbours j at distances l_j.
+    """Return the geometric Laplacian v - Σ_j v_j/l_j / Σ_j 1/l_j of each vertex, over neighbours j at distances l_j.
 
     Edges of length 0 do not count; a vertex without other edges gets 0.
     """
@@ -63,7 +63,7 @@ def geometric_laplacian(x: Positions, edges: Edges) -> Positions:
 
 @jax.jit
 def gl(original: Positions, distorted: Positions, edges: Edges) -> Scalar:
-    """The mean of two RMS changes, of positions and of the geometric Laplacian, in the units of the positions.
+    """Return the mean of two RMS changes, of positions and of the geometric Laplacian, in the units of the positions.
 
     Reference: Karni, Gotsman, "Spectral compression of mesh geometry", SIGGRAPH 2000, section 5. The paper divides the
     roots of sums of squares by the number of vertices. Here they are root mean squares, so that meshes with different
@@ -75,7 +75,7 @@ def gl(original: Positions, distorted: Positions, edges: Edges) -> Scalar:
 
 @jax.jit
 def stretch(original: Positions, distorted: Positions, edges: Edges, share: float | Scalar = HIGH_SHARE) -> Scalar:
-    """The change of length that 1 % of the edges (1 - `share`) exceed, over the length that each has in the original.
+    """Return the change of length that 1 % of the edges (1 - `share`) exceed, over the length that each has in the original.
 
     Displacements along the surface change lengths, and so textures, where shading hardly changes. Edges of length 0 do
     not count. The gradient is that of the edge at this percentile.
@@ -99,9 +99,9 @@ class PointPlanes(NamedTuple):
 def point_to_plane(displacement: Float64[np.ndarray, "points 3"], around: PointPlanes) -> float:
     """Measure the displacement across the surface that 5 % of the points exceed, over the distance of nearest points.
 
-    A cloud is drawn as dots or small discs about as large as the points are apart: a small share of that neither
-    roughens its surface nor opens it. Along the surface, points may stand anywhere. `around` has the planes of the
-    points before they moved, in the units of the displacement.
+    A cloud is drawn as dots or small discs, which are about as large as the distance between points. Displacements by a
+    small fraction of that distance neither roughen the surface nor open gaps. Displacements along the surface do not
+    count. `around` has the planes of the points before they moved, in the units of the displacement.
     """
     across = np.abs(np.sum(displacement * around.normals, axis=1))
     return float(np.quantile(across, _HIGH_SHARE_OF_POINTS) / (around.spacing or 1.0))
@@ -112,7 +112,7 @@ def texture_drift(
 ) -> float | None:
     """Measure the drift of a texture that 1 % of the faces' corners exceed, in texels of a texture of 2,048 x 2,048.
 
-    A corner that moves along the surface takes its place in the texture along, past what was there before.
+    A corner that moves along the surface moves its part of the texture with it.
 
     Args:
         original: any mesh.

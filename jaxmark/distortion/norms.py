@@ -35,7 +35,7 @@ def _where_positive(function: Callable[[Any], Any], x: Any, xp: Any = jnp) -> An
 
 
 def ratio(numerator: Float[Array, "*shape"], denominator: Float[Array, "*#shape"]) -> Float[Array, "*shape"]:
-    """The numerator over the denominator; 0 with gradient 0 where the denominator is not positive."""
+    """Return the numerator over the denominator; 0 with gradient 0 where the denominator is not positive."""
     positive = denominator > 0
     return jnp.where(positive, numerator / jnp.where(positive, denominator, 1), 0)
 
@@ -50,12 +50,12 @@ def with_dtype(tree: Tree, dtype: DTypeLike) -> Tree:
 
 
 def lengths(x: Float[Array, "rows 3"]) -> Float[Array, " rows"]:
-    """Lengths of vectors; the gradient at 0 is 0."""
+    """Compute the lengths of vectors; the gradient at 0 is 0."""
     return root(jnp.sum(x**2, axis=1))
 
 
 def rms(displacement: Float[Array | np.ndarray, "vertices 3"]) -> Scalar | np.ndarray:
-    """Root mean square √(mean over v of |d_v|²), unweighted, in the units of `displacement`; the gradient at 0 is 0.
+    """Compute the root mean square √(mean over v of |d_v|²), unweighted, in the units of `displacement`; the gradient at 0 is 0.
 
     A NumPy array gives a NumPy result, so that float64 stays float64 on the host.
     """
@@ -64,13 +64,13 @@ def rms(displacement: Float[Array | np.ndarray, "vertices 3"]) -> Scalar | np.nd
 
 
 def maximum(displacement: Float[Array | np.ndarray, "vertices 3"]) -> Scalar | np.ndarray:
-    """Largest |d_v| over the vertices, in the units of `displacement`; the gradient at 0 is 0."""
+    """Compute the largest |d_v| over the vertices, in the units of `displacement`; the gradient at 0 is 0."""
     xp: Any = np if isinstance(displacement, np.ndarray) else jnp
     return root(xp.max(xp.sum(displacement**2, axis=-1)), xp)
 
 
 def cubic_mean(values: PerVertex) -> Scalar:
-    """The cube root of the mean of cubes; the gradient at 0 is 0."""
+    """Return the cube root of the mean of cubes; the gradient at 0 is 0."""
     return cube_root(jnp.mean(values**3))
 
 

@@ -1,7 +1,8 @@
-"""How different two meshes look: pictures of both, compared by metrics of images.
+"""Metrics of rendered pictures: pictures of two meshes, compared by metrics of images.
 
-Both are seen from six sides under three lights, one of which grazes what faces the eye, with flat and with smooth
-shading. The result is slow, and depends on sides and lights; it is a check on metrics of the surface.
+Both meshes are rendered from six sides, with three lights, and with flat and smooth shading. One of the lights grazes
+the surfaces that face the viewer. These metrics are slow, and depend on sides and lights; they serve to check the
+metrics of the surface.
 """
 
 from collections.abc import Callable, Iterator
@@ -94,7 +95,7 @@ def _compare(original: Mesh, distorted: Mesh, size: int, compared: Callable[[Gra
 def _pictures(original: Mesh, distorted: Mesh, size: int) -> Iterator[tuple[np.ndarray, Gray, Gray]]:
     """Yield the mask of the pixels that show the object, and pictures of both meshes, for each side.
 
-    Those by each light, flat and smooth, lie side by side in one, because programs take long to begin with a picture.
+    The pictures of all lights, flat and smooth, are joined to one picture, because the metrics take long to start.
     """
     meshes = host_mesh(original), host_mesh(distorted)
     frame = Frame.of(meshes[0])
@@ -110,6 +111,6 @@ def _pictures(original: Mesh, distorted: Mesh, size: int) -> Iterator[tuple[np.n
 
 
 def _around(shown: Bool[np.ndarray, "rows columns"]) -> tuple[slice, ...]:
-    """The part of a picture that shows something, with a margin for the filters of metrics."""
+    """Return the part of a picture that shows something, with a margin for the filters of metrics."""
     parts = (np.append(np.flatnonzero(shown.any(axis=axis)), [] if shown.any() else [0]) for axis in (1, 0))
     return tuple(slice(max(int(part[0]) - _MARGIN, 0), int(part[-1]) + _MARGIN + 1) for part in parts)

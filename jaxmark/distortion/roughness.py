@@ -15,7 +15,7 @@ from jaxmark.distortion.norms import PerVertex, Positions, Scalar, lengths, rati
 from jaxmark.geometry.mesh import boundary_vertices
 
 POWER = 0.15  # exponent by which roughness is modulated
-_SLOPE_ABOVE_MEAN = 0.5  # factor on the part of a modulated roughness above the mean's
+_SLOPE_ABOVE_MEAN = 0.5  # factor on the part of a modulated roughness that exceeds the mean
 MIN_ROUGHNESS, MAX_ROUGHNESS = 5e-4, 0.2  # roughness is clipped to these, in radians
 _MAX_OVER_MEAN = 5.0  # the upper bound is at least this many times the mean
 _HALF_COTANGENTS = (1e-3, 1e3)  # range to which half cotangents are clipped
@@ -60,7 +60,7 @@ def _local_roughness(x: Positions, faces: Int[Array, "faces 3"], boundary: Bool[
 
 @jax.jit
 def fmpd(first: Rough, second: Rough) -> Scalar:
-    """Fast mesh perceptual distance, 0 to 1: how much rougher one surface is than another as a whole.
+    """Compute the fast mesh perceptual distance, 0 to 1: how much rougher one surface is than another as a whole.
 
     Connectivities may differ. The metric is nearly blind to slow waves, so do not rely on it alone for a mark of low
     frequencies.

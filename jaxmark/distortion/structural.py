@@ -43,7 +43,7 @@ _MAX_WINDOWS = 20_000  # in larger meshes, windows are around this number of ran
 
 @jax.jit
 def curvature_tensor(x: Positions, hinges: Hinges, balls: Neighbourhoods) -> Tensors:
-    """The tensor T = 1/(πr²) Σ β_e/|e| e eᵀ over the pieces e of edges in the ball around each vertex.
+    """Return the tensor T = 1/(πr²) Σ β_e/|e| e eᵀ over the pieces e of edges in the ball around each vertex.
 
     β_e is the dihedral angle. As in MEPP2, whose values are published, it is computed by the inverse sine, and so at
     most π/2 however sharp the edge is, and edges across the direction of the search from the centre do not count. The
@@ -66,7 +66,7 @@ def curvature(tensor: Tensors) -> PerVertex:
 
 
 def _eigenvalues(matrix: Tensors) -> Positions:
-    """Eigenvalues of symmetric matrices, in closed form (Smith, Communications of the ACM 4, 1961).
+    """Compute the eigenvalues of symmetric matrices, in closed form (Smith, Communications of the ACM 4, 1961).
 
     LAPACK is avoided, for the determinant, too: on processors, several of its batched calls at once can deadlock.
     """
@@ -86,7 +86,7 @@ def _eigenvalues(matrix: Tensors) -> Positions:
 
 @jax.jit
 def tensor_distance(original: Tensors, distorted: Tensors) -> Scalar:
-    """Change of curvature in size and direction, 0 to 1: the cubic mean of ‖T - T'‖/(‖T‖ + ‖T'‖ + ε) over vertices.
+    """Compute the change of curvature in size and direction, 0 to 1: the cubic mean of ‖T - T'‖/(‖T‖ + ‖T'‖ + ε) over vertices.
 
     This follows TPDM (Torkhani, Wang, Chassery, "A curvature-tensor-based perceptual quality metric for 3D triangular
     meshes", Machine Graphics & Vision 2014) in comparing tensors relative to their size, but has none of its visibility
@@ -165,7 +165,7 @@ def _views(
 
 @jax.jit
 def local_msdm2(original: Originals, distorted: Positions, views: Views) -> Float[Array, " centres"]:
-    """Distortion at each centre of the views, from 0 to 1: (L + C + S/2)/2.5, averaged over scales.
+    """Compute the distortion at each centre of the views, from 0 to 1: (L + C + S/2)/2.5, averaged over scales.
 
     L, C and S are the differences of curvature, contrast and structure; arguments are those of `msdm2`.
     """
@@ -175,7 +175,7 @@ def local_msdm2(original: Originals, distorted: Positions, views: Views) -> Floa
 
 @jax.jit
 def msdm2(original: Originals, distorted: Positions, views: Views) -> Scalar:
-    """Multiscale structural distortion of a mesh, from 0 to 1; not symmetric. Connectivities may differ.
+    """Compute the multiscale structural distortion of a mesh, from 0 to 1; not symmetric. Connectivities may differ.
 
     The views are those that `msdm2_views` prepares, for these positions or others near them.
     """
@@ -184,7 +184,7 @@ def msdm2(original: Originals, distorted: Positions, views: Views) -> Scalar:
 
 @jax.jit
 def msdm(original: Positions, distorted: Positions, views: Views) -> Scalar:
-    """Structural distortion of a mesh at one scale, from 0 to 1; connectivities must be the same.
+    """Compute the structural distortion of a mesh at one scale, from 0 to 1; connectivities must be the same.
 
     By the paper's equations, the local distortion is ((L³ + C³ + S³/2)/2.5)^(1/3), from the differences of curvature L,
     contrast C and structure S, and the global one the cubic mean of local ones. The views are those that `msdm_views`
@@ -195,7 +195,7 @@ def msdm(original: Positions, distorted: Positions, views: Views) -> Scalar:
 
 
 def _compared(original: Array, distorted: Array, views: Views, offset: float) -> tuple[Array, Array, Array]:
-    """Contributions of curvature, contrast and structure, `[scales, centres]` each."""
+    """Compute the contributions of curvature, contrast and structure, `[scales, centres]` each."""
     share = jnp.asarray(views.share).astype(distorted.dtype)
     closest = einsum("vk,vkc->vc", share, original[views.corners])
 
@@ -217,7 +217,7 @@ def _contributions(
     sigma: float | np.ndarray | Scalar,
     offset: float,
 ) -> tuple[PerVertex, ...]:
-    """Differences of curvature, contrast and structure in the window of each vertex, as SSIM has them of images.
+    """Compute the differences of curvature, contrast and structure in the window of each vertex, as SSIM has them of images.
 
     Each is relative to its size plus an offset. Curvatures and positions are those of both meshes at the distorted
     mesh's vertices; points are weighted by a Gaussian of width `sigma` of their distance from the centre.

@@ -1,7 +1,7 @@
-"""Evaluation: what a mark survives, by robustness curves and by studies with controls, and how strong it should be.
+"""Evaluation of marks: robustness curves, studies with controls, and tuning of the strength.
 
-`pictures` draws their results; `tune` chooses the strengths of the bands for the attacks that a mark
-must survive, `tune_blind` width and step of a mark that is read without the original.
+`pictures` draws the results. `tune` chooses the strengths of the bands for the attacks that a mark must survive;
+`tune_blind` chooses the width and the step of a blind mark.
 """
 
 from jaxmark.evaluation._rates import Control as Control

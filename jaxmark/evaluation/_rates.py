@@ -24,13 +24,13 @@ class Row(NamedTuple):
     strength: float
     unit: str  # unit of the strength
     seed: int  # seed of key, message and attack
-    control: Control  # read: the mark with its key, the unmarked mesh with that key, or the mark with another key
-    read: bool  # the exact message was read, and its tag fits
-    wrong: bool  # another message was read, whose tag fits
+    control: Control  # the mark with its key; or the unmarked mesh with that key, or the mark with another key
+    read: bool  # whether the exact message was read, and its tag matches
+    wrong: bool  # whether another message was read, whose tag matches
     bit_errors: float  # share of the message's bits that are wrong in the best guess; 1/2 if there is no guess
     log10_p: float  # log10 of a bound on the false-positive probability, with the message unknown
     log10_p_unfloored: float  # the same without its floor at -77, see `Detection`
-    detected: bool  # log10_p is at most `LOG10_LEVEL`
+    detected: bool  # whether log10_p is at most `LOG10_LEVEL`
     refusal: str  # a sentence that says why nothing could be read; empty otherwise
     seconds: float  # duration of the reading, with the alignment unless the row before includes it
     rms: float  # RMS displacement by the mark over the diagonal; 0 without a mark

@@ -20,8 +20,8 @@ from jaxmark.watermark.markers import Marker
 class Outcome(NamedTuple):
     """The reading of one suspect, compared with the message that was written."""
 
-    read: bool  # the exact message was read, and its tag fits
-    wrong: bool  # another message was read, whose tag fits
+    read: bool  # whether the exact message was read, and its tag matches
+    wrong: bool  # whether another message was read, whose tag matches
     bit_errors: float  # share of the message's bits that are wrong in the best guess; 1/2 if there is no guess
     log10_p: float  # log10 of a bound on the false-positive probability, with the message unknown
     log10_p_unfloored: float  # the same without its floor at -77, see `Detection`
@@ -35,7 +35,7 @@ class Robustness(NamedTuple):
     bit_errors: Float64[np.ndarray, "strengths samples"]  # see `Outcome`
     log10_p: Float64[np.ndarray, "strengths samples"]  # see `Outcome`
     log10_p_unfloored: Float64[np.ndarray, "strengths samples"]
-    refusals: tuple[tuple[str, ...], ...]  # `[strengths][samples]`; a sentence, empty where there is an answer
+    refusals: tuple[tuple[str, ...], ...]  # `[strengths][samples]`; the reason of a refusal, or an empty string
 
 
 class Trial(NamedTuple):
@@ -54,7 +54,7 @@ class Breaking(NamedTuple):
     curve: tuple[Trial, ...]  # all trials, weak ones first
 
     def cost(self, metric: str) -> float:
-        """The attack's distortion over the mark's own, by a metric (a field of `Comparison`) that was measured.
+        """Return the attack's distortion over the mark's own, by a metric (a field of `Comparison`) that was measured.
 
         It is infinite if the attack does not succeed, and NaN if its distortion is unknown or the mark has none.
         """
@@ -156,7 +156,7 @@ def minimum_distortion(
 
     def detects(strength: float) -> bool:
         log10_p, suspect = 0.0, attack(marked, kind, strength, seed=seed)
-        with suppress(JaxmarkError):  # what cannot be aligned is not detected
+        with suppress(JaxmarkError):  # a suspect that cannot be aligned is not detected
             log10_p = marker.detect(suspect, message).log10_p
         trials.append(Trial(strength, compare(marked, suspect, metrics), log10_p))
         return log10_p <= math.log10(alpha)

@@ -1,6 +1,6 @@
-"""Strengths per band that leave most after the worst of several attacks, for given channels.
+"""Optimal strengths per band for the worst of several attacks, for given channels.
 
-The problem is concave: `allocate` solves it and is differentiable, `upper_bound` says how much better other strengths
+The problem is concave. `allocate` solves it and is differentiable; `upper_bound` bounds how much better other strengths
 could be. This is the only module that imports jaxopt, and only when it is called.
 """
 
@@ -36,7 +36,7 @@ def allocate(
     steps: int = 500,
     start: Bands | None = None,
 ) -> Bands:
-    """Strengths per band that maximise the worst attack's margin under Σ_j cost_j β_j² = budget²; traceable.
+    """Compute the strengths per band that maximise the worst attack's margin under Σ_j cost_j β_j² = budget²; traceable.
 
     The problem is solved by projected gradients for the bands' shares of the budget, which lie on a simplex cut off at
     `cap`, so that the budget is met exactly. The worst margin is an annealed soft minimum, whose gap to the minimum is
@@ -111,15 +111,15 @@ def minimise(
     """Minimise a function over a convex set by projected gradients; call it in compiled code, because jaxopt retraces.
 
     Args:
-        loss: function of a point and of `data`, by which jaxopt differentiates its solution; a closure's values do not
-            count.
+        loss: function of a point and of `data`. jaxopt differentiates the solution with respect to `data`, but not with
+            respect to variables that the function closes over.
         project: projection onto the set.
         start: a point of the set.
         data: keyword arguments of `loss`.
         options: options of `jaxopt.ProjectedGradient`.
     """
     with warnings.catch_warnings():
-        # It says at import that nobody maintains it; no maintained library solves constrained problems in JAX.
+        # jaxopt warns at import that it is not maintained; no maintained library solves constrained problems in JAX.
         warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
         import jaxopt
     with jax.numpy_dtype_promotion("standard"):  # jaxopt mixes integers into its floats
@@ -147,7 +147,7 @@ def _capped_simplex(x: Bands, cap: float) -> Bands:
 def upper_bound(
     channels: Channels, cost: Float[Array | np.ndarray, " bands"], *, cap: float = 1.0, margin: Margin = "rate"
 ) -> float:
-    """Upper bound on the worst attack's margin over all strengths with Σ_j cost_j β_j² ≤ 1; host side, in float64.
+    """Compute the upper bound on the worst attack's margin over all strengths with Σ_j cost_j β_j² ≤ 1; host side, in float64.
 
     By weak duality: for weights w ≥ 0, Σ_a w_a = 1 of the attacks and a price μ ≥ 0 of the budget, the worst margin is
     at most μ + Σ_j max_p [Σ_a w_a m_aj(p) - μ cost_j p] over 0 ≤ p ≤ cap/cost_j, whatever w and μ are. The search is
@@ -165,13 +165,13 @@ def upper_bound(
         return half * {"rate": np.log2(1 + snr), "evidence": snr / (1 + snr), "snr": snr}[margin]
 
     def rising(shares: np.ndarray) -> np.ndarray:
-        """The derivative of `worth`."""
+        """Return the derivative of `worth`."""
         snr = slope * shares
         each = {"rate": 1 / (1 + snr) / np.log(2), "evidence": 1 / (1 + snr) ** 2, "snr": np.ones_like(snr)}
         return half * slope * each[margin]
 
     def spent(weights: np.ndarray, price: float) -> np.ndarray:
-        """The share of each band that is best at a price."""
+        """Return the share of each band that is best at a price."""
         low, high = np.zeros(len(cost)), np.full(len(cost), min(cap, 1.0))
         for _ in range(60):
             middle = (low + high) / 2
@@ -191,7 +191,8 @@ def upper_bound(
     even = worth(np.full(len(cost), 1 / len(cost))).sum(axis=1)
     start = np.append(np.zeros(len(gain)), np.log(max(even.min(), 1e-300)))
     best = np.inf
-    # The bound holds at every trial, so the least of all counts; a kink of it can stop a search, so it starts again.
+    # The bound holds at every trial, so that the least value of all is a bound. It is not smooth, so that a search may
+    # stop early and is started again.
     for _ in range(20):
         found = optimize.minimize(bound, start, jac=True, method="L-BFGS-B", options={"maxiter": 500})
         improved, best, start = found.fun < best * (1 - 1e-6), min(best, float(found.fun)), found.x
@@ -207,7 +208,7 @@ def balance(
     cap: float,
     start: Float[np.ndarray, " bands"] | None,
 ) -> tuple[Float64[np.ndarray, " bands"], Float64[np.ndarray, " limits"]]:
-    """Strengths within several limits at once, and the weights of the single budget that has the same solution.
+    """Compute the strengths within several limits at once, and the weights of the single budget that has the same solution.
 
     Any weighted mean of the limits is a weaker bound than all of them together. The weights for which its solution
     keeps all limits are found by raising those of limits that are exceeded.

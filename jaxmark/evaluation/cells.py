@@ -1,6 +1,6 @@
-"""Run the cells of a study on many workers; a file gets a line for each finished cell, so that a killed run resumes.
+"""Run the cells of a study on many workers; each finished cell is appended to a file, from which a killed run resumes.
 
-Any `concurrent.futures` executor will do: processes here, or the workers of Dask, Ray or MPI.
+Workers are those of any `concurrent.futures` executor: local processes, or the workers of Dask, Ray or MPI.
 """
 
 import json
@@ -21,19 +21,19 @@ from jaxmark.files.atomic import read_file
 Cell = tuple[str | int | float, ...]  # values that JSON keeps as they are
 Row = Mapping[str, Any]
 Pool = Callable[[], AbstractContextManager[Executor]]
-_MAX_BROKEN_POOLS = 3  # in a row, without finishing a cell
+_MAX_BROKEN_POOLS = 3  # most pools that may break one after another without finishing a cell
 
 
 def processes(workers: int, begin: Callable[[], object] | None = None) -> Callable[[], ProcessPoolExecutor]:
-    """Return a maker of pools of processes, which are spawned because forks of a started JAX would hang.
+    """Return a function that makes pools of processes, which are spawned because forks of a running JAX would hang.
 
-    Each process calls `begin`, a function at the top level of a module, before its first work.
+    Each process first calls `begin`, a function at the top level of a module.
     """
     return lambda: ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin, (begin,))
 
 
 def _begin(begin: Callable[[], object] | None) -> None:
-    """Have this process end when the one that spawned it is killed: it would wait for work forever."""
+    """Let this process end when its parent is killed; otherwise it would wait for work forever."""
     if (parent := multiprocessing.parent_process()) is not None:
         threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
     if begin is not None:
@@ -45,20 +45,21 @@ def run(
     work: Callable[[Cell], Row],
     pool: int | Pool,
     output: str | os.PathLike[str],
-    say: Callable[[str], None] = lambda line: None,
+    log: Callable[[str], None] = lambda line: None,
     name: Callable[[Cell], str] = lambda cell: "",
 ) -> list[dict[str, Any]]:
-    """Work on the cells that are not finished, with a new pool whenever one breaks.
+    """Compute the cells that are not finished, with a new pool whenever one breaks.
 
     Args:
         cells: the cells, each once; they identify their rows.
-        work: function from a cell to its results, which JSON can hold; at the top level of a module if the workers are
-            processes.
-        pool: number of processes, where 1 is this one; or a function that makes an executor, called again when one
-            breaks, as a pool does when a process is killed.
-        output: file of JSON lines, `{"cell": [...], ...}`, each written to disk at once. It may hold other cells, too.
-        say: function that is called with a line about the progress after each cell.
-        name: the name of a cell in such a line.
+        work: function from a cell to its results, which must be JSON values; it must be at the top level of a module if
+            the workers are processes.
+        pool: number of processes, where 1 is this process; or a function that makes an executor. It is called again
+            when an executor breaks, for example because a process is killed.
+        output: file of JSON lines, `{"cell": [...], ...}`; each line is written to disk at once. The file may contain
+            other cells, too.
+        log: callback, called with a line about the progress after each cell.
+        name: function that names a cell in such a line.
 
     Returns:
         The rows of the cells in their order, including those of earlier runs.
@@ -82,8 +83,8 @@ def run(
                         broken, missing = 0, missing - 1
                         pace = (time.monotonic() - start) / (count - missing)
                         done = f"{len(cells) - missing}/{len(cells)} {name(futures[future])}".rstrip()
-                        say(f"{done}, {left_over(missing * pace)}")
-                except BaseException:  # an interruption, too: cells that have not begun do not begin
+                        log(f"{done}, {left_over(missing * pace)}")
+                except BaseException:  # also an interruption: cells that have not begun are cancelled
                     executor.shutdown(wait=False, cancel_futures=True)
                     raise
         except BrokenExecutor as error:
@@ -93,7 +94,7 @@ def run(
                 raise JaxmarkError(
                     f"{broken} pools of workers broke without finishing a cell of {missing}{first}: {error}"
                 ) from None
-            say(f"{error} A new pool goes on.")
+            log(f"{error} A new pool continues.")
         rows = _finished_rows(target)
     return [rows[cell] for cell in cells]
 
@@ -103,7 +104,7 @@ def _finished_rows(output: Path) -> dict[Cell, dict[str, Any]]:
 
 
 def left_over(seconds: float) -> str:
-    """How long work still takes, in words: seconds, minutes or hours."""
+    """Express the remaining time in words: seconds, minutes or hours."""
     for unit, size in (("h", 3600), ("min", 60)):
         if seconds >= 2 * size:
             return f"about {seconds / size:.0f} {unit} left"
@@ -111,10 +112,10 @@ def left_over(seconds: float) -> str:
 
 
 def load_finished(output: str | os.PathLike[str]) -> list[dict[str, Any]]:
-    """Load the rows of a file; a last line that a killed run left incomplete is cut off.
+    """Load the rows of a file; an incomplete last line of a killed run is removed.
 
     Raises:
-        JaxmarkError: if the file cannot be read, or a line is no row.
+        JaxmarkError: if the file cannot be read, or a line is not a row.
     """
     path = Path(output)
     try:
@@ -133,12 +134,12 @@ def _row(line: bytes, path: Path, number: int) -> dict[str, Any]:
         row = json.loads(line)
     cell = row.get("cell") if isinstance(row, dict) else None
     if not isinstance(cell, list) or not all(isinstance(value, str | int | float) for value in cell):
-        raise JaxmarkError(f"Line {number} of {path} is no row of a study; delete that line to have it done again.")
+        raise JaxmarkError(f"Line {number} of {path} is no row of a study; delete this line, and its cell is computed again.")
     return row
 
 
 def append(output: Path, row: Row) -> None:
-    """Append a row, and wait until it is on disk; a disk that is full leaves part of a line, which is cut off later.
+    """Append a row, and wait until it is on disk; if the disk is full, a part of a line may remain, which is removed later.
 
     Raises:
         JaxmarkError: if it cannot be written.

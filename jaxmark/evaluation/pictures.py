@@ -117,7 +117,7 @@ def success(curves: Mapping[str, Robustness], unit: str, *, confidence: float = 
 
 
 def band_visibility(original: Original, metrics: Sequence[Metric], bands: int = 64) -> Picture:
-    """Plot how far metrics rise per unit of displacement in each of several Jackson-damped scaling functions.
+    """Plot by how much metrics increase per unit of displacement in each of several Jackson-damped scaling functions.
 
     The values are those of `jaxmark.watermark.perception.visibility.band_visibility`; metrics are names in
     `distortion.METRICS`, or functions of your own.
@@ -144,7 +144,7 @@ def curves(rows: Sequence[Row], of: Measure = "read") -> Picture:
         of: `"read"`, the share of messages that were read, and for controls the share that was detected, with 95 %
             Clopper-Pearson intervals; or `"log10_p"`, the median with bars from the least to the largest, upwards the
             more evidence there is, and the level at which a mark counts as detected; or `"log10_p_unfloored"`, the
-            same where the bound has its floor, too, which is a line there.
+            same without the floor of the bound, which is drawn as a line.
 
     Raises:
         JaxmarkError: if matplotlib is missing.
@@ -177,7 +177,7 @@ def _draw(panel: Any, rows: Sequence[Row], names: Sequence[str], of: Measure) ->
         draw_aside(panel, line, place, len(series), len(strengths), **style)
     if len(strengths) > 1 and min(strengths) > 0:
         panel.set_xscale("log")
-    panel.margins(x=0.12, y=0.08)  # room for the markers beside the outermost strengths
+    panel.margins(x=0.12, y=0.08)  # space for the markers next to the outermost strengths
     panel.set_xticks(strengths, [f"{strength:g}" for strength in strengths], fontsize=8)
     panel.minorticks_off()
     if strengths[0] > strengths[-1]:
@@ -209,7 +209,7 @@ def _draw_level(panel: Any, log10_p: float, label: str) -> None:
 
 
 def _series(rows: Sequence[Row], names: Sequence[str]) -> list[Series]:
-    """The lines of a panel; controls, over all schemes, are last."""
+    """Return the lines of a panel; the last lines are the controls, pooled over all schemes."""
     marked: dict[str, list[dict[str, Any]]] = {}
     for rate in rates(rows, [*names, "control", "strength"]):
         if rate["control"] == "marked":

@@ -1,6 +1,6 @@
-"""Studies: what marks survive, over a declared grid of meshes, schemes, payloads, budgets, attacks and seeds."""
+"""Robustness studies over a declared grid of meshes, schemes, payloads, budgets, attacks and seeds."""
 
-from __future__ import annotations  # so that `help` shows names of types instead of what they stand for
+from __future__ import annotations  # so that `help` shows the names of type aliases, not their definitions
 
 import hashlib
 import json
@@ -36,8 +36,8 @@ from jaxmark.watermark.markers import Marker, prepare
 from jaxmark.watermark.perception.budget import Budget, BudgetLike
 from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, find_blind, get_nonblind, parameters_of
 
-_SEEDS_PER_CELL = 5  # attacked by one call
-_MAX_FILE_BYTES = 2**24  # of a TOML file
+_SEEDS_PER_CELL = 5  # most seeds of a cell, whose attacks are computed by one call
+_MAX_FILE_BYTES = 2**24  # largest size of a TOML file
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Study:
                 raise JaxmarkError(f"A payload is a positive multiple of 8 bits, got {bits!r}.")
 
     def _check_forms(self) -> None:
-        """Check that what has names has them, and what may be several is given as several."""
+        """Check that fields with names are mappings, and that fields of several values are sequences."""
         examples = {"meshes": '{"bunny": mesh}', "attacks": '{"noise": [0.005]}'}
         for name, example in examples.items():
             if not isinstance(getattr(self, name), Mapping):
@@ -113,22 +113,22 @@ class Study:
         self,
         output: str | os.PathLike[str],
         workers: int | Pool = 1,
-        say: Callable[[str], None] = lambda line: None,
+        log: Callable[[str], None] = lambda line: None,
     ) -> Results:
-        """Run the cells that are not finished, and return the results of all.
+        """Run the cells that are not finished, and return the results of all cells.
 
         Args:
-            output: file of JSON lines, which grows while the study runs. The same study resumes where it was ended, and
-                a wider one takes over the cells that both have. Cells are identified by the content of mesh files and
-                the fields of schemes, but an attack of your own by its name only.
+            output: file of JSON lines, to which each finished cell is appended. The same study resumes from it, and a
+                study with more cells reuses the finished ones. Cells are identified by the content of mesh files and
+                the fields of schemes, but an attack of your own is identified by its name only.
             workers: number of processes, where 1 is this process; or a function that makes an executor (see
                 `jaxmark.evaluation.cells`). A script that asks for more than one must do so below
                 `if __name__ == "__main__":`, because the processes import it.
-            say: function that is called with a line about the progress after each cell.
+            log: callback, called with a line about the progress after each cell.
 
         Raises:
-            JaxmarkError: if a mesh cannot be read, or the study cannot be sent to workers. A refused
-                mesh or attack does not end a study: the sentence of the refusal stands in its rows.
+            JaxmarkError: if a mesh cannot be read, or the study cannot be sent to workers. A refused mesh or attack
+                does not end a study; the reason is stored in its rows.
         """
         cells = list(dict.fromkeys(self._cells()))
         if isinstance(workers, int):
@@ -143,7 +143,7 @@ class Study:
                         " module, or use one worker."
                     ) from None
         try:
-            done = run(cells, partial(work, self), workers, output, say, self._name)
+            done = run(cells, partial(work, self), workers, output, log, self._name)
         finally:
             _marker.cache_clear()
             _mark.cache_clear()
@@ -159,12 +159,12 @@ class Study:
 
     @property
     def _budgets(self) -> dict[str, Budget]:
-        """Budgets by the names that they have in rows: `0.0008`, `hidden`, or `dame=0.008`."""
+        """The budgets by their names in rows: `0.0008`, `hidden`, or `dame=0.008`."""
         return {str(one): one for one in map(Budget.of, self.budgets)}
 
     @property
     def _attacks(self) -> dict[str, tuple[Attack, Sequence[float]]]:
-        """Attacks with their strengths, by the names that they have in rows."""
+        """The attacks with their strengths, by their names in rows."""
         attacks = {name: one if isinstance(one, Attack) else get_attack(name) for name, one in self.attacks.items()}
         own = {name: one.strengths if isinstance(one, Attack) else one for name, one in self.attacks.items()}
         return {name: (attacks[name], own[name]) for name in own}
@@ -183,7 +183,7 @@ class Study:
                     yield mesh, scheme, bits, budget, name, float(strength), *block, digest
 
     def _name(self, cell: Cell) -> str:
-        """A cell by what varies in this study, such as `noise 0.02, budget 0.0004`."""
+        """Return a cell by what varies in this study, such as `noise 0.02, budget 0.0004`."""
         mesh, scheme, bits, budget, attack, strength, *_ = cell
         names = str(mesh), str(scheme), f"{bits} bits", f"budget {budget}"
         parts = self.meshes, self.schemes, self.payloads, self.budgets
@@ -210,7 +210,7 @@ class _Point:
 
 
 def work(study: Study, cell: Cell) -> dict[str, Any]:
-    """Compute a cell: one attack at one strength for a few seeds. At the top level, where workers find it.
+    """Compute a cell: one attack at one strength for a few seeds; at the top level, so that workers can import it.
 
     For each seed, the marked suspect is read with its key and with another one, and the unmarked suspect with the key.
     """
@@ -234,7 +234,7 @@ def work(study: Study, cell: Cell) -> dict[str, Any]:
 
 
 def _attack_meshes(meshes: list[Mesh | str], attack: Attack, strength: float, seeds: list[int]) -> list[Mesh | str]:
-    """Attack meshes by one call, or one by one if any is refused; a refused mesh is replaced by the sentence."""
+    """Attack meshes by one call, or one by one if any is refused; a refused mesh is replaced by the reason."""
     there = {place: mesh for place, mesh in enumerate(meshes) if isinstance(mesh, Mesh)}
     if not there:
         return meshes
@@ -274,7 +274,7 @@ def _marker(point: _Point, seed: int) -> Marker:
 
 @lru_cache(maxsize=_SEEDS_PER_CELL)
 def _mark(point: _Point, seed: int) -> tuple[Mesh | str, float]:
-    """Mark as strongly as the budget allows, readable or not; return the mesh, or why not, and the mark's RMS."""
+    """Mark as strongly as the budget allows, readable or not; return the mesh or the reason of a refusal, and the RMS."""
     budget = replace(point.budget, noise=0.0 if point.budget.noise is None else point.budget.noise)
     message = _derive(seed, "message", point.bits // 8)
     try:
@@ -296,7 +296,7 @@ def _derive(seed: int, label: str, size: int) -> bytes:
 
 
 def _digest(mesh: str | os.PathLike[str] | Mesh) -> str:
-    """Hexadecimal hash of a file's bytes, or of a mesh's geometry."""
+    """Compute the hexadecimal hash of a file's bytes, or of a mesh's geometry."""
     if isinstance(mesh, Mesh):
         return geometry_hash(mesh).hex()
     try:

@@ -26,7 +26,7 @@ class Results:
     rows: tuple[Row, ...]
 
     def frame(self) -> Any:
-        """The rows as a `pandas.DataFrame`. Needs the extra `study`.
+        """Return the rows as a `pandas.DataFrame`. Needs the extra `study`.
 
         Raises:
             JaxmarkError: if pandas is missing.
@@ -38,14 +38,14 @@ class Results:
         return rates.rates(self.rows, by, level)
 
     def markdown(self) -> str:
-        """The rates as a Markdown table with their controls, the totals of the controls, and every refusal."""
+        """Return the rates as a Markdown table with their controls, the totals of the controls, and every refusal."""
         heads, lines = self._table()
         text = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|", *(f"| {' | '.join(line)} |" for line in lines)]
         text += ["", *(f"{said}  " for said in self._controls()), "", *(f"- {said}" for said in self._refusals())]
         return "\n".join(text).strip() + "\n"
 
     def _table(self) -> tuple[list[str], list[list[str]]]:
-        """The heads of a table of all points, and its lines."""
+        """Return the heads of a table of all points, and its lines."""
         cells: dict[tuple[Any, ...], dict[Control, dict[str, Any]]] = {}
         for rate in self.rates():
             cells.setdefault(tuple(rate[name] for name in POINT), {})[rate["control"]] = rate
@@ -61,7 +61,7 @@ class Results:
         return heads, lines
 
     def _controls(self) -> list[str]:
-        """The total of each control."""
+        """Return the total of each control."""
         return [
             f"{_LABELS[rate['control']]}: {rate['detected']}/{rate['trials']}, "
             f"95 % interval up to {100 * rate['detected_high']:.2g} %"
@@ -79,7 +79,7 @@ class Results:
         return [f"{', '.join(case[:-1])}, {count} ×: {case[-1]}" for case, count in counts.items()]
 
     def save_page(self, path: str | os.PathLike[str], title: str = "What a mark survives") -> None:
-        """Write one HTML page with pictures, table, controls and refusals, which loads nothing. Needs the extra `plot`.
+        """Write an HTML page with pictures, table, controls and refusals, without external resources. Needs `plot`.
 
         Raises:
             JaxmarkError: if matplotlib or Jinja2 is missing, or the page cannot be written.
@@ -98,7 +98,7 @@ class Results:
         )
 
     def save_csv(self, path: str | os.PathLike[str]) -> None:
-        """Write all rows as comma-separated values, the file whole or not at all.
+        """Write all rows as comma-separated values, atomically.
 
         Raises:
             JaxmarkError: if it cannot be written.

@@ -1,8 +1,9 @@
-"""Trials of marks, written, attacked and read with public signs: how much strengths are worth to the detector.
+"""Trials of strengths: marks with public signs are written, attacked and read, to measure their worth to the detector.
 
-Channels (`jaxmark.evaluation.channels`) give the best strengths for a model of attacks, limits and reader, quickly and
-with a proof. Trials leave nothing out, and `Trials.ascend` differentiates them: from strengths to the mark within its
-limits, to the part of it that each attack leaves, to the weights that the reader gives the bands, to the claim.
+Channels (`jaxmark.evaluation.channels`) give the best strengths for a model of attacks, limits and reader, fast and
+with a proof. Trials use the real attacks, limits and reader. `Trials.ascend` differentiates them: from strengths to the
+mark within its limits, to the part of it that remains after each attack, to the reader's weights of the bands, to the
+claim.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,28 +32,28 @@ from jaxmark.watermark.schemes.keyed import KeyedScheme
 
 Attack = Callable[[Mesh, int], Mesh]  # an attack of some strength on a mesh, with a seed
 
-# Numbers of the signs of marks, each of which is tried beside its opposite. Strengths are fitted to the first ones, the
-# best of several are chosen by others, and the choice is checked by others again: each is good by chance for its own.
+# Numbers of the signs of marks; each mark is tested together with its opposite. Strengths are fitted with the first
+# signs, the best of several are chosen with others, and the choice is checked with others again, to avoid overfitting.
 FITTED, CHOSEN, CHECKED = range(3, 6), range(3), range(6, 14)
-_SHARPNESS = 50.0  # of the soft minimum over attacks, over the least worth
-_SHAPES = 5  # cosines over the bands that strengths are changed by: more would fit what is chance in each band
-_STEPS, _TRIES = 5, 5  # of the gradient, and of the size of each step, before marks are tried again
-_REACH = 0.7  # logarithm of the factor by which each cosine changes strengths until then
-_LEAST_GAIN = 1.05  # of the worth of the worst attack, for which an ascent goes on
-_SURE = 3.0  # standard errors of the mean gain over marks, from which on it is no chance
-_LEAST_WORTH = 1.0  # nats or bits, of which a smaller gain is none: next to nothing is no better than nothing
+_SHARPNESS = 50.0  # sharpness of the soft minimum over attacks, relative to the least worth
+_SHAPES = 5  # number of cosines over the bands by which strengths are changed; more would overfit single bands
+_STEPS, _TRIES = 5, 5  # gradient steps, and trials of the size of each step, between two trials of marks
+_REACH = 0.7  # largest logarithm of the factor by which each cosine changes strengths between two trials
+_LEAST_GAIN = 1.05  # least ratio of improvement, of the worth after the worst attack, for which the ascent continues
+_SURE = 3.0  # least mean gain over marks, in standard errors, that counts as significant
+_LEAST_WORTH = 1.0  # least mean gain over marks, in nats or bits, that counts as an improvement
 
 
 class Trial(NamedTuple):
-    """Marks of one profile of strengths, copies of them after each attack, and their worth to the detector."""
+    """A trial: marks of one profile of strengths, attacked copies of them, and their worth to the detector."""
 
     scheme: KeyedScheme
     reader: KeyedReader
-    word: Float[Array, " code"]  # of all marks
-    signs: tuple[Int8[Array, "vertices channels"], ...]  # of each mark
+    word: Float[Array, " code"]  # codeword of all marks
+    signs: tuple[Int8[Array, "vertices channels"], ...]  # carrier signs of each mark
     scales: tuple[float, ...]  # factor on each mark's displacement, within the limits, in diagonals
-    used: Float64[np.ndarray, " limits"]  # share of each limit that the first mark uses up
-    observations: tuple[tuple[Observation, ...], ...]  # for each attack, copies of all marks, seed by seed
+    used: Float64[np.ndarray, " limits"]  # fraction of each limit that the first mark uses
+    observations: tuple[tuple[Observation, ...], ...]  # for each attack, observations of all marks, seed by seed
     worth: Float64[np.ndarray, " attacks"]
     by_signs: Float64[np.ndarray, "marks attacks"]  # worth of each mark with its opposite
 
@@ -63,13 +64,13 @@ class Trial(NamedTuple):
 
     @property
     def strengths(self) -> Float64[np.ndarray, " passing"]:
-        """Strength of each band of the pass band, in diagonals."""
+        """The strength of each band of the pass band, in diagonals."""
         return np.mean(self.scales) * np.asarray(self.reader.carrier.profile, np.float64)
 
     def surpasses(self, other: "Trial", least: float) -> bool:
-        """Whether the worst attack leaves more than of another trial of the same signs, beyond chance.
+        """Whether the worth after the worst attack is significantly larger than that of a trial with the same signs.
 
-        The factor between them must be `least` at least.
+        The ratio of the two must be at least `least`.
         """
         gains = self.by_signs.min(axis=1) - other.by_signs.min(axis=1)
         error = float(np.std(gains, ddof=1)) / len(gains) ** 0.5
@@ -78,7 +79,7 @@ class Trial(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """The worth of strengths on one original, by attacks and limits; all profiles are tried alike."""
+    """A series of trials on one original, with the same attacks and limits for all profiles of strengths."""
 
     original: Original
     bits: int
@@ -88,7 +89,7 @@ class Trials:
     margin: Margin
 
     def fits(self, scheme: KeyedScheme) -> bool:
-        """Whether the bands of a scheme have room for the payload."""
+        """Whether the capacity of a scheme's bands suffices for the payload."""
         try:
             scheme.code_length(self.original, self.bits)
         except JaxmarkError:
@@ -98,8 +99,8 @@ class Trials:
     def run(self, scheme: KeyedScheme, numbers: range = CHOSEN) -> Trial:
         """Write, attack and read marks of a scheme.
 
-        Each mark is tried with its opposite: correlations of the attacks with its signs by chance cancel, so that few
-        marks suffice to distinguish two profiles.
+        Each mark is tested together with its opposite. Chance correlations of the attacks with its signs then cancel,
+        so that few marks suffice to compare two profiles.
 
         Args:
             scheme: the scheme with its strengths.
@@ -129,10 +130,10 @@ class Trials:
         return Trial(scheme, reader, word, signs, scales, used, observations, worth, by_signs)
 
     def ascend(self, start: Trial, cost: Float64[np.ndarray, "limits bands"]) -> Trial:
-        """Change strengths along the gradient of what the worst attack leaves, as long as trials agree.
+        """Improve strengths along the gradient of the worth after the worst attack, as long as trials confirm it.
 
-        `cost` is the share of each limit, squared, that β_j² = 1 uses up in band j. The best trial is returned, which
-        is the first one if no other is better.
+        `cost` is the squared fraction of each limit that β_j² = 1 uses in band j. The best trial is returned, which is
+        the first one if no other is better.
         """
         best, found = start, self.run(self._improved(start, cost))
         while found.worst > _LEAST_GAIN * best.worst:
@@ -140,7 +141,7 @@ class Trials:
         return best
 
     def _improved(self, tried: Trial, cost: Float64[np.ndarray, "limits bands"]) -> KeyedScheme:
-        """The scheme with the strengths that are best by what is seen of others, which are not far."""
+        """Return the scheme with improved strengths, by the observations of a trial whose strengths are similar."""
         at = self.run(tried.scheme, FITTED)
         carrier, dtype = at.reader.carrier, at.word.dtype
         base = jnp.asarray(carrier.profile)
@@ -172,7 +173,7 @@ class Trials:
         signs: Sequence[Int8[Array, "vertices channels"]],
         copies: Sequence[Observation],
     ) -> Float64[np.ndarray, "seeds marks two values"]:
-        """The remainder of each mark and its opposite after an attack: S/‖a‖, or the soft decision of each bit."""
+        """Compute the remaining evidence of each mark and its opposite after an attack: S/‖a‖, or the soft decisions."""
         readers = cycle([reader.with_carrier(_with_signs(reader.carrier, one)) for one in signs])
         pairs = [(own, own.receive(one)) for one, own in zip(copies, readers, strict=False)]
         if self.margin == "rate":
@@ -183,14 +184,14 @@ class Trials:
         return np.reshape(values, (len(self.seeds), len(signs) // 2, 2, -1))
 
     def _worth(self, values: Float64[np.ndarray, "*axes"]) -> float:
-        """The worth of such remainders in the unit of the margin."""
+        """Compute the worth of this evidence, in the unit of the margin."""
         mean = max(np.mean(values), 0)
         if self.margin == "rate":
             return float(values.shape[-1] / 2 * np.log2(1 + (mean / (np.std(values) or 1)) ** 2))
         return float(mean**2 / 2)
 
     def _used(self, written: Written) -> Float64[np.ndarray, " limits"]:
-        """The share of each limit that a mark uses up, the RMS budget's last."""
+        """Compute the fraction of each limit that a mark uses; the last is that of the RMS budget."""
         found = self._reference.measure(written.mesh, self.bounds.limits.keys())
         shares = [(found[metric] or 0.0) / limit for metric, limit in self.bounds.limits.items()]
         return np.array(shares + ([written.moved.rms / self.bounds.rms] if self.bounds.rms is not None else []))
@@ -201,23 +202,24 @@ class Trials:
 
 
 class _Copy(NamedTuple):
-    """An attacked copy of a mark, as it was observed."""
+    """The observation of an attacked mark."""
 
     observation: Observation
-    gain: Float[Array, " passing"]  # share of the mark's amplitude that the attack leaves in each band
-    signs: Int8[Array, "vertices channels"]  # of the mark
-    scale: Float[Array, ""]  # factor on its displacement
-    attack: Array  # its number
+    gain: Float[Array, " passing"]  # remaining fraction of the mark's amplitude in each band
+    signs: Int8[Array, "vertices channels"]  # carrier signs of the mark
+    scale: Float[Array, ""]  # factor on the mark's displacement
+    attack: Array  # number of the attack
 
 
 class _Limits(NamedTuple):
     cost: Float[Array, "limits passing"]  # see `Trials.ascend`
-    used: Float[Array, " limits"]  # at the strengths that were tried, over the largest
+    used: Float[Array, " limits"]  # fraction of each limit that the tested strengths use, over the largest fraction
 
     def scale(self, strengths: Float[Array, " passing"], base: Float[Array, " passing"]) -> Float[Array, ""]:
-        """Factor that brings strengths within the limits, as a share of that of the strengths that were tried.
+        """Compute the factor that brings strengths within the limits, relative to that of the tested strengths.
 
-        Limits rise as the root of the sum of what bands use up of them; the metrics themselves say where they stand.
+        By the model, a metric grows with the root of the sum of the bands' costs. Its value at the tested strengths was
+        measured.
         """
         share = jnp.sqrt((self.cost @ strengths**2) / (self.cost @ base**2))
         return 1 / jnp.max(self.used * share)
@@ -228,7 +230,10 @@ def _with_signs(carrier: KeyedCarrier, signs: Int8[Array, "vertices channels"]) 
 
 
 def _widened(observation: Observation, columns: int) -> Observation:
-    """The same with so many columns of nuisance, if it has any: the reader drops zeros, and one program serves all."""
+    """Pad the nuisance of an observation to a number of columns, so that one compiled program serves all observations.
+
+    The reader ignores columns of zeros.
+    """
     if observation.nuisance is None:
         return observation
     return observation._replace(
@@ -245,7 +250,7 @@ def _climb(
     level: Float[Array, ""],
     attacks: int,
 ) -> Float[Array, " passing"]:
-    """The strengths that leave most after the worst attack, of those that differ smoothly, and not by much."""
+    """Search for the strengths with the best worst attack, among strengths that differ smoothly and not too much."""
     base = jnp.asarray(reader.carrier.profile)
     places = (np.arange(len(base)) + 0.5) / len(base)
     shapes = jnp.asarray(np.cos(np.pi * np.outer(places, np.arange(1, _SHAPES + 1))), base.dtype)
@@ -255,7 +260,7 @@ def _climb(
         left = limits.scale(strengths, base) * strengths - base
 
         def ratio(copy: _Copy) -> Array:
-            """S/‖a‖, where noise and what happened to the host stay as they were."""
+            """Compute S/‖a‖ for changed strengths; the noise and the changes of the host stay the same."""
             carrier = _with_signs(reader.carrier, copy.signs)
             moved = copy.scale * carrier.with_bands(copy.gain * left).displacement(word)
             changed = reader.with_carrier(carrier.with_bands(strengths))

@@ -1,8 +1,8 @@
-"""Choose the strengths of bands, or the width and the step of a blind mark, for the worst of several attacks.
+"""Tuning: choose the strengths of bands, or the width and the step of a blind mark, for the worst of several attacks.
 
-`tune` measures what attacks leave of each band of a mesh, solves for the strengths that are best for these channels,
-with a proof of how good they are, and goes on from there, or from the scheme's default strengths, by trials with the
-detector itself. `tune_blind` compares all widths and steps that a budget allows.
+`tune` measures the channels of the attacks: how much of each band of a mark remains. It solves for the best strengths
+for these channels, with a proof of how good they are. From these strengths, or from the scheme's default strengths, it
+continues by trials with the detector. `tune_blind` compares all widths and steps that a budget allows.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -43,37 +43,37 @@ from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, DEFAULT_SCHEME, fi
 
 Attacker = tuple[Kind, float] | Callable[[Mesh, int], Mesh]  # an attack and a strength, or (mesh, seed) → mesh
 
-_LOW_PASS = (1 / 8, 1 / 4)  # shares of the spectrum that are tried with equal strengths
-_PUBLIC_KEY = bytes(32)  # of blind marks: predictions hardly depend on the key
-_LEAST_GAIN = 1.2  # of what the worst attack leaves by the scheme's own strengths, for which others are returned
+_LOW_PASS = (1 / 8, 1 / 4)  # lowest fractions of the spectrum that are tested with equal strengths
+_PUBLIC_KEY = bytes(32)  # key of the predictions of blind marks, which hardly depend on it
+_LEAST_GAIN = 1.2  # least ratio of improvement over the scheme's own strengths, for which others are returned
 
 
 class Report(NamedTuple):
-    """How well the tuned strengths do, and how much better any others could.
+    """A report on the quality of tuned strengths, with a bound on the quality of all others.
 
-    Channels are a model of attacks, limits and reader, in which a solution comes with a proof. Trials of the detector
-    on marks, written within the limits and attacked, decide.
+    The bound is for channels, which are a model of attacks, limits and reader. The decision is made by trials, in which
+    marks are written within the limits, attacked and read.
     """
 
     margins: Float64[np.ndarray, " attacks"]  # margin of the channels' best strengths after each attack
     bound: float  # upper bound on the worst margin, by the channels, of any strengths within the budget
     gap: float  # (bound - worst margin) / bound
     binding: Mapping[str, float]  # weights of the limits in the channels' budget
-    trials: Float64[np.ndarray, " attacks"]  # what the detector has of the tuned strengths after each attack
-    channel_trials: Float64[np.ndarray, " attacks"]  # the same of the channels' best; 0 if the payload does not fit
-    default_trials: Float64[np.ndarray, " attacks"]  # the same of the scheme as `embed` takes it
+    trials: Float64[np.ndarray, " attacks"]  # worth of the tuned strengths to the detector after each attack
+    channel_trials: Float64[np.ndarray, " attacks"]  # the same for the channels' best strengths; 0 if the payload does not fit
+    default_trials: Float64[np.ndarray, " attacks"]  # the same for the scheme with the strengths that `embed` uses
     default_kept: (
         bool  # whether no strengths were better than those of the scheme as `embed` takes it, which is returned
     )
 
 
 class Tuned(NamedTuple):
-    """Strengths per band that are tuned to a mesh."""
+    """A scheme with strengths per band that are tuned to a mesh."""
 
-    scheme: KeyedScheme  # has the strengths as its profile; `embed` takes it
+    scheme: KeyedScheme  # the scheme for `embed`, with the strengths as its profile
     beta: Float64[np.ndarray, " bands"]  # the strengths in diagonals, within the limits
     channels: Channels  # of the attacks, as measured
-    cost: Float64[np.ndarray, "limits bands"]  # share of each limit, squared, that β_j² = 1 uses up
+    cost: Float64[np.ndarray, "limits bands"]  # squared fraction of each limit that β_j² = 1 uses
     detector_weights: Float64[np.ndarray, "attacks bands"]  # matched to each attack: gain · β / noise
     report: Report
 
@@ -93,26 +93,26 @@ def tune(
 ) -> Tuned:
     """Tune the strengths of a scheme's bands to a mesh, a set of attacks and a budget.
 
-    Each attack's channel is measured from a probe that spends equal shares of the budget in all bands. Limits on other
-    metrics than RMS displacement count as quadratic in the strengths, with the measured visibility of each band. The
-    strengths that are best by this model have a proof, but the model simplifies limits, attacks and reader. So marks of
-    them, of the scheme's own strengths in the adaptive pass band, and of low-pass filters are written within the real
-    limits, attacked and read. The best ones are improved by the gradient of the detector's margin after the worst
-    attack, as long as trials with other signs and seeds agree (`jaxmark.evaluation.trials`). If the scheme's own
-    strengths are as good, they are returned.
+    Each attack's channel is measured with a probe that uses an equal share of the budget in all bands. Limits on
+    metrics other than the RMS displacement are modelled as quadratic in the strengths, with the measured visibility of
+    each band. For this model, the best strengths are proven, but the model simplifies limits, attacks and reader.
+    Therefore three kinds of strengths are compared by trials within the real limits: these strengths, the scheme's own
+    strengths in the adaptive pass band, and low-pass profiles. The best of them are improved by the gradient of the
+    detector's margin after the worst attack, as long as trials with other signs and seeds confirm the improvement
+    (`jaxmark.evaluation.trials`). If the scheme's own strengths are as good, they are returned.
 
     Args:
         mesh: the original.
         attacks: the attacks to survive: pairs of a name in `ATTACKS`, or an `Attack`, and a strength; or functions of
             mesh and seed.
         budget: see `embed`.
-        seed: of the attacks' random choices, a whole number or a JAX random key; not secret.
+        seed: seed of the attacks' random choices, a whole number or a JAX random key; it need not be secret.
         bits: size of the payload in bits.
         scheme: the scheme whose bands are tuned; its profile is replaced.
         samples: number of times that each attack is tried; measurements are averaged.
-        margin: what the worst attack should leave: `"evidence"`, for a claimed message, or `"rate"`, for a message that
-            is to be read; see `jaxmark.evaluation.channels.margins`. Trials have S²/2‖a‖² in nats of the claim, or the
-            bits that the soft decisions of joint decoding transmit.
+        margin: the quantity to maximise after the worst attack: `"evidence"`, for a claimed message, or `"rate"`, for a
+            message that is to be decoded; see `jaxmark.evaluation.channels.margins`. Trials measure S²/2‖a‖² of the
+            claim, in nats, or the bits that the soft decisions of joint decoding transmit.
         cap: the largest share of the budget that one band gets, so that losing a band does not lose the mark.
         start: strengths to start from, such as those of an earlier tuning.
 
@@ -123,7 +123,7 @@ def tune(
     if margin not in get_args(Margin):
         raise JaxmarkError(f"The margin to tune for is one of {', '.join(get_args(Margin))}, got {margin!r}.")
     if find_blind(scheme) is not None:
-        raise JaxmarkError(f"The scheme {scheme!r} is read without the original, and has no bands; see tune_blind.")
+        raise JaxmarkError(f"The blind scheme {scheme!r} has no bands to tune; use tune_blind.")
     tunable = get_nonblind(scheme).tunable()
     original, family = make_original(mesh), tunable.family()
     bounds = Budget.of(budget).bounds(original.mesh)
@@ -163,7 +163,7 @@ def tune(
     low_pass = [tunable.with_profile((1.0,) * round(share * len(family))) for share in _LOW_PASS]
     others = [trials.run(one) for one in (solved, *low_pass) if trials.fits(one)]
     chosen = trials.ascend(max(default, *others, key=lambda one: one.worst), cost)
-    # The best of several in few trials is the best partly by chance: other marks decide.
+    # The best of several in few trials is partly the best by chance; therefore other marks decide.
     checked = {one: trials.run(one, CHECKED) for one in {default.scheme, solved, chosen.scheme} if trials.fits(one)}
     usual, best = checked[default.scheme], max(checked.values(), key=lambda one: one.worst)
     if not best.surpasses(usual, _LEAST_GAIN):
@@ -184,7 +184,7 @@ def _costs(
     mask: Float[Array, " rows *axes"] | None,
     bounds: Bounds,
 ) -> Float64[np.ndarray, "limits bands"]:
-    """Share of each limit, squared, that β_j = 1 uses up in band j."""
+    """Compute the squared fraction of each limit that β_j = 1 uses in band j."""
     whole = band_energies(original.operator, jnp.asarray(family, signs.dtype), signs, signs)
     energy = np.maximum(np.asarray(whole, np.float64) / original.used.sum(), 1e-12)
     names = list(bounds.limits)
@@ -194,16 +194,16 @@ def _costs(
 
 
 def _profile(beta: Float64[np.ndarray, " bands"]) -> tuple[float, ...]:
-    """Relative strengths, to four digits; bands below a hundredth of the strongest are set to zero."""
+    """Round relative strengths to four digits; bands below a hundredth of the strongest are set to zero."""
     relative = np.where(beta >= 0.01 * beta.max(), beta / beta.max(), 0)
     return tuple(float(f"{value:.4g}") for value in relative[: 1 + np.flatnonzero(relative)[-1]])
 
 
 class TunedBlind(NamedTuple):
-    """A blind scheme of the width and the step that are predicted to leave most after the worst attack."""
+    """A blind scheme, with the width and the step whose predicted surplus after the worst attack is largest."""
 
-    scheme: BlindScheme  # `embed` takes it; whoever reads needs no more than the scheme's name
-    worst: float  # surplus after the worst of the attacks; if it is negative, messages are not expected to read
+    scheme: BlindScheme  # the scheme for `embed`; reading needs the scheme's name only
+    worst: float  # surplus after the worst of the attacks; if it is negative, messages are not expected to be readable
     choices: tuple[tuple[float, float], ...]  # all widths and steps that the budget allows
     surplus: Float64[np.ndarray, "choices attacks"]  # in nats, see `jaxmark.watermark.blind.prediction.margin`
 
@@ -220,15 +220,16 @@ def tune_blind(
 ) -> TunedBlind:
     """Choose width and step of a blind mark for the attacks that it must survive; for other parameters see `tune`.
 
-    The original is attacked, and looked at as a suspect is; the change of its values predicts how much would be left of
-    any mark. A wide average survives more smoothing, a narrow one gives more anchors; a large step survives more noise,
-    a small one is met more exactly within the same budget. All that a budget allows are compared, by how much the
-    information that is left exceeds the needs of payload and tag. If that is negative after the worst of the attacks,
-    the mark is not expected to survive it. `scheme` is a blind scheme, whose widths and steps are compared.
+    The original is attacked, and the values of its anchors are read as in a suspect; their change predicts how much of
+    a mark would remain. A wide average survives more smoothing, a narrow one gives more anchors. A large step survives
+    more noise, a small step is realised more exactly within the same budget. All widths and steps that the budget
+    allows are compared by their surplus: the remaining information, minus the information of payload and tag. If the
+    surplus is negative after the worst attack, the mark is not expected to survive it. `scheme` is a blind scheme,
+    whose widths and steps are compared.
 
     Raises:
-        JaxmarkError: if the mesh, an attack, the budget or a number is unusable, the scheme is no blind one, or the
-            budget leaves nothing to write in.
+        JaxmarkError: if the mesh, an attack, the budget or a number is unusable, the scheme is not blind, or the budget
+            allows no width and step.
     """
     seeds = _draw_seeds("tune_blind", attacks, samples, seed)
     blind = find_blind(scheme)

@@ -35,7 +35,7 @@ def asteroid(vertices: int = 10_000, seed: int = 2) -> Mesh:
 
 
 def _radius(points: Float64[np.ndarray, "points 3"], random: np.random.Generator) -> Float64[np.ndarray, " points"]:
-    """Distance from the centre in each direction: waves of all lengths, craters with rims, and roughness."""
+    """Compute the distance from the centre in each direction: waves of all lengths, craters with rims, and roughness."""
     radius = np.ones(len(points))
     for octave in range(4):
         waves = np.sin(2.0**octave * points @ (1.6 * random.normal(size=(3, 8))) + random.uniform(0, 2 * np.pi, 8))

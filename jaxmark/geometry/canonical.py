@@ -41,7 +41,7 @@ def geometry_hash(mesh: Mesh) -> bytes:
 
 
 def grid_spacing(diagonal: float) -> float:
-    """The spacing of the grid for a bounding-box diagonal, in its units: a power of two, so that rounding is exact."""
+    """Return the spacing of the grid for a bounding-box diagonal, in its units: a power of two, so that rounding is exact."""
     return 2.0 ** math.floor(math.log2(diagonal / _CELLS))
 
 
@@ -101,7 +101,7 @@ def mix(values: UInt64[np.ndarray, "*values"]) -> UInt64[np.ndarray, "*values"]:
 
 
 def _digest(label: bytes, *arrays: ArrayLike) -> bytes:
-    """SHA-256 of a label and arrays, as little-endian float64 or int64."""
+    """Compute the SHA-256 of a label and arrays, as little-endian float64 or int64."""
     state = hashlib.sha256(label)
     for array in map(np.asarray, arrays):
         state.update(array.astype("<f8" if array.dtype.kind == "f" else "<i8").tobytes())

@@ -32,7 +32,7 @@ class Planes(NamedTuple):
 
 
 def spacings(points: Points, neighbours: int = 1) -> Float64[np.ndarray, " points"]:
-    """Mean distance of each point to the nearest others; 0 for a point alone."""
+    """Compute the mean distance of each point to the nearest others; 0 for a point alone."""
     count = min(neighbours, len(points) - 1)
     if count < 1:
         return np.zeros(len(points))
@@ -79,12 +79,12 @@ class Cloud:
         return planes(self.tree, self.points)
 
     def without_strays(self) -> "Cloud":
-        """The points that are not much further from the nearest others than most, without floaters and outliers."""
+        """Return the points that are not much further from the nearest others than most, without floaters and outliers."""
         apart = spacings(self.points, _STRAY_POINTS)
         return Cloud(self.points[apart <= _STRAY_RATIO * np.median(apart)])
 
     def anchors(self) -> tuple[Points, Points]:
-        """Random ones of the points, and unit normals there, of either side."""
+        """Compute the random ones of the points, and unit normals there, of either side."""
         chosen = np.sort(np.random.default_rng(0).permutation(len(self.points))[:_ANCHORS])
         return self.points[chosen], self.planes.normals[chosen]
 
@@ -119,7 +119,7 @@ class Cloud:
         return Samples(places, unit(np.where(outward < 0, -normals, normals)), area)
 
     def _cells(self, count: int) -> tuple[Int64[np.ndarray, " points"], float]:
-        """Number of the cell of each point, of cells so large that about `count` have points, and their size."""
+        """Compute the number of the cell of each point, of cells so large that about `count` have points, and their size."""
         chosen = np.random.default_rng(0).permutation(len(self.points))[:_COUNTED_POINTS]
         low, extent = self.points.min(axis=0), float(np.ptp(self.points, axis=0).max()) or 1.0
 

@@ -83,7 +83,7 @@ class Rings:
         return self._colours
 
     def least(self, numbers: Int64[np.ndarray, " vertices"]) -> Int64[np.ndarray, " vertices"]:
-        """The least number of each vertex and its neighbours."""
+        """Return the least number of each vertex and its neighbours."""
         found = numbers.copy()
         if len(self._neighbour):
             around = np.minimum.reduceat(numbers[self._neighbour], self._start)
@@ -92,7 +92,7 @@ class Rings:
 
 
 def _unique(colours: Colours) -> Int64[np.ndarray, " unique"]:
-    """Vertices whose colour no other vertex has."""
+    """Return the vertices whose colour no other vertex has."""
     _, first, count = np.unique(colours, return_index=True, return_counts=True)
     return first[count == 1]
 
@@ -112,7 +112,7 @@ class _Apexes:
         self._apex = apex[single]
 
     def __call__(self, corners: Int64[np.ndarray, "sides 2"]) -> Int64[np.ndarray, " sides"]:
-        """The apex of each side, or -1 where there is none, or no vertex at one of the ends."""
+        """Return the apex of each side, or -1 where there is none, or no vertex at one of the ends."""
         apex = np.full(len(corners), -1)
         known = np.flatnonzero((corners >= 0).all(axis=1))
         asked = corners[known, 0] * self._size + corners[known, 1]

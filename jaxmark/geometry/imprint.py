@@ -94,7 +94,7 @@ def restore(copy: Mesh, imprint: Imprint) -> Restored:
 
 
 def _moments(mesh: Mesh) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, "3 3"]]:
-    """Centre and covariance of a surface: unlike those of its vertices, they do not depend on what is welded.
+    """Compute the centre and covariance of a surface: unlike those of its vertices, they do not depend on what is welded.
 
     Those of a cloud are of its distinct points, as it has nothing else.
     """
@@ -143,7 +143,7 @@ def _find(
 
 
 def _poses(centre: Float64[np.ndarray, " 3"], covariance: Float64[np.ndarray, "3 3"], imprint: Imprint) -> list[Pose]:
-    """The similarities that bring the moments of a copy onto an original's, in all 24 ways that do not mirror."""
+    """Return the similarities that bring the moments of a copy onto an original's, in all 24 ways that do not mirror."""
     (size, axes), (wide, onto) = np.linalg.eigh(covariance), np.linalg.eigh(imprint.covariance)
     if not size.sum() > 0:
         return []
@@ -156,7 +156,7 @@ def _poses(centre: Float64[np.ndarray, " 3"], covariance: Float64[np.ndarray, "3
 
 
 def _distance(centre: Float64[np.ndarray, " 3"], covariance: Float64[np.ndarray, "3 3"], imprint: Imprint) -> float:
-    """Distance of two ellipsoids by their centres and widths, after one is scaled and turned like the other if needed.
+    """Compute the distance of two ellipsoids by their centres and widths, after one is scaled and turned like the other if needed.
 
     It is the smaller of the distances with that alignment and without, as a shift, a turn or a scale is no difference.
     """

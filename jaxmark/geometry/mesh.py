@@ -131,12 +131,12 @@ def weld(vertices: Float[Array | np.ndarray, "vertices 3"]) -> Weld:
 
 
 def weld_mesh(mesh: Mesh, welded: Weld) -> Mesh:
-    """The mesh of the distinct points: the same faces, as indices of points instead of vertices."""
+    """Return the mesh of the distinct points: the same faces, as indices of points instead of vertices."""
     return Mesh(np.asarray(mesh.vertices)[welded.first], welded.point[np.asarray(mesh.faces)])
 
 
 def edges(faces: Faces) -> Int64[np.ndarray, "edges 2"]:
-    """The undirected edges of the faces, sorted, as `[E, 2]` with the smaller index first.
+    """Return the undirected edges of the faces, sorted, as `[E, 2]` with the smaller index first.
 
     An edge counts once, whether one face has it, two, or more. A side of a degenerate face that joins a vertex to
     itself is no edge.
@@ -145,7 +145,7 @@ def edges(faces: Faces) -> Int64[np.ndarray, "edges 2"]:
 
 
 def sides(faces: Faces) -> tuple[Int64[np.ndarray, "sides 2"], Int64[np.ndarray, " sides"]]:
-    """The directed sides of the faces, and the corner opposite to each.
+    """Return the directed sides of the faces, and the corner opposite to each.
 
     The first sides of all faces come first, then all second sides, then all third.
     """
@@ -155,7 +155,7 @@ def sides(faces: Faces) -> tuple[Int64[np.ndarray, "sides 2"], Int64[np.ndarray,
 
 
 def face_pairs(faces: Faces) -> tuple[Int64[np.ndarray, "pairs 2"], Bool[np.ndarray, " pairs"]]:
-    """Pairs of faces that alone share an edge, each once, and whether they run along it in the same direction."""
+    """Return the pairs of faces that alone share an edge, each once, and whether they run along it in the same direction."""
     faces = np.asarray(faces, np.int64)
     start, face = faces.T.ravel(), np.tile(np.arange(len(faces)), 3)
     code = _side_codes(faces)[0].T.ravel()
@@ -173,7 +173,7 @@ def face_pairs(faces: Faces) -> tuple[Int64[np.ndarray, "pairs 2"], Bool[np.ndar
 
 
 def diagonal(mesh: Mesh) -> float:
-    """Length of the bounding-box diagonal, in the mesh's units; all distortions are relative to it.
+    """Compute the length of the bounding-box diagonal, in the mesh's units; all distortions are relative to it.
 
     The box is axis-aligned, and contains the vertices that faces use.
 
@@ -190,36 +190,36 @@ def diagonal(mesh: Mesh) -> float:
 
 
 def vertex_normals(mesh: Mesh) -> Float64[np.ndarray, "vertices 3"]:
-    """Unit normals of vertices: area-weighted means of the face normals; zero where these cancel or have no area."""
+    """Compute the unit normals of vertices: area-weighted means of the face normals; zero where these cancel or have no area."""
     corner, normals, size = np.ravel(mesh.faces), _area_vectors(mesh), len(mesh.vertices)
     return unit(np.stack([np.bincount(corner, np.repeat(column, 3), size) for column in normals.T], axis=1))
 
 
 def face_normals(mesh: Mesh) -> Float64[np.ndarray, "faces 3"]:
-    """Unit normals of faces; zero where a face has no area."""
+    """Compute the unit normals of faces; zero where a face has no area."""
     return unit(_area_vectors(mesh))
 
 
 def boundary_vertices(faces: Faces) -> Int64[np.ndarray, " boundary"]:
-    """Indices of the vertices on edges that only one face has, ascending."""
+    """Return the indices of the vertices on edges that only one face has, ascending."""
     pairs, count = _count_sides(faces)
     return np.unique(pairs[count == 1])
 
 
 def open_sides(faces: Faces) -> Bool[np.ndarray, "faces 3"]:
-    """Mask of the sides of each face that no other side runs along; side k goes from corner k to corner k + 1."""
+    """Return the mask of the sides of each face that no other side runs along; side k goes from corner k to corner k + 1."""
     codes, proper, _ = _side_codes(faces)
     _, which, count = np.unique(codes, return_inverse=True, return_counts=True)
     return (count == 1)[which.reshape(codes.shape)] & proper
 
 
 def face_areas(mesh: Mesh) -> Float64[np.ndarray, " faces"]:
-    """Area of each face."""
+    """Compute the area of each face."""
     return np.linalg.norm(_area_vectors(mesh), axis=1) / 2
 
 
 def area(mesh: Mesh) -> float:
-    """Total surface area, in squared units of the mesh."""
+    """Compute the total surface area, in squared units of the mesh."""
     return float(face_areas(mesh).sum())
 
 
@@ -239,7 +239,7 @@ def components(mesh: Mesh) -> list[Mesh]:
 
 
 def used_vertices(mesh: Mesh) -> Bool[np.ndarray, " vertices"]:
-    """Mask of the vertices that faces use; the others are no part of the surface. A cloud uses all of its points."""
+    """Return the mask of the vertices that faces use; the others are no part of the surface. A cloud uses all of its points."""
     if len(mesh.faces) == 0:
         return np.ones(len(mesh.vertices), bool)
     used = np.zeros(len(mesh.vertices), bool)
@@ -283,7 +283,7 @@ def same_connectivity(first: Mesh, second: Mesh) -> bool:
 
 
 def displacement(mesh: Mesh, suspect: Mesh, welded: Weld, length: float) -> Float64[np.ndarray, "points 3"]:
-    """Displacement of each welded point from a mesh to a suspect, divided by `length`; copies of a point are averaged.
+    """Compute the displacement of each welded point from a mesh to a suspect, divided by `length`; copies of a point are averaged.
 
     Points are welded by the mesh, not by the suspect's positions, because quantisation makes other vertices coincide. A
     point that no face uses is no part of the surface: wherever it went, it counts as unmoved.
@@ -314,14 +314,14 @@ def displacement(mesh: Mesh, suspect: Mesh, welded: Weld, length: float) -> Floa
 
 
 def _area_vectors(mesh: Mesh) -> Float64[np.ndarray, "faces 3"]:
-    """Normals of faces, as long as twice the face's area."""
+    """Compute the normals of faces, as long as twice the face's area."""
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     return cross_product(b - a, c - a)
 
 
 def cross_product(x: Float64[np.ndarray, "rows 3"], y: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3"]:
-    """The cross product row by row; four times as fast as NumPy's, which is for any axes."""
+    """Return the cross product row by row; four times as fast as NumPy's, which is for any axes."""
     return np.stack([x[:, i] * y[:, j] - x[:, j] * y[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
 
 
@@ -332,14 +332,14 @@ def unit(x: Float64[np.ndarray, "*rows 3"]) -> Float64[np.ndarray, "*rows 3"]:
 
 
 def _count_sides(faces: Faces) -> tuple[Int64[np.ndarray, "edges 2"], Int64[np.ndarray, " edges"]]:
-    """The undirected edges, sorted, and the number of face sides that each stands for."""
+    """Return the undirected edges, sorted, and the number of face sides that each stands for."""
     codes, proper, bits = _side_codes(faces)
     codes, count = np.unique(codes[proper], return_counts=True)
     return np.stack([codes >> bits, codes & ((1 << bits) - 1)], axis=1), count
 
 
 def _side_codes(faces: Faces) -> tuple[Int64[np.ndarray, "faces 3"], Bool[np.ndarray, "faces 3"], int]:
-    """A number for each undirected side, whether its ends differ, and the bits of the larger end in the number.
+    """Return a number for each undirected side, whether its ends differ, and the bits of the larger end in the number.
 
     One integer per pair sorts many times faster than rows do.
     """

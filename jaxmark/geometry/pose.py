@@ -22,16 +22,16 @@ class Pose(NamedTuple):
         return points @ np.swapaxes(self.matrix, -1, -2) + self.shift[..., None, :]
 
     def then(self, other: "Pose") -> "Pose":
-        """The composition of this map and, after it, the other."""
+        """Return the composition of this map and, after it, the other."""
         return Pose(other.matrix @ self.matrix, other.matrix @ self.shift + other.shift)
 
     def inverse(self) -> "Pose":
-        """The inverse map."""
+        """Return the inverse map."""
         matrix = np.linalg.inv(self.matrix)
         return Pose(matrix, -matrix @ self.shift)
 
     def facts(self) -> dict[str, list]:
-        """The map as values for JSON."""
+        """Return the map as values for JSON."""
         return {"matrix": self.matrix.tolist(), "shift": self.shift.tolist()}
 
     @property

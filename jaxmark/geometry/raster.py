@@ -47,7 +47,7 @@ class Raster(NamedTuple):
         return self.face >= 0
 
     def normals(self, *, smooth: bool) -> Float64[np.ndarray, "rows columns 3"]:
-        """Unit normals in the camera's directions, turned towards the eye; 0 beside the object.
+        """Compute the unit normals in the camera's directions, turned towards the eye; 0 beside the object.
 
         Args:
             smooth: whether to interpolate normals of vertices rather than to take those of faces.

@@ -29,15 +29,15 @@ class Geometry(Protocol):
     """A shape that registration aligns: the surface of a mesh, or the points of a cloud."""
 
     def anchors(self) -> tuple[Points, Points]:
-        """Points of the shape itself, and unit normals there."""
+        """Return the points of the shape itself, and unit normals there."""
         ...
 
     def closest(self, points: Points, pose: Pose = IDENTITY) -> tuple[Points, Int64[np.ndarray, " points"]]:
-        """The closest places on the shape, placed by a pose, and the face or point of each."""
+        """Return the closest places on the shape, placed by a pose, and the face or point of each."""
         ...
 
     def sample(self, count: int) -> Samples:
-        """Points all over the shape, in random order and the same at every call."""
+        """Return the points all over the shape, in random order and the same at every call."""
         ...
 
 
@@ -67,7 +67,7 @@ class Surface:
         return pose(np.asarray(closest).reshape(-1, 3)), np.asarray(face).ravel().astype(np.int64)
 
     def anchors(self) -> tuple[Points, Points]:
-        """The vertices that faces use, and unit normals there."""
+        """Return the vertices that faces use, and unit normals there."""
         used = used_vertices(self.mesh)
         return np.asarray(self.mesh.vertices)[used], vertex_normals(self.mesh)[used]
 
@@ -99,7 +99,7 @@ def sample(mesh: Mesh, count: int) -> Samples:
 def on_rim(
     mesh: Mesh, face: Int64[np.ndarray, " points"], closest: Float64[np.ndarray, "points 3"]
 ) -> Bool[np.ndarray, " points"]:
-    """Mask of the closest points on the rim of a hole, whose query points may lie beyond the rim."""
+    """Return the mask of the closest points on the rim of a hole, whose query points may lie beyond the rim."""
     rim = np.zeros(len(mesh.vertices), bool)
     rim[boundary_vertices(mesh.faces)] = True
     if not rim.any():
@@ -111,7 +111,7 @@ def on_rim(
 def barycentric(
     mesh: Mesh, face: Int64[np.ndarray, " points"], points: Float64[np.ndarray, "points 3"]
 ) -> Float64[np.ndarray, "points 3"]:
-    """Barycentric coordinates of points on faces; zeros on a face without area."""
+    """Compute the barycentric coordinates of points on faces; zeros on a face without area."""
     from trimesh import triangles
 
     with np.errstate(all="ignore"):
@@ -128,14 +128,14 @@ class Moments(NamedTuple):
 
 
 def surface_moments(corners: Corners) -> Moments:
-    """Moments of a surface."""
+    """Compute the moments of a surface."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     area = (_cross(b - a, c - a) ** 2).sum(axis=1) ** 0.5 / 2
     return _moments(area, area.sum(), (a, b, c), (3, 12))
 
 
 def volume_moments(corners: Corners) -> Moments:
-    """Moments of what a closed surface encloses: sums over the tetrahedra that its faces and the origin span.
+    """Compute the moments of what a closed surface encloses: sums over the tetrahedra that its faces and the origin span.
 
     The mass is not positive if normals point inwards; centre and covariance do not depend on that.
     """
@@ -145,7 +145,7 @@ def volume_moments(corners: Corners) -> Moments:
 
 
 def _moments(weight: Any, mass: Any, corners: tuple[Any, Any, Any], over: tuple[int, int]) -> Moments:
-    """Moments of simplices: with the sum s of n corners p, they are s/n and (ssᵀ + Σ ppᵀ)/(n(n + 1))."""
+    """Compute the moments of simplices: with the sum s of n corners p, they are s/n and (ssᵀ + Σ ppᵀ)/(n(n + 1))."""
     total = corners[0] + corners[1] + corners[2]
     centre = weight @ total / over[0] / mass
     square = sum((part.T * weight) @ part for part in (total, *corners)) / over[1] / mass
@@ -153,5 +153,5 @@ def _moments(weight: Any, mass: Any, corners: tuple[Any, Any, Any], over: tuple[
 
 
 def _cross(x: Any, y: Any) -> Any:
-    """The cross products of rows, of NumPy or traced arrays."""
+    """Return the cross products of rows, of NumPy or traced arrays."""
     return x[:, [1, 2, 0]] * y[:, [2, 0, 1]] - x[:, [2, 0, 1]] * y[:, [1, 2, 0]]

@@ -1,4 +1,4 @@
-"""Pictures of meshes and spectra by matplotlib: headless, deterministic, colour-blind safe. Extra `plot`.
+"""Pictures of meshes and spectra by matplotlib; they need no screen, and are deterministic. Needs the extra `plot`.
 
 `draw`, `draw_renderings` and the functions of spectra return a `Picture`, which notebooks show and `save` writes;
 `show` returns an interactive view of a mesh.

@@ -79,7 +79,7 @@ def spectra(original: Original, moves: Mapping[str, tuple[Mesh, Mesh]], bands: i
 def mean_squares(
     original: Original, signal: Float64[np.ndarray, "points 3"], bands: int
 ) -> Float64[np.ndarray, " bands"]:
-    """Mean square of a displacement (in diagonals) in each band, over the vertices that faces use.
+    """Compute the mean square of a displacement (in diagonals) in each band, over the vertices that faces use.
 
     Vertices are weighted by valence, as in the inner product of the bands. Values at the level of rounding are NaN.
     """

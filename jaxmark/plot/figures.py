@@ -1,4 +1,4 @@
-"""Parts that all pictures share: figures that need no screen, styles of lines, and PNG files."""
+"""Common parts of all pictures: figures that need no screen, line styles, PNG files and HTML pages."""
 
 import base64
 import io
@@ -18,8 +18,8 @@ MARKERS = "os^Dvx"
 BOUND = {"color": "black", "linestyle": "--"}  # the line of a bound that is proven, not counted
 FIELD = "cividis"  # the colour map of values on meshes
 _MARKERS_PER_LINE = 12
-_ASIDE = 0.1  # inches between series that are drawn beside each other, at most
-_ASIDE_IN_ALL = 1.5  # inches that they take of the width
+_ASIDE = 0.1  # largest distance, in inches, of series that are drawn next to each other
+_ASIDE_IN_ALL = 1.5  # largest total of these distances, in inches
 
 
 class Picture(NamedTuple):
@@ -28,7 +28,7 @@ class Picture(NamedTuple):
     figure: Any  # `matplotlib.figure.Figure`, for changes of your own
 
     def png(self) -> bytes:
-        """The picture as the bytes of a PNG file, the same each time."""
+        """Return the picture as the bytes of a PNG file, the same each time."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         self.figure.draw_without_rendering()  # colour bars find their places in the second pass
@@ -37,7 +37,7 @@ class Picture(NamedTuple):
         return buffer.getvalue()
 
     def save(self, path: str | os.PathLike[str]) -> "Picture":
-        """Write a PNG file, whole or not at all, and return the picture, which a notebook then shows, too.
+        """Write a PNG file atomically; returns the picture, so that a notebook shows it.
 
         Raises:
             JaxmarkError: if it cannot be written.
@@ -58,7 +58,7 @@ def panels(
     legend: float = 0.0,
     **options: Any,
 ) -> tuple[Any, Any]:
-    """Make a figure of panels, of which width and height are in inches, side by side.
+    """Make a figure of panels side by side; sizes are in inches.
 
     Args:
         count: number of panels.
@@ -90,10 +90,10 @@ def styles(points: int) -> Iterator[dict[str, Any]]:
 
 
 def draw_aside(axes: Any, line: Sequence[Any], place: int, count: int, points: int, **style: Any) -> None:
-    """Draw one of several lines with error bars, moved aside on the page so that all are visible.
+    """Draw one of several lines with error bars, shifted on the page so that lines do not hide each other.
 
     Args:
-        axes: matplotlib's axes, of any scale; their limits are taken from where the line is without being moved.
+        axes: matplotlib's axes, of any scale; their limits are those of the line before the shift.
         line: x, y, and the lower and upper ends of the bars.
         place: place of the line among all, from 0.
         count: number of lines.
@@ -123,13 +123,13 @@ def fill_template(package: str, name: str, **values: Any) -> str:
 
 
 def write_page(path: str | os.PathLike[str], title: str, pictures: Mapping[str, Picture], **parts: Any) -> None:
-    """Write an HTML page of pictures and tables, which loads nothing. Needs the extra `plot`.
+    """Write an HTML page of pictures and tables, without external resources. Needs the extra `plot`.
 
     Args:
         path: file for the page.
-        title: its title.
+        title: title of the page.
         pictures: pictures by their headings.
-        parts: `tables`, objects with `title`, `remark`, `heads` and `lines`; as needed `about`, a sentence below the
+        parts: `tables`, objects with `title`, `note`, `heads` and `lines`; and optionally `about`, a sentence below the
             title; `alt`, the end of each picture's description; sentences as `notes` and `refusals`; and `nowrap`,
             whether cells stay on one line.
 

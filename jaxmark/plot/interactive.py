@@ -1,4 +1,4 @@
-"""Interactive views of meshes: trimesh's viewer, an HTML page that contains three.js and needs no network."""
+"""Interactive views of meshes in HTML pages, by trimesh's viewer; they contain three.js and need no network."""
 
 import html
 import os
@@ -18,10 +18,10 @@ _PLAIN = (205, 205, 200, 255)  # the colour of a mesh without values
 class Viewer(NamedTuple):
     """An interactive view of meshes, which a notebook shows if it is the last expression of a cell."""
 
-    page: str  # HTML with nothing loaded from outside
+    page: str  # HTML without external resources
 
     def save(self, path: str | os.PathLike[str]) -> "Viewer":
-        """Write an HTML file for any browser, whole or not at all, and return the view, which a notebook then shows.
+        """Write an HTML file for any browser, atomically; returns the view, so that a notebook shows it.
 
         Raises:
             JaxmarkError: if it cannot be written.
@@ -36,10 +36,10 @@ class Viewer(NamedTuple):
 def show(*views: View | Mesh) -> Viewer:
     """Make an interactive view of meshes, which notebooks and browsers show without network.
 
-    One mesh is seen at a time; all are seen from where the mouse has turned the first. To look for a mark, call
-    `show(View("original", original.mesh), View("marked", marked), exaggerate(original, marked))`. Titles are those by
-    which meshes are chosen; values are shown as colours from 0 to the largest. Meshes keep their places relative to the
-    first one.
+    One mesh is shown at a time, and all meshes from the same side, which the mouse changes. To inspect a mark, call
+    `show(View("original", original.mesh), View("marked", marked), exaggerate(original, marked))`. Meshes are selected
+    by their titles. Values are shown as colours, from 0 to the largest value. Meshes keep their positions relative to
+    the first one.
 
     Raises:
         JaxmarkError: if matplotlib or Jinja2 is missing, there is no view, there is not one finite value for each
@@ -57,7 +57,7 @@ def show(*views: View | Mesh) -> Viewer:
     meshes = [host_mesh(view.mesh) for view in named]
     # A mesh of unit size lies between the near and the far plane of the viewer's camera.
     centre, size = np.mean(meshes[0].vertices, axis=0), diagonal(meshes[0])
-    # Without names of our own, trimesh would choose random ones.
+    # The nodes are named here, because trimesh would choose random names.
     scene = Scene(camera=Camera("camera", fov=(60, 45)))
     shown = [_present(view, len(mesh.vertices)) for view, mesh in zip(named, meshes, strict=True)]
     for place, (mesh, (colours, _)) in enumerate(zip(meshes, shown, strict=True)):
@@ -72,7 +72,7 @@ def show(*views: View | Mesh) -> Viewer:
 
 
 def _present(view: View, vertices: int) -> tuple[np.ndarray, dict[str, Any]]:
-    """The colours of the vertices, and the legend of the page: the title, and the scale of the colours of values."""
+    """Return the colours of the vertices, and the legend: the title, and the scale of the colours of values."""
     legend: dict[str, Any] = {"title": view.title, "most": "", "unit": "", "colours": []}
     if view.values is None:
         return np.tile(np.array(_PLAIN, np.uint8), (vertices, 1)), legend

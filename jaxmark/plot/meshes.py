@@ -40,9 +40,9 @@ def displacement(original: Original, moved: Mesh, title: str = "displacement") -
 def visibility(
     original: Original, moved: Mesh, title: str = "visibility: displacement over what roughness hides"
 ) -> View:
-    """Make a heat map of displacement over the displacement that roughness masks; see `roughness_masking`.
+    """Make a heat map of displacement, divided by the displacement that roughness masks; see `roughness_masking`.
 
-    The same displacement shows more where the mesh is smooth.
+    A displacement is more visible where the mesh is smooth.
 
     Raises:
         JaxmarkError: if the connectivity differs from the original's.
@@ -57,7 +57,7 @@ def _map_percent(original: Original, moved: Mesh, title: str, masked: Float[np.n
 
 
 def roughness_masking(original: Original) -> Float[Array, " rows"]:
-    """Compute the relative displacement that each point masks: roughness^0.15, averaged around it, of RMS 1.
+    """Compute the relative displacement that each point masks: roughness^0.15, averaged around it, with RMS 1.
 
     Rough regions mask displacement that is visible in smooth ones. The model is that of FMPD (Wang, Torkhani,
     Montanvert, "A fast roughness-based approach to the assessment of 3D mesh visual quality", Computers & Graphics
@@ -76,7 +76,7 @@ def roughness_masking(original: Original) -> Float[Array, " rows"]:
 
 
 def shading(original: Mesh, moved: Mesh, title: str = "visible turn of normals") -> View:
-    """Make a heat map of the turn of normals over what the original masks; see `jaxmark.distortion.visible_turn`.
+    """Make a heat map of the turn of normals, divided by the masked turn; see `jaxmark.distortion.visible_turn`.
 
     Raises:
         JaxmarkError: if the connectivity differs, or a mesh is unusable.
@@ -114,7 +114,7 @@ def draw(views: Sequence[View], *, elevation: float = 15.0, azimuth: float = 25.
 
 
 def save_views(views: Sequence[View], path: str | os.PathLike[str], **eye: float) -> None:
-    """Write the picture of `draw`, of which `eye` has the angles, to a PNG file, whole or not at all.
+    """Write the picture of `draw` to a PNG file, atomically; `eye` are keyword arguments of `draw`.
 
     Raises:
         JaxmarkError: see `draw`; also if the file cannot be written.
@@ -123,7 +123,7 @@ def save_views(views: Sequence[View], path: str | os.PathLike[str], **eye: float
 
 
 def rotation(elevation: float, azimuth: float) -> Float[np.ndarray, "3 3"]:
-    """Matrix that turns the direction of the eye, given in radians, to +z."""
+    """Return the matrix that rotates the direction of the viewer, given in radians, to +z."""
     around = np.array([[np.cos(azimuth), 0, -np.sin(azimuth)], [0, 1, 0], [np.sin(azimuth), 0, np.cos(azimuth)]])
     down = np.array([[1, 0, 0], [0, np.cos(elevation), -np.sin(elevation)], [0, np.sin(elevation), np.cos(elevation)]])
     return down @ around
@@ -137,7 +137,7 @@ def _paint(axes, view: View, turn: np.ndarray):
     corners = (np.asarray(mesh.vertices) @ turn.T)[np.asarray(mesh.faces)]
     normals = face_normals(Mesh(mesh.vertices @ turn.T, mesh.faces))
     light = np.array([0.3, 0.5, 0.8]) / np.linalg.norm([0.3, 0.5, 0.8])
-    # Soups and open surfaces have no inside: light both sides.
+    # Both sides are lit, because triangle soups and open surfaces have no inside.
     brightness = (0.35 + 0.65 * np.abs(normals @ light))[:, None]
     order = np.argsort(corners[:, :, 2].mean(axis=1), kind="stable")
     mappable, colours = None, brightness * np.array([0.80, 0.80, 0.84])

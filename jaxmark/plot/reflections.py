@@ -1,4 +1,4 @@
-"""Pictures of meshes pixel by pixel: flat and smooth shading, and the reflection of stripes, which shows every dent."""
+"""Pictures of meshes by pixels: flat and smooth shading, and reflections of stripes, which show small dents."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
@@ -14,9 +14,9 @@ from jaxmark.plot.figures import Picture, panels
 from jaxmark.plot.meshes import rotation
 
 Style = Literal["flat", "smooth", "zebra"]
-_STRIPES = 24  # dark ones all around
+_STRIPES = 24  # number of dark stripes around the mesh
 _EDGE = 0.15  # width of a stripe's soft edge, over half a stripe
-_GLOSS = 0.75  # share of the stripes in what is seen; the rest is diffuse light
+_GLOSS = 0.75  # fraction of the reflected stripes in the shading; the rest is diffuse light
 _LIGHT = LIGHTS[0]
 
 
@@ -31,11 +31,10 @@ class Rendering(NamedTuple):
 
 
 def render(rendering: Rendering, size: int = 600) -> Float64[np.ndarray, "rows columns"]:
-    """Render a mesh as gray values, 0 to 1, white beside it, with `size` pixels on each side.
+    """Render a mesh as grey values from 0 to 1 on a white background, with `size` pixels on each side.
 
-    `"flat"` and `"smooth"` are lit from the upper left; `"zebra"` is smooth and glossy and reflects bands of light that
-    run around it, as body shops and designers of surfaces inspect them: where normals turn by an angle, stripes move by
-    twice that angle.
+    `"flat"` and `"smooth"` are lit from the upper left. `"zebra"` is smooth and glossy, and reflects bands of light
+    around it, as in the inspection of car bodies: where normals turn by an angle, stripes move by twice that angle.
 
     Raises:
         JaxmarkError: if libigl is missing, or there is no such style or side.
@@ -73,9 +72,9 @@ def _camera(side: str | tuple[float, float]) -> Float64[np.ndarray, "3 3"]:
 
 
 def _stripes(raster: Raster) -> Float64[np.ndarray, "rows columns"]:
-    """The stripes that a mirror shows, by the height at which the reflected line of sight ends."""
+    """Compute the stripes that a mirror shows, from the height at which the reflected line of sight ends."""
     normals = raster.normals(smooth=True)
     # The eye is far away at +z: its line of sight is reflected to 2 (n·z) n - z.
     height = np.clip(2 * normals[:, :, 2] * normals[:, :, 1], -1, 1)
-    # Surfaces that face the eye show the middle of a stripe, so that a plane is plain.
+    # Surfaces that face the viewer show the middle of a stripe, so that a plane is uniform.
     return 0.5 + 0.5 * np.tanh(np.cos(_STRIPES * np.arcsin(height)) / _EDGE)

@@ -48,7 +48,7 @@ class Operator(Protocol):
         ...
 
     def linked(self, like: Values) -> Bool[Array, " vertices *ones"]:
-        """A mask of the vertices that have edges, to select from signals like this."""
+        """Return a mask of the vertices that have edges, to select from signals like this."""
         ...
 
     @property
@@ -64,7 +64,7 @@ class Operator(Protocol):
         ...
 
     def rows(self, like: Values) -> Rows | None:
-        """The rows of Δ - I for compiled kernels, in the dtype of `like`; None if they are not all at hand."""
+        """Return the rows of Δ - I for compiled kernels, in the dtype of `like`; None if they are not all at hand."""
         ...
 
     def enter(self, x: Values) -> Values:
@@ -151,7 +151,7 @@ class Laplacian(NamedTuple):
         return lambda x: own * x - inverse * total(x)
 
     def rows(self, like: Values) -> Rows | None:
-        """The rows of Δ - I for compiled kernels; see `Operator`."""
+        """Return the rows of Δ - I for compiled kernels; see `Operator`."""
         table, flat = self._table, like.reshape(len(like), -1)[:, 0]
         if table is None:
             return None
@@ -160,7 +160,7 @@ class Laplacian(NamedTuple):
         return Rows(table.vertices, weights, own - 1, inverse, table.rest, rest_weights, table.order)
 
     def _own(self, like: Array) -> tuple[Array, Array]:
-        """The diagonal of Δ, and the factor of the sums over neighbours, in the operator's own order."""
+        """Return the diagonal of Δ, and the factor of the sums over neighbours, in the operator's own order."""
         degree, inverse = (self.enter(rows) for rows in (per_row(self.degree, like), self.inverse_mass(like)))
         own = (degree > 0).astype(like.dtype) if self.lumped_mass is None else degree * inverse
         if self.weights is None and self._table is not None:
@@ -169,7 +169,7 @@ class Laplacian(NamedTuple):
         return own, inverse
 
     def linked(self, like: Values) -> Bool[Array, " vertices *ones"]:
-        """A mask of the vertices that have edges; see `Operator`."""
+        """Return a mask of the vertices that have edges; see `Operator`."""
         return per_row(self.degree, like) > 0
 
     def inverse_mass(self, like: Values) -> Float[Array, " vertices *ones"]:
@@ -195,14 +195,14 @@ class Laplacian(NamedTuple):
         return None if table is None or (self.weights is not None and table.edges is None) else table
 
     def _table_weights(self, table: Neighbours, like: Array) -> tuple[Array | None, Array | None]:
-        """The weights of the edges in the table's slots, and of those without a slot; None if all are 1."""
+        """Return the weights of the edges in the table's slots, and of those without a slot; None if all are 1."""
         if self.weights is None or table.edges is None:
             return None, None
         padded = jnp.append(jnp.asarray(self.weights).astype(like.dtype), 0)
         return padded[table.edges], padded[table.rest[:, 2]]
 
     def _by_table(self, table: Neighbours, like: Array) -> Callable[[Array], Array]:
-        """The map x → Wx, slot by slot; without weights, each empty slot adds the vertex's own row."""
+        """Return the map x → Wx, slot by slot; without weights, each empty slot adds the vertex's own row."""
         weights, rest_weights = self._table_weights(table, like)
         factors = [1.0] * len(table.vertices) if weights is None else [per_row(slot, like) for slot in weights]
         slots, rest = list(zip(factors, table.vertices, strict=True)), jnp.asarray(table.rest)
@@ -215,7 +215,7 @@ class Laplacian(NamedTuple):
         return total
 
     def _by_edges(self, like: Array) -> Callable[[Array], Array]:
-        """The map x → Wx by two segment-sums over the edges."""
+        """Return the map x → Wx by two segment-sums over the edges."""
         tail, head = self.edges[:, 0], self.edges[:, 1]
         weights = 1 if self.weights is None else per_row(self.weights, like)
         size = self.degree.shape[0]
@@ -304,7 +304,7 @@ def cuthill_mckee(pairs: Int[np.ndarray, "edges 2"], size: int) -> Int64[np.ndar
 
 
 def adjacency(pairs: Int[np.ndarray, "edges 2"], size: int) -> sparse.csr_array:
-    """The adjacency matrix of the edges, with the numbers of the edges as entries."""
+    """Return the adjacency matrix of the edges, with the numbers of the edges as entries."""
     pairs = pairs.astype(np.int32, copy=False)
     (tail, head), edge = np.concatenate([pairs, pairs[:, ::-1]]).T, np.tile(np.arange(len(pairs), dtype=np.int32), 2)
     return sparse.csr_array(sparse.coo_array((edge, (tail, head)), shape=(size, size)))
@@ -367,7 +367,7 @@ def sparse_matrices(operator: Laplacian) -> tuple[sparse.csr_array, sparse.dia_a
 
 
 def symmetric_matrix(operator: Laplacian) -> tuple[Int64[np.ndarray, " linked"], np.ndarray, sparse.csr_array]:
-    """The vertices that have edges, √M on them, and the symmetric form M^½ΔM^-½ of Δ on them, on the host."""
+    """Return the vertices that have edges, √M on them, and the symmetric form M^½ΔM^-½ of Δ on them, on the host."""
     stiffness, mass = sparse_matrices(operator)
     linked = np.flatnonzero(np.asarray(operator.degree) > 0)
     root = np.sqrt(mass.diagonal()[linked])
@@ -376,7 +376,7 @@ def symmetric_matrix(operator: Laplacian) -> tuple[Int64[np.ndarray, " linked"],
 
 
 def host_edges(operator: Laplacian) -> tuple[Int[np.ndarray, "edges 2"], Float64[np.ndarray, " edges"]]:
-    """The operator's edges without padding, and their weights, as NumPy arrays; weights are 1 if it has none."""
+    """Return the operator's edges without padding, and their weights, as NumPy arrays; weights are 1 if it has none."""
     pairs = np.asarray(operator.edges)
     real = pairs[:, 0] < len(operator.degree)
     weights = np.ones(len(pairs)) if operator.weights is None else np.asarray(operator.weights, np.float64)

@@ -40,7 +40,7 @@ class Linear:
         return _primitive.bind(*map(jnp.asarray, leaves), rule=self, structure=structure)
 
     def derivative(self, index: int, arguments: tuple[PyTree, ...], tangent: PyTree) -> Array:
-        """The derivative in the direction of a tangent of one argument."""
+        """Return the derivative in the direction of a tangent of one argument."""
         if index == len(arguments) - 1:
             return self(*arguments[:-1], tangent)
         if self.derivatives is not None:
@@ -53,17 +53,17 @@ class Linear:
 
 
 def along(function: Callable[[Any], Array], tree: PyTree, change: PyTree) -> Array:
-    """The derivative of a function in the direction of a change of a pytree's floating leaves."""
+    """Return the derivative of a function in the direction of a change of a pytree's floating leaves."""
     return jax.jvp(lambda part: function(combine(part, tree)), (floats(tree),), (change,))[1]
 
 
 def floats(tree: PyTree) -> PyTree:
-    """The pytree with None in place of leaves that have no derivatives."""
+    """Return the pytree with None in place of leaves that have no derivatives."""
     return jax.tree.map(lambda leaf: leaf if jnp.issubdtype(leaf.dtype, jnp.inexact) else None, tree)
 
 
 def combine(part: PyTree, whole: PyTree) -> PyTree:
-    """The pytree `whole` with its floating leaves taken from `part`, of which `floats` gives the structure."""
+    """Return the pytree `whole` with its floating leaves taken from `part`, of which `floats` gives the structure."""
     leaves = iter(jax.tree.leaves(part))
     return jax.tree.map(lambda leaf: next(leaves) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf, whole)
 
@@ -149,7 +149,7 @@ def _map(operands: Any, axes: Any, *, rule: Linear, structure: Any) -> tuple[Arr
 
 
 def _split(structure: Any, leaves: Any) -> list[tuple[Any, tuple[Any, ...]]]:
-    """The structure and the leaves of each argument."""
+    """Return the structure and the leaves of each argument."""
     parts, start = [], 0
     for tree in structure.children():
         parts.append((tree, tuple(leaves[start : start + tree.num_leaves])))

@@ -116,7 +116,7 @@ def stack(operators: Sequence[Laplacian]) -> Laplacian:
     own = np.arange(size, dtype=np.int32)
 
     def padded(table: Neighbours, edges: int) -> Neighbours:
-        """A table for a graph of more vertices, edges, slots and neighbours without a slot."""
+        """Return a table for a graph of more vertices, edges, slots and neighbours without a slot."""
         old_slots, old_size = np.shape(table.vertices)
         vertices, empty = np.tile(own, (slots, 1)), np.full(size, slots, np.int32)
         vertices[:old_slots, :old_size] = table.vertices

@@ -58,7 +58,7 @@ class Shard(NamedTuple):
         return self.interior.mass
 
     def linked(self, like: Array) -> Array:
-        """A mask of the block's vertices that have edges; see `Operator`."""
+        """Return a mask of the block's vertices that have edges; see `Operator`."""
         return self.interior.linked(like)
 
     @property
@@ -293,7 +293,7 @@ def _interior(
     degree: Float[np.ndarray, "devices rows"],
     table: bool,
 ) -> Laplacian:
-    """The Laplacians of the edges within blocks, stacked; in `pairs`, vertices are device · rows + row."""
+    """Return the Laplacians of the edges within blocks, stacked; in `pairs`, vertices are device · rows + row."""
     count, rows = degree.shape
     order = np.argsort(pairs[:, 0] // rows, kind="stable")
     pairs = pairs[order]

@@ -119,7 +119,7 @@ def _form_derivative(
 
 
 def symmetric(operator: Operator, like: Array) -> Callable[[Array], Array]:
-    """The map y → M^½ΔM^-½ y, in the vertices' order."""
+    """Return the map y → M^½ΔM^-½ y, in the vertices' order."""
     product, root = operator.product(like), jnp.sqrt(inner_mass(operator, like))
     return lambda y: root * operator.leave(product(operator.enter(y / root)))
 
@@ -202,14 +202,14 @@ def lowest_eigenpairs(operator: Operator, count: int, seed: Seed, *, dtype: Any 
 
 
 def _product(operator: Operator, like: Array) -> Callable[[Array], Array]:
-    """The map y → Ay, in which isolated vertices are the highest frequency, so that they are none of the lowest."""
+    """Return the map y → Ay, in which isolated vertices are the highest frequency, so that they are none of the lowest."""
     product, linked = symmetric(operator, like), operator.linked(like)
     return lambda y: product(y) + jnp.where(linked, 0, 2 * y)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _pairs(count: int, operator: Operator, start: Array) -> tuple[Array, Array]:
-    """The lowest eigenpairs of A = M^½ΔM^-½, one for each column of the start, of which `count` have converged."""
+    """Return the lowest eigenpairs of A = M^½ΔM^-½, one for each column of the start, of which `count` have converged."""
     product, small = _product(operator, start), 100 * jnp.finfo(start.dtype).eps
 
     def rotate(block: Array) -> tuple[Array, Array, Array]:

@@ -355,6 +355,7 @@ def detect_scene(
         bits = 8 * len(message)
     readings: dict[str, _MeshReading] = {}
     skipped: dict[str, str] = {}
+    refuted: list[str] = []
     identities: set[tuple[bytes, bytes]] = set()
     suspect_names = pair(chosen, suspects)
     for name, original in chosen.items():
@@ -363,6 +364,8 @@ def detect_scene(
                 raise JaxmarkError("No mesh of the suspect resembles it.")
             mesh_record = None if record is None else record.meshes[name]
             marker = make_marker(original, key, bits=bits, record=mesh_record, scheme=get_nonblind(scheme))
+            if message is not None and is_recorded(mesh_record, message, marker.choices) is False:
+                refuted.append(name)
             identity = marker.original.geometry, marker.original.order
             if identity in identities:
                 raise JaxmarkError("It equals another mesh, which counts once.")
@@ -373,6 +376,11 @@ def detect_scene(
         except JaxmarkError as error:
             skipped[name] = str(error).rstrip(".")
         after()
+    if refuted:
+        names = ", ".join(map(repr, refuted))
+        raise JaxmarkError(
+            f"The records of {names} commit to another message than the one claimed; claim that or none."
+        )
     if not readings:
         raise JaxmarkError(f"None of the {len(chosen)} meshes could be compared: {_reasons(skipped)}.")
     parts = {name: reading.found for name, reading in readings.items()}

@@ -24,7 +24,7 @@ from jaxmark.watermark.interfaces import Carrier, Detector, Reader, Received, Sc
 from jaxmark.watermark.perception.budget import Budget, BudgetLike, displace_within
 from jaxmark.watermark.perception.capacity import Capacity, Survival
 from jaxmark.watermark.record import Content, Record, commit, seal_imprint
-from jaxmark.watermark.schemes.registry import SCHEMES, parameters_of
+from jaxmark.watermark.schemes.registry import is_builtin, parameters_of
 
 _MIN_ORIGINAL_SHARE = 0.5  # least share of an original's points with which an edited copy is used, for an estimate
 _SAME_SHAPE = 0.01  # distance of shapes over their size; with a smaller one the mesh looks like a marked or edited copy
@@ -79,7 +79,7 @@ class Mark:
         content: Content = "message" if bits else "presence"
         choices = bind_mark(key, original, scheme, bits, content, record)
         carrier = scheme.carrier(original, choices, bits, code_bits)
-        if not isinstance(scheme, tuple(SCHEMES.values())):
+        if not is_builtin(scheme):
             caveats += (f"the scheme {scheme.name!r} is not one of this library",)
         if detector not in (None, scheme.detector):
             caveats += ("the detector is not the scheme's own",)

@@ -130,6 +130,7 @@ def read(
         np.zeros(mark.code_bits),
         mark.coverage(received.observed),
         mark.scheme.name,
+        premises=f"key, original, message and {'record' if mark.record else 'options'}",
     )
     # Rounding moves no coordinate by more than half of the grid spacing, and the fit of the pose by little more. A mark
     # that can be read moves some coordinates by more.

@@ -320,8 +320,8 @@ class TimestampedCommitment:
 
         Args:
             record: the record that the suspect was read with.
-            claimed: whether the message was claimed instead of decoded. If the record does not commit to a message, all
-                messages are then charged.
+            claimed: whether the message was claimed instead of decoded. All messages of the meshes whose records commit
+                to no message are then charged.
 
         Raises:
             JaxmarkError: if the commitment does not contain the record.
@@ -330,7 +330,8 @@ class TimestampedCommitment:
             raise JaxmarkError(
                 f"The record (digest {record.digest()}) is not in the commitment, which does not prove its age."
             )
-        free = record.bits if claimed and not record.message_commitment else 0
+        uncommitted = (part.bits for part in record.meshes.values() if not part.message_commitment)
+        free = sum(uncommitted) if claimed else 0
         return (ledger.COMMITMENT.charge("each", len(self.digests), bits=free),)
 
     def timestamp_request(self) -> bytes:

@@ -69,7 +69,7 @@ def test_networks_turn_with_the_mesh(work, mesh, x64):
 def test_what_is_learned_holds_on_other_meshes_and_is_an_attack(goal: Goal, mark, steps, mesh):
     lines, key = [], jax.random.key(0)
     meshes = [asteroid(500, seed=seed) for seed in (2, 3, 4)]
-    found = learn(meshes, [mesh], seed=key, goal=goal, bits=8, mark=mark, steps=steps, say=lines.append)
+    found = learn(meshes, [mesh], seed=key, goal=goal, bits=8, mark=mark, steps=steps, log=lines.append)
     assert found.after < 0.99 * found.before
     assert len(found.losses) == steps
     assert len(lines) == steps // 100

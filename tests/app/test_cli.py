@@ -360,7 +360,9 @@ def test_demo_leaves_tables_and_pictures(workshop: Workshop, monkeypatch):
     assert [row["control"] for row in controls] == 3 * ["unmarked", "wrong-key"]
     assert not any(row["message_read"] or row["detected"] for row in controls)
     assert told["verdict"][0].startswith("The scheme 'keyed' read the message from ")
-    assert told["verdict"][-1] == "In 6 controls, without a mark or with a wrong key, nothing was detected, as expected."
+    assert (
+        told["verdict"][-1] == "In 6 controls, without a mark or with a wrong key, nothing was detected, as expected."
+    )
     meshes = {name: loaded(f"shown/marked-{name}.ply").vertices for name in ("keyed", "host", "eigen")}
     moved = [np.linalg.norm(mesh - loaded("model.ply").vertices) for mesh in meshes.values()]
     assert moved == pytest.approx([moved[0]] * 3, rel=0.01)  # all at one displacement

@@ -388,7 +388,7 @@ def small(tmp_path: Path) -> dict:
 def test_a_run_of_ones_own_methods_is_calibrated_and_goes_on_where_it_was_ended(small: dict, plain: Path):
     said: list[str] = []
     methods = {"methods": [SIGNS, plain], "limits": ["perceptual"], "payloads": [8]}
-    found = jm.bench.run(**small, **methods, say=said.append)
+    found = jm.bench.run(**small, **methods, log=said.append)
     assert len(said) == 2 + 2 * (2 * 60 + 1 + 2) + 2
     entries = jm.bench.entries(found)
     assert set(entries) == {"signs", "plain"}
@@ -409,7 +409,7 @@ def test_a_run_of_ones_own_methods_is_calibrated_and_goes_on_where_it_was_ended(
     assert entries["signs"]["payloads"]["8"]["calibration"]["bound"][0]["trials"] == 124
     assert entries["signs"]["validated"] == "not validated"
     assert found.projected(8, 5) == pytest.approx(40 * found.seconds)
-    again = jm.bench.run(**small, **methods, say=lambda line: pytest.fail(line))
+    again = jm.bench.run(**small, **methods, log=lambda line: pytest.fail(line))
     assert jm.bench.entries(again) == entries
     assert found.paired("signs", "plain", "smi2010").both >= 1
     assert found.paired("signs", "plain", "smi2010", attacks=["none"]) != found.paired("signs", "plain", "smi2010")
@@ -609,10 +609,10 @@ def test_the_command_writes_an_entry_for_each_method_and_a_page(tmp_path: Path, 
     assert attacks["none"]["read"] == 1
     page = (output / "page.html").read_text()
     assert "http" not in page.replace("http-equiv", "")
-    assert "plain (not validated)" in page
+    assert "plain†" in page
     text = (output / "results.md").read_text()
     assert "| attack |" in text
-    assert re.search(r"\| noise 0.003 \| 1/1, BER 0.00, detected 1/1, p 10\^-\d", text)
+    assert re.search(r"\| noise 0.003 \| 1/1 0.00 1/1 -\d", text)
     assert "## smi2010, perceptual limits: distortion by the attacks" in text
     refused = subprocess.run(
         [*command[:5], "--methods", "nothing", "--output", str(output)], capture_output=True, text=True

@@ -107,7 +107,7 @@ def test_records_and_copies_belong_to_their_originals(folder: Path, key: jm.Key)
             catalogue.add_record(info.record)
         catalogue.add("large.ply")
         assert [catalogue.add_record(info.record)[0].status for _ in range(2)] == ["added", "known"]
-        with pytest.raises(jm.JaxmarkError, match="without which no copy is traced"):
+        with pytest.raises(jm.JaxmarkError, match="without which its copies cannot be traced"):
             catalogue.remove("1")
         shown = catalogue.show("1")
         assert shown["shapes"][0]["records"][0]["digest"] == info.record.digest()

@@ -109,17 +109,17 @@ def test_a_study_that_is_ended_goes_on(results, output, tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        study().run(again, say=interrupt)
+        study().run(again, log=interrupt)
     assert len(load_finished(again)) < 3
-    assert without_seconds(study().run(again, say=said.append).rows) == without_seconds(results.rows)
+    assert without_seconds(study().run(again, log=said.append).rows) == without_seconds(results.rows)
     # What is finished is not done again: the seconds are the same, too.
-    assert study().run(again, say=said.append).rows == study().run(again, say=said.append).rows
+    assert study().run(again, log=said.append).rows == study().run(again, say=said.append).rows
     assert len(said) == 3 - 1 or len(said) == 3 - 2
     # A wider study takes over what it shares, another mesh of the same name does not.
     said.clear()
-    study(attacks={"noise": [0.002]}).run(again, say=said.append)
+    study(attacks={"noise": [0.002]}).run(again, log=said.append)
     assert said == []
-    study(attacks={"noise": [0.002]}, meshes={"ball": bumpy_sphere(3, seed=1)}, samples=1).run(again, say=said.append)
+    study(attacks={"noise": [0.002]}, meshes={"ball": bumpy_sphere(3, seed=1)}, samples=1).run(again, log=said.append)
     assert len(said) == 1
 
 

@@ -37,7 +37,13 @@ MARKS = dict.fromkeys(
 )
 MARKS |= dict.fromkeys(("docs/blind.md", "docs/how-to/strength.md"), pytest.mark.long)  # which tune
 # These have tests of their own.
-APART = ("README.md", "docs/robustness.md", "docs/how-to/arrays.md", "docs/how-to/recipients.md", "docs/how-to/study.md")
+APART = (
+    "README.md",
+    "docs/robustness.md",
+    "docs/how-to/arrays.md",
+    "docs/how-to/recipients.md",
+    "docs/how-to/study.md",
+)
 COMMANDS = {"README.md": 4, "docs/reference/command_line.md": 19}
 SAMPLED = re.compile(r"^ *```python\n(.*?)^ *```\n(?:\n```text\n(.*?)^```)?", re.DOTALL | re.MULTILINE)
 NUMBER = re.compile(r"-?\d+(\.\d+)?")

@@ -30,7 +30,9 @@ def test_pictures_are_what_their_sources_draw(front: ModuleType, drawn: ModuleTy
     assert front.PICTURES.keys() <= before.keys()
     assert before.keys() == {path.name for path in FOLDER.glob("*.png")}
     stale = [name for name, hashes in before.items() if hashes != drawn.hashes(name)]
-    assert not stale, f"draw {', '.join(stale)} anew: make pictures, and make looks for those of docs/results/visibility.md"
+    assert not stale, (
+        f"draw {', '.join(stale)} anew: make pictures, and make looks for those of docs/results/visibility.md"
+    )
 
 
 def test_what_has_changed_is_seen(drawn: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -32,6 +32,7 @@ from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Detection, Evidence, Tag, weigh
 from jaxmark.watermark.evidence.ledger import Choice
 from jaxmark.watermark.record import Record, is_recorded
+from jaxmark.watermark.schemes.registry import is_builtin
 
 TAG_BITS = 40
 _CODE_SPREAD = 4  # least number of code bits per bit of message and tag: few anchors then share a code bit
@@ -261,9 +262,15 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
     agreement = float(score[chosen] / reading.anchors)
     return _nothing(scheme, reading.soft, reading.anchored._replace(agreement=agreement))._replace(
         message=None if decoded is None else decoded.message,
-        evidence=weigh(ways, bits=bits, fixed=fixed, tag=tag, charges=charges, looks=looks),
+        premises=f"key, message and {'options' if record is None else 'record'}",
+        evidence=weigh(ways, bits=bits, fixed=fixed, tag=tag, charges=charges, looks=looks, caveats=_caveats(scheme)),
         notes=tuple(notes),
     )
+
+
+def _caveats(scheme: BlindScheme) -> tuple[str, ...]:
+    """Return why readings with a scheme prove nothing, if so."""
+    return () if is_builtin(scheme) else (f"the scheme {scheme.name!r} is not one of this library",)
 
 
 def _nothing(scheme: BlindScheme, soft: Float64[np.ndarray, " code"], anchored: Anchored) -> Detection:

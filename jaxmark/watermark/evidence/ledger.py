@@ -7,8 +7,8 @@ with. The ledger gives each alternative a share of the significance budget, and 
 Bonferroni correction). An alternative with the share s adds -log10 s to log10 p.
 
 Choices form a tree: `Alternative.then` is the choice that follows an alternative. A reading is charged along one path
-that starts at a root. A choice that was not open to the reading is skipped and costs nothing. No other module of the
-package divides the significance budget.
+that starts at a root. A choice that a reading does not have, such as that of the pass band if a record names it, is
+skipped and costs nothing. No other module of the package divides the significance budget.
 """
 
 import math
@@ -32,7 +32,7 @@ class Alternative(NamedTuple):
     """One alternative of a choice."""
 
     name: str
-    share: float | None  # of the significance budget; None if counted alternatives have equal shares
+    share: float | None  # of the significance budget; None if alternatives are counted and have equal shares
     then: "Choice | None" = None  # the choice that follows
 
 
@@ -41,7 +41,7 @@ class Choice(NamedTuple):
 
     name: str
     alternatives: tuple[Alternative, ...]
-    counted: str = ""  # the things that are counted, if shares are equal
+    counted: str = ""  # the shares in words, if alternatives are counted
     in_bound: bool = False  # see `Charge`
 
     def charge(self, taken: str, count: float = 1.0, *, bits: float = 0.0) -> Charge:
@@ -95,15 +95,17 @@ def _alignment(then: Choice) -> Choice:
 
 # Choices are defined from the leaves to the roots. The charge for the rank of a tag is a union bound, not a Bonferroni
 # correction: the probability that one of the first r candidates has the right tag is at most r times that of one.
-RANK = _each("tag rank", "candidate messages whose tags were compared, up to the one that matched", in_bound=True)
+RANK = _each("tag rank", "1/n if the tag of the n-th candidate message is the first that matches", in_bound=True)
 DECODER = Choice(
     "decoder", (Alternative("correlations", 0.03, RANK), Alternative("joint decoding", 0.97, RANK)), in_bound=True
 )
-PAYLOAD = _each("payload", "messages that the payload can hold, unless the message was fixed beforehand", in_bound=True)
+PAYLOAD = _each(
+    "payload", "1/n for each of the n messages of this size; 1 if the message was fixed beforehand", in_bound=True
+)
 PROOF = Choice(
     "proof",
     (Alternative("score", None, PAYLOAD), Alternative("tag", None, DECODER)),
-    "the ways of weighting the suspect, plus one for the tag if a message was decoded",
+    "1/n for each of n tests: the scores and, if a message was decoded without being claimed, its tag",
 )
 MESSAGE = Choice("message", (Alternative("claimed or recorded", 0.97, PROOF), Alternative("another", 0.03, PROOF)))
 READING = Choice(
@@ -125,42 +127,51 @@ PASS_BAND = Choice(
 
 # Scenes: either the sum of scores over meshes, in the poses that the readings of single meshes chose, or one mesh.
 SUM_ALIGNMENT = _alignment(MESSAGE)
-MESHES = _each("mesh", "meshes of the original scene that were compared", REFLECTION)
+MESHES = _each("mesh", "1/n for each of the n meshes of the original scene that were compared", REFLECTION)
 SCENE = Choice("scene", (Alternative("sum over meshes", 0.5, SUM_ALIGNMENT), Alternative("one mesh", 0.5, MESHES)))
 
 # Blind reading. The rank of a tag counts the candidates of all readings, because tags are compared reading by reading.
-LOOKS = _each("view", "combinations of width, view, quantisation step and pose", PAYLOAD, in_bound=True)
+LOOKS = _each(
+    "view",
+    "1/n for each of n combinations of width, quantisation step, undone smoothing or blur, half turn or reflection,"
+    " and change of pose",
+    PAYLOAD,
+    in_bound=True,
+)
 BLIND_PROOF = Choice(
-    "proof", (Alternative("score", None, LOOKS), Alternative("tag", None, RANK)), "the score and the tag"
+    "proof",
+    (Alternative("score", None, LOOKS), Alternative("tag", None, RANK)),
+    "1/n for each of n tests: the score and, if a message was decoded without being claimed, its tag",
 )
 BLIND_MESSAGE = Choice(
     "message", (Alternative("claimed or recorded", 0.97, BLIND_PROOF), Alternative("another", 0.03, BLIND_PROOF))
 )
-BLIND_SCHEME = _each("scheme (no record)", "blind schemes", BLIND_MESSAGE)
-PARTS = _each("part of a file", "meshes of the suspect, times the number of records", BLIND_SCHEME)
+BLIND_SCHEME = _each("scheme (no record)", "1/n for each of the n blind schemes that are tried", BLIND_MESSAGE)
+PARTS = _each("part of a file", "1/n for each of n pairs of a mesh of the suspect and a record", BLIND_SCHEME)
 
 # Several marks in one mesh: their p-values are independent, so they are united by Fisher's product, which has a factor
 # instead of a share. The uncommitted p-value is the smallest of the marks' own, charged for their number.
 MARKS = Choice(
     "marks in one mesh",
     (Alternative("product", None), Alternative("one mark", None, REFLECTION)),
-    "the factor of Fisher's product of independent p-values; for one mark, the number of marks",
+    "product: no share, but a factor by Fisher's method; one mark (uncommitted): 1/n for each of the n marks",
 )
 
 # Copies for recipients.
-RECIPIENTS = _each("recipient", "recipients who were tested")
+RECIPIENTS = _each("recipient", "1/n for each of the n recipients who were tested")
 COPY_ALIGNMENT = _alignment(RECIPIENTS)
 
 # Catalogues: everything that could have been identified instead.
 ORIGINALS = Choice(
     "catalogue",
     (Alternative("original", None, PASS_BAND), Alternative("copy", None, COPY_ALIGNMENT)),
-    "pieces of the suspect, times keys, times the number of originals without a record, records and recipient lists",
+    "1/n for each of n readings: each piece of the suspect, under each key, with each original that has no record,"
+    " each record and each recipient list",
 )
 
 # The commitment under which everything else was fixed beforehand, if any.
-COMMITMENT = _each("timestamped commitment", "records in the commitment", PASS_BAND)
-UNCOMMITTED = _each("forgery", "2^64 keys, originals and records, the most that anyone can afford to try", PASS_BAND)
+COMMITMENT = _each("timestamped commitment", "1/n for each of the n records in the commitment", PASS_BAND)
+UNCOMMITTED = _each("forgery", "2^-64 for each key, original and record that a forger can afford to try", PASS_BAND)
 
 FORGERIES = UNCOMMITTED.charge("each", bits=64)
 
@@ -201,18 +212,14 @@ def is_charged_along_a_path(charges: Sequence[Charge]) -> bool:
 
 
 def table() -> str:
-    """Return the ledger as a Markdown table: for each path, its choices and the shares of their alternatives."""
-    lines = ["| path | choice | alternatives and their shares of the significance budget |", "|---|---|---|"]
+    """Return the ledger as a Markdown table: for each kind of reading, its choices and the shares of alternatives."""
+    lines = ["| path | choice | share of the significance budget for each alternative |", "|---|---|---|"]
     listed: list[Choice] = []
     for path, root in ROOTS.items():
         for choice in choices(root):
             if choice in listed:
                 continue
             listed.append(choice)
-            shares = "; ".join(
-                one.name if one.share is None else f"{one.name} {100 * one.share:g} %" for one in choice.alternatives
-            )
-            if choice.counted:
-                shares = f"{shares}: equal shares; counted: {choice.counted}".removeprefix("each: ")
-            lines.append(f"| {path} | {choice.name} | {shares} |")
+            shares = [f"{one.name} {100 * one.share:g} %" for one in choice.alternatives if one.share is not None]
+            lines.append(f"| {path} | {choice.name} | {choice.counted or '; '.join(shares)} |")
     return "\n".join(lines) + "\n"

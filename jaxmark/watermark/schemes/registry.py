@@ -44,6 +44,11 @@ class Named(Protocol):
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
 
+def is_builtin(scheme: Scheme | BlindScheme) -> bool:
+    """Whether a scheme is one of this library; a subclass may do anything, and is not."""
+    return type(scheme) in (*SCHEMES.values(), *map(type, BLIND_SCHEMES.values()))
+
+
 def find_blind(scheme: str | Scheme | BlindScheme) -> BlindScheme | None:
     """Return the blind scheme of a name; a blind scheme is returned unchanged, and anything else gives None."""
     if isinstance(scheme, str):

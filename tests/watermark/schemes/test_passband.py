@@ -164,7 +164,7 @@ def test_evidence_grows_with_the_mark_up_to_half_of_the_dimensions():
     sizes = [1e-5, 1e-4, 1e-3, 1.0]
     values = [capacity.evidence(16, size, NOISE) for size in sizes]
     assert values == sorted(values)
-    assert values[-1] == pytest.approx(capacity._left(16).dimensions.sum() / 2, rel=1e-3)
+    assert values[-1] == pytest.approx(capacity._free_dimensions(16).dimensions.sum() / 2, rel=1e-3)
     assert capacity.needed(16, values[1], NOISE) == pytest.approx(sizes[1], rel=1e-6)
     assert capacity.needed(16, 2 * values[-1], NOISE) == math.inf
 
