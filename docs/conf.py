@@ -100,13 +100,13 @@ def add_fields(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines:
 
 
 def list_face(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Let the page of a room begin with what can be imported from it, and where each of that is described."""
+    """Let the page of a package begin with what can be imported from it, and where each of that is described."""
     if what != "module" or not (shown := _face(obj)):
         return
     links, data = [], []
     for shown_name, module in shown.items():
         value, place = getattr(obj, shown_name), f"{_home(module)}.{shown_name}"
-        if inspect.ismethod(value):  # of one object that a room shows; described in its class
+        if inspect.ismethod(value):  # of one object that a package shows; described in its class
             place = f"{value.__module__}.{value.__qualname__}"
         comment = ModuleAnalyzer.for_module(module).find_attr_docs().get(("", shown_name))
         linked = inspect.isclass(value) or inspect.isroutine(value) or inspect.ismodule(value) or comment
@@ -117,7 +117,7 @@ def list_face(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: 
 
 
 def skip_member(app: Sphinx, what: str, name: str, obj: Any, skip: bool, options: Any) -> bool | None:
-    """A name is described where it is defined, or in the room of its private module; a field, with its class."""
+    """A name is described where it is defined, or in the package of its private module; a field, with its class."""
     described = inspect.isroutine(obj) or inspect.isclass(obj)
     if what == "module":
         return True if described and _home(obj.__module__ or "") != app.env.temp_data["autodoc:module"] else None
@@ -140,9 +140,9 @@ def sign_as_written(
 
 
 def _home(module: str) -> str:
-    """The public place of what a module defines: a private module's is the room that shows it."""
-    room, _, own = module.rpartition(".")
-    return room if own.startswith("_") else module
+    """The public place of what a module defines: a private module's is the package that shows it."""
+    package, _, own = module.rpartition(".")
+    return package if own.startswith("_") else module
 
 
 def _face(package: Any) -> dict[str, str]:

@@ -1,7 +1,7 @@
-"""jaxmark: differentiable spectral filtering of polygonal meshes, and the watermarking built on it.
+"""jaxmark: differentiable spectral filtering of polygonal meshes, and watermarking based on it.
 
-What is listed in `__init__.pyi` is imported when it is first used, so that a room comes alone: `import
-jaxmark.spectral` loads filters and nothing of the watermark.
+The names in `__init__.pyi` are imported when they are first used, so that subpackages load separately: `import
+jaxmark.spectral` loads the filters, but no watermarking.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-# The face of the package: its rooms, and the names of everyday use.
+# The public names of the package: its subpackages, and the names of everyday use.
 from . import adversaries as adversaries
 from . import alignment as alignment
 from . import attacks as attacks

@@ -1,4 +1,4 @@
-"""`python -m jaxmark`."""
+"""Run the command line by `python -m jaxmark`."""
 
 from jaxmark.app.start import main
 

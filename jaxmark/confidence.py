@@ -18,10 +18,11 @@ class Interval(NamedTuple):
 
 
 def clopper_pearson(successes: ArrayLike, trials: ArrayLike, confidence: float = 0.95) -> Interval:
-    """Exact confidence interval of a probability from counted successes (Clopper, Pearson, Biometrika 26, 1934).
+    """Compute the exact confidence interval of a probability (Clopper, Pearson, Biometrika 26, 1934).
 
-    It covers the true probability at least as often as `confidence` says, for any number of trials. Each end misses
-    with at most half of the remaining probability, so that one end alone is a bound of confidence (1 + confidence)/2.
+    The interval covers the true probability with a probability of at least `confidence`, for any number of trials. Each
+    end fails with at most half of the remaining probability, so that one end alone is a bound with the confidence
+    (1 + confidence)/2.
 
     Args:
         successes: numbers of successful trials, whole, of any shape.
@@ -36,9 +37,9 @@ def clopper_pearson(successes: ArrayLike, trials: ArrayLike, confidence: float =
     """
     counts, total = np.broadcast_arrays(np.asarray(successes, np.float64), np.asarray(trials, np.float64))
     if not ((counts == np.floor(counts)) & (total == np.floor(total)) & (counts >= 0) & (counts <= total)).all():
-        raise JaxmarkError("An interval needs whole numbers of trials, and of successes from 0 to as many.")
+        raise JaxmarkError("An interval needs whole numbers of trials and successes, with at most as many successes.")
     if not ((total >= 1).all() and 0 < confidence < 1):
-        raise JaxmarkError(f"An interval needs one trial or more, and a confidence in (0, 1), got {confidence:g}.")
+        raise JaxmarkError(f"An interval needs at least one trial, and a confidence in (0, 1), got {confidence:g}.")
     missed, failures = (1 - confidence) / 2, total - counts
     # Quantiles of beta distributions; without successes the lower bound is 0, without failures the upper bound is 1.
     low = np.where(counts > 0, betaincinv(np.maximum(counts, 1), failures + 1, missed), 0.0)

@@ -1,4 +1,4 @@
-"""The one exception that jaxmark raises, and imports of optional dependencies, whose absence raises it."""
+"""`JaxmarkError`, the exception that jaxmark raises, and imports of optional dependencies."""
 
 import importlib
 import importlib.util
@@ -7,9 +7,9 @@ from types import ModuleType
 
 
 class JaxmarkError(ValueError):
-    """Input that jaxmark refuses; the message says in one sentence what is wrong, where, and how to mend it.
+    """The error for input that jaxmark refuses; the message says what is wrong, where, and how to mend it.
 
-    The command line prints the message and ends with status 2.
+    The command line prints the message and ends with exit status 2.
     """
 
 

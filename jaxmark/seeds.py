@@ -1,6 +1,6 @@
-"""Randomness comes in as a seed: a whole number, a JAX random key, or on the host a NumPy generator.
+"""Seeds of random choices: a whole number, a JAX random key, or on the host a NumPy generator.
 
-A whole number and the JAX key that it makes stand for the same random choices, in traced code and on the host.
+A whole number gives the same random choices as the JAX key that is made from it, in traced code and on the host.
 """
 
 import jax
@@ -13,22 +13,24 @@ from jaxmark.errors import JaxmarkError
 Seed = int | np.integer | Int[Array, ""] | PRNGKeyArray
 Randomness = Seed | np.random.Generator
 
-# What is computed from probes enters marks and readings, so these seeds must never change.
+# The results of probes affect marks and readings; therefore these seeds must never change.
 _PROBES = {"reception": 0, "detection": 1, "capacity": 2, "channels": 3, "visibility": 4, "tuning": 5}
 
 
 def random_key(seed: Randomness) -> PRNGKeyArray:
-    """Make a JAX random key from a seed; a key is returned as it is, and a NumPy generator draws one.
+    """Make a JAX random key from a seed; a key is returned unchanged, and a NumPy generator draws a key.
 
     Raises:
-        JaxmarkError: if it is neither a whole number, nor a key, nor a generator.
+        JaxmarkError: if the seed is neither a whole number, nor a key, nor a generator.
     """
     if isinstance(seed, np.random.Generator):
         return jax.random.key(int(seed.integers(2**31)))
     if isinstance(seed, int | np.integer):
         return jax.random.key(seed)
     if not isinstance(seed, jax.Array | np.ndarray):
-        raise JaxmarkError(f"A seed is a whole number, such as 0, or a random key of JAX, got {type(seed).__name__}.")
+        raise JaxmarkError(
+            f"A seed must be a whole number, such as 0, or a random key of JAX, got {type(seed).__name__}."
+        )
     return jax.random.key(seed) if jnp.issubdtype(seed.dtype, jnp.integer) and not seed.ndim else seed
 
 
@@ -40,11 +42,11 @@ def generator(seed: Randomness) -> np.random.Generator:
 
 
 def probe_signs(purpose: str, *shapes: tuple[int, ...], dtype: DTypeLike) -> list[Float[Array, "..."]]:
-    """Draw arrays of independent random signs that probe linear maps; they are public, and the same at every call.
+    """Draw arrays of independent random signs for probing linear maps; they are public, and equal at every call.
 
     Args:
-        purpose: what is probed: "reception", "detection", "capacity", "channels", "visibility" or "tuning"; each has
-            signs of its own.
+        purpose: the purpose of the probe: "reception", "detection", "capacity", "channels", "visibility" or "tuning";
+            each has its own signs.
         shapes: the shape of each array.
         dtype: the dtype of all arrays.
     """

@@ -16,4 +16,4 @@ FLAGS = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split
 if version("jaxlib").startswith("0.10."):  # XLA ends the process for a flag it does not know
     FLAGS.append("--xla_cpu_use_fusion_emitters=false")
 os.environ["XLA_FLAGS"] = " ".join([*FLAGS, os.environ.get("XLA_FLAGS", "")])
-install_import_hook("jaxmark", "tests.typecheck.check")  # for as long as tests run, as rooms are imported late
+install_import_hook("jaxmark", "tests.typecheck.check")  # for as long as tests run, as subpackages are imported late

@@ -45,7 +45,7 @@ def mine(mesh: Mesh, strength: float, randomness: object) -> Mesh:
         (lambda: jm.attack(MESH, "noise", "much", seed=0), "strength of an attack must be a number, .* got 'much'"),
         (
             lambda: jm.attack(MESH, "noise", 0.1, seed=None),
-            "seed is a whole number, .* or a random key of JAX, got None",
+            "seed must be a whole number, .* or a random key of JAX, got None",
         ),
         (lambda: jm.embed("model.ply", b"x", KEY), "A mesh is needed, got str; jaxmark.load_mesh reads one"),
         (lambda: jm.detect("model.ply", key=KEY), "A mesh is needed, got str"),

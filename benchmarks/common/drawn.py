@@ -31,7 +31,7 @@ def small(png: bytes, width: int) -> bytes:
 
 
 def sources(picture: str) -> list[Path]:
-    """The files that a picture is drawn by: a program of pictures, and the notebook or the rooms that draw for it."""
+    """Return the files that draw a picture: a program of pictures, and the notebook or packages that draw for it."""
     programs, package = ROOT / "benchmarks" / "pictures", ROOT / "jaxmark"
     if picture == "growth.png":
         return []

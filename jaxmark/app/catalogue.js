@@ -54,7 +54,7 @@ function show(answer) {
   if (answer.dossier) {
     const link = make("a", "Dossier");
     link.href = `dossiers/${answer.dossier}`;
-    box.append(make("p", null, link, ` (of this original only: its bounds do not count the other ${answer.readings - 1} readings)`));
+    box.append(make("p", null, link, ` of this original (its bounds also count all ${answer.readings} readings)`));
   }
   const rows = answer.matches.map((match) => make("tr", null,
     make("td", null, picture(match.id)), make("td", match.original), make("td", `${match.by}, rank ${match.rank}`),

@@ -126,9 +126,9 @@ class Desk:
         return values
 
     def _dossier(self, suspect: Path, match: Match, readings: int, folder: Path) -> str | None:
-        """Make the dossier of a message that was read from a file of one mesh; returns its token in the address.
+        """Make the dossier of a message that was read from a file of one mesh, and return its token in the address.
 
-        It is charged for all readings by which the catalogue could have named an original, as the verdict is.
+        The dossier is charged, like the verdict, for all readings by which the catalogue could have named an original.
 
         Returns None if no message was read, if the file has several meshes or pieces, or if a dossier cannot be made.
         """

@@ -1,4 +1,4 @@
-"""Attacks: what may happen to a marked mesh, by accident or by a tool.
+"""Attacks: changes of a marked mesh that happen by accident, or that common tools make.
 
 `jaxmark.adversaries.by_name.ATTACKS` lists them by their names, with those of keyless attackers. An attack is a
 function `(mesh, strength, seed)` that returns the attacked mesh; `mark_noise` alone takes the original, too. Its

@@ -1,4 +1,4 @@
-"""Attacks on point clouds, on the host: points are lost, added, displaced, merged with another scan, or sampled again.
+"""Attacks on point clouds: remove, add or displace points, merge another scan, or resample; on the host.
 
 All raise `JaxmarkError` if the mesh has faces, or if no point would be left.
 """
@@ -12,15 +12,15 @@ from jaxmark.geometry.mesh import Mesh, diagonal
 from jaxmark.geometry.pose import Points
 from jaxmark.seeds import Randomness, generator
 
-_AROUND = 0.25  # width of what lies around a cloud's box on each side, over its diagonal
-_CORNERS = 6  # nearest points among which two span a triangle with a point
+_AROUND = 0.25  # width of the margin around a cloud's box on each side, over its diagonal
+_CORNERS = 6  # number of nearest points, two of which form a triangle with a point
 
 
 @on_host
 def subsampling(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
-    """Lose points at random; the others stay where they are, in their order.
+    """Remove random points; the others keep their positions and their order.
 
-    The strength is the share of the points that are lost, in [0, 1).
+    The strength is the fraction of the points that are removed, in [0, 1).
     """
     points = _points("Subsampling", mesh)
     check_share(strength, "points")
@@ -32,9 +32,9 @@ def subsampling(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
 
 @on_host
 def outliers(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
-    """Throw points off to random places in and around the cloud's box.
+    """Move random points to random positions in and around the cloud's box.
 
-    The strength is the share of the points that are thrown off, in [0, 1).
+    The strength is the fraction of the points that are moved, in [0, 1).
     """
     points, random = np.array(_points("Throwing points off", mesh)), generator(seed)
     check_share(strength, "points")
@@ -45,9 +45,9 @@ def outliers(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
 
 @on_host
 def floaters(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
-    """Add points at random places in and around the cloud's box, in random order among the others.
+    """Add points at random positions in and around the cloud's box, in random order among the others.
 
-    The strength is the number of points that are added, over those that are there.
+    The strength is the number of added points, over the number of points of the cloud.
     """
     points, random = _points("Adding points", mesh), generator(seed)
     more = _anywhere(mesh, round(strength * len(points)), random)
@@ -68,9 +68,9 @@ def merging(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
 
 @on_host
 def resampling(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
-    """Sample the surface again: random places between points that are near each other take the place of all points.
+    """Resample the surface: replace all points by random positions between neighbouring points.
 
-    The strength is the number of new points, over those that were there.
+    The strength is the number of new points, over the number of points of the cloud.
     """
     points = _points("Resampling", mesh)
     if not (count := round(strength * len(points))):
@@ -86,13 +86,13 @@ def _points(name: str, mesh: Mesh) -> Points:
 
 
 def _anywhere(mesh: Mesh, count: int, random: np.random.Generator) -> Points:
-    """Draw random places in the box of a cloud, and around it."""
+    """Draw random positions in the box of a cloud, and around it."""
     points, wide = np.asarray(mesh.vertices, np.float64), _AROUND * diagonal(mesh)
     return random.uniform(points.min(axis=0) - wide, points.max(axis=0) + wide, (count, 3))
 
 
 def _between(points: Points, count: int, random: np.random.Generator) -> np.ndarray:
-    """Draw random places in triangles, each of a random point and two of those nearest to it."""
+    """Draw random positions in triangles, each formed by a random point and two of its nearest points."""
     around = min(_CORNERS, len(points) - 1)
     if around < 1:
         return np.repeat(points, count, axis=0)[:count]

@@ -1,4 +1,4 @@
-"""Attacks by their names, and how one or several of them are applied to a mesh."""
+"""Attacks by their names, and functions that apply one or several attacks to a mesh."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -45,10 +45,10 @@ class Attack(NamedTuple):
     Attributes:
         apply: function (mesh, strength, seed) → mesh. On the host, the seed is a `numpy.random.Generator`, and the mesh
             is as it is; else a JAX random key, and the mesh is centred and at unit diagonal.
-        unit: what its strength is, in words.
+        unit: description of the strength and its unit.
         strengths: usual strengths, weak ones first.
-        host: whether it is NumPy or another program; else it is traced.
-        faces: whether it needs faces, so that point clouds are refused.
+        host: whether the attack runs on the host, in NumPy or another program; otherwise, it is traced.
+        faces: whether the attack needs faces, so that point clouds are refused.
     """
 
     apply: Callable[[Mesh, Any, Any], Mesh]
@@ -149,8 +149,8 @@ class Registry(NamedTuple):
         Args:
             mesh: any mesh.
             kind: a name in `ATTACKS`, or an `Attack` of your own.
-            strength: how strong the attack is, in its unit.
-            seed: of the attack's random choices, where it makes any: a whole number or a JAX random key.
+            strength: strength of the attack, in its unit.
+            seed: seed of the attack's random choices, if it makes any: a whole number or a JAX random key.
 
         Returns:
             The attacked mesh with float64 vertices, in the same number and order unless the attack makes a new mesh.
@@ -261,7 +261,7 @@ def _restore_copies(mesh: Mesh, welded: Weld, points: Mesh, found: Mesh) -> Mesh
 
 
 def _normalise(points: Mesh) -> tuple[Mesh, Callable[[Mesh], Mesh]]:
-    """Compute the centre a mesh and scale it to unit diagonal, where float32 keeps its digits; also return the map back."""
+    """Centre a mesh and scale it to unit diagonal, so that float32 is accurate; also return the map back."""
     centre, length = np.asarray(points.vertices)[used_vertices(points)].mean(axis=0), diagonal(points)
     start = (points.vertices - centre) / length
 

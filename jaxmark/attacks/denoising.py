@@ -1,4 +1,4 @@
-"""Denoising that takes small detail for noise: shrinkage of wavelets, and averages over places that look alike."""
+"""Denoising, which removes small detail as noise: shrinkage of wavelets, and averages over similar places."""
 
 from functools import lru_cache
 
@@ -42,14 +42,14 @@ def shrinkage(mesh: Mesh, strength: Strength, seed: Seed | None = None) -> Mesh:
 
 @on_host
 def nonlocal_means(mesh: Mesh, strength: float, seed: Randomness | None = None) -> Mesh:
-    """Give each place the detail that places like it have on average, wherever on the surface they are; on the host.
+    """Replace the detail at each place by the mean detail of similar places on the whole surface; on the host.
 
     Non-local means (Buades, Coll, Morel, "A non-local algorithm for image denoising", CVPR 2005; on meshes Yoshizawa,
     Belyaev, Seidel, "Smoothing by example", SMI 2006). Detail is the offset along the normal between a vertex and the
-    surface after diffusion of a time t. Places are alike if the differences of the diffusions t, 2t, … 16t along their
-    normals are: the 64 that are most alike are averaged, with weights exp(-d²/h²) where h is the median distance of the
-    farthest. The strength is the time t, at most 1,000, in units of the graph Laplacian: exp(-tΔ) is about t steps of
-    smoothing.
+    surface after diffusion of a time t. Places are similar if the differences of the diffusions t, 2t, … 16t along
+    their normals are similar. The 64 most similar places are averaged with the weights exp(-d²/h²), where h is the
+    median of the largest distances. The strength is the time t, at most 1,000, in units of the graph Laplacian:
+    exp(-tΔ) is about t steps of smoothing.
     """
     if strength > 1000:
         raise JaxmarkError(f"The time of diffusion of non-local means is 1,000 at most, got {strength:g}.")

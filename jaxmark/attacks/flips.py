@@ -1,4 +1,4 @@
-"""Other faces on the same points: edge flips (Sohn et al.), and reordering; on the host."""
+"""Changes of faces on the same points: edge flips (Sohn et al.), and reordering; on the host."""
 
 import math
 
@@ -116,6 +116,6 @@ def reordering(mesh: Mesh, strength: float, seed: Randomness) -> Mesh:
 def _cycle(
     indices: Int64[np.ndarray, " indices"], share: float, random: np.random.Generator
 ) -> tuple[Int64[np.ndarray, " chosen"], Int64[np.ndarray, " chosen"]]:
-    """Draw a share of some indices, and for each the index that it moves to: a cyclic permutation."""
+    """Draw a fraction of some indices, and a cyclic permutation of them."""
     chosen = random.permutation(indices)[: round(share * len(indices))]
     return chosen, np.roll(chosen, 1)

@@ -1,7 +1,7 @@
-"""Parts of a mesh: lost by cropping, moved apart, or added beside it; on the host.
+"""Attacks on parts of a mesh: crop it, move its pieces apart, or add objects next to it; on the host.
 
-If parts are lost, the result has the faces whose vertices are all left, and the vertices that they use, exactly
-where they were. `JaxmarkError` is raised if no face would be left, or if a shift or size is relative to a mesh whose
+If vertices are removed, the result has the faces whose vertices all remain, and the vertices of these faces, at their
+old positions. `JaxmarkError` is raised if no face would remain, or if a shift or size is relative to a mesh whose
 vertices are all at one point.
 """
 
@@ -132,7 +132,7 @@ def _resolve_share(mesh: Mesh, share: float) -> tuple[Int64[np.ndarray, " used"]
 
 
 def _nearest(mesh: Mesh, among: Int64[np.ndarray, " among"], centre: int, count: int) -> Int64[np.ndarray, " nearest"]:
-    """Return the vertices nearest to a centre along edges (Dijkstra, 1959), then the unreachable ones, nearest in space."""
+    """Return the vertices nearest to a centre along edges (Dijkstra, 1959), then unreachable ones by distance."""
     vertices, size = np.asarray(mesh.vertices), len(mesh.vertices)
     i, j = edges(mesh.faces).T
     graph = sparse.csr_array((np.linalg.norm(vertices[i] - vertices[j], axis=1), (i, j)), (size, size))

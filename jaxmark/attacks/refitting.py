@@ -19,12 +19,13 @@ from jaxmark.seeds import Randomness
 
 _MAX_DEGREES = 30.0
 _MIN_REGION_VERTICES = 10  # fewer fit most shapes
-_MAX_STRAY_SHARE = 0.05  # of a region's area, whose normals may be off: noise tilts single faces
+_MAX_STRAY_SHARE = 0.05  # largest fraction of a region's area whose normals do not fit, because noise tilts faces
 _MAX_RMS_DISTANCE = 0.005  # distance of a region's vertices to its shape, in diagonals of the mesh
 _MIN_INNER_SHARE = 0.25  # of the vertices of a broad region: those that are not on its boundary
 _CURVED_TURN_FACTOR = 3.0  # curved regions may turn from face to face by this multiple of the angle
 _ANGLE_HALVINGS = 3
-# Singular value over the largest: planes at less than 2 atan 0.2, 23°, count as one, as where they meet says little.
+# Least singular value, over the largest. Two planes at less than 2 atan 0.2, 23°, count as one plane, because their
+# intersection is inaccurate.
 _RANK_CUTOFF = 0.2
 _GAUSS_NEWTON_STEPS = 5  # the tangent planes of curved shapes turn a little as vertices move
 
@@ -35,7 +36,7 @@ Found = tuple[Shape, Int64[np.ndarray, " _"]]  # a shape, and the vertices that 
 
 
 class Region(NamedTuple):
-    """Some of the faces, and what fitting a shape to them needs."""
+    """A region of faces, with the quantities that fitting a shape needs."""
 
     points: Points  # the positions of their vertices
     centroids: Float64[np.ndarray, "faces 3"]

@@ -15,7 +15,7 @@ from jaxmark.geometry.pose import Points
 from jaxmark.seeds import Randomness, generator
 
 _SAMPLES_PER_VERTEX = 30
-_CELLS_PER_BLOCK = 4  # along each side of a block; a coarse grid of blocks tells where the surface may be
+_CELLS_PER_BLOCK = 4  # cells along each side of a block; a coarse grid of blocks shows where the surface may be
 
 
 @on_host
@@ -67,7 +67,7 @@ def iso_surface(mesh: Mesh, strength: float, seed: Randomness | None = None) -> 
     mesh = mesh._replace(vertices=(mesh.vertices - low) / cell)  # libigl's winding numbers are in single precision
     coarse = np.ceil(extent / cell / _CELLS_PER_BLOCK).astype(int) + 3
     rough = _signed_distance(mesh, _CELLS_PER_BLOCK * np.argwhere(np.ones(coarse))).reshape(coarse)
-    # The distance at the nearest coarse point tells where the surface may be: it changes no faster than the position.
+    # The distance at the nearest coarse point shows where the surface may be: it changes no faster than the position.
     near = [
         (np.arange(_CELLS_PER_BLOCK * (count - 1) + 1) + _CELLS_PER_BLOCK // 2) // _CELLS_PER_BLOCK for count in coarse
     ]

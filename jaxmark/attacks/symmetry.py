@@ -1,6 +1,6 @@
-"""Averaging over what a shape repeats, such as mirrored halves or equal parts; on the host.
+"""Averaging over repeated parts of a shape, such as mirrored halves or equal parts; on the host.
 
-A mark that differs from one repetition to the next is averaged out.
+A mark that differs between the repeated parts is averaged out.
 """
 
 from collections.abc import Iterator

@@ -1,6 +1,6 @@
 """Transformations of space: random similarities and affine maps (Sohn et al.), warping, bending and twisting.
 
-The last three move no neighbouring parts of the surface against each other, but no affine map undoes them.
+The last three do not move neighbouring parts of the surface relative to each other, but no affine map inverts them.
 """
 
 from collections.abc import Callable

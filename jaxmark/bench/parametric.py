@@ -182,7 +182,7 @@ def vase(points: int) -> Mesh:
 
 
 def gear(points: int, teeth: int) -> Mesh:
-    """A wheel with teeth, a hole and flat sides: a rectangle carried around an outline."""
+    """Make a wheel with teeth, a hole and flat sides: a rectangle carried around an outline."""
     across = 24
     along = round(points / across)
     i, j, faces = grid(along, across, (True, True))

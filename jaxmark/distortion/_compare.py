@@ -211,7 +211,7 @@ _ANY_CONNECTIVITY = {"mrms", "hausdorff", "fmpd", "msdm2", *RENDERED}
 
 
 def metrics_of(original: Mesh, distorted: Mesh) -> tuple[str, ...]:
-    """Return the names in `METRICS` that two meshes can be compared by: if one is a point cloud, those in `OF_POINTS`."""
+    """Return the names in `METRICS` that apply to two meshes; if one is a point cloud, those in `OF_POINTS`."""
     for mesh in (original, distorted):
         check_mesh(mesh)
     return METRICS if len(original.faces) and len(distorted.faces) else OF_POINTS

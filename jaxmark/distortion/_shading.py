@@ -213,7 +213,7 @@ def _diffusions(count: int) -> Float[np.ndarray, "scales terms"]:
 
 
 def _bands(links: Laplacian, x: Array, count: int) -> Array:
-    """Split signals of faces into bands, starting with the shortest waves; the longest waves are in none of the bands."""
+    """Split signals of faces into bands, starting with the shortest waves; the longest waves are in no band."""
     passed = _diffusions(count)
     bands = _GAINS[:count, None] * (np.vstack([np.eye(1, passed.shape[1]), passed[:-1]]) - passed)
     # Most bands need only few of the terms.
@@ -222,7 +222,7 @@ def _bands(links: Laplacian, x: Array, count: int) -> Array:
 
 
 def _by_length(series: Float[np.ndarray, "series terms"]) -> list[Float[np.ndarray, "some fewer"]]:
-    """Split series, sorted by length, into short ones, whose terms beyond `_FEW_TERMS` are 0 and cut off, and others."""
+    """Split series, sorted by length, into those of at most `_FEW_TERMS` terms, without the zeros, and the others."""
     short = int((~series[:, _FEW_TERMS:].any(axis=1)).sum())
     return [some for some in (series[:short, :_FEW_TERMS], series[short:]) if len(some)]
 

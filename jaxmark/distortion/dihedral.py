@@ -61,13 +61,13 @@ def dihedral_sine_cosine(x: Positions, hinges: Hinges) -> tuple[Float[Array, " e
 
 @jax.jit
 def dihedral_angles(x: Positions, hinges: Hinges) -> Float[Array, " edges"]:
-    """Compute the angle by which the surface turns at each edge, in radians from -π to π; 0 if it is flat or there is no hinge."""
+    """Compute the angle by which the surface turns at each edge, in radians from -π to π; 0 without a hinge."""
     return jnp.arctan2(*dihedral_sine_cosine(x, hinges))
 
 
 @jax.jit
 def dame(original: Positions, distorted: Positions, hinges: Hinges) -> Scalar:
-    """Compute the dihedral angle mesh error: mean change of dihedral angles over inner edges, masked where the original is sharp.
+    """Compute the dihedral angle mesh error: the masked mean change of dihedral angles over inner edges.
 
     The error is in radians, and independent of scale. It is the paper's sum with masking m = exp((kα)²), k² =
     ln(0.01)/π², by the original's angle α. The paper's visibility weights, which need rendered images, are 1 here.

@@ -50,7 +50,7 @@ def surface_distance(first: Mesh, second: Mesh) -> SurfaceDistance:
 
 @jax.jit
 def geometric_laplacian(x: Positions, edges: Edges) -> Positions:
-    """Return the geometric Laplacian v - Σ_j v_j/l_j / Σ_j 1/l_j of each vertex, over neighbours j at distances l_j.
+    """Compute the geometric Laplacian v - Σ_j v_j/l_j / Σ_j 1/l_j of each vertex, over neighbours at distances l_j.
 
     Edges of length 0 do not count; a vertex without other edges gets 0.
     """
@@ -63,7 +63,7 @@ def geometric_laplacian(x: Positions, edges: Edges) -> Positions:
 
 @jax.jit
 def gl(original: Positions, distorted: Positions, edges: Edges) -> Scalar:
-    """Return the mean of two RMS changes, of positions and of the geometric Laplacian, in the units of the positions.
+    """Compute the mean of two RMS changes, of positions and of the geometric Laplacian, in units of the positions.
 
     Reference: Karni, Gotsman, "Spectral compression of mesh geometry", SIGGRAPH 2000, section 5. The paper divides the
     roots of sums of squares by the number of vertices. Here they are root mean squares, so that meshes with different
@@ -75,7 +75,7 @@ def gl(original: Positions, distorted: Positions, edges: Edges) -> Scalar:
 
 @jax.jit
 def stretch(original: Positions, distorted: Positions, edges: Edges, share: float | Scalar = HIGH_SHARE) -> Scalar:
-    """Return the change of length that 1 % of the edges (1 - `share`) exceed, over the length that each has in the original.
+    """Compute the relative change of length that 1 % of the edges (1 - `share`) exceed.
 
     Displacements along the surface change lengths, and so textures, where shading hardly changes. Edges of length 0 do
     not count. The gradient is that of the edge at this percentile.

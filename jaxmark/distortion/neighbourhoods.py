@@ -114,7 +114,7 @@ def filled(balls: Neighbourhoods, pieces: int, count: int) -> Neighbourhoods:
 
 
 def share_inside(x: Float[Array, "vertices 3"], pieces: Neighbourhoods) -> Float[Array, " pieces"]:
-    """Compute the share of each edge that lies in its ball, 0 to 1, at positions near those that `pieces` was made for."""
+    """Compute the fraction of each edge inside its ball, 0 to 1, at positions near those of `pieces`."""
     along, out = x[pieces.head] - x[pieces.tail], x[pieces.tail] - x[pieces.centre]
     a, b = jnp.sum(along**2, axis=1), jnp.sum(along * out, axis=1)
     c = jnp.sum(out**2, axis=1) - jnp.asarray(pieces.radius).astype(x.dtype) ** 2

@@ -20,7 +20,7 @@ def root(square: Any, xp: Any = jnp) -> Any:
 
 
 def cube_root(values: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """∛values; 0 with gradient 0 where they are not positive."""
+    """Compute ∛values; 0 with gradient 0 for values that are not positive."""
     return _where_positive(jnp.cbrt, values)
 
 
@@ -35,7 +35,7 @@ def _where_positive(function: Callable[[Any], Any], x: Any, xp: Any = jnp) -> An
 
 
 def ratio(numerator: Float[Array, "*shape"], denominator: Float[Array, "*#shape"]) -> Float[Array, "*shape"]:
-    """Return the numerator over the denominator; 0 with gradient 0 where the denominator is not positive."""
+    """Divide the numerator by the denominator; 0 with gradient 0 for denominators that are not positive."""
     positive = denominator > 0
     return jnp.where(positive, numerator / jnp.where(positive, denominator, 1), 0)
 
@@ -55,7 +55,7 @@ def lengths(x: Float[Array, "rows 3"]) -> Float[Array, " rows"]:
 
 
 def rms(displacement: Float[Array | np.ndarray, "vertices 3"]) -> Scalar | np.ndarray:
-    """Compute the root mean square √(mean over v of |d_v|²), unweighted, in the units of `displacement`; the gradient at 0 is 0.
+    """Compute the unweighted root mean square √(mean over v of |d_v|²); the gradient at 0 is 0.
 
     A NumPy array gives a NumPy result, so that float64 stays float64 on the host.
     """
@@ -70,7 +70,7 @@ def maximum(displacement: Float[Array | np.ndarray, "vertices 3"]) -> Scalar | n
 
 
 def cubic_mean(values: PerVertex) -> Scalar:
-    """Return the cube root of the mean of cubes; the gradient at 0 is 0."""
+    """Compute the cube root of the mean of cubes; the gradient at 0 is 0."""
     return cube_root(jnp.mean(values**3))
 
 

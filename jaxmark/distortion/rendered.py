@@ -111,6 +111,6 @@ def _pictures(original: Mesh, distorted: Mesh, size: int) -> Iterator[tuple[np.n
 
 
 def _around(shown: Bool[np.ndarray, "rows columns"]) -> tuple[slice, ...]:
-    """Return the part of a picture that shows something, with a margin for the filters of metrics."""
+    """Crop a picture to the object, with a margin for the filters of metrics."""
     parts = (np.append(np.flatnonzero(shown.any(axis=axis)), [] if shown.any() else [0]) for axis in (1, 0))
     return tuple(slice(max(int(part[0]) - _MARGIN, 0), int(part[-1]) + _MARGIN + 1) for part in parts)

@@ -60,7 +60,7 @@ def _local_roughness(x: Positions, faces: Int[Array, "faces 3"], boundary: Bool[
 
 @jax.jit
 def fmpd(first: Rough, second: Rough) -> Scalar:
-    """Compute the fast mesh perceptual distance, 0 to 1: how much rougher one surface is than another as a whole.
+    """Compute the fast mesh perceptual distance, 0 to 1: the difference of the global roughness of two surfaces.
 
     Connectivities may differ. The metric is nearly blind to slow waves, so do not rely on it alone for a mark of low
     frequencies.

@@ -43,7 +43,7 @@ _MAX_WINDOWS = 20_000  # in larger meshes, windows are around this number of ran
 
 @jax.jit
 def curvature_tensor(x: Positions, hinges: Hinges, balls: Neighbourhoods) -> Tensors:
-    """Return the tensor T = 1/(πr²) Σ β_e/|e| e eᵀ over the pieces e of edges in the ball around each vertex.
+    """Compute the tensor T = 1/(πr²) Σ β_e/|e| e eᵀ over the pieces e of edges in the ball around each vertex.
 
     β_e is the dihedral angle. As in MEPP2, whose values are published, it is computed by the inverse sine, and so at
     most π/2 however sharp the edge is, and edges across the direction of the search from the centre do not count. The
@@ -86,7 +86,7 @@ def _eigenvalues(matrix: Tensors) -> Positions:
 
 @jax.jit
 def tensor_distance(original: Tensors, distorted: Tensors) -> Scalar:
-    """Compute the change of curvature in size and direction, 0 to 1: the cubic mean of ‖T - T'‖/(‖T‖ + ‖T'‖ + ε) over vertices.
+    """Compute the change of curvature, 0 to 1: the cubic mean of ‖T - T'‖/(‖T‖ + ‖T'‖ + ε) over vertices.
 
     This follows TPDM (Torkhani, Wang, Chassery, "A curvature-tensor-based perceptual quality metric for 3D triangular
     meshes", Machine Graphics & Vision 2014) in comparing tensors relative to their size, but has none of its visibility
@@ -217,7 +217,7 @@ def _contributions(
     sigma: float | np.ndarray | Scalar,
     offset: float,
 ) -> tuple[PerVertex, ...]:
-    """Compute the differences of curvature, contrast and structure in the window of each vertex, as SSIM has them of images.
+    """Compute the differences of curvature, contrast and structure in the window of each vertex, as in SSIM.
 
     Each is relative to its size plus an offset. Curvatures and positions are those of both meshes at the distorted
     mesh's vertices; points are weighted by a Gaussian of width `sigma` of their distance from the centre.

@@ -54,7 +54,7 @@ class Breaking(NamedTuple):
     curve: tuple[Trial, ...]  # all trials, weak ones first
 
     def cost(self, metric: str) -> float:
-        """Return the attack's distortion over the mark's own, by a metric (a field of `Comparison`) that was measured.
+        """Compute the ratio of the attack's distortion to the mark's own, by a metric that was measured.
 
         It is infinite if the attack does not succeed, and NaN if its distortion is unknown or the mark has none.
         """

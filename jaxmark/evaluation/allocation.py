@@ -36,7 +36,7 @@ def allocate(
     steps: int = 500,
     start: Bands | None = None,
 ) -> Bands:
-    """Compute the strengths per band that maximise the worst attack's margin under Σ_j cost_j β_j² = budget²; traceable.
+    """Compute strengths per band that maximise the worst attack's margin under Σ_j cost_j β_j² = budget²; traceable.
 
     The problem is solved by projected gradients for the bands' shares of the budget, which lie on a simplex cut off at
     `cap`, so that the budget is met exactly. The worst margin is an annealed soft minimum, whose gap to the minimum is
@@ -147,7 +147,7 @@ def _capped_simplex(x: Bands, cap: float) -> Bands:
 def upper_bound(
     channels: Channels, cost: Float[Array | np.ndarray, " bands"], *, cap: float = 1.0, margin: Margin = "rate"
 ) -> float:
-    """Compute the upper bound on the worst attack's margin over all strengths with Σ_j cost_j β_j² ≤ 1; host side, in float64.
+    """Bound the worst attack's margin over all strengths with Σ_j cost_j β_j² ≤ 1; on the host, in float64.
 
     By weak duality: for weights w ≥ 0, Σ_a w_a = 1 of the attacks and a price μ ≥ 0 of the budget, the worst margin is
     at most μ + Σ_j max_p [Σ_a w_a m_aj(p) - μ cost_j p] over 0 ≤ p ≤ cap/cost_j, whatever w and μ are. The search is
@@ -160,18 +160,18 @@ def upper_bound(
     half, slope = dimensions / 2, gain**2 / noise / cost
 
     def worth(shares: np.ndarray) -> np.ndarray:
-        """Each attack's margin in each band."""
+        """Compute each attack's margin in each band."""
         snr = slope * shares
         return half * {"rate": np.log2(1 + snr), "evidence": snr / (1 + snr), "snr": snr}[margin]
 
     def rising(shares: np.ndarray) -> np.ndarray:
-        """Return the derivative of `worth`."""
+        """Compute the derivative of `worth`."""
         snr = slope * shares
         each = {"rate": 1 / (1 + snr) / np.log(2), "evidence": 1 / (1 + snr) ** 2, "snr": np.ones_like(snr)}
         return half * slope * each[margin]
 
     def spent(weights: np.ndarray, price: float) -> np.ndarray:
-        """Return the share of each band that is best at a price."""
+        """Compute the optimal share of each band at a price."""
         low, high = np.zeros(len(cost)), np.full(len(cost), min(cap, 1.0))
         for _ in range(60):
             middle = (low + high) / 2
@@ -208,7 +208,7 @@ def balance(
     cap: float,
     start: Float[np.ndarray, " bands"] | None,
 ) -> tuple[Float64[np.ndarray, " bands"], Float64[np.ndarray, " limits"]]:
-    """Compute the strengths within several limits at once, and the weights of the single budget that has the same solution.
+    """Compute strengths within several limits, and the weights of the single budget that has the same solution.
 
     Any weighted mean of the limits is a weaker bound than all of them together. The weights for which its solution
     keeps all limits are found by raising those of limits that are exceeded.

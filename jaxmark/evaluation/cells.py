@@ -134,12 +134,12 @@ def _row(line: bytes, path: Path, number: int) -> dict[str, Any]:
         row = json.loads(line)
     cell = row.get("cell") if isinstance(row, dict) else None
     if not isinstance(cell, list) or not all(isinstance(value, str | int | float) for value in cell):
-        raise JaxmarkError(f"Line {number} of {path} is no row of a study; delete this line, and its cell is computed again.")
+        raise JaxmarkError(f"Line {number} of {path} is no row of a study; delete the line to compute its cell again.")
     return row
 
 
 def append(output: Path, row: Row) -> None:
-    """Append a row, and wait until it is on disk; if the disk is full, a part of a line may remain, which is removed later.
+    """Append a row, and wait until it is on disk; a full disk may leave a part of the line, which readers remove.
 
     Raises:
         JaxmarkError: if it cannot be written.

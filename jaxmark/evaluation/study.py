@@ -183,7 +183,7 @@ class Study:
                     yield mesh, scheme, bits, budget, name, float(strength), *block, digest
 
     def _name(self, cell: Cell) -> str:
-        """Return a cell by what varies in this study, such as `noise 0.02, budget 0.0004`."""
+        """Name a cell by the fields that vary in this study, such as `noise 0.02, budget 0.0004`."""
         mesh, scheme, bits, budget, attack, strength, *_ = cell
         names = str(mesh), str(scheme), f"{bits} bits", f"budget {budget}"
         parts = self.meshes, self.schemes, self.payloads, self.budgets
@@ -274,7 +274,7 @@ def _marker(point: _Point, seed: int) -> Marker:
 
 @lru_cache(maxsize=_SEEDS_PER_CELL)
 def _mark(point: _Point, seed: int) -> tuple[Mesh | str, float]:
-    """Mark as strongly as the budget allows, readable or not; return the mesh or the reason of a refusal, and the RMS."""
+    """Mark as strongly as the budget allows, readable or not; return the mesh or the reason of a refusal, and RMS."""
     budget = replace(point.budget, noise=0.0 if point.budget.noise is None else point.budget.noise)
     message = _derive(seed, "message", point.bits // 8)
     try:

@@ -38,14 +38,14 @@ class Results:
         return rates.rates(self.rows, by, level)
 
     def markdown(self) -> str:
-        """Return the rates as a Markdown table with their controls, the totals of the controls, and every refusal."""
+        """Return the rates as a Markdown table, with the controls, their totals, and every refusal."""
         heads, lines = self._table()
         text = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|", *(f"| {' | '.join(line)} |" for line in lines)]
         text += ["", *(f"{said}  " for said in self._controls()), "", *(f"- {said}" for said in self._refusals())]
         return "\n".join(text).strip() + "\n"
 
     def _table(self) -> tuple[list[str], list[list[str]]]:
-        """Return the heads of a table of all points, and its lines."""
+        """Return the column heads and the lines of a table of all points."""
         cells: dict[tuple[Any, ...], dict[Control, dict[str, Any]]] = {}
         for rate in self.rates():
             cells.setdefault(tuple(rate[name] for name in POINT), {})[rate["control"]] = rate

@@ -173,7 +173,7 @@ class Trials:
         signs: Sequence[Int8[Array, "vertices channels"]],
         copies: Sequence[Observation],
     ) -> Float64[np.ndarray, "seeds marks two values"]:
-        """Compute the remaining evidence of each mark and its opposite after an attack: S/‖a‖, or the soft decisions."""
+        """Compute the remaining evidence of each mark and its opposite after an attack: S/‖a‖, or soft decisions."""
         readers = cycle([reader.with_carrier(_with_signs(reader.carrier, one)) for one in signs])
         pairs = [(own, own.receive(one)) for one, own in zip(copies, readers, strict=False)]
         if self.margin == "rate":

@@ -60,7 +60,7 @@ class Report(NamedTuple):
     gap: float  # (bound - worst margin) / bound
     binding: Mapping[str, float]  # weights of the limits in the channels' budget
     trials: Float64[np.ndarray, " attacks"]  # worth of the tuned strengths to the detector after each attack
-    channel_trials: Float64[np.ndarray, " attacks"]  # the same for the channels' best strengths; 0 if the payload does not fit
+    channel_trials: Float64[np.ndarray, " attacks"]  # the same for the channels' optimum; 0 if the payload does not fit
     default_trials: Float64[np.ndarray, " attacks"]  # the same for the scheme with the strengths that `embed` uses
     default_kept: (
         bool  # whether no strengths were better than those of the scheme as `embed` takes it, which is returned

@@ -1,6 +1,6 @@
-"""Read and write mesh files: OBJ, PLY, OFF, STL, GLB, glTF and 3MF; and point clouds: XYZ, LAS and LAZ, too.
+"""Read and write mesh files (OBJ, PLY, OFF, STL, GLB, glTF, 3MF) and point clouds (also XYZ, LAS, LAZ).
 
-A file is saved by patching the one that it was loaded from: all bytes but those of positions and normals stay.
+A file is saved by patching the file that it was loaded from: all bytes except those of positions and normals stay.
 """
 
 import os
@@ -56,7 +56,7 @@ class Scene(NamedTuple):
     """The meshes of a file."""
 
     meshes: Mapping[str, Mesh]  # by name, in the file's order, each in its own coordinates
-    skipped: Mapping[str, str]  # those that cannot be used, by name, and why
+    skipped: Mapping[str, str]  # meshes that cannot be used, by name, and the reasons
 
 
 def load_mesh(path: str | os.PathLike) -> Mesh:
@@ -138,7 +138,7 @@ def load_skin(path: str | os.PathLike) -> Skinning:
 
 
 def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | None = None) -> None:
-    """Write a mesh to a file, which appears whole or not at all.
+    """Write a mesh to a file, atomically.
 
     Args:
         mesh: the mesh to write.
@@ -175,7 +175,7 @@ def _save_whole(mesh: Mesh, source: Source, path: str | os.PathLike, like: str |
 
 
 def save_scene(meshes: Mapping[str, Mesh], path: str | os.PathLike, *, like: str | os.PathLike) -> tuple[str, ...]:
-    """Write a file in which some meshes have other vertices.
+    """Write a file of several meshes, with changed vertices of some meshes.
 
     Args:
         meshes: meshes by their names in `load_scene`; those that are not given stay as they are.
@@ -204,7 +204,7 @@ def save_scene(meshes: Mapping[str, Mesh], path: str | os.PathLike, *, like: str
 
 
 def number_check(like: str | os.PathLike) -> Callable[[str, Mesh], None]:
-    """Make a function that checks whether a file's numbers are fine enough for a mesh, by name, with other vertices.
+    """Make a function (name, mesh) that checks whether a file's numbers are precise enough for changed vertices.
 
     The function raises a `JaxmarkError` if they are not, see `save_mesh`.
     """
@@ -234,7 +234,7 @@ def _suffix(path: str | os.PathLike) -> str:
 
 
 def _parse(path: str | os.PathLike, data: bytes) -> Source:
-    """Parse the bytes of a file; those of some formats refer to other files beside it."""
+    """Parse the bytes of a file; files of some formats refer to other files in the same folder."""
     suffix = _suffix(path)
     beside = (read_beside(Path(path).parent),) if suffix in (".glb", ".gltf") else ()
     return _FORMATS[suffix](data, *beside)
@@ -258,7 +258,7 @@ def _whole(source: Source, path: str | os.PathLike) -> Mesh:
 
 
 def _source_of(path: str | os.PathLike, like: str | os.PathLike) -> Source:
-    """Read the file that another one is written like."""
+    """Read the file that a new file is patched from."""
     if _suffix(path) != Path(like).suffix.lower():
         raise JaxmarkError(
             f"{os.fspath(path)} must have the same suffix as {os.fspath(like)}, whose bytes it takes over."

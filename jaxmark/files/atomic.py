@@ -1,4 +1,4 @@
-"""Read whole files, and write files that appear whole or not at all."""
+"""Read whole files, and write files atomically: a reader sees either the old file or the complete new one."""
 
 import errno
 import hashlib
@@ -14,7 +14,7 @@ from pathlib import Path
 
 from jaxmark.errors import JaxmarkError
 
-_PREFIX = ".jaxmark-"  # of drafts, which are written before they get the file's name
+_PREFIX = ".jaxmark-"  # prefix of drafts, which are renamed to the file's name when they are complete
 
 
 def read_file(path: str | os.PathLike, most: int | None = None) -> bytes:
@@ -75,13 +75,13 @@ def read_beside(folder: Path) -> Callable[[str], bytes]:
 
 
 def _own_prefix() -> str:
-    """Return the prefix of this process's drafts, by which others see whether it still runs."""
+    """Return the prefix of this process's drafts, from which others can find out whether it still runs."""
     return f"{_PREFIX}{re.sub('[^A-Za-z0-9]', '_', platform.node())}-{os.getpid()}-"
 
 
 def _clear_drafts(folder: Path) -> None:
     """Delete drafts of processes of this machine that were killed before they could do so themselves."""
-    if os.name != "posix":  # elsewhere a process cannot be asked without being disturbed
+    if os.name != "posix":  # on other systems, there is no harmless way to test a process
         return
     own = re.compile(_own_prefix().replace(f"-{os.getpid()}-", r"-(\d+)-") + ".*")
     for draft in folder.glob(_PREFIX + "*"):
@@ -107,7 +107,7 @@ def _runs(process: int) -> bool:
 
 @contextmanager
 def _writing(path: str | os.PathLike) -> Iterator[None]:
-    """Refuse in a sentence if the system refuses to write a file."""
+    """Convert an OSError of writing a file to a `JaxmarkError`."""
     try:
         yield
     except OSError as error:
@@ -115,9 +115,9 @@ def _writing(path: str | os.PathLike) -> Iterator[None]:
 
 
 def write_atomically(path: str | os.PathLike, data: bytes, *, mode: int | None = None) -> None:
-    """Write a file through a temporary one beside it, so that no reader ever sees half of it.
+    """Write a file through a temporary file in the same folder, so that no reader ever sees a part of it.
 
-    Whatever goes wrong, a file that was there before is unchanged and no temporary file is left.
+    If an error occurs, an existing file is unchanged, and no temporary file remains.
 
     Args:
         path: the file to write; a symbolic link is followed, and an existing file is replaced.
@@ -154,7 +154,7 @@ def write_atomically(path: str | os.PathLike, data: bytes, *, mode: int | None =
 
 
 def write_together(path: str | os.PathLike, data: bytes, beside: Mapping[str, bytes]) -> None:
-    """Write a file and others that belong to it, all or none; those are there before the file is.
+    """Write a file and other files that belong to it, all or none; the other files are written first.
 
     Args:
         path: the file to write.

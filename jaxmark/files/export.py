@@ -1,4 +1,4 @@
-"""Write new mesh files, without a source to patch."""
+"""Write new mesh files, without an existing file to patch."""
 
 import io
 import zipfile

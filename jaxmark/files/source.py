@@ -1,4 +1,4 @@
-"""Parsed mesh files, which can be written again with other positions, the normals that follow, and all other bytes."""
+"""Parsed mesh files, which can be written with other positions and normals, while all other bytes stay."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -178,7 +178,7 @@ class Source:
         texture: reads the texture coordinates of each face's corners, NaN where there are none; None without any.
         skin: reads which joints move each point; None without any.
         parts: the meshes in the file that can be marked; empty if there is just one in it.
-        skipped: the other meshes by name, and why they cannot be marked.
+        skipped: the other meshes by name, and the reasons why they cannot be marked.
     """
 
     data: bytes
@@ -226,13 +226,13 @@ def unusable(skipped: Mapping[str, str], count: int) -> str:
 
 
 def linked(one: Indices, other: Indices, count: int) -> Indices:
-    """Number the connected components of a graph of `count` nodes, and return that of each node."""
+    """Return the number of the connected component of each node of a graph of `count` nodes."""
     graph = sparse.coo_array((np.ones(len(one), np.int8), (one, other)), (count, count))
     return csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 def unique_names(names: Iterable[str]) -> list[str]:
-    """Number repeated names, so that no two are the same."""
+    """Append numbers to repeated names, so that no two are the same."""
     count: dict[str, int] = {}
     unique: list[str] = []
     for name in names:

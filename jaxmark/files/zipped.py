@@ -37,7 +37,7 @@ class Member:
 
     @property
     def shown(self) -> str:
-        """The name, fit for a message."""
+        """The name, escaped and shortened for messages."""
         return ascii(self.name)[:80]
 
 

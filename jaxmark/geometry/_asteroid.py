@@ -1,4 +1,4 @@
-"""A mesh to try things on, without a file: irregular triangles over large forms and fine detail, as scans have them."""
+"""A sample mesh without a file: irregular triangles, with large forms and fine detail, as in scans."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -8,8 +8,8 @@ from jaxmark.geometry.mesh import Mesh, make_mesh
 
 _AXES = (1.0, 0.72, 0.8)
 _CRATERS = 60
-_ROUGHNESS = 0.002  # of the radius
-_SHAKE = 0.3  # of the distance of neighbours
+_ROUGHNESS = 0.002  # relative to the radius
+_SHAKE = 0.3  # standard deviation of random shifts, over the distance of neighbours
 
 
 def asteroid(vertices: int = 10_000, seed: int = 2) -> Mesh:
@@ -17,10 +17,10 @@ def asteroid(vertices: int = 10_000, seed: int = 2) -> Mesh:
 
     Args:
         vertices: number of vertices, at least 100.
-        seed: seed of its form.
+        seed: seed of the shape.
     """
     random = np.random.default_rng(seed)
-    # A spiral spreads points evenly, a shake makes their triangles irregular.
+    # A spiral spreads points evenly, and random shifts make their triangles irregular.
     turn = np.arange(vertices) * np.pi * (3 - np.sqrt(5))
     height = 1 - (2 * np.arange(vertices) + 1) / vertices
     ring = np.sqrt(1 - height**2)
@@ -35,7 +35,7 @@ def asteroid(vertices: int = 10_000, seed: int = 2) -> Mesh:
 
 
 def _radius(points: Float64[np.ndarray, "points 3"], random: np.random.Generator) -> Float64[np.ndarray, " points"]:
-    """Compute the distance from the centre in each direction: waves of all lengths, craters with rims, and roughness."""
+    """Compute the distance from the centre in each direction: waves, craters with rims, and roughness."""
     radius = np.ones(len(points))
     for octave in range(4):
         waves = np.sin(2.0**octave * points @ (1.6 * random.normal(size=(3, 8))) + random.uniform(0, 2 * np.pi, 8))

@@ -41,7 +41,7 @@ def geometry_hash(mesh: Mesh) -> bytes:
 
 
 def grid_spacing(diagonal: float) -> float:
-    """Return the spacing of the grid for a bounding-box diagonal, in its units: a power of two, so that rounding is exact."""
+    """Return the grid's spacing for a bounding-box diagonal: a power of two of its unit, so that rounding is exact."""
     return 2.0 ** math.floor(math.log2(diagonal / _CELLS))
 
 

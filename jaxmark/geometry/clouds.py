@@ -15,12 +15,12 @@ from jaxmark.geometry.pose import IDENTITY, Points, Pose
 from jaxmark.geometry.surfaces import Samples
 
 _PLANE_POINTS = 12  # nearest points that a plane is fitted to
-_SIDE_POINTS = 80  # nearest samples whose mean is inside, by which normals are turned outside
+_SIDE_POINTS = 80  # number of nearest samples whose mean is assumed to be inside, to orient normals outwards
 _BLOCK = 2**16  # points whose planes are fitted at a time
 _COUNTED_POINTS = 200_000  # random points by which the size of cells is chosen
 _ANCHORS = 20_000  # points that are enough to find a pose by
-_STRAY_POINTS, _STRAY_RATIO = 8, 3.0  # a stray is so many times further from so many others than the median point is
-_REACH = 2.0  # spacings beside a point to which its plane reaches; beyond, the point itself is the closest
+_STRAY_POINTS, _STRAY_RATIO = 8, 3.0  # stray points: mean distance to 8 nearest points above 3 times the median one
+_REACH = 2.0  # radius of a point's plane, in spacings; beyond it, the closest place is the point itself
 
 
 class Planes(NamedTuple):
@@ -57,7 +57,7 @@ def planes(tree: KDTree, places: Points, neighbours: int = _PLANE_POINTS) -> Pla
 
 
 class Cloud:
-    """Points that stand for the surface they lie on, as `jaxmark.geometry.surfaces.Surface` is of a mesh."""
+    """A point cloud as a surface, with the same methods as `jaxmark.geometry.surfaces.Surface`."""
 
     def __init__(self, points: Points) -> None:
         """Take over points, each of which counts."""
@@ -79,12 +79,12 @@ class Cloud:
         return planes(self.tree, self.points)
 
     def without_strays(self) -> "Cloud":
-        """Return the points that are not much further from the nearest others than most, without floaters and outliers."""
+        """Return the points without floaters and outliers, whose nearest points are much further than usual."""
         apart = spacings(self.points, _STRAY_POINTS)
         return Cloud(self.points[apart <= _STRAY_RATIO * np.median(apart)])
 
     def anchors(self) -> tuple[Points, Points]:
-        """Compute the random ones of the points, and unit normals there, of either side."""
+        """Choose random points, and unit normals there, with arbitrary signs."""
         chosen = np.sort(np.random.default_rng(0).permutation(len(self.points))[:_ANCHORS])
         return self.points[chosen], self.planes.normals[chosen]
 
@@ -119,7 +119,7 @@ class Cloud:
         return Samples(places, unit(np.where(outward < 0, -normals, normals)), area)
 
     def _cells(self, count: int) -> tuple[Int64[np.ndarray, " points"], float]:
-        """Compute the number of the cell of each point, of cells so large that about `count` have points, and their size."""
+        """Assign points to cells, of which about `count` have points; returns cell numbers and the cell size."""
         chosen = np.random.default_rng(0).permutation(len(self.points))[:_COUNTED_POINTS]
         low, extent = self.points.min(axis=0), float(np.ptp(self.points, axis=0).max()) or 1.0
 

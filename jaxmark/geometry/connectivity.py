@@ -112,7 +112,7 @@ class _Apexes:
         self._apex = apex[single]
 
     def __call__(self, corners: Int64[np.ndarray, "sides 2"]) -> Int64[np.ndarray, " sides"]:
-        """Return the apex of each side, or -1 where there is none, or no vertex at one of the ends."""
+        """Return the apex of each side; -1 if there is none, or an end of the side is -1."""
         apex = np.full(len(corners), -1)
         known = np.flatnonzero((corners >= 0).all(axis=1))
         asked = corners[known, 0] * self._size + corners[known, 1]

@@ -1,4 +1,4 @@
-"""Imprints of originals, by which a copy that was saved again is restored to exactly the geometry that was hashed.
+"""Imprints of originals, which restore a copy that was saved again to exactly the geometry that was hashed.
 
 If a coordinate lies between two planes of the grid, rounding a copy may choose the other plane. So the imprint keeps a
 short hash of each point: of the eight corners of the grid's cube around a point of the copy, the one with a known hash
@@ -19,7 +19,7 @@ from jaxmark.geometry.pose import IDENTITY, Points, Pose, similarity
 
 _NEAR, _WIDE = (0.0, 1.0), (-1.0, 0.0, 1.0, 2.0)  # planes of the grid about a coordinate, from the one below
 _SAMPLE = 500  # points by which a pose is tried
-_MIN_SHARE = 0.25  # share of them that must be found for a pose to be pursued; a wrong pose finds none but by chance
+_MIN_SHARE = 0.25  # least fraction of sample points that a pose must recognise; a wrong pose has only chance matches
 _MAX_ROUNDS = 4  # of fitting the pose to the points that were found, and finding them again
 
 
@@ -41,7 +41,7 @@ class Restored(NamedTuple):
     exact: bool  # whether its canonical geometry is the original's
     places: Int64[np.ndarray, " vertices"]  # canonical index of the point at each vertex; -1 if it is none
     share: float  # share of the original's points that were found, but for the few whose hashes coincide
-    distance: float  # between the two shapes by their moments, over the original's size; says how unlike they are
+    distance: float  # distance of the two shapes by their moments, over the original's size
 
 
 def make_imprint(canonical: Canonical, grid: float) -> Imprint:
@@ -94,7 +94,7 @@ def restore(copy: Mesh, imprint: Imprint) -> Restored:
 
 
 def _moments(mesh: Mesh) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, "3 3"]]:
-    """Compute the centre and covariance of a surface: unlike those of its vertices, they do not depend on what is welded.
+    """Compute the centre and covariance of a surface, which, unlike those of its vertices, ignore welding.
 
     Those of a cloud are of its distinct points, as it has nothing else.
     """
@@ -143,7 +143,7 @@ def _find(
 
 
 def _poses(centre: Float64[np.ndarray, " 3"], covariance: Float64[np.ndarray, "3 3"], imprint: Imprint) -> list[Pose]:
-    """Return the similarities that bring the moments of a copy onto an original's, in all 24 ways that do not mirror."""
+    """Compute the similarities that map the moments of a copy to an original's, as all 24 rotations."""
     (size, axes), (wide, onto) = np.linalg.eigh(covariance), np.linalg.eigh(imprint.covariance)
     if not size.sum() > 0:
         return []
@@ -156,7 +156,7 @@ def _poses(centre: Float64[np.ndarray, " 3"], covariance: Float64[np.ndarray, "3
 
 
 def _distance(centre: Float64[np.ndarray, " 3"], covariance: Float64[np.ndarray, "3 3"], imprint: Imprint) -> float:
-    """Compute the distance of two ellipsoids by their centres and widths, after one is scaled and turned like the other if needed.
+    """Compute the distance of two ellipsoids by their centres and widths, if needed after alignment.
 
     It is the smaller of the distances with that alignment and without, as a shift, a turn or a scale is no difference.
     """

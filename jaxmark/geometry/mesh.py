@@ -131,7 +131,7 @@ def weld(vertices: Float[Array | np.ndarray, "vertices 3"]) -> Weld:
 
 
 def weld_mesh(mesh: Mesh, welded: Weld) -> Mesh:
-    """Return the mesh of the distinct points: the same faces, as indices of points instead of vertices."""
+    """Weld a mesh: return its distinct points, and its faces as indices of points instead of vertices."""
     return Mesh(np.asarray(mesh.vertices)[welded.first], welded.point[np.asarray(mesh.faces)])
 
 
@@ -155,7 +155,7 @@ def sides(faces: Faces) -> tuple[Int64[np.ndarray, "sides 2"], Int64[np.ndarray,
 
 
 def face_pairs(faces: Faces) -> tuple[Int64[np.ndarray, "pairs 2"], Bool[np.ndarray, " pairs"]]:
-    """Return the pairs of faces that alone share an edge, each once, and whether they run along it in the same direction."""
+    """Return the pairs of faces that share an edge with no other face, and whether they run along it alike."""
     faces = np.asarray(faces, np.int64)
     start, face = faces.T.ravel(), np.tile(np.arange(len(faces)), 3)
     code = _side_codes(faces)[0].T.ravel()
@@ -190,13 +190,13 @@ def diagonal(mesh: Mesh) -> float:
 
 
 def vertex_normals(mesh: Mesh) -> Float64[np.ndarray, "vertices 3"]:
-    """Compute the unit normals of vertices: area-weighted means of the face normals; zero where these cancel or have no area."""
+    """Compute unit normals of vertices, as area-weighted means of the face normals; zero if these cancel."""
     corner, normals, size = np.ravel(mesh.faces), _area_vectors(mesh), len(mesh.vertices)
     return unit(np.stack([np.bincount(corner, np.repeat(column, 3), size) for column in normals.T], axis=1))
 
 
 def face_normals(mesh: Mesh) -> Float64[np.ndarray, "faces 3"]:
-    """Compute the unit normals of faces; zero where a face has no area."""
+    """Compute unit normals of faces; zero for faces of area 0."""
     return unit(_area_vectors(mesh))
 
 
@@ -207,7 +207,7 @@ def boundary_vertices(faces: Faces) -> Int64[np.ndarray, " boundary"]:
 
 
 def open_sides(faces: Faces) -> Bool[np.ndarray, "faces 3"]:
-    """Return the mask of the sides of each face that no other side runs along; side k goes from corner k to corner k + 1."""
+    """Return a mask of the sides of faces without a second face; side k goes from corner k to corner k + 1."""
     codes, proper, _ = _side_codes(faces)
     _, which, count = np.unique(codes, return_inverse=True, return_counts=True)
     return (count == 1)[which.reshape(codes.shape)] & proper
@@ -239,7 +239,7 @@ def components(mesh: Mesh) -> list[Mesh]:
 
 
 def used_vertices(mesh: Mesh) -> Bool[np.ndarray, " vertices"]:
-    """Return the mask of the vertices that faces use; the others are no part of the surface. A cloud uses all of its points."""
+    """Return a mask of the vertices that faces use, which form the surface; a cloud uses all its points."""
     if len(mesh.faces) == 0:
         return np.ones(len(mesh.vertices), bool)
     used = np.zeros(len(mesh.vertices), bool)
@@ -283,7 +283,9 @@ def same_connectivity(first: Mesh, second: Mesh) -> bool:
 
 
 def displacement(mesh: Mesh, suspect: Mesh, welded: Weld, length: float) -> Float64[np.ndarray, "points 3"]:
-    """Compute the displacement of each welded point from a mesh to a suspect, divided by `length`; copies of a point are averaged.
+    """Compute the displacement of each welded point from a mesh to a suspect, divided by `length`.
+
+    Displacements of vertices that share a point are averaged.
 
     Points are welded by the mesh, not by the suspect's positions, because quantisation makes other vertices coincide. A
     point that no face uses is no part of the surface: wherever it went, it counts as unmoved.
@@ -321,7 +323,7 @@ def _area_vectors(mesh: Mesh) -> Float64[np.ndarray, "faces 3"]:
 
 
 def cross_product(x: Float64[np.ndarray, "rows 3"], y: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3"]:
-    """Return the cross product row by row; four times as fast as NumPy's, which is for any axes."""
+    """Compute the cross product row by row, four times as fast as NumPy's, which supports any axes."""
     return np.stack([x[:, i] * y[:, j] - x[:, j] * y[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
 
 
@@ -332,14 +334,14 @@ def unit(x: Float64[np.ndarray, "*rows 3"]) -> Float64[np.ndarray, "*rows 3"]:
 
 
 def _count_sides(faces: Faces) -> tuple[Int64[np.ndarray, "edges 2"], Int64[np.ndarray, " edges"]]:
-    """Return the undirected edges, sorted, and the number of face sides that each stands for."""
+    """Return the undirected edges, sorted, and the number of sides of faces on each edge."""
     codes, proper, bits = _side_codes(faces)
     codes, count = np.unique(codes[proper], return_counts=True)
     return np.stack([codes >> bits, codes & ((1 << bits) - 1)], axis=1), count
 
 
 def _side_codes(faces: Faces) -> tuple[Int64[np.ndarray, "faces 3"], Bool[np.ndarray, "faces 3"], int]:
-    """Return a number for each undirected side, whether its ends differ, and the bits of the larger end in the number.
+    """Return a code for each undirected side, whether its ends differ, and the bits of the larger end in the code.
 
     One integer per pair sorts many times faster than rows do.
     """

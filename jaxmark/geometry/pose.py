@@ -22,7 +22,7 @@ class Pose(NamedTuple):
         return points @ np.swapaxes(self.matrix, -1, -2) + self.shift[..., None, :]
 
     def then(self, other: "Pose") -> "Pose":
-        """Return the composition of this map and, after it, the other."""
+        """Compose this map with another map that is applied after it."""
         return Pose(other.matrix @ self.matrix, other.matrix @ self.shift + other.shift)
 
     def inverse(self) -> "Pose":
@@ -36,7 +36,7 @@ class Pose(NamedTuple):
 
     @property
     def mirrors(self) -> bool:
-        """Whether this one map makes left hands of right ones."""
+        """Whether the map is a reflection; for a single map."""
         return bool(np.linalg.det(self.matrix) < 0)
 
 
@@ -51,7 +51,8 @@ def similarity(source: PointSets, target: PointSets, mirrored: bool | None = Fal
     Args:
         source: points, or several sets of them.
         target: as many points.
-        mirrored: whether the map also mirrors; None lets the fit decide, and a flat shape, which does not tell, turn.
+        mirrored: whether the map is a reflection; None chooses the better fit, and a rotation for flat shapes, which
+            fit both.
     """
     source_mean, target_mean = source.mean(axis=-2, keepdims=True), target.mean(axis=-2, keepdims=True)
     u, size, vt = np.linalg.svd(np.swapaxes(target - target_mean, -1, -2) @ (source - source_mean))

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64, Int64
 from jaxmark.errors import require
 from jaxmark.geometry.mesh import Mesh, diagonal, face_normals, unit, used_vertices, vertex_normals
 
-#: Cameras by the side that they look at: right, up and towards the eye, as rows. +y is up, the front is +z.
+#: Cameras by the side that they show: the axes right, up and towards the viewer, as rows. +y is up, the front is +z.
 SIDES: Mapping[str, Float64[np.ndarray, "3 3"]] = {
     "front": np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]),
     "back": np.array([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]]),
@@ -28,7 +28,7 @@ class Frame(NamedTuple):
 
     @classmethod
     def of(cls, mesh: Mesh) -> "Frame":
-        """Make the frame in which a mesh is seen whole from everywhere; raises as `diagonal` does."""
+        """Make the frame that shows a whole mesh from every side; raises as `diagonal` does."""
         points = np.asarray(mesh.vertices, np.float64)[used_vertices(mesh)]
         return cls((points.min(axis=0) + points.max(axis=0)) / 2, diagonal(mesh))
 
@@ -47,7 +47,7 @@ class Raster(NamedTuple):
         return self.face >= 0
 
     def normals(self, *, smooth: bool) -> Float64[np.ndarray, "rows columns 3"]:
-        """Compute the unit normals in the camera's directions, turned towards the eye; 0 beside the object.
+        """Compute unit normals in the camera's axes, turned towards the viewer; 0 for pixels without the object.
 
         Args:
             smooth: whether to interpolate normals of vertices rather than to take those of faces.

@@ -26,7 +26,7 @@ class Samples(NamedTuple):
 
 @runtime_checkable
 class Geometry(Protocol):
-    """A shape that registration aligns: the surface of a mesh, or the points of a cloud."""
+    """A shape for registration: the surface of a mesh, or the points of a cloud."""
 
     def anchors(self) -> tuple[Points, Points]:
         """Return the points of the shape itself, and unit normals there."""
@@ -99,7 +99,7 @@ def sample(mesh: Mesh, count: int) -> Samples:
 def on_rim(
     mesh: Mesh, face: Int64[np.ndarray, " points"], closest: Float64[np.ndarray, "points 3"]
 ) -> Bool[np.ndarray, " points"]:
-    """Return the mask of the closest points on the rim of a hole, whose query points may lie beyond the rim."""
+    """Return a mask of the closest points on the rim of a hole, whose query points may lie beyond the rim."""
     rim = np.zeros(len(mesh.vertices), bool)
     rim[boundary_vertices(mesh.faces)] = True
     if not rim.any():
@@ -135,7 +135,7 @@ def surface_moments(corners: Corners) -> Moments:
 
 
 def volume_moments(corners: Corners) -> Moments:
-    """Compute the moments of what a closed surface encloses: sums over the tetrahedra that its faces and the origin span.
+    """Compute the moments of the volume that a closed surface encloses, as sums over tetrahedra to the origin.
 
     The mass is not positive if normals point inwards; centre and covariance do not depend on that.
     """
@@ -153,5 +153,5 @@ def _moments(weight: Any, mass: Any, corners: tuple[Any, Any, Any], over: tuple[
 
 
 def _cross(x: Any, y: Any) -> Any:
-    """Return the cross products of rows, of NumPy or traced arrays."""
+    """Compute the cross products of rows of NumPy or traced arrays."""
     return x[:, [1, 2, 0]] * y[:, [2, 0, 1]] - x[:, [2, 0, 1]] * y[:, [1, 2, 0]]

@@ -28,7 +28,7 @@ class Picture(NamedTuple):
     figure: Any  # `matplotlib.figure.Figure`, for changes of your own
 
     def png(self) -> bytes:
-        """Return the picture as the bytes of a PNG file, the same each time."""
+        """Return the picture as the bytes of a PNG file, which are deterministic."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         self.figure.draw_without_rendering()  # colour bars find their places in the second pass

@@ -1,8 +1,8 @@
 """Differentiable spectral filtering of meshes by polynomials and rational functions of the graph Laplacian.
 
-`from_mesh`, `from_edges`, `from_points` and `from_matrices` build the operator of a graph, `bands` has families of band
-filters as Chebyshev coefficients, `filter` applies one filter to a signal and `band_components` a whole family,
-`inverse` brings a signal back from its parts, and `cheb_conv` is a layer of learned ones; `eigenpairs` is the exact
+`from_mesh`, `from_edges`, `from_points` and `from_matrices` build the operator of a graph. `bands` has families of band
+filters as Chebyshev coefficients. `filter` applies one filter to a signal, and `band_components` a whole family;
+`inverse` recovers a signal from its parts. `cheb_conv` is a layer of learned filters. `eigenpairs` is the exact
 reference.
 """
 

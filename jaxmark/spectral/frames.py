@@ -106,14 +106,14 @@ def _inverse(operator: Operator, c: Array, parts: Array) -> Array:
 
 
 def _power(c: Array) -> Array:
-    """Return the Chebyshev series of Σ_j g_j², of twice the degree: cosine series squared as Laurent series."""
+    """Compute the Chebyshev series of Σ_j g_j², of twice the degree, by squaring cosine series as Laurent series."""
     laurent = jnp.concatenate([c[:, :0:-1] / 2, c[:, :1], c[:, 1:] / 2], axis=1)
     square = fftconvolve(laurent, laurent, axes=[1]).sum(axis=0)[2 * (c.shape[1] - 1) :]
     return jnp.concatenate([square[:1], 2 * square[1:]])
 
 
 def _at_nodes(row: np.ndarray, points: int) -> Float64[np.ndarray, " points"]:
-    """Return the values of a Chebyshev series at the zeros of T_points, by decreasing λ; it has no more terms than points."""
+    """Evaluate a Chebyshev series of at most `points` terms at the zeros of T_points, by decreasing λ."""
     return np.asarray(fft.dct(np.concatenate([row[:1], row[1:] / 2]), type=3, n=points))
 
 

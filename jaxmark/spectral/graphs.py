@@ -241,7 +241,7 @@ def from_points(
 def nearest_pairs(
     positions: Float64[np.ndarray, "points axes"], count: int
 ) -> tuple[Int64[np.ndarray, "edges 2"], float]:
-    """Return the pairs of points one of which is among the nearest of the other, and the mean distance of the last of these."""
+    """Find the pairs of points that are neighbours, and the mean distance to the farthest neighbour."""
     found = KDTree(positions).query(positions, count + 1)
     distance, nearest = (np.asarray(part) for part in found)
     size = len(positions)
@@ -257,7 +257,7 @@ def nearest_pairs(
 def _graph(
     vertices: Float[Array | np.ndarray, "vertices 3"], faces: np.ndarray, elements: Elements
 ) -> tuple[Int64[np.ndarray, "edges 2"], Float[Array | np.ndarray, "elements 3"]]:
-    """Return the edges of the graph of a mesh's elements, and where these stand."""
+    """Return the edges of the graph of a mesh's elements, and the elements' positions."""
     match elements:
         case "vertices":
             return edges(faces), vertices
@@ -270,7 +270,7 @@ def _graph(
 
 
 def _meetings(pairs: Int64[np.ndarray, "edges 2"]) -> Int64[np.ndarray, "meetings 2"]:
-    """Return the pairs of edges that share a vertex, each once."""
+    """Find the pairs of edges that share a vertex, each pair once."""
     ends = pairs.T.ravel()
     order = np.argsort(ends, kind="stable")
     around = order % max(len(pairs), 1)  # the edges around the first vertex, then around the second, and so on
@@ -315,7 +315,7 @@ def _with_mass(operator: Laplacian, mass: ArrayLike | None, bound: float | None)
 
 
 def _bound(operator: Laplacian) -> float:
-    """Return a bound of the spectrum of M⁻¹(D - W): by its rows (Gershgorin), or a little above the largest eigenvalue."""
+    """Bound the spectrum of M⁻¹(D - W), by its rows (Gershgorin) or by the largest eigenvalue and a margin."""
     linked, root, scaled = symmetric_matrix(operator)
     if len(linked) == 0:
         return 2.0

@@ -1,4 +1,4 @@
-"""The graph Laplacian of a mesh as edge arrays, the operator that all filters are functions of.
+"""The graph Laplacian of a mesh as edge arrays; all filters are functions of this operator.
 
 Δ = I - D⁻¹W with symmetric non-negative edge weights W and the diagonal D of their row sums (Sohn et al., eq. 4-5; the
 paper prints D = diag(1/d), but its Lemma 3.1 holds for D = diag(d)). The spectrum is real and lies in [0, 2], and Δ is
@@ -376,7 +376,7 @@ def symmetric_matrix(operator: Laplacian) -> tuple[Int64[np.ndarray, " linked"],
 
 
 def host_edges(operator: Laplacian) -> tuple[Int[np.ndarray, "edges 2"], Float64[np.ndarray, " edges"]]:
-    """Return the operator's edges without padding, and their weights, as NumPy arrays; weights are 1 if it has none."""
+    """Return the edges without padding, and their weights, as NumPy arrays; weights are 1 if the operator has none."""
     pairs = np.asarray(operator.edges)
     real = pairs[:, 0] < len(operator.degree)
     weights = np.ones(len(pairs)) if operator.weights is None else np.asarray(operator.weights, np.float64)

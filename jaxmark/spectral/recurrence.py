@@ -59,7 +59,7 @@ def _scan_terms(
 
 
 def _factors(terms: int, x: Array) -> Array:
-    """Return the factors of the recurrence from T_1 on: T_1 = Δ̃T_0 is that with factor 1 and T_{-1} = 0."""
+    """Return the factors of the recurrence from T_1 on; T_1 = Δ̃T_0 is a step with factor 1 and T_{-1} = 0."""
     return jnp.full(terms - 1, 2, x.dtype).at[:1].set(1)
 
 
@@ -98,7 +98,7 @@ def _projection_scan(family: Family, terms: int, operator: Operator, x: Array, y
 
 
 def _pulled_back(family: Family, operator: Operator, w: Array, x: Array, y: Array) -> list[Array]:
-    """Return the gradient of Σ_k ⟨mix(T_k(Δ̃)x, w_k), y⟩ with respect to the floating leaves of the operator, in O(N) memory.
+    """Compute the gradient of Σ_k ⟨mix(T_k(Δ̃)x, w_k), y⟩ by the operator's floating leaves, in O(N) memory.
 
     With z_k = mix(y, turn(w_k)) and b_k = z_k + 2Δ̃ᵀb_{k+1} - b_{k+2}, it is the sum of the gradients of
     ⟨b_{k+1}, 2Δ T_k x⟩ over k, where b and T are held fixed, and the factor 2 is 1 at k = 0. Both recurrences run
@@ -159,7 +159,7 @@ def _changed(family: Family) -> Linear:
 
 @cache
 def _filtered(family: Family) -> Linear:
-    """Return a filter as a function of the signal: `(operator, w, x)`."""
+    """Make a filter as a function of the signal: `(operator, w, x)`."""
     scan = partial(_filter_scan, family)
 
     def transposed(operator: Operator, w: Array, y: Array) -> Array:
@@ -176,7 +176,7 @@ def _filtered(family: Family) -> Linear:
 
 @cache
 def _of_weights(family: Family, terms: int) -> Linear:
-    """Return a filter as a function of its weights: `(operator, x, w)`."""
+    """Make a filter as a function of its weights: `(operator, x, w)`."""
     scan = partial(_filter_scan, family)
     on_processors = where_installed(family.filter_kernel, scan)
     return Linear(
@@ -206,7 +206,7 @@ COLUMNS = Family(lambda t, c: c * t, lambda t, u: _sums(u * t), lambda c: c, fil
 
 @cache
 def projection(terms: int, family: Family = COLUMNS) -> Linear:
-    """Return the pairs of T_k(Δ̃)x and y, for each of so many k, as a function of y: `(operator, x, y)`."""
+    """Make the map from y to the pairings ⟨T_k(Δ̃)x, y⟩ for all k < `terms`: `(operator, x, y)`."""
     scan = partial(_projection_scan, family, terms)
 
     def by_signal(operator: Operator, x: Array, y: Array, change: Array) -> Array:
@@ -222,7 +222,7 @@ def projection(terms: int, family: Family = COLUMNS) -> Linear:
 
 
 def _mix(x: Array, weight: Array) -> Array:
-    """Return the product xW; by sums over columns where these are few, as processors are slow at such narrow matrices."""
+    """Compute the product xW; few columns are summed one by one, as narrow matrices are slow on processors."""
     if x.shape[1] > _MAX_SUMMED_COLUMNS:
         return matmul(x, weight)
     return sum((x[:, i, None] * weight[i] for i in range(1, x.shape[1])), x[:, :1] * weight[0])
@@ -247,7 +247,7 @@ def solve(
 
 
 def inner_mass(operator: Operator, x: Array) -> Array:
-    """Return the mass of each vertex, or 1 at vertices without any: they are blocks of their own, so any mass serves."""
+    """Return the mass of each vertex, or 1 at vertices without mass, for which any mass is correct."""
     mass = per_row(operator.mass, x)
     return jnp.where(mass > 0, mass, 1)
 

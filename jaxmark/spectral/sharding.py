@@ -293,7 +293,7 @@ def _interior(
     degree: Float[np.ndarray, "devices rows"],
     table: bool,
 ) -> Laplacian:
-    """Return the Laplacians of the edges within blocks, stacked; in `pairs`, vertices are device · rows + row."""
+    """Compute the Laplacians of the edges within blocks, stacked; in `pairs`, vertices are device · rows + row."""
     count, rows = degree.shape
     order = np.argsort(pairs[:, 0] // rows, kind="stable")
     pairs = pairs[order]

@@ -81,7 +81,7 @@ def eigenpairs(operator: Laplacian, count: int | None = None, *, tolerance: floa
 
 
 def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: int) -> Quadrature:
-    """Compute the Gauss quadrature of a signal's spectral measure, by Lanczos iteration with full reorthogonalisation.
+    """Compute a Gauss quadrature of a signal's spectral measure, by Lanczos iteration with full reorthogonalisation.
 
     Reference: Golub, Meurant, "Matrices, Moments and Quadrature with Applications", 2010, ch. 6.
 
@@ -115,7 +115,7 @@ def quadrature(operator: Laplacian, x: Float64[np.ndarray, " vertices"], steps: 
 
 
 def white_probes(operator: Laplacian, seed: Seed, probes: int) -> Float64[np.ndarray, "vertices probes"]:
-    """Compute the random signals whose spectral measures sum, in expectation, to the counting measure of the eigenvalues.
+    """Draw random signals whose spectral measures sum, in expectation, to the count of the eigenvalues.
 
     The signals are random signs over √M, as in Hutchinson's estimator: Σ_p ⟨u_p, f(Δ)u_p⟩_M estimates Σ_i f(λ_i), over
     eigenvalues above the null space, with a variance of at most 2 Σ_i f(λ_i)²/probes (Avron, Toledo, J. ACM 58, 2011).
@@ -135,7 +135,7 @@ def white_probes(operator: Laplacian, seed: Seed, probes: int) -> Float64[np.nda
 def _lowest(
     scaled: sparse.csc_array, root: np.ndarray, component: np.ndarray, wanted: int
 ) -> tuple[Float64[np.ndarray, " pairs"], Float64[np.ndarray, "vertices pairs"]]:
-    """Return the lowest eigenpairs above the null space of M^1/2 Δ M^-1/2, by shift-and-invert Lanczos.
+    """Compute the lowest eigenpairs above the null space of M^1/2 Δ M^-1/2, by shift-and-invert Lanczos.
 
     The null vectors, M^1/2 on each component, are known; with them projected out, only wanted pairs are iterated for.
     """

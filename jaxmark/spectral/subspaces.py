@@ -202,14 +202,14 @@ def lowest_eigenpairs(operator: Operator, count: int, seed: Seed, *, dtype: Any 
 
 
 def _product(operator: Operator, like: Array) -> Callable[[Array], Array]:
-    """Return the map y → Ay, in which isolated vertices are the highest frequency, so that they are none of the lowest."""
+    """Return the map y → Ay, in which isolated vertices have the highest frequency, so that they are left out."""
     product, linked = symmetric(operator, like), operator.linked(like)
     return lambda y: product(y) + jnp.where(linked, 0, 2 * y)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _pairs(count: int, operator: Operator, start: Array) -> tuple[Array, Array]:
-    """Return the lowest eigenpairs of A = M^½ΔM^-½, one for each column of the start, of which `count` have converged."""
+    """Compute the lowest eigenpairs of A = M^½ΔM^-½, one per column of the start; `count` have converged."""
     product, small = _product(operator, start), 100 * jnp.finfo(start.dtype).eps
 
     def rotate(block: Array) -> tuple[Array, Array, Array]:
@@ -255,7 +255,7 @@ def _damped(product: Any, block: Array, cut: Array) -> Array:
 
 
 def _solve_beside(operator: Operator, vectors: Array, values: Array, right: Array) -> Array:
-    """(A - λ_i)⁺ on what is orthogonal to all vectors; it is definite there if all other eigenvalues are larger."""
+    """Apply (A - λ_i)⁺ orthogonally to all vectors, where it is definite if all other eigenvalues are larger."""
     product = symmetric(operator, right)
 
     def project(y: Array) -> Array:

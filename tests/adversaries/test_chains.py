@@ -79,13 +79,13 @@ def test_refusals(sphere: Mesh):
         search_chain(lambda steps: 1.0, tools={"nothing": (1, 2)})
     with pytest.raises(jm.JaxmarkError, match=r"must be positive, got \(0, 1\) for 'noise'"):
         search_chain(lambda steps: 1.0, tools={"noise": (0, 1)})
-    with pytest.raises(jm.JaxmarkError, match="costs no number"):
+    with pytest.raises(jm.JaxmarkError, match="returned NaN"):
         search_chain(lambda steps: float("nan"), generations=1)
     with pytest.raises(jm.JaxmarkError, match="There is no metric 'x'; there are rms"):
         projected_cost([], "x")
     with pytest.raises(jm.JaxmarkError, match="got 0 tools, 4, 12 and 8"):
         search_chain(lambda steps: 1.0, tools={})
-    with pytest.raises(jm.JaxmarkError, match="marks of the attacker's own"):
+    with pytest.raises(jm.JaxmarkError, match="at least one mark of the attacker"):
         projected_cost([])
     marker = jm.make_marker(sphere, jm.Key(bytes(32)), bits=8)
     with pytest.raises(jm.JaxmarkError, match="not proven before any attack"):

@@ -85,9 +85,9 @@ def test_refusals(mesh, unchecked):
         adversaries.learn([mesh], [mesh], seed=0, goal="x")  # type: ignore[arg-type]
     with pytest.raises(jm.JaxmarkError, match="There is no goal 'x'"):
         learned_attack(init_network(jax.random.key(0)), "x")  # type: ignore[arg-type]
-    with pytest.raises(jm.JaxmarkError, match="pass its `network`, and its `goal`"):
+    with pytest.raises(jm.JaxmarkError, match="pass its attributes `network` and `goal`"):
         learned_attack(Learned((), "estimate", np.zeros(0), 0.0, 0.0), "estimate")  # type: ignore[arg-type]
-    with pytest.raises(jm.JaxmarkError, match="of a mark is positive, got -1"):
+    with pytest.raises(jm.JaxmarkError, match="of a mark must be positive, got -1"):
         adversaries.learn([mesh], [mesh], seed=0, mark=-1.0)
-    with pytest.raises(jm.JaxmarkError, match="got 1, 0, 400"):
+    with pytest.raises(jm.JaxmarkError, match="got 1, 0 and 400"):
         adversaries.learn([mesh], [], seed=0)

@@ -166,5 +166,5 @@ def test_refusals(marked):
         estimated_gradient(len, queries=1)
     with pytest.raises(jm.JaxmarkError, match="at least 1 query"):
         random_search(len, queries=0)
-    with pytest.raises(jm.JaxmarkError, match="positive step"):
+    with pytest.raises(jm.JaxmarkError, match="must be positive"):
         quantise_scores(len, 0.0)

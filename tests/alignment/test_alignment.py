@@ -446,7 +446,7 @@ def test_a_surface_with_little_more_than_the_shape_is_read_as_a_whole_only():
     assert 0.005 < found.residual < 0.01
     assert found.nuisance is not None  # what smoothing did to the host
     np.testing.assert_allclose(found.pose.matrix @ turn.as_matrix() * 3, np.eye(3), atol=0.05)
-    with pytest.raises(jm.JaxmarkError, match="could not be aligned: its surface lies"):
+    with pytest.raises(jm.JaxmarkError, match="could not be aligned: the distance of its surface"):
         align(original, jm.attack(smooth, "cropping", 0.6, seed=0))
 
 

@@ -66,9 +66,9 @@ def test_a_key_that_cannot_be_written_leaves_no_file(tmp_path: Path, monkeypatch
 def test_a_key_that_others_may_read_is_told(tmp_path: Path, ball: Path, monkeypatch, capsys):
     jm.watermark.save_key(jm.new_key(), tmp_path / "me.key")
     arguments = ["embed", ball, tmp_path / "marked.obj", "--key", tmp_path / "me.key", "--message", "00" * 512]
-    assert "may be read by others" not in run(arguments, monkeypatch, capsys)[1]
+    assert "other users may read" not in run(arguments, monkeypatch, capsys)[1]
     (tmp_path / "me.key").chmod(0o644)
-    assert "me.key may be read by others; chmod 600" in run(arguments, monkeypatch, capsys)[1]
+    assert "me.key; prevent this by: chmod 600" in run(arguments, monkeypatch, capsys)[1]
 
 
 def test_a_folder_without_meshes_leaves_no_folder(tmp_path: Path, monkeypatch, capsys):

@@ -71,7 +71,7 @@ def test_commands_say_what_they_do(workshop: Workshop, monkeypatch, quiet: bool)
     for command, said in (
         (["embed", "model.ply", "marked.ply", "--key", "owner.key", "--text", "hi"], "embedding model.ply"),
         (["attack", "marked.ply", "suspect.ply", "noise", 0.001], "attacking marked.ply: noise 0.001"),
-        (["detect", "suspect.ply", *DETECT, "--bits", 16], "aligning suspect.ply, and looking for a mark in it"),
+        (["detect", "suspect.ply", *DETECT, "--bits", 16], "aligning suspect.ply and reading it"),
     ):
         terminal = Terminal()
         monkeypatch.setattr(sys, "stderr", terminal)

@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -155,9 +156,13 @@ def test_a_file_that_is_dropped_is_named_with_its_dossier(tmp_path: Path):
     before = (tmp_path / "shop.db").read_bytes()
     marked, _ = jm.embed(mesh, b"8 bytes!", KEY, budget=0.004)
     jm.save_mesh(marked, tmp_path / "suspect.obj")
-    desk = Desk(tmp_path / "shop.db", [KEY])
+    desk = Desk(tmp_path / "shop.db", [KEY, jm.Key(bytes(32))])
     found = desk.find((tmp_path / "suspect.obj").read_bytes(), ".obj")
     assert (found["original"], found["id"], found["message"]) == ("model.obj", 1, b"8 bytes!".hex())
-    assert b"8 bytes!".hex().encode() in desk.dossiers[found["dossier"]]
+    page = desk.dossiers[found["dossier"]].decode()
+    assert b"8 bytes!".hex() in page
+    assert found["readings"] == 2
+    assert f"<sup>{found['log10_p']:.1f}</sup>" in page, "the dossier is charged for the catalogue, as the verdict is"
+    assert f"<sup>{found['log10_p'] - math.log10(2):.1f}</sup>" not in page
     assert KEY.hex() not in str(found)
     assert (tmp_path / "shop.db").read_bytes() == before

@@ -358,12 +358,15 @@ def test_a_toml_file_makes_programs_a_method(tmp_path: Path):
 def test_toml_files_that_declare_no_method_are_refused(tmp_path: Path):
     path = tmp_path / "bad.toml"
     for text, sentence in (
-        ("name = 3 =", "is no TOML"),
+        ("name = 3 =", "is not a TOML file"),
         ('name = "x"', "declares no embed"),
         (DECLARED.format(python="python") + "speed = 1\n", "speed is no field"),
         (DECLARED.format(python="python").replace("[1e-6, 1e-1]", "[1e-6]"), "two numbers"),
-        (DECLARED.format(python="python").replace("{suspect}", "{suspekt}"), "has {suspekt}; here there are suspect"),
-        (DECLARED.format(python="python").replace("false", "true"), "has {original}; here there are suspect, key"),
+        (
+            DECLARED.format(python="python").replace("{suspect}", "{suspekt}"),
+            "field {suspekt}; allowed here are suspect",
+        ),
+        (DECLARED.format(python="python").replace("false", "true"), "field {original}; allowed here are suspect, key"),
     ):
         path.write_text(text)
         with pytest.raises(jm.JaxmarkError, match=sentence):
@@ -477,7 +480,7 @@ def test_a_run_is_held_against_a_published_one(small: dict, plain: Path, tmp_pat
     published.write_text(f"{head}\n{','.join(fields)}\n")
     shared, (difference,) = jm.bench.hold_against(found, jm.bench.load_published(published))
     assert shared == 1
-    assert "read 1 here, 0 there" in difference
+    assert "read 1, published 0" in difference
     fields[head.split(",").index("bit_errors")] = "nan"
     for wrong in (f"{head}\n{line}\n{line}\n", f"{head}\n{','.join(fields)}\n", "x\n1\n", "", f"{head}\n", "\0\n"):
         published.write_text(wrong)
@@ -528,7 +531,7 @@ def test_names_that_no_league_has_are_refused(small: dict):
         ({"methods": ["nothing"]}, "no method 'nothing'"),
         ({"meshes": ["nowhere.ply"]}, "nowhere.ply"),
         ({"rate": 2.0}, "between 0 and 1"),
-        ({"workers": 0}, "needs a worker"),
+        ({"workers": 0}, "needs at least one worker"),
     ):
         with pytest.raises(jm.JaxmarkError, match=sentence):
             jm.bench.run(**{**small, **wrong})

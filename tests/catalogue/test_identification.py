@@ -85,7 +85,15 @@ def test_a_suspect_in_any_pose_is_named_with_its_message(shop: Shop):
     assert verdict.named[0].key == commitment(shop.key)
 
 
-def test_other_ways_of_aligning_are_paid_for(shop: Shop):
+def test_a_verdict_has_the_figures_of_the_original_that_it_names():
+    named = Match("a.ply", "", "", "whole", 1, 0.0, named=True, log10_p=-8.0, log10_p_uncommitted=-1.0)
+    estimate = Match("b.ply", "", "", "whole", 1, 0.0, log10_p=-60.0, caveats=("the original was edited",))
+    both, alone = (Verdict("", matches, 2).as_json() for matches in ((named, estimate), (estimate,)))
+    assert (both["original"], both["log10_p"], both["log10_p_uncommitted"], both["caveats"]) == ("a.ply", -8, -1, ())
+    assert (alone["named"], alone["log10_p"], alone["caveats"]) == (False, -60, ("the original was edited",))
+
+
+def test_other_ways_of_aligning_are_charged(shop: Shop):
     suspect = jm.attack(shop.marked[3], "noise", 0.02, seed=0)
     auto, same = (named(shop, suspect, align=align)[1] for align in ("auto", "same"))
     assert -70 < auto.named[0].log10_p < -10  # not at the floor, so that what is paid shows

@@ -113,7 +113,7 @@ def test_a_study_that_is_ended_goes_on(results, output, tmp_path):
     assert len(load_finished(again)) < 3
     assert without_seconds(study().run(again, log=said.append).rows) == without_seconds(results.rows)
     # What is finished is not done again: the seconds are the same, too.
-    assert study().run(again, log=said.append).rows == study().run(again, say=said.append).rows
+    assert study().run(again, log=said.append).rows == study().run(again, log=said.append).rows
     assert len(said) == 3 - 1 or len(said) == 3 - 2
     # A wider study takes over what it shares, another mesh of the same name does not.
     said.clear()

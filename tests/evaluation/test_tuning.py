@@ -258,13 +258,13 @@ def test_refusals(x64, unchecked):
     with pytest.raises(jm.JaxmarkError, match="at least one attack"):
         tune(rough_sphere(300), [], seed=jax.random.key(0))
     for wrong in (0.5, jm.new_key()):
-        with pytest.raises(jm.JaxmarkError, match="A seed is a whole number, such as 0, or a random key of JAX"):
+        with pytest.raises(jm.JaxmarkError, match="A seed must be a whole number, such as 0, or a random key of JAX"):
             tune(rough_sphere(300), ATTACKS, seed=wrong)  # type: ignore[arg-type]
     with pytest.raises(jm.JaxmarkError, match=r"pair such as \('noise', 0.005\), got 'noise'"):
         tune(rough_sphere(300), ["noise"], seed=jax.random.key(0))  # type: ignore[list-item]
     with pytest.raises(jm.JaxmarkError, match="one of rate, evidence, snr, got 'x'"):
         tune(rough_sphere(300), ATTACKS, seed=jax.random.key(0), margin="x")  # type: ignore[arg-type]
-    with pytest.raises(jm.JaxmarkError, match="see tune_blind"):
+    with pytest.raises(jm.JaxmarkError, match="use tune_blind"):
         tune(rough_sphere(300), ATTACKS, seed=jax.random.key(0), scheme="field")
     with pytest.raises(jm.JaxmarkError, match="name of ATTACKS or an Attack"):
         jm.attack(rough_sphere(300), lambda mesh: mesh, 0.1, seed=0)  # type: ignore[arg-type]

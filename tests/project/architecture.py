@@ -1,4 +1,4 @@
-"""The rooms of the package, their modules and imports, read from the code; run it to write table and figures again."""
+"""The subpackages, their modules and imports, read from the code; run it to write table and figures again."""
 
 import ast
 from collections.abc import Iterator, Mapping
@@ -19,14 +19,14 @@ def modules() -> set[str]:
     return {path.stem.lstrip("_") for path in PACKAGE.rglob("*.py")} | {path.name for path in PACKAGE.rglob("*/")}
 
 
-def rooms() -> dict[str, set[str]]:
+def packages() -> dict[str, set[str]]:
     """For each module or folder at the top of the package, what it imports of the others."""
     found: dict[str, set[str]] = {}
     for path in sorted(PACKAGE.rglob("*.py")):
-        room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-        if not room.startswith("_"):
-            found.setdefault(room, set()).update(set(imports(path.read_text())) - {room})
-    return {room: others & found.keys() for room, others in found.items()}
+        package = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        if not package.startswith("_"):
+            found.setdefault(package, set()).update(set(imports(path.read_text())) - {package})
+    return {package: others & found.keys() for package, others in found.items()}
 
 
 def imports(source: str) -> Iterator[str]:
@@ -43,27 +43,28 @@ def imports(source: str) -> Iterator[str]:
 
 
 def floors(found: Mapping[str, set[str]]) -> list[list[str]]:
-    """The rooms, floor by floor: each above all that it imports."""
+    """The packages, floor by floor: each above all that it imports."""
     floor: dict[str, int] = {}
-    for room in sorted(found, key=lambda room: len(below(found, room))):
-        floor[room] = max((floor[other] + 1 for other in below(found, room)), default=0)
-    return [sorted(room for room in found if floor[room] == number) for number in range(max(floor.values()) + 1)]
+    for package in sorted(found, key=lambda package: len(below(found, package))):
+        floor[package] = max((floor[other] + 1 for other in below(found, package)), default=0)
+    heights = range(max(floor.values()) + 1)
+    return [sorted(package for package in found if floor[package] == height) for height in heights]
 
 
-def below(found: Mapping[str, set[str]], room: str) -> set[str]:
-    """All rooms that a room rests on."""
-    return set().union(*({other} | below(found, other) for other in found[room]))
+def below(found: Mapping[str, set[str]], package: str) -> set[str]:
+    """All packages that a package rests on."""
+    return set().union(*({other} | below(found, other) for other in found[package]))
 
 
 def table(found: Mapping[str, set[str]]) -> str:
-    """The rooms and their modules, with the first lines of their docstrings; a room imports from those above."""
-    rows = ["| room or module | what it is |", "|---|---|"]
-    for room in (room for floor in floors(found) for room in floor):
-        folder = PACKAGE / room
+    """The packages and their modules, with the first lines of their docstrings; a package imports from those above."""
+    rows = ["| package or module | what it is |", "|---|---|"]
+    for package in (package for floor in floors(found) for package in floor):
+        folder = PACKAGE / package
         if not folder.is_dir():
-            rows.append(f"| `{room}` | {_first_line(folder.with_suffix('.py'))} |")
+            rows.append(f"| `{package}` | {_first_line(folder.with_suffix('.py'))} |")
             continue
-        rows.append(f"| `{room}/` | **{_first_line(folder / '__init__.py')}** |")
+        rows.append(f"| `{package}/` | **{_first_line(folder / '__init__.py')}** |")
         for path in sorted(folder.rglob("*.py"), key=lambda path: path.relative_to(folder).parts):
             name = path.relative_to(folder).with_suffix("").as_posix().removesuffix("__init__")
             if name and (line := _first_line(path)):
@@ -84,13 +85,13 @@ def _first_line(path: Path) -> str:
 
 
 def draw(found: Mapping[str, set[str]]) -> str:
-    """An SVG of the rooms, each above all that it imports; an import that others imply has no arrow."""
+    """An SVG of the packages, each above all that it imports; an import that others imply has no arrow."""
     rows = floors(found)
     widest = max(map(len, rows))
     place = {
-        room: (ACROSS * (column + (widest - len(row) + 1) / 2), DOWN * (len(rows) - number - 0.5))
+        package: (ACROSS * (column + (widest - len(row) + 1) / 2), DOWN * (len(rows) - number - 0.5))
         for number, row in enumerate(rows)
-        for column, room in enumerate(row)
+        for column, package in enumerate(row)
     }
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {ACROSS * widest} {DOWN * len(rows)}"'
@@ -99,23 +100,23 @@ def draw(found: Mapping[str, set[str]]) -> str:
         '<path d="M0 0 L8 4 L0 8 z" fill="#4a6fa5"/></marker></defs>',
         '<rect width="100%" height="100%" fill="white"/>',
     ]
-    for room, others in sorted(found.items()):
-        x, y = place[room]
+    for package, others in sorted(found.items()):
+        x, y = place[package]
         for other in sorted(others - set().union(*(below(found, one) for one in others))):
             to, down = place[other]
             lines.append(
                 f'<line x1="{x:g}" y1="{y + HIGH / 2:g}" x2="{to:g}" y2="{down - HIGH / 2:g}" stroke="#4a6fa5"'
                 ' marker-end="url(#head)"/>'
             )
-    for room, (x, y) in sorted(place.items()):
+    for package, (x, y) in sorted(place.items()):
         lines.append(
             f'<rect x="{x - WIDE / 2:g}" y="{y - HIGH / 2:g}" width="{WIDE}" height="{HIGH}" rx="5" fill="#eef3fa"'
-            f' stroke="#4a6fa5"/><text x="{x:g}" y="{y + 4:g}">{room}</text>'
+            f' stroke="#4a6fa5"/><text x="{x:g}" y="{y + 4:g}">{package}</text>'
         )
     return "\n".join([*lines, "</svg>", ""])
 
 
 if __name__ == "__main__":
-    FIGURE.write_text(draw(rooms()))
+    FIGURE.write_text(draw(packages()))
     data_flow.FIGURE.write_text(data_flow.draw())
-    MAP.write_text(written(MAP.read_text(), table(rooms())))
+    MAP.write_text(written(MAP.read_text(), table(packages())))

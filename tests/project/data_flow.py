@@ -5,7 +5,7 @@ from tests import ROOT
 FIGURE = ROOT / "docs" / "data_flow.svg"
 WIDE, ACROSS, DOWN, LINE = 290, 345, 150, 17  # of a box, from one to the next, and of a line of text
 
-#: Name of each box, its column and row, its title, and the modules and rooms that it stands for, by lines.
+#: Name of each box, its column and row, its title, and the modules and packages that it stands for, by lines.
 BOXES: dict[str, tuple[int, int, str, tuple[str, ...]]] = {
     "original": (0, 0, "the original, prepared", ("files mesh canonical", "padding original")),
     "filters": (1, 0, "filters", ("laplacian chebyshev product", "rational bands spectrum")),

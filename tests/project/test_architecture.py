@@ -1,4 +1,4 @@
-"""The order of rooms that CONTRIBUTING.md gives, and the pictures of them, are those of the code."""
+"""The order of packages that CONTRIBUTING.md gives, and the pictures of them, are those of the code."""
 
 import re
 import subprocess
@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ElementTree
 
 import jaxmark as jm
 from tests.project import data_flow
-from tests.project.architecture import FIGURE, MAP, PACKAGE, draw, imports, modules, rooms, table, written
+from tests.project.architecture import FIGURE, MAP, PACKAGE, draw, imports, modules, packages, table, written
 
 MOST_ROOMS = 16  # at the top of the package
 FILTERING = {"errors", "seeds", "geometry", "spectral"}  # what a filter needs
@@ -17,7 +17,7 @@ AGAIN = "write it again: python -m tests.project.architecture"
 
 
 def named_rooms(text: str) -> list[str]:
-    """The rooms in the first column of the table, row by row."""
+    """The packages in the first column of the table, row by row."""
     rows = re.findall(r"^\| (`[^|]*`) \|", text, re.MULTILINE)
     return [name for row in rows for name in re.findall(r"`(\w+)/?`", row)]
 
@@ -26,27 +26,27 @@ def backward(order: list[str], found: dict[str, set[str]]) -> list[str]:
     """Imports of what stands later in an order."""
     place = {name: number for number, name in enumerate(order)}
     return [
-        f"{room} imports {other}"
-        for room, others in found.items()
+        f"{package} imports {other}"
+        for package, others in found.items()
         for other in sorted(others)
-        if place[other] > place[room]
+        if place[other] > place[package]
     ]
 
 
 def test_the_table_names_every_room_once():
     named = named_rooms(MAP.read_text())
-    assert sorted(named) == sorted(rooms())
+    assert sorted(named) == sorted(packages())
     assert len(named) <= MOST_ROOMS
 
 
 def test_imports_flow_down_the_table():
-    found = rooms()
+    found = packages()
     assert found["evaluation"] >= {"attacks", "watermark", "plot"}
     assert not backward(named_rooms(MAP.read_text()), found)
 
 
 def test_filtering_knows_nothing_of_the_watermark():
-    assert rooms()["spectral"] | rooms()["geometry"] <= FILTERING
+    assert packages()["spectral"] | packages()["geometry"] <= FILTERING
 
 
 def test_an_import_against_the_flow_is_seen():
@@ -67,16 +67,16 @@ def test_the_package_shows_its_rooms_and_what_is_used_every_day():
     shown = dir(jm)
     assert {"spectral", "watermark", "attacks", "distortion", "plot", "embed", "detect"} <= set(shown)
     assert all(hasattr(jm, name) for name in shown)
-    assert len(set(shown) - set(rooms())) <= 24
+    assert len(set(shown) - set(packages())) <= 24
 
 
 def test_the_figure_is_drawn_from_the_imports():
-    assert FIGURE.read_text() == draw(rooms()), AGAIN
+    assert FIGURE.read_text() == draw(packages()), AGAIN
 
 
 def test_the_table_has_all_modules_with_their_first_lines():
     text = MAP.read_text()
-    assert text == written(text, table(rooms())), AGAIN
+    assert text == written(text, table(packages())), AGAIN
     private = {path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if path.name != "__init__.py"}
     assert len(re.findall(r"^\| (· )?`", text, re.MULTILINE)) >= len(private)
 
@@ -91,7 +91,7 @@ def test_modules_in_the_picture_of_the_data_exist():
 
 
 def test_no_module_is_hidden_by_a_function_of_its_name():
-    """A function that a room shows takes the name of a public module from whoever imports the room."""
+    """A function that a package shows takes the name of a public module from whoever imports the package."""
     for face in PACKAGE.rglob("__init__.py"):
         shown = set(re.findall(r"import \w+ as (\w+)$", face.read_text(), re.MULTILINE))
         public = {path.stem for path in face.parent.glob("*.py")}

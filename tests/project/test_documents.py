@@ -281,14 +281,14 @@ def reference(heading: str) -> set[str]:
     ("heading", "shown"), [("Everyday names", [jm]), ("Filters", [jm.spectral, jm.spectral.bands])]
 )
 def test_the_reference_lists_all_names(heading: str, shown: list):
-    names = {name for room in shown for name, value in inspect.getmembers(room) if not inspect.ismodule(value)}
+    names = {name for package in shown for name, value in inspect.getmembers(package) if not inspect.ismodule(value)}
     listed = {name.rpartition(".")[2] for name in reference(heading)}
     assert listed == {name for name in names if name[0] != "_"}
 
 
 def test_the_reference_has_all_rooms():
-    rooms = {f"jaxmark.{room.name}" for room in pkgutil.iter_modules(jm.__path__) if room.name[0] != "_"}
-    assert reference("Subpackages") == rooms
+    packages = {f"jaxmark.{package.name}" for package in pkgutil.iter_modules(jm.__path__) if package.name[0] != "_"}
+    assert reference("Subpackages") == packages
 
 
 def test_published_rates_are_those_of_the_protocol():

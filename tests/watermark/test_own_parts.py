@@ -16,11 +16,14 @@ from jaxmark.alignment.original import Original
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.laplacian import per_row
 from jaxmark.spectral.precision import matmul, sum_and_norm
+from jaxmark.watermark.blind.local import LocalScheme
+from jaxmark.watermark.blind.reading import _caveats
 from jaxmark.watermark.carriers import Carrier, Claim, PlainReader, Reader
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import code_length
 from jaxmark.watermark.interfaces import Detector, Scheme
 from jaxmark.watermark.reading.detectors import claims, correlate
+from jaxmark.watermark.schemes.keyed import KeyedScheme
 from tests.samples import bumpy_sphere
 
 pytestmark = pytest.mark.core
@@ -111,6 +114,21 @@ def test_it_marks_and_reads(marked, key: jm.Key):
     assert found.message == MESSAGE
     assert found.log10_p < -4
     assert marker.detect(marker.original.mesh).log10_p == 0
+
+
+def test_subclasses_of_schemes_prove_nothing(marked, key: jm.Key):
+    class Keyed(KeyedScheme):
+        """May do anything."""
+
+    class Local(LocalScheme):
+        """May do anything."""
+
+    _, mesh = marked
+    assert not jm.make_marker(mesh, key, bits=BITS).caveats
+    assert "not one of this library" in jm.make_marker(mesh, key, bits=BITS, scheme=Keyed()).caveats[0]
+    own = _caveats(Local())
+    assert own == ("the scheme 'local' is not one of this library",)
+    assert not _caveats(LocalScheme())
 
 
 def test_its_capacity_is_what_it_has_code_bits_for():

@@ -14,7 +14,7 @@ import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.watermark.coding.keys import Choices, bind
 from jaxmark.watermark.evidence.ledger import figure
-from jaxmark.watermark.record import TimestampedCommitment, commit, make_commitment
+from jaxmark.watermark.record import SceneRecord, TimestampedCommitment, commit, make_commitment
 from jaxmark.watermark.schemes.keyed import KeyedScheme
 from tests.geometry.test_imprint import COPIES
 from tests.samples import bumpy_sphere
@@ -154,7 +154,7 @@ def test_the_order_of_an_original_is_no_choice(original: Mesh, key: jm.Key):
     found = turned.detect(marked)
     assert found.message == MESSAGE
     assert found.registration.method != "same"
-    with pytest.raises(jm.JaxmarkError, match="another order"):
+    with pytest.raises(jm.JaxmarkError, match="order of vertices in the original's file differs"):
         turned.detect(marked, align="same")
     # Without the record, another order has other choices.
     assert jm.make_marker(crafted, key, bits=16).choices.context != marker.choices.context
@@ -220,6 +220,10 @@ def test_deposits_date_records(marked, original: Mesh, key: jm.Key, tmp_path: Pa
     dated = make_commitment([first.digest()])
     assert charged(dated, first, claimed=True) == pytest.approx(-20 + 16 * np.log10(2)), "it commits to none"
     assert charged(dated, first, claimed=False) == -20
+    presence = dataclasses.replace(first, bits=0, content="presence")
+    scene = SceneRecord({"a": presence, "b": first, "c": record})
+    dated = make_commitment([scene.digest()])
+    assert charged(dated, scene, claimed=True) == pytest.approx(-20 + 16 * np.log10(2)), "b commits to none"
     with pytest.raises(jm.JaxmarkError, match="not in the commitment"):
         charged(make_commitment(others), record, claimed=True)
     path = tmp_path / "deposit.json"

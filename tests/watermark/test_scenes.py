@@ -1,5 +1,6 @@
 """Files of several meshes: each is marked alone, and what they prove together is no more than they do."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -69,6 +70,17 @@ def test_together_they_prove_more_than_the_best_alone(marked, originals, key: jm
     # By Hoeffding's bound for the sum of scores over their norms, which have variances of at most 1 each.
     ratios = [np.sqrt(-2 * np.log(10) * (one.log10_p - 0.5)) for one in found.parts.values()]
     assert found.log10_p >= -(np.sum(ratios) ** 2) / 3 / 2 / np.log(10) - 3
+
+
+def test_a_claim_that_a_record_of_the_scene_refutes_is_refused(marked, originals, key: jm.Key):
+    meshes, info = marked
+    record = info.record.meshes["left"]
+    free = dataclasses.replace(info.record.meshes["right"], message_commitment="").sealed(key)
+    both = {name: originals[name] for name in ("left", "right")}
+    with pytest.raises(jm.JaxmarkError, match="records of 'left' commit to another message"):
+        detect_scene(
+            meshes, originals=both, key=key, record=SceneRecord({"left": record, "right": free}), message=b"no"
+        )
 
 
 def test_each_reads_alone(marked, originals, key: jm.Key):

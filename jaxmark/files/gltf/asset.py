@@ -30,7 +30,7 @@ from jaxmark.geometry.skinning import Skinning
 
 _JOINTS = 2**16  # of a skin at most: their numbers have two bytes
 _SETS = 4  # of joints that move a vertex, four in each
-_MAX_WORK = 64  # how often the bytes of a file are looked at to see what else reads them
+_MAX_WORK = 64  # largest work, in passes over the bytes of a file, of finding out what else reads them
 
 
 def parse(data: bytes, read: Read) -> Source:
@@ -166,7 +166,7 @@ def _triangles(corners: Indices, mode: int, where: str) -> Faces:
 
 
 def _shared_bytes(document: Document, found: dict[str, list[_Primitive]]) -> dict[str, str]:
-    """Find the meshes whose positions or normals something else reads, too; returns their names with the reason."""
+    """Find the meshes whose positions or normals are also read by something else; returns names and reasons."""
     names = list(found)
     owner = np.zeros(len(document.data), np.int32)  # number of the mesh that a byte moves with, from 1
     refused: dict[str, str] = {}
@@ -249,7 +249,7 @@ def _source(document: Document, found: dict[str, list[_Primitive]], left: dict[s
 
 
 def _rows(accessors: dict[int, Elements]) -> dict[int, range]:
-    """Number the elements of accessors that follow each other."""
+    """Assign each accessor the range of its elements among those of all, in order."""
     rows, size = {}, 0
     for index, elements in accessors.items():
         rows[index] = range(size, size + len(elements.starts))
@@ -314,7 +314,7 @@ def _part_of_skin(document: Document, primitive: _Primitive, skin: int | None) -
 
 @dataclass(kw_only=True)
 class _GltfSource(Source):
-    """A source that also keeps the `min` and `max` of its position accessors true, as glTF demands."""
+    """A source that also updates the `min` and `max` of its position accessors, which glTF requires."""
 
     document: Document
     points: dict[int, Elements]  # the accessors of positions, in the order of the points

@@ -15,7 +15,7 @@ from jaxmark.errors import JaxmarkError
 
 
 def diffusion(scales: int, terms: int) -> Float64[np.ndarray, "scales terms"]:
-    """Compute the Chebyshev coefficients of (1 - λ/2)^s for s = 1, 2, 4 … 2^(scales - 1), one a row, in this order.
+    """Compute the Chebyshev coefficients of (1 - λ/2)^s for s = 1, 2, 4 … 2^(scales - 1), one row each.
 
     With λ - 1 = cos θ this is sin^2s(θ/2), a cosine series with binomial coefficients: 4^-s C(2s, s) for k = 0, and
     2(-1)^k 4^-s C(2s, s - k).
@@ -34,7 +34,7 @@ def diffusion(scales: int, terms: int) -> Float64[np.ndarray, "scales terms"]:
 
 
 def heat(times: ArrayLike, degree: int | None = None) -> Float64[np.ndarray, "times terms"]:
-    """Compute the Chebyshev coefficients of e^{-tλ}, one time t a row: e^{-t}I_0(t) for k = 0, and 2(-1)^k e^{-t}I_k(t).
+    """Compute the Chebyshev coefficients of e^{-tλ}, one row per time t: e^{-t}I_0(t), and 2(-1)^k e^{-t}I_k(t).
 
     I_k are modified Bessel functions. All times together, `band_components(operator, heat(times), x)`, cost as many
     products as the longest. `spectral.heat` has derivatives with respect to t.
@@ -53,7 +53,7 @@ def heat(times: ArrayLike, degree: int | None = None) -> Float64[np.ndarray, "ti
 
 
 def heat_degree(times: ArrayLike, error: float = float(np.finfo(np.float64).eps)) -> int:
-    """Return a degree from which on the series of e^{-tλ} is off by less than `error`, for all of the times.
+    """Return a degree at which the truncated series of e^{-tλ} has an error below `error`, for all of the times.
 
     All |c_k| but the first are the probabilities that two Poisson counts of mean t/2 differ by k, one way or the other,
     so that the rest of the series is at most P(|difference| > degree), which Bernstein's inequality bounds by

@@ -78,7 +78,7 @@ def _exchange(error: Float64[np.ndarray, " points"], size: int) -> Int64[np.ndar
 
 
 def hat(knots: Float[np.ndarray, " bands"], degree: int) -> Float64[np.ndarray, "bands terms"]:
-    """Compute the Chebyshev coefficients of polynomials close to piecewise linear hats, one knot a row: a partition of unity.
+    """Compute polynomials close to piecewise linear hats, one row per knot: a partition of unity.
 
     Hat j is 1 at its knot and 0 from the neighbouring knots on; the first and the last stay 1 to the ends of [0, 2].
     Such local bands are further work of Sohn et al. (Fig. 15-16). Best approximations of the hats themselves would not

@@ -19,7 +19,7 @@ _BISECTIONS = 60  # enough to find the angle of an edge to the last bit
 
 
 def damping_factors(name: Damping, terms: int) -> Float64[np.ndarray, " terms"]:
-    """Compute the factors g_k by which the terms of a truncated Chebyshev series are multiplied; g_0 = 1.
+    """Compute the factors g_k that damp the terms of a truncated Chebyshev series; g_0 = 1.
 
     `"jackson"` is Jackson's kernel (Weiße et al., Rev. Mod. Phys. 78, 2006, eq. 71): the series of a non-negative
     function stays non-negative, and is blurred by about 1/terms in the angle arccos(λ - 1). `"lanczos"` are the
@@ -38,7 +38,7 @@ def damping_factors(name: Damping, terms: int) -> Float64[np.ndarray, " terms"]:
 
 
 def nodes(bands: int) -> Float64[np.ndarray, " bands"]:
-    """Return the zeros λ of T_bands(λ - 1), ascending.
+    """Compute the zeros λ of T_bands(λ - 1), ascending.
 
     At each of them one scaling function of the halved kernel is 1 and all others are 0, so that
     `values @ scaling(bands)` is the Chebyshev series of degree bands - 1 that interpolates the values at the nodes.
@@ -52,7 +52,7 @@ def scaling(
     kernel: Literal["halved", "printed"] = "halved",
     damping: Damping = "none",
 ) -> Float64[np.ndarray, "bands terms"]:
-    """Compute the Chebyshev coefficients of the scaling functions, one band a row, of degree bands - 1 (Sohn et al., section 3.4).
+    """Compute the scaling functions, one row per band, of degree bands - 1 (Sohn et al., section 3.4).
 
     Band j of n + 1 is the kernel polynomial K_n(·; ξ_j) = Σ_k T_k(·)T_k(ξ_j), scaled, at the zero
     ξ_j = cos((2j + 1)π/(2n + 2)) of T_{n+1}. The paper counts from the highest band, because the eigenvalues of Δ̃ rise
@@ -80,7 +80,7 @@ def scaling(
 
 
 def bernstein(bands: int) -> Float64[np.ndarray, "bands terms"]:
-    """Compute the Chebyshev coefficients of C(n, j) (λ/2)^j (1 - λ/2)^(n - j), n = bands - 1 ≥ 0, one band a row.
+    """Compute the Chebyshev coefficients of C(n, j) (λ/2)^j (1 - λ/2)^(n - j), n = bands - 1 ≥ 0, one row per band.
 
     The bands are a partition of unity within [0, 1], without any oscillation, but wide (Sohn et al., section 3.3). Band
     j has its peak at λ = 2j/n and is about √(λ(2 - λ)/n) wide: bands half as wide take four times the degree, where
@@ -95,7 +95,7 @@ def bernstein(bands: int) -> Float64[np.ndarray, "bands terms"]:
 
 
 def lagrange(eigenvalues: Float[np.ndarray, " bands"]) -> Float64[np.ndarray, "bands terms"]:
-    """Compute the Chebyshev coefficients of Π_{i≠j} (λ - λ_i)/(λ_j - λ_i), one λ_j a row: a partition of unity.
+    """Compute the Chebyshev coefficients of Π_{i≠j} (λ - λ_i)/(λ_j - λ_i), one row per λ_j: a partition of unity.
 
     At the distinct eigenvalues, including the 0 of the null space,
 
@@ -139,7 +139,7 @@ def lagrange(eigenvalues: Float[np.ndarray, " bands"]) -> Float64[np.ndarray, "b
 def intervals(
     edges: Float[np.ndarray, " edges"], terms: int, *, damping: Damping = "jackson"
 ) -> Float64[np.ndarray, "bands terms"]:
-    """Compute the Chebyshev coefficients of the indicators of [edges_j, edges_{j+1}], truncated and damped, one band a row.
+    """Compute truncated, damped Chebyshev series of the indicators of [edges_j, edges_{j+1}], one row per band.
 
     With λ - 1 = cos φ an indicator is a cosine series, c_0 = (φ_j - φ_{j+1})/π and
     c_k = 2 (sin kφ_j - sin kφ_{j+1})/(πk). If the edges reach from 0 to 2, the bands are a partition of unity.
@@ -159,7 +159,7 @@ def intervals(
 
 
 def equal_edges(moments: Float[Array | np.ndarray, " terms"], bands: int) -> Float64[np.ndarray, " edges"]:
-    """Return the edges that divide a spectral measure into equal parts, by the kernel polynomial method.
+    """Compute edges that divide a spectral measure into equal parts, by the kernel polynomial method.
 
     The measure μ is given by its Chebyshev moments m_k = ∫ T_k(λ - 1) dμ(λ). `chebyshev.moments(operator, x,
     degree=...)` of the host are those of its energy; of `spectrum.white_probes` signals, summed, those of the count of

@@ -1,4 +1,4 @@
-"""Figures of how cleanly a family separates a mesh into bands, by the conditions of Sohn et al., section 3."""
+"""Measures of how well a family separates a mesh into bands, by the conditions of Sohn et al., section 3."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -13,7 +13,7 @@ _GRID_POINTS = 4096  # on which responses that are functions are evaluated; poly
 
 
 class FamilyReport(NamedTuple):
-    """Figures of a family of bands on one signal of one mesh, all dimensionless."""
+    """Measures of a family of bands on one signal of one mesh, all dimensionless."""
 
     partition_error: float  # max over [0, 2] of |Σ_j f_j(λ) - 1|
     overshoot: Float64[np.ndarray, " bands"]  # how far each response leaves [0, 1], over its largest value

@@ -17,7 +17,7 @@ Kernel = Callable[[np.ndarray], np.ndarray]
 
 
 def mexican_hat(bands: int, degree: int | None = None, *, span: float = 20.0) -> Float64[np.ndarray, "bands terms"]:
-    """Compute the Chebyshev coefficients of Mexican hat wavelets sλ e^{-sλ}, of a scale s a row, and of a low-pass below them.
+    """Compute the coefficients of Mexican hat wavelets sλ e^{-sλ}, one row per scale s, after those of a low-pass.
 
     The scales fall from `span` to 1/2 in equal ratios, so that wavelets peak from λ = 1/span to 2. The low-pass is
     1.2/e · exp(-(λ span/0.8)⁴). Reference: Hammond, Vandergheynst, Gribonval, "Wavelets on graphs via spectral graph
@@ -37,7 +37,7 @@ def mexican_hat(bands: int, degree: int | None = None, *, span: float = 20.0) ->
 
 
 def abspline(bands: int, degree: int | None = None, *, span: float = 20.0) -> Float64[np.ndarray, "bands terms"]:
-    """Compute the Chebyshev coefficients of spline wavelets g(sλ), of a scale s a row, and of a low-pass below them.
+    """Compute the coefficients of spline wavelets g(sλ), one row per scale s, after those of a low-pass.
 
     g(x) is x² up to 1, 4/x² from 2 on, and between them the cubic -5 + 11x - 6x² + x³ that joins them smoothly. The
     low-pass is γ exp(-(λ span/1.2)⁴) with γ = max g. Scales, reference and arguments are those of `mexican_hat`. With
@@ -56,7 +56,7 @@ def abspline(bands: int, degree: int | None = None, *, span: float = 20.0) -> Fl
 
 
 def meyer(bands: int, degree: int | None = None) -> Float64[np.ndarray, "bands terms"]:
-    """Compute the Chebyshev coefficients of Meyer wavelets, each band an octave, and of a low-pass below them: a tight frame.
+    """Compute the coefficients of Meyer wavelets, one row per octave, after those of a low-pass: a tight frame.
 
     The squares of the kernels sum to 1: what falls as cos² in one band rises as sin² in the next. With v = 1, 2, 4 …
     from the lowest, band j rises from 2/3 to 4/3 and falls from 4/3 to 8/3 of x = 2^(bands - 1 - j) λ/1.5. Reference:
@@ -79,7 +79,7 @@ def meyer(bands: int, degree: int | None = None) -> Float64[np.ndarray, "bands t
 
 
 def itersine(bands: int, degree: int | None = None) -> Float64[np.ndarray, "bands terms"]:
-    """Compute the Chebyshev coefficients of itersine filters, equally wide and half overlapping: a tight frame.
+    """Compute the coefficients of itersine filters, which are equally wide and half overlapping: a tight frame.
 
     Filter j is sin(π/2 cos²(πx)) of x = (bands - 1)λ/4 - j/2 where |x| ≤ 1/2, and 0 elsewhere, so that the squares sum
     to 1. The iterated sine is a window of time-frequency analysis; as graph filters they are Perraudin's, in PyGSP.
@@ -99,7 +99,7 @@ def itersine(bands: int, degree: int | None = None) -> Float64[np.ndarray, "band
 
 
 def _step(x: np.ndarray) -> np.ndarray:
-    """Compute the Meyer's polynomial x⁴(35 - 84x + 70x² - 20x³) from 0 to 1, constant before and after."""
+    """Evaluate Meyer's polynomial x⁴(35 - 84x + 70x² - 20x³) from 0 to 1; it is constant before and after."""
     x = x.clip(0, 1)
     return x**4 * (35 - 84 * x + 70 * x**2 - 20 * x**3)
 
@@ -107,7 +107,7 @@ def _step(x: np.ndarray) -> np.ndarray:
 def _scaled(
     name: str, bands: int, degree: int | None, span: float, low: Kernel, wavelet: Kernel
 ) -> Float64[np.ndarray, "bands terms"]:
-    """Return a low-pass, and a wavelet at scales from `span` to 1/2."""
+    """Compute a low-pass, and wavelets at scales from `span` to 1/2."""
     if not span >= 1:
         raise JaxmarkError(f"{name}(span=...) must be at least 1, got {span}.")
 

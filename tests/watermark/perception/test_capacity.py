@@ -194,7 +194,8 @@ def test_what_carries_a_payload_carries_a_shorter_one():
 def test_payloads_that_must_not_be_refused(vertices, bits, budget, known: Capacity):
     """They read with half of the vertices lost under the strongest noise of the protocol.
 
-    The room is measured with one probe, which may be off by a percent; that some points move more takes another.
+    The free dimensions are measured with one probe, which may be off by a percent. That some points move more takes
+    another percent.
     """
     budget *= 1.02
     if vertices == 1100:

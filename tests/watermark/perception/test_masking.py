@@ -196,9 +196,9 @@ def test_capacity_counts_the_dimensions_that_are_left(key: jm.Key):
     assert carrier._replace(masking=flat).masked_share() == pytest.approx(rows / 200 / 3)
     half = np.where(np.arange(rows) < 100, 2.0, 0.0)
     assert carrier._replace(masking=half).masked_share() == pytest.approx(0.5)
-    room = carrier.reader().free_dimensions(original.to_traced(original.used))
+    free = carrier.reader().free_dimensions(original.to_traced(original.used))
     less = carrier._replace(masking=half).reader().free_dimensions(original.to_traced(original.used))
-    np.testing.assert_allclose(less.dimensions * less.energy, room.dimensions * room.energy, rtol=1e-6)
+    np.testing.assert_allclose(less.dimensions * less.energy, free.dimensions * free.energy, rtol=1e-6)
 
 
 @pytest.mark.usefixtures("unchecked")

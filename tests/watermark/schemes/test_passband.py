@@ -141,7 +141,7 @@ def test_a_forgotten_payload_size_is_told_whatever_the_band(monkeypatch):
     marked = faint().embed(b"ab", FAINT)[0]
     usual = jm.make_marker(SHAPE, jm.Key(bytes(32)))
     (hint,) = diagnosis.diagnose(marked, usual, "auto")
-    assert hint.startswith("A message of 16 bits reads with the scheme 'keyed'")
+    assert hint.startswith("A message of 16 bits is readable with the scheme 'keyed'")
     exchanged = jm.make_marker(marked, jm.Key(bytes(32)), bits=16)
     (hint,) = diagnosis.diagnose(SHAPE, exchanged, "auto")
     assert hint.startswith("The files look exchanged")
