@@ -17,7 +17,7 @@ from tests.samples import bumpy_sphere, ordered_laplacian
 pytestmark = pytest.mark.core
 
 BANDS = np.random.default_rng(0).normal(size=(3, 5))
-WEIGHTS = np.random.default_rng(1).normal(size=(4, 2, 3))
+WEIGHTS = np.random.default_rng(1).normal(size=(2, 3, 4))
 SECTIONS = np.array([[1, 0.5, 0, 1, 0.5, 0.1]])
 FRAME = np.array([[2.5, 0], [1.5, 1]])
 FACTORS = spectral.Factors(np.array([0.3, 1.2]), np.array([0.5, -0.7]))
@@ -111,7 +111,7 @@ FUNCTIONS: dict[str, tuple[Callable[[Laplacian, jax.Array], Any], Callable[[Dens
     ),
     "cheb_conv": (
         lambda op, x: spectral.cheb_conv(op, {"weight": WEIGHTS, "bias": np.ones(3)}, x),
-        lambda d, x: jnp.einsum("kuv,vi,kio->uo", d.terms[:4], x, jnp.asarray(WEIGHTS, x.dtype)) + 1,
+        lambda d, x: jnp.einsum("kuv,vi,iok->uo", d.terms[:4], x, jnp.asarray(WEIGHTS, x.dtype)) + 1,
     ),
 }
 

@@ -22,7 +22,7 @@ def marked(key: jm.Key) -> tuple[jm.watermark.NonBlindMarker, Mesh]:
 def evidence(marker: jm.watermark.NonBlindMarker, suspect: Mesh) -> float:
     """S/‖a‖ of a claim of the message."""
     code = marker.codeword(MESSAGE)
-    seen = marker.observe(suspect)
+    seen = marker.observe(marker.register(suspect))
     score, norm = marker.carrier.claim(seen, jnp.asarray(code, seen.residual.dtype))
     return float(score / norm)
 
@@ -48,7 +48,7 @@ def test_the_size_is_met_and_evidence_falls(marked):
 def test_slopes_agree_with_finite_differences(key: jm.Key, x64):
     marker = jm.make_marker(bumpy_sphere(2), key, bits=8)
     mesh = marker.embed(b"k", jm.Budget(rms=5e-3, noise=0), read_back=False)[0]
-    seen = marker.observe(jm.attack(mesh, "noise", 1e-3, seed=0))
+    seen = marker.observe(marker.register(jm.attack(mesh, "noise", 1e-3, seed=0)))
     code = jnp.asarray(marker.codeword(b"k"))
     value, slope = _slope(marker.reader, seen, code)
     way = jnp.asarray(np.random.default_rng(0).normal(size=seen.residual.shape) * marker.original.moving[:, None])

@@ -417,8 +417,8 @@ def test_smoothing_by_cotangents_is_noticed_and_taken_off():
     smoothed = spsolve((mass - 2e-3 * igl.cotmatrix(vertices, faces)).tocsc(), mass @ vertices)
     aligned = align(marker.original, make_mesh(smoothed, faces))
     assert aligned.nuisance is not None
-    before, after = (marker.detect(one, message=message).log10_p for one in (aligned._replace(nuisance=None), aligned))
-    assert marker.detect(aligned).message == message
+    before, after = (marker.read(one, message=message).log10_p for one in (aligned._replace(nuisance=None), aligned))
+    assert marker.read(aligned).message == message
     assert after < 1.5 * before
     for other in (marked, jm.attack(marked, "noise", 1e-3, seed=0)):
         assert align(marker.original, other).nuisance is None
@@ -480,7 +480,7 @@ def test_a_suspect_is_aligned_once_for_several_keys(original: Original):
     first, second = (jm.make_marker(mesh, bytes([i]) * 32, bits=8) for i in (1, 2))
     suspect, _ = anywhere(first.embed(message, jm.Budget(noise=0))[0], 6)
     aligned = align(first.original, suspect)
-    found, again = first.detect(suspect), first.detect(aligned)
+    found, again = first.detect(suspect), first.read(aligned)
     assert found.message == again.message == message
     assert found.log10_p == again.log10_p
-    assert second.detect(aligned).message is None
+    assert second.read(aligned).message is None

@@ -258,13 +258,13 @@ def test_other_connectivity_is_read_where_it_can_be(workshop: Workshop):
     trimesh.Trimesh(30 * vertices @ turn.T + 7, faces, process=False).export("finer.obj", digits=12)
     told = workshop.json("detect", "finer.obj", *DETECT, "--report", "seen")
     assert told["message"] == MESSAGE
-    alignment = told["alignment"]
+    alignment = told["registration"]
     assert alignment["method"] == "surface"
     np.testing.assert_allclose(np.array(alignment["pose"]["matrix"]) @ turn * 30, np.eye(3), atol=2e-3)
     assert 0 < alignment["residual"] < 1e-3
     assert alignment["seconds"] > 0
     assert Path("seen/alignment.png").read_bytes().startswith(b"\x89PNG")
-    assert workshop.json("detect", "marked.ply", *DETECT, "--align", "same")["alignment"]["method"] == "same"
+    assert workshop.json("detect", "marked.ply", *DETECT, "--align", "same")["registration"]["method"] == "same"
     assert "does not share" in workshop.refused("detect", "finer.obj", *DETECT, "--align", "same")
 
 

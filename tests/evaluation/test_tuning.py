@@ -199,7 +199,7 @@ def test_what_was_predicted_is_measured(tuned, key: jm.Key):
     word = jnp.asarray(marker.codeword(b"ok"), jnp.float32)
     predicted = margins(found.channels, jnp.asarray(found.beta**2, jnp.float32), "evidence")
     for one, expected in zip(ATTACKS, predicted, strict=True):
-        score, norm = marker.reader.claim(marker.receive(jm.attack(marked, *one, seed=11)), word)
+        score, norm = marker.reader.claim(marker.receive(marker.register(jm.attack(marked, *one, seed=11))), word)
         # What smoothing leaves of the host is no white noise within a band.
         least = 0.6 if one[0] == "smoothing" else 0.8
         assert least < float(score**2 / (2 * norm**2)) / float(expected) < 1.25

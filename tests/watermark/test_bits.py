@@ -140,7 +140,7 @@ def test_evidence_is_what_a_detection_says(x64):
     original = marker.original
     moved = (np.asarray(suspect.vertices) - original.mesh.vertices)[original.weld.first] / original.diagonal
     x = jnp.asarray(original.signal)
-    seen = marker.observe(suspect)
+    seen = marker.observe(marker.register(suspect))
     word = jnp.asarray(marker.codeword(b"ok"), x.dtype)
 
     def nats(residual):

@@ -99,7 +99,7 @@ def marked(key: jm.Key) -> tuple[jm.watermark.NonBlindMarker, Mesh]:
 def owner_sees(marker: jm.watermark.NonBlindMarker, suspect: Mesh) -> float:
     """S/‖a‖ of the claim of the message."""
     codeword = jnp.asarray(marker.codeword(MESSAGE), jnp.float32)
-    score, norm = claims(marker.reader, marker.receive(suspect), codeword)
+    score, norm = claims(marker.reader, marker.receive(marker.register(suspect)), codeword)
     return float(score[0] / norm[0])
 
 

@@ -257,7 +257,7 @@ def test_refusals(shape: Mesh, marked, key: jm.Key, sphere: Mesh, unchecked):
         jm.embed(shape._replace(faces=np.zeros((0, 3), int)), MESSAGE, key, scheme="field")
     with pytest.raises(jm.JaxmarkError, match="nothing to write in"):
         jm.embed(shape, MESSAGE, key, budget=1e-6, scheme=SCHEME)
-    with pytest.raises(jm.JaxmarkError, match="is read beside the original"):
+    with pytest.raises(jm.JaxmarkError, match="is read with the original"):
         jm.detect(shape, key=key, scheme="keyed")
     with pytest.raises(jm.JaxmarkError, match="without alignment"):
         jm.detect(shape, key=key, align="same")  # pyright: ignore

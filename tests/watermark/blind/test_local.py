@@ -195,4 +195,4 @@ def test_commands_for_several_marks(shape: Mesh, tmp_path: Path, monkeypatch, ca
     assert both["message"] == CLI_MESSAGE
     assert any("'local' alone" in remark for remark in both["notes"])
     assert "not one of" in workshop.refused("embed", "model.ply", "x.ply", *key, "--scheme", "keyed,nothing")
-    assert "an informed one" in workshop.refused("embed", "model.ply", "x.ply", *key, "--scheme", "field,keyed")
+    assert "read with the original" in workshop.refused("embed", "model.ply", "x.ply", *key, "--scheme", "field,keyed")

@@ -255,7 +255,7 @@ def test_a_message_at_capacity_reads_after_the_noise_it_is_stated_for(thousand: 
         known = random.permutation(len(noisy)) < len(noisy) // 2
         found = marker.detect(make_mesh(noisy, thousand.faces), weights=known.astype(float))
         assert found.message == message
-        assert found.detected()
+        assert found.detected(allow_estimate=True)  # weights that a reader chooses make it an estimate
         assert found.coverage == 0.5
 
 

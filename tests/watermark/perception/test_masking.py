@@ -181,7 +181,7 @@ def test_planes_stay_plane(key: jm.Key):
     plain = jm.make_marker(mesh, key, bits=40, scheme=KeyedScheme(hiding=False))
     isotropic, told = plain.write(plain.codeword(b"plane"), None)
     assert told.rms < info.rms / 3
-    assert plain.read_quickly(plain.observe(isotropic)) == b"plane"
+    assert plain.read_quickly(plain.observe(plain.register(isotropic))) == b"plane"
 
 
 def test_capacity_counts_the_dimensions_that_are_left(key: jm.Key):
