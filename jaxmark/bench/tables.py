@@ -161,10 +161,13 @@ def _attacks(title: str, parts: Mapping[str, Any], entries: Entries) -> Table:
     def cell(name: str, rates: Mapping[str, Any] | None) -> str:
         if rates is None:
             return "-"
-        read = f"{_share(rates, 'read')} {rates['bit_errors']:.2f}" if entries[name]["bits"] else "- -"
-        bound = "" if rates["log10_p"] is None else f" {rates['log10_p']:.1f}"
-        return f"{read} {_share(rates, 'detected')}{bound}"
+        detected = _share(rates, "detected")
+        read = _share(rates, "read") if entries[name]["bits"] else ""
+        text = f"{read} {rates['bit_errors']:.2f}" if read else ""
+        text += "" if read == detected else f" [{detected}]"
+        return f"{text} {_number(rates['log10_p'], '.1f')}".removesuffix(" -").strip()
 
+    parts = {name: part for name, part in parts.items() if part["marks"]["made"]}
     lines = []
     for attack in dict.fromkeys(attack for part in parts.values() for attack in part["attacks"]):
         of_attack = {name: part["attacks"].get(attack) for name, part in parts.items()}
@@ -175,8 +178,9 @@ def _attacks(title: str, parts: Mapping[str, Any], entries: Entries) -> Table:
     if all(line[-2:] == ["-", "-"] for line in lines):  # no rates were published for this track
         heads, lines = heads[:-2], [line[:-2] for line in lines]
     note = (
-        "Values in each cell: the suspects from which the exact message is read; the mean bit error rate of the"
-        " best guess; the suspects that are detected; and, if the method bounds it, the median log10 p. -: no value."
+        "Each cell has the suspects from which the exact message is read and the mean bit error rate of the best guess;"
+        " in brackets, the suspects that are detected, if their number differs; and the median log10 p, if the method"
+        " bounds it. Methods that marked no mesh are left out."
     )
     return Table(title, heads, lines, note)
 

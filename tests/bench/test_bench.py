@@ -615,7 +615,7 @@ def test_the_command_writes_an_entry_for_each_method_and_a_page(tmp_path: Path, 
     assert "plain†" in page
     text = (output / "results.md").read_text()
     assert "| attack |" in text
-    assert re.search(r"\| noise 0.003 \| 1/1 0.00 1/1 -\d", text)
+    assert re.search(r"\| noise 0.003 \| 1/1 0.00 -\d", text)
     assert "## smi2010, perceptual limits: distortion by the attacks" in text
     refused = subprocess.run(
         [*command[:5], "--methods", "nothing", "--output", str(output)], capture_output=True, text=True
