@@ -40,7 +40,7 @@ from jaxmark.app.options import (
     message_options,
     read_key,
 )
-from jaxmark.app.output import FileOutcome, answer, check_distinct, check_suffix, error_text, power, say
+from jaxmark.app.output import FileOutcome, answer, charges_values, check_distinct, check_suffix, error_text, power, say
 from jaxmark.app.process import end_by_exception
 from jaxmark.app.progress import current
 from jaxmark.app.read_files import FileReader
@@ -358,7 +358,7 @@ def identify_command(
     accused = [entry for entry in ranking if entry.log10_p <= math.log10(alpha)]
     values = {
         "accused": [entry.recipient for entry in accused],
-        "ranking": [entry._asdict() for entry in ranking],
+        "ranking": [entry._asdict() | {"charges": charges_values(entry.charges)} for entry in ranking],
         "recipients": len(names),
     }
     lines = [

@@ -4,7 +4,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +13,8 @@ import click
 from jaxmark.app.progress import current
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import file_hash
-from jaxmark.watermark.evidence.detection import Detection
+from jaxmark.watermark.evidence.detection import Detection, Evidence
+from jaxmark.watermark.evidence.ledger import Charge
 from jaxmark.watermark.perception.capacity import Survival
 
 
@@ -95,13 +96,13 @@ def survival_text(survives: Survival) -> str:
     return f"noise of {whole} of the mean distance to the centre, {half} with half of the vertices lost"
 
 
-def detection_text(detection: Detection, alpha: float, timestamped: float | None, *, charges: bool = False) -> str:
+def detection_text(detection: Detection, alpha: float, timestamped: Evidence | None, *, charges: bool = False) -> str:
     """Describe a detection in words.
 
     Args:
         detection: the detection.
         alpha: largest false-positive probability of a detection.
-        timestamped: log10 of the bound if the commitment is older than the suspect; None without a commitment.
+        timestamped: the evidence if the commitment is older than the suspect; None without a commitment.
         charges: whether to list how much each choice of the reader cost.
     """
     evidence = detection.evidence
@@ -117,12 +118,19 @@ def detection_text(detection: Detection, alpha: float, timestamped: float | None
             f" before the suspect existed, {power(evidence.log10_p_uncommitted)} even if they were chosen afterwards"
         )
         if timestamped is not None:
-            text += f", {power(timestamped)} if the commitment is older than the suspect"
+            text += f", {power(timestamped.log10_p)} if the commitment is older than the suspect"
     text = " ".join([f"{text} (--alpha {alpha:g})", *detection.notes])
     if charges:
-        charged = [f"{charge.choice}: {charge.taken} {charge.log10:.2f}" for charge in evidence.charges]
-        text += f"\ncharged in log10 p: {', '.join(charged) or 'nothing'}"
+        named = {
+            "": timestamped or evidence,
+            **{f" of {name}": part.evidence for name, part in detection.parts.items()},
+        }
+        text += "".join(f"\ncharged in log10 p{name}: {_charged(entry)}" for name, entry in named.items())
     return text
+
+
+def _charged(evidence: Evidence) -> str:
+    return ", ".join(f"{one.choice}: {one.taken} {one.log10:.2f}" for one in evidence.charges) or "nothing"
 
 
 def detection_values(
@@ -130,7 +138,7 @@ def detection_values(
     alpha: float,
     suspect: Path,
     obtained: str,
-    timestamped: float | None,
+    timestamped: Evidence | None,
     record_digest: str | None,
 ) -> dict[str, Any]:
     """Describe a detection as values for JSON.
@@ -146,8 +154,6 @@ def detection_values(
     values = {
         **_figures(detection, alpha),
         "proof": not detection.evidence.caveats,
-        "caveats": list(detection.evidence.caveats),
-        "charges": [charge._asdict() for charge in detection.evidence.charges],
         "notes": list(detection.notes),
         "scheme": detection.scheme,
         "version": detection.version,
@@ -166,7 +172,8 @@ def detection_values(
     if record_digest is not None:
         values["record_digest"] = record_digest
     if timestamped is not None:
-        values["log10_p_timestamped"] = timestamped
+        values["log10_p_timestamped"] = timestamped.log10_p
+        values["charges_timestamped"] = charges_values(timestamped.charges)
     return values
 
 
@@ -179,7 +186,14 @@ def _figures(detection: Detection, alpha: float) -> dict[str, Any]:
         "log10_p_uncommitted": evidence.log10_p_uncommitted,
         "log10_p_gaussian": evidence.log10_p_gaussian,
         "log10_p_unfloored": evidence.log10_p_unfloored,
+        "caveats": list(evidence.caveats),
+        "charges": charges_values(evidence.charges),
     }
+
+
+def charges_values(charges: Iterable[Charge]) -> list[dict[str, Any]]:
+    """Describe charges as values for JSON."""
+    return [charge._asdict() for charge in charges]
 
 
 def check_suffix(source: Path, target: Path) -> None:

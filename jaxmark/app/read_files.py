@@ -116,7 +116,7 @@ class FileReader:
         timestamped = None
         if record is not None and self.commitment is not None:
             charges = self.commitment.charges(record, claimed=self.message is not None)
-            timestamped = detection.evidence.charged(*charges).log10_p
+            timestamped = detection.evidence.charged(*charges)
         digest = None if record is None else record.digest()
         values = detection_values(detection, self.alpha, suspect, self.obtained, timestamped, digest)
         text = detection_text(detection, self.alpha, timestamped, charges=self.shows_charges)

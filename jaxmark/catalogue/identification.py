@@ -29,6 +29,7 @@ from jaxmark.geometry.pose import Points, Pose
 from jaxmark.watermark.coding.keys import Key, commitment
 from jaxmark.watermark.everyday import alternatives
 from jaxmark.watermark.evidence import ledger
+from jaxmark.watermark.evidence.ledger import Charge
 from jaxmark.watermark.markers import make_marker
 from jaxmark.watermark.record import Record, is_recorded
 from jaxmark.watermark.tracing.tracer import make_tracer
@@ -67,6 +68,7 @@ class Match(NamedTuple):
     coverage: float = 0.0  # fraction of the original that is registered to the piece
     residual: float | None = None  # RMS residual of the registration, in diagonals
     caveats: tuple[str, ...] = ()  # reasons why the probabilities are estimates
+    charges: tuple[Charge, ...] = ()  # choices that `log10_p` is charged for
     notes: tuple[str, ...] = ()
     refused: str | None = None  # the reason why the piece could not be read
 
@@ -109,7 +111,9 @@ class Verdict(NamedTuple):
             "caveats": likeliest.caveats if likeliest else (),
             "readings": self.readings,
             "suspect_sha256": self.suspect or None,
-            "matches": [match._asdict() for match in self.matches],
+            "matches": [
+                match._asdict() | {"charges": [charge._asdict() for charge in match.charges]} for match in self.matches
+            ],
         }
 
 
@@ -353,6 +357,7 @@ class Finder(Generic[AnyOriginals]):
                     coverage=detection.coverage,
                     residual=_finite(registration.residual),
                     caveats=evidence.caveats,
+                    charges=evidence.charges,
                     notes=detection.notes,
                 )
                 agrees = message is None or is_recorded(record, message, mark.choices) is not False
@@ -383,10 +388,11 @@ class Finder(Generic[AnyOriginals]):
         tracer = make_tracer(pair.original, key, record=record)
         mark, aligned = tracer.mark, tracer.register(pair.suspect, self.align)
         charge = ledger.ORIGINALS.charge("copy", pair.readings)
-        bounds = {entry.recipient: entry.charged(charge).log10_p for entry in tracer.read(aligned, recipients)}
-        accused = tuple(name for name, log10_p in bounds.items() if log10_p <= math.log10(self.alpha))
+        tested = [entry.charged(charge) for entry in tracer.read(aligned, recipients)]
+        accused = tuple(entry.recipient for entry in tested if entry.log10_p <= math.log10(self.alpha))
         accused = () if mark.caveats else accused
-        best = min(bounds.values(), default=0.0)
+        likeliest = min(tested, key=lambda entry: entry.log10_p, default=None)
+        best = likeliest.log10_p if likeliest else 0.0
         covered = aligned.weights[mark.original.used] > 0
         match = pair.match._replace(
             named=bool(accused),
@@ -399,6 +405,7 @@ class Finder(Generic[AnyOriginals]):
             coverage=float(covered.mean()),
             residual=_finite(aligned.residual),
             caveats=mark.caveats,
+            charges=likeliest.charges if likeliest else (),
         )
         return pair._replace(match=match, pose=aligned.pose)
 

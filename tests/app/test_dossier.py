@@ -83,6 +83,9 @@ def test_a_dossier_shows_all_but_the_secret(workshop: Workshop):
     assert told["suspect_sha256"] == hashlib.sha256(Path("marked.ply").read_bytes()).hexdigest()
     assert told["record_digest"] == jm.Record.load(RECORD[1]).digest()
     assert told["log10_p_timestamped"] == pytest.approx(told["log10_p"] + np.log10(2))
+    first, *others = told["charges_timestamped"]
+    assert others == told["charges"]
+    assert (first["choice"], first["log10"]) == ("timestamped commitment", pytest.approx(np.log10(2)))
     assert told["log10_p"] < told["log10_p_uncommitted"] < -6
     assert told["dossier"] == "case"
     assert {path.name for path in Path("case").iterdir()} == {"dossier.html", "dossier.json"}

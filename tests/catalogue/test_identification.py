@@ -98,6 +98,10 @@ def test_other_ways_of_aligning_are_charged(shop: Shop):
     auto, same = (named(shop, suspect, align=align)[1] for align in ("auto", "same"))
     assert -70 < auto.named[0].log10_p < -10  # not at the floor, so that what is paid shows
     assert same.named[0].log10_p == pytest.approx(auto.named[0].log10_p + math.log10(0.97 / 0.01), abs=1e-6)
+    first, second = (sum(charge.log10 for charge in found.named[0].charges) for found in (auto, same))
+    assert second - first == pytest.approx(math.log10(0.97 / 0.01), abs=1e-6)
+    (original,) = (charge for charge in auto.named[0].charges if charge.taken == "original")
+    assert original.log10 == pytest.approx(math.log10(auto.readings))
     refused = Match("3.obj", "", "", "landmarks", 1, 0.0, refused="The vertices are in another order.")
     assert "3.obj could not be read: The vertices" in describe(Verdict("", (refused,), 1), 1e-6)
 

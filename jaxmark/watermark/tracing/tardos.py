@@ -17,7 +17,7 @@ from jaxtyping import Float, Float64, Int8
 from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.evidence.detection import accuse
-from jaxmark.watermark.evidence.ledger import UNFLOORED, Charge, figure
+from jaxmark.watermark.evidence.ledger import RECIPIENTS, UNFLOORED, Charge, figure
 
 Slots = Float[np.ndarray, " slots"]
 
@@ -42,10 +42,11 @@ class Accusation(NamedTuple):
     score: float  # score, of mean 0 and variance 1 for innocents
     log10_p: float  # log10 of a bound on the probability that any innocent among those tested reaches this score
     caveats: tuple[str, ...] = ()  # the reasons why the probability is an estimate; empty if it is a proof
+    charges: tuple[Charge, ...] = ()  # the choices that the probability is charged for
 
     def charged(self, *charges: Charge) -> "Accusation":
         """Charge further choices, see `jaxmark.watermark.evidence.ledger`."""
-        return self._replace(log10_p=figure(self.log10_p, charges, UNFLOORED))
+        return self._replace(log10_p=figure(self.log10_p, charges, UNFLOORED), charges=(*self.charges, *charges))
 
 
 def biases(choices: Choices, length: int) -> Float64[np.ndarray, " slots"]:
@@ -132,7 +133,11 @@ def rank(values: Slots, recipients: Iterable[str], choices: Choices, *, top: int
         totals[i : i + _CHUNK_RECIPIENTS] = scores(y, p, codewords(candidates[i : i + _CHUNK_RECIPIENTS], choices, p))
     best = np.argsort(-totals, kind="stable")[:top]
     log10_p = accuse(totals[best], y, p, len(candidates))
-    return [Accusation(candidates[i], float(totals[i]), float(bound)) for i, bound in zip(best, log10_p, strict=True)]
+    charges = (RECIPIENTS.charge("each", max(len(candidates), 1)),)
+    return [
+        Accusation(candidates[i], float(totals[i]), float(bound), charges=charges)
+        for i, bound in zip(best, log10_p, strict=True)
+    ]
 
 
 def _remove_trend(y: np.ndarray, p: np.ndarray) -> np.ndarray:

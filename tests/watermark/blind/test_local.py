@@ -194,5 +194,8 @@ def test_commands_for_several_marks(shape: Mesh, tmp_path: Path, monkeypatch, ca
     both = workshop.json("detect", "marked.ply", *key, "--original", "model.ply", "--scheme", "keyed,local")
     assert both["message"] == CLI_MESSAGE
     assert any("'local' alone" in note for note in both["notes"])
+    assert {"alignment", "message"} & {charge["choice"] for charge in both["parts"]["keyed"]["charges"]}
+    said = workshop("detect", "marked.ply", *key, "--original", "model.ply", "--scheme", "keyed,local", "--charges")[1]
+    assert said.count("charged in log10 p") == 3
     assert "not one of" in workshop.refused("embed", "model.ply", "x.ply", *key, "--scheme", "keyed,nothing")
     assert "read with the original" in workshop.refused("embed", "model.ply", "x.ply", *key, "--scheme", "field,keyed")

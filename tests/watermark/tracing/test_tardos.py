@@ -10,6 +10,7 @@ from scipy import special, stats
 
 import jaxmark as jm
 from jaxmark.watermark.coding.keys import Choices
+from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.bounds import log10_p_fingerprint
 from jaxmark.watermark.evidence.detection import accuse
 from jaxmark.watermark.evidence.ledger import MIN_LOG10_P
@@ -203,7 +204,8 @@ def test_rank_by_hand(key: jm.Key):
 
 
 def test_nothing_to_go_by(key: jm.Key):
-    nobody = [Accusation("a", 0.0, 0.0), Accusation("b", 0.0, 0.0)]
+    charges = (ledger.RECIPIENTS.charge("each", 2),)
+    nobody = [Accusation(name, 0.0, 0.0, charges=charges) for name in ("a", "b")]
     for y in (np.zeros(30), np.ones(30), np.arange(3.0)):
         assert rank(y, ["a", "b"], Choices(key, GEOMETRY)) == nobody
     assert rank(np.arange(30.0), [], Choices(key, GEOMETRY)) == []

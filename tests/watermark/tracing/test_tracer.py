@@ -69,6 +69,8 @@ def test_functions_and_record(key: jm.Key):
     assert info.record.content == "fingerprint"
     found = jm.identify(copy, ["bob", "alice"], original=mesh, key=key, record=info.record, top=1)
     assert found[0].recipient == "alice"
+    (charge,) = found[0].charges
+    assert (charge.choice, charge.log10) == ("recipient", pytest.approx(np.log10(2)))
     with pytest.raises(jm.JaxmarkError, match="identify reads it"):
         jm.detect(copy, original=mesh, key=key, record=info.record)
     _, message = jm.embed(mesh, b"x", key)
