@@ -26,7 +26,7 @@ from jaxmark.geometry.mesh import Mesh
 
 Bits = Bool[np.ndarray, " bits"]
 
-#: The factory of each method: a module of `jaxmark.bench.methods` and a function in it, which takes the payload in bits.
+#: The factory of each method, which takes the payload in bits: a module of `jaxmark.bench.methods` and a function.
 METHODS: Mapping[str, str] = {
     **{name: f"builtin_schemes:{name}" for name in ("keyed", "eigen", "host", "paper", "field", "local", "harmonics")},
     "cho": "vertex_norms:cho",

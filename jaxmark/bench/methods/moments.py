@@ -10,7 +10,7 @@ This implementation fills gaps of the publication as follows.
 
 - The quantised value is the logarithm of the volume, relative to the volume of the whole surface.
 - The grid divides the axis into equal parts between the ends of the surface, and the circle about it into equal angles.
-- The two axes of largest skewness point in the direction of positive skewness; the third completes a right-handed frame.
+- The two axes of largest skewness point to positive skewness; the third completes a right-handed frame.
 - Points move along their normals. The displacement is a sum of three modes per patch: a mask that falls to zero at the
   rim of the patch, and two odd modes that compensate the change of pose. Among all deformations with the desired
   moments, it is the one of least squares over the surface. Newton's method finds it for the resulting surface.
