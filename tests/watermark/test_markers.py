@@ -311,7 +311,7 @@ def test_refusals(sphere: Mesh, key: jm.Key):
     tiny = make_mesh(np.vstack([np.eye(3), [[0, 0, 0]]]), np.array([[0, 1, 2], [0, 1, 3], [1, 2, 3], [2, 0, 3]]))
     nan = sphere._replace(vertices=np.where(sphere.vertices > 1, np.nan, sphere.vertices))
     for mesh, message, options, sentence in [
-        (tiny, MESSAGE, {}, "places, too few for any message"),
+        (tiny, MESSAGE, {}, "code bits, too few for any message"),
         (
             bumpy_sphere(2),
             MESSAGE,

@@ -129,7 +129,7 @@ def test_limits_from_the_shell(mesh: Mesh, tmp_path, monkeypatch, capsys):
     assert max(found["dame"] / 0.004, found["gl"] / 0.0001) > 0.98
     assert found["rms"] == pytest.approx(written["rms"], rel=1e-5)
     assert run("capacity", model, "--limit", "dame=0.05")["limits"] == {"dame": 0.05}
-    for wrong, sentence in (("dame", "is no limit"), ("dame=x", "is no limit"), ("size=1", "no metric 'size'")):
+    for wrong, sentence in (("dame", "is not a limit"), ("dame=x", "is not a limit"), ("size=1", "no metric 'size'")):
         monkeypatch.setattr(sys, "argv", ["jaxmark", *mark, "--limit", wrong])
         with pytest.raises(SystemExit) as end:
             cli.main()
