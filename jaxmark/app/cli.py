@@ -40,7 +40,7 @@ from jaxmark.app.options import (
     message_options,
     read_key,
 )
-from jaxmark.app.output import FileOutcome, answer, charges_values, check_distinct, check_suffix, error_text, power, say
+from jaxmark.app.output import FileOutcome, answer, check_distinct, check_suffix, error_text, power, say
 from jaxmark.app.process import end_by_exception
 from jaxmark.app.progress import current
 from jaxmark.app.read_files import FileReader
@@ -56,6 +56,7 @@ from jaxmark.geometry.mesh import same_connectivity
 from jaxmark.watermark.coding.keys import commitment, new_key, save_key
 from jaxmark.watermark.coding.message import DEFAULT_BITS
 from jaxmark.watermark.everyday import capacity
+from jaxmark.watermark.evidence.ledger import charges_as_json
 from jaxmark.watermark.perception.budget import Budget
 from jaxmark.watermark.perception.capacity import COVERAGE, NOISE
 from jaxmark.watermark.record import RECORD_SUFFIX, Record, TimestampedCommitment, load_record, make_commitment
@@ -358,7 +359,7 @@ def identify_command(
     accused = [entry for entry in ranking if entry.log10_p <= math.log10(alpha)]
     values = {
         "accused": [entry.recipient for entry in accused],
-        "ranking": [entry._asdict() | {"charges": charges_values(entry.charges)} for entry in ranking],
+        "ranking": [entry._asdict() | {"charges": charges_as_json(entry.charges)} for entry in ranking],
         "recipients": len(names),
     }
     lines = [

@@ -28,6 +28,7 @@ from jaxmark.plot import View, draw, save_views
 from jaxmark.plot.figures import fill_template
 from jaxmark.watermark.coding.keys import commitment as commitment_to
 from jaxmark.watermark.evidence.detection import Detection
+from jaxmark.watermark.evidence.ledger import charges_as_json
 from jaxmark.watermark.mark import Mark
 from jaxmark.watermark.record import TimestampedCommitment
 
@@ -121,7 +122,7 @@ def _facts(case: Case) -> dict[str, Any]:
         "notes": list(detection.notes),
         "log10_p": evidence.log10_p,
         "log10_p_uncommitted": evidence.log10_p_uncommitted,
-        "charges": [charge._asdict() for charge in evidence.charges],
+        "charges": charges_as_json(evidence.charges),
         "chance": _in_words(evidence.log10_p_uncommitted if timestamped is None else timestamped["log10_p"]),
         "commitment": timestamped,
         "obtained": case.obtained,

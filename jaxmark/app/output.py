@@ -4,7 +4,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from jaxmark.app.progress import current
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import file_hash
 from jaxmark.watermark.evidence.detection import Detection, Evidence
-from jaxmark.watermark.evidence.ledger import Charge
+from jaxmark.watermark.evidence.ledger import charges_as_json
 from jaxmark.watermark.perception.capacity import Survival
 
 
@@ -173,7 +173,7 @@ def detection_values(
         values["record_digest"] = record_digest
     if timestamped is not None:
         values["log10_p_timestamped"] = timestamped.log10_p
-        values["charges_timestamped"] = charges_values(timestamped.charges)
+        values["charges_timestamped"] = charges_as_json(timestamped.charges)
     return values
 
 
@@ -187,13 +187,8 @@ def _figures(detection: Detection, alpha: float) -> dict[str, Any]:
         "log10_p_gaussian": evidence.log10_p_gaussian,
         "log10_p_unfloored": evidence.log10_p_unfloored,
         "caveats": list(evidence.caveats),
-        "charges": charges_values(evidence.charges),
+        "charges": charges_as_json(evidence.charges),
     }
-
-
-def charges_values(charges: Iterable[Charge]) -> list[dict[str, Any]]:
-    """Describe charges as values for JSON."""
-    return [charge._asdict() for charge in charges]
 
 
 def check_suffix(source: Path, target: Path) -> None:

@@ -111,9 +111,7 @@ class Verdict(NamedTuple):
             "caveats": likeliest.caveats if likeliest else (),
             "readings": self.readings,
             "suspect_sha256": self.suspect or None,
-            "matches": [
-                match._asdict() | {"charges": [charge._asdict() for charge in match.charges]} for match in self.matches
-            ],
+            "matches": [match._asdict() | {"charges": ledger.charges_as_json(match.charges)} for match in self.matches],
         }
 
 

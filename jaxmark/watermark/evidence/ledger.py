@@ -12,8 +12,8 @@ skipped and costs nothing. No other module of the package divides the significan
 """
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 MIN_LOG10_P = -77.0  # a 256-bit key supports no claim below 2^-256
 UNFLOORED = -math.inf
@@ -55,6 +55,11 @@ class Choice(NamedTuple):
         share = next(one.share for one in self.alternatives if one.name == taken)
         cost = math.log10(count) + bits * math.log10(2) if share is None else -math.log10(share)
         return Charge(self.name, taken, cost, self.in_bound)
+
+
+def charges_as_json(charges: Iterable[Charge]) -> list[dict[str, Any]]:
+    """Return charges as values for JSON."""
+    return [charge._asdict() for charge in charges]
 
 
 def figure(log10_p: float, charges: Sequence[Charge], floor: float = MIN_LOG10_P) -> float:
