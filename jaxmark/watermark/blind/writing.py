@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, Float64
-from scipy import optimize
 
 from jaxmark import distortion
 from jaxmark.alignment.original import Original, displace, shift_of
@@ -263,6 +262,8 @@ class Writer:
 
         If half of the vertices are lost, half of the anchors are left, or none if the scheme needs the whole shape.
         """
+        from scipy import optimize  # takes long to import
+
         spread = self._spread(plan.host) / NOISE  # per unit of noise
 
         def strongest(share: float) -> float:

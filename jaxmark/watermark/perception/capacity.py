@@ -8,7 +8,6 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64
-from scipy import optimize
 from scipy.special import log_ndtr, ndtri  # scipy.stats takes long to import
 
 from jaxmark import distortion
@@ -33,6 +32,13 @@ _PROBES = 5  # number of marks from which the strength that limits allow is meas
 _SPREADS, _MIN_SPREAD = 3, 0.007  # standard deviations of the log strengths to subtract, and their lower limit
 
 
+def _root(function: Callable[[float], float], bracket: tuple[float, float]) -> float:
+    """Find a root of a function that changes its sign in the bracket."""
+    from scipy import optimize  # takes long to import
+
+    return optimize.root_scalar(function, bracket=bracket).root
+
+
 def least_energy(bits: int, error: float = 1e-3) -> float:
     """Compute the least E/N0 with which any code can carry bits in white noise at a message error rate.
 
@@ -48,7 +54,7 @@ def least_energy(bits: int, error: float = 1e-3) -> float:
     def excess(root: float) -> float:
         return float(log_ndtr(-(root + ndtri(error)))) + bits * math.log(2)
 
-    root = optimize.root_scalar(excess, bracket=(0.0, 10.0 + 4.0 * math.sqrt(bits))).root
+    root = _root(excess, (0.0, 10.0 + 4.0 * math.sqrt(bits)))
     return root**2 / 2
 
 
@@ -161,7 +167,7 @@ class Capacity:
         def excess(logarithm: float) -> float:
             return worth(math.exp(2 * logarithm) * ratio, dimensions) - needed
 
-        return math.exp(optimize.root_scalar(excess, bracket=(-100.0, 100.0)).root)
+        return math.exp(_root(excess, (-100.0, 100.0)))
 
     def noise(self, bits: int, reached: float, conditions: Conditions) -> float:
         """Predict the strongest noise, in the unit of `Conditions`, that a payload survives at an RMS displacement.
@@ -204,7 +210,7 @@ class Capacity:
         def excess(logarithm: float) -> float:
             return self.evidence(bits, math.exp(logarithm), noise) - evidence
 
-        return math.exp(optimize.root_scalar(excess, bracket=(-100.0, 0.0)).root)
+        return math.exp(_root(excess, (-100.0, 0.0)))
 
     def _free_dimensions(self, bits: int) -> FreeDimensions | None:
         """Return the free dimensions for a payload."""
