@@ -36,7 +36,6 @@ from jaxmark.watermark.coding.message import encode
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import united_score, weigh
 from jaxmark.watermark.evidence.ledger import Charge
-from jaxmark.watermark.nonblind import order_charges
 from jaxmark.watermark.reading.coarse import receive_coarse
 from jaxmark.watermark.reading.detectors import claims
 from jaxmark.watermark.reading.reception import Reception
@@ -242,7 +241,7 @@ def in_both_orders(
             with suppress(jm.JaxmarkError):  # such a suspect gives no evidence in this order
                 observed[name] = reading.observe(reading.register(suspect))
         claims = best_claims(reading, stackable(observed), keys, messages)
-        values = weighed(*claims, bits=marker.bits, fixed=fixed, charges=order_charges(reading))
+        values = weighed(*claims, bits=marker.bits, fixed=fixed, charges=reading.order_charges)
         by_name = dict(zip(observed, values.T, strict=True))
         found.append(np.array([by_name.get(name, np.zeros(len(values))) for name in seen]).T)
     return np.minimum(*found)

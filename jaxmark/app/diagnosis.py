@@ -1,8 +1,10 @@
 """Diagnose a suspect without a detection: exchanged files, another payload or another scheme.
 
-The readings that are made here use the key, and their number is not charged. Their results are hints, not evidence.
+The readings that are made here use the key, and their number is not charged. Their results are hints, not evidence, and
+a hint says what a reading that follows it must be charged.
 """
 
+import math
 from collections.abc import Iterator
 from itertools import product
 
@@ -50,10 +52,13 @@ def diagnose(suspect: Mesh, mark: Mark, align: Align) -> tuple[str, ...]:
         pass  # the suspect cannot be marked
     if len(mark.original.positions) > _MAX_EIGEN_POINTS:
         schemes = [scheme for scheme in schemes if not isinstance(scheme, EigenScheme)]
-    for scheme, bits in _readable(mark, suspect, schemes, sorted({*_PAYLOADS, mark.bits}), align):
+    payloads = sorted({*_PAYLOADS, mark.bits})
+    tried = len(schemes) * len(payloads)
+    for scheme, bits in _readable(mark, suspect, schemes, payloads, align):
         if (scheme.name, bits) != (mark.scheme.name, mark.bits):
             return (
-                f"A message of {bits} bits is readable with the scheme {scheme.name!r}: give both, or give the record.",
+                f"A message of {bits} bits is readable with the scheme {scheme.name!r}: give both, or give the record."
+                f" {tried} readings led to this hint; if nothing else says so, add {math.log10(tried):.1f} to log10 p.",
             )
     return (
         "Without the record, the original must have exactly the coordinates, and the order, in which it was marked.",

@@ -29,7 +29,7 @@ from jaxmark.watermark.evidence.detection import Detection, Evidence, united_sco
 from jaxmark.watermark.interfaces import Detector, Scheme
 from jaxmark.watermark.mark import EmbedInfo
 from jaxmark.watermark.markers import Marker, NonBlindMarker, make_blind_marker, make_marker, prepare, unite
-from jaxmark.watermark.nonblind import Alternatives, check_claim, claims_of, order_charges
+from jaxmark.watermark.nonblind import Alternatives, check_claim, claims_of
 from jaxmark.watermark.perception.budget import Budget, BudgetLike
 from jaxmark.watermark.perception.capacity import COVERAGE, NOISE, Capacity, Conditions
 from jaxmark.watermark.record import Record, SceneRecord, is_recorded
@@ -436,7 +436,7 @@ def _unite_meshes(readings: Sequence[_MeshReading], claimed: bytes | None) -> De
             continue
         recorded = [is_recorded(reading.marker.record, message, reading.marker.choices) for reading in readings]
         fixed = claimed is not None or all(recorded)
-        order = [charge for reading in readings for charge in order_charges(reading.marker)]
+        order = [charge for reading in readings for charge in reading.marker.order_charges]
         charges = [
             ledger.SCENE.charge("sum over meshes"),
             *([ledger.in_all(order)] if order else []),

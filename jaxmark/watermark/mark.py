@@ -20,6 +20,8 @@ from jaxmark.geometry.imprint import Imprint, make_imprint, restore
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.coding.keys import Choices, Key, bind, commitment
 from jaxmark.watermark.coding.message import CANDIDATES, Decoded, decode, encode
+from jaxmark.watermark.evidence import ledger
+from jaxmark.watermark.evidence.ledger import Charge
 from jaxmark.watermark.interfaces import Carrier, Detector, Reader, Received, Scheme
 from jaxmark.watermark.perception.budget import Budget, BudgetLike, displace_within
 from jaxmark.watermark.perception.capacity import Capacity, Survival
@@ -100,6 +102,13 @@ class Mark:
     def capacity(self) -> Capacity:
         """The capacity of the original with the scheme."""
         return Capacity(self.original, self.scheme, {self.bits: lambda: self.reader})
+
+    @property
+    def order_charges(self) -> tuple[Charge, ...]:
+        """The charge for the order of vertices in which the original was presented, if there is a record."""
+        if self.record is None:
+            return ()
+        return (ledger.ORDER.charge("marked" if self.original.in_order else "another"),)
 
     @property
     def uses_own_detector(self) -> bool:

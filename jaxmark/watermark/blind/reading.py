@@ -32,7 +32,7 @@ from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Detection, Evidence, Tag, weigh
 from jaxmark.watermark.evidence.ledger import Choice
 from jaxmark.watermark.record import Record, is_recorded
-from jaxmark.watermark.schemes.registry import is_builtin
+from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, is_builtin
 
 TAG_BITS = 40
 _CODE_SPREAD = 4  # least number of code bits per bit of message and tag: few anchors then share a code bit
@@ -128,7 +128,10 @@ def read(
     """
     choices, length = context(Key(key), bits, scheme.name), code_length(bits)
     claim = _Claim(choices, bits, b"" if message is None and not bits else message, record)
-    looks = len(scheme.widths) * scheme.looks * len(scheme.steps) * _CHANGES
+    # Without a record, widths and steps that were left out may have been left out after seeing the suspect.
+    usual = scheme if record is not None else BLIND_SCHEMES.get(scheme.name, scheme)
+    kinds = max(len(one.widths) * len(one.steps) for one in (scheme, usual))
+    looks = kinds * scheme.looks * _CHANGES
     best = _nothing(scheme, np.zeros(length), Anchored(Pose(np.eye(3), np.zeros(3))))
     tags_compared = 0  # number of messages whose tags were already compared
     for _, group in groupby(scheme.views(suspect, choices), key=lambda view: view.undone):
@@ -260,17 +263,23 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
     if reading.view.mirrored[reading.turn]:
         notes.append("The suspect is the mirror image of the marked mesh.")
     agreement = float(score[chosen] / reading.anchors)
+    caveats = _caveats(scheme, record)
     return _nothing(scheme, reading.soft, reading.anchored._replace(agreement=agreement))._replace(
         message=None if decoded is None else decoded.message,
         premises=f"key, message and {'options' if record is None else 'record'}",
-        evidence=weigh(ways, bits=bits, fixed=fixed, tag=tag, charges=charges, looks=looks, caveats=_caveats(scheme)),
+        evidence=weigh(ways, bits=bits, fixed=fixed, tag=tag, charges=charges, looks=looks, caveats=caveats),
         notes=tuple(notes),
     )
 
 
-def _caveats(scheme: BlindScheme) -> tuple[str, ...]:
+def _caveats(scheme: BlindScheme, record: Record | None) -> tuple[str, ...]:
     """Return why readings with a scheme prove nothing, if so."""
-    return () if is_builtin(scheme) else (f"the scheme {scheme.name!r} is not one of this library",)
+    if not is_builtin(scheme):
+        return (f"the scheme {scheme.name!r} is not one of this library",)
+    usual = BLIND_SCHEMES[scheme.name]
+    if record is None and not (set(scheme.widths) <= set(usual.widths) and set(scheme.steps) <= set(usual.steps)):
+        return (f"the widths or steps of the scheme {scheme.name!r} were chosen by the reader",)
+    return ()
 
 
 def _nothing(scheme: BlindScheme, soft: Float64[np.ndarray, " code"], anchored: Anchored) -> Detection:

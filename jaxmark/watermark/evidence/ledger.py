@@ -134,6 +134,13 @@ def _alignment(then: Choice) -> Choice:
     )
 
 
+def _order(then: Choice) -> Choice:
+    """Make the choice of the order in which an original with a record is presented."""
+    return Choice(
+        "order of the original (record)", (Alternative("marked", 0.97, then), Alternative("another", 0.03, then))
+    )
+
+
 # Choices are defined from the leaves to the roots. The charge for the rank of a tag is a union bound, not a Bonferroni
 # correction: the probability that one of the first r candidates has the right tag is at most r times that of one.
 RANK = _each("tag rank", "1/n if the tag of the n-th candidate message is the first that matches", in_bound=True)
@@ -155,9 +162,7 @@ READING = Choice(
 ALIGNMENT = _alignment(READING)
 # With a record, an original may be presented in another order of vertices than the marked one, which alignment uses.
 # Its points are sorted then, so all other orders are alike. Without a record, keyed choices are bound to the order.
-ORDER = Choice(
-    "order of the original (record)", (Alternative("marked", 0.97, ALIGNMENT), Alternative("another", 0.03, ALIGNMENT))
-)
+ORDER = _order(ALIGNMENT)
 REFLECTION = Choice("reflection", (Alternative("better fit", 0.97, ORDER), Alternative("worse fit", 0.03, ORDER)))
 PASS_BAND = Choice(
     "pass band (no record)",
@@ -170,7 +175,7 @@ PASS_BAND = Choice(
 
 # Scenes: either the sum of scores over meshes, in the poses that the readings of single meshes chose, or one mesh.
 SUM_ALIGNMENT = _alignment(MESSAGE)
-SUM_ORDER = ORDER._replace(alternatives=tuple(one._replace(then=SUM_ALIGNMENT) for one in ORDER.alternatives))
+SUM_ORDER = _order(SUM_ALIGNMENT)
 MESHES = _each("mesh", "1/n for each of the n meshes of the original scene that were compared", PASS_BAND)
 SCENE = Choice("scene", (Alternative("sum over meshes", 0.5, SUM_ORDER), Alternative("one mesh", 0.5, MESHES)))
 PICKED = _each("meshes picked", "2^-k/m for each of the m sets of k meshes that could be picked", SCENE)
@@ -206,11 +211,12 @@ MARKS = Choice(
 # Copies for recipients.
 RECIPIENTS = _each("recipient", "1/n for each of the n recipients who were tested")
 COPY_ALIGNMENT = _alignment(RECIPIENTS)
+COPY_ORDER = _order(COPY_ALIGNMENT)
 
 # Catalogues: everything that could have been identified instead.
 ORIGINALS = Choice(
     "catalogue",
-    (Alternative("original", None, PASS_BAND), Alternative("copy", None, COPY_ALIGNMENT)),
+    (Alternative("original", None, PASS_BAND), Alternative("copy", None, COPY_ORDER)),
     "1/n for each of n readings: each piece of the suspect, under each key, with each original that has no record,"
     " each record and each recipient list",
 )
@@ -229,7 +235,7 @@ ROOTS: dict[str, Choice] = {
     "A scene of several meshes": SELECTION,
     "Blind": PARTS,
     "Several marks in one mesh": MARKS,
-    "Copies for recipients": COPY_ALIGNMENT,
+    "Copies for recipients": COPY_ORDER,
     "A catalogue of originals": ORIGINALS,
     "A record with a timestamped commitment": COMMITMENT,
     "Without a commitment": UNCOMMITTED,

@@ -67,9 +67,9 @@ class Tracer:
     def read(self, aligned: Alignment, recipients: Iterable[str], top: int = 10) -> list[Accusation]:
         """Rank recipients by their scores in an aligned suspect; see `identify`."""
         soft = self.mark.soft_decisions(self.mark.receive(aligned))
-        charge = ledger.COPY_ALIGNMENT.charge(aligned.align)
+        charges = *self.mark.order_charges, ledger.COPY_ALIGNMENT.charge(aligned.align)
         ranking = rank(soft, recipients, self.mark.choices, top=top)
-        return [accusation.charged(charge)._replace(caveats=self.mark.caveats) for accusation in ranking]
+        return [accusation.charged(*charges)._replace(caveats=self.mark.caveats) for accusation in ranking]
 
 
 def make_tracer(original: Mesh, key: bytes, *, record: Record | None = None) -> Tracer:
