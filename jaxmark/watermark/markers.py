@@ -307,7 +307,7 @@ class BlindMarker:
     def reads(self, marked: Mesh, message: bytes) -> bool:
         """Whether a message is decoded, or, for a presence mark, its presence is proven."""
         detection = self.detect(marked)
-        return detection.message == message if message else detection.detected()
+        return detection.message == message if message else detection.detected(allow_estimate=True)
 
     def measure_survival(self, marked: Mesh, message: bytes, predicted: Survival) -> Survival | None:
         """See `Marker`."""

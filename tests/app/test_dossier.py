@@ -76,7 +76,7 @@ def test_a_dossier_shows_all_but_the_secret(workshop: Workshop):
     detect = ("detect", "marked.ply", "--original", "millimetres.stl", "--key", "secrets/mine.key", *RECORD)
     more = ("--commitment", "all.json", "--obtained", "a shop <b>& co</b>, 1 May", "--dossier", "case")
     told = workshop.json(*detect, *more)
-    assert told["detected"] is told["proof"] is True
+    assert (told["detected"], told["estimate"]) == (True, False)
     assert told["caveats"] == told["notes"] == []
     assert told["message"] == b"ok".hex()
     assert told["version"] == 2
@@ -119,12 +119,17 @@ def test_a_dossier_shows_all_but_the_secret(workshop: Workshop):
 
 
 def test_there_is_no_dossier_of_less_than_a_proof(workshop: Workshop):
-    told = workshop.json("detect", "marked.ply", *DETECT[2:], "--original", "dented.ply", *RECORD)
-    assert told["detected"] is True
-    assert told["proof"] is False
+    told = workshop.json("detect", "marked.ply", *DETECT[2:], "--original", "dented.ply", *RECORD, status=3)
+    assert (told["detected"], told["estimate"]) == (False, True)
+    assert told["log10_p"] < -6
     assert "the original was edited" in told["caveats"][0]
-    said = workshop("detect", "marked.ply", *DETECT[2:], "--original", "dented.ply", *RECORD)[1]
+    status, said, _ = workshop("detect", "marked.ply", *DETECT[2:], "--original", "dented.ply", *RECORD)
+    assert status == 3
+    assert said.startswith("estimate, not a proof: message 6f6b")
     assert "an estimate: the original was edited" in said
+    weak = ("--original", "dented.ply", *RECORD, "--alpha", "1e-300")
+    told = workshop.json("detect", "marked.ply", *DETECT[2:], *weak, status=1)
+    assert (told["detected"], told["estimate"]) == (False, False)
     assert "no dossier of an estimate" in workshop.refused(
         "detect", "marked.ply", *DETECT[2:], "--original", "dented.ply", *RECORD, "--dossier", "case"
     )
