@@ -241,7 +241,7 @@ def grinding(mesh: Mesh, seen: dict[str, Mesh], tries: int) -> Row:
 
 
 class Edit(NamedTuple):
-    """An edit of the original, made by somebody who knows the mark."""
+    """An edit of the original, made with knowledge of the mark."""
 
     chosen: str  # how the points are chosen
     share: float  # share of the points that are moved
@@ -290,7 +290,7 @@ def edited(mesh: Mesh) -> list[Row]:
             "with noise, edited points ignored": reading.detect(noisy, MESSAGE, kept.astype(float)),
         }
         row |= {name: one.log10_p for name, one in found.items()}
-        row["proof"] = any(one.detected() for one in found.values())
+        row["detected"] = any(one.detected() for one in found.values())
         say(*row.values(), sep=", ")
     return rows
 
@@ -346,7 +346,7 @@ def try_grinding(mesh: Mesh, options: argparse.Namespace) -> Checks:
 def try_edited(mesh: Mesh, options: argparse.Namespace) -> Checks:
     rows = edited(mesh)
     print(f"an original edited with knowledge of the mark; unmarked suspects\n\n{table(rows)}\n")
-    return {"proofs by edited originals": not any(row.get("proof", False) for row in rows)}
+    return {"detections by edited originals": not any(row.get("detected", False) for row in rows)}
 
 
 def try_message(mesh: Mesh, options: argparse.Namespace) -> Checks:

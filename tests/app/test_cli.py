@@ -201,30 +201,6 @@ def test_nothing_found_is_status_1(workshop: Workshop):
     assert "nothing detected" in out
 
 
-@pytest.mark.slow
-def test_an_original_moved_against_the_mark_makes_no_unmarked_suspect_detected(workshop: Workshop):
-    """The owner moves the points that the mark moves most, so that the unmarked mesh differs as a marked one does."""
-    record = jm.Record.load(workshop.embed("--budget", "0.001")["record"])
-    original, marked = jm.load_mesh("model.ply"), jm.load_mesh("marked.ply")
-    shift = np.asarray(marked.vertices, np.float64) - original.vertices
-    order = np.argsort(-np.linalg.norm(shift, axis=1))
-    command = ("detect", "model.ply", "--original", "edited.ply", "--key", "owner.key", "--record", "record.json")
-    Path("record.json").write_text(record.to_json())
-    for share, status in ((0.45, 3), (0.7, 2)):
-        moved = np.asarray(original.vertices, np.float64).copy()
-        moved[order[: int(share * len(moved))]] -= shift[order[: int(share * len(moved))]]
-        edited = original._replace(vertices=moved)
-        jm.save_mesh(edited, "edited.ply", like="model.ply")
-        if status == 2:
-            assert "not the mesh that the record was made for" in workshop.refused(*command)
-            continue
-        found = workshop.json(*command, status=status)
-        assert (found["detected"], found["estimate"]) == (False, True)
-        assert found["log10_p"] < -10  # the figure that a caveat must accompany
-        key = jm.Key(bytes(range(32)))
-        assert not jm.detect(original, original=edited, key=key, record=record).detected()
-
-
 def test_refusals_are_one_sentence_and_leave_nothing(workshop: Workshop):
     workshop.embed()
     Path("broken.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\n")
