@@ -11,7 +11,7 @@ import jaxmark as jm
 from jaxmark.app.find_commands import describe
 from jaxmark.catalogue import Finder, Match, Verdict
 from jaxmark.catalogue.descriptors import centred
-from jaxmark.catalogue.identification import split
+from jaxmark.catalogue.identification import _Comparison, split
 from jaxmark.catalogue.landmarks import KEPT, MOST, LandmarkIndex, landmarks
 from jaxmark.catalogue.partial_registration import Part, fit_whole
 from jaxmark.geometry.mesh import compact
@@ -93,6 +93,16 @@ def test_a_verdict_has_the_figures_of_the_original_that_it_names():
     assert (both["original"], both["log10_p"], both["log10_p_uncommitted"], both["caveats"]) == ("a.ply", -8, -1, ())
     assert (alone["named"], alone["log10_p"], alone["caveats"]) == (False, -60, caveats)
     assert (both["estimate"], alone["estimate"]) == (False, True)
+
+
+def test_a_proof_is_preferred_to_an_estimate_and_to_nothing():
+    """A record that reads nothing contradicts no record, and an estimate may have any figure."""
+    mesh, match = rough_sphere(60), Match("a.ply", "", "", "whole", 1, 0.0)
+    proof, estimate = match._replace(named=True, log10_p=-8.0), match._replace(estimate=True, log10_p=-60.0)
+    proof_of_another_message = _Comparison(proof, mesh, mesh, 1, agrees=False)
+    readings = [_Comparison(match, mesh, mesh, 1), _Comparison(estimate, mesh, mesh, 1), proof_of_another_message]
+    assert min(readings, key=lambda reading: reading.order) is proof_of_another_message
+    assert min(readings[:2], key=lambda reading: reading.order).match.estimate
 
 
 def test_an_estimate_names_no_original_and_accuses_nobody(workshop: Workshop, monkeypatch):
