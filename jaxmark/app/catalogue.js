@@ -21,9 +21,10 @@ const text = (hexadecimal) => {
     return /^[\p{L}\p{N}\p{P}\p{S} ]+$/u.test(decoded) ? `${hexadecimal} ("${decoded}")` : hexadecimal;
   } catch { return hexadecimal; }
 };
-const content = (match) =>
-  match.recipient ? `copy for ${match.accused.join(", ")}` : match.message ? `message ${text(match.message)}` :
-  match.named ? "a mark" : match.refused || "nothing detected";
+const content = (match) => (match.estimate ? "estimate, not a proof: " : "") + result(match);
+const result = (match) =>
+  match.accused.length + match.estimates.length ? `copy for ${match.accused.concat(match.estimates).join(", ")}` : match.message ? `message ${text(match.message)}` :
+  match.named || match.estimate ? "a mark" : match.refused || "nothing detected";
 
 let listed = 0;
 async function list() {

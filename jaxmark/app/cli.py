@@ -1,9 +1,9 @@
 """The command line: every command reads files, writes files, and prints one answer.
 
-The exit status is 0 if the command is done or a mark is detected, and 1 if `detect` detects nothing or `identify`
-accuses nobody. It is 2 if the input is refused; then standard error has one sentence, and no output file is written.
-With --json, standard output is exactly one JSON object. For a folder, it is one line or one object per file, and the
-exit status is the largest of all files.
+The exit status is 0 if the command is done or a mark is detected, 1 if `detect` detects nothing or `identify` accuses
+nobody, and 3 if they have only an estimate, which proves nothing. It is 2 if the input is refused; then standard error
+has one sentence, and no output file is written. With --json, standard output is exactly one JSON object. For a folder,
+it is one line or one object per file, and the exit status is the worst of all files, see `Status`.
 """
 
 import math
@@ -40,7 +40,17 @@ from jaxmark.app.options import (
     message_options,
     read_key,
 )
-from jaxmark.app.output import FileOutcome, answer, check_distinct, check_suffix, error_text, power, say
+from jaxmark.app.output import (
+    ESTIMATE,
+    FileOutcome,
+    Status,
+    answer,
+    check_distinct,
+    check_suffix,
+    error_text,
+    power,
+    say,
+)
 from jaxmark.app.process import end_by_exception
 from jaxmark.app.progress import current
 from jaxmark.app.read_files import FileReader
@@ -66,8 +76,9 @@ from jaxmark.watermark.tracing.tracer import identify
 
 @click.group(
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog="Exit status: 0 if done or detected, 1 if nothing is detected, 2 if the input is refused. Compiled programs"
-    " are cached in ~/.cache/jaxmark for later commands; JAX_ENABLE_COMPILATION_CACHE=false turns the cache off.",
+    epilog="Exit status: 0 if done or detected, 1 if nothing is detected, 2 if the input is refused, 3 if there is only"
+    " an estimate, which proves nothing. Compiled programs are cached in ~/.cache/jaxmark for later commands;"
+    " JAX_ENABLE_COMPILATION_CACHE=false turns the cache off.",
 )
 @click.version_option(package_name="jaxmark", prog_name="jaxmark")
 def cli() -> None:
@@ -259,8 +270,9 @@ def detect_command(
     If SUSPECT is a folder, one line is printed per file. --original and --record may then be folders, with files of
     the same names.
 
-    Exit status 0 if the false-positive probability is at most --alpha, 1 if it is larger, 2 if SUSPECT is refused; for
-    a folder, the largest of all files.
+    Exit status 0 if the false-positive probability is at most --alpha, 1 if it is larger, 2 if SUSPECT is refused, 3 if
+    it is at most --alpha but only an estimate, which proves nothing, for example because the original was edited. For a
+    folder, 0 if it is 0 for all files; otherwise 2, 1 or 3, the first of these that any file has.
     """
     if commitment_file is not None and record_file is None:
         raise JaxmarkError("--commitment is to a record; also give the --record that it contains.")
@@ -291,7 +303,7 @@ def detect_command(
         _each(suspect, as_json, partial(_read_member, reader, original, record_file, report, dossier), workers)
     outcome = replace(reader, doing=current().doing).read(suspect, original, record_file, report, dossier)
     answer(as_json, outcome.values, outcome.text)
-    sys.exit(0 if outcome.done else 1)
+    sys.exit(outcome.status)
 
 
 @cli.command(name="identify")
@@ -332,7 +344,8 @@ def identify_command(
     Needs the key, and either the original and a list of recipients, or a catalogue. Prints each accused recipient. A
     recipient is accused if the probability that any innocent recipient has as high a score is at most --alpha.
 
-    Exit status 0 if a recipient is accused, 1 if nobody is accused, 2 if SUSPECT is refused.
+    Exit status 0 if a recipient is accused, 1 if nobody is accused, 2 if SUSPECT is refused, 3 if the probability is
+    only an estimate, for example because the original was edited. An estimate accuses nobody.
     """
     if not 0 < alpha < 1:
         raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
@@ -356,20 +369,23 @@ def identify_command(
     meshes = load_mesh(suspect), load_mesh(original)
     current().doing(f"testing the copies of {len(names)} recipients in {suspect}")
     ranking = identify(meshes[0], names, original=meshes[1], key=key, record=record, top=top, align=align)
-    accused = [entry for entry in ranking if entry.log10_p <= math.log10(alpha)]
+    likely = [entry for entry in ranking if entry.log10_p <= math.log10(alpha)]
+    accused = [entry.recipient for entry in likely if not entry.caveats]
     values = {
-        "accused": [entry.recipient for entry in accused],
+        "accused": accused,
+        "estimates": [entry.recipient for entry in likely if entry.caveats],
         "ranking": [entry._asdict() | {"charges": charges_as_json(entry.charges)} for entry in ranking],
         "recipients": len(names),
     }
     lines = [
-        f"{entry.recipient}: score {entry.score:.1f}, probability "
-        + (f"about {power(entry.log10_p)}, an estimate: {'; '.join(entry.caveats)}" if entry.caveats else "")
-        + ("" if entry.caveats else f"at most {power(entry.log10_p)}")
-        for entry in accused
+        f"{ESTIMATE}: {entry.recipient}: score {entry.score:.1f}, probability about {power(entry.log10_p)}:"
+        f" {'; '.join(entry.caveats)}"
+        if entry.caveats
+        else f"{entry.recipient}: score {entry.score:.1f}, probability at most {power(entry.log10_p)}"
+        for entry in likely
     ]
     answer(as_json, values, "\n".join(lines) or f"none of {len(names)} recipients is accused (--alpha {alpha:g})")
-    sys.exit(0 if accused else 1)
+    sys.exit(Status.of(bool(accused), bool(likely)))
 
 
 @cli.command(name="commit")
@@ -656,12 +672,12 @@ def _refuse(sentence: str) -> NoReturn:
 
 
 def _each(folder: Path, as_json: bool, work: Work, workers: int) -> NoReturn:
-    """Process the mesh files of a folder, print a line for each, and exit with the largest status of all."""
-    files, status, start = mesh_files(folder), 0, time.monotonic()
+    """Process the mesh files of a folder, print a line for each, and exit with the worst status of all."""
+    files, status, start = mesh_files(folder), Status.DONE, time.monotonic()
     current().doing(f"0/{len(files)} files of {folder}")
     with closing(each(files, work, workers)) as results:
         for done, (file, outcome) in enumerate(results, 1):
-            status = max(status, 2 if outcome.refused else 0 if outcome.done else 1)
+            status = Status.worst([status, outcome.status])
             answer(as_json, {"file": file.name, **outcome.values}, f"{file.name}: {outcome.text}")
             pace = (time.monotonic() - start) / done
             current().doing(f"{done}/{len(files)} files of {folder}, {left_over((len(files) - done) * pace)}")

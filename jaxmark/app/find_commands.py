@@ -13,7 +13,7 @@ from jaxmark.alignment.result import Align
 from jaxmark.app.catalogue_commands import CATALOGUE, catalogue_group
 from jaxmark.app.folders import begin_worker
 from jaxmark.app.options import ALIGN, FILE, JSON, KEYS, QUIET, read_key
-from jaxmark.app.output import answer, message_text, power, say
+from jaxmark.app.output import ESTIMATE, Status, answer, message_text, power, say
 from jaxmark.app.process import release_programs
 from jaxmark.app.progress import current
 from jaxmark.catalogue import Catalogue, Finder, Match, Plan, Verdict, find_each, mesh_files_below
@@ -86,8 +86,9 @@ def find_command(
     --output already are skipped. Suspects that cannot be read are listed in a file next to it, whose name ends in
     .dead.jsonl.
 
-    Exit status 0 if an original is named, 1 if none is named, 2 if SUSPECT is refused; for many suspects, the largest
-    of all.
+    Exit status 0 if an original is named, 1 if none is named, 2 if SUSPECT is refused, 3 if there is only an estimate,
+    which names no original. For many suspects, 0 if it is 0 for all; otherwise 2, 1 or 3, the first of these that any
+    suspect has.
     """
     if (suspect is None) == (list_file is None):
         raise JaxmarkError("Give either SUSPECT or --list.")
@@ -103,33 +104,36 @@ def find_command(
         verdict = Finder(catalogue, keys, alpha=alpha, bits=bits, depth=depth, align=align).find(suspect)
         keep(catalogue, suspect, verdict)
     answer(as_json, verdict.as_json(), describe(verdict, alpha))
-    sys.exit(0 if verdict.named else 1)
+    sys.exit(Status.of(bool(verdict.named), bool(verdict.estimates)))
 
 
 def _find_many(
     plan: Plan, suspects: Iterable[Path], output: Path | None, workers: int | Pool, as_json: bool
 ) -> NoReturn:
-    """Find the originals of many suspects, print a line for each, and exit with the largest status of all."""
+    """Find the originals of many suspects, print a line for each, and exit with the worst status of all."""
     if output is None:
         raise JaxmarkError("Many suspects need a file for the verdicts; give --output.")
     if output.resolve() in (plan.catalogue, *plan.keys):
         raise JaxmarkError(f"{output} is the catalogue or a key; give another --output.")
-    counts = {0: 0, 1: 0, 2: 0}
+    counts = dict.fromkeys(Status, 0)
     current().doing("comparing the first of many suspects with the originals")
     with closing(find_each(plan, suspects, output, workers, say)) as rows:
         for row in rows:
-            status = 2 if "refused" in row else 0 if row["named"] else 1
+            status = Status.REFUSED if "refused" in row else Status.of(row["named"], row["estimate"])
             counts[status] += 1
             answer(as_json, row, f"{row['suspect']}: {_line(row)}")
             current().doing(f"{sum(counts.values())} suspects done")
-    say(f"{counts[0]} named, {counts[1]} without an original, {counts[2]} refused → {output}")
-    sys.exit(max((status for status, count in counts.items() if count), default=0))
+    named, nothing, refused, estimates = counts.values()
+    say(f"{named} named, {estimates} estimates, {nothing} without an original, {refused} refused → {output}")
+    sys.exit(Status.worst(status for status, count in counts.items() if count))
 
 
 def _line(row: Mapping[str, Any]) -> str:
     """Describe the verdict on one of many suspects."""
     if "refused" in row:
         return f"refused. {row['refused']}"
+    if row["estimate"]:
+        return f"{ESTIMATE}: no original is named: {'; '.join(row['caveats'])}"
     if not row["named"]:
         return "no original is named"
     content = row["recipient"] or row["message"] or "a mark"
@@ -170,9 +174,11 @@ def identify_by_catalogue(
         finder = Finder(catalogue, [read_key(key_file)], alpha=alpha, align=align, only_recipients=True)
         verdict = finder.find(suspect)
         keep(catalogue, suspect, verdict)
-    accused = {name: match.original for match in verdict.named for name in match.accused}
-    answer(as_json, {"accused": list(accused), **verdict.as_json()}, describe(verdict, alpha))
-    sys.exit(0 if accused else 1)
+    accused = list(dict.fromkeys(name for match in verdict.named for name in match.accused))
+    estimates = list(dict.fromkeys(name for match in verdict.estimates for name in match.estimates))
+    values = {"accused": accused, "estimates": estimates, **verdict.as_json()}
+    answer(as_json, values, describe(verdict, alpha))
+    sys.exit(Status.of(bool(accused), bool(estimates)))
 
 
 def opened(catalogue_file: Path) -> Catalogue:
@@ -194,12 +200,13 @@ def keep(catalogue: Catalogue, suspect: Path, verdict: Verdict) -> None:
 
 def describe(verdict: Verdict, alpha: float) -> str:
     """Describe a verdict."""
-    if verdict.named:
-        return "\n".join(_named(match) for match in verdict.named)
+    if verdict.named or verdict.estimates:
+        return "\n".join(_likely(match) for match in verdict.named + verdict.estimates)
     read = [match for match in verdict.matches if match.refused is None]
     text = f"no original is named: none of {verdict.readings} readings detects a mark (--alpha {alpha:g})"
     if read:
-        text += f"; most similar to {_place(read[0])}, probability at most {power(read[0].log10_p)}"
+        bound = "about" if read[0].caveats else "at most"
+        text += f"; most similar to {_place(read[0])}, probability {bound} {power(read[0].log10_p)}"
         text += "".join(f". {note}" for note in read[0].notes)
     elif verdict.matches:
         text += f"; {_place(verdict.matches[0])} could not be read: {verdict.matches[0].refused}"
@@ -215,17 +222,21 @@ def _place(match: Match) -> str:
     return match.original + (f", mesh {match.mesh!r}" if match.mesh else "")
 
 
-def _named(match: Match) -> str:
-    if match.accused:
-        content = f"copy for {', '.join(match.accused)}"
+def _likely(match: Match) -> str:
+    """Describe an original that is named, or the estimate of one."""
+    if recipients := match.accused + match.estimates:
+        content = f"copy for {', '.join(recipients)}"
     elif match.message:
         content = f"message {message_text(bytes.fromhex(match.message))}"
     else:
         content = "a mark"
     piece = f"{match.piece}: " if match.piece else ""
     part = "" if match.coverage >= 0.95 else f", {100 * match.coverage:.0f} % of it"
+    result = f"{piece}{_place(match)}{part}: {content}; probability"
+    if match.estimate:
+        return f"{ESTIMATE}: {result} about {power(match.log10_p)}: {'; '.join(match.caveats)}"
     return (
-        f"{piece}{_place(match)}{part}: {content}; probability at most {power(match.log10_p)} if keys, originals and"
+        f"{result} at most {power(match.log10_p)} if keys, originals and"
         f" records were fixed before the suspect existed, {power(match.log10_p_uncommitted)} even if they were chosen"
         " afterwards"
     )

@@ -12,7 +12,7 @@ from functools import lru_cache
 from multiprocessing import connection
 from pathlib import Path
 
-from jaxmark.app.output import FileOutcome, error_text
+from jaxmark.app.output import FileOutcome, Status, error_text
 from jaxmark.app.process import end_by_exception, keep_programs, release_programs
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.cells import processes
@@ -83,7 +83,7 @@ def _run(work: Work, file: Path) -> FileOutcome:
         return work(file)
     except Exception as error:
         text = error_text(error)
-        return FileOutcome({"refused": text}, f"refused. {text}", done=False, refused=True)
+        return FileOutcome({"refused": text}, f"refused. {text}", Status.REFUSED)
     finally:
         release_programs()
 

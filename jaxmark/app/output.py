@@ -4,7 +4,8 @@ import json
 import math
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from enum import IntEnum
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,14 +18,39 @@ from jaxmark.watermark.evidence.detection import Detection, Evidence
 from jaxmark.watermark.evidence.ledger import charges_as_json
 from jaxmark.watermark.perception.capacity import Survival
 
+ESTIMATE = "estimate, not a proof"  # how the text of an estimate begins
+
+
+class Status(IntEnum):
+    """The exit status of a command, and the outcome for one of several files."""
+
+    DONE = 0  # also if a mark is detected, an original named or a recipient accused
+    NOTHING = 1
+    REFUSED = 2
+    ESTIMATE = 3  # the figures would suffice for a detection, but they have caveats
+
+    @classmethod
+    def of(cls, proven: bool, sufficient: bool) -> "Status":
+        """Return the status of a reading.
+
+        Args:
+            proven: whether it has a proof with sufficient figures.
+            sufficient: whether it has sufficient figures, with or without caveats.
+        """
+        return cls.DONE if proven else cls.ESTIMATE if sufficient else cls.NOTHING
+
+    @classmethod
+    def worst(cls, statuses: Iterable["Status"]) -> "Status":
+        """Return the status of several files, which is at most as good as that of each: 0 before 3, 1 and 2."""
+        return max(statuses, key=[cls.DONE, cls.ESTIMATE, cls.NOTHING, cls.REFUSED].index, default=cls.DONE)
+
 
 class FileOutcome(NamedTuple):
     """The outcome for one file."""
 
     values: dict[str, Any]  # for programs: values for JSON, except that numbers may not be finite
     text: str  # for people: one sentence
-    done: bool = True  # False if nothing was detected, or the file was refused
-    refused: bool = False
+    status: Status = Status.DONE
 
 
 def say(line: str, err: bool = True) -> None:
@@ -96,6 +122,14 @@ def survival_text(survives: Survival) -> str:
     return f"noise of {whole} of the mean distance to the centre, {half} with half of the vertices lost"
 
 
+def detection_status(detection: Detection, alpha: float) -> Status:
+    """Return the status of a detection."""
+    return Status.of(detection.detected(alpha), detection.detected(alpha, allow_estimate=True))
+
+
+_VERDICTS = {Status.DONE: "detected", Status.ESTIMATE: ESTIMATE, Status.NOTHING: "nothing detected"}
+
+
 def detection_text(detection: Detection, alpha: float, timestamped: Evidence | None, *, charges: bool = False) -> str:
     """Describe a detection in words.
 
@@ -107,7 +141,7 @@ def detection_text(detection: Detection, alpha: float, timestamped: Evidence | N
     """
     evidence = detection.evidence
     read = f"message {message_text(detection.message)}" if detection.message is not None else "no message could be read"
-    text = f"{'detected' if detection.detected(alpha, allow_estimate=True) else 'nothing detected'}: {read}; "
+    text = f"{_VERDICTS[detection_status(detection, alpha)]}: {read}; "
     if evidence.caveats:
         text += (
             f"false-positive probability about {power(detection.log10_p)}, an estimate: {'; '.join(evidence.caveats)}"
@@ -153,7 +187,6 @@ def detection_values(
     """
     values = {
         **_figures(detection, alpha),
-        "proof": not detection.evidence.caveats,
         "notes": list(detection.notes),
         "scheme": detection.scheme,
         "version": detection.version,
@@ -178,9 +211,10 @@ def detection_values(
 
 
 def _figures(detection: Detection, alpha: float) -> dict[str, Any]:
-    evidence = detection.evidence
+    evidence, status = detection.evidence, detection_status(detection, alpha)
     return {
-        "detected": detection.detected(alpha, allow_estimate=True),
+        "detected": status is Status.DONE,
+        "estimate": status is Status.ESTIMATE,
         "message": None if detection.message is None else detection.message.hex(),
         "log10_p": evidence.log10_p,
         "log10_p_uncommitted": evidence.log10_p_uncommitted,

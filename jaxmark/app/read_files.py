@@ -11,7 +11,7 @@ from jaxmark.alignment.result import Align
 from jaxmark.app.diagnosis import diagnose, is_original
 from jaxmark.app.dossier import Case, save_dossier, save_report
 from jaxmark.app.mark_files import pick
-from jaxmark.app.output import FileOutcome, detection_text, detection_values
+from jaxmark.app.output import FileOutcome, Status, detection_status, detection_text, detection_values
 from jaxmark.app.process import release_programs
 from jaxmark.app.progress import Doing, quietly
 from jaxmark.errors import JaxmarkError
@@ -100,11 +100,11 @@ class FileReader:
         if report is not None:
             self.doing("drawing the report")
             save_report(report, mark.original, mesh, detection.registration)
-        detected, notes = detection.detected(self.alpha, allow_estimate=True), detection.notes
-        if self.diagnoses and record is None and detection.message is None and not detected and not notes:
+        nothing, notes = detection_status(detection, self.alpha) is Status.NOTHING, detection.notes
+        if self.diagnoses and record is None and detection.message is None and nothing and not notes:
             self.doing("nothing detected, diagnosing")
             notes = diagnose(mesh, mark, self.align)
-        if not detected and detection.registration.deformed is not None and _has_skin(original):
+        if nothing and detection.registration.deformed is not None and _has_skin(original):
             notes += ("If the suspect is in another pose of the original's skeleton, remove it by `jaxmark unpose`.",)
         outcome = self._outcome(detection._replace(notes=notes), suspect, loaded)
         if dossier is not None:
@@ -127,7 +127,7 @@ class FileReader:
         digest = None if record is None else record.digest()
         values = detection_values(detection, self.alpha, suspect, self.obtained, timestamped, digest)
         text = detection_text(detection, self.alpha, timestamped, charges=self.shows_charges)
-        return FileOutcome(values, text, detection.detected(self.alpha, allow_estimate=True))
+        return FileOutcome(values, text, detection_status(detection, self.alpha))
 
     def _read_blind(self, suspect: Path, record: Record | SceneRecord | None) -> Detection:
         """Read a file without its original; if it has several meshes, read each, and charge for their number."""
@@ -181,7 +181,7 @@ class FileReader:
 
     def _count_proving(self, detection: Detection, parts: Sequence[Detection], meshes: int) -> Detection:
         """Add a note on how many of several meshes prove the mark without the others."""
-        proving = sum(part.detected(self.alpha, allow_estimate=True) for part in parts)
+        proving = sum(part.detected(self.alpha) for part in parts)
         note = f"{proving} of {meshes} meshes prove the mark without the others."
         return detection._replace(notes=(*detection.notes, note))
 

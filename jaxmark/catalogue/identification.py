@@ -7,7 +7,7 @@ significance budget nevertheless covers every original of the catalogue, with ev
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar, get_args, runtime_checkable
 
@@ -61,6 +61,8 @@ class Match(NamedTuple):
     message: str | None = None  # hexadecimal
     recipient: str | None = None
     accused: tuple[str, ...] = ()  # all recipients that are accused
+    estimate: bool = False  # whether the probability is at most alpha, but an estimate, which names and accuses nobody
+    estimates: tuple[str, ...] = ()  # the recipients that would be accused without the caveats
     log10_p: float = 0.0  # log10 of a bound on the probability that any original, key or recipient is named by chance
     log10_p_uncommitted: float = 0.0  # the bound if keys, originals and records may have been chosen afterwards
     key: str | None = None  # commitment to the key that was used
@@ -88,10 +90,18 @@ class Verdict(NamedTuple):
     @property
     def named(self) -> tuple[Match, ...]:
         """The matches of the originals that are named, one per original."""
+        return self._likeliest(match for match in self.matches if match.named)
+
+    @property
+    def estimates(self) -> tuple[Match, ...]:
+        """The matches that are estimates, which name no original, one per original."""
+        return self._likeliest(match for match in self.matches if match.estimate)
+
+    @staticmethod
+    def _likeliest(matches: Iterable[Match]) -> tuple[Match, ...]:
         likeliest: dict[tuple[str, str], Match] = {}
-        for match in self.matches:
-            if match.named:
-                likeliest.setdefault((match.original, match.mesh), match)
+        for match in matches:
+            likeliest.setdefault((match.original, match.mesh), match)
         return tuple(likeliest.values())
 
     def as_json(self) -> dict[str, Any]:
@@ -105,6 +115,7 @@ class Verdict(NamedTuple):
         likeliest = named or min(self.matches, key=lambda match: match.log10_p, default=None)
         return {
             "named": named is not None,
+            "estimate": named is None and bool(self.estimates),
             **head,
             "log10_p": likeliest.log10_p if likeliest else 0.0,
             "log10_p_uncommitted": likeliest.log10_p_uncommitted if likeliest else 0.0,
@@ -132,6 +143,14 @@ class _Comparison(NamedTuple):
     readings: int
     pose: Pose | None = None  # map from the suspect to the original
     agrees: bool = True  # whether the record that was used commits to the result
+
+    @property
+    def order(self) -> tuple[bool, bool, float]:
+        """The sort key by which readings of one original come first: proofs, and then results that a record commits to.
+
+        The suspect was made with such a record.
+        """
+        return not self.match.named, not self.agrees, self.match.log10_p
 
 
 @runtime_checkable
@@ -321,8 +340,7 @@ class Finder(Generic[AnyOriginals]):
         try:
             pair = pair._replace(original=self.catalogue.load(shape))
             for reading in self._read(pair, shape):
-                # Readings whose record commits to the result are preferred: the suspect was made with such a record.
-                if best is None or (not reading.agrees, reading.match.log10_p) < (not best.agrees, best.match.log10_p):
+                if best is None or reading.order < best.order:
                     best = reading
                 if reading.match.named and reading.agrees:
                     break
@@ -347,6 +365,7 @@ class Finder(Generic[AnyOriginals]):
                 message, registration = detection.message, detection.registration
                 match = pair.match._replace(
                     named=detection.detected(self.alpha),
+                    estimate=bool(evidence.caveats) and detection.detected(self.alpha, allow_estimate=True),
                     message=None if message is None else message.hex(),
                     log10_p=evidence.log10_p,
                     log10_p_uncommitted=evidence.log10_p_uncommitted,
@@ -387,8 +406,8 @@ class Finder(Generic[AnyOriginals]):
         mark, aligned = tracer.mark, tracer.register(pair.suspect, self.align)
         charge = ledger.ORIGINALS.charge("copy", pair.readings)
         tested = [entry.charged(charge) for entry in tracer.read(aligned, recipients)]
-        accused = tuple(entry.recipient for entry in tested if entry.log10_p <= math.log10(self.alpha))
-        accused = () if mark.caveats else accused
+        likely = tuple(entry.recipient for entry in tested if entry.log10_p <= math.log10(self.alpha))
+        accused, estimates = ((), likely) if mark.caveats else (likely, ())
         likeliest = min(tested, key=lambda entry: entry.log10_p, default=None)
         best = likeliest.log10_p if likeliest else 0.0
         covered = aligned.weights[mark.original.used] > 0
@@ -396,6 +415,8 @@ class Finder(Generic[AnyOriginals]):
             named=bool(accused),
             recipient=accused[0] if accused else None,
             accused=accused,
+            estimate=bool(estimates),
+            estimates=estimates,
             log10_p=best,
             log10_p_uncommitted=ledger.uncommitted(best),
             key=commitment(key),

@@ -262,7 +262,8 @@ def recall(original: Mesh, key: bytes, record: Record | None) -> tuple[Original,
     places = np.full(len(ready.used), -1)
     places[ready.weld.point] = copy.places
     ready = replace(ready, geometry=imprint.hash, places=places, count=len(imprint.tags))
-    return _in_order_of(ready, imprint), (f"the original was edited: {100 * copy.share:.1f} % of its points are left",)
+    left = f"{100 * copy.share:.1f} % of its points are left"
+    return _in_order_of(ready, imprint), (f"the original was edited, and edits can feign a mark: {left}",)
 
 
 def _in_order_of(original: Original, imprint: Imprint) -> Original:

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import jaxmark as jm
+from jaxmark.app.output import Status
 from tests.app.test_cli import Workshop
 from tests.samples import bumpy_sphere
 
@@ -58,6 +59,13 @@ def test_a_folder_is_marked_and_read(workshop: Workshop):
     assert code in (1, 2)
     assert found[0]["detected"]
     assert not found[1].get("detected")
+
+
+@pytest.mark.parametrize(
+    ("statuses", "worst"), [([], 0), ([0, 0], 0), ([0, 3], 3), ([0, 3, 1], 1), ([3, 2, 1], 2), ([3, 3], 3)]
+)
+def test_a_folder_has_the_worst_status_of_its_files(statuses: list[int], worst: int):
+    assert Status.worst(map(Status, statuses)) == worst
 
 
 def test_one_that_is_refused_does_not_stop_the_others(workshop: Workshop):

@@ -162,6 +162,15 @@ def test_copies_are_traced(workshop: Workshop):
     assert found["recipients"] == 3
     assert found["ranking"][0]["recipient"] == "bob"
     assert workshop.json("identify", "model.ply", *who, status=1)["accused"] == []
+    original = jm.load_mesh("model.ply")
+    dented = np.where(original.vertices[:, :1] > 0.8, 1.01 * original.vertices, original.vertices)
+    jm.save_mesh(original._replace(vertices=dented), "dented.ply", like="model.ply")
+    edited = ("--original", "dented.ply", *who[2:], "--record", told["record"])
+    found = workshop.json("identify", "copy.ply", *edited, status=3)
+    assert (found["accused"], found["estimates"]) == ([], ["bob"])
+    status, said, _ = workshop("identify", "copy.ply", *edited)
+    assert status == 3
+    assert said.startswith("estimate, not a proof: bob: score")
     Path("nobody.txt").write_text("\n")
     for arguments, sentence in [
         (("identify", "copy.ply", *who[:-1], "nobody.txt"), "contains no recipient"),

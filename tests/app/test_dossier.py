@@ -76,7 +76,7 @@ def test_a_dossier_shows_all_but_the_secret(workshop: Workshop):
     detect = ("detect", "marked.ply", "--original", "millimetres.stl", "--key", "secrets/mine.key", *RECORD)
     more = ("--commitment", "all.json", "--obtained", "a shop <b>& co</b>, 1 May", "--dossier", "case")
     told = workshop.json(*detect, *more)
-    assert told["detected"] is told["proof"] is True
+    assert (told["detected"], told["estimate"]) == (True, False)
     assert told["caveats"] == told["notes"] == []
     assert told["message"] == b"ok".hex()
     assert told["version"] == 2
@@ -119,11 +119,13 @@ def test_a_dossier_shows_all_but_the_secret(workshop: Workshop):
 
 
 def test_there_is_no_dossier_of_less_than_a_proof(workshop: Workshop):
-    told = workshop.json("detect", "marked.ply", *DETECT[2:], "--original", "dented.ply", *RECORD)
-    assert told["detected"] is True
-    assert told["proof"] is False
+    told = workshop.json("detect", "marked.ply", *DETECT[2:], "--original", "dented.ply", *RECORD, status=3)
+    assert (told["detected"], told["estimate"]) == (False, True)
+    assert told["log10_p"] < -6
     assert "the original was edited" in told["caveats"][0]
-    said = workshop("detect", "marked.ply", *DETECT[2:], "--original", "dented.ply", *RECORD)[1]
+    status, said, _ = workshop("detect", "marked.ply", *DETECT[2:], "--original", "dented.ply", *RECORD)
+    assert status == 3
+    assert said.startswith("estimate, not a proof: message 6f6b")
     assert "an estimate: the original was edited" in said
     assert "no dossier of an estimate" in workshop.refused(
         "detect", "marked.ply", *DETECT[2:], "--original", "dented.ply", *RECORD, "--dossier", "case"
@@ -135,6 +137,29 @@ def test_there_is_no_dossier_of_less_than_a_proof(workshop: Workshop):
     assert "was edited" in workshop.refused("detect", "marked.ply", *DETECT, *RECORD, "--commitment", "all.json")
     assert "not a commitment" in workshop.refused("detect", "marked.ply", *DETECT, *RECORD, "--commitment", RECORD[1])
     assert not Path("case").exists()
+
+
+@pytest.mark.slow
+def test_an_original_moved_against_the_mark_does_not_make_its_unmarked_mesh_detected(workshop: Workshop):
+    """The owner moves the points that the mark moves most, so that the unmarked mesh differs as a marked one would."""
+    original, marked = jm.load_mesh("model.ply"), jm.load_mesh("marked.ply")
+    shift = np.asarray(marked.vertices, np.float64) - original.vertices
+    order = np.argsort(-np.linalg.norm(shift, axis=1))
+    detect = ("detect", "model.ply", "--original", "edited.ply", *DETECT[2:], *RECORD, "--text", "ok")
+
+    def edit(share: float) -> jm.Mesh:
+        moved, some = np.array(original.vertices, np.float64), order[: int(share * len(order))]
+        moved[some] -= 0.5 * shift[some]
+        jm.save_mesh(original._replace(vertices=moved), "edited.ply", like="model.ply")
+        return jm.load_mesh("edited.ply")
+
+    edited, record = edit(0.25), jm.Record.load(RECORD[1])
+    found = workshop.json(*detect, status=3)
+    assert (found["detected"], found["estimate"]) == (False, True)
+    assert found["log10_p"] < -9  # the figure that the caveat accompanies
+    assert not jm.detect(original, original=edited, key=KEY, record=record, message=b"ok").detected()
+    edit(0.7)
+    assert "not the mesh that the record was made for" in workshop.refused(*detect)
 
 
 def test_a_claim_against_the_record_is_refused(workshop: Workshop):

@@ -11,7 +11,7 @@ import pytest
 
 import jaxmark as jm
 from jaxmark.app.folders import each
-from jaxmark.app.output import FileOutcome
+from jaxmark.app.output import FileOutcome, Status
 
 FILES = [Path(f"{name}.ply") for name in "abcdef"]
 
@@ -62,7 +62,7 @@ def test_several_workers_report_each_file(files):
     told = dict(each(files, Count(), workers=2))
     assert {file.stem for file in told} == set("abcdef")
     refused = {"refused": f"{files[2]} is not to my liking."}
-    assert told.pop(files[2]) == FileOutcome(refused, text_of_c(files), done=False, refused=True)
+    assert told.pop(files[2]) == FileOutcome(refused, text_of_c(files), Status.REFUSED)
     # Each worker keeps what it has prepared, and counts on from file to file.
     by_worker: dict[int, list[int]] = {}
     for one in told.values():

@@ -11,7 +11,7 @@ import jaxmark as jm
 from jaxmark.app.find_commands import describe
 from jaxmark.catalogue import Finder, Match, Verdict
 from jaxmark.catalogue.descriptors import centred
-from jaxmark.catalogue.identification import split
+from jaxmark.catalogue.identification import _Comparison, split
 from jaxmark.catalogue.landmarks import KEPT, MOST, LandmarkIndex, landmarks
 from jaxmark.catalogue.partial_registration import Part, fit_whole
 from jaxmark.geometry.mesh import compact
@@ -87,10 +87,47 @@ def test_a_suspect_in_any_pose_is_named_with_its_message(shop: Shop):
 
 def test_a_verdict_has_the_figures_of_the_original_that_it_names():
     named = Match("a.ply", "", "", "whole", 1, 0.0, named=True, log10_p=-8.0, log10_p_uncommitted=-1.0)
-    estimate = Match("b.ply", "", "", "whole", 1, 0.0, log10_p=-60.0, caveats=("the original was edited",))
+    caveats = ("the original was edited",)
+    estimate = Match("b.ply", "", "", "whole", 1, 0.0, estimate=True, log10_p=-60.0, caveats=caveats)
     both, alone = (Verdict("", matches, 2).as_json() for matches in ((named, estimate), (estimate,)))
     assert (both["original"], both["log10_p"], both["log10_p_uncommitted"], both["caveats"]) == ("a.ply", -8, -1, ())
-    assert (alone["named"], alone["log10_p"], alone["caveats"]) == (False, -60, ("the original was edited",))
+    assert (alone["named"], alone["log10_p"], alone["caveats"]) == (False, -60, caveats)
+    assert (both["estimate"], alone["estimate"]) == (False, True)
+
+
+def test_a_proof_is_preferred_to_an_estimate_and_to_nothing():
+    """A record that reads nothing contradicts no record, and an estimate may have any figure."""
+    mesh, match = rough_sphere(60), Match("a.ply", "", "", "whole", 1, 0.0)
+    proof, estimate = match._replace(named=True, log10_p=-8.0), match._replace(estimate=True, log10_p=-60.0)
+    proof_of_another_message = _Comparison(proof, mesh, mesh, 1, agrees=False)
+    readings = [_Comparison(match, mesh, mesh, 1), _Comparison(estimate, mesh, mesh, 1), proof_of_another_message]
+    assert min(readings, key=lambda reading: reading.order) is proof_of_another_message
+    assert min(readings[:2], key=lambda reading: reading.order).match.estimate
+
+
+def test_an_estimate_names_no_original_and_accuses_nobody(workshop: Workshop, monkeypatch):
+    match = Match(
+        "model.ply", "", "", "whole", 1, 0.0, estimate=True, estimates=("bob",), log10_p=-60.0, caveats=("c",)
+    )
+    monkeypatch.setattr(Finder, "find", lambda finder, suspect: Verdict("00", (match,), 1))
+    shop = ("--key", "owner.key", "--catalogue", "shop.db")
+    jm.Catalogue("shop.db").close()
+    found = workshop.json("catalogue", "find", "model.ply", *shop, status=3)
+    assert (found["named"], found["estimate"], found["original"]) == (False, True, None)
+    found = workshop.json("identify", "model.ply", *shop, status=3)
+    assert (found["accused"], found["estimates"]) == ([], ["bob"])
+    for command in (("catalogue", "find"), ("identify",)):
+        status, said, _ = workshop(*command, "model.ply", *shop)
+        assert status == 3
+        assert said == "estimate, not a proof: model.ply, 0 % of it: copy for bob; probability about 10^-60.0: c\n"
+    Path("suspects").mkdir()
+    Path("model.ply").rename("suspects/model.ply")
+    jm.save_mesh(rough_sphere(60), "original.obj")
+    with jm.Catalogue("shop.db") as catalogue:
+        catalogue.add("original.obj")
+    status, said, _ = workshop("catalogue", "find", "suspects", *shop, "--output", "found.jsonl")
+    assert status == 3
+    assert said.endswith("model.ply: estimate, not a proof: no original is named: c\n")
 
 
 def test_other_ways_of_aligning_are_charged(shop: Shop):

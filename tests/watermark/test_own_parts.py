@@ -22,9 +22,10 @@ from jaxmark.watermark.carriers import Carrier, Claim, PlainReader, Reader
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import code_length
 from jaxmark.watermark.interfaces import Detector, Scheme
+from jaxmark.watermark.markers import make_blind_marker
 from jaxmark.watermark.reading.detectors import claims, correlate
 from jaxmark.watermark.schemes.keyed import KeyedScheme
-from tests.samples import bumpy_sphere
+from tests.samples import bumpy_sphere, rough_sphere
 
 pytestmark = pytest.mark.core
 
@@ -129,6 +130,17 @@ def test_subclasses_of_schemes_prove_nothing(marked, key: jm.Key):
     own = _caveats(Local())
     assert own == ("the scheme 'local' is not one of this library",)
     assert not _caveats(LocalScheme())
+
+
+@pytest.mark.slow
+def test_a_presence_mark_of_ones_own_blind_scheme_reads_back(key: jm.Key):
+    class Local(LocalScheme):
+        """May do anything."""
+
+    marker = make_blind_marker(rough_sphere(2500, 0), key, bits=0, scheme=Local())
+    marked, _ = marker.embed(b"", jm.Budget(rms=4e-3, noise=0))
+    assert marker.detect(marked).evidence.caveats
+    assert marker.reads(marked, b"")
 
 
 def test_its_capacity_is_what_it_has_code_bits_for():

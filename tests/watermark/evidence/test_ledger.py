@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
+from jaxmark.app.output import Status, detection_status
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Evidence, accuse, weigh
@@ -221,6 +222,8 @@ def test_what_has_caveats_is_no_proof(original: Mesh, marked, key: jm.Key):
     assert found.detected(allow_estimate=True)
     assert not estimate.detected()
     assert estimate.detected(allow_estimate=True)
+    assert [detection_status(one, 1e-6) for one in (found, estimate)] == [Status.DONE, Status.ESTIMATE]
+    assert [detection_status(one, 1e-99) for one in (found, estimate)] == [Status.NOTHING] * 2
     for alpha in (0.0, 1.0, -1.0):
         with pytest.raises(jm.JaxmarkError, match="alpha is a probability"):
             found.detected(alpha)
