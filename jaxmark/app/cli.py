@@ -33,6 +33,7 @@ from jaxmark.app.options import (
     JSON,
     KEY,
     MESHES,
+    OVERWRITE,
     QUIET,
     WORKERS,
     Schemes,
@@ -51,6 +52,7 @@ from jaxmark.evaluation.pictures import Measure
 from jaxmark.evaluation.study import load_study
 from jaxmark.files import load_mesh, load_scene, load_skin, save_mesh, save_scene
 from jaxmark.files.atomic import replacing, write_atomically
+from jaxmark.files.pair import writing_pair
 from jaxmark.geometry import unpose
 from jaxmark.geometry.mesh import same_connectivity
 from jaxmark.watermark.coding.keys import commitment, new_key, save_key
@@ -124,6 +126,7 @@ def keygen(keyfile: Path, as_json: bool) -> None:
     " original. Several schemes, separated by commas (keyed,field), mark the mesh with each of them.",
 )
 @click.option("--record", "record_file", type=FILE, help=f"File for the record.  [default: MARKED{RECORD_SUFFIX}]")
+@OVERWRITE
 @WORKERS
 @QUIET
 @JSON
@@ -138,6 +141,7 @@ def embed_command(
     meshes: tuple[str, ...],
     schemes: tuple[str, ...],
     record_file: Path | None,
+    overwrite: bool,
     workers: int,
     as_json: bool,
 ) -> None:
@@ -147,7 +151,7 @@ def embed_command(
 
     Writes MARKED, in the same format, and its record. Only positions change, and normals where the file has them;
     materials, colours, groups and comments stay the same, byte by byte. The record holds no secret. `jaxmark detect`
-    takes scheme and payload from it.
+    takes scheme and payload from it. Files that exist are refused without --overwrite.
 
     In a file of several meshes, all that can carry the message are marked; the output names those left unchanged.
 
@@ -165,6 +169,7 @@ def embed_command(
         budget=budget,
         scheme=schemes[0] if len(schemes) == 1 else schemes,
         meshes=meshes,
+        overwrite=overwrite,
     )
     check_distinct(original=original, marked=marked)
     if not original.is_dir():
@@ -377,13 +382,15 @@ def identify_command(
 @click.option(
     "--output", type=FILE, required=True, help="File for the commitment; a timestamp request is written next to it."
 )
+@OVERWRITE
 @JSON
-def commit_command(records: tuple[Path, ...], output: Path, as_json: bool) -> None:
+def commit_command(records: tuple[Path, ...], output: Path, overwrite: bool, as_json: bool) -> None:
     """Commit to RECORDS, so that a timestamp can prove that they existed before a suspect.
 
     Writes OUTPUT, the commitment, which reveals nothing of the records; and OUTPUT.tsq, a request for a timestamp. To
     timestamp the commitment, publish the root that is printed, or print it on paper, or sign a commit with it; or send
-    OUTPUT.tsq to a timestamping authority (RFC 3161), and keep the answer.
+    OUTPUT.tsq to a timestamping authority (RFC 3161), and keep the answer. Files that exist are refused without
+    --overwrite.
 
     `jaxmark detect --commitment OUTPUT` then prints the bound on the false-positive probability that holds if the
     commitment is older than the suspect. It charges log10 of the number of records.
@@ -391,9 +398,9 @@ def commit_command(records: tuple[Path, ...], output: Path, as_json: bool) -> No
     check_distinct(output=output, **{f"record {place}": path for place, path in enumerate(records)})
     made = make_commitment(load_record(path).digest() for path in records)
     request = output.with_name(output.name + ".tsq")
-    with replacing(request) as draft:
-        write_atomically(draft, made.timestamp_request())
-        write_atomically(output, made.to_json().encode())
+    with writing_pair(request, output, overwrite=overwrite) as (request_draft, draft):
+        write_atomically(request_draft, made.timestamp_request())
+        write_atomically(draft, made.to_json().encode())
     values = {"root": made.root, "records": len(made.digests), "commitment": str(output), "request": str(request)}
     size = f"{len(made.digests)} record{'s' if len(made.digests) > 1 else ''}"
     answer(as_json, values, f"{size} → {output}, root {made.root}, request → {request}")
