@@ -63,6 +63,8 @@ def add_command(files: tuple[Path, ...], catalogue_file: Path, records: bool, co
         for file in _each_file(meshes):
             current().doing(f"adding {file}")
             try:
+                if file.is_dir():
+                    mesh_files(file)  # raises an error: folders come here only if they have no mesh file
                 added = catalogue.add(file, copy=copy)
             except (JaxmarkError, OSError) as error:
                 status = 2
@@ -85,14 +87,18 @@ def add_command(files: tuple[Path, ...], catalogue_file: Path, records: bool, co
 
 
 def _each_file(files: Sequence[Path]) -> Iterator[Path]:
+    """Yield files and the files in folders; a folder without any is yielded itself, to be refused."""
     for file in files:
-        yield from mesh_files(file) if file.is_dir() else [file]
+        try:
+            yield from mesh_files(file) if file.is_dir() else [file]
+        except JaxmarkError:
+            yield file
 
 
 def _refused(as_json: bool, file: Path, error: Exception) -> None:
     text = error_text(error)
     if as_json:
-        answer(True, {"file": str(file), "refused": text}, "")
+        answer(True, {"file": str(file), "refused": text})
     else:
         say(f"{file}: refused. {text}")
 
@@ -135,7 +141,7 @@ def show_command(original: str, catalogue_file: Path, as_json: bool) -> None:
         lines += [
             f"  copy for {copy['recipient']}, key {copy['key'][:16]}, {copy['added']}" for copy in shape["copies"]
         ]
-    answer(as_json, shown, "\n".join(lines))
+    answer(as_json, shown, *lines)
 
 
 @catalogue_group.command(name="remove")
@@ -206,7 +212,7 @@ def check_command(catalogue_file: Path, as_json: bool) -> None:
             count += 1
             wrong += problem is not None
             if as_json:
-                answer(True, {"id": entry.id, "path": entry.path, "problem": problem}, "")
+                answer(True, {"id": entry.id, "path": entry.path, "problem": problem})
             elif problem is not None:
                 answer(False, {}, f"{entry.id}  {entry.path}: {problem}")
     if not as_json:
@@ -265,7 +271,7 @@ def mark_for_command(
     current().doing(f"marking {original} for {recipient}")
     with Catalogue(catalogue_file) as catalogue:
         outcome = mark_copy(catalogue, recipient, original, output, key, budget, overwrite=overwrite)
-    answer(as_json, {"recipient": recipient, **outcome.values}, outcome.text)
+    answer(as_json, {"recipient": recipient, **outcome.values}, *outcome.lines)
 
 
 def mark_copy(
@@ -300,7 +306,7 @@ def mark_copy(
         # catalogue could not be traced.
         catalogue.add_copy(Record.load(record_draft), recipient, file_hash(draft))
     places = {str(draft): str(copy), str(record_draft): str(record)}
-    text = outcome.text
+    lines = outcome.lines
     for place, name in places.items():
-        text = text.replace(place, name)
-    return outcome._replace(values={**outcome.values, "record": str(record), "marked": str(copy)}, text=text)
+        lines = tuple(line.replace(place, name) for line in lines)
+    return outcome._replace(values={**outcome.values, "record": str(record), "marked": str(copy)}, lines=lines)

@@ -177,7 +177,7 @@ def embed_command(
         check_suffix(original, marked)
         check_distinct(original=original, marked=marked, key=key_file, record=record_file)
         outcome = mark(original, marked, record_file, key=read_key(key_file), doing=current().doing)
-        return answer(as_json, outcome.values, outcome.text)
+        return answer(as_json, outcome.values, *outcome.lines)
     if record_file is not None:
         raise JaxmarkError("In a folder, each marked file gets a record next to it; leave out --record.")
     work = partial(_mark_member, partial(mark, key=read_key(key_file)), marked)
@@ -295,7 +295,7 @@ def detect_command(
     if suspect.is_dir():
         _each(suspect, as_json, partial(_read_member, reader, original, record_file, report, dossier), workers)
     outcome = replace(reader, doing=current().doing).read(suspect, original, record_file, report, dossier)
-    answer(as_json, outcome.values, outcome.text)
+    answer(as_json, outcome.values, *outcome.lines)
     sys.exit(0 if outcome.done else 1)
 
 
@@ -373,7 +373,7 @@ def identify_command(
         + ("" if entry.caveats else f"at most {power(entry.log10_p)}")
         for entry in accused
     ]
-    answer(as_json, values, "\n".join(lines) or f"none of {len(names)} recipients is accused (--alpha {alpha:g})")
+    answer(as_json, values, *(lines or [f"none of {len(names)} recipients is accused (--alpha {alpha:g})"]))
     sys.exit(0 if accused else 1)
 
 
@@ -475,7 +475,7 @@ def _attack_scene(source: Path, target: Path, steps: list[tuple[str, float]], se
     largest = max(size["rms"] for size in sizes.values())
     lines = [f"{_steps_text(steps)} → {target}, {len(meshes)} meshes, RMS up to {largest:.3g} of their diagonals"]
     lines += [f"left unchanged: {name!r}: {reason}" for name, reason in scene.skipped.items()]
-    answer(as_json, values, "\n".join(lines))
+    answer(as_json, values, *lines)
 
 
 def _steps(words: tuple[str, ...]) -> list[tuple[str, float]]:
@@ -517,7 +517,7 @@ def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> N
         f"{name:<14} {'needs the same connectivity' if value is None else f'{value:.6g}'}"
         for name, value in values.items()
     ]
-    answer(as_json, values, "\n".join(lines))
+    answer(as_json, values, *lines)
 
 
 @cli.command(name="capacity")
@@ -569,7 +569,7 @@ def demo(mesh: Path | None, output: Path, as_json: bool) -> None:
 
     rows = run_demo(mesh, output, partial(say, err=as_json), current().doing)
     if as_json:
-        answer(True, {"output": str(output), "rows": [row._asdict() for row in rows], "verdict": verdict(rows)}, "")
+        answer(True, {"output": str(output), "rows": [row._asdict() for row in rows], "verdict": verdict(rows)})
 
 
 @cli.command(name="study")
@@ -614,7 +614,8 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
         for measure in get_args(Measure):
             results.plot(measure).save(output / f"{measure}.png")
         results.save_page(output / "study.html")
-    answer(as_json, {"output": str(output), "readings": len(results.rows), "rates": results.rates()}, table.rstrip())
+    values = {"output": str(output), "readings": len(results.rows), "rates": results.rates()}
+    answer(as_json, values, *table.rstrip().split("\n"))
 
 
 @cli.command(name="unpose")
@@ -658,7 +659,7 @@ def main() -> None:
 
 
 def _refuse(sentence: str) -> NoReturn:
-    click.echo(f"jaxmark: {sentence}", err=True)
+    say(f"jaxmark: {sentence}")
     sys.exit(2)
 
 
@@ -669,7 +670,8 @@ def _each(folder: Path, as_json: bool, work: Work, workers: int) -> NoReturn:
     with closing(each(files, work, workers)) as results:
         for done, (file, outcome) in enumerate(results, 1):
             status = max(status, 2 if outcome.refused else 0 if outcome.done else 1)
-            answer(as_json, {"file": file.name, **outcome.values}, f"{file.name}: {outcome.text}")
+            first, *others = outcome.lines
+            answer(as_json, {"file": file.name, **outcome.values}, f"{file.name}: {first}", *others)
             pace = (time.monotonic() - start) / done
             current().doing(f"{done}/{len(files)} files of {folder}, {left_over((len(files) - done) * pace)}")
     sys.exit(status)

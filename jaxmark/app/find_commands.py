@@ -20,6 +20,9 @@ from jaxmark.catalogue import Catalogue, Finder, Match, Plan, Verdict, find_each
 from jaxmark.errors import JaxmarkError, require
 from jaxmark.evaluation.cells import Pool, processes
 
+_MOST_REFUSED = 5  # most refusals that a description lists
+_DIGITS = 16  # digits of a record's digest that are printed
+
 
 @catalogue_group.command(name="find")
 @click.argument("suspect", type=FILE, required=False)
@@ -102,7 +105,7 @@ def find_command(
     with opened(catalogue_file) as catalogue:
         verdict = Finder(catalogue, keys, alpha=alpha, bits=bits, depth=depth, align=align).find(suspect)
         keep(catalogue, suspect, verdict)
-    answer(as_json, verdict.as_json(), describe(verdict, alpha))
+    answer(as_json, verdict.as_json(), *describe(verdict, alpha))
     sys.exit(0 if verdict.named else 1)
 
 
@@ -130,10 +133,12 @@ def _line(row: Mapping[str, Any]) -> str:
     """Describe the verdict on one of many suspects."""
     if "refused" in row:
         return f"refused. {row['refused']}"
+    refused = sum(match["refused"] is not None for match in row["matches"])
+    refusals = f"; {refused} readings refused" if refused else ""
     if not row["named"]:
-        return "no original is named"
+        return f"no original is named{refusals}"
     content = row["recipient"] or row["message"] or "a mark"
-    return f"{row['original']}, {content}, probability at most {power(row['log10_p'])}"
+    return f"{row['original']}, {content}, probability at most {power(row['log10_p'])}{refusals}"
 
 
 def _listed(file: Path) -> Iterator[Path]:
@@ -171,7 +176,7 @@ def identify_by_catalogue(
         verdict = finder.find(suspect)
         keep(catalogue, suspect, verdict)
     accused = {name: match.original for match in verdict.named for name in match.accused}
-    answer(as_json, {"accused": list(accused), **verdict.as_json()}, describe(verdict, alpha))
+    answer(as_json, {"accused": list(accused), **verdict.as_json()}, *describe(verdict, alpha))
     sys.exit(0 if accused else 1)
 
 
@@ -192,18 +197,25 @@ def keep(catalogue: Catalogue, suspect: Path, verdict: Verdict) -> None:
         catalogue.record_verdict(verdict.suspect, os.path.realpath(suspect), verdict.as_json())
 
 
-def describe(verdict: Verdict, alpha: float) -> str:
-    """Describe a verdict."""
+def describe(verdict: Verdict, alpha: float) -> tuple[str, ...]:
+    """Describe a verdict in lines, with the refusals."""
+    refused = dict.fromkeys(_refused(match) for match in verdict.matches if match.refused is not None)
+    refusals = list(refused)[:_MOST_REFUSED]
+    if len(refused) > _MOST_REFUSED:
+        refusals.append(f"{len(refused) - _MOST_REFUSED} more could not be read, see --json")
     if verdict.named:
-        return "\n".join(_named(match) for match in verdict.named)
+        return (*map(_named, verdict.named), *refusals)
     read = [match for match in verdict.matches if match.refused is None]
     text = f"no original is named: none of {verdict.readings} readings detects a mark (--alpha {alpha:g})"
     if read:
         text += f"; most similar to {_place(read[0])}, probability at most {power(read[0].log10_p)}"
         text += "".join(f". {note}" for note in read[0].notes)
-    elif verdict.matches:
-        text += f"; {_place(verdict.matches[0])} could not be read: {verdict.matches[0].refused}"
-    return text + _caveats(read)
+    return text + _caveats(read), *refusals
+
+
+def _refused(match: Match) -> str:
+    record = f", record {match.record[:_DIGITS]}," if match.record else ""
+    return f"{_place(match)}{record} could not be read: {match.refused}"
 
 
 def _caveats(matches: Sequence[Match]) -> str:

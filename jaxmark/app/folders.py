@@ -83,7 +83,7 @@ def _run(work: Work, file: Path) -> FileOutcome:
         return work(file)
     except Exception as error:
         text = error_text(error)
-        return FileOutcome({"refused": text}, f"refused. {text}", done=False, refused=True)
+        return FileOutcome({"refused": text}, (f"refused. {text}",), done=False, refused=True)
     finally:
         release_programs()
 

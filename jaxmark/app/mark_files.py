@@ -154,7 +154,7 @@ def mark_file(
         text += f"; because the mark is weak, it is written in the pass band {band!r}, which is in the record"
     if drift is not None:
         text += f"; the texture drifts by {drift:.2g} texels, if it has 2,048 x 2,048"
-    return FileOutcome(values, text)
+    return FileOutcome(values, (text,))
 
 
 def _mark_scene(
@@ -226,11 +226,10 @@ def _mark_scene(
         f"{payload_text(info.record.bits)} in {len(each)} of {len(each) + len(skipped)} meshes → {marked},"
         f" {_moved_text(most)} of their diagonals; record → {record}; the weakest mark survives {survival_text(least)}"
     )
-    for name, reason in list(skipped.items())[:_MOST_NAMED]:
-        text += f"\nleft unchanged: {name!r}: {reason}"
+    lines = [text, *(f"left unchanged: {name!r}: {reason}" for name, reason in list(skipped.items())[:_MOST_NAMED])]
     if len(skipped) > _MOST_NAMED:
-        text += f"\nleft unchanged: {len(skipped) - _MOST_NAMED} more, see --json"
-    return FileOutcome(values, "\n".join([text, *notes]))
+        lines.append(f"left unchanged: {len(skipped) - _MOST_NAMED} more, see --json")
+    return FileOutcome(values, (*lines, *notes))
 
 
 def _without_caches(marker: Any) -> Any:
