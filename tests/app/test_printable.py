@@ -168,3 +168,11 @@ def test_marking_a_scene_is_harmless(shell: Shell) -> None:
     read = ("--original", "scene.glb", "--key", "owner.key", "--record", f"{HOSTILE}.glb.jaxmark.json")
     shell("detect", f"{HOSTILE}.glb", *read, "--charges")
     shell("detect", f"{HOSTILE}.glb", *read, "--mesh", "none", status=2)
+
+
+def test_pages_insert_names_as_text_only() -> None:
+    package = Path(jm.__file__).parent
+    pages = [path for path in package.rglob("*") if path.suffix in (".html", ".js")]
+    assert {"catalogue.js", "catalogue.html", "dossier.html"} <= {path.name for path in pages}
+    markup = re.compile(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b|\|\s*safe\b|autoescape false")
+    assert [path.name for path in pages if markup.search(path.read_text(encoding="utf-8"))] == []
