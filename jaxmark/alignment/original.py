@@ -48,6 +48,14 @@ class Original:
             return math.sqrt(3) / (2 * math.pi)
         return 2 / float(np.mean(np.asarray(self.operator.degree)[: len(self.used)]))
 
+    @property
+    def marked_order(self) -> Mesh:
+        """The canonical points in the marked order of vertices and faces; if the file has another, in their own order.
+
+        Unlike `mesh`, it does not depend on how a copy of the original was presented, except for `in_order`.
+        """
+        return Mesh(self.points.vertices[self.weld.point], self.mesh.faces) if self.in_order else self.points
+
     @cached_property
     def radius(self) -> float:
         """Mean distance of the points that faces use to their centre, in diagonals."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+from jaxmark.alignment.original import Original
 from jaxmark.alignment.pairing import pair
 from jaxmark.alignment.result import Align
 from jaxmark.app.diagnosis import diagnose, is_original
@@ -14,7 +15,7 @@ from jaxmark.app.output import FileOutcome, detection_lines, detection_values
 from jaxmark.app.process import release_programs
 from jaxmark.app.progress import Doing, quietly
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import load_mesh, load_scene, load_skin
+from jaxmark.files import Scene, load_mesh, load_scene, load_skin
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.reading import best_of, try_each
 from jaxmark.watermark.coding.keys import Key
@@ -75,21 +76,27 @@ class FileReader:
                 f"--scheme {self.schemes[0]} contradicts the record, whose scheme is {loaded.scheme}; leave it out."
             )
         self.doing(f"reading {suspect} and {original}")
-        meshes = self._pick(suspect, original, loaded)
-        if meshes is None:
-            if report is not None or dossier is not None:
-                raise JaxmarkError("--report and --dossier need one mesh, and there are several; select one by --mesh.")
-            if len(self.schemes) > 1:
-                raise JaxmarkError("Several schemes can only be read from one mesh; select it by --mesh.")
-            return self._outcome(self._read_scene(suspect, original, loaded), suspect, loaded)
-        mesh, original_mesh, loaded = meshes
+        if isinstance(loaded, Record):  # a record of the whole file
+            name, original_mesh, marked = "", load_mesh(original), loaded.meshes
+        else:
+            scene = load_scene(original)
+            name, *others = self._names(scene, original, loaded)
+            if others:
+                if report is not None or dossier is not None:
+                    raise JaxmarkError("--report and --dossier need one mesh, not several; select one by --mesh.")
+                if len(self.schemes) > 1:
+                    raise JaxmarkError("Several schemes can only be read from one mesh; select it by --mesh.")
+                return self._outcome(self._read_scene(suspect, scene, loaded), suspect, loaded)
+            original_mesh, marked = scene.meshes[name], (loaded or scene).meshes
         self.doing(f"preparing {original}")
-        marks = self._alternatives(original_mesh, original, loaded, mesh)
+        marks = self._alternatives(original_mesh, original, None if loaded is None else loaded.meshes[name], suspect)
+        mesh = load_mesh(suspect) if isinstance(loaded, Record) else _resembling(suspect, name, marks.first.original)
         self.doing(f"aligning {suspect} and reading it")
         detection, mark = marks.read(mesh, self.message, align=self.align)
         blind_schemes = [BLIND_SCHEMES[name] for name in self.schemes[1:]]
         detection = with_blind(detection, blind_schemes, mesh, self.key, mark.bits, self.message)
-        detection = detection._replace(evidence=detection.evidence.charged(*self.charges))
+        charges = *self.charges, *ledger.selection(1, len(marked))
+        detection = detection._replace(evidence=detection.evidence.charged(*charges))
         if report is not None:
             self.doing("drawing the report")
             save_report(report, mark.original, mesh, detection.registration)
@@ -144,40 +151,23 @@ class FileReader:
         best = best_of(detections, ledger.PARTS, len(candidates) * len(records))
         return self._count_proving(best, detections, len(candidates)) if several else best
 
-    def _pick(
-        self, suspect: Path, original: Path, record: Record | SceneRecord | None
-    ) -> tuple[Mesh, Mesh, Record | None] | None:
-        """Return the suspect's mesh, the original's mesh and its record; None if there are several meshes to read."""
-        if isinstance(record, Record):  # a record of the whole file
-            return load_mesh(suspect), load_mesh(original), record
-        originals, record = self._originals(original, record)
-        if len(originals) != 1:
-            return None
-        ((name, mesh),) = originals.items()
-        suspects = load_scene(suspect).meshes
-        other = pair(originals, suspects).get(name)
-        suspect_mesh = load_mesh(suspect) if other is None else suspects[other]
-        return suspect_mesh, mesh, None if record is None else record.meshes[name]
+    def _names(self, scene: Scene, original: Path, record: SceneRecord | None) -> list[str]:
+        """Return the names of the meshes to read; the record must have them, if there is one."""
+        marked = scene.meshes if record is None else record.meshes
+        for name in self.meshes:
+            if name in scene.meshes and name not in marked:
+                names = ", ".join(map(repr, marked))
+                raise JaxmarkError(f"The record has no mesh {name!r}, which --mesh selects; it has {names}.")
+        names = list(dict.fromkeys(self.meshes or marked))
+        return list(pick(scene, names, original).meshes)
 
-    def _originals(self, original: Path, record: SceneRecord | None) -> tuple[dict[str, Mesh], SceneRecord | None]:
-        """Return the selected meshes of an original, and their records."""
-        originals = dict(pick(load_scene(original), self.meshes, original).meshes)
-        if record is None:
-            return originals, None
-        picked = {name: entry for name, entry in record.meshes.items() if not self.meshes or name in self.meshes}
-        if not picked:
-            names = ", ".join(map(repr, record.meshes))
-            raise JaxmarkError(f"The record has none of the meshes that --mesh selects; it has {names}.")
-        return {name: mesh for name, mesh in originals.items() if name in picked}, SceneRecord(picked)
-
-    def _read_scene(self, suspect: Path, original: Path, record: Record | SceneRecord | None) -> Detection:
-        """Read all meshes of a file, and combine their evidence."""
-        assert not isinstance(record, Record)
-        originals, record = self._originals(original, record)
-        self.doing(f"reading {len(originals)} meshes of {suspect}")
+    def _read_scene(self, suspect: Path, original: Scene, record: SceneRecord | None) -> Detection:
+        """Read several meshes of a file, and combine their evidence."""
+        self.doing(f"reading {len(original.meshes)} meshes of {suspect}")
         detection = detect_scene(
             load_scene(suspect).meshes,
-            originals=originals,
+            originals=original.meshes,
+            names=self.meshes,
             key=self.key,
             record=record,
             bits=self.bits,
@@ -195,7 +185,7 @@ class FileReader:
         note = f"{proving} of {meshes} meshes prove the mark without the others."
         return detection._replace(notes=(*detection.notes, note))
 
-    def _alternatives(self, mesh: Mesh, original: Path, record: Record | None, suspect: Mesh) -> Alternatives:
+    def _alternatives(self, mesh: Mesh, original: Path, record: Record | None, suspect: Path) -> Alternatives:
         place = original, None if record is None else record.digest()
         if self._last is None or self._last[0] != place:
             bits = self.bits
@@ -205,12 +195,19 @@ class FileReader:
             try:
                 marks = alternatives(make_marker(mesh, self.key, bits=bits, record=record, scheme=scheme), scheme)
             except JaxmarkError as error:
-                if record is not None and is_original(suspect, record, self.key):
+                if record is not None and is_original(load_mesh(suspect), record, self.key):
                     sentence = f"{error} The suspect is the record's original: exchange the two files."
                     raise JaxmarkError(sentence) from None
                 raise
             self._last = place, marks
         return self._last[1]
+
+
+def _resembling(suspect: Path, name: str, original: Original) -> Mesh:
+    """Return the mesh of a suspect's file that resembles an original; all of the file if there is none."""
+    meshes = load_scene(suspect).meshes
+    other = pair({name: original.marked_order}, meshes).get(name)
+    return load_mesh(suspect) if other is None else meshes[other]
 
 
 def _has_skin(path: Path) -> bool:

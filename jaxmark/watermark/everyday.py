@@ -7,7 +7,7 @@ equal marks and count once.
 
 from __future__ import annotations  # so that `help` shows the names of type aliases
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from typing import NamedTuple
@@ -29,7 +29,7 @@ from jaxmark.watermark.evidence.detection import Detection, Evidence, united_sco
 from jaxmark.watermark.interfaces import Detector, Scheme
 from jaxmark.watermark.mark import EmbedInfo
 from jaxmark.watermark.markers import Marker, NonBlindMarker, make_blind_marker, make_marker, prepare, unite
-from jaxmark.watermark.nonblind import Alternatives, claims_of
+from jaxmark.watermark.nonblind import Alternatives, check_claim, claims_of, order_charges
 from jaxmark.watermark.perception.budget import Budget, BudgetLike
 from jaxmark.watermark.perception.capacity import COVERAGE, NOISE, Capacity, Conditions
 from jaxmark.watermark.record import Record, SceneRecord, is_recorded
@@ -317,6 +317,7 @@ def detect_scene(
     originals: Mapping[str, Mesh],
     key: bytes,
     record: SceneRecord | None = None,
+    names: Collection[str] = (),
     bits: int | None = None,
     message: bytes | None = None,
     scheme: str | Scheme = DEFAULT_SCHEME,
@@ -328,11 +329,17 @@ def detect_scene(
     Each original mesh is compared with the suspect mesh that resembles it, see `jaxmark.alignment.pairing.pair`. Two
     kinds of evidence are computed: from each mesh alone, and from the weighted sum of all scores for one message.
 
+    **The set of meshes must be fixed before the suspect exists**, like everything else that is claimed: whoever chooses
+    meshes afterwards can choose those that happen to agree with the suspect. So all meshes of the record must be there,
+    or, without a record, all of `originals` are read. Picking some of them by `names` is charged, and the uncommitted
+    p-value of a sum is charged for a forged original of each mesh.
+
     Args:
         suspects: meshes by name, from `jaxmark.files.load_scene`.
         originals: the unmarked meshes by name.
         key: see `detect`.
         record: the record of the file, which contains the names of the marked meshes; by default, all may be marked.
+        names: names of the marked meshes to read; by default all of them.
         bits: see `detect`.
         message: see `detect`.
         scheme: see `detect`.
@@ -344,47 +351,54 @@ def detect_scene(
         be compared, with reasons. Fields that belong to one mesh are those of the mesh with most evidence.
 
     Raises:
-        JaxmarkError: if no mesh can be compared; see also `detect`.
+        JaxmarkError: if no mesh can be compared, or an original mesh is missing or is not the recorded one; see also
+            `detect`.
     """
-    chosen = dict(originals)
-    if record is not None:
-        if missing := record.meshes.keys() - originals.keys():
-            raise JaxmarkError(f"The original has no mesh {min(missing)!r}, which is marked according to the record.")
-        chosen = {name: originals[name] for name in record.meshes}
+    marked = originals if record is None else record.meshes
+    chosen = [name for name in marked if name in names or not names]
+    for name in (*chosen, *names):
+        if name not in originals or name not in marked:
+            whose = "original" if name not in originals else "record"
+            raise JaxmarkError(f"The {whose} has no mesh {name!r}; select others, or give another {whose}.")
     if bits is None and record is None and message is not None:
         bits = 8 * len(message)
-    readings: dict[str, _MeshReading] = {}
+    markers: dict[str, NonBlindMarker] = {}
     skipped: dict[str, str] = {}
-    refuted: list[str] = []
+    for name in chosen:
+        mesh_record = None if record is None else record.meshes[name]
+        try:
+            marker = make_marker(originals[name], key, bits=bits, record=mesh_record, scheme=scheme)
+        except JaxmarkError as error:
+            if record is None:
+                skipped[name] = str(error).rstrip(".")
+                continue
+            # If such meshes were skipped, who presents the original could choose the meshes that are read.
+            raise JaxmarkError(f"The mesh {name!r} of the original cannot be read: {error}") from None
+        if message is not None:
+            check_claim(marker, message)
+        # Cached results of markers are dropped here and below: those of all meshes would not fit into memory.
+        markers[name] = replace(marker)
+    suspect_names = pair({name: marker.original.marked_order for name, marker in markers.items()}, suspects)
+    readings: dict[str, _MeshReading] = {}
     identities: set[tuple[bytes, bytes]] = set()
-    suspect_names = pair(chosen, suspects)
-    for name, original in chosen.items():
+    for name, marker in markers.items():
         try:
             if name not in suspect_names:
                 raise JaxmarkError("No mesh of the suspect resembles it.")
-            mesh_record = None if record is None else record.meshes[name]
-            marker = make_marker(original, key, bits=bits, record=mesh_record, scheme=get_nonblind(scheme))
-            if message is not None and is_recorded(mesh_record, message, marker.choices) is False:
-                refuted.append(name)
             identity = marker.original.geometry, marker.original.order
             if identity in identities:
                 raise JaxmarkError("It equals another mesh, which counts once.")
             aligned = marker.register(suspects[suspect_names[name]], align)
-            # The marker's cached results are dropped here, because those of all meshes would not fit into memory.
-            readings[name] = _MeshReading(replace(marker), aligned, marker.read(aligned, message))
+            readings[name] = _MeshReading(marker, aligned, replace(marker).read(aligned, message))
             identities.add(identity)
         except JaxmarkError as error:
             skipped[name] = str(error).rstrip(".")
         after()
-    if refuted:
-        names = ", ".join(map(repr, refuted))
-        raise JaxmarkError(
-            f"The records of {names} commit to another message than the one claimed; claim that or none."
-        )
     if not readings:
         raise JaxmarkError(f"None of the {len(chosen)} meshes could be compared: {_reasons(skipped)}.")
     parts = {name: reading.found for name, reading in readings.items()}
-    return _unite_meshes(list(readings.values()), message)._replace(parts=parts, skipped=skipped)
+    united = _unite_meshes(list(readings.values()), message)._replace(parts=parts, skipped=skipped)
+    return united._replace(evidence=united.evidence.charged(*ledger.selection(len(chosen), len(marked))))
 
 
 class _MeshReading(NamedTuple):
@@ -422,13 +436,18 @@ def _unite_meshes(readings: Sequence[_MeshReading], claimed: bytes | None) -> De
             continue
         recorded = [is_recorded(reading.marker.record, message, reading.marker.choices) for reading in readings]
         fixed = claimed is not None or all(recorded)
-        charges = [ledger.SCENE.charge("sum over meshes"), ledger.SUM_ALIGNMENT.charge(readings[0].aligned.align)]
+        order = [charge for reading in readings for charge in order_charges(reading.marker)]
+        charges = [
+            ledger.SCENE.charge("sum over meshes"),
+            *([ledger.in_all(order)] if order else []),
+            ledger.SUM_ALIGNMENT.charge(readings[0].aligned.align),
+        ]
         if fixed or any(flag is not None for flag in recorded):
             charges.append(ledger.MESSAGE.charge("claimed or recorded" if fixed else "another"))
         scores, norms = zip(*(reading.claim(message) for reading in readings), strict=True)
         # The weight of a mesh is the number of its points that the suspect shows.
         score = united_score(scores, norms, [float(np.sum(reading.aligned.weights > 0)) for reading in readings])
-        united = weigh([(score, 1.0)], bits=bits, fixed=fixed, charges=charges)
+        united = weigh([(score, 1.0)], bits=bits, fixed=fixed, charges=charges, meshes=len(readings))
         if united.log10_p < evidence.log10_p:
             read = message if any(detection.message == message for detection in detections) else None
         evidence = Evidence.least(evidence, united)

@@ -136,7 +136,7 @@ def read(
     # that can be read moves some coordinates by more.
     if np.abs(aligned.displacement).max() * mark.original.diagonal <= 0.75 * mark.original.grid:
         return empty._replace(notes=("The suspect is the original itself, without a mark.",))
-    charges = (*charges, ledger.ALIGNMENT.charge(aligned.align))
+    charges = (*charges, *order_charges(mark), ledger.ALIGNMENT.charge(aligned.align))
     reading = _Reading(mark, aligned, empty, claimed)
     second_reading = reading.alternative(received) if weights is None else None
     if second_reading is None:
@@ -148,6 +148,13 @@ def read(
     if not second.detected(allow_estimate=True):
         second = second._replace(notes=standard.notes)
     return min(standard, second, key=lambda detection: detection.rank)
+
+
+def order_charges(mark: Mark) -> Charges:
+    """Return the charge for the order in which the original was presented, if there is a record."""
+    if mark.record is None:
+        return ()
+    return (ledger.ORDER.charge("marked" if mark.original.in_order else "another"),)
 
 
 def claims_of(mark: Mark, received: Received, message: bytes) -> list[tuple[Array, Array]]:

@@ -11,6 +11,7 @@ import base64
 import hashlib
 import hmac
 import json
+import math
 import os
 import re
 from collections.abc import Iterable, Mapping
@@ -59,9 +60,19 @@ _FIELDS = {  # the fields of a file, in which "told" is the commitment to the me
 }
 
 
+_MAX_BITS = 2**23  # the largest payload, and the largest number of slots of a fingerprint
+_HASH = re.compile("[0-9a-f]{64}")
+
+
 @dataclass(frozen=True)
 class Record:
-    """The record of a mark; a file stores it as JSON."""
+    """The record of a mark; a file stores it as JSON.
+
+    Every field has a range, which is checked whoever made the record.
+
+    Raises:
+        JaxmarkError: if a field is out of its range.
+    """
 
     scheme: str  # name of the scheme
     bits: int  # size of the payload in bits, without the tag; number of slots for a fingerprint
@@ -74,6 +85,24 @@ class Record:
     message_commitment: str = ""  # commitment to message or recipient, see `commit`; empty for presence
     imprint: Mapping[str, Any] = field(default_factory=dict)  # of the original, with encrypted tags; empty if blind
     code: str = ""  # authentication code with the key over all other fields, hexadecimal
+
+    def __post_init__(self) -> None:
+        """Check the ranges of all fields."""
+        hashes = {
+            "original": self.original,
+            "key": self.key,
+            "message_commitment": self.message_commitment,
+            "code": self.code,
+        }
+        is_in_range = {
+            **{name: _HASH.fullmatch(value) or (not value and name != "key") for name, value in hashes.items()},
+            "bits": 0 <= self.bits <= _MAX_BITS
+            and (self.bits > 0) == (self.content != "presence")
+            and (self.bits % 8 == 0 or self.content == "fingerprint"),
+            "beta": math.isfinite(self.beta) and self.beta >= 0,
+        }
+        if wrong := [name for name, is_right in is_in_range.items() if not is_right]:
+            raise JaxmarkError(f"A record is damaged or forged: {', '.join(wrong)} out of range. Use an unedited copy.")
 
     @property
     def meshes(self) -> Mapping[str, "Record"]:
@@ -148,7 +177,7 @@ class Record:
         """
         try:
             tags = np.frombuffer(base64.b64decode(self.imprint["tags"], validate=True), "<u4")
-            return Imprint(
+            imprint = Imprint(
                 bytes.fromhex(self.original),
                 float(self.imprint["grid"]),
                 np.array(self.imprint["centre"], np.float64).reshape(3),
@@ -156,8 +185,13 @@ class Record:
                 tags ^ _stream(key, self.original, len(tags)),
                 bytes.fromhex(self.imprint["order"]),
             )
+            if not (imprint.grid > 0 and np.isfinite([imprint.grid, *imprint.centre, *imprint.covariance.flat]).all()):
+                raise ValueError("numbers out of range")
+            return imprint
         except (KeyError, ValueError, TypeError):
-            raise JaxmarkError("The record is damaged: its imprint of the original is incomplete.") from None
+            raise JaxmarkError(
+                "The record is damaged: its imprint of the original is incomplete or out of range."
+            ) from None
 
     def _stored(self) -> dict[str, Any]:
         """Return the fields by their names in a file."""
@@ -195,8 +229,11 @@ class Record:
         if data.keys() != _FIELDS.keys() or any(type(data[name]) is not kind for name, kind in _FIELDS.items()):
             raise JaxmarkError(f"The record {where} is damaged: its fields are not those of a record.")
         if data["content"] not in _READERS:
-            raise JaxmarkError(f"The record {where} is of a {data['content']}, which this jaxmark does not know.")
-        return cls(message_commitment=data.pop("told"), **data)
+            raise JaxmarkError(f"The record {where} has a content that this jaxmark does not know.")
+        try:
+            return cls(message_commitment=data.pop("told"), **data)
+        except JaxmarkError as error:
+            raise JaxmarkError(f"{where}: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -205,20 +242,37 @@ class SceneRecord:
 
     meshes: Mapping[str, Record]
 
+    def __post_init__(self) -> None:
+        """Check that the meshes agree in everything that is stated of the whole."""
+        if not self.meshes:
+            raise JaxmarkError("A record of a scene needs the record of at least one mesh.")
+        for kind in ("scheme", "bits", "content", "key"):
+            if len({getattr(record, kind) for record in self.meshes.values()}) > 1:
+                raise JaxmarkError(f"The records of the meshes of a scene differ in {kind}; use an unedited copy.")
+        if len({not record.message_commitment for record in self.meshes.values()}) > 1:
+            raise JaxmarkError(
+                "Some of the meshes of a scene have a record that commits to a message, and some have not; use an"
+                " unedited copy."
+            )
+
     @property
     def scheme(self) -> str:
-        """Name of the scheme."""
-        return next(iter(self.meshes.values())).scheme
+        """Name of the scheme, which all meshes have."""
+        return self._any.scheme
 
     @property
     def bits(self) -> int:
-        """Size of the payload in bits."""
-        return next(iter(self.meshes.values())).bits
+        """Size of the payload in bits, which all meshes have."""
+        return self._any.bits
 
     @property
     def message_commitment(self) -> str:
         """The commitments of all records, concatenated; empty if none commits to a message."""
         return "".join(record.message_commitment for record in self.meshes.values())
+
+    @property
+    def _any(self) -> Record:
+        return next(iter(self.meshes.values()))
 
     def to_json(self) -> str:
         """Return the records as JSON text."""
@@ -247,7 +301,11 @@ def load_record(path: str | os.PathLike[str]) -> Record | SceneRecord:
         )
     if not isinstance(meshes, dict) or not meshes:
         raise JaxmarkError(f"The record {path} is damaged: it has no meshes.")
-    return SceneRecord({name: Record.of(item, f"{path}, mesh {name!r},") for name, item in meshes.items()})
+    records = {name: Record.of(item, f"{path}, mesh {name!r},") for name, item in meshes.items()}
+    try:
+        return SceneRecord(records)
+    except JaxmarkError as error:
+        raise JaxmarkError(f"{path}: {error}") from None
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
@@ -320,8 +378,8 @@ class TimestampedCommitment:
 
         Args:
             record: the record that the suspect was read with.
-            claimed: whether the message was claimed instead of decoded. All messages of the meshes whose records commit
-                to no message are then charged.
+            claimed: whether the message was claimed instead of decoded. All messages are then charged, if the record
+                commits to none.
 
         Raises:
             JaxmarkError: if the commitment does not contain the record.
@@ -330,8 +388,7 @@ class TimestampedCommitment:
             raise JaxmarkError(
                 f"The record (digest {record.digest()}) is not in the commitment, which does not prove its age."
             )
-        uncommitted = (part.bits for part in record.meshes.values() if not part.message_commitment)
-        free = sum(uncommitted) if claimed else 0
+        free = record.bits if claimed and not record.message_commitment else 0
         return (ledger.COMMITMENT.charge("each", len(self.digests), bits=free),)
 
     def timestamp_request(self) -> bytes:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -13,8 +14,9 @@ import pytest
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.watermark.coding.keys import Choices, bind
+from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.ledger import figure
-from jaxmark.watermark.record import SceneRecord, TimestampedCommitment, commit, make_commitment
+from jaxmark.watermark.record import SceneRecord, TimestampedCommitment, commit, load_record, make_commitment
 from jaxmark.watermark.schemes.keyed import KeyedScheme
 from tests.geometry.test_imprint import COPIES
 from tests.samples import bumpy_sphere
@@ -220,10 +222,9 @@ def test_deposits_date_records(marked, original: Mesh, key: jm.Key, tmp_path: Pa
     dated = make_commitment([first.digest()])
     assert charged(dated, first, claimed=True) == pytest.approx(-20 + 16 * np.log10(2)), "it commits to none"
     assert charged(dated, first, claimed=False) == -20
-    presence = dataclasses.replace(first, bits=0, content="presence")
-    scene = SceneRecord({"a": presence, "b": first, "c": record})
+    scene = SceneRecord({"a": first, "b": first})
     dated = make_commitment([scene.digest()])
-    assert charged(dated, scene, claimed=True) == pytest.approx(-20 + 16 * np.log10(2)), "b commits to none"
+    assert charged(dated, scene, claimed=True) == pytest.approx(-20 + 16 * np.log10(2)), "one message for all"
     with pytest.raises(jm.JaxmarkError, match="not in the commitment"):
         charged(make_commitment(others), record, claimed=True)
     path = tmp_path / "deposit.json"
@@ -240,6 +241,78 @@ def test_deposits_date_records(marked, original: Mesh, key: jm.Key, tmp_path: Pa
     for bad in ([], ["xy"], ["0" * 63]):
         with pytest.raises(jm.JaxmarkError, match="at least one record digest"):
             make_commitment(bad)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("bits", -1000),
+        ("bits", 12),
+        ("bits", 0),
+        ("bits", 2**40),
+        ("beta", math.nan),
+        ("beta", math.inf),
+        ("beta", -1e-3),
+        ("original", "ab"),
+        ("key", ""),
+        ("key", "é" * 64),
+        ("message_commitment", "0" * 63),
+        ("code", "Z" * 64),
+    ],
+)
+def test_fields_of_records_have_ranges(marked, field: str, value, tmp_path: Path):
+    _, record = marked
+    with pytest.raises(jm.JaxmarkError, match=field):
+        dataclasses.replace(record, **{field: value})
+    data = json.loads(record.to_json())
+    (tmp_path / "a.json").write_text(json.dumps({**data, {"message_commitment": "told"}.get(field, field): value}))
+    with pytest.raises(jm.JaxmarkError, match=r"a\.json"):
+        load_record(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(("field", "value"), [("grid", 0.0), ("grid", -1.0), ("centre", [0.0, 0.0])])
+def test_imprints_have_ranges(marked, original: Mesh, key: jm.Key, field: str, value):
+    _, record = marked
+    forged = dataclasses.replace(record, imprint={**record.imprint, field: value}).sealed(key)
+    with pytest.raises(jm.JaxmarkError, match="imprint"):
+        jm.make_marker(original, key, record=forged)
+
+
+def test_the_records_of_a_scene_agree(marked, tmp_path: Path):
+    _, record = marked
+    others = {
+        "bits": dataclasses.replace(record, bits=24),
+        "scheme": dataclasses.replace(record, scheme="host"),
+        "content": dataclasses.replace(record, content="fingerprint"),
+        "key": dataclasses.replace(record, key="0" * 64),
+        "commits to a message": dataclasses.replace(record, message_commitment=""),
+    }
+    scene = json.loads(SceneRecord({"a": record, "b": record}).to_json())
+    for wrong, other in others.items():
+        for pair in ({"a": record, "b": other}, {"a": other, "b": record}):
+            with pytest.raises(jm.JaxmarkError, match=wrong):
+                SceneRecord(pair)
+            scene["meshes"] = {name: json.loads(part.to_json()) for name, part in pair.items()}
+            (tmp_path / "scene.json").write_text(json.dumps(scene))
+            with pytest.raises(jm.JaxmarkError, match=r"scene\.json"):
+                load_record(tmp_path / "scene.json")
+
+
+def test_a_reordered_original_is_charged_and_all_orders_read_alike(marked, original: Mesh, key: jm.Key):
+    suspect, record = marked
+    noisy = jm.attack(suspect, "noise", 0.002, seed=0)
+    usual = jm.detect(noisy, original=original, key=key, record=record)
+    assert ledger.ORDER.charge("marked") in usual.evidence.charges
+    found = []
+    for seed in range(2):
+        order = np.random.default_rng(seed).permutation(len(original.vertices))
+        place = np.argsort(order)
+        other = jm.make_mesh(original.vertices[order], np.roll(place[original.faces], seed, axis=1)[::-1])
+        found.append(jm.detect(noisy, original=other, key=key, record=record))
+        assert ledger.ORDER.charge("another") in found[-1].evidence.charges
+    assert found[0].log10_p == found[1].log10_p
+    without = jm.detect(noisy, original=original, key=key, bits=16)
+    assert "order of the original (record)" not in {charge.choice for charge in without.evidence.charges}
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is absent")

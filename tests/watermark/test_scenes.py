@@ -1,7 +1,7 @@
 """Files of several meshes: each is marked alone, and what they prove together is no more than they do."""
 
-import dataclasses
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,9 @@ from jaxmark.alignment.pairing import pair
 from jaxmark.files import load_scene
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.everyday import detect_scene, embed_scene
-from jaxmark.watermark.evidence.detection import Detection, united_score
+from jaxmark.watermark.evidence import ledger
+from jaxmark.watermark.evidence.detection import Detection, united_score, weigh
+from jaxmark.watermark.evidence.ledger import is_charged_along_a_path
 from jaxmark.watermark.nonblind import claims_of
 from jaxmark.watermark.record import SceneRecord, load_record
 from tests.app.test_cli import Workshop
@@ -74,13 +76,54 @@ def test_together_they_prove_more_than_the_best_alone(marked, originals, key: jm
 
 def test_a_claim_that_a_record_of_the_scene_refutes_is_refused(marked, originals, key: jm.Key):
     meshes, info = marked
-    record = info.record.meshes["left"]
-    free = dataclasses.replace(info.record.meshes["right"], message_commitment="").sealed(key)
     both = {name: originals[name] for name in ("left", "right")}
-    with pytest.raises(jm.JaxmarkError, match="records of 'left' commit to another message"):
-        detect_scene(
-            meshes, originals=both, key=key, record=SceneRecord({"left": record, "right": free}), message=b"no"
-        )
+    record = SceneRecord({name: info.record.meshes[name] for name in both})
+    with pytest.raises(jm.JaxmarkError, match="commits to another message"):
+        detect_scene(meshes, originals=both, key=key, record=record, message=b"no")
+
+
+def test_picking_meshes_is_charged(marked, originals, key: jm.Key):
+    every = read(marked, originals, key, 0.006, message=MESSAGE)
+    assert every.evidence.charges[0] == ledger.SELECTION.charge("all")
+    two = read(marked, originals, key, 0.006, message=MESSAGE, names=NAMES[:2])
+    assert list(two.parts) == list(NAMES[:2])
+    # 3 % for all sets that could be picked, 1/4 of it for those of two, of which there are three.
+    spent = [charge.log10 for charge in two.evidence.charges[:2]]
+    assert sum(spent) == pytest.approx(-np.log10(0.03 / 4 / 3))
+    assert is_charged_along_a_path(two.evidence.charges)
+    one = read(marked, originals, key, 0.006, message=MESSAGE, names=NAMES[:1])
+    alone = every.parts[NAMES[0]]
+    assert one.log10_p == pytest.approx(alone.log10_p - np.log10(0.03 / 2 / 3))
+    for wrong, whose in (("small", "original"), ("again", "original")):
+        with pytest.raises(jm.JaxmarkError, match=f"{whose} has no mesh '{wrong}'"):
+            read(marked, originals, key, 0.0, names=[wrong])
+
+
+@pytest.mark.parametrize("count", range(2, 8))
+def test_the_shares_of_all_sets_add_up_to_no_more_than_the_budget(count: int):
+    spent = sum(
+        math.comb(count, read) * 10 ** -sum(charge.log10 for charge in ledger.selection(read, count))
+        for read in range(1, count + 1)
+    )
+    assert 0.97 < spent <= 1
+
+
+def test_a_damaged_original_does_not_choose_the_meshes(marked, originals, key: jm.Key):
+    """Otherwise whoever presents it could leave out the meshes that disagree with the suspect."""
+    wrong = {**originals, "right": bumpy_sphere(3, 17)}
+    with pytest.raises(jm.JaxmarkError, match="'right' of the original cannot be read"):
+        read(marked, wrong, key, 0.0)
+    assert read(marked, wrong, key, 0.0, names=["left", "third"]).detected()
+
+
+def test_meshes_chosen_by_their_scores_prove_nothing_uncommitted():
+    """A forger tries 1,200 variants of an original, and unites those that happen to agree with the suspect."""
+    scores = np.sort(np.random.default_rng(0).normal(size=1200))[-299:]
+    score = united_score(scores.tolist(), [1.0] * 299, [1.0] * 299)
+    forged = weigh([(score, 1.0)], bits=16, fixed=True, meshes=299)
+    assert forged.log10_p < -70, "the attack works against what must be fixed beforehand"
+    assert forged.log10_p_uncommitted == 0.0
+    assert weigh([(score, 1.0)], bits=16, fixed=True).log10_p_uncommitted < -30, "what one forgery is charged"
 
 
 def test_each_reads_alone(marked, originals, key: jm.Key):
@@ -98,7 +141,7 @@ def test_equal_meshes_count_once(marked, originals, key: jm.Key):
     found = detect_scene({name: meshes[name] for name in twice}, originals=twice, key=key, record=record)
     alone = jm.detect(meshes["left"], original=originals["left"], key=key, record=record.meshes["left"])
     assert list(found.parts) == ["left"]
-    assert found.log10_p == alone.log10_p
+    assert found.log10_p == pytest.approx(alone.log10_p - np.log10(0.97)), "all meshes of the record were read"
 
 
 @pytest.mark.long

@@ -99,6 +99,7 @@ def weigh(
     tag: Tag | None = None,
     charges: Sequence[Charge] = (),
     looks: float = 1.0,
+    meshes: int = 1,
     caveats: tuple[str, ...] = (),
 ) -> Evidence:
     """Compute the evidence for one message: the smallest p-value of its scores and its tag, after all charges.
@@ -111,6 +112,7 @@ def weigh(
         tag: the message's tag, if it is evidence; None if the message was claimed and not decoded.
         charges: charges for earlier choices.
         looks: number of views of the suspect whose scores were compared; blind readings are charged for them.
+        meshes: number of meshes whose scores were added.
         caveats: the reasons why the result is an estimate.
     """
     proof = ledger.PROOF if looks == 1 else ledger.BLIND_PROOF
@@ -125,7 +127,7 @@ def weigh(
     log10_p, spent = min(proofs, key=lambda candidate: figure(*candidate, UNFLOORED))
     spent = (*charges, *spent)
     # Without a commitment, the payload is always charged: the message may have been chosen to suit the suspect.
-    uncommitted = (ledger.FORGERIES, *charges, proof.charge("score", len(ways)), *message_charges)
+    uncommitted = (ledger.forgeries(meshes), *charges, proof.charge("score", len(ways)), *message_charges)
     gaussian = min(bounds.log10_p_gaussian(*way) for way in ways)
     return Evidence(
         log10_p=figure(log10_p, spent),

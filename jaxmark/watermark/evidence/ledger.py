@@ -78,7 +78,43 @@ def figure(log10_p: float, charges: Sequence[Charge], floor: float = MIN_LOG10_P
 
 def uncommitted(log10_p: float) -> float:
     """Return log10 of the bound if nothing was fixed beforehand; `log10_p` must include all other charges."""
-    return figure(log10_p, [FORGERIES], UNFLOORED)
+    return figure(log10_p, [forgeries()], UNFLOORED)
+
+
+def forgeries(meshes: int = 1) -> Charge:
+    """Return the charge for the keys, originals and records that a forger can try.
+
+    A forger tries originals for each mesh of a sum on its own, keeps those with a large score, and thereby also chooses
+    how many meshes are united. If N can be tried for one mesh, then at most Nᵏ/k! sets of k meshes can be united. A
+    share of N⁻ᵏ for each set of at least two spends Σ 1/k! = e - 2 < 1.
+
+    Args:
+        meshes: number of meshes whose scores were added.
+    """
+    return UNCOMMITTED.charge("each", bits=64 * meshes)
+
+
+def selection(read: int, among: int) -> tuple[Charge, ...]:
+    """Return the charges for reading all meshes of an original, or only those that somebody picked.
+
+    The share of a set of k of n meshes is 2⁻ᵏ divided by the number of such sets; the shares of all sets add up to less
+    than 1.
+
+    Args:
+        read: number of meshes that are read.
+        among: number of meshes that could be picked.
+    """
+    if among == 1:
+        return ()
+    if read == among:
+        return (SELECTION.charge("all"),)
+    return SELECTION.charge("picked"), PICKED.charge("each", math.comb(among, read), bits=read)
+
+
+def in_all(charges: Sequence[Charge]) -> Charge:
+    """Return the charge for a choice that was made for each of several meshes: the product of all shares."""
+    dearest = max(charges, key=lambda charge: charge.log10)
+    return dearest._replace(log10=math.fsum(charge.log10 for charge in charges))
 
 
 def _each(name: str, counted: str, then: Choice | None = None, *, in_bound: bool = False) -> Choice:
@@ -117,10 +153,12 @@ READING = Choice(
     "reading method", (Alternative("standard", 0.95, MESSAGE), Alternative("coarse or non-rigid", 0.05, MESSAGE))
 )
 ALIGNMENT = _alignment(READING)
-REFLECTION = Choice(
-    "reflection",
-    (Alternative("better fit", 0.97, ALIGNMENT), Alternative("worse fit", 0.03, ALIGNMENT)),
+# With a record, an original may be presented in another order of vertices than the marked one, which alignment uses.
+# Its points are sorted then, so all other orders are alike. Without a record, keyed choices are bound to the order.
+ORDER = Choice(
+    "order of the original (record)", (Alternative("marked", 0.97, ALIGNMENT), Alternative("another", 0.03, ALIGNMENT))
 )
+REFLECTION = Choice("reflection", (Alternative("better fit", 0.97, ORDER), Alternative("worse fit", 0.03, ORDER)))
 PASS_BAND = Choice(
     "pass band (no record)",
     (
@@ -132,8 +170,11 @@ PASS_BAND = Choice(
 
 # Scenes: either the sum of scores over meshes, in the poses that the readings of single meshes chose, or one mesh.
 SUM_ALIGNMENT = _alignment(MESSAGE)
-MESHES = _each("mesh", "1/n for each of the n meshes of the original scene that were compared", REFLECTION)
-SCENE = Choice("scene", (Alternative("sum over meshes", 0.5, SUM_ALIGNMENT), Alternative("one mesh", 0.5, MESHES)))
+SUM_ORDER = ORDER._replace(alternatives=tuple(one._replace(then=SUM_ALIGNMENT) for one in ORDER.alternatives))
+MESHES = _each("mesh", "1/n for each of the n meshes of the original scene that were compared", PASS_BAND)
+SCENE = Choice("scene", (Alternative("sum over meshes", 0.5, SUM_ORDER), Alternative("one mesh", 0.5, MESHES)))
+PICKED = _each("meshes picked", "2^-k/m for each of the m sets of k meshes that could be picked", SCENE)
+SELECTION = Choice("meshes read", (Alternative("all", 0.97, SCENE), Alternative("picked", 0.03, PICKED)))
 
 # Blind reading. The rank of a tag counts the candidates of all readings, because tags are compared reading by reading.
 LOOKS = _each(
@@ -176,14 +217,16 @@ ORIGINALS = Choice(
 
 # The commitment under which everything else was fixed beforehand, if any.
 COMMITMENT = _each("timestamped commitment", "1/n for each of the n records in the commitment", PASS_BAND)
-UNCOMMITTED = _each("forgery", "2^-64 for each key, original and record that a forger can afford to try", PASS_BAND)
-
-FORGERIES = UNCOMMITTED.charge("each", bits=64)
+UNCOMMITTED = _each(
+    "forgery",
+    "2^-64 for each key, original and record that a forger can afford to try; 2^-64k for a sum over k meshes",
+    PASS_BAND,
+)
 
 #: The roots of the tree, by the kind of reading.
 ROOTS: dict[str, Choice] = {
     "One mesh, non-blind": PASS_BAND,
-    "A scene of several meshes": SCENE,
+    "A scene of several meshes": SELECTION,
     "Blind": PARTS,
     "Several marks in one mesh": MARKS,
     "Copies for recipients": COPY_ALIGNMENT,
