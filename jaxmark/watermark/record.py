@@ -138,7 +138,7 @@ class Record:
             raise JaxmarkError(f"The record is of a {self.content}; {_READERS[self.content]} reads it.")
         if self.key != commitment(key):
             raise JaxmarkError("The key is not the one that the record commits to.")
-        if not hmac.compare_digest(self.code.encode(errors="replace"), self._code(key).encode()):
+        if not hmac.compare_digest(self.code, self._code(key)):
             raise JaxmarkError("The record was edited: its code does not match its fields. Use an unedited copy.")
 
     def payload(self, key: bytes, bits: int | None = None) -> int:
@@ -158,7 +158,7 @@ class Record:
 
     def commits_to(self, content: bytes, choices: Choices) -> bool:
         """Whether the record commits to this message or recipient."""
-        return hmac.compare_digest(self.message_commitment.encode(errors="replace"), commit(content, choices).encode())
+        return hmac.compare_digest(self.message_commitment, commit(content, choices))
 
     def check_claim(self, message: bytes, choices: Choices) -> None:
         """Check that the record does not commit to another message than the claimed one.
