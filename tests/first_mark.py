@@ -5,6 +5,7 @@ Run by itself from a clone; pytest does not collect it.
 
 import re
 import shlex
+import shutil
 import subprocess
 import tempfile
 import time
@@ -62,10 +63,13 @@ def main() -> None:
         others = [block for guide in guides for block in python_blocks(guide)]
         Path(folder, "readme.py").write_text("\n".join([*first, *others]))
         subprocess.run([python, "readme.py"], cwd=folder, check=True)
+        shell = Path(folder, "shell")  # a folder of its own, because existing files are refused
+        shell.mkdir()
+        shutil.copy(Path(folder, "model.ply"), shell)
         for line in lines:
             _, *arguments = shlex.split(line)
             print(line, flush=True)
-            subprocess.run([jaxmark, *arguments], cwd=folder, check=True)
+            subprocess.run([jaxmark, *arguments], cwd=shell, check=True)
     print(f"README and guides were run after {time.time() - start:.0f} s")
 
 

@@ -127,7 +127,7 @@ def main() -> None:
         make_folder(folder / "models", options.meshes, options.count)
         key = ["--key", "{folder}/owner.key"]
         words = {
-            "embed": ["embed", "{file}", "{folder}/marked {set}/{name}", *key, "--message", MESSAGE],
+            "embed": ["embed", "{file}", "{folder}/marked {set}/{name}", *key, "--message", MESSAGE, "--overwrite"],
             "detect": ["detect", "{folder}/marked {set}/{name}", "--original", "{file}", *key],
         }
         print(table(list(measure(folder, ways, words, options.alone))))

@@ -188,7 +188,7 @@ def bench_command(
         lines = [f"{repeated.shared} readings are published; {len(repeated.differences)} of them differ:"]
         text += "\n\n" + "\n".join([*lines, *repeated.differences])
     values = {} if repeated is None else {"repeated": repeated.shared, "differences": list(repeated.differences)}
-    answer(as_json, {"output": str(output), "methods": entries(results), **values}, text)
+    answer(as_json, {"output": str(output), "methods": entries(results), **values}, *text.split("\n"))
     if repeated is not None and (repeated.differences or not repeated.shared):
         sys.exit(1)
 
@@ -235,8 +235,10 @@ def bench_equal_command(
         workers=processes(workers, keep_programs),
         log=current().doing,
     )
-    write_atomically(output / "equal.md", (table.markdown() + "\n").encode())
-    answer(as_json, {"heads": list(table.heads), "lines": [list(line) for line in table.lines]}, table.markdown())
+    text = table.markdown()
+    write_atomically(output / "equal.md", (text + "\n").encode())
+    values = {"heads": list(table.heads), "lines": [list(line) for line in table.lines]}
+    answer(as_json, values, *text.split("\n"))
 
 
 @click.command(name="bench-corpus")

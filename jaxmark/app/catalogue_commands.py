@@ -10,12 +10,13 @@ import click
 
 from jaxmark.app.folders import mesh_files
 from jaxmark.app.mark_files import mark_file
-from jaxmark.app.options import FILE, JSON, KEY, QUIET, budget_options, read_key
+from jaxmark.app.options import FILE, JSON, KEY, OVERWRITE, QUIET, budget_options, read_key
 from jaxmark.app.output import FileOutcome, answer, error_text, say
 from jaxmark.app.progress import current
 from jaxmark.catalogue import Catalogue, export_catalogue, import_catalogue
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.atomic import file_hash, replacing
+from jaxmark.files.atomic import file_hash
+from jaxmark.files.pair import refuse_existing, writing_pair
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.perception.budget import Budget
 from jaxmark.watermark.record import RECORD_SUFFIX, Record, load_record
@@ -62,6 +63,8 @@ def add_command(files: tuple[Path, ...], catalogue_file: Path, records: bool, co
         for file in _each_file(meshes):
             current().doing(f"adding {file}")
             try:
+                if file.is_dir():
+                    mesh_files(file)  # raises an error: folders come here only if they have no mesh file
                 added = catalogue.add(file, copy=copy)
             except (JaxmarkError, OSError) as error:
                 status = 2
@@ -84,14 +87,18 @@ def add_command(files: tuple[Path, ...], catalogue_file: Path, records: bool, co
 
 
 def _each_file(files: Sequence[Path]) -> Iterator[Path]:
+    """Yield files and the files in folders; a folder without any is yielded itself, to be refused."""
     for file in files:
-        yield from mesh_files(file) if file.is_dir() else [file]
+        try:
+            yield from mesh_files(file) if file.is_dir() else [file]
+        except JaxmarkError:
+            yield file
 
 
 def _refused(as_json: bool, file: Path, error: Exception) -> None:
     text = error_text(error)
     if as_json:
-        answer(True, {"file": str(file), "refused": text}, "")
+        answer(True, {"file": str(file), "refused": text})
     else:
         say(f"{file}: refused. {text}")
 
@@ -134,7 +141,7 @@ def show_command(original: str, catalogue_file: Path, as_json: bool) -> None:
         lines += [
             f"  copy for {copy['recipient']}, key {copy['key'][:16]}, {copy['added']}" for copy in shape["copies"]
         ]
-    answer(as_json, shown, "\n".join(lines))
+    answer(as_json, shown, *lines)
 
 
 @catalogue_group.command(name="remove")
@@ -157,11 +164,16 @@ def remove_command(original: str, catalogue_file: Path, with_records: bool, as_j
 @catalogue_group.command(name="export")
 @click.argument("file", type=FILE)
 @CATALOGUE
+@OVERWRITE
 @JSON
-def export_command(file: Path, catalogue_file: Path, as_json: bool) -> None:
-    """Write the whole content of the catalogue to FILE, as JSON Lines."""
+def export_command(file: Path, catalogue_file: Path, overwrite: bool, as_json: bool) -> None:
+    """Write the whole content of the catalogue to FILE, as JSON Lines.
+
+    A FILE that exists may be the only backup of a catalogue, and is refused without --overwrite.
+    """
     if file.resolve() == catalogue_file.resolve():
         raise JaxmarkError(f"FILE and --catalogue are the same file, {file}; give another name.")
+    refuse_existing(file, overwrite=overwrite)
     with Catalogue(catalogue_file, read_only=True) as catalogue:
         counts = export_catalogue(catalogue, file)
     answer(as_json, counts._asdict(), f"{_counts_text(counts)} → {file}")
@@ -200,7 +212,7 @@ def check_command(catalogue_file: Path, as_json: bool) -> None:
             count += 1
             wrong += problem is not None
             if as_json:
-                answer(True, {"id": entry.id, "path": entry.path, "problem": problem}, "")
+                answer(True, {"id": entry.id, "path": entry.path, "problem": problem})
             elif problem is not None:
                 answer(False, {}, f"{entry.id}  {entry.path}: {problem}")
     if not as_json:
@@ -230,6 +242,7 @@ def _counts_text(counts: tuple[int, ...]) -> str:
     help="File for the copy.  [default: in the working directory, named after ORIGINAL and RECIPIENT: model-alice.ply]",
 )
 @budget_options(limits=False)
+@OVERWRITE
 @QUIET
 @JSON
 def mark_for_command(
@@ -239,12 +252,14 @@ def mark_for_command(
     key_file: Path,
     output: Path | None,
     budget: Budget,
+    overwrite: bool,
     as_json: bool,
 ) -> None:
     """Make the copy of ORIGINAL for RECIPIENT, and store both in the catalogue.
 
     Needs the key. Writes the copy and its record. `jaxmark catalogue find` and `jaxmark identify` trace the copy by the
     catalogue. The recipient is stored before the copy is written. The same recipient always gets the same copy.
+    Files that exist are refused without --overwrite.
     """
     if output is None:
         if not _PLAIN.fullmatch(recipient):
@@ -255,12 +270,19 @@ def mark_for_command(
     key = read_key(key_file)
     current().doing(f"marking {original} for {recipient}")
     with Catalogue(catalogue_file) as catalogue:
-        outcome = mark_copy(catalogue, recipient, original, output, key, budget)
-    answer(as_json, {"recipient": recipient, **outcome.values}, outcome.text)
+        outcome = mark_copy(catalogue, recipient, original, output, key, budget, overwrite=overwrite)
+    answer(as_json, {"recipient": recipient, **outcome.values}, *outcome.lines)
 
 
 def mark_copy(
-    catalogue: Catalogue, recipient: str, original: Path, copy: Path, key: Key, budget: Budget
+    catalogue: Catalogue,
+    recipient: str,
+    original: Path,
+    copy: Path,
+    key: Key,
+    budget: Budget,
+    *,
+    overwrite: bool = False,
 ) -> FileOutcome:
     """Make a recipient's copy and its record, and store original, record and recipient in the catalogue.
 
@@ -271,19 +293,20 @@ def mark_copy(
         copy: path of the copy; the record is written next to it.
         key: the key to mark with.
         budget: how strong the mark may be, see `embed`.
+        overwrite: see `mark_file`.
 
     Raises:
         JaxmarkError: see `mark_file`.
     """
-    catalogue.add(original)
     record = copy.with_name(copy.name + RECORD_SUFFIX)
-    with replacing(copy) as draft, replacing(record) as record_draft:
+    with writing_pair(copy, record, overwrite=overwrite) as (draft, record_draft):
+        catalogue.add(original)
         outcome = mark_file(original, draft, record_draft, key=key, recipient=recipient, budget=budget)
         # The recipient is stored first: a recipient without a copy does no harm, but a copy without a recipient in the
         # catalogue could not be traced.
         catalogue.add_copy(Record.load(record_draft), recipient, file_hash(draft))
     places = {str(draft): str(copy), str(record_draft): str(record)}
-    text = outcome.text
+    lines = outcome.lines
     for place, name in places.items():
-        text = text.replace(place, name)
-    return outcome._replace(values={**outcome.values, "record": str(record), "marked": str(copy)}, text=text)
+        lines = tuple(line.replace(place, name) for line in lines)
+    return outcome._replace(values={**outcome.values, "record": str(record), "marked": str(copy)}, lines=lines)

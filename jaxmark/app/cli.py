@@ -33,6 +33,7 @@ from jaxmark.app.options import (
     JSON,
     KEY,
     MESHES,
+    OVERWRITE,
     QUIET,
     WORKERS,
     Schemes,
@@ -61,6 +62,7 @@ from jaxmark.evaluation.pictures import Measure
 from jaxmark.evaluation.study import load_study
 from jaxmark.files import load_mesh, load_scene, load_skin, save_mesh, save_scene
 from jaxmark.files.atomic import replacing, write_atomically
+from jaxmark.files.pair import writing_pair
 from jaxmark.geometry import unpose
 from jaxmark.geometry.mesh import same_connectivity
 from jaxmark.watermark.coding.keys import commitment, new_key, save_key
@@ -135,6 +137,7 @@ def keygen(keyfile: Path, as_json: bool) -> None:
     " original. Several schemes, separated by commas (keyed,field), mark the mesh with each of them.",
 )
 @click.option("--record", "record_file", type=FILE, help=f"File for the record.  [default: MARKED{RECORD_SUFFIX}]")
+@OVERWRITE
 @WORKERS
 @QUIET
 @JSON
@@ -149,6 +152,7 @@ def embed_command(
     meshes: tuple[str, ...],
     schemes: tuple[str, ...],
     record_file: Path | None,
+    overwrite: bool,
     workers: int,
     as_json: bool,
 ) -> None:
@@ -158,7 +162,7 @@ def embed_command(
 
     Writes MARKED, in the same format, and its record. Only positions change, and normals where the file has them;
     materials, colours, groups and comments stay the same, byte by byte. The record holds no secret. `jaxmark detect`
-    takes scheme and payload from it.
+    takes scheme and payload from it. Files that exist are refused without --overwrite.
 
     In a file of several meshes, all that can carry the message are marked; the output names those left unchanged.
 
@@ -176,6 +180,7 @@ def embed_command(
         budget=budget,
         scheme=schemes[0] if len(schemes) == 1 else schemes,
         meshes=meshes,
+        overwrite=overwrite,
     )
     check_distinct(original=original, marked=marked)
     if not original.is_dir():
@@ -183,7 +188,7 @@ def embed_command(
         check_suffix(original, marked)
         check_distinct(original=original, marked=marked, key=key_file, record=record_file)
         outcome = mark(original, marked, record_file, key=read_key(key_file), doing=current().doing)
-        return answer(as_json, outcome.values, outcome.text)
+        return answer(as_json, outcome.values, *outcome.lines)
     if record_file is not None:
         raise JaxmarkError("In a folder, each marked file gets a record next to it; leave out --record.")
     work = partial(_mark_member, partial(mark, key=read_key(key_file)), marked)
@@ -302,7 +307,7 @@ def detect_command(
     if suspect.is_dir():
         _each(suspect, as_json, partial(_read_member, reader, original, record_file, report, dossier), workers)
     outcome = replace(reader, doing=current().doing).read(suspect, original, record_file, report, dossier)
-    answer(as_json, outcome.values, outcome.text)
+    answer(as_json, outcome.values, *outcome.lines)
     sys.exit(outcome.status)
 
 
@@ -384,7 +389,7 @@ def identify_command(
         else f"{entry.recipient}: score {entry.score:.1f}, probability at most {power(entry.log10_p)}"
         for entry in likely
     ]
-    answer(as_json, values, "\n".join(lines) or f"none of {len(names)} recipients is accused (--alpha {alpha:g})")
+    answer(as_json, values, *(lines or [f"none of {len(names)} recipients is accused (--alpha {alpha:g})"]))
     sys.exit(Status.of(bool(accused), bool(likely)))
 
 
@@ -393,13 +398,15 @@ def identify_command(
 @click.option(
     "--output", type=FILE, required=True, help="File for the commitment; a timestamp request is written next to it."
 )
+@OVERWRITE
 @JSON
-def commit_command(records: tuple[Path, ...], output: Path, as_json: bool) -> None:
+def commit_command(records: tuple[Path, ...], output: Path, overwrite: bool, as_json: bool) -> None:
     """Commit to RECORDS, so that a timestamp can prove that they existed before a suspect.
 
     Writes OUTPUT, the commitment, which reveals nothing of the records; and OUTPUT.tsq, a request for a timestamp. To
     timestamp the commitment, publish the root that is printed, or print it on paper, or sign a commit with it; or send
-    OUTPUT.tsq to a timestamping authority (RFC 3161), and keep the answer.
+    OUTPUT.tsq to a timestamping authority (RFC 3161), and keep the answer. Files that exist are refused without
+    --overwrite.
 
     `jaxmark detect --commitment OUTPUT` then prints the bound on the false-positive probability that holds if the
     commitment is older than the suspect. It charges log10 of the number of records.
@@ -407,9 +414,9 @@ def commit_command(records: tuple[Path, ...], output: Path, as_json: bool) -> No
     check_distinct(output=output, **{f"record {place}": path for place, path in enumerate(records)})
     made = make_commitment(load_record(path).digest() for path in records)
     request = output.with_name(output.name + ".tsq")
-    with replacing(request) as draft:
-        write_atomically(draft, made.timestamp_request())
-        write_atomically(output, made.to_json().encode())
+    with writing_pair(request, output, overwrite=overwrite) as (request_draft, draft):
+        write_atomically(request_draft, made.timestamp_request())
+        write_atomically(draft, made.to_json().encode())
     values = {"root": made.root, "records": len(made.digests), "commitment": str(output), "request": str(request)}
     size = f"{len(made.digests)} record{'s' if len(made.digests) > 1 else ''}"
     answer(as_json, values, f"{size} → {output}, root {made.root}, request → {request}")
@@ -484,7 +491,7 @@ def _attack_scene(source: Path, target: Path, steps: list[tuple[str, float]], se
     largest = max(size["rms"] for size in sizes.values())
     lines = [f"{_steps_text(steps)} → {target}, {len(meshes)} meshes, RMS up to {largest:.3g} of their diagonals"]
     lines += [f"left unchanged: {name!r}: {reason}" for name, reason in scene.skipped.items()]
-    answer(as_json, values, "\n".join(lines))
+    answer(as_json, values, *lines)
 
 
 def _steps(words: tuple[str, ...]) -> list[tuple[str, float]]:
@@ -526,7 +533,7 @@ def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> N
         f"{name:<14} {'needs the same connectivity' if value is None else f'{value:.6g}'}"
         for name, value in values.items()
     ]
-    answer(as_json, values, "\n".join(lines))
+    answer(as_json, values, *lines)
 
 
 @cli.command(name="capacity")
@@ -578,7 +585,7 @@ def demo(mesh: Path | None, output: Path, as_json: bool) -> None:
 
     rows = run_demo(mesh, output, partial(say, err=as_json), current().doing)
     if as_json:
-        answer(True, {"output": str(output), "rows": [row._asdict() for row in rows], "verdict": verdict(rows)}, "")
+        answer(True, {"output": str(output), "rows": [row._asdict() for row in rows], "verdict": verdict(rows)})
 
 
 @cli.command(name="study")
@@ -623,7 +630,8 @@ def study_command(file: Path, output: Path, workers: int, as_json: bool) -> None
         for measure in get_args(Measure):
             results.plot(measure).save(output / f"{measure}.png")
         results.save_page(output / "study.html")
-    answer(as_json, {"output": str(output), "readings": len(results.rows), "rates": results.rates()}, table.rstrip())
+    values = {"output": str(output), "readings": len(results.rows), "rates": results.rates()}
+    answer(as_json, values, *table.rstrip().split("\n"))
 
 
 @cli.command(name="unpose")
@@ -667,7 +675,7 @@ def main() -> None:
 
 
 def _refuse(sentence: str) -> NoReturn:
-    click.echo(f"jaxmark: {sentence}", err=True)
+    say(f"jaxmark: {sentence}")
     sys.exit(2)
 
 
@@ -678,7 +686,8 @@ def _each(folder: Path, as_json: bool, work: Work, workers: int) -> NoReturn:
     with closing(each(files, work, workers)) as results:
         for done, (file, outcome) in enumerate(results, 1):
             status = Status.worst([status, outcome.status])
-            answer(as_json, {"file": file.name, **outcome.values}, f"{file.name}: {outcome.text}")
+            first, *others = outcome.lines
+            answer(as_json, {"file": file.name, **outcome.values}, f"{file.name}: {first}", *others)
             pace = (time.monotonic() - start) / done
             current().doing(f"{done}/{len(files)} files of {folder}, {left_over((len(files) - done) * pace)}")
     sys.exit(status)

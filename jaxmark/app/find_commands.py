@@ -20,6 +20,9 @@ from jaxmark.catalogue import Catalogue, Finder, Match, Plan, Verdict, find_each
 from jaxmark.errors import JaxmarkError, require
 from jaxmark.evaluation.cells import Pool, processes
 
+_MOST_REFUSED = 5  # most refusals that a description lists
+_DIGITS = 16  # digits of a record's digest that are printed
+
 
 @catalogue_group.command(name="find")
 @click.argument("suspect", type=FILE, required=False)
@@ -103,7 +106,7 @@ def find_command(
     with opened(catalogue_file) as catalogue:
         verdict = Finder(catalogue, keys, alpha=alpha, bits=bits, depth=depth, align=align).find(suspect)
         keep(catalogue, suspect, verdict)
-    answer(as_json, verdict.as_json(), describe(verdict, alpha))
+    answer(as_json, verdict.as_json(), *describe(verdict, alpha))
     sys.exit(Status.of(bool(verdict.named), bool(verdict.estimates)))
 
 
@@ -134,10 +137,12 @@ def _line(row: Mapping[str, Any]) -> str:
         return f"refused. {row['refused']}"
     if row["estimate"]:
         return f"{ESTIMATE}: no original is named: {'; '.join(row['caveats'])}"
+    refused = sum(match["refused"] is not None for match in row["matches"])
+    refusals = f"; {refused} readings refused" if refused else ""
     if not row["named"]:
-        return "no original is named"
+        return f"no original is named{refusals}"
     content = row["recipient"] or row["message"] or "a mark"
-    return f"{row['original']}, {content}, probability at most {power(row['log10_p'])}"
+    return f"{row['original']}, {content}, probability at most {power(row['log10_p'])}{refusals}"
 
 
 def _listed(file: Path) -> Iterator[Path]:
@@ -177,7 +182,7 @@ def identify_by_catalogue(
     accused = list(dict.fromkeys(name for match in verdict.named for name in match.accused))
     estimates = list(dict.fromkeys(name for match in verdict.estimates for name in match.estimates))
     values = {"accused": accused, "estimates": estimates, **verdict.as_json()}
-    answer(as_json, values, describe(verdict, alpha))
+    answer(as_json, values, *describe(verdict, alpha))
     sys.exit(Status.of(bool(accused), bool(estimates)))
 
 
@@ -198,19 +203,26 @@ def keep(catalogue: Catalogue, suspect: Path, verdict: Verdict) -> None:
         catalogue.record_verdict(verdict.suspect, os.path.realpath(suspect), verdict.as_json())
 
 
-def describe(verdict: Verdict, alpha: float) -> str:
-    """Describe a verdict."""
+def describe(verdict: Verdict, alpha: float) -> tuple[str, ...]:
+    """Describe a verdict in lines, with the refusals."""
+    refused = dict.fromkeys(_refused(match) for match in verdict.matches if match.refused is not None)
+    refusals = list(refused)[:_MOST_REFUSED]
+    if len(refused) > _MOST_REFUSED:
+        refusals.append(f"{len(refused) - _MOST_REFUSED} more could not be read, see --json")
     if verdict.named or verdict.estimates:
-        return "\n".join(_likely(match) for match in verdict.named + verdict.estimates)
+        return (*map(_likely, verdict.named + verdict.estimates), *refusals)
     read = [match for match in verdict.matches if match.refused is None]
     text = f"no original is named: none of {verdict.readings} readings detects a mark (--alpha {alpha:g})"
     if read:
         bound = "about" if read[0].caveats else "at most"
         text += f"; most similar to {_place(read[0])}, probability {bound} {power(read[0].log10_p)}"
         text += "".join(f". {note}" for note in read[0].notes)
-    elif verdict.matches:
-        text += f"; {_place(verdict.matches[0])} could not be read: {verdict.matches[0].refused}"
-    return text + _caveats(read)
+    return text + _caveats(read), *refusals
+
+
+def _refused(match: Match) -> str:
+    record = f", record {match.record[:_DIGITS]}," if match.record else ""
+    return f"{_place(match)}{record} could not be read: {match.refused}"
 
 
 def _caveats(matches: Sequence[Match]) -> str:

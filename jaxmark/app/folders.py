@@ -83,7 +83,7 @@ def _run(work: Work, file: Path) -> FileOutcome:
         return work(file)
     except Exception as error:
         text = error_text(error)
-        return FileOutcome({"refused": text}, f"refused. {text}", Status.REFUSED)
+        return FileOutcome({"refused": text}, (f"refused. {text}",), Status.REFUSED)
     finally:
         release_programs()
 

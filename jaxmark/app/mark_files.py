@@ -13,7 +13,8 @@ from jaxmark.app.process import release_programs
 from jaxmark.app.progress import Doing, quietly
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import Scene, load_mesh, load_scene, load_texture, number_check, save_mesh, save_scene
-from jaxmark.files.atomic import replacing, write_atomically
+from jaxmark.files.atomic import write_atomically
+from jaxmark.files.pair import refuse_existing, writing_pair
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.everyday import embed_scene
@@ -57,9 +58,10 @@ def mark_file(
     budget: Budget,
     scheme: AnyScheme = DEFAULT_SCHEME,
     meshes: Sequence[str] = (),
+    overwrite: bool = False,
     doing: Doing = quietly,
 ) -> FileOutcome:
-    """Mark a mesh file, and write the marked file and its record; if an error occurs, neither is written.
+    """Mark a mesh file, and write the marked file and its record together, see `writing_pair`.
 
     Args:
         original: the mesh file to mark.
@@ -71,13 +73,16 @@ def mark_file(
         budget: see `embed`.
         scheme: see `embed`.
         meshes: names of the meshes to mark, in a file of several meshes; by default all that can carry the message.
+        overwrite: whether an existing marked file and its record may be replaced; the old record is kept.
         doing: progress callback, called with a description of each step that begins.
 
     Raises:
-        JaxmarkError: see `embed`; also if the mark cannot be read from the written file, whose numbers are rounded.
+        JaxmarkError: see `embed`; also if the mark cannot be read from the written file, whose numbers are rounded, or
+            a file exists that may not be replaced.
     """
     if (message is None) == (recipient is None):
         raise JaxmarkError("Give --message, --presence or --recipient, one of them.")
+    refuse_existing(marked, record, overwrite=overwrite)
     doing(f"reading {original}")
     scene = pick(load_scene(original), meshes, original)
     if len(scene.meshes) + len(scene.skipped) > 1:
@@ -86,7 +91,7 @@ def mark_file(
                 f"A fingerprint needs a file of one mesh, and {original} has several; save each mesh in its own file."
             )
         try:
-            return _mark_scene(original, marked, record, scene, message, key, budget, scheme, doing)
+            return _mark_scene(original, marked, record, scene, message, key, budget, scheme, overwrite, doing)
         except JaxmarkError:
             # All objects of an OBJ file share one coordinate system. Marked as one mesh, they may carry a message that
             # is too long for each of them.
@@ -113,7 +118,7 @@ def mark_file(
         result, info = tracer.fingerprint(name, budget)
         prepared, payload = tracer.mark.original, f"fingerprint of {recipient}"
         read_back, check = partial(tracer.finds, recipient=name), None
-    with replacing(marked) as draft, replacing(record) as record_draft:
+    with writing_pair(marked, record, overwrite=overwrite) as (draft, record_draft):
         doing(f"writing {marked}, and measuring the noise that the mark survives")
         save_mesh(result, draft, like=original)
         # The mark must be readable from the written file, whose numbers are rounded.
@@ -149,7 +154,7 @@ def mark_file(
         text += f"; because the mark is weak, it is written in the pass band {band!r}, which is in the record"
     if drift is not None:
         text += f"; the texture drifts by {drift:.2g} texels, if it has 2,048 x 2,048"
-    return FileOutcome(values, text)
+    return FileOutcome(values, (text,))
 
 
 def _mark_scene(
@@ -161,6 +166,7 @@ def _mark_scene(
     key: Key,
     budget: Budget,
     scheme: AnyScheme,
+    overwrite: bool,
     doing: Doing,
 ) -> FileOutcome:
     """Mark all meshes of a file that can carry a message; if an error occurs, neither file nor record is written.
@@ -183,7 +189,7 @@ def _mark_scene(
     doing(f"embedding {len(scene.meshes)} meshes of {original}")
     meshes, info = embed_scene(scene.meshes, message, key, budget=budget, scheme=scheme, after=check)
     survives: dict[str, Survival] = {}
-    with replacing(marked) as draft, replacing(record) as record_draft:
+    with writing_pair(marked, record, overwrite=overwrite) as (draft, record_draft):
         doing(f"writing {marked}, and reading it back")
         notes = save_scene(meshes, draft, like=original)
         # The marks must be readable from the written file, whose numbers are rounded.
@@ -220,11 +226,10 @@ def _mark_scene(
         f"{payload_text(info.record.bits)} in {len(each)} of {len(each) + len(skipped)} meshes → {marked},"
         f" {_moved_text(most)} of their diagonals; record → {record}; the weakest mark survives {survival_text(least)}"
     )
-    for name, reason in list(skipped.items())[:_MOST_NAMED]:
-        text += f"\nleft unchanged: {name!r}: {reason}"
+    lines = [text, *(f"left unchanged: {name!r}: {reason}" for name, reason in list(skipped.items())[:_MOST_NAMED])]
     if len(skipped) > _MOST_NAMED:
-        text += f"\nleft unchanged: {len(skipped) - _MOST_NAMED} more, see --json"
-    return FileOutcome(values, "\n".join([text, *notes]))
+        lines.append(f"left unchanged: {len(skipped) - _MOST_NAMED} more, see --json")
+    return FileOutcome(values, (*lines, *notes))
 
 
 def _without_caches(marker: Any) -> Any:

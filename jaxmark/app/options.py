@@ -29,6 +29,11 @@ MESHES = click.option(
     multiple=True,
     help="Name of a mesh to use, in a file of several meshes. Repeat the option for several meshes.  [default: all]",
 )
+OVERWRITE = click.option(
+    "--overwrite",
+    is_flag=True,
+    help="Replace output files that exist. A replaced record is kept next to the new one, as old-1-….",
+)
 WORKERS = click.option(
     "--workers",
     type=click.IntRange(1),

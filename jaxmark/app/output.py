@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import click
 
+from jaxmark.app.printable import printable
 from jaxmark.app.progress import current
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import file_hash
@@ -49,21 +50,21 @@ class FileOutcome(NamedTuple):
     """The outcome for one file."""
 
     values: dict[str, Any]  # for programs: values for JSON, except that numbers may not be finite
-    text: str  # for people: one sentence
+    lines: tuple[str, ...]  # for people: one sentence, and further lines
     status: Status = Status.DONE
 
 
 def say(line: str, err: bool = True) -> None:
     """Print a line that is not part of the answer; by default on standard error."""
     current().clear()
-    click.echo(line, err=err)
+    click.echo(printable(line), err=err)
 
 
-def answer(as_json: bool, values: Mapping[str, Any], text: str) -> None:
-    """Print an answer: its values as one line of JSON, or its text."""
+def answer(as_json: bool, values: Mapping[str, Any], *lines: str) -> None:
+    """Print an answer: its values as one line of JSON, or its lines."""
     current().clear()
     try:
-        click.echo(json.dumps(_finite(values), allow_nan=False) if as_json else text)
+        click.echo(json.dumps(_finite(values), allow_nan=False) if as_json else "\n".join(map(printable, lines)))
         sys.stdout.flush()
     except BrokenPipeError:
         # The program that reads our output has ended. The work is done, and the exit status still reports the result.
@@ -130,8 +131,10 @@ def detection_status(detection: Detection, alpha: float) -> Status:
 _VERDICTS = {Status.DONE: "detected", Status.ESTIMATE: ESTIMATE, Status.NOTHING: "nothing detected"}
 
 
-def detection_text(detection: Detection, alpha: float, timestamped: Evidence | None, *, charges: bool = False) -> str:
-    """Describe a detection in words.
+def detection_lines(
+    detection: Detection, alpha: float, timestamped: Evidence | None, *, charges: bool = False
+) -> tuple[str, ...]:
+    """Describe a detection in words, in one line, and further lines for charges.
 
     Args:
         detection: the detection.
@@ -159,8 +162,8 @@ def detection_text(detection: Detection, alpha: float, timestamped: Evidence | N
             "": timestamped or evidence,
             **{f" of {name}": part.evidence for name, part in detection.parts.items()},
         }
-        text += "".join(f"\ncharged in log10 p{name}: {_charged(entry)}" for name, entry in named.items())
-    return text
+        return text, *(f"charged in log10 p{name}: {_charged(entry)}" for name, entry in named.items())
+    return (text,)
 
 
 def _charged(evidence: Evidence) -> str:
@@ -179,10 +182,10 @@ def detection_values(
 
     Args:
         detection: the detection.
-        alpha: see `detection_text`.
+        alpha: see `detection_lines`.
         suspect: the suspect's file.
         obtained: when and where the suspect was obtained.
-        timestamped: see `detection_text`.
+        timestamped: see `detection_lines`.
         record_digest: digest of the record; None without a record.
     """
     values = {

@@ -7,6 +7,8 @@ from typing import TextIO
 import click
 import jax
 
+from jaxmark.app.printable import printable
+
 Doing = Callable[[str], None]  # progress callback, called with a description of each step that begins
 
 # Events of JAX: a program is requested, and it was found in the cache, so that it need not be compiled.
@@ -55,7 +57,7 @@ class Progress:
     def _draw(self, line: str) -> None:
         if self._stream is not None:
             width = shutil.get_terminal_size().columns - 1
-            self._stream.write(f"{_START_OF_LINE}{line[:width]}{_ERASE}")
+            self._stream.write(f"{_START_OF_LINE}{printable(line)[:width]}{_ERASE}")
             self._stream.flush()
 
 

@@ -11,7 +11,7 @@ from jaxmark.alignment.result import Align
 from jaxmark.app.diagnosis import diagnose, is_original
 from jaxmark.app.dossier import Case, save_dossier, save_report
 from jaxmark.app.mark_files import pick
-from jaxmark.app.output import FileOutcome, Status, detection_status, detection_text, detection_values
+from jaxmark.app.output import FileOutcome, Status, detection_lines, detection_status, detection_values
 from jaxmark.app.process import release_programs
 from jaxmark.app.progress import Doing, quietly
 from jaxmark.errors import JaxmarkError
@@ -126,8 +126,8 @@ class FileReader:
             timestamped = detection.evidence.charged(*charges)
         digest = None if record is None else record.digest()
         values = detection_values(detection, self.alpha, suspect, self.obtained, timestamped, digest)
-        text = detection_text(detection, self.alpha, timestamped, charges=self.shows_charges)
-        return FileOutcome(values, text, detection_status(detection, self.alpha))
+        lines = detection_lines(detection, self.alpha, timestamped, charges=self.shows_charges)
+        return FileOutcome(values, lines, detection_status(detection, self.alpha))
 
     def _read_blind(self, suspect: Path, record: Record | SceneRecord | None) -> Detection:
         """Read a file without its original; if it has several meshes, read each, and charge for their number."""

@@ -273,20 +273,16 @@ class Catalogue:
         return entry
 
     def check(self) -> Iterator[tuple[Entry, str | None]]:
-        """Yield each original with a problem of its file, which is missing or changed; None if there is no problem."""
+        """Yield each original, and the problem of its file: missing, changed or unreadable; None without a problem."""
         for entry in self.originals():
-            problem, path = None, Path(entry.path)
-            if not path.is_file():
-                problem = "its file is missing"
-            elif path.stat().st_size != entry.bytes or file_hash(path) != entry.content:
-                problem = "its file has changed"
+            problem = _problem(Path(entry.path), entry.bytes, entry.content)
             yield entry, f"{problem}, but the catalogue has a copy" if problem and entry.copied else problem
 
     def load(self, shape: int) -> Mesh:
         """Read the mesh of an original, from its file if that is unchanged, else from the copy in the catalogue.
 
         Raises:
-            JaxmarkError: if the file is missing or changed, and there is no copy.
+            JaxmarkError: if the file is missing, changed or unreadable, and there is no copy; or it lacks the mesh.
         """
         query = (
             "SELECT s.name, o.path, o.content, o.bytes, o.copy FROM shapes s JOIN originals o ON o.id = s.original"
@@ -294,8 +290,8 @@ class Catalogue:
         )
         (row,) = self.database.rows(query, shape)
         path = Path(row["path"])
-        if path.is_file() and path.stat().st_size == row["bytes"] and file_hash(path) == row["content"]:
-            return meshes_of(path).meshes[row["name"]]
+        if _problem(path, row["bytes"], row["content"]) is None:
+            return _mesh_of(path, row["name"])
         if row["copy"] is None:
             raise JaxmarkError(
                 f"The original {path} is missing or has changed; restore it, or add it again from its new path."
@@ -303,7 +299,7 @@ class Catalogue:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / f"original{path.suffix}"
             file.write_bytes(row["copy"])
-            return meshes_of(file).meshes[row["name"]]
+            return _mesh_of(file, row["name"])
 
     def find(self, suspect: str | os.PathLike[str] | Mesh, keys: Sequence[bytes], **options: Any) -> Verdict:
         """Find the originals that a suspect was made from.
@@ -332,6 +328,28 @@ class Catalogue:
         """Yield all stored verdicts, the oldest first."""
         for row in self.database.each("SELECT suspect, path, given, versions, result FROM verdicts ORDER BY id"):
             yield dict(row) | {name: json.loads(row[name]) for name in ("versions", "result")}
+
+
+def _problem(path: Path, size: int, content: str) -> str | None:
+    """Return the problem of an original's file; None if it is readable and unchanged."""
+    try:
+        if not path.is_file():
+            return "its file is missing"
+        return "its file has changed" if path.stat().st_size != size or file_hash(path) != content else None
+    except (JaxmarkError, OSError):
+        return "its file cannot be read"
+
+
+def _mesh_of(path: Path, name: str) -> Mesh:
+    """Read a mesh of a file by its name.
+
+    Raises:
+        JaxmarkError: if the file cannot be read, or has no such mesh.
+    """
+    meshes = meshes_of(path).meshes
+    if name not in meshes:
+        raise JaxmarkError(f"The original {path} has no mesh {name!r}; remove it from the catalogue, and add it again.")
+    return meshes[name]
 
 
 def _now() -> str:

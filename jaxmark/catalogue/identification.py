@@ -7,8 +7,9 @@ significance budget nevertheless covers every original of the catalogue, with ev
 import json
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar, get_args, runtime_checkable
 
 import numpy as np
@@ -72,7 +73,7 @@ class Match(NamedTuple):
     caveats: tuple[str, ...] = ()  # reasons why the probabilities are estimates
     charges: tuple[Charge, ...] = ()  # choices that `log10_p` is charged for
     notes: tuple[str, ...] = ()
-    refused: str | None = None  # the reason why the piece could not be read
+    refused: str | None = None  # the reason why the piece could not be read, with this record if one is named
 
     @property
     def order(self) -> tuple[bool, float, bool, float]:
@@ -84,7 +85,7 @@ class Verdict(NamedTuple):
     """The result of identifying a suspect."""
 
     suspect: str  # SHA-256 of its file, hexadecimal; empty for a mesh without a file
-    matches: tuple[Match, ...]  # all comparisons, the likeliest first
+    matches: tuple[Match, ...]  # all comparisons and all refusals, the likeliest first
     readings: int  # number of readings that could have been made, by which all probabilities are corrected
 
     @property
@@ -151,6 +152,18 @@ class _Comparison(NamedTuple):
         The suspect was made with such a record.
         """
         return not self.match.named, not self.agrees, self.match.log10_p
+
+    def refused(self, reason: JaxmarkError | str, **fields: Any) -> "_Comparison":
+        """Return the comparison without a result, for a reason."""
+        return self._replace(match=self.match._replace(refused=str(reason), **fields))
+
+
+class _Stored(NamedTuple):
+    """The stored records of an original under a key."""
+
+    records: list[Record]  # of messages and presence marks
+    ways: list[tuple[Record, list[str]]]  # one record for each way of marking copies, with its recipients
+    refusals: dict[str, str]  # records that cannot be used by their digests, and the reasons
 
 
 @runtime_checkable
@@ -330,75 +343,100 @@ class Finder(Generic[AnyOriginals]):
                     continue
                 compared.add(near.shape)
                 match = Match(rows[0]["path"], rows[0]["name"], piece.name, by, number, near.distance)
-                best = self._best(_Comparison(match, piece.mesh, piece.mesh, readings), near.shape)
-                is_whole |= best.match.coverage >= _WHOLE
-                yield best
+                comparison = _Comparison(match, piece.mesh, piece.mesh, readings)
+                for reading in self._best(comparison, near.shape):
+                    is_whole |= reading.match.coverage >= _WHOLE
+                    yield reading
 
-    def _best(self, pair: _Comparison, shape: int) -> _Comparison:
-        """Read a piece with an original in all ways, and return the most significant reading."""
-        best = None
+    def _best(self, pair: _Comparison, shape: int) -> list[_Comparison]:
+        """Read a piece with an original in all ways; returns all refusals, and then the most significant reading.
+
+        A refusal ends one reading only: otherwise, a record that anybody can forge would hide all marks of an original.
+        """
         try:
             pair = pair._replace(original=self.catalogue.load(shape))
-            for reading in self._read(pair, shape):
-                if best is None or reading.order < best.order:
-                    best = reading
-                if reading.match.named and reading.agrees:
-                    break
         except JaxmarkError as error:
-            pair = pair._replace(match=pair.match._replace(refused=str(error)))
-        return best or pair
+            return [pair.refused(error)]
+        refusals, best = [], None
+        for reading in self._read(pair, shape):
+            if reading.match.refused is not None:
+                refusals.append(reading)
+                continue
+            if best is None or reading.order < best.order:
+                best = reading
+            if reading.match.named and reading.agrees:
+                break
+        return [*refusals, best] if best is not None else refusals or [pair]
 
     def _read(self, pair: _Comparison, shape: int) -> Iterator[_Comparison]:
-        """Read a piece with an original, by each key and record."""
+        """Read a piece with an original, by each key and record; each reading that is refused is yielded as well."""
         for name, key in self.keys.items():
-            records, traced = self._stored(shape, name)
-            for record, recipients in traced:
-                yield self._trace(pair._replace(readings=pair.readings * len(traced)), key, record, recipients)
-            if self.only_recipients:
-                continue
-            for record in records or [None]:
-                bits = self.bits if record is None else None
-                marker = make_marker(pair.original, key, bits=bits, record=record)
-                detection, mark = alternatives(marker).read(pair.suspect, align=self.align)
-                evidence = detection.evidence.charged(ledger.ORIGINALS.charge("original", pair.readings))
-                detection = detection._replace(evidence=evidence)
-                message, registration = detection.message, detection.registration
-                match = pair.match._replace(
-                    named=detection.detected(self.alpha),
-                    estimate=bool(evidence.caveats) and detection.detected(self.alpha, allow_estimate=True),
-                    message=None if message is None else message.hex(),
-                    log10_p=evidence.log10_p,
-                    log10_p_uncommitted=evidence.log10_p_uncommitted,
-                    key=name,
-                    record=None if record is None else record.digest(),
-                    coverage=detection.coverage,
-                    residual=_finite(registration.residual),
-                    caveats=evidence.caveats,
-                    charges=evidence.charges,
-                    notes=detection.notes,
-                )
-                agrees = message is None or is_recorded(record, message, mark.choices) is not False
-                yield pair._replace(match=match, pose=registration.pose, agrees=agrees)
+            stored = self._stored(shape, key)
+            for digest, reason in stored.refusals.items():
+                yield pair.refused(reason, key=name, record=digest)
+            readings: list[tuple[Record | None, Callable[[], _Comparison]]] = []
+            traced = pair._replace(readings=pair.readings * len(stored.ways))
+            readings += [(record, partial(self._trace, traced, key, record, names)) for record, names in stored.ways]
+            # Without any usable record, the original is read as if it had none. This is one reading, and at least one
+            # was counted for its records.
+            untraced = [] if self.only_recipients else stored.records or [None]
+            readings += [(record, partial(self._detect, pair, key, record)) for record in untraced]
+            for record, read in readings:
+                try:
+                    yield read()
+                except JaxmarkError as error:
+                    yield pair.refused(error, key=name, record=None if record is None else record.digest())
 
-    def _stored(self, shape: int, key: str) -> tuple[list[Record], list[tuple[Record, list[str]]]]:
-        """Return the stored records of an original under a key.
-
-        Returns:
-            The records of messages and presence marks; and one record for each way of marking copies, with its
-            recipients.
-        """
-        rows = self.catalogue.database.rows
+    def _stored(self, shape: int, key: Key) -> _Stored:
+        """Return the stored records of an original under a key, without those that were edited or are damaged."""
+        rows, name = self.catalogue.database.rows, commitment(key)
+        records: dict[str, Record] = {}
+        refusals: dict[str, str] = {}
         query = "SELECT digest, json FROM records WHERE shape = ? AND key = ? ORDER BY added DESC, digest"
-        records = {
-            row["digest"]: Record.of(_parsed(row["json"]), "in the catalogue") for row in rows(query, shape, key)
-        }
+        for row in rows(query, shape, name):
+            try:
+                record = Record.of(_parsed(row["json"]), "in the catalogue")
+                record.check(record.content, key)
+                records[row["digest"]] = record
+            except JaxmarkError as error:
+                refusals[row["digest"]] = str(error)
         ways: dict[tuple[Any, ...], tuple[Record, list[str]]] = {}
         query = "SELECT recipient, record FROM copies WHERE shape = ? AND key = ? ORDER BY id"
-        for row in rows(query, shape, key):
-            record = records[row["record"]]
+        for row in rows(query, shape, name):
+            record = records.get(row["record"])
+            if record is None:
+                belongs = f"It is the record of the copy for {row['recipient']}, but of another original or key."
+                refusals.setdefault(row["record"], belongs)
+                continue
             way = record.version, record.scheme, record.bits, repr(sorted(record.parameters.items()))
             ways.setdefault(way, (record, []))[1].append(row["recipient"])
-        return [record for record in records.values() if record.content != "fingerprint"], list(ways.values())
+        messages = [record for record in records.values() if record.content != "fingerprint"]
+        return _Stored(messages, list(ways.values()), refusals)
+
+    def _detect(self, pair: _Comparison, key: Key, record: Record | None) -> _Comparison:
+        """Read a message or a presence mark in a piece."""
+        bits = self.bits if record is None else None
+        marker = make_marker(pair.original, key, bits=bits, record=record)
+        detection, mark = alternatives(marker).read(pair.suspect, align=self.align)
+        evidence = detection.evidence.charged(ledger.ORIGINALS.charge("original", pair.readings))
+        detection = detection._replace(evidence=evidence)
+        message, registration = detection.message, detection.registration
+        match = pair.match._replace(
+            named=detection.detected(self.alpha),
+            estimate=bool(evidence.caveats) and detection.detected(self.alpha, allow_estimate=True),
+            message=None if message is None else message.hex(),
+            log10_p=evidence.log10_p,
+            log10_p_uncommitted=evidence.log10_p_uncommitted,
+            key=commitment(key),
+            record=None if record is None else record.digest(),
+            coverage=detection.coverage,
+            residual=_finite(registration.residual),
+            caveats=evidence.caveats,
+            charges=evidence.charges,
+            notes=detection.notes,
+        )
+        agrees = message is None or is_recorded(record, message, mark.choices) is not False
+        return pair._replace(match=match, pose=registration.pose, agrees=agrees)
 
     def _trace(self, pair: _Comparison, key: Key, record: Record, recipients: list[str]) -> _Comparison:
         """Test a piece for the copies of recipients."""

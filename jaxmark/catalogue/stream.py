@@ -87,7 +87,10 @@ def find_each(
         for path, row in _run(pool, ahead, plan, _unfinished(suspects, finished), log):
             line = {"suspect": path, "identity": _identity(path), **row}
             if catalogue is not None and "refused" not in row:
-                catalogue.record_verdict(row["suspect_sha256"], path, row)
+                try:
+                    catalogue.record_verdict(row["suspect_sha256"], path, row)
+                except JaxmarkError as error:  # such as for a name that is not UTF-8
+                    log(f"The verdict on {path} is not stored in the catalogue: {error}")
             append(dead if "refused" in row else target, line)
             yield line
 
@@ -112,7 +115,10 @@ def mesh_files_below(folder: Path) -> Iterator[Path]:
 def _unfinished(suspects: Iterable[str | os.PathLike[str]], finished: set[bytes]) -> Iterator[str]:
     """Yield the suspects that are not finished, each once."""
     for suspect in suspects:
-        path = os.path.realpath(suspect)
+        try:
+            path = os.path.realpath(suspect)
+        except ValueError:  # a NUL in its name: it is refused when it is read
+            path = os.fspath(suspect)
         digest = _digest(_identity(path))
         if digest not in finished:
             finished.add(digest)

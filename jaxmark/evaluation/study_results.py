@@ -53,7 +53,7 @@ class Results:
         lines = []
         for point, rate in cells.items():
             mark = rate["marked"]
-            line = [f"{one:g}" if isinstance(one, float) else str(one) for one in point]
+            line = [f"{one:g}" if isinstance(one, float) else " ".join(str(one).split()) for one in point]
             low, high = 100 * mark["read_low"], 100 * mark["read_high"]
             line += [f"{mark['read']}/{mark['trials']}", f"{low:.0f} - {high:.0f}"]
             line += [f"{100 * mark['bit_errors']:.1f} %", f"{mark['log10_p']:.1f}", f"{mark['log10_p_unfloored']:.1f}"]
@@ -76,7 +76,8 @@ class Results:
             for row in self.rows
             if row.refusal and row.control != "wrong-key"
         )
-        return [f"{', '.join(case[:-1])}, {count} ×: {case[-1]}" for case, count in counts.items()]
+        said = (f"{', '.join(case[:-1])}, {count} ×: {case[-1]}" for case, count in counts.items())
+        return [" ".join(line.split()) for line in said]
 
     def save_page(self, path: str | os.PathLike[str], title: str = "What a mark survives") -> None:
         """Write an HTML page with pictures, table, controls and refusals, without external resources. Needs `plot`.

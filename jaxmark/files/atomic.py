@@ -190,12 +190,14 @@ def replacing(target: Path) -> Iterator[Path]:
     symbolic link is followed. Refusals of the draft name the file.
 
     Raises:
-        JaxmarkError: if the file's folder does not exist, or the target is itself a folder.
+        JaxmarkError: if the file's folder does not exist, or the target exists and is no ordinary file.
     """
     if not target.parent.is_dir():
         raise JaxmarkError(f"The folder {target.parent} does not exist.")
     if target.is_dir():
         raise JaxmarkError(f"{target} is a folder; name a file.")
+    if target.exists() and not target.is_file():
+        raise JaxmarkError(f"Cannot write {target}: it is not an ordinary file.")
     real = Path(os.path.realpath(target))
     _clear_drafts(real.parent)
     with tempfile.TemporaryDirectory(prefix=_own_prefix(), dir=real.parent) as folder:

@@ -301,6 +301,26 @@ def test_key_files_are_private_and_keys_never_shown(workshop: Workshop):
     assert owner not in Path("marked.ply.jaxmark.json").read_text()
 
 
+def test_existing_files_are_replaced_on_request_only(workshop: Workshop):
+    """The record of a copy that was handed out is kept."""
+    record, mark = "marked.ply.jaxmark.json", ("--key", "owner.key", "--message", "c0ffee00c0ffee00")
+    workshop.embed()
+    first = Path(record).read_bytes()
+    refusal = "jaxmark: {} exists; give another name, or replace it by --overwrite.\n"
+    assert workshop.refused("embed", "model.ply", "marked.ply", *mark) == refusal.format("marked.ply")
+    Path("marked.ply").rename("given away.ply")
+    assert workshop.refused("embed", "model.ply", "marked.ply", *mark) == refusal.format(record)
+    Path("given away.ply").rename("marked.ply")
+    workshop.json("embed", "model.ply", "marked.ply", *mark, "--overwrite")
+    assert Path(f"old-1-{record}").read_bytes() == first
+    assert workshop.json("detect", "marked.ply", *DETECT, "--record", record)["message"] == "c0ffee00c0ffee00"
+    workshop.json("commit", record, "--output", "commitment.json")
+    before = Path("commitment.json").read_bytes()
+    assert "commitment.json" in workshop.refused("commit", f"old-1-{record}", "--output", "commitment.json")
+    workshop.json("commit", f"old-1-{record}", "--output", "commitment.json", "--overwrite")
+    assert Path("old-1-commitment.json").read_bytes() == before != Path("commitment.json").read_bytes()
+
+
 def test_help_teaches_and_units_are_stated(workshop: Workshop):
     for command in (
         [],

@@ -26,26 +26,26 @@ class Count:
         if file.stem == "c":
             raise jm.JaxmarkError(f"{file} is not to my liking.")
         self._seen.append(file.stem)
-        return FileOutcome({"worker": os.getpid(), "seen": len(self._seen)}, file.stem)
+        return FileOutcome({"worker": os.getpid(), "seen": len(self._seen)}, (file.stem,))
 
 
 def die(file: Path) -> FileOutcome:
     """As a process does that takes too much memory."""
     os.kill(os.getpid(), signal.SIGKILL)
-    return FileOutcome({}, "")
+    return FileOutcome({}, ())
 
 
 def wait(file: Path) -> FileOutcome:
     """Leave a draft while it works, as jobs do, which is removed whatever ends it."""
     if file.stem == "f":
-        return FileOutcome({}, "")
+        return FileOutcome({}, ())
     draft = file.with_suffix(".draft")
     try:
         draft.touch()
         time.sleep(60)
     finally:
         draft.unlink()
-    return FileOutcome({}, "")
+    return FileOutcome({}, ())
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def test_several_workers_report_each_file(files):
     told = dict(each(files, Count(), workers=2))
     assert {file.stem for file in told} == set("abcdef")
     refused = {"refused": f"{files[2]} is not to my liking."}
-    assert told.pop(files[2]) == FileOutcome(refused, text_of_c(files), Status.REFUSED)
+    assert told.pop(files[2]) == FileOutcome(refused, (text_of_c(files),), Status.REFUSED)
     # Each worker keeps what it has prepared, and counts on from file to file.
     by_worker: dict[int, list[int]] = {}
     for one in told.values():
@@ -70,7 +70,7 @@ def test_several_workers_report_each_file(files):
     assert os.getpid() not in by_worker
     assert all(sorted(seen) == list(range(1, len(seen) + 1)) for seen in by_worker.values())
     alone = Count()
-    assert [(file.stem, one.text) for file, one in each(files, alone)] == [
+    assert [(file.stem, *one.lines) for file, one in each(files, alone)] == [
         (file.stem, text_of_c(files) if file.stem == "c" else file.stem) for file in files
     ]
 

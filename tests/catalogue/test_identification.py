@@ -1,6 +1,7 @@
 """Which of several originals a suspect is, and whose copy."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from jaxmark.catalogue.landmarks import KEPT, MOST, LandmarkIndex, landmarks
 from jaxmark.catalogue.partial_registration import Part, fit_whole
 from jaxmark.geometry.mesh import compact
 from jaxmark.watermark.coding.keys import commitment
+from jaxmark.watermark.record import Record
 from tests.app.test_cli import Workshop
 from tests.samples import rough_sphere
 
@@ -31,6 +33,7 @@ class Shop(NamedTuple):
     originals: list[jm.Mesh]
     key: jm.Key
     marked: dict[int, jm.Mesh]
+    records: dict[int, Record]
 
 
 def joined(*meshes: jm.Mesh) -> jm.Mesh:
@@ -60,8 +63,9 @@ def shop(tmp_path_factory: pytest.TempPathFactory) -> Shop:
         for number, mesh in enumerate(originals):
             jm.save_mesh(mesh, folder / f"{number}.obj")
             catalogue.add(folder / f"{number}.obj")
-    marked = {number: jm.embed(originals[number], MESSAGE, key, budget=0.004)[0] for number in (1, 3)}
-    return Shop(folder / "shop.db", originals, key, marked)
+    made = {number: jm.embed(originals[number], MESSAGE, key, budget=0.004) for number in (1, 3)}
+    marked, records = {number: made[number][0] for number in made}, {number: made[number][1].record for number in made}
+    return Shop(folder / "shop.db", originals, key, marked, records)
 
 
 def named(shop: Shop, suspect: jm.Mesh, *keys: jm.Key, **options) -> tuple[list[str], jm.catalogue.Verdict]:
@@ -140,7 +144,7 @@ def test_other_ways_of_aligning_are_charged(shop: Shop):
     (original,) = (charge for charge in auto.named[0].charges if charge.taken == "original")
     assert original.log10 == pytest.approx(math.log10(auto.readings))
     refused = Match("3.obj", "", "", "landmarks", 1, 0.0, refused="The vertices are in another order.")
-    assert "3.obj could not be read: The vertices" in describe(Verdict("", (refused,), 1), 1e-6)
+    assert "3.obj could not be read: The vertices are in another order." in describe(Verdict("", (refused,), 1), 1e-6)
 
 
 def test_nobody_is_named_without_the_key_or_the_mark(shop: Shop):
@@ -183,6 +187,70 @@ def test_records_bind_and_are_paid_for(shop: Shop, tmp_path: Path):
         assert (verdict.named[0].message, verdict.named[0].record) == (MESSAGE.hex(), info.record.digest())
 
 
+def test_a_record_that_is_refused_hides_no_other_evidence(shop: Shop, tmp_path: Path):
+    """Records that anybody can forge, alone and beside a genuine one; and records that are damaged in the file."""
+    mesh, genuine = shop.originals[3], shop.records[3]
+    suspect = jm.attack(shop.marked[3], "noise", 0.02, seed=0)  # read far from the floor of log10 p
+    forged = [replace(genuine, beta=2 * genuine.beta, code=code) for code in ("00" * 32, "11" * 32, "22" * 32)]
+    damaged = {forged[1].digest(): forged[1].to_json().replace("11" * 32, "ö"), forged[2].digest(): "{"}
+    jm.save_mesh(mesh, tmp_path / "3.obj")
+    with jm.Catalogue(tmp_path / "own.db") as catalogue:
+        catalogue.add(tmp_path / "3.obj")
+        for record in forged:
+            catalogue.add_record(record)
+        with catalogue.database.writing():
+            for digest, text in damaged.items():
+                catalogue.database.run("UPDATE records SET json = ? WHERE digest = ?", text, digest)
+        for records, used in ((forged, None), ([*forged, genuine], genuine)):
+            if used is not None:
+                catalogue.add_record(used)
+            alone = jm.detect(suspect, original=mesh, key=shop.key, record=used, bits=8 * len(MESSAGE)).log10_p
+            verdict = catalogue.find(suspect, [shop.key], bits=8 * len(MESSAGE))
+            (match,) = verdict.named
+            assert match.message == MESSAGE.hex()
+            assert match.record == (None if used is None else used.digest())
+            assert verdict.readings == len(records)
+            assert match.log10_p == pytest.approx(alone + math.log10(len(records)), abs=1e-6)
+            refused = {one.record: one.refused for one in verdict.matches if one.refused is not None}
+            assert set(refused) == {record.digest() for record in forged}
+            reasons = ("was edited", "code out of range", "not a record")
+            for record, reason in zip(forged, reasons, strict=True):
+                assert reason in (refused[record.digest()] or "")
+            shown = [entry["record"] for entry in verdict.as_json()["matches"] if entry["refused"]]
+            assert set(shown) == set(refused)
+            first, *others = describe(verdict, 1e-6)
+            assert MESSAGE.hex() in first
+            assert len(others) == len(forged)
+            assert any(
+                f"record {forged[0].digest()[:16]}, could not be read: The record was edited" in x for x in others
+            )
+
+
+@pytest.mark.long
+def test_a_refused_record_of_a_copy_hides_no_other_recipient(shop: Shop, tmp_path: Path):
+    mesh = rough_sphere(2500, 8)
+    jm.save_mesh(mesh, tmp_path / "8.obj")
+    copy, info = jm.fingerprint(mesh, "bob", shop.key, budget=0.004)
+    forged = replace(info.record, beta=2 * info.record.beta)
+    with jm.Catalogue(tmp_path / "own.db") as catalogue:
+        catalogue.add(tmp_path / "8.obj")
+        catalogue.add_copy(forged, "alice", "00" * 32)
+        catalogue.add_copy(info.record, "bob", "11" * 32)
+        options = {"only_recipients": True, "align": "same", "depth": 1}
+        verdict = Finder(catalogue, [shop.key], **options).find(copy)
+        assert [match.accused for match in verdict.named] == [("bob",)]
+        assert [match.record for match in verdict.matches if match.refused] == [forged.digest()]
+        # A copy of another mesh, as only a hostile export contains it.
+        jm.save_mesh(shop.originals[0], tmp_path / "0.obj")
+        catalogue.add(tmp_path / "0.obj")
+        with catalogue.database.writing():
+            catalogue.database.run("UPDATE copies SET shape = 2 WHERE recipient = 'alice'")
+        verdict = Finder(catalogue, [shop.key], **options).find(shop.originals[0])
+        assert [match.refused for match in verdict.matches if Path(match.original).name == "0.obj"] == [
+            "It is the record of the copy for alice, but of another original or key."
+        ]
+
+
 @pytest.fixture
 def workshop(tmp_path, monkeypatch, capfd) -> Workshop:
     return Workshop(tmp_path, monkeypatch, capfd)
@@ -194,9 +262,11 @@ def test_copies_are_issued_and_traced(workshop: Workshop):
     jm.save_mesh(rough_sphere(SIZE, 7), "other.ply")
     shop = ("--key", "owner.key", "--catalogue", "shop.db")
     workshop("catalogue", "add", "other.ply", "--catalogue", "shop.db")
-    for name in ("alice", "bob", "alice"):
-        told = workshop.json("mark-for", name, "model.ply", *shop)
+    for name, *again in (("alice",), ("bob",), ("alice", "--overwrite")):
+        told = workshop.json("mark-for", name, "model.ply", *shop, *again)
         assert told["marked"] == f"model-{name}.ply"
+    assert "exists" in workshop.refused("mark-for", "alice", "model.ply", *shop)
+    assert list(Path().glob("old-*")) == []  # the same copy has the same record
     assert "--output" in workshop.refused("mark-for", "../eve", "model.ply", *shop)
     assert "the original" in workshop.refused("mark-for", "eve", "model.ply", *shop, "--output", "model.ply")
     assert "copy for alice" in workshop.json("catalogue", "add", "model-alice.ply", *shop[2:], status=2)["refused"]

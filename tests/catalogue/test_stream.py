@@ -190,3 +190,18 @@ def test_dask_workers_search_as_one_process_does(tmp_path: Path, monkeypatch):
     assert rows == alone
     assert (Path(rows["marked.obj"]["original"]).name, rows["marked.obj"]["message"]) == ("0.obj", b"ab".hex())
     assert not rows["nobodys.obj"]["named"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="other systems have no such names")
+def test_names_that_cannot_be_stored_stop_no_other_suspect(folder: Path, quick: Quick):
+    """A name that is not UTF-8, which SQLite refuses, and one with a NUL, which no file can have."""
+    odd = "suspects/\udcff.obj"
+    Path("suspects/a.obj").rename(odd)
+    said: list[str] = []
+    rows = run(suspects=[odd, "suspects/\0.obj", "suspects/b.obj"], said=said.append)
+    assert [Path(row["suspect"]).name for row in rows] == ["\udcff.obj", "\0.obj", "b.obj"]
+    assert ["refused" in row for row in rows] == [False, True, False]
+    assert len(said) == 1
+    assert "not stored in the catalogue" in said[0]
+    with jm.Catalogue("shop.db", read_only=True) as catalogue:
+        assert [Path(verdict["path"]).name for verdict in catalogue.verdicts()] == ["b.obj"]

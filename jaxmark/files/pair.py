@@ -1,0 +1,105 @@
+"""Write a file and the record that belongs to it, so that a killed process leaves no file beside another's record."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.files.atomic import read_file, replacing, write_atomically
+
+
+def refuse_existing(*paths: Path, overwrite: bool) -> None:
+    """Refuse files that exist already, unless they may be overwritten.
+
+    Raises:
+        JaxmarkError: if one of them exists.
+    """
+    for path in paths:
+        if not overwrite and path.is_file():
+            raise JaxmarkError(f"{path} exists; give another name, or replace it by --overwrite.")
+
+
+@contextmanager
+def writing_pair(file: Path, record: Path, *, overwrite: bool = False) -> Iterator[tuple[Path, Path]]:
+    """Yield drafts of a file and of its record, which get their names if the block succeeds, and are deleted if not.
+
+    No record is ever lost, and the record beside the file is always that of this file, even if the process is killed at
+    any moment:
+
+    - A new file gets its name after its record. Between the two steps, there is a record without a file.
+    - If the pair exists already, the old record is first copied to `old-1-NAME` in its folder, and the old file is
+      renamed to `old-1-NAME` in its folder; the number is the first that neither name has yet. The new record and the
+      new file then get their names. Until they have, the old pair is complete, under its own names or under those with
+      `old-1-`, and there is no file of the given name. At the end, the old file is deleted. The old record stays, for
+      copies that were handed out, unless it is equal to the new one.
+
+    Args:
+        file: path of the file.
+        record: path of its record.
+        overwrite: whether existing files may be replaced.
+
+    Raises:
+        JaxmarkError: if one of them exists and may not be replaced; see `replacing`. The files are then as before.
+    """
+    refuse_existing(file, record, overwrite=overwrite)
+    old = None
+    try:
+        with replacing(file) as draft, replacing(record) as record_draft:
+            yield draft, record_draft
+            refuse_existing(file, record, overwrite=overwrite)  # another process may have written them meanwhile
+            old = _Old.of(file, record)
+            old.set_aside()
+    except BaseException:
+        if old is not None:
+            old.restore()
+        raise
+    if old is not None:
+        old.discard()
+
+
+class _Old(NamedTuple):
+    """The file and the record of a pair, and the names that the old ones have while they are replaced."""
+
+    file: Path
+    record: Path
+    aside: Path | None  # the old file; None if there is none
+    copy: Path | None  # a copy of the old record; None if there is none
+
+    @classmethod
+    def of(cls, file: Path, record: Path) -> "_Old":
+        """Choose names that no file has yet."""
+        file, record = (Path(os.path.realpath(path)) for path in (file, record))
+        names = ([path.with_name(f"old-{number}-{path.name}") for path in (file, record)] for number in count(1))
+        aside, copy = next(pair for pair in names if not any(path.exists() for path in pair))
+        return cls(file, record, aside if file.exists() else None, copy if record.exists() else None)
+
+    def set_aside(self) -> None:
+        """Copy an existing record, and then rename an existing file."""
+        if self.copy is not None:
+            write_atomically(self.copy, read_file(self.record))
+        if self.aside is not None:
+            self.file.rename(self.aside)
+
+    def restore(self) -> None:
+        """Undo as much as was done, unless the new pair is complete: give record and file their names again."""
+        if not self.file.exists():
+            if self.copy is None:
+                self.record.unlink(missing_ok=True)
+            elif self.copy.exists():
+                write_atomically(self.record, read_file(self.copy))
+            if self.aside is not None:
+                self.aside.rename(self.file)
+        self._drop_equal()
+
+    def discard(self) -> None:
+        """Delete the old file, and a copy of the old record that is equal to the new record."""
+        if self.aside is not None:
+            self.aside.unlink()
+        self._drop_equal()
+
+    def _drop_equal(self) -> None:
+        if self.copy is not None and self.copy.exists() and read_file(self.copy) == read_file(self.record):
+            self.copy.unlink()
