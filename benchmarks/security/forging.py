@@ -8,22 +8,27 @@ For suspects without the owner's mark, the owner chooses afterwards what should 
   edited     the presented original is edited: points are moved against the mark, or so that the imprint no longer
              recognises them; the suspects are the original itself, and the original with noise
   message    the message is the one that decodes best, whatever its tag
+  scenes     of many originals, those are united that agree with the suspect: variants of one mesh, without a record, or
+             meshes of an honest record, picked by name or by damaging the others
+  records    fields of a scene's record are forged, and the record is sealed and timestamped as it is
 
 The output has log10 p as `jaxmark.detect` prints it, committed and uncommitted; the lowest over keys and suspects, if
 there are several. The exit status is 1 if chance does not explain a figure: if it is lower, by two orders of magnitude,
 than the least of that many tries. The search for the message stops before its tag, which would take 2^28 hashes; it is
 judged by the figure that would be printed.
 
-    python benchmarks/security/forging.py MESH [--strengths] [--grinding] [--edited] [--message]
-        [--keys N] [--tries N] [--bands N ...]
+    python benchmarks/security/forging.py MESH [--strengths] [--grinding] [--edited] [--message] [--scenes] [--records]
+        [--keys N] [--tries N] [--bands N ...] [--originals N]
 
 Without the flag of a section, all sections are run.
 """
 
 import argparse
 import dataclasses
+import json
 import math
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from pathlib import Path
@@ -44,10 +49,13 @@ from jaxmark.watermark.carriers import make_chips
 from jaxmark.watermark.coding import polar
 from jaxmark.watermark.coding.keys import bind
 from jaxmark.watermark.coding.message import TAG_BITS, encode
+from jaxmark.watermark.everyday import detect_scene
 from jaxmark.watermark.evidence import bounds, ledger
+from jaxmark.watermark.evidence.detection import Detection
 from jaxmark.watermark.evidence.ledger import Charge, figure, uncommitted
 from jaxmark.watermark.markers import NonBlindMarker
-from jaxmark.watermark.record import Record, commit
+from jaxmark.watermark.nonblind import claims_of as claims_of_mark
+from jaxmark.watermark.record import Record, SceneRecord, commit, load_record, make_commitment
 from jaxmark.watermark.schemes.keyed import KeyedScheme
 from jaxmark.watermark.schemes.registry import parameters_of
 
@@ -70,6 +78,7 @@ FACTORS = (0.01, 0.5, 1.0, 2.0)  # of the mark's displacement, by which points a
 GRID_STEPS = 20  # by which points are moved that the imprint shall not recognise
 NOISE = 0.0005
 PAYLOADS = (64, 128, 256)
+VARIANT, RECORDED = 1e-4, 150  # noise of the variants of a mesh, and number of meshes in a scene's record
 
 Checks = dict[str, bool]  # whether chance explains the figures of each kind
 
@@ -326,6 +335,109 @@ def message(mesh: Mesh, seen: dict[str, Mesh], bits: int) -> Row:
     }
 
 
+def claimed_score(marker: NonBlindMarker, suspect: Mesh) -> float:
+    """Score of the message over its norm, by the first way of weighting."""
+    score, norm = claims_of_mark(marker, marker.receive(marker.register(suspect)), MESSAGE)[0]
+    return float(score) / float(norm)
+
+
+def scenes(mesh: Mesh, count: int) -> list[Row]:
+    """Unite the originals that agree with an unmarked suspect."""
+    key, suspect = key_of(0), jm.attack(mesh, "noise", 0.001, seed=1)
+    originals = {str(number): jm.attack(mesh, "noise", VARIANT, seed=number + 2) for number in range(count)}
+    markers = {name: jm.make_marker(one, key, bits=8 * len(MESSAGE)) for name, one in originals.items()}
+    scores = {}
+    for name, marker in markers.items():
+        scores[name] = claimed_score(dataclasses.replace(marker), suspect)
+        if len(scores) % 100 == 0:
+            say(f"{len(scores)} of {count} originals")
+    recorded = list(originals)[:RECORDED]
+    record = SceneRecord({name: record_of(markers[name]) for name in recorded})
+    chosen, picked = best_set(scores), best_set({name: scores[name] for name in recorded})
+    options = {"key": key, "message": MESSAGE, "align": "same"}
+    free = detect_scene({"suspect": suspect}, originals={name: originals[name] for name in chosen}, **options)
+    honest = {"originals": {name: originals[name] for name in recorded}, "record": record, **options}
+    every = detect_scene({"suspect": suspect}, **honest)
+    by_name = detect_scene({"suspect": suspect}, **honest, names=picked)
+    damaged = {name: original if name in picked else mesh for name, original in honest["originals"].items()}
+    try:
+        figure_of_damaged = f"{detect_scene({'suspect': suspect}, **{**honest, 'originals': damaged}).log10_p:.2f}"
+    except jm.JaxmarkError:
+        figure_of_damaged = "refused"
+    return [
+        {"originals": f"{len(chosen)} of {count} variants", **both(free)},
+        {"originals": f"all {len(recorded)} of a record", **both(every)},
+        {"originals": f"{len(picked)} of {len(recorded)} of a record, by name", **both(by_name)},
+        {"originals": f"{len(picked)} of {len(recorded)} of a record, others damaged", "committed": figure_of_damaged},
+    ]
+
+
+def best_set(scores: dict[str, float]) -> list[str]:
+    """The meshes whose scores have the largest sum over the root of their number."""
+    names = sorted(scores, key=lambda name: -scores[name])
+    sums = np.cumsum([scores[name] for name in names]) / np.sqrt(np.arange(1, len(names) + 1))
+    return names[: int(np.argmax(sums)) + 1]
+
+
+def both(found: Detection) -> Row:
+    return {"committed": found.log10_p, "uncommitted": found.evidence.log10_p_uncommitted}
+
+
+def records(mesh: Mesh) -> list[Row]:
+    """Load records of a scene with forged fields, which the owner sealed, and read with those that load."""
+    key, suspect = key_of(0), jm.attack(mesh, "noise", 0.001, seed=1)
+    originals = {name: jm.attack(mesh, "noise", VARIANT, seed=seed) for seed, name in enumerate("ab", 2)}
+    honest = {name: record_of(jm.make_marker(one, key)) for name, one in originals.items()}
+    scene = json.loads(SceneRecord(honest).to_json())
+    edits: dict[str, dict[str, Any]] = {
+        "none": {},
+        "bits -1000": {"bits": -1000},
+        "bits 8": {"bits": 8},
+        "bits 2^40": {"bits": 2**40},
+        "no commitment to a message": {"told": ""},
+        "presence": {"bits": 0, "content": "presence", "told": ""},
+        "another scheme": {"scheme": "host", "parameters": {}},
+        "another key": {"key": "0" * 64},
+        "beta NaN": {"beta": math.nan},
+    }
+    rows = []
+    for edit, fields in edits.items():
+        for name in originals:
+            meshes = {**scene["meshes"], name: {**scene["meshes"][name], **fields}}
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder, "record.json")
+                path.write_text(json.dumps({**scene, "meshes": meshes}))
+                try:
+                    record = load_record(path)
+                    assert isinstance(record, SceneRecord)
+                    sealed = SceneRecord({name: one.sealed(key) for name, one in record.meshes.items()})
+                    found = detect_scene({"x": suspect}, originals=originals, key=key, record=sealed, message=MESSAGE)
+                    charges = make_commitment([sealed.digest()]).charges(sealed, claimed=True)
+                    result = found.evidence.charged(*charges).log10_p
+                except jm.JaxmarkError as refusal:
+                    result = "refused: " + str(refusal).replace(f"{path}: ", "")
+            rows.append({"edit": edit, "mesh": name, "timestamped": result})
+    return rows
+
+
+def try_scenes(mesh: Mesh, options: argparse.Namespace) -> Checks:
+    rows = scenes(mesh, options.originals)
+    print(f"originals chosen by their scores\n\n{table(rows)}\n")
+    _, every, by_name, damaged = rows
+    fixed = [row["committed"] for row in (every, by_name)]
+    return {
+        "uncommitted claims of scenes": all(row.get("uncommitted", 0.0) >= -SLACK for row in rows),
+        "claims of recorded scenes": min(fixed) >= -SLACK and damaged["committed"] == "refused",
+    }
+
+
+def try_records(mesh: Mesh, options: argparse.Namespace) -> Checks:
+    rows = records(mesh)
+    print(f"forged records of a scene\n\n{table(rows)}\n")
+    figures = [row["timestamped"] for row in rows if not isinstance(row["timestamped"], str)]
+    return {"forged records of scenes": min(figures) >= -SLACK}
+
+
 def try_strengths(mesh: Mesh, options: argparse.Namespace) -> Checks:
     seen = suspects(mesh)
     chance = -math.log10(options.keys * len(seen)) - SLACK
@@ -361,6 +473,8 @@ SECTIONS: dict[str, Callable[[Mesh, argparse.Namespace], Checks]] = {
     "grinding": try_grinding,
     "edited": try_edited,
     "message": try_message,
+    "scenes": try_scenes,
+    "records": try_records,
 }
 
 
@@ -370,6 +484,7 @@ def main() -> None:
     parser.add_argument("--keys", type=int, default=20, help="keys under which strengths are fitted")
     parser.add_argument("--bands", type=int, nargs="+", default=[64, 128, 256, 512, 1024], help="numbers of strengths")
     parser.add_argument("--tries", type=int, default=100_000, help="records that are ground")
+    parser.add_argument("--originals", type=int, default=1200, help="originals of which scenes are chosen")
     for name in SECTIONS:
         parser.add_argument(f"--{name}", action="store_true", help="run this section, and not those without a flag")
     options = parser.parse_args()
