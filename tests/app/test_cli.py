@@ -301,24 +301,38 @@ def test_key_files_are_private_and_keys_never_shown(workshop: Workshop):
     assert owner not in Path("marked.ply.jaxmark.json").read_text()
 
 
-def test_existing_files_are_replaced_on_request_only(workshop: Workshop):
-    """The record of a copy that was handed out is kept."""
-    record, mark = "marked.ply.jaxmark.json", ("--key", "owner.key", "--message", "c0ffee00c0ffee00")
+def test_existing_files_are_refused(workshop: Workshop):
+    refusal = "jaxmark: {} exists; give another name, or replace it by --overwrite.\n"
+    for name in ("marked.ply", "other.ply.jaxmark.json"):
+        Path(name).write_text("there already")
+        marked = name.removesuffix(".jaxmark.json")
+        mark = ("model.ply", marked, "--key", "owner.key", "--message", MESSAGE)
+        assert workshop.refused("embed", *mark) == refusal.format(name)
+    for name, bits in (("first.json", 64), ("second.json", 32)):
+        Path(name).write_text(jm.Record("keyed", bits, 0.1, "00" * 32, "11" * 32).to_json())
+    commit = ("--output", "commitment.json")
+    workshop.json("commit", "first.json", *commit)
+    before = Path("commitment.json").read_bytes()
+    assert workshop.refused("commit", "second.json", *commit) == refusal.format("commitment.json.tsq")
+    workshop.json("commit", "second.json", *commit, "--overwrite")
+    assert Path("old-1-commitment.json").read_bytes() == before != Path("commitment.json").read_bytes()
+    jm.Catalogue("shop.db").close()
+    export = ("catalogue", "export", "first.json", "--catalogue", "shop.db")
+    assert workshop.refused(*export) == refusal.format("first.json")
+    assert workshop.json(*export, "--overwrite")["originals"] == 0
+
+
+@pytest.mark.slow
+def test_overwriting_keeps_the_record_of_the_replaced_copy(workshop: Workshop):
+    record, other = "marked.ply.jaxmark.json", "c0ffee00c0ffee00"
     workshop.embed()
     first = Path(record).read_bytes()
-    refusal = "jaxmark: {} exists; give another name, or replace it by --overwrite.\n"
-    assert workshop.refused("embed", "model.ply", "marked.ply", *mark) == refusal.format("marked.ply")
-    Path("marked.ply").rename("given away.ply")
-    assert workshop.refused("embed", "model.ply", "marked.ply", *mark) == refusal.format(record)
-    Path("given away.ply").rename("marked.ply")
-    workshop.json("embed", "model.ply", "marked.ply", *mark, "--overwrite")
+    workshop.json("embed", "model.ply", "marked.ply", "--key", "owner.key", "--message", other, "--overwrite")
     assert Path(f"old-1-{record}").read_bytes() == first
-    assert workshop.json("detect", "marked.ply", *DETECT, "--record", record)["message"] == "c0ffee00c0ffee00"
-    workshop.json("commit", record, "--output", "commitment.json")
-    before = Path("commitment.json").read_bytes()
-    assert "commitment.json" in workshop.refused("commit", f"old-1-{record}", "--output", "commitment.json")
-    workshop.json("commit", f"old-1-{record}", "--output", "commitment.json", "--overwrite")
-    assert Path("old-1-commitment.json").read_bytes() == before != Path("commitment.json").read_bytes()
+    assert workshop.json("detect", "marked.ply", *DETECT, "--record", record)["message"] == other
+    assert {path.name for path in Path().iterdir()} == {
+        *("model.ply", "owner.key", "marked.ply", record, f"old-1-{record}")
+    }
 
 
 def test_help_teaches_and_units_are_stated(workshop: Workshop):
