@@ -1,7 +1,7 @@
 """The budget of a file: how much it may unpack to, and how much it may hold, before a mark is looked for.
 
-A small file must not cost minutes or gigabytes. Every file may have the least amount of each limit, and a large file may
-have more, in proportion to its bytes. `docs/reference/limits.md` has the reasons and the costs.
+A small file must not cost minutes or gigabytes. Every file may have the least amount of each limit, and a large file
+may have more, in proportion to its bytes. `docs/how-to/files.md` has a table of the limits.
 """
 
 from typing import NamedTuple
@@ -47,5 +47,7 @@ ELEMENTS = Limit("XML elements that are read one by one", 2**20, 1)
 ACCESSED = Limit("elements of accessors", 2**20, 16)
 #: Meshes, or objects, that are read one by one.
 MESHES = Limit("meshes", 2**14, 0)
-#: Meshes of a file that are read for a blind mark, the largest ones; see `jaxmark.app.read_files`.
-BLIND_MESHES = 16
+#: Points that a mesh needs to be read for a blind mark. Such marks have no anchors on coarser meshes.
+BLIND_POINTS = 100
+#: Meshes of a file that are read for a blind mark unless they are named, the largest ones. Each may take half a minute.
+BLIND_MESHES = 8

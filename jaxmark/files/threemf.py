@@ -102,7 +102,9 @@ def _model_members(archive: Archive, elements: Count) -> list[Member]:
     relationships = archive.find("_rels/.rels")
     if relationships is not None:
         with concerning(relationships.shown):
-            targets = [target for kind, target in read_relationships(archive.read(relationships), elements) if kind == _MODEL]
+            targets = [
+                target for kind, target in read_relationships(archive.read(relationships), elements) if kind == _MODEL
+            ]
         if targets:
             root = posixpath.normpath("/" + unquote(targets[0])).lstrip("/")
     first = archive.find(root)

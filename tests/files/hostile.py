@@ -13,7 +13,9 @@ _CORNERS = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
 _MODELS = ("3D/3dmodel.model", "3D/b.model", "3D/c.model")
 
 
-def _mesh(vertices: tuple[bytes, int], triangles: tuple[bytes, int] = (b'<triangle v1="0" v2="1" v3="2"/>', 1)) -> bytes:
+def _mesh(
+    vertices: tuple[bytes, int], triangles: tuple[bytes, int] = (b'<triangle v1="0" v2="1" v3="2"/>', 1)
+) -> bytes:
     rows = [element * count for element, count in (vertices, triangles)]
     return b'<object id="1"><mesh><vertices>%s</vertices><triangles>%s</triangles></mesh></object>' % tuple(rows)
 
@@ -24,7 +26,7 @@ _TRIANGLE = _mesh((b'<vertex x="0" y="0" z="0"/><vertex x="1" y="0" z="0"/><vert
 def archive(models: int, content: bytes, others: Mapping[str, bytes] | None = None) -> bytes:
     """A 3MF file in which some models have the same content, without what standard modules would check."""
     data = entries = b""
-    members = {name: content for name in _MODELS[:models]} | dict(others or {})
+    members = dict.fromkeys(_MODELS[:models], content) | dict(others or {})
     packed = {content: _deflated(content) for content in {*members.values()}}
     for name, content in members.items():
         sizes = (0, 8, 0, 33, zlib.crc32(content), len(packed[content]), len(content), len(name), 0)
@@ -61,12 +63,16 @@ def plain_vertices(count: int) -> bytes:
 
 def triangles(count: int) -> bytes:
     """Triangles as most programs write them."""
-    return archive(1, _HEAD + _mesh((b'<vertex x="0" y="0" z="0"/>', 3), (b'<triangle v1="0" v2="1" v3="2"/>', count)) + _TAIL)
+    return archive(
+        1, _HEAD + _mesh((b'<vertex x="0" y="0" z="0"/>', 3), (b'<triangle v1="0" v2="1" v3="2"/>', count)) + _TAIL
+    )
 
 
 def attributes(count: int) -> bytes:
     """An element of many attributes."""
-    return archive(1, _HEAD + _TRIANGLE + b"<a" + b"".join(b' a%05x=""' % number for number in range(count)) + b"/>" + _TAIL)
+    return archive(
+        1, _HEAD + _TRIANGLE + b"<a" + b"".join(b' a%05x=""' % number for number in range(count)) + b"/>" + _TAIL
+    )
 
 
 def long_name(count: int) -> bytes:
@@ -131,6 +137,39 @@ ARCHIVES: dict[str, tuple[Callable[[int], bytes], int]] = {
     "meshes": (meshes, len(_TRIANGLE)),
     "lists": (lists, 11),
 }
+
+
+#: Pieces that a fuzzer repeats and inserts.
+PIECES = (
+    b"<a/>",
+    b"<a>",
+    b"</a>",
+    b"<!---->",
+    b"<![CDATA[ ]]>",
+    b"<?a?>",
+    b"text ",
+    b"&#49;",
+    b"<a b='1' c=\"2\"/>",
+    b'<vertex x="0" y="0" z="1"/>',
+    b"<vertex x='1' y='0' z='0'/>",
+    b'<vertex x="0" y="1e0"\nz=" 0 " a:x="2"></vertex>',
+    b'<triangle v1="0" v2="1" v3="2"/>',
+    b"<triangle v3='2' v2='1' v1='0'/>",
+    b"<vertices>",
+    b"</vertices>",
+    b"<triangles>",
+    b"</triangles>",
+    b"<vertices/>",
+    b'<object id="1"><mesh>',
+    b"</mesh></object>",
+    _TRIANGLE,
+)
+
+
+def model(pieces: list[tuple[bytes, int]], room: int) -> bytes:
+    """A model of repeated pieces, within so many bytes."""
+    parts = [piece * min(count, room // len(pieces) // len(piece)) for piece, count in pieces]
+    return _HEAD + _TRIANGLE + b"".join(parts) + _TAIL
 
 
 def threemf(kind: str, room: int) -> bytes:
