@@ -108,13 +108,16 @@ class Text:
 
     def read(self, tokens: Int64[np.ndarray, "..."], kind: type) -> Shaped[np.ndarray, "..."]:
         """Read tokens, in any order, as numbers: `float`, exactly, or `int`, of up to 18 digits."""
-        starts, ends = self.starts[tokens.ravel()], self.ends[tokens.ravel()]
+        return self.read_spans(self.starts[tokens.ravel()], self.ends[tokens.ravel()], kind).reshape(tokens.shape)
+
+    def read_spans(self, starts: Indices, ends: Indices, kind: type) -> Shaped[np.ndarray, " spans"]:
+        """Read byte spans, in any order, as numbers; see `read`."""
         if (starts[:-1] <= starts[1:]).all():
-            return self._converted(kind, starts, ends).reshape(tokens.shape)
+            return self._converted(kind, starts, ends)
         order = np.argsort(starts, kind="stable")
-        values = np.empty(tokens.size, kind)
+        values = np.empty(len(starts), kind)
         values[order] = self._converted(kind, starts[order], ends[order])
-        return values.reshape(tokens.shape)
+        return values
 
     def _converted(self, kind: type, starts: Indices, ends: Indices) -> Shaped[np.ndarray, " spans"]:
         """Convert the bytes of each span by `kind`; the spans ascend."""
@@ -176,7 +179,7 @@ class TextNumbers:
         """Read tokens of a text, in any order; if the file declares `whole` numbers, no others may be written."""
         self._text, self._whole = text, whole
         self._starts, self._ends = text.starts[tokens.ravel()], text.ends[tokens.ravel()]
-        self.values = text.read(tokens, float)
+        self.values = text.read_spans(self._starts, self._ends, float).reshape(-1, 3)
 
     @cached_property
     def _style(self) -> Style:

@@ -183,15 +183,18 @@ class Model(_Parser):
         if matched is None or not self.data.startswith(b"</" + opened[0][1:], matched.end()):
             return start
         quotes = start + np.flatnonzero(self._buffer[start : matched.end()] == ord(quote))
-        spans = []
-        for column in _COLUMNS[kind]:
-            mine = np.ones(len(quotes) // 2, bool)
-            for back, char in enumerate(reversed(column + b"="), 1):
-                mine &= self._buffer[quotes[::2] - back] == char
+        opening, closing = quotes[::2], quotes[1::2]
+        spans = NO_TRIPLES
+        for column, name in enumerate(_COLUMNS[kind]):
+            mine = np.ones(len(opening), bool)
+            for back, char in enumerate(reversed(name + b"="), 1):
+                mine &= self._buffer[opening - back] == char
             # No other attribute ends so, except behind a colon or in a longer word.
-            mine &= self._buffer[quotes[::2] - len(column) - 2] <= ord(" ")
-            spans.append(np.stack([quotes[::2][mine] + 1, quotes[1::2][mine]], axis=1))
-        self.meshes[-1].lists[kind] = np.stack(spans, axis=1)
+            mine &= self._buffer[opening - len(name) - 2] <= ord(" ")
+            if column == 0:
+                spans = np.empty((int(mine.sum()), 3, 2), np.int64)
+            spans[:, column, 0], spans[:, column, 1] = opening[mine] + 1, closing[mine]
+        self.meshes[-1].lists[kind] = spans
         return matched.end()
 
     def _read_rows(self, kind: str) -> Triples:
