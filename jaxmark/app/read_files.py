@@ -15,7 +15,7 @@ from jaxmark.app.output import FileOutcome, Status, detection_lines, detection_s
 from jaxmark.app.process import release_programs
 from jaxmark.app.progress import Doing, quietly
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import Scene, load_mesh, load_scene, load_skin
+from jaxmark.files import Scene, limits, load_mesh, load_scene, load_skin
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.reading import best_of, try_each
 from jaxmark.watermark.coding.keys import Key
@@ -130,15 +130,29 @@ class FileReader:
         return FileOutcome(values, lines, detection_status(detection, self.alpha))
 
     def _read_blind(self, suspect: Path, record: Record | SceneRecord | None) -> Detection:
-        """Read a file without its original; if it has several meshes, read each, and charge for their number."""
+        """Read a file without its original; if it has several meshes, read the selected ones, or else the largest.
+
+        The charge is for all meshes that could have been selected, because a user may try one after another.
+        """
         records = [None] if record is None else list(record.meshes.values())
         for entry in records:
             if entry is not None and entry.scheme not in BLIND_SCHEMES:
                 raise JaxmarkError(f"The scheme {entry.scheme!r} of the record is not blind; give --original.")
         self.doing(f"reading {suspect}")
-        scene = pick(load_scene(suspect), self.meshes, suspect)
+        scene = load_scene(suspect)
+        selected = pick(scene, self.meshes, suspect).meshes
         several = len(scene.meshes) > 1
-        candidates = scene.meshes if several else {"": load_mesh(suspect)}
+        meshes = scene.meshes if several else {"": load_mesh(suspect)}
+        readable = [name for name, mesh in meshes.items() if len(mesh.vertices) >= limits.BLIND_POINTS]
+        largest = sorted(readable, key=lambda name: -len(meshes[name].vertices))
+        names = [name for name in largest if name in selected] if several and self.meshes else largest
+        if not names:
+            raise JaxmarkError(
+                f"{suspect}: a blind mark needs a mesh of {limits.BLIND_POINTS} points or more, and there is none"
+                f"{' among the selected ones' if self.meshes else ''}; give --original."
+            )
+        if not self.meshes:
+            names = names[: limits.BLIND_MESHES]
         self.doing(f"reading {suspect} without an original")
         blind_schemes = [BLIND_SCHEMES[name] for name in self.schemes if name in BLIND_SCHEMES]
         schemes = blind_schemes if len(blind_schemes) == 1 and record is None else []
@@ -147,9 +161,12 @@ class FileReader:
             release_programs()
             return read_blind(mesh, self.key, bits=self.bits, message=self.message, record=record, schemes=schemes)
 
-        detections = list(try_each(partial(read, mesh, entry) for mesh in candidates.values() for entry in records))
-        best = best_of(detections, ledger.PARTS, len(candidates) * len(records))
-        return self._count_proving(best, detections, len(candidates)) if several else best
+        detections = list(try_each(partial(read, meshes[name], entry) for name in names for entry in records))
+        best = best_of(detections, ledger.PARTS, len(readable) * len(records))
+        if not self.meshes and len(names) < len(readable):
+            note = f"Only the {len(names)} largest of {len(readable)} meshes were read; select others by --mesh."
+            best = best._replace(notes=(*best.notes, note))
+        return self._count_proving(best, detections, len(names)) if several else best
 
     def _names(self, scene: Scene, original: Path, record: SceneRecord | None) -> list[str]:
         """Return the names of the meshes to read; the record must have them, if there is one."""

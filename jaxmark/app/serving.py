@@ -1,8 +1,8 @@
 """A local web page that shows a catalogue and finds the originals of uploaded files. Needs the extra `serve`.
 
 The server answers only this machine. It writes nothing unless --keep is given, its answers contain no key, and no name
-from a request becomes a path. It holds at most two uploaded files, which it reads one after the other, and rejects a
-third.
+from a request becomes a path. Two processes with limits of time and memory read uploaded files. Two more files may
+wait, and the server rejects others.
 """
 
 import asyncio
@@ -12,14 +12,17 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import click
 
 from jaxmark.app.catalogue_commands import CATALOGUE
 from jaxmark.app.find_commands import keep
+from jaxmark.app.limited import Worker
 from jaxmark.app.options import read_key
 from jaxmark.app.output import answer, error_text
 from jaxmark.app.process import release_programs
@@ -33,7 +36,9 @@ from jaxmark.watermark.evidence import ledger
 
 _PATH = click.Path(path_type=Path)
 _HOST = "127.0.0.1"
-_MOST_JOBS = 2  # most uploaded files that wait or are being read
+_WORKERS = 2  # processes that read uploaded files
+_MOST_JOBS = 4  # most uploaded files that wait or are being read
+_MOST_SECONDS, _MOST_MEGABYTES = 120.0, 4096  # for reading one file
 _UPLOAD_SECONDS = 120.0
 _MOST_DOSSIERS = 16  # most dossiers in memory
 _MOST_LISTED = 200  # most originals in one answer
@@ -86,6 +91,7 @@ def serve_command(
     app = make_app(desk, most_megabytes * 2**20)
     settings = uvicorn.Config(app, host=_HOST, port=port, log_level="warning", server_header=False, access_log=False)
     server = uvicorn.Server(settings)
+    desk.begin()
     with settings.bind_socket() as socket:
         answer(False, {}, f"http://{_HOST}:{socket.getsockname()[1]}/ shows {catalogue_file}; Ctrl+C ends it")
         server.run(sockets=[socket])
@@ -93,63 +99,102 @@ def serve_command(
 
 @dataclass
 class Desk:
-    """The state of the server: it finds the originals of files, one at a time, and keeps the latest dossiers."""
+    """The state of the server: it finds the originals of files in its workers, and keeps the latest dossiers."""
 
     catalogue: Path
     keys: Sequence[Key]
     keeps: bool = False  # whether verdicts are stored in the catalogue
     dossiers: OrderedDict[str, bytes] = field(default_factory=OrderedDict)
-    _finder: Finder | None = None
+    _workers: SimpleQueue[Worker] = field(default_factory=SimpleQueue)  # those that are not reading a file
+
+    def __post_init__(self) -> None:
+        for _ in range(_WORKERS):
+            self._workers.put(Worker(_MOST_SECONDS, _MOST_MEGABYTES))
+
+    def begin(self) -> None:
+        """Begin the processes of the workers, so that the first files need not wait for them."""
+        workers = [self._workers.get() for _ in range(_WORKERS)]
+        for worker in workers:
+            worker.begin()
+            self._workers.put(worker)
+
+    def end(self) -> None:
+        """End the processes of the workers that are not reading a file."""
+        while not self._workers.empty():
+            self._workers.get().end()
 
     def find(self, data: bytes, suffix: str) -> dict[str, Any]:
-        """Find the originals of an uploaded file.
+        """Find the originals of an uploaded file; wait for a worker if all are reading.
 
         Raises:
-            JaxmarkError: see `Finder`.
+            JaxmarkError: see `Finder` and `Worker`.
         """
-        if self._finder is None:
-            self._finder = Finder(Catalogue(self.catalogue, read_only=not self.keeps), self.keys)
-        with tempfile.TemporaryDirectory() as folder:
-            suspect = Path(folder) / f"suspect{suffix}"
-            suspect.write_bytes(data)
-            verdict = self._finder.find(suspect)
-            if self.keeps:
-                keep(self._finder.catalogue, Path("uploaded"), verdict)
-            values = verdict.as_json()
-            for match in verdict.named[:1]:
-                values["dossier"] = self._dossier(suspect, match, verdict.readings, Path(folder))
-        release_programs()
-        numbers = {entry.path: entry.id for entry in self._finder.catalogue.originals()}
-        for entry in (values, *values["matches"]):
-            if entry["original"] is not None:
-                entry["id"], entry["original"] = numbers.get(entry["original"]), Path(entry["original"]).name
-        return values
-
-    def _dossier(self, suspect: Path, match: Match, readings: int, folder: Path) -> str | None:
-        """Make the dossier of a message that was read from a file of one mesh, and return its token in the address.
-
-        The dossier is charged, like the verdict, for all readings by which the catalogue could have named an original.
-
-        Returns None if no message was read, if the file has several meshes or pieces, or if a dossier cannot be made.
-        """
-        if not match.message or match.mesh or match.piece or self._finder is None:
-            return None
-        key = next(key for name, key in self._finder.keys.items() if name == match.key)
-        query, record = "SELECT json FROM records WHERE digest = ?", None
-        for row in self._finder.catalogue.database.rows(query, match.record):
-            record = folder / "record.json"
-            write_atomically(record, row["json"].encode())
-        bits = None if record is not None else 4 * len(match.message)
-        charge = ledger.ORIGINALS.charge("original", readings)
-        reader = FileReader(key, bits, None, diagnoses=False, charges=(charge,))
-        with suppress(JaxmarkError):  # without the extra `plot` there is a verdict, but no dossier
-            reader.read(suspect, Path(match.original), record, dossier=folder / "dossier")
-            token = secrets.token_urlsafe(16)
-            self.dossiers[token] = (folder / "dossier" / "dossier.html").read_bytes()
+        worker = self._workers.get()
+        try:
+            values, page = worker.run(_find, self.catalogue, tuple(self.keys), self.keeps, data, suffix)
+        finally:
+            self._workers.put(worker)
+        if page is not None:
+            values["dossier"] = secrets.token_urlsafe(16)
+            self.dossiers[values["dossier"]] = page
             while len(self.dossiers) > _MOST_DOSSIERS:
                 self.dossiers.popitem(last=False)
-            return token
+        return values
+
+
+@lru_cache(maxsize=1)
+def _finder(catalogue: Path, keys: tuple[Key, ...], keeps: bool) -> Finder[Catalogue]:
+    return Finder(Catalogue(catalogue, read_only=not keeps), keys)
+
+
+def _find(
+    catalogue: Path, keys: tuple[Key, ...], keeps: bool, data: bytes, suffix: str
+) -> tuple[dict[str, Any], bytes | None]:
+    """Find the originals of a file in a worker; returns the verdict as values for JSON, and the page of a dossier.
+
+    Raises:
+        JaxmarkError: see `Finder`.
+    """
+    finder, page = _finder(catalogue, keys, keeps), None
+    with tempfile.TemporaryDirectory() as folder:
+        suspect = Path(folder) / f"suspect{suffix}"
+        suspect.write_bytes(data)
+        verdict = finder.find(suspect)
+        if keeps:
+            keep(finder.catalogue, Path("uploaded"), verdict)
+        values = verdict.as_json()
+        for match in verdict.named[:1]:
+            values["dossier"] = None
+            page = _dossier(finder, suspect, match, verdict.readings, Path(folder))
+    release_programs()
+    numbers = {entry.path: entry.id for entry in finder.catalogue.originals()}
+    for entry in (values, *values["matches"]):
+        if entry["original"] is not None:
+            entry["id"], entry["original"] = numbers.get(entry["original"]), Path(entry["original"]).name
+    return values, page
+
+
+def _dossier(finder: Finder[Catalogue], suspect: Path, match: Match, readings: int, folder: Path) -> bytes | None:
+    """Make the dossier of a message that was read from a file of one mesh.
+
+    The dossier is charged, like the verdict, for all readings by which the catalogue could have named an original.
+
+    Returns None if no message was read, if the file has several meshes or pieces, or if a dossier cannot be made.
+    """
+    if not match.message or match.mesh or match.piece:
         return None
+    key = next(key for name, key in finder.keys.items() if name == match.key)
+    query, record = "SELECT json FROM records WHERE digest = ?", None
+    for row in finder.catalogue.database.rows(query, match.record):
+        record = folder / "record.json"
+        write_atomically(record, row["json"].encode())
+    bits = None if record is not None else 4 * len(match.message)
+    charge = ledger.ORIGINALS.charge("original", readings)
+    reader = FileReader(key, bits, None, diagnoses=False, charges=(charge,))
+    with suppress(JaxmarkError):  # without the extra `plot` there is a verdict, but no dossier
+        reader.read(suspect, Path(match.original), record, dossier=folder / "dossier")
+        return (folder / "dossier" / "dossier.html").read_bytes()
+    return None
 
 
 def make_app(desk: Desk, most_bytes: int) -> Any:
@@ -171,7 +216,7 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
     from starlette.responses import JSONResponse, Response
     from starlette.routing import Route
 
-    turn, waiting = asyncio.Lock(), 0
+    waiting = 0
 
     def reply(content: bytes, kind: str, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
         return Response(content, status, {**_HEADERS, **(headers or {})}, kind)
@@ -220,7 +265,7 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
         if suffix not in _UPLOADED:
             return refuse(f"This is not a mesh file; drop one of {', '.join(_UPLOADED)}.", 415)
         if waiting >= _MOST_JOBS:
-            return refuse("Two files are being processed; try again when one is done.", 503)
+            return refuse(f"{_MOST_JOBS} files are being processed; try again when one is done.", 503)
         waiting += 1
         try:
             async with asyncio.timeout(_UPLOAD_SECONDS):
@@ -230,8 +275,7 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
                     if len(data) > most_bytes:
                         sentence = f"The file is larger than {most_bytes // 2**20} megabytes, the limit of this server."
                         return refuse(sentence, 413)
-            async with turn:
-                return respond(await run_in_threadpool(desk.find, bytes(data), suffix))
+            return respond(await run_in_threadpool(desk.find, bytes(data), suffix))
         except TimeoutError:
             return refuse(f"The upload took longer than {_UPLOAD_SECONDS:g} seconds.", 408)
         except ClientDisconnect:

@@ -45,7 +45,7 @@ _WHOLE = 0.95  # coverage from which on a piece counts as a whole original
 _MOST_PIECES = 32  # most pieces of a suspect, the largest ones
 _MOST_COMPONENTS = 8  # most components of a mesh
 _LEAST_SHARE = 0.02  # least area of a component, as a fraction of the mesh's area
-_LEAST_FACES = 50  # least number of faces of a component
+_LEAST_FACES = 50  # least number of faces of a component, or of one of several meshes
 _NEAR = 0.01  # largest distance of a piece from an original, over its size, if the original explains the piece
 
 
@@ -468,11 +468,15 @@ class Finder(Generic[AnyOriginals]):
 
 
 def split(meshes: Mapping[str, Mesh]) -> list[Piece]:
-    """Split a suspect into pieces: its distinct meshes, then the components of meshes with several large ones."""
+    """Split a suspect into pieces: its distinct meshes, then the components of meshes with several large ones.
+
+    Of several meshes, those with few faces are left out: they carry no mark, and there may be thousands of them.
+    """
     distinct: dict[bytes, Piece] = {}
     for name, mesh in meshes.items():
         distinct.setdefault(geometry_hash(mesh), Piece(name, mesh, ""))
-    wholes = sorted(distinct.values(), key=lambda piece: -len(piece.mesh.faces))[:_MOST_PIECES]
+    readable = [piece for piece in distinct.values() if len(distinct) == 1 or _is_readable(piece.mesh)]
+    wholes = sorted(readable, key=lambda piece: -len(piece.mesh.faces))[:_MOST_PIECES]
     pieces = [*wholes]
     for piece in wholes:
         parts = _components(piece.mesh)
@@ -480,6 +484,11 @@ def split(meshes: Mapping[str, Mesh]) -> list[Piece]:
             names = (f"{piece.name}#{number}".lstrip() for number in range(1, len(parts) + 1))
             pieces += [Piece(name, part, piece.name) for name, part in zip(names, parts, strict=True)]
     return pieces[:_MOST_PIECES]
+
+
+def _is_readable(mesh: Mesh) -> bool:
+    """Whether a mesh has enough faces, or is a point cloud."""
+    return not len(mesh.faces) or len(mesh.faces) >= _LEAST_FACES
 
 
 def _components(mesh: Mesh) -> list[Mesh]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files import limits
 from jaxmark.files.source import Faces, Indices, Part, Source, Texture, Transported, fan, linked, ranges, unique_names
 from jaxmark.files.text import Lines, Text, unix, without_comments
 
@@ -70,6 +71,7 @@ def parse(data: bytes) -> Source:
     index = referred(vertices, starts, slash, slice(None))
     text.refuse(index < 0, starts, absent)
     source = Source(data, coordinates, index[triangles], texture=texture)
+    limits.MESHES.check(len(objects.first), len(data))
     if len(objects.first) > 1:
         owner = np.repeat(np.searchsorted(objects.first, polygons.first), sizes - 2)  # 0 before the first object
         source.parts = _objects(text, source.faces, owner, objects.first, len(vertices.first))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxmark.errors import JaxmarkError, require
+from jaxmark.files import limits
 from jaxmark.files.binary import BinaryNumbers, overlay
 from jaxmark.files.source import Changes, Indices, Patched, Rows, Source, splice
 from jaxmark.files.text import Lines, Text, blank, is_numeral, unix, without_comments
@@ -16,7 +17,6 @@ _BOX = 179  # byte offset of the header's bounding box: largest and smallest x, 
 _INTEGER = np.dtype("<i4")
 _HEADER_BYTES, _HEADER_BYTES_1_4 = 227, 375
 _RECORD_BYTES, _EXTENDED_BYTES = 54, 60  # of a variable length record at least, and of one behind the points
-_MAX_PACKING = 2_000  # bytes of points for each byte of a LAZ file; scans have 5 to 20, made ones some hundreds
 _NO_FACES = np.zeros((0, 3), np.int64)
 
 
@@ -114,13 +114,15 @@ def _check_counts(data: bytes) -> None:
     if data[25] >= 4 and len(data) >= _HEADER_BYTES_1_4:  # version 1.4
         later, extended, wide_count = struct.unpack_from("<QIQ", data, 235)
         count = max(count, wide_count)
-    held = len(data) * (_MAX_PACKING if kind & 0x80 else 1)  # of compressed points, the highest bit is set
+    packed = bool(kind & 0x80)  # of compressed points, the highest bit is set
     if (
         begin + _RECORD_BYTES * records > min(points, len(data))
         or (extended and later + _EXTENDED_BYTES * extended > len(data))
-        or count * size > held
+        or (count * size > len(data) and not packed)
     ):
         raise JaxmarkError(
             f"This LAS or LAZ file is damaged: its header counts {count} points and {records + extended} other records,"
             f" more than its {len(data)} bytes hold."
         )
+    if packed:
+        limits.UNPACKED.check(count * size, len(data))

@@ -15,6 +15,8 @@ from jaxmark.files.source import Changes, Edits, Indices, Rows, changed
 # The bytes that bytes.split() takes for white space.
 _SPACE = np.zeros(256, dtype=bool)
 _SPACE[list(b" \t\n\r\v\f")] = True
+_NAMES = {int: "whole number", float: "number"}
+_BLOCK = 2**18  # numbers that are converted at once
 
 
 def unix(data: bytes) -> bytes:
@@ -102,25 +104,35 @@ class Text:
 
     def ints(self, starts: Indices, ends: Indices) -> Int64[np.ndarray, " spans"]:
         """Read the whole numbers in ascending byte spans; see `read`."""
-        return np.array(self._converted(int, starts, ends), np.int64)
+        return self._converted(int, starts, ends)
 
     def read(self, tokens: Int64[np.ndarray, "..."], kind: type) -> Shaped[np.ndarray, "..."]:
         """Read tokens, in any order, as numbers: `float`, exactly, or `int`, of up to 18 digits."""
-        order = np.argsort(self.starts[tokens], axis=None, kind="stable")
-        flat = tokens.ravel()[order]
-        values = np.empty(tokens.size, kind)
-        values[order] = self._converted(kind, self.starts[flat], self.ends[flat])
-        return values.reshape(tokens.shape)
+        return self.read_spans(self.starts[tokens.ravel()], self.ends[tokens.ravel()], kind).reshape(tokens.shape)
 
-    def _converted(self, kind: type, starts: Indices, ends: Indices) -> list:
+    def read_spans(self, starts: Indices, ends: Indices, kind: type) -> Shaped[np.ndarray, " spans"]:
+        """Read byte spans, in any order, as numbers; see `read`."""
+        if (starts[:-1] <= starts[1:]).all():
+            return self._converted(kind, starts, ends)
+        order = np.argsort(starts, kind="stable")
+        values = np.empty(len(starts), kind)
+        values[order] = self._converted(kind, starts[order], ends[order])
+        return values
+
+    def _converted(self, kind: type, starts: Indices, ends: Indices) -> Shaped[np.ndarray, " spans"]:
         """Convert the bytes of each span by `kind`; the spans ascend."""
-        name = "whole number" if kind is int else "number"
-        if len(starts) == 0:
-            return []
         if kind is int:
             too_long = "a whole number of more than 18 digits cannot be an index or a count"
             self.refuse(ends - starts > 18, starts, too_long)
-        self.refuse(starts >= ends, starts, f"a {name} is missing")
+        self.refuse(starts >= ends, starts, f"a {_NAMES[kind]} is missing")
+        values = np.empty(len(starts), np.dtype(kind))
+        for at in range(0, len(starts), _BLOCK):
+            block = slice(at, at + _BLOCK)
+            values[block] = self._converted_block(kind, starts[block], ends[block])
+        return values
+
+    def _converted_block(self, kind: type, starts: Indices, ends: Indices) -> list:
+        """Convert some spans; Python's numbers take ten times the memory of the file, so there are not all of them."""
         low, high = int(starts[0]), int(ends[-1]) + 1
         # With +1 where a span begins and -1 behind the byte that follows it, the running sum marks the bytes to keep.
         steps = np.zeros(high - low + 1, np.int8)
@@ -136,7 +148,7 @@ class Text:
         except ValueError:
             bad = next(k for k, numeral in enumerate(numerals) if b"_" in numeral or not is_numeral(kind, numeral))
             shown = numerals[bad][:40].decode("ascii", "backslashreplace")
-            raise self.error(starts[bad], f"'{shown}' is not a {name}") from None
+            raise self.error(starts[bad], f"'{shown}' is not a {_NAMES[kind]}") from None
 
 
 class Spans(Text):
@@ -167,7 +179,7 @@ class TextNumbers:
         """Read tokens of a text, in any order; if the file declares `whole` numbers, no others may be written."""
         self._text, self._whole = text, whole
         self._starts, self._ends = text.starts[tokens.ravel()], text.ends[tokens.ravel()]
-        self.values = text.read(tokens, float)
+        self.values = text.read_spans(self._starts, self._ends, float).reshape(-1, 3)
 
     @cached_property
     def _style(self) -> Style:

@@ -3,12 +3,15 @@
 import posixpath
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 from urllib.parse import unquote
 
 import numpy as np
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files import limits
+from jaxmark.files.limits import Count
 from jaxmark.files.source import Faces, JoinedNumbers, Part, Patched, Source, concerning, splice, unique_names, unusable
 from jaxmark.files.text import Spans, TextNumbers
 from jaxmark.files.threemf_xml import NO_TRIPLES, Model, RawMesh, read_relationships
@@ -47,10 +50,11 @@ def parse(data: bytes) -> Source:
     archive = Archive(data)
     signed = _is_signed(archive)
     found: list[tuple[Member, bytes, list[RawMesh]]] = []
-    for member in _model_members(archive):
+    elements, counted = (Count(limit, len(data)) for limit in (limits.ELEMENTS, limits.MESHES))
+    for member in _model_members(archive, elements):
         content = archive.read(member)
         with concerning(member.shown):
-            found.append((member, content, Model(content).meshes))
+            found.append((member, content, Model(content, elements, counted).meshes))
     names = iter(unique_names(mesh.name for _, _, meshes in found for mesh in meshes))
     models: list[_Model] = []
     parts: list[Part] = []
@@ -92,13 +96,15 @@ def _is_signed(archive: Archive) -> bool:
     return signed
 
 
-def _model_members(archive: Archive) -> list[Member]:
+def _model_members(archive: Archive, elements: Count) -> list[Member]:
     """Find the members that are models, in the order of the archive."""
     root = _DEFAULT
     relationships = archive.find("_rels/.rels")
     if relationships is not None:
         with concerning(relationships.shown):
-            targets = [target for kind, target in read_relationships(archive.read(relationships)) if kind == _MODEL]
+            targets = [
+                target for kind, target in read_relationships(archive.read(relationships), elements) if kind == _MODEL
+            ]
         if targets:
             root = posixpath.normpath("/" + unquote(targets[0])).lstrip("/")
     first = archive.find(root)
@@ -115,12 +121,17 @@ def _model_members(archive: Archive) -> list[Member]:
 def _read_objects(
     content: bytes, meshes: Sequence[RawMesh], names: Iterator[str], skipped: dict[str, str]
 ) -> list[_Object]:
-    """Read the numbers of a model's meshes; those that cannot be marked are put into `skipped`."""
-    lists = [mesh.lists.get(kind, NO_TRIPLES) for mesh in meshes for kind in ("vertices", "triangles")]
+    """Read the numbers of a model's meshes; those that cannot be marked are put into `skipped`.
+
+    The lists of the meshes are emptied, because they take several times the memory of the numbers.
+    """
+    lists = [mesh.lists.pop(kind, NO_TRIPLES) for mesh in meshes for kind in ("vertices", "triangles")]
+    ends = 3 * np.cumsum([len(one) for one in lists])
     spans = np.concatenate([NO_TRIPLES, *lists])
+    lists.clear()
     text = Spans(content, spans[..., 0].ravel(), spans[..., 1].ravel())
-    tokens = np.arange(3 * len(spans)).reshape(-1, 3)
-    pieces = iter(np.split(tokens, np.cumsum([len(one) for one in lists])))
+    del spans
+    pieces = (np.arange(start, end).reshape(-1, 3) for start, end in pairwise([0, *ends]))
     objects = []
     for _ in meshes:
         name, numbers, faces = next(names), TextNumbers(text, next(pieces)), text.read(next(pieces), int)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files.limits import Count
 from jaxmark.files.text import line_error
 
 _ENCODINGS = ("utf-8", "utf8", "us-ascii", "ascii")
@@ -16,14 +17,20 @@ _ROWS = {"vertices": "vertex", "triangles": "triangle"}
 _LIST = re.compile(rb"<(?:[\w.-]+:)?(?:vertices|triangles)(?=[\s/>])[^<>]*>")
 _TAG = re.compile(rb"<[^\s/>]+")
 _ATTRIBUTE = re.compile(rb"""\s+([^\s=]+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
-_WORD, _VALUE = rb'"[^"<&\x00-\x20\x7f-\xff]*+"', rb'"[^"<&\x00-\x1f\x7f-\xff]*+"'
-# Possessive, so that nothing is tried twice. Comments, single quotes and the like are left to the parser.
+_WORD, _VALUE = (
+    rb"%(quote)s[^%(quote)s<&\x00-\x20\x7f-\xff]*+%(quote)s",
+    rb"%(quote)s[^%(quote)s<&\x00-\x1f\x7f-\xff]*+%(quote)s",
+)
+_FIRST_QUOTE = re.compile(rb"""\s*+<[^<>=]*+=(["'])""")
+# Possessive, so that nothing is tried twice. Comments, both quotes in one list and the like are left to the parser.
 _PLAIN = (
     rb"(?:\s*+<%(row)s\s++%(first)s=%(word)s\s++%(second)s=%(word)s\s++%(third)s=%(word)s"
     rb"(?:\s++(?!xmlns|(?:%(first)s|%(second)s|%(third)s)=)[A-Za-z_][\w.:-]*+=%(value)s)*+"
     rb"\s*+(?:/>|>\s*+</%(row)s>))*+\s*+"
 )
 _MAX_NAME = 200
+_BLOCK = 2**20  # bytes that are parsed at once
+_MAX_TOKEN = 2**22  # bytes of a tag or comment, all of which is in memory when it is handled
 
 
 Triples = Int64[np.ndarray, "rows 3 2"]  # first byte and end of the three numbers in each element of a list
@@ -41,7 +48,7 @@ class _Parser:
     """An XML parser of some data that knows its byte offsets, also if bytes are skipped."""
 
     def __init__(self, data: bytes) -> None:
-        self.data, self.skipped = data, 0
+        self.data, self.skipped, self._fed = data, 0, 0
         self.expat = expat.ParserCreate("utf-8", " ")
         self.expat.StartDoctypeDeclHandler = self._doctype
         self.expat.XmlDeclHandler = self._declaration
@@ -56,7 +63,14 @@ class _Parser:
     def feed(self, start: int, end: int, *, final: bool) -> None:
         """Parse some bytes."""
         try:
-            self.expat.Parse(self.data[start:end], final)
+            for at in range(start, end, _BLOCK):
+                stop = min(at + _BLOCK, end)
+                self.expat.Parse(self.data[at:stop], False)
+                self._fed += stop - at
+                if self._fed - self.expat.CurrentByteIndex > _MAX_TOKEN:
+                    raise self.error(self.at, f"a tag or comment has more than {_MAX_TOKEN} bytes; shorten it")
+            if final:
+                self.expat.Parse(b"", True)
         except expat.ExpatError as error:
             at = max(0, self.expat.ErrorByteIndex + self.skipped)
             raise self.error(at, f"the XML is broken ({expat.ErrorString(error.code)})") from None
@@ -77,11 +91,12 @@ def _not_utf8(encoding: str) -> JaxmarkError:
     return JaxmarkError(f"The XML is encoded in {encoding!a}; only UTF-8 is supported, so save it as that.")
 
 
-def read_relationships(data: bytes) -> list[tuple[str, str]]:
-    """Read the type and the target of each relationship that a `.rels` member states."""
+def read_relationships(data: bytes, elements: Count) -> list[tuple[str, str]]:
+    """Read the type and the target of each relationship that a `.rels` member states, and count its elements."""
     found: list[tuple[str, str]] = []
 
     def start(name: str, attributes: dict[str, str]) -> None:
+        elements.add()
         if name.rpartition(" ")[2] == "Relationship":
             found.append((attributes.get("Type", ""), attributes.get("Target", "")))
 
@@ -95,11 +110,13 @@ class Model(_Parser):
     """The meshes of objects in a model; refused if an element lacks one of its three numbers.
 
     Lists of vertices and triangles that are written as nearly all programs do are not shown to the parser: a regular
-    expression checks that there is nothing else in them, which is many times faster.
+    expression checks that there is nothing else in them, which is many times faster. Other elements, and meshes, are
+    counted.
     """
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes, elements: Count, meshes: Count) -> None:
         super().__init__(data)
+        self._count_element, self._count_mesh = elements.add, meshes.add
         self.meshes: list[RawMesh] = []
         self._buffer = np.frombuffer(data, np.uint8)
         self._space: str | None = None  # the namespace of the root with a space behind it
@@ -122,6 +139,7 @@ class Model(_Parser):
         self.feed(at, len(data), final=True)
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
+        self._count_element()
         space, _, local = name.rpartition(" ")
         if self._space is None:
             self._space = space
@@ -131,9 +149,10 @@ class Model(_Parser):
             if self._path[-2:] == [self._list, _ROWS[self._list]]:
                 self._rows.append(self.at)
         elif self._path[-1] == "object":
-            words = " ".join(attributes.get("name", "").split())[:_MAX_NAME]
-            self._name = words or f"object {' '.join(attributes.get('id', '?').split())[:_MAX_NAME]}"
+            words = " ".join(attributes.get("name", "")[:_MAX_NAME].split())
+            self._name = words or f"object {' '.join(attributes.get('id', '?')[:_MAX_NAME].split())}"
         elif self._path[-2:] == ["object", "mesh"]:
+            self._count_mesh()
             self.meshes.append(RawMesh(self._name, {}))
         elif self._path[-1] in _ROWS and self._path[-3:-1] == ["object", "mesh"]:
             self._list = self._path[-1]
@@ -156,20 +175,26 @@ class Model(_Parser):
         prefix = opened[0][1 : -len(kind)]
         columns = dict(zip((b"first", b"second", b"third"), _COLUMNS[kind], strict=True))
         row = re.escape(prefix + _ROWS[kind].encode())
-        plain = re.compile(_PLAIN % {b"row": row, b"word": _WORD, b"value": _VALUE, **columns})
+        first = _FIRST_QUOTE.match(self.data, start)
+        quote = b'"' if first is None else first[1]
+        word, value = (form % {b"quote": quote} for form in (_WORD, _VALUE))
+        plain = re.compile(_PLAIN % {b"row": row, b"word": word, b"value": value, **columns})
         matched = plain.match(self.data, start)
         if matched is None or not self.data.startswith(b"</" + opened[0][1:], matched.end()):
             return start
-        quotes = start + np.flatnonzero(self._buffer[start : matched.end()] == ord('"'))
-        spans = []
-        for column in _COLUMNS[kind]:
-            mine = np.ones(len(quotes) // 2, bool)
-            for back, char in enumerate(reversed(column + b"="), 1):
-                mine &= self._buffer[quotes[::2] - back] == char
+        quotes = start + np.flatnonzero(self._buffer[start : matched.end()] == ord(quote))
+        opening, closing = quotes[::2], quotes[1::2]
+        spans = NO_TRIPLES
+        for column, name in enumerate(_COLUMNS[kind]):
+            mine = np.ones(len(opening), bool)
+            for back, char in enumerate(reversed(name + b"="), 1):
+                mine &= self._buffer[opening - back] == char
             # No other attribute ends so, except behind a colon or in a longer word.
-            mine &= self._buffer[quotes[::2] - len(column) - 2] <= ord(" ")
-            spans.append(np.stack([quotes[::2][mine] + 1, quotes[1::2][mine]], axis=1))
-        self.meshes[-1].lists[kind] = np.stack(spans, axis=1)
+            mine &= self._buffer[opening - len(name) - 2] <= ord(" ")
+            if column == 0:
+                spans = np.empty((int(mine.sum()), 3, 2), np.int64)
+            spans[:, column, 0], spans[:, column, 1] = opening[mine] + 1, closing[mine]
+        self.meshes[-1].lists[kind] = spans
         return matched.end()
 
     def _read_rows(self, kind: str) -> Triples:

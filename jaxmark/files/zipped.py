@@ -9,11 +9,9 @@ from functools import partial
 import numpy as np
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files import limits
 from jaxmark.files.source import Edits, splice
 
-_MAX_TOTAL = 2**31  # bytes of all members together
-# Text is seldom packed to a fiftieth; a large member that is packed further was made to fill memories.
-_MAX_RATIO, _MAX_SMALL = 200, 2**28
 _STORED, _DEFLATED = 0, 8
 _ENCRYPTED, _DESCRIBED, _UTF8 = 1 << 0, 1 << 3, 1 << 11  # flags; described: checksum and sizes follow the data
 _FULL = 0xFFFFFFFF  # stands for a number that is in the ZIP64 field instead
@@ -110,14 +108,7 @@ class Archive:
         for member in self.members:
             if member.flags & _ENCRYPTED:
                 raise JaxmarkError(f"The member {member.shown} is encrypted; save it without a password.")
-            if member.size > _MAX_SMALL and member.size > _MAX_RATIO * member.packed:
-                raise JaxmarkError(
-                    f"The member {member.shown} would grow from {member.packed} to {member.size} bytes, as nothing but"
-                    " an attack does."
-                )
-        total = sum(member.size for member in self.members)
-        if total > _MAX_TOTAL:
-            raise JaxmarkError(f"Unpacked, the archive has {total} bytes; 2 GB is the most, so split it.")
+        limits.UNPACKED.check(sum(member.size for member in self.members), len(self.data))
 
     def _locate(self) -> None:
         """Find each member's data; members that overlap are refused."""

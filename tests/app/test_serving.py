@@ -128,23 +128,23 @@ def test_files_are_taken_from_the_page_only_and_up_to_a_size(server: Server):
     assert b"Traceback" not in answer
 
 
-def test_a_third_file_is_turned_away(server: Server):
+def test_a_fifth_file_is_turned_away(server: Server):
     found: list[int] = []
 
     def send() -> None:
         found.append(server("POST", "/find?name=a.obj", b"x", **OURS)[0])
 
-    threads = [threading.Thread(target=send) for _ in range(2)]
+    threads = [threading.Thread(target=send) for _ in range(4)]
     for thread in threads:
         thread.start()
-    time.sleep(0.5)  # both are there
+    time.sleep(0.5)  # all are there
     assert server("POST", "/find?name=a.obj", b"x", **OURS)[0] == 503
-    assert len(server.desk.seen) == 1  # the other one waits
+    assert server("GET", "/originals")[0] == 200
     server.desk.go.set()
     for thread in threads:
         thread.join(20)
-    assert found == [200, 200]
-    assert len(server.desk.seen) == 2
+    assert found == [200] * 4
+    assert len(server.desk.seen) == 4
 
 
 @pytest.mark.slow
@@ -166,3 +166,9 @@ def test_a_file_that_is_dropped_is_named_with_its_dossier(tmp_path: Path):
     assert f"<sup>{found['log10_p'] - math.log10(2):.1f}</sup>" not in page
     assert KEY.hex() not in str(found)
     assert (tmp_path / "shop.db").read_bytes() == before
+    for worker in (desk._workers.get(), desk._workers.get()):
+        worker._seconds = 0.5
+        desk._workers.put(worker)
+    with pytest.raises(jm.JaxmarkError, match=r"more than 0\.5 seconds"):
+        desk.find((tmp_path / "suspect.obj").read_bytes(), ".obj")
+    desk.end()

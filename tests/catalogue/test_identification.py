@@ -155,6 +155,14 @@ def test_nobody_is_named_without_the_key_or_the_mark(shop: Shop):
     assert Path(verdict.matches[0].original).stem == "1"
 
 
+def test_small_meshes_of_a_file_are_left_out():
+    small, large = rough_sphere(12), rough_sphere(60)
+    many = {str(number): small._replace(vertices=(1 + number) * np.asarray(small.vertices)) for number in range(40)}
+    assert [piece.name for piece in split({**many, "large": large})] == ["large"]
+    assert split(many) == []
+    assert [piece.name for piece in split({"only": small})] == ["only"]
+
+
 @pytest.mark.long
 def test_both_models_of_a_merged_file_are_named(shop: Shop):
     merged = joined(shop.marked[3], shop.originals[0], shop.marked[1])

@@ -174,7 +174,7 @@ def test_numbers_that_are_referred_to_too_often_are_refused(tmp_path: Path) -> N
     for mesh in document["meshes"]:
         mesh["primitives"] *= 10_000
     (tmp_path / "many.glb").write_bytes(glb(json.dumps(document), data))
-    with pytest.raises(JaxmarkError, match="read the same bytes too often"):
+    with pytest.raises(JaxmarkError, match="elements of accessors"):
         load_scene(tmp_path / "many.glb")
 
 
@@ -328,5 +328,5 @@ def test_draco_that_announces_too_much_is_refused(tmp_path: Path) -> None:
     for accessor in document["accessors"]:
         accessor["count"] = 2**30
     (tmp_path / "a.glb").write_bytes(glb(json.dumps(document), data))
-    with pytest.raises(JaxmarkError, match="announces"):
+    with pytest.raises(JaxmarkError, match="bytes of unpacked content"):
         load_mesh(tmp_path / "a.glb")

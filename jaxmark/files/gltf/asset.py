@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files import limits
 from jaxmark.files.binary import BinaryNumbers, encode, gather
 from jaxmark.files.gltf import draco
 from jaxmark.files.gltf.document import FLOAT, Document, Elements, Read, attribute, objects, uses, whole
@@ -47,6 +48,7 @@ def parse(data: bytes, read: Read) -> Source:
     meshes = document.items("meshes")
     if not meshes:
         raise JaxmarkError("The file has no meshes.")
+    limits.MESHES.check(len(meshes), len(data))
     names = unique_names(str(mesh.get("name") or f"mesh {index}") for index, mesh in enumerate(meshes))
     found: dict[str, list[_Primitive]] = {}
     left: dict[str, str] = {}

@@ -13,8 +13,10 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files import limits
 from jaxmark.files.binary import gather
 from jaxmark.files.gltf.json_text import rewrite
+from jaxmark.files.limits import Count
 from jaxmark.files.source import Indices, Patched
 
 #: Reads a file by its path relative to the folder of the document.
@@ -27,7 +29,6 @@ COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _COMPRESSED = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 _MAX_COUNT = 2**31
-_MAX_READS = 16  # elements that are read for each byte of a file, on average; accessors may share bytes
 
 
 class Elements(NamedTuple):
@@ -71,6 +72,7 @@ class Document:
         data: the bytes of the buffers, and whatever is added behind them.
         located: the elements of accessors that were read or decoded, by index.
         decoded: the indices of those that were compressed.
+        unpacked: counts the bytes of those that are decompressed.
     """
 
     def __init__(self, file: bytes, read: Read) -> None:
@@ -106,7 +108,7 @@ class Document:
         self.located: dict[int, Elements] = {}
         self.decoded: set[int] = set()
         self._lists: dict[str, list[dict[str, Any]]] = {}
-        self._reads = 0
+        self._accessed, self.unpacked = (Count(one, size) for one in (limits.ACCESSED, limits.UNPACKED))
 
     def add(self, data: bytes) -> int:
         """Append bytes to the data, and return where they begin."""
@@ -147,9 +149,7 @@ class Document:
         where = f"accessors[{index}]"
         dtype, width, unit, count = self.form(index)
         size = dtype.itemsize * width
-        self._reads += count
-        if self._reads > _MAX_READS * len(self.data) + 2**20:
-            raise JaxmarkError(f"{where} and others read the same bytes too often; save the file with other software.")
+        self._accessed.add(count)
         accessor = self.item("accessors", index)
         if "sparse" in accessor:
             raise JaxmarkError(f"{where} is sparse, which is not supported.")

@@ -1,0 +1,77 @@
+"""Which meshes of a file are read without an original, and what that costs."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxmark as jm
+from jaxmark.app import read_files
+from jaxmark.files import limits
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark.evidence.detection import Detection, Evidence
+from tests.samples import rough_sphere
+
+pytestmark = pytest.mark.usefixtures("unchecked")
+KEY = jm.Key(bytes(range(32)))
+LOG10_P = -20.0
+
+
+@pytest.fixture
+def read(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The numbers of points of the meshes that are read, each with the same evidence."""
+    points: list[int] = []
+
+    def read_blind(mesh: Mesh, *_: object, **__: object) -> Detection:
+        points.append(len(mesh.vertices))
+        evidence = Evidence(LOG10_P, LOG10_P, LOG10_P, LOG10_P)
+        return Detection(b"8 bytes!", evidence, None, np.zeros(1), None, "local")
+
+    monkeypatch.setattr(read_files, "read_blind", read_blind)
+    monkeypatch.setattr(read_files, "detection_values", lambda detection, *_: {"detection": detection})
+    monkeypatch.setattr(read_files, "detection_text", lambda *_, **__: "")
+    return points
+
+
+def file_of(folder: Path, sizes: list[int]) -> Path:
+    """An OBJ file of spheres of so many points, named by their sizes."""
+    lines, first = [], 1
+    for size in sizes:
+        mesh = rough_sphere(size)
+        lines += [f"o {size}", *("v {} {} {}".format(*row) for row in np.asarray(mesh.vertices))]
+        lines += ["f {} {} {}".format(*row) for row in np.asarray(mesh.faces) + first]
+        first += size
+    (folder / "scene.obj").write_text("\n".join(lines))
+    return folder / "scene.obj"
+
+
+def detection(file: Path, *meshes: str) -> Detection:
+    reader = read_files.FileReader(KEY, 64, None, meshes=meshes)
+    return reader.read(file, None).values["detection"]
+
+
+def test_the_largest_meshes_are_read_and_all_are_charged(tmp_path: Path, read: list[int]):
+    sizes = [*range(40, 60), *range(100, 111)]
+    found = detection(file_of(tmp_path, sizes))
+    assert read == [*range(110, 110 - limits.BLIND_MESHES, -1)]
+    assert "Only the 8 largest of 11 meshes were read" in found.notes[0]
+    assert found.log10_p == pytest.approx(LOG10_P + math.log10(11))
+
+
+def test_selected_meshes_are_charged_as_all_that_could_be_selected(tmp_path: Path, read: list[int]):
+    found = detection(file_of(tmp_path, [*range(40, 60), *range(100, 111)]), "101")
+    assert read == [101]
+    assert not any("largest" in note for note in found.notes)
+    assert found.log10_p == pytest.approx(LOG10_P + math.log10(11))
+
+
+def test_meshes_that_are_too_small_are_refused_unread(tmp_path: Path, read: list[int]):
+    file = file_of(tmp_path, [40, 50, 100])
+    assert detection(file).log10_p == LOG10_P
+    for meshes in (["40"], ["40", "50"]):
+        with pytest.raises(jm.JaxmarkError, match="needs a mesh of 100 points or more"):
+            detection(file, *meshes)
+    with pytest.raises(jm.JaxmarkError, match="needs a mesh of 100 points or more, and there is none; give --original"):
+        detection(file_of(tmp_path, [40]))
+    assert read == [100]

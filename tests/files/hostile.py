@@ -1,0 +1,178 @@
+"""Small files that would cost minutes or gigabytes without limits; each function has the amount that makes it large."""
+
+import io
+import struct
+import zlib
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+_CORE = b"http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+_HEAD, _TAIL = b'<model xmlns="' + _CORE + b'"><resources>', b"</resources></model>"
+_CORNERS = ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
+_MODELS = ("3D/3dmodel.model", "3D/b.model", "3D/c.model")
+
+
+def _mesh(
+    vertices: tuple[bytes, int], triangles: tuple[bytes, int] = (b'<triangle v1="0" v2="1" v3="2"/>', 1)
+) -> bytes:
+    rows = [element * count for element, count in (vertices, triangles)]
+    return b'<object id="1"><mesh><vertices>%s</vertices><triangles>%s</triangles></mesh></object>' % tuple(rows)
+
+
+_TRIANGLE = _mesh((b'<vertex x="0" y="0" z="0"/><vertex x="1" y="0" z="0"/><vertex x="0" y="1" z="0"/>', 1))
+
+
+def archive(models: int, content: bytes, others: Mapping[str, bytes] | None = None) -> bytes:
+    """A 3MF file in which some models have the same content, without what standard modules would check."""
+    data = entries = b""
+    members = dict.fromkeys(_MODELS[:models], content) | dict(others or {})
+    packed = {content: _deflated(content) for content in {*members.values()}}
+    for name, content in members.items():
+        sizes = (0, 8, 0, 33, zlib.crc32(content), len(packed[content]), len(content), len(name), 0)
+        entries += struct.pack("<4s6H3I5H2I", b"PK\1\2", 20, 20, *sizes, 0, 0, 0, 0, len(data)) + name.encode()
+        data += struct.pack("<4s5H3I2H", b"PK\3\4", 20, *sizes) + name.encode() + packed[content]
+    count = len(members)
+    return data + entries + struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, count, count, len(entries), len(data), 0)
+
+
+def _deflated(content: bytes) -> bytes:
+    packer = zlib.compressobj(9, wbits=-15)
+    return packer.compress(content) + packer.flush()
+
+
+def filler(count: int, models: int = 1) -> bytes:
+    """Elements that mean nothing, beside a triangle."""
+    return archive(models, _HEAD + _TRIANGLE + b"<a/>" * count + _TAIL)
+
+
+def nested(count: int) -> bytes:
+    """Elements in each other."""
+    return archive(1, _HEAD + _TRIANGLE + b"<a>" * count + b"</a>" * count + _TAIL)
+
+
+def single_quotes(count: int) -> bytes:
+    """Vertices whose attributes are in single quotes, which are read one by one."""
+    return archive(1, _HEAD + _mesh((b"<vertex x='0' y='0' z='0'/>", count)) + _TAIL)
+
+
+def plain_vertices(count: int) -> bytes:
+    """Vertices as most programs write them."""
+    return archive(1, _HEAD + _mesh((b'<vertex x="0" y="0" z="0"/>', count)) + _TAIL)
+
+
+def triangles(count: int) -> bytes:
+    """Triangles as most programs write them."""
+    return archive(
+        1, _HEAD + _mesh((b'<vertex x="0" y="0" z="0"/>', 3), (b'<triangle v1="0" v2="1" v3="2"/>', count)) + _TAIL
+    )
+
+
+def attributes(count: int) -> bytes:
+    """An element of many attributes."""
+    return archive(
+        1, _HEAD + _TRIANGLE + b"<a" + b"".join(b' a%05x=""' % number for number in range(count)) + b"/>" + _TAIL
+    )
+
+
+def long_name(count: int) -> bytes:
+    """An object whose name has many words."""
+    return archive(1, _HEAD + _TRIANGLE.replace(b"id=", b'name="' + b"a " * count + b'" id=') + _TAIL)
+
+
+def relationships(count: int) -> bytes:
+    """Many relationships of the archive."""
+    return archive(1, _HEAD + _TRIANGLE + _TAIL, {"_rels/.rels": b"<r>" + b"<a/>" * count + b"</r>"})
+
+
+def comments(count: int) -> bytes:
+    """Vertices with comments between them, which are read one by one."""
+    return archive(1, _HEAD + _mesh((b'<vertex x="0" y="0" z="0"/><!---->', count)) + _TAIL)
+
+
+def lists(count: int) -> bytes:
+    """Lists outside of meshes."""
+    return archive(1, _HEAD + _TRIANGLE + b"<vertices/>" * count + _TAIL)
+
+
+def meshes(count: int) -> bytes:
+    """Objects of one triangle."""
+    return archive(1, _HEAD + _TRIANGLE * count + _TAIL)
+
+
+def laz(count: int, size: int) -> bytes:
+    """Equal points, and zeros behind them up to a size."""
+    import laspy
+
+    header = laspy.LasHeader(point_format=0, version="1.2")
+    cloud = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(count, header=header))
+    out = io.BytesIO()
+    cloud.write(out, do_compress=True)
+    return out.getvalue().ljust(size, b"\0")
+
+
+def tetrahedra(count: int) -> bytes:
+    """Objects of four vertices in OBJ."""
+    lines = []
+    for number in range(count):
+        shift = np.array([2 * number, number % 7, 0.1 * (number % 3)])
+        lines += [f"o t{number}", *("v {:g} {:g} {:g}".format(*(shift + corner)) for corner in _CORNERS)]
+        lines += ["f " + " ".join(str(4 * number + corner) for corner in face) for face in _FACES]
+    return "\n".join(lines).encode() + b"\n"
+
+
+_FACES = ((1, 3, 2), (1, 2, 4), (1, 4, 3), (2, 3, 4))
+#: Functions that make a 3MF file, and the bytes of one of their elements.
+ARCHIVES: dict[str, tuple[Callable[[int], bytes], int]] = {
+    "filler": (filler, 4),
+    "three": (lambda count: filler(count // 3, 3), 4),
+    "nested": (nested, 7),
+    "attributes": (attributes, 10),
+    "name": (long_name, 2),
+    "relationships": (relationships, 4),
+    "single": (single_quotes, 27),
+    "comments": (comments, 36),
+    "plain": (plain_vertices, 27),
+    "triangles": (triangles, 32),
+    "meshes": (meshes, len(_TRIANGLE)),
+    "lists": (lists, 11),
+}
+
+
+#: Pieces that a fuzzer repeats and inserts.
+PIECES = (
+    b"<a/>",
+    b"<a>",
+    b"</a>",
+    b"<!---->",
+    b"<![CDATA[ ]]>",
+    b"<?a?>",
+    b"text ",
+    b"&#49;",
+    b"<a b='1' c=\"2\"/>",
+    b'<vertex x="0" y="0" z="1"/>',
+    b"<vertex x='1' y='0' z='0'/>",
+    b'<vertex x="0" y="1e0"\nz=" 0 " a:x="2"></vertex>',
+    b'<triangle v1="0" v2="1" v3="2"/>',
+    b"<triangle v3='2' v2='1' v1='0'/>",
+    b"<vertices>",
+    b"</vertices>",
+    b"<triangles>",
+    b"</triangles>",
+    b"<vertices/>",
+    b'<object id="1"><mesh>',
+    b"</mesh></object>",
+    _TRIANGLE,
+)
+
+
+def model(pieces: list[tuple[bytes, int]], room: int) -> bytes:
+    """A model of repeated pieces, within so many bytes."""
+    parts = [piece * min(count, room // len(pieces) // len(piece)) for piece, count in pieces]
+    return _HEAD + _TRIANGLE + b"".join(parts) + _TAIL
+
+
+def threemf(kind: str, room: int) -> bytes:
+    """A hostile 3MF file of a kind whose models have so many bytes, at most."""
+    make, size = ARCHIVES[kind]
+    return make((room - 2**12) // size)

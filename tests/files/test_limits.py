@@ -1,0 +1,179 @@
+"""No small file costs minutes or gigabytes: it is read within its budget, or refused in one sentence."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+from jaxmark.app.limited import Worker
+from jaxmark.errors import JaxmarkError
+from jaxmark.files import limits, load_mesh, load_scene, threemf_xml
+from jaxmark.files.limits import Limit
+from tests.files import hostile
+from tests.files.helpers import loaded, written
+
+_SECONDS, _MEGABYTES = 60.0, 800  # on a busy machine; a process that loads nothing has some 200 megabytes more
+REFUSED = {
+    "filler": "more than 100 XML elements",
+    "three": "more than 100 XML elements",
+    "nested": "more than 100 XML elements",
+    "comments": "more than 100 XML elements",
+    "relationships": "more than 100 XML elements",
+    "lists": "more than 100 XML elements",
+    "meshes": "more than 10 meshes",
+    "attributes": "a tag or comment has more than 1000 bytes",
+    "name": "a tag or comment has more than 1000 bytes",
+}
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let limits be small."""
+    monkeypatch.setattr(limits, "ELEMENTS", Limit("XML elements", 100, 0))
+    monkeypatch.setattr(limits, "MESHES", Limit("meshes", 10, 0))
+    monkeypatch.setattr(threemf_xml, "_MAX_TOKEN", 1000)
+    monkeypatch.setattr(threemf_xml, "_BLOCK", 500)
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize(("kind", "message"), REFUSED.items())
+def test_elements_of_3mf_files_are_limited(tmp_path: Path, kind: str, message: str) -> None:
+    with pytest.raises(JaxmarkError, match=rf"bad\.3mf: .*{message}[^.]*\.$"):
+        loaded(tmp_path, "bad.3mf", hostile.threemf(kind, 2**13 + 2**12))
+
+
+@pytest.mark.usefixtures("small")
+def test_three_models_share_a_limit(tmp_path: Path) -> None:
+    loaded(tmp_path, "one.3mf", hostile.filler(60))
+    with pytest.raises(JaxmarkError, match="more than 100 XML elements"):
+        loaded(tmp_path, "three.3mf", hostile.filler(60, 3))
+
+
+@pytest.mark.usefixtures("small")
+def test_vertices_and_triangles_are_no_other_elements(tmp_path: Path) -> None:
+    for kind in ("single", "plain"):
+        source = written(tmp_path, "good.3mf", hostile.threemf(kind, 2**14))
+        np.testing.assert_array_equal(load_mesh(source).vertices, np.zeros(((2**14 - 2**12) // 27, 3)))
+    assert len(loaded(tmp_path, "good.3mf", hostile.triangles(1000)).faces) == 1000
+
+
+def test_tags_of_any_length_below_the_limit_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected = loaded(tmp_path, "a.3mf", hostile.attributes(0)).vertices
+    for block in (1, 7, 64):
+        monkeypatch.setattr(threemf_xml, "_BLOCK", block)
+        np.testing.assert_array_equal(loaded(tmp_path, "b.3mf", hostile.attributes(500)).vertices, expected)
+
+
+@pytest.mark.parametrize(("name", "data"), [("a.3mf", hostile.filler(5000)), ("a.laz", None)])
+def test_unpacked_bytes_are_limited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, data: bytes | None
+) -> None:
+    if data is None:
+        pytest.importorskip("lazrs")
+        data = hostile.laz(1000, 3000)
+    loaded(tmp_path, name, data)
+    monkeypatch.setattr(limits, "UNPACKED", Limit("bytes of unpacked content", 10_000, 1))
+    with pytest.raises(JaxmarkError, match="more than 10000 bytes of unpacked content, the most for a file of"):
+        loaded(tmp_path, name, data)
+
+
+def test_a_large_file_may_have_more() -> None:
+    limit = Limit("things", 10, 2)
+    limit.check(10, 1)
+    limit.check(200, 100)
+    with pytest.raises(JaxmarkError, match="more than 200 things, the most for a file of 100 bytes"):
+        limit.check(201, 100)
+
+
+@pytest.mark.usefixtures("small")
+def test_objects_of_obj_files_are_limited(tmp_path: Path) -> None:
+    assert len(load_scene(written(tmp_path, "a.obj", hostile.tetrahedra(10))).meshes) == 10
+    with pytest.raises(JaxmarkError, match="more than 10 meshes"):
+        load_scene(written(tmp_path, "a.obj", hostile.tetrahedra(11)))
+
+
+@pytest.fixture(scope="module")
+def worker() -> Iterator[Worker]:
+    running = Worker(_SECONDS, _MEGABYTES)
+    yield running
+    running.end()
+
+
+def _count(path: Path) -> int:
+    """Count the meshes of a file, in a worker."""
+    return len(load_scene(path).meshes)
+
+
+def _within_budget(worker: Worker, path: Path) -> str:
+    """Read a file in a worker; return why it is refused, or nothing."""
+    try:
+        assert worker.run(_count, path)
+    except JaxmarkError as error:
+        assert "limit of this process" not in str(error)  # noqa: PT017
+        assert "\n" not in str(error)  # noqa: PT017
+        return str(error)
+    return ""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", hostile.ARCHIVES)
+def test_the_largest_files_that_are_unpacked(tmp_path: Path, worker: Worker, kind: str) -> None:
+    data = hostile.threemf(kind, limits.UNPACKED.least)
+    refusal = _within_budget(worker, written(tmp_path, "a.3mf", data))
+    assert bool(refusal) == (kind not in ("plain", "single", "triangles"))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("name", "make", "refused"),
+    [
+        ("filler.3mf", lambda: hostile.threemf("filler", 2**28), True),
+        ("three.3mf", lambda: hostile.threemf("three", 2**29), True),
+        ("single.3mf", lambda: hostile.threemf("single", 2**28), True),
+        ("plain.3mf", lambda: hostile.threemf("plain", 2**28), True),
+        ("padded.laz", lambda: hostile.laz(36_000_000, 361_000), True),
+        ("full.laz", lambda: hostile.laz(limits.UNPACKED.least // 20, 361_000), False),
+        ("objects.obj", lambda: hostile.tetrahedra(7000), False),
+        ("more.obj", lambda: hostile.tetrahedra(20_000), True),
+    ],
+)
+def test_small_files_that_took_minutes_or_gigabytes(
+    tmp_path: Path, worker: Worker, name: str, make: Callable[[], bytes], refused: bool
+) -> None:
+    if name.endswith(".laz"):
+        pytest.importorskip("lazrs")
+    assert bool(_within_budget(worker, written(tmp_path, name, make()))) == refused
+
+
+PIECE = st.tuples(st.sampled_from(hostile.PIECES), st.integers(0, 21).map(lambda power: 2**power))
+CHANGE = st.tuples(st.floats(0, 1), st.integers(0, 6), st.sampled_from(hostile.PIECES) | st.binary(max_size=4))
+
+
+@pytest.mark.long
+@settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))
+@given(pieces=st.lists(PIECE, min_size=1, max_size=5), changes=st.lists(CHANGE, max_size=3), kind=st.integers(0, 4))
+def test_mutants(
+    tmp_path_factory: pytest.TempPathFactory,
+    worker: Worker,
+    pieces: list[tuple[bytes, int]],
+    changes: list[tuple[float, int, bytes]],
+    kind: int,
+) -> None:
+    """Repeated pieces of models, in any order and number, with some bytes changed; also OBJ and LAZ."""
+    folder = tmp_path_factory.mktemp("mutants")
+    if kind == 0:
+        name, content = "a.obj", hostile.tetrahedra(7000)
+    elif kind == 1:
+        pytest.importorskip("lazrs")
+        name, content = "a.laz", hostile.laz(200_000, 20_000)
+    else:
+        name, content = "a.3mf", hostile.model(pieces, limits.UNPACKED.least - 2**12)
+    for where, removed, put in changes:
+        at = int(where * len(content)) if kind else int(where * 300)
+        content = content[:at] + put + content[at + removed :]
+    data = hostile.archive(1 + pieces[0][1] % 3, content) if name == "a.3mf" else content
+    _within_budget(worker, written(folder, name, data))
+    (folder / name).unlink()
