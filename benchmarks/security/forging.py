@@ -359,7 +359,8 @@ def scenes(mesh: Mesh, count: int) -> list[Row]:
     honest = {"originals": {name: originals[name] for name in recorded}, "record": record, **options}
     every = detect_scene({"suspect": suspect}, **honest)
     by_name = detect_scene({"suspect": suspect}, **honest, names=picked)
-    damaged = {name: original if name in picked else mesh for name, original in honest["originals"].items()}
+    wreck = jm.attack(mesh, "noise", 0.05, seed=0)
+    damaged = {name: original if name in picked else wreck for name, original in honest["originals"].items()}
     try:
         figure_of_damaged = f"{detect_scene({'suspect': suspect}, **{**honest, 'originals': damaged}).log10_p:.2f}"
     except jm.JaxmarkError:
@@ -415,7 +416,7 @@ def records(mesh: Mesh) -> list[Row]:
                     charges = make_commitment([sealed.digest()]).charges(sealed, claimed=True)
                     result = found.evidence.charged(*charges).log10_p
                 except jm.JaxmarkError as refusal:
-                    result = "refused: " + str(refusal).replace(f"{path}: ", "")
+                    result = "refused: " + str(refusal).replace(str(path), "the file")
             rows.append({"edit": edit, "mesh": name, "timestamped": result})
     return rows
 
