@@ -13,7 +13,6 @@ import venv
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-LONGEST = 300.0  # s, to the first mark read back
 # Go on with the README's mesh and key; that on strengths tunes for minutes, and is among the long tests.
 GUIDES = ("study", "recipients", "arrays", "pictures")
 
@@ -30,7 +29,6 @@ import time
 seconds = time.time() - {start}
 print(f"first mark read back after {{seconds:.0f}} s, installation included", flush=True)
 assert detection.message == b"jaxmark!", detection
-assert seconds < {longest}, "the first mark took too long"
 """
 
 
@@ -47,7 +45,7 @@ def shell_lines(page: str) -> list[str]:
 
 
 def main() -> None:
-    """Fail where README or guides do not work in an empty environment, or the first mark takes too long."""
+    """Fail where README or guides do not work in an empty environment."""
     start = time.time()
     page = (ROOT / "README.md").read_text()
     guides = [(ROOT / "docs" / "how-to" / f"{name}.md").read_text() for name in GUIDES]
@@ -59,7 +57,7 @@ def main() -> None:
         python, jaxmark = (Path(folder, "venv", "bin", name) for name in ("python", "jaxmark"))
         subprocess.run([python, "-m", "pip", "install", "--quiet", ".[all]"], cwd=ROOT, check=True)
         print(f"installed after {time.time() - start:.0f} s", flush=True)
-        first = [MODEL, *python_blocks(page), FIRST.format(start=start, longest=LONGEST)]
+        first = [MODEL, *python_blocks(page), FIRST.format(start=start)]
         others = [block for guide in guides for block in python_blocks(guide)]
         Path(folder, "readme.py").write_text("\n".join([*first, *others]))
         subprocess.run([python, "readme.py"], cwd=folder, check=True)

@@ -95,7 +95,7 @@ def forgeries(meshes: int = 1) -> Charge:
 
 
 def selection(read: int, among: int) -> tuple[Charge, ...]:
-    """Return the charges for reading all meshes of an original, or only those that somebody picked.
+    """Return the charges for reading all meshes of an original, or only some of them, which the reader picked.
 
     The share of a set of k of n meshes is 2⁻ᵏ divided by the number of such sets; the shares of all sets add up to less
     than 1.
