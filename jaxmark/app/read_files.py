@@ -94,7 +94,7 @@ class FileReader:
         self.doing(f"aligning {suspect} and reading it")
         detection, mark = marks.read(mesh, self.message, align=self.align)
         blind_schemes = [BLIND_SCHEMES[name] for name in self.schemes[1:]]
-        detection = with_blind(detection, blind_schemes, mesh, self.key, mark.bits, self.message)
+        detection = with_blind(detection, blind_schemes, mesh, self.key, mark, self.message)
         charges = *self.charges, *ledger.selection(1, len(marked))
         detection = detection._replace(evidence=detection.evidence.charged(*charges))
         if report is not None:

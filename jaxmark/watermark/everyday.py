@@ -7,7 +7,7 @@ equal marks and count once.
 
 from __future__ import annotations  # so that `help` shows the names of type aliases
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from typing import NamedTuple
@@ -26,8 +26,9 @@ from jaxmark.watermark.coding.keys import KEY_BYTES, Key
 from jaxmark.watermark.coding.message import DEFAULT_BITS, check_size
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Detection, Evidence, united_score, weigh
+from jaxmark.watermark.evidence.ledger import Charge
 from jaxmark.watermark.interfaces import Detector, Scheme
-from jaxmark.watermark.mark import EmbedInfo
+from jaxmark.watermark.mark import EmbedInfo, Mark
 from jaxmark.watermark.markers import Marker, NonBlindMarker, make_blind_marker, make_marker, prepare, unite
 from jaxmark.watermark.nonblind import Alternatives, check_claim, claims_of
 from jaxmark.watermark.perception.budget import Budget, BudgetLike
@@ -190,7 +191,7 @@ def detect(
     scheme = scheme or DEFAULT_SCHEME
     usual = make_marker(original, key, bits=bits, record=record, scheme=scheme, detector=detector)
     detection, mark = alternatives(usual, scheme).read(suspect, message, weights, align)
-    return with_blind(detection, together, suspect, key, mark.bits, message)
+    return with_blind(detection, together, suspect, key, mark, message)
 
 
 def alternatives(usual: NonBlindMarker, scheme: str | Scheme | BlindScheme = DEFAULT_SCHEME) -> Alternatives:
@@ -249,15 +250,27 @@ def read_blind(
 
 
 def with_blind(
-    found: Detection, schemes: Sequence[BlindScheme], suspect: Mesh, key: bytes, bits: int, message: bytes | None
+    found: Detection, schemes: Sequence[BlindScheme], suspect: Mesh, key: bytes, mark: Mark, message: bytes | None
 ) -> Detection:
     """Read further, blind marks of the same message, if there are any, and unite the evidence of all marks.
+
+    Args:
+        found: the detection of the non-blind mark.
+        schemes: the schemes of the blind marks; a record does not name them, so their choice is charged.
+        suspect: see `detect`.
+        key: see `detect`.
+        mark: the non-blind mark.
+        message: see `detect`.
 
     Raises:
         JaxmarkError: see `detect`.
     """
-    blind = [read_blind(suspect, key, bits=bits, message=message, schemes=[scheme]) for scheme in schemes]
-    return unite(found, blind) if blind else found
+    blind = [read_blind(suspect, key, bits=mark.bits, message=message, schemes=[scheme]) for scheme in schemes]
+    united = unite(found, blind) if blind else found
+    if mark.record is None:
+        return united
+    names = " and ".join(sorted(scheme.name for scheme in schemes)) or "none"
+    return united._replace(evidence=united.evidence.charged(ledger.BESIDE.charge(names)))
 
 
 class SceneInfo(NamedTuple):
@@ -355,7 +368,8 @@ def detect_scene(
             `detect`.
     """
     marked = originals if record is None else record.meshes
-    chosen = [name for name in marked if name in names or not names]
+    # The order of a file's meshes decides which of equal meshes counts; a record's digest does not cover it.
+    chosen = sorted(name for name in marked if name in names or not names)
     for name in (*chosen, *names):
         if name not in originals or name not in marked:
             whose = "original" if name not in originals else "record"
@@ -396,9 +410,28 @@ def detect_scene(
         after()
     if not readings:
         raise JaxmarkError(f"None of the {len(chosen)} meshes could be compared: {_reasons(skipped)}.")
-    parts = {name: reading.found for name, reading in readings.items()}
-    united = _unite_meshes(list(readings.values()), message)._replace(parts=parts, skipped=skipped)
-    return united._replace(evidence=united.evidence.charged(*ledger.selection(len(chosen), len(marked))))
+    # Whoever presents the originals can make one unlike its counterpart, so that it is skipped. So the orders and the
+    # caveats of all originals count, and the number of meshes is that of all originals.
+    orders = [charge for marker in markers.values() for charge in marker.order_charges]
+    presented = *ledger.selection(len(chosen), len(marked)), *ledger.in_all(orders)
+    caveats = tuple(dict.fromkeys(caveat for marker in markers.values() for caveat in marker.caveats))
+    alone = () if len(chosen) == 1 else (ledger.SCENE.charge("one mesh"), ledger.MESHES.charge("each", len(chosen)))
+
+    def charged(evidence: Evidence, *charges: Charge) -> Evidence:
+        return evidence.charged(*presented, *charges)._replace(caveats=caveats)
+
+    parts = {
+        name: reading.found._replace(evidence=charged(reading.found.evidence, *alone))
+        for name, reading in readings.items()
+    }
+    best = min(parts.values(), key=lambda detection: detection.rank)
+    evidence, read = Evidence.least(*(detection.evidence for detection in parts.values())), best.message
+    for candidate, of_sum in _sums(list(readings.values()), message):
+        united = charged(of_sum)
+        if united.log10_p < evidence.log10_p:
+            read = candidate if any(detection.message == candidate for detection in parts.values()) else None
+        evidence = Evidence.least(evidence, united)
+    return best._replace(message=read, evidence=evidence, parts=parts, skipped=skipped)
 
 
 class _MeshReading(NamedTuple):
@@ -415,31 +448,19 @@ class _MeshReading(NamedTuple):
         return np.asarray(score), np.asarray(norm)
 
 
-def _unite_meshes(readings: Sequence[_MeshReading], claimed: bytes | None) -> Detection:
-    """Unite the evidence of the meshes of a scene: that of one of them, or of the sum of scores for one message."""
-    detections = [reading.found for reading in readings]
-    best = min(detections, key=lambda detection: detection.rank)
-    if len(detections) == 1:
-        return best
-    charges = ledger.SCENE.charge("one mesh"), ledger.MESHES.charge("each", len(detections))
-    evidence = Evidence.least(*(detection.evidence.charged(*charges) for detection in detections))
-    read, bits = best.message, readings[0].marker.bits
+def _sums(readings: Sequence[_MeshReading], claimed: bytes | None) -> Iterator[tuple[bytes, Evidence]]:
+    """Yield each message that is claimed or was decoded, and the evidence of the sum of its scores over all meshes."""
+    bits = readings[0].marker.bits
     if not bits:
         claimed = b""
-    messages = (
-        {claimed}
-        if claimed is not None
-        else {detection.message for detection in detections if detection.message is not None}
-    )
-    for message in messages:
-        if any(8 * len(message) != reading.marker.bits for reading in readings):
+    decoded = {reading.found.message for reading in readings} - {None}
+    for message in decoded if claimed is None else {claimed}:
+        if message is None or len(readings) == 1 or any(8 * len(message) != one.marker.bits for one in readings):
             continue
         recorded = [is_recorded(reading.marker.record, message, reading.marker.choices) for reading in readings]
         fixed = claimed is not None or all(recorded)
-        order = [charge for reading in readings for charge in reading.marker.order_charges]
         charges = [
             ledger.SCENE.charge("sum over meshes"),
-            *([ledger.in_all(order)] if order else []),
             ledger.SUM_ALIGNMENT.charge(readings[0].aligned.align),
         ]
         if fixed or any(flag is not None for flag in recorded):
@@ -447,11 +468,7 @@ def _unite_meshes(readings: Sequence[_MeshReading], claimed: bytes | None) -> De
         scores, norms = zip(*(reading.claim(message) for reading in readings), strict=True)
         # The weight of a mesh is the number of its points that the suspect shows.
         score = united_score(scores, norms, [float(np.sum(reading.aligned.weights > 0)) for reading in readings])
-        united = weigh([(score, 1.0)], bits=bits, fixed=fixed, charges=charges, meshes=len(readings))
-        if united.log10_p < evidence.log10_p:
-            read = message if any(detection.message == message for detection in detections) else None
-        evidence = Evidence.least(evidence, united)
-    return best._replace(message=read, evidence=evidence)
+        yield message, weigh([(score, 1.0)], bits=bits, fixed=fixed, charges=charges, meshes=len(readings))
 
 
 def _reasons(skipped: Mapping[str, str]) -> str:

@@ -17,7 +17,7 @@ from jaxmark.alignment.result import Alignment
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.canonical import Canonical
 from jaxmark.geometry.imprint import Imprint, make_imprint, restore
-from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh, compact
 from jaxmark.watermark.coding.keys import Choices, Key, bind, commitment
 from jaxmark.watermark.coding.message import CANDIDATES, Decoded, decode, encode
 from jaxmark.watermark.evidence import ledger
@@ -241,13 +241,13 @@ def recall(original: Mesh, key: bytes, record: Record | None) -> tuple[Original,
     if record is None:
         return make_original(original), ()
     imprint = record.open_imprint(key)
-    ready = make_original(original, imprint.grid)
+    ready = _restored(original, imprint)
     if ready.geometry == imprint.hash:
-        return _in_order_of(ready, imprint), ()
+        return ready, ()
     copy = restore(original, imprint)
-    ready = make_original(copy.mesh, imprint.grid)
     if copy.exact:
-        return _in_order_of(ready, imprint), ()
+        return _restored(copy.mesh, imprint), ()
+    ready = make_original(copy.mesh, imprint.grid)
     if copy.share < _MIN_ORIGINAL_SHARE:
         share = f"it has {100 * copy.share:.0f} % of that mesh's points"
         if copy.distance < _SAME_SHAPE:
@@ -262,8 +262,19 @@ def recall(original: Mesh, key: bytes, record: Record | None) -> tuple[Original,
     places = np.full(len(ready.used), -1)
     places[ready.weld.point] = copy.places
     ready = replace(ready, geometry=imprint.hash, places=places, count=len(imprint.tags))
-    left = f"{100 * copy.share:.1f} % of its points are left"
+    left = f"{math.floor(1000 * copy.share) / 10:.1f} % of its points are left; use an exact copy"
     return _in_order_of(ready, imprint), (f"the original was edited, and edits can feign a mark: {left}",)
+
+
+def _restored(copy: Mesh, imprint: Imprint) -> Original:
+    """Prepare a copy of an original; in another order than the marked one, without vertices that no face uses.
+
+    The imprint does not cover such vertices, but alignment depends on their number.
+    """
+    ready = make_original(copy, imprint.grid)
+    if ready.order != imprint.order and len(copy.faces) and not ready.used.all():
+        ready = make_original(compact(copy), imprint.grid)
+    return _in_order_of(ready, imprint)
 
 
 def _in_order_of(original: Original, imprint: Imprint) -> Original:

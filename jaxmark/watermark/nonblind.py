@@ -255,7 +255,15 @@ class _Reading(NamedTuple):
             tag = Tag(TAG_BITS, (*decoder_charges, ledger.RANK.charge("each", decoded.rank)))
         ways = claims_of(mark, received, message)
         caveats = detection.evidence.caveats
-        evidence = weigh(ways, bits=mark.bits, fixed=fixed, tag=tag, charges=charges, caveats=caveats)
+        evidence = weigh(
+            ways,
+            bits=mark.bits,
+            fixed=fixed,
+            tag=tag,
+            charges=charges,
+            tag_was_open=bool(mark.bits) and recorded is not None,
+            caveats=caveats,
+        )
         detection = detection._replace(evidence=evidence)
         if not is_another:
             return detection

@@ -61,7 +61,7 @@ _FIELDS = {  # the fields of a file, in which "told" is the commitment to the me
 
 
 _MAX_BITS = 2**23  # the largest payload, and the largest number of slots of a fingerprint
-_HASH = re.compile("[0-9a-f]{64}")
+_HASH, _HASH_BYTES = re.compile("[0-9a-f]{64}"), 32
 
 
 @dataclass(frozen=True)
@@ -185,10 +185,13 @@ class Record:
                 tags ^ _stream(key, self.original, len(tags)),
                 bytes.fromhex(self.imprint["order"]),
             )
-            if not (imprint.grid > 0 and np.isfinite([imprint.grid, *imprint.centre, *imprint.covariance.flat]).all()):
+            numbers = [imprint.grid, *imprint.centre, *imprint.covariance.flat]
+            if not (
+                np.isfinite(numbers).all() and imprint.grid > 0 and len(tags) and len(imprint.order) == _HASH_BYTES
+            ):
                 raise ValueError("numbers out of range")
             return imprint
-        except (KeyError, ValueError, TypeError):
+        except (KeyError, ValueError, TypeError, OverflowError):
             raise JaxmarkError(
                 "The record is damaged: its imprint of the original is incomplete or out of range."
             ) from None
@@ -231,9 +234,13 @@ class Record:
         if data["content"] not in _READERS:
             raise JaxmarkError(f"The record {where} has a content that this jaxmark does not know.")
         try:
-            return cls(message_commitment=data.pop("told"), **data)
+            record = cls(message_commitment=data.pop("told"), **data)
+            record.digest()
         except JaxmarkError as error:
             raise JaxmarkError(f"{where}: {error}") from None
+        except RecursionError:
+            raise JaxmarkError(f"The record {where} is damaged: its fields are nested too deeply.") from None
+        return record
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     monkeypatch.setattr(read_files, "read_blind", read_blind)
     monkeypatch.setattr(read_files, "detection_values", lambda detection, *_: {"detection": detection})
-    monkeypatch.setattr(read_files, "detection_text", lambda *_, **__: "")
+    monkeypatch.setattr(read_files, "detection_lines", lambda *_, **__: "")
     return points
 
 

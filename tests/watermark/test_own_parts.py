@@ -1,5 +1,6 @@
 """A carrier and a scheme of one's own take part in everything that the library's own do."""
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -127,9 +128,16 @@ def test_subclasses_of_schemes_prove_nothing(marked, key: jm.Key):
     _, mesh = marked
     assert not jm.make_marker(mesh, key, bits=BITS).caveats
     assert "not one of this library" in jm.make_marker(mesh, key, bits=BITS, scheme=Keyed()).caveats[0]
-    own = _caveats(Local())
+    own = _caveats(Local(), None)
     assert own == ("the scheme 'local' is not one of this library",)
-    assert not _caveats(LocalScheme())
+    assert not _caveats(LocalScheme(), None)
+
+
+def test_widths_and_steps_of_ones_own_prove_nothing_without_a_record():
+    usual = LocalScheme()
+    other = dataclasses.replace(usual, steps=(1.01 * usual.steps[0],))
+    assert "chosen by the reader" in _caveats(other, None)[0]
+    assert not _caveats(dataclasses.replace(usual, steps=usual.steps[:1]), None), "which is charged for all"
 
 
 @pytest.mark.slow

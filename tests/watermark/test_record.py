@@ -270,12 +270,54 @@ def test_fields_of_records_have_ranges(marked, field: str, value, tmp_path: Path
         load_record(tmp_path / "a.json")
 
 
-@pytest.mark.parametrize(("field", "value"), [("grid", 0.0), ("grid", -1.0), ("centre", [0.0, 0.0])])
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("grid", 0.0),
+        ("grid", 10**400),
+        ("centre", [0.0, 0.0]),
+        ("centre", [10**400, 0, 0]),
+        ("tags", ""),
+        ("order", "00"),
+    ],
+)
 def test_imprints_have_ranges(marked, original: Mesh, key: jm.Key, field: str, value):
     _, record = marked
     forged = dataclasses.replace(record, imprint={**record.imprint, field: value}).sealed(key)
     with pytest.raises(jm.JaxmarkError, match="imprint"):
         jm.make_marker(original, key, record=forged)
+
+
+def test_records_nested_too_deeply_are_refused(marked, tmp_path: Path):
+    data = json.loads(marked[1].to_json())
+    for _ in range(900):
+        data["imprint"] = {"imprint": data["imprint"]}
+    (tmp_path / "a.json").write_text(json.dumps(data))
+    with pytest.raises(jm.JaxmarkError, match="nested too deeply"):
+        load_record(tmp_path / "a.json")
+
+
+def test_isolated_vertices_and_empty_faces_of_a_reordered_original_change_nothing(marked, original: Mesh, key: jm.Key):
+    _, record = marked
+    order = np.random.default_rng(3).permutation(len(original.vertices))
+    other = jm.make_mesh(original.vertices[order], np.argsort(order)[original.faces])
+    more = jm.make_mesh(
+        np.vstack([other.vertices, [[0.1, 0.2, 0.3], [0.5, 0.1, 0.0]]]), np.vstack([other.faces, [[0, 400, 400]]])
+    )
+    one, two = (jm.make_marker(mesh, key, record=record).original for mesh in (other, more))
+    assert one.geometry == two.geometry
+    assert not one.in_order
+    assert not two.in_order
+    np.testing.assert_array_equal(one.marked_order.vertices, two.marked_order.vertices)
+    np.testing.assert_array_equal(one.marked_order.faces, two.marked_order.faces)
+    np.testing.assert_array_equal(one.positions, two.positions)
+
+
+def test_claiming_the_recorded_message_costs_what_reading_it_does(marked, original: Mesh, key: jm.Key):
+    suspect, record = marked
+    found = [jm.detect(suspect, original=original, key=key, record=record, message=one) for one in (None, MESSAGE)]
+    assert [charge.log10 for charge in found[1].evidence.charges if charge.choice == "proof"] == [np.log10(3)]
+    assert found[0].log10_p == found[1].log10_p
 
 
 def test_the_records_of_a_scene_agree(marked, tmp_path: Path):

@@ -90,10 +90,12 @@ def test_picking_meshes_is_charged(marked, originals, key: jm.Key):
     # 3 % for all sets that could be picked, 1/4 of it for those of two, of which there are three.
     spent = [charge.log10 for charge in two.evidence.charges[:2]]
     assert sum(spent) == pytest.approx(-np.log10(0.03 / 4 / 3))
-    assert is_charged_along_a_path(two.evidence.charges)
+    for found in (every, two, *every.parts.values()):
+        assert is_charged_along_a_path(found.evidence.charges)
     one = read(marked, originals, key, 0.006, message=MESSAGE, names=NAMES[:1])
-    alone = every.parts[NAMES[0]]
-    assert one.log10_p == pytest.approx(alone.log10_p - np.log10(0.03 / 2 / 3))
+    # Among all, it is charged for the evidence of one mesh among three, and for the order of two more originals.
+    among = every.parts[NAMES[0]].log10_p + np.log10(0.97 * 0.97**2 / 2 / 3)
+    assert one.log10_p == pytest.approx(among - np.log10(0.03 / 2 / 3))
     for wrong, whose in (("small", "original"), ("again", "original")):
         with pytest.raises(jm.JaxmarkError, match=f"{whose} has no mesh '{wrong}'"):
             read(marked, originals, key, 0.0, names=[wrong])
@@ -114,6 +116,25 @@ def test_a_damaged_original_does_not_choose_the_meshes(marked, originals, key: j
     with pytest.raises(jm.JaxmarkError, match="'right' of the original cannot be read"):
         read(marked, wrong, key, 0.0)
     assert read(marked, wrong, key, 0.0, names=["left", "third"]).detected()
+
+
+def test_presenting_an_original_so_that_it_is_not_found_is_charged_and_keeps_its_caveat(originals, key: jm.Key):
+    """Otherwise, whoever presents originals in another order, or damages them, chooses the meshes that are united."""
+    rng = np.random.default_rng(5)
+    scene = {name: mesh._replace(faces=rng.permutation(mesh.faces)) for name, mesh in originals.items()}
+    meshes, info = embed_scene(scene, MESSAGE, key, budget=BUDGET)
+    long = {f"long {name}": mesh._replace(vertices=mesh.vertices * [1, 1, 3]) for name, mesh in meshes.items()}
+    order = rng.permutation(len(scene["left"].vertices))
+    other = Mesh(scene["left"].vertices[order], np.argsort(order)[scene["left"].faces])
+    found = detect_scene(long, originals={**scene, "left": other}, key=key, record=info.record)
+    assert "left" in found.skipped
+    charges = {charge.choice: charge for charge in found.evidence.charges}
+    assert charges["order of the original (record)"].log10 >= -np.log10(0.03) - 2 * np.log10(0.97) - 1e-9
+    dented = scene["left"].vertices * np.where(scene["left"].vertices[:, :1] > 0.3, 1.05, 1.0)
+    edited = Mesh(dented[order], other.faces)
+    found = detect_scene(long, originals={**scene, "left": edited}, key=key, record=info.record)
+    assert any("edited" in caveat for caveat in found.evidence.caveats)
+    assert not found.detected()
 
 
 def test_meshes_chosen_by_their_scores_prove_nothing_uncommitted():
@@ -140,8 +161,15 @@ def test_equal_meshes_count_once(marked, originals, key: jm.Key):
     record = SceneRecord({name: info.record.meshes[name] for name in twice})
     found = detect_scene({name: meshes[name] for name in twice}, originals=twice, key=key, record=record)
     alone = jm.detect(meshes["left"], original=originals["left"], key=key, record=record.meshes["left"])
-    assert list(found.parts) == ["left"]
-    assert found.log10_p == pytest.approx(alone.log10_p - np.log10(0.97)), "all meshes of the record were read"
+    assert list(found.parts) == ["again"], "the first by name"
+    # All meshes were read, the evidence is that of one among two, and the order of each original is a choice. That of
+    # blind marks beside the record's is none.
+    charged = alone.log10_p - np.log10(0.97) - 2 * np.log10(0.97) + np.log10(2 * 2) + np.log10(0.97)
+    assert found.log10_p == pytest.approx(charged)
+    turned = SceneRecord(dict(reversed(record.meshes.items())))
+    again = detect_scene({name: meshes[name] for name in twice}, originals=twice, key=key, record=turned)
+    assert turned.digest() == record.digest()
+    assert again.log10_p == found.log10_p, "a digest does not cover the order of the meshes"
 
 
 @pytest.mark.long

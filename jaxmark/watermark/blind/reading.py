@@ -267,7 +267,16 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
     return _nothing(scheme, reading.soft, reading.anchored._replace(agreement=agreement))._replace(
         message=None if decoded is None else decoded.message,
         premises=f"key, message and {'options' if record is None else 'record'}",
-        evidence=weigh(ways, bits=bits, fixed=fixed, tag=tag, charges=charges, looks=looks, caveats=caveats),
+        evidence=weigh(
+            ways,
+            bits=bits,
+            fixed=fixed,
+            tag=tag,
+            charges=charges,
+            looks=looks,
+            tag_was_open=recorded,
+            caveats=caveats,
+        ),
         notes=tuple(notes),
     )
 

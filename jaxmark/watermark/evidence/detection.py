@@ -100,6 +100,7 @@ def weigh(
     charges: Sequence[Charge] = (),
     looks: float = 1.0,
     meshes: int = 1,
+    tag_was_open: bool = False,
     caveats: tuple[str, ...] = (),
 ) -> Evidence:
     """Compute the evidence for one message: the smallest p-value of its scores and its tag, after all charges.
@@ -113,6 +114,7 @@ def weigh(
         charges: charges for earlier choices.
         looks: number of views of the suspect whose scores were compared; blind readings are charged for them.
         meshes: number of meshes whose scores were added.
+        tag_was_open: whether the reader could have tested the tag instead, by leaving out the claim.
         caveats: the reasons why the result is an estimate.
     """
     proof = ledger.PROOF if looks == 1 else ledger.BLIND_PROOF
@@ -120,7 +122,7 @@ def weigh(
     message_charges = (*view_charges, ledger.PAYLOAD.charge("each", bits=bits))
     score_charges = view_charges if fixed else message_charges
     scores = [bounds.log10_p_score(*way) for way in ways]
-    count = len(ways) + (tag is not None)
+    count = len(ways) + (tag is not None or tag_was_open)
     proofs = [(score, (proof.charge("score", count), *score_charges)) for score in scores]
     if tag is not None:
         proofs.append((bounds.log10_p_tag(tag.bits), (proof.charge("tag", count), *tag.charges)))

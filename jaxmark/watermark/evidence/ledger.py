@@ -111,10 +111,12 @@ def selection(read: int, among: int) -> tuple[Charge, ...]:
     return SELECTION.charge("picked"), PICKED.charge("each", math.comb(among, read), bits=read)
 
 
-def in_all(charges: Sequence[Charge]) -> Charge:
-    """Return the charge for a choice that was made for each of several meshes: the product of all shares."""
+def in_all(charges: Sequence[Charge]) -> tuple[Charge, ...]:
+    """Return the charge for a choice that was made for each of several meshes, if any: the product of all shares."""
+    if not charges:
+        return ()
     dearest = max(charges, key=lambda charge: charge.log10)
-    return dearest._replace(log10=math.fsum(charge.log10 for charge in charges))
+    return (dearest._replace(log10=math.fsum(charge.log10 for charge in charges)),)
 
 
 def _each(name: str, counted: str, then: Choice | None = None, *, in_bound: bool = False) -> Choice:
@@ -173,13 +175,33 @@ PASS_BAND = Choice(
     ),
 )
 
+# Several marks in one mesh: their p-values are independent, so they are united by Fisher's product, which has a factor
+# instead of a share. The uncommitted p-value is the smallest of the marks' own, charged for their number.
+MARKS = Choice(
+    "marks in one mesh",
+    (Alternative("product", None), Alternative("one mark", None, REFLECTION)),
+    "product: no share, but a factor by Fisher's method; one mark (uncommitted): 1/n for each of the n marks",
+)
+
+# The record of several marks in one mesh is that of the first, so that the reader names the others.
+BESIDE = Choice(
+    "marks beside the record's",
+    (
+        Alternative("none", 0.97, PASS_BAND),
+        Alternative("field", 0.01, MARKS),
+        Alternative("local", 0.01, MARKS),
+        Alternative("field and local", 0.01, MARKS),
+    ),
+)
+
 # Scenes: either the sum of scores over meshes, in the poses that the readings of single meshes chose, or one mesh.
+# Whoever presents the originals chooses their orders, also of those meshes that are not found in the suspect then.
 SUM_ALIGNMENT = _alignment(MESSAGE)
-SUM_ORDER = _order(SUM_ALIGNMENT)
-MESHES = _each("mesh", "1/n for each of the n meshes of the original scene that were compared", PASS_BAND)
-SCENE = Choice("scene", (Alternative("sum over meshes", 0.5, SUM_ORDER), Alternative("one mesh", 0.5, MESHES)))
-PICKED = _each("meshes picked", "2^-k/m for each of the m sets of k meshes that could be picked", SCENE)
-SELECTION = Choice("meshes read", (Alternative("all", 0.97, SCENE), Alternative("picked", 0.03, PICKED)))
+MESHES = _each("mesh", "1/n for each of the n meshes of the original scene that are read", BESIDE)
+SCENE = Choice("scene", (Alternative("sum over meshes", 0.5, SUM_ALIGNMENT), Alternative("one mesh", 0.5, MESHES)))
+SCENE_ORDER = _order(SCENE)
+PICKED = _each("meshes picked", "2^-k/m for each of the m sets of k meshes that could be picked", SCENE_ORDER)
+SELECTION = Choice("meshes read", (Alternative("all", 0.97, SCENE_ORDER), Alternative("picked", 0.03, PICKED)))
 
 # Blind reading. The rank of a tag counts the candidates of all readings, because tags are compared reading by reading.
 LOOKS = _each(
@@ -200,14 +222,6 @@ BLIND_MESSAGE = Choice(
 BLIND_SCHEME = _each("scheme (no record)", "1/n for each of the n blind schemes that are tried", BLIND_MESSAGE)
 PARTS = _each("part of a file", "1/n for each of n pairs of a mesh of the suspect and a record", BLIND_SCHEME)
 
-# Several marks in one mesh: their p-values are independent, so they are united by Fisher's product, which has a factor
-# instead of a share. The uncommitted p-value is the smallest of the marks' own, charged for their number.
-MARKS = Choice(
-    "marks in one mesh",
-    (Alternative("product", None), Alternative("one mark", None, REFLECTION)),
-    "product: no share, but a factor by Fisher's method; one mark (uncommitted): 1/n for each of the n marks",
-)
-
 # Copies for recipients.
 RECIPIENTS = _each("recipient", "1/n for each of the n recipients who were tested")
 COPY_ALIGNMENT = _alignment(RECIPIENTS)
@@ -216,17 +230,17 @@ COPY_ORDER = _order(COPY_ALIGNMENT)
 # Catalogues: everything that could have been identified instead.
 ORIGINALS = Choice(
     "catalogue",
-    (Alternative("original", None, PASS_BAND), Alternative("copy", None, COPY_ORDER)),
+    (Alternative("original", None, BESIDE), Alternative("copy", None, COPY_ORDER)),
     "1/n for each of n readings: each piece of the suspect, under each key, with each original that has no record,"
     " each record and each recipient list",
 )
 
 # The commitment under which everything else was fixed beforehand, if any.
-COMMITMENT = _each("timestamped commitment", "1/n for each of the n records in the commitment", PASS_BAND)
+COMMITMENT = _each("timestamped commitment", "1/n for each of the n records in the commitment", BESIDE)
 UNCOMMITTED = _each(
     "forgery",
     "2^-64 for each key, original and record that a forger can afford to try; 2^-64k for a sum over k meshes",
-    PASS_BAND,
+    BESIDE,
 )
 
 #: The roots of the tree, by the kind of reading.
@@ -235,6 +249,7 @@ ROOTS: dict[str, Choice] = {
     "A scene of several meshes": SELECTION,
     "Blind": PARTS,
     "Several marks in one mesh": MARKS,
+    "One mesh with a record": BESIDE,
     "Copies for recipients": COPY_ORDER,
     "A catalogue of originals": ORIGINALS,
     "A record with a timestamped commitment": COMMITMENT,

@@ -71,7 +71,7 @@ def receive_coarse(
         return None
     marks = [original.to_host(_any_mark(carrier, number)) for number in range(others)]
     unit = float(distortion.rms(marks[0][original.used]))
-    shifts = [first_rms(original.mesh) / unit * mark for mark in marks]
+    shifts = [first_rms(original.points) / unit * mark for mark in marks]
     faces = original.points.faces
     surface = Surface(Mesh(original.positions, faces))
     elsewhere = [
