@@ -156,7 +156,7 @@ def detection_lines(
         )
         if timestamped is not None:
             text += f", {power(timestamped.log10_p)} if the commitment is older than the suspect"
-    text = " ".join([f"{text} (--alpha {alpha:g})", *detection.notes])
+    text = " ".join([f"{text} (--alpha {alpha:g})" + "." * bool(detection.notes), *detection.notes])
     if charges:
         named = {
             "": timestamped or evidence,
