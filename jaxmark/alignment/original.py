@@ -52,9 +52,14 @@ class Original:
     def marked_order(self) -> Mesh:
         """The canonical points in the marked order of vertices and faces; if the file has another, in their own order.
 
-        Unlike `mesh`, it does not depend on how a copy of the original was presented, except for `in_order`.
+        Unlike `mesh`, it does not depend on how a copy of the original was presented, except for `in_order`. Points
+        that no face uses, which the hash does not cover, are at the centroid of the others.
         """
-        return Mesh(self.points.vertices[self.weld.point], self.mesh.faces) if self.in_order else self.points
+        if not self.in_order:
+            return self.points
+        points = np.array(self.points.vertices)
+        points[~self.used] = points[self.used].mean(axis=0)
+        return Mesh(points[self.weld.point], self.mesh.faces)
 
     @cached_property
     def radius(self) -> float:

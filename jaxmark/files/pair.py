@@ -45,6 +45,8 @@ def writing_pair(file: Path, record: Path, *, overwrite: bool = False) -> Iterat
         JaxmarkError: if one of them exists and may not be replaced; see `replacing`. The files are then as before.
     """
     refuse_existing(file, record, overwrite=overwrite)
+    if os.path.realpath(file) == os.path.realpath(record):
+        raise JaxmarkError(f"{file} cannot be both the file and its record; give another name for one of them.")
     old = None
     try:
         with replacing(file) as draft, replacing(record) as record_draft:
@@ -73,7 +75,8 @@ class _Old(NamedTuple):
         """Choose names that no file has yet."""
         file, record = (Path(os.path.realpath(path)) for path in (file, record))
         names = ([path.with_name(f"old-{number}-{path.name}") for path in (file, record)] for number in count(1))
-        aside, copy = next(pair for pair in names if not any(path.exists() for path in pair))
+        taken = {file, record}
+        aside, copy = next(pair for pair in names if not any(path in taken or path.exists() for path in pair))
         return cls(file, record, aside if file.exists() else None, copy if record.exists() else None)
 
     def set_aside(self) -> None:
@@ -88,7 +91,7 @@ class _Old(NamedTuple):
         if not self.file.exists():
             if self.copy is None:
                 self.record.unlink(missing_ok=True)
-            elif self.copy.exists():
+            elif self.copy.exists() and not (self.record.exists() and read_file(self.record) == read_file(self.copy)):
                 write_atomically(self.record, read_file(self.copy))
             if self.aside is not None:
                 self.aside.rename(self.file)

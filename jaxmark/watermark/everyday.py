@@ -30,7 +30,7 @@ from jaxmark.watermark.evidence.ledger import Charge
 from jaxmark.watermark.interfaces import Detector, Scheme
 from jaxmark.watermark.mark import EmbedInfo, Mark
 from jaxmark.watermark.markers import Marker, NonBlindMarker, make_blind_marker, make_marker, prepare, unite
-from jaxmark.watermark.nonblind import Alternatives, check_claim, claims_of
+from jaxmark.watermark.nonblind import Alternatives, check_claim, claims_of, read
 from jaxmark.watermark.perception.budget import Budget, BudgetLike
 from jaxmark.watermark.perception.capacity import COVERAGE, NOISE, Capacity, Conditions
 from jaxmark.watermark.record import Record, SceneRecord, is_recorded
@@ -403,7 +403,9 @@ def detect_scene(
             if identity in identities:
                 raise JaxmarkError("It equals another mesh, which counts once.")
             aligned = marker.register(suspects[suspect_names[name]], align)
-            readings[name] = _MeshReading(marker, aligned, replace(marker).read(aligned, message))
+            # One mesh alone may be read in both reflections, by `detect`.
+            charges = (ledger.REFLECTION.charge("better fit"),) if aligned.method == "surface" else ()
+            readings[name] = _MeshReading(marker, aligned, read(replace(marker), aligned, message, charges=charges))
             identities.add(identity)
         except JaxmarkError as error:
             skipped[name] = str(error).rstrip(".")
@@ -425,13 +427,13 @@ def detect_scene(
         for name, reading in readings.items()
     }
     best = min(parts.values(), key=lambda detection: detection.rank)
-    evidence, read = Evidence.least(*(detection.evidence for detection in parts.values())), best.message
+    evidence, decoded = Evidence.least(*(detection.evidence for detection in parts.values())), best.message
     for candidate, of_sum in _sums(list(readings.values()), message):
         united = charged(of_sum)
         if united.log10_p < evidence.log10_p:
-            read = candidate if any(detection.message == candidate for detection in parts.values()) else None
+            decoded = candidate if any(detection.message == candidate for detection in parts.values()) else None
         evidence = Evidence.least(evidence, united)
-    return best._replace(message=read, evidence=evidence, parts=parts, skipped=skipped)
+    return best._replace(message=decoded, evidence=evidence, parts=parts, skipped=skipped)
 
 
 class _MeshReading(NamedTuple):

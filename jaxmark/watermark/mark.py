@@ -17,7 +17,7 @@ from jaxmark.alignment.result import Alignment
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.canonical import Canonical
 from jaxmark.geometry.imprint import Imprint, make_imprint, restore
-from jaxmark.geometry.mesh import Mesh, compact
+from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.coding.keys import Choices, Key, bind, commitment
 from jaxmark.watermark.coding.message import CANDIDATES, Decoded, decode, encode
 from jaxmark.watermark.evidence import ledger
@@ -137,6 +137,11 @@ class Mark:
             JaxmarkError: if the carrier does not displace this mesh at all; see also `displace_within`.
         """
         original, bounds = self.original, Budget.of(budget).bounds(self.original.mesh)
+        if original.weld.point.max() >= len(original.used):
+            raise JaxmarkError(
+                "The original has vertices that no face uses, and another order than when it was marked with this"
+                " record; mark it without the record."
+            )
         unit = original.to_host(self.carrier.displacement(jnp.asarray(amplitudes, original.signal.dtype)))
         size = float(distortion.rms(unit[original.used]))
         if not (math.isfinite(size) and size > 0):
@@ -208,7 +213,7 @@ class Mark:
         values, point = np.asarray(weights, np.float64), self.original.weld.point
         if values.shape != point.shape or not (np.isfinite(values) & (values >= 0)).all():
             raise JaxmarkError(f"weights must be {len(point)} finite numbers of at least 0, one for each vertex.")
-        return np.bincount(point, values) / np.bincount(point)
+        return (np.bincount(point, values) / np.bincount(point))[: len(self.original.used)]
 
 
 def bind_mark(
@@ -267,13 +272,15 @@ def recall(original: Mesh, key: bytes, record: Record | None) -> tuple[Original,
 
 
 def _restored(copy: Mesh, imprint: Imprint) -> Original:
-    """Prepare a copy of an original; in another order than the marked one, without vertices that no face uses.
+    """Prepare a copy of an original whose points and faces are exactly those of the original.
 
-    The imprint does not cover such vertices, but alignment depends on their number.
+    In another order than the marked one, only its canonical points that faces use and its canonical faces count. All
+    else, which the imprint does not cover, would be the free choice of whoever presents the copy.
     """
     ready = make_original(copy, imprint.grid)
-    if ready.order != imprint.order and len(copy.faces) and not ready.used.all():
-        ready = make_original(compact(copy), imprint.grid)
+    if ready.order != imprint.order and not ready.used.all():
+        surface = Mesh(ready.points.vertices[ready.used], ready.points.faces)
+        ready = replace(make_original(surface, imprint.grid), mesh=ready.mesh, weld=ready.weld, order=ready.order)
     return _in_order_of(ready, imprint)
 
 

@@ -261,7 +261,7 @@ class _Reading(NamedTuple):
             fixed=fixed,
             tag=tag,
             charges=charges,
-            tag_was_open=bool(mark.bits) and recorded is not None,
+            tag_was_open=bool(mark.bits) and mark.record is not None,
             caveats=caveats,
         )
         detection = detection._replace(evidence=evidence)

@@ -147,3 +147,19 @@ def test_a_device_is_not_replaced(tmp_path: Path) -> None:
     with pytest.raises(JaxmarkError, match="not an ordinary file"), writing_pair(tmp_path / "a.ply", Path(os.devnull)):
         pass
     assert not Path(os.devnull).is_file()
+
+
+def test_names_that_collide_with_those_of_the_old_pair_lose_nothing(tmp_path: Path) -> None:
+    file, record = tmp_path / "x.obj", tmp_path / "old-1-x.obj"
+    file.write_bytes(b"old")
+    with writing_pair(file, record, overwrite=True) as (draft, record_draft):
+        draft.write_bytes(b"new")
+        record_draft.write_text(NEW.to_json())
+    assert file.read_bytes() == b"new"
+    assert Record.load(record) == NEW
+    with (
+        pytest.raises(JaxmarkError, match="cannot be both"),
+        writing_pair(record, tmp_path / "." / record.name, overwrite=True),
+    ):
+        pass
+    assert Record.load(record) == NEW

@@ -302,7 +302,8 @@ def test_isolated_vertices_and_empty_faces_of_a_reordered_original_change_nothin
     order = np.random.default_rng(3).permutation(len(original.vertices))
     other = jm.make_mesh(original.vertices[order], np.argsort(order)[original.faces])
     more = jm.make_mesh(
-        np.vstack([other.vertices, [[0.1, 0.2, 0.3], [0.5, 0.1, 0.0]]]), np.vstack([other.faces, [[0, 400, 400]]])
+        np.vstack([other.vertices, [[0.1, 0.2, 0.3], [0.5, 0.1, 0.0]]]),
+        np.vstack([other.faces, [[0, 400, 400], [642, 642, 642]]]),
     )
     one, two = (jm.make_marker(mesh, key, record=record).original for mesh in (other, more))
     assert one.geometry == two.geometry
@@ -367,3 +368,14 @@ def test_openssl_reads_the_request_for_a_date(tmp_path: Path):
     assert shown == deposit.root
     assert "Hash Algorithm: sha256" in said
     assert "Certificate required: yes" in said
+
+
+def test_isolated_vertices_in_the_marked_order_do_not_choose_a_partner(original: Mesh, key: jm.Key):
+    """The hashes do not cover where they are."""
+    lonely = jm.make_mesh(np.vstack([original.vertices, [[0.1, 0.2, 0.3]]]), original.faces)
+    marker = jm.make_marker(lonely, key, bits=16)
+    record = marker.write(marker.codeword(MESSAGE), 2e-3, content=MESSAGE)[1].record
+    away = jm.make_mesh(np.vstack([original.vertices, [[150.0, 7.0, 3.0]]]), original.faces)
+    found = [jm.make_marker(mesh, key, record=record).original for mesh in (lonely, away)]
+    assert all(one.in_order for one in found)
+    np.testing.assert_array_equal(found[0].marked_order.vertices, found[1].marked_order.vertices)

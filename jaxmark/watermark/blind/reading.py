@@ -274,7 +274,7 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
             tag=tag,
             charges=charges,
             looks=looks,
-            tag_was_open=recorded,
+            tag_was_open=bool(bits) and record is not None,
             caveats=caveats,
         ),
         notes=tuple(notes),
