@@ -327,8 +327,8 @@ def test_draco_is_decoded_and_encoded_again(tmp_path: Path, joints: type) -> Non
 
 def test_numbers_decoded_by_draco_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     document, data = compressed(np.uint8)
-    points, corners = len(BALLS[0].vertices), 3 * len(BALLS[0].faces)
-    enough = 3 * points + corners + 2 * points  # announced, decoded, and read as positions and normals
+    points, faces = len(BALLS[0].vertices), len(BALLS[0].faces)
+    enough = 3 * points + faces + 2 * points  # announced, decoded, and read as positions and normals
     for limit, refused in ((enough, False), (enough - 1, True)):
         monkeypatch.setattr(limits, "ACCESSED", limits.Limit("elements of accessors", limit, 0))
         (tmp_path / "a.glb").write_bytes(glb(json.dumps(document), data))

@@ -49,7 +49,7 @@ def decompress(document: Document, primitive: dict[str, Any], where: str) -> Com
         faces = np.asarray(found.faces, np.int64).reshape(-1, 3)
     except Exception as error:  # the decoder has several kinds of its own
         raise JaxmarkError(f"{where} cannot be decoded by Draco: {error}.") from None
-    document.accessed.add(faces.size)
+    document.accessed.add(len(faces))
     decoded = {}
     for name, (dtype, width, _, count) in forms.items():
         data = by_id.get(whole(named, name, where))
