@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import re
+import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
@@ -31,7 +32,7 @@ class Worker:
         self._connection, other = _SPAWN.Pipe()
         process = _SPAWN.Process(target=_work, args=(other, self._megabytes * 2**20), daemon=True)
         process.start()
-        self._process = process
+        self._process, self._used = process, False
         other.close()
 
     def end(self) -> None:
@@ -45,29 +46,37 @@ class Worker:
     def run(self, function: Callable[..., Any], *args: Any) -> Any:
         """Call a function at the top level of a module, and return its value, which can be pickled, as its arguments.
 
+        If the process dies after earlier calls, which may have filled its memory, a fresh one repeats this call in the
+        time that is left.
+
         Raises:
             JaxmarkError: if the function raises it, or exceeds a limit.
             RuntimeError: if the function raises another exception.
         """
+        until = time.monotonic() + self._seconds
         if self._process is None:
             self.begin()
-        try:
-            self._connection.send((function, args))
-            if not self._connection.poll(self._seconds):
-                raise TimeoutError
-            value, error = self._connection.recv()
-        except (EOFError, OSError) as error:  # TimeoutError is an OSError
-            self.end()
-            self.begin()
-            late = isinstance(error, TimeoutError)
-            limit = f"{self._seconds:g} seconds" if late else f"{self._megabytes} megabytes of memory"
-            raise JaxmarkError(
-                f"The file was not read, because that takes more than {limit}, the limit of this process; simplify the"
-                " file, or read it from the command line."
-            ) from None
-        if error is not None:
-            raise error
-        return value
+        while True:
+            again, self._used = self._used, True
+            try:
+                self._connection.send((function, args))
+                if not self._connection.poll(max(0.0, until - time.monotonic())):
+                    raise TimeoutError
+                value, error = self._connection.recv()
+            except (EOFError, OSError) as error:  # TimeoutError is an OSError
+                self.end()
+                self.begin()
+                late = isinstance(error, TimeoutError)
+                if again and not late:
+                    continue
+                limit = f"{self._seconds:g} seconds" if late else f"{self._megabytes} megabytes of memory"
+                raise JaxmarkError(
+                    f"The file was not read, because that takes more than {limit}, the limit of this process; simplify"
+                    " the file, or read it from the command line."
+                ) from None
+            if error is not None:
+                raise error
+            return value
 
 
 def _work(connection: Connection, most_bytes: int) -> None:

@@ -131,7 +131,10 @@ class Desk:
         """
         worker = self._workers.get()
         try:
-            values, page = worker.run(_find, self.catalogue, tuple(self.keys), self.keeps, data, suffix)
+            with tempfile.TemporaryDirectory() as folder:  # here, because nothing of a killed worker deletes it
+                suspect = Path(folder) / f"suspect{suffix}"
+                suspect.write_bytes(data)
+                values, page = worker.run(_find, self.catalogue, tuple(self.keys), self.keeps, suspect)
         finally:
             self._workers.put(worker)
         if page is not None:
@@ -147,25 +150,22 @@ def _finder(catalogue: Path, keys: tuple[Key, ...], keeps: bool) -> Finder[Catal
     return Finder(Catalogue(catalogue, read_only=not keeps), keys)
 
 
-def _find(
-    catalogue: Path, keys: tuple[Key, ...], keeps: bool, data: bytes, suffix: str
-) -> tuple[dict[str, Any], bytes | None]:
+def _find(catalogue: Path, keys: tuple[Key, ...], keeps: bool, suspect: Path) -> tuple[dict[str, Any], bytes | None]:
     """Find the originals of a file in a worker; returns the verdict as values for JSON, and the page of a dossier.
+
+    The dossier is written into the folder of the file.
 
     Raises:
         JaxmarkError: see `Finder`.
     """
     finder, page = _finder(catalogue, keys, keeps), None
-    with tempfile.TemporaryDirectory() as folder:
-        suspect = Path(folder) / f"suspect{suffix}"
-        suspect.write_bytes(data)
-        verdict = finder.find(suspect)
-        if keeps:
-            keep(finder.catalogue, Path("uploaded"), verdict)
-        values = verdict.as_json()
-        for match in verdict.named[:1]:
-            values["dossier"] = None
-            page = _dossier(finder, suspect, match, verdict.readings, Path(folder))
+    verdict = finder.find(suspect)
+    if keeps:
+        keep(finder.catalogue, Path("uploaded"), verdict)
+    values = verdict.as_json()
+    for match in verdict.named[:1]:
+        values["dossier"] = None
+        page = _dossier(finder, suspect, match, verdict.readings, suspect.parent)
     release_programs()
     numbers = {entry.path: entry.id for entry in finder.catalogue.originals()}
     for entry in (values, *values["matches"]):

@@ -57,8 +57,10 @@ def file_hash(path: str | os.PathLike[str]) -> str:
 def read_beside(folder: Path) -> Callable[[str], bytes]:
     """Make a function that reads files by their paths relative to a folder, and none outside of it.
 
+    A file is read once: the function returns the same object for all paths of it.
     The function raises a `JaxmarkError`, half a sentence, for a file that cannot be read.
     """
+    contents: dict[tuple[int, int], bytes] = {}
 
     def read(path: str) -> bytes:
         try:
@@ -66,7 +68,11 @@ def read_beside(folder: Path) -> Callable[[str], bytes]:
             target = os.path.realpath(Path(inside) / path)
             if os.path.commonpath([inside, target]) != inside:
                 raise JaxmarkError(f"the file {ascii(path)[:80]} that it refers to is outside of its folder")
-            return read_file(target)
+            status = Path(target).stat()
+            file = status.st_dev, status.st_ino
+            if file not in contents:
+                contents[file] = read_file(target)
+            return contents[file]
         except (OSError, ValueError) as error:
             said = getattr(error, "strerror", None) or str(error)
             raise JaxmarkError(f"the file {ascii(path)[:80]} that it refers to cannot be read: {said}") from None

@@ -12,7 +12,7 @@ _MAX_CLIPPED = 1e-3  # of the range of integers
 INTEGER_ADVICE = "declare its coordinates as float or double instead of integers"
 
 
-def gather(data: bytes, offsets: Int64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.ndarray, "..."]:
+def gather(data: bytes | bytearray, offsets: Int64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.ndarray, "..."]:
     """Read the numbers of a type at byte offsets, which must lie inside the data."""
     raw = np.frombuffer(data, np.uint8)
     rows = np.empty((*offsets.shape, dtype.itemsize), np.uint8)

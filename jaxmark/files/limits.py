@@ -41,9 +41,9 @@ class Count:
 
 #: Bytes of a 3MF file's members, a LAZ file's points or Draco's numbers, after decompression.
 UNPACKED = Limit("bytes of unpacked content", 2**26, 50)
-#: XML elements of a 3MF file, without the vertices and triangles that are written as nearly all programs do.
+#: XML elements and comments of a 3MF file, without vertices and triangles that are written as nearly all programs do.
 ELEMENTS = Limit("XML elements that are read one by one", 2**19, 0.5)
-#: Elements of glTF accessors, which may share bytes.
+#: Elements of glTF accessors, which may share bytes, corners of strips and fans, and faces in Draco.
 ACCESSED = Limit("elements of accessors", 2**20, 16)
 #: Meshes, or objects, that are read one by one.
 MESHES = Limit("meshes", 2**14, 0)

@@ -14,7 +14,9 @@ from jaxmark.files.text import line_error
 _ENCODINGS = ("utf-8", "utf8", "us-ascii", "ascii")
 _COLUMNS = {"vertices": (b"x", b"y", b"z"), "triangles": (b"v1", b"v2", b"v3")}
 _ROWS = {"vertices": "vertex", "triangles": "triangle"}
-_LIST = re.compile(rb"<(?:[\w.-]+:)?(?:vertices|triangles)(?=[\s/>])[^<>]*>")
+# The start tag of a list, or the beginning of something in which there are no tags.
+_MARKUP = re.compile(rb"<(?:!--|!\[CDATA\[|\?|!|(?:[\w.-]+:)?(?:vertices|triangles)(?=[\s/>])[^<>]*>)")
+_CLOSING = {b"<!--": b"-->", b"<![CDATA[": b"]]>", b"<?": b"?>"}
 _TAG = re.compile(rb"<[^\s/>]+")
 _ATTRIBUTE = re.compile(rb"""\s+([^\s=]+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
 _WORD, _VALUE = (
@@ -110,8 +112,8 @@ class Model(_Parser):
     """The meshes of objects in a model; refused if an element lacks one of its three numbers.
 
     Lists of vertices and triangles that are written as nearly all programs do are not shown to the parser: a regular
-    expression checks that there is nothing else in them, which is many times faster. Other elements, and meshes, are
-    counted.
+    expression checks that there is nothing else in them, which is many times faster. Other elements, comments, sections
+    of text (CDATA), processing instructions and meshes are counted.
     """
 
     def __init__(self, data: bytes, elements: Count, meshes: Count) -> None:
@@ -125,18 +127,26 @@ class Model(_Parser):
         self._list: str | None = None  # which list is open
         self._list_at = -1  # the offset of its start tag, while nothing was seen in it
         self._rows: list[int] = []  # offsets of its elements
+        self._prefix: bytes | None = None  # of the first list, to read others like it
         self.expat.StartElementHandler = self._start
         self.expat.EndElementHandler = self._end
-        at = 0
-        while (found := _LIST.search(data, at)) is not None:
-            self.feed(at, found.end(), final=False)
+        at = fed = 0
+        while (found := _MARKUP.search(data, at)) is not None and found[0] != b"<!":  # a document type is refused
             at = found.end()
-            # Nothing of this kind was opened where a comment, say, holds the word.
+            if found[0] in _CLOSING:  # is not parsed up to a list in it: the parser would begin again at each of them
+                self._count_element()
+                at = data.find(_CLOSING[found[0]], at)
+                if at < 0:
+                    break
+                continue
+            self.feed(fed, at, final=False)
+            # No list of a mesh was opened if this element is somewhere else.
             if self._list is not None and self._list_at == found.start():
                 end = self._read_plain(self._list, at)
                 self.skipped += end - at
                 at = end
-        self.feed(at, len(data), final=True)
+            fed = at
+        self.feed(fed, len(data), final=True)
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         self._count_element()
@@ -173,6 +183,9 @@ class Model(_Parser):
         opened = _TAG.match(self.data, self._list_at)
         assert opened is not None, "the parser found a tag here"
         prefix = opened[0][1 : -len(kind)]
+        if self._prefix not in (None, prefix):  # an expression for each prefix would take long
+            return start
+        self._prefix = prefix
         columns = dict(zip((b"first", b"second", b"third"), _COLUMNS[kind], strict=True))
         row = re.escape(prefix + _ROWS[kind].encode())
         first = _FIRST_QUOTE.match(self.data, start)

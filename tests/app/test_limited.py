@@ -51,6 +51,57 @@ def test_memory_is_limited(worker: Worker):
     assert worker.run(len, b"abc") == 3
 
 
+_HELD: list[bytes] = []
+
+
+def _hold(size: int) -> int:
+    """Take memory and keep it, in a worker; return how much it holds."""
+    _HELD.append(bytes(size))
+    return sum(map(len, _HELD))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit memory so")
+def test_memory_of_earlier_calls_is_not_charged(worker: Worker):
+    worker.end()
+    assert worker.run(_hold, 200 * 2**20) == 200 * 2**20
+    assert worker.run(_hold, 150 * 2**20) == 150 * 2**20, "a fresh process answers"
+    with pytest.raises(JaxmarkError, match="more than 300 megabytes of memory"):
+        worker.run(_hold, 400 * 2**20)
+
+
+def test_a_repeated_call_has_the_time_that_is_left(monkeypatch: pytest.MonkeyPatch):
+    """The processes are replaced by pipes: the used one dies late, and the fresh one does not answer."""
+    running, waits = Worker(0.3, 300), list[float]()
+
+    class Pipe:
+        def __init__(self, dead: bool) -> None:
+            self.dead = dead
+
+        def send(self, call: object) -> None:
+            pass
+
+        def poll(self, seconds: float) -> bool:
+            waits.append(seconds)
+            time.sleep(0.2 if self.dead else 0)
+            return self.dead
+
+        def recv(self) -> None:
+            raise EOFError
+
+    def begin() -> None:
+        running._connection, running._used = Pipe(dead=False), False  # type: ignore[assignment]
+
+    monkeypatch.setattr(running, "begin", begin)
+    monkeypatch.setattr(running, "end", lambda: None)
+    begin()
+    running._connection, running._used = Pipe(dead=True), True  # type: ignore[assignment]
+    monkeypatch.setattr(running, "_process", object())
+    with pytest.raises(JaxmarkError, match=r"more than 0\.3 seconds"):
+        running.run(len, b"abc")
+    assert waits[0] == pytest.approx(0.3, abs=0.05)
+    assert waits[1] < 0.11
+
+
 def test_a_killed_process_is_replaced(worker: Worker):
     with pytest.raises(JaxmarkError, match="was not read"):
         worker.run(os._exit, 1)

@@ -147,6 +147,27 @@ def test_a_fifth_file_is_turned_away(server: Server):
     assert len(server.desk.seen) == 4
 
 
+def test_a_killed_worker_leaves_no_file(tmp_path: Path):
+    seen: list[Path] = []
+
+    class Killed:
+        """A worker that is killed while it reads a file."""
+
+        def run(self, function: Any, *args: Any) -> Any:
+            seen.append(args[-1])
+            assert (seen[0].name, seen[0].read_bytes()) == ("suspect.obj", b"v 0 0 0")
+            raise jm.JaxmarkError("The file was not read.")
+
+    desk = Desk(tmp_path / "shop.db", [KEY])
+    for _ in range(2):
+        desk._workers.get()
+    desk._workers.put(Killed())  # type: ignore[arg-type]
+    with pytest.raises(jm.JaxmarkError, match="not read"):
+        desk.find(b"v 0 0 0", ".obj")
+    assert not seen[0].parent.exists()
+    assert isinstance(desk._workers.get(), Killed), "the next file finds a worker"
+
+
 @pytest.mark.slow
 def test_a_file_that_is_dropped_is_named_with_its_dossier(tmp_path: Path):
     mesh = rough_sphere(900)

@@ -1,6 +1,8 @@
 """Small files that would cost minutes or gigabytes without limits; each function has the amount that makes it large."""
 
 import io
+import json
+import re
 import struct
 import zlib
 from collections.abc import Callable, Mapping
@@ -90,6 +92,32 @@ def comments(count: int) -> bytes:
     return archive(1, _HEAD + _mesh((b'<vertex x="0" y="0" z="0"/><!---->', count)) + _TAIL)
 
 
+def remarks(count: int) -> bytes:
+    """Empty comments outside of meshes."""
+    return archive(1, _HEAD + _TRIANGLE + b"<!---->" * count + _TAIL)
+
+
+def hidden(count: int, opening: bytes = b"<!--", closing: bytes = b"-->", each: int = 100_000) -> bytes:
+    """Comments, or the like, of up to so many lists each, in front of a mesh."""
+    full = opening + b"<vertices>" * each + closing
+    rest = opening + b"<vertices>" * (count % each) + closing
+    return archive(1, _HEAD + full * (count // each) + rest + _TRIANGLE + _TAIL)
+
+
+def doctype(count: int) -> bytes:
+    """A document type of many lists."""
+    return archive(1, b'<!DOCTYPE a SYSTEM "' + b"<vertices>" * count + b'">' + _HEAD + _TRIANGLE + _TAIL)
+
+
+def prefixes(count: int) -> bytes:
+    """Meshes whose elements have a prefix each."""
+    meshes = (
+        re.sub(rb"<(/?)", rb"<\1p%d:" % number, _TRIANGLE).replace(b" id", b' xmlns:p%d="%s" id' % (number, _CORE))
+        for number in range(count)
+    )
+    return archive(1, _HEAD + b"".join(meshes) + _TAIL)
+
+
 def lists(count: int) -> bytes:
     """Lists outside of meshes."""
     return archive(1, _HEAD + _TRIANGLE + b"<vertices/>" * count + _TAIL)
@@ -136,6 +164,9 @@ ARCHIVES: dict[str, tuple[Callable[[int], bytes], int]] = {
     "triangles": (triangles, 32),
     "meshes": (meshes, len(_TRIANGLE)),
     "lists": (lists, 11),
+    "remarks": (remarks, 7),
+    "hidden": (hidden, 10),
+    "doctype": (doctype, 10),
 }
 
 
@@ -176,3 +207,38 @@ def threemf(kind: str, room: int) -> bytes:
     """A hostile 3MF file of a kind whose models have so many bytes, at most."""
     make, size = ARCHIVES[kind]
     return make((room - 2**12) // size)
+
+
+def gltf(document: dict[str, object], chunk: bytes) -> bytes:
+    """A GLB file."""
+    text = json.dumps({"asset": {"version": "2.0"}} | document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(chunk), len(text), 0x4E4F534A)
+    return head + text + struct.pack("<II", len(chunk), 0x004E4942) + chunk
+
+
+def fans(count: int, corners: int, mode: int) -> bytes:
+    """Primitives that share a list of corners."""
+    primitive = {"attributes": {"POSITION": 0}, "indices": 1, "mode": mode}
+    document = {
+        "meshes": [{"primitives": [primitive] * count}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5121, "count": corners, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 48},
+            {"buffer": 0, "byteOffset": 48, "byteLength": corners},
+        ],
+        "buffers": [{"byteLength": 48 + corners}],
+    }
+    chunk = struct.pack("<12f", *(number for corner in _CORNERS for number in corner))
+    return gltf(document, chunk + bytes(number % 4 for number in range(corners)) + bytes(-corners % 4))
+
+
+def itself(names: list[str], data: bytes) -> bytes:
+    """A GLB file with more buffers, which are files."""
+    size = struct.unpack_from("<I", data, 12)[0]
+    document = json.loads(data[20 : 20 + size])
+    document["buffers"] += [{"uri": name, "byteLength": 4} for name in names]
+    return gltf(document, data[28 + size :])

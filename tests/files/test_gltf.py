@@ -3,6 +3,7 @@
 import base64
 import json
 import struct
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ import trimesh
 from hypothesis import given
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import load_mesh, load_scene, save_mesh, save_scene
+from jaxmark.files import limits, load_mesh, load_scene, save_mesh, save_scene
+from jaxmark.files.gltf.document import Document
 from jaxmark.files.gltf.json_text import rewrite
 from tests.files.test_glb import glb
 from tests.samples import bumpy_sphere
@@ -321,6 +323,27 @@ def test_draco_is_decoded_and_encoded_again(tmp_path: Path, joints: type) -> Non
         by_id = {item["unique_id"]: item["data"] for item in found.attributes}
         ids = text["meshes"][0]["primitives"][0]["extensions"]["KHR_draco_mesh_compression"]["attributes"]
         np.testing.assert_array_equal(by_id[ids["JOINTS_0"]], np.arange(4 * len(BALLS[0].vertices)).reshape(-1, 4) % 7)
+
+
+def test_numbers_decoded_by_draco_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    document, data = compressed(np.uint8)
+    points, faces = len(BALLS[0].vertices), len(BALLS[0].faces)
+    enough = 3 * points + faces + 2 * points  # announced, decoded, and read as positions and normals
+    for limit, refused in ((enough, False), (enough - 1, True)):
+        monkeypatch.setattr(limits, "ACCESSED", limits.Limit("elements of accessors", limit, 0))
+        (tmp_path / "a.glb").write_bytes(glb(json.dumps(document), data))
+        with pytest.raises(JaxmarkError, match="elements of accessors") if refused else nullcontext():
+            load_mesh(tmp_path / "a.glb")
+
+
+def test_many_decoded_numbers_are_added_without_copies() -> None:
+    document = Document(b'{"buffers": [{"uri": "data:;base64,AAAA"}]}', lambda path: b"")
+    begins = [document.add(b"ab") for _ in range(3)]
+    assert begins == [3, 5, 7]
+    same = document.data
+    document.add(b"c")
+    assert document.data is same
+    assert bytes(same) == b"\0\0\0abababc"
 
 
 def test_draco_that_announces_too_much_is_refused(tmp_path: Path) -> None:

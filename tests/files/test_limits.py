@@ -10,7 +10,8 @@ from hypothesis import HealthCheck, given, settings
 
 from jaxmark.app.limited import Worker
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import limits, load_mesh, load_scene, threemf_xml
+from jaxmark.files import atomic, limits, load_mesh, load_scene, threemf_xml
+from jaxmark.files.gltf.document import Document
 from jaxmark.files.limits import Limit
 from tests.files import hostile
 from tests.files.helpers import loaded, written
@@ -24,6 +25,9 @@ REFUSED = {
     "relationships": "more than 100 XML elements",
     "lists": "more than 100 XML elements",
     "meshes": "more than 10 meshes",
+    "remarks": "more than 100 XML elements",
+    "hidden": "a tag or comment has more than 1000 bytes",
+    "doctype": "The XML has a document type|a tag or comment has more than 1000 bytes",
     "attributes": "a tag or comment has more than 1000 bytes",
     "name": "a tag or comment has more than 1000 bytes",
 }
@@ -58,6 +62,67 @@ def test_vertices_and_triangles_are_no_other_elements(tmp_path: Path) -> None:
         source = written(tmp_path, "good.3mf", hostile.threemf(kind, 2**14))
         np.testing.assert_array_equal(load_mesh(source).vertices, np.zeros(((2**14 - 2**12) // 27, 3)))
     assert len(loaded(tmp_path, "good.3mf", hostile.triangles(1000)).faces) == 1000
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda count: hostile.hidden(count),
+        lambda count: hostile.hidden(count, b"<![CDATA[", b"]]>"),
+        lambda count: hostile.hidden(count, b"<?a ", b"?>"),
+        hostile.doctype,
+    ],
+    ids=["comment", "text", "instruction", "document type"],
+)
+def test_words_in_comments_are_parsed_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Callable[[int], bytes]
+) -> None:
+    feed, fed = threemf_xml._Parser.feed, list[int]()
+
+    def spy(parser: threemf_xml._Parser, start: int, end: int, *, final: bool) -> None:
+        fed.append(end - start)
+        feed(parser, start, end, final=final)
+
+    monkeypatch.setattr(threemf_xml._Parser, "feed", spy)
+    try:
+        assert len(loaded(tmp_path, "a.3mf", make(90_000)).faces) == 1
+    except JaxmarkError as error:
+        assert make is hostile.doctype
+        assert "document type" in str(error)  # noqa: PT017
+    assert len(fed) <= 4
+    assert max(fed) > 900_000
+
+
+def test_one_expression_is_made_for_all_lists(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = load_scene(written(tmp_path, "a.3mf", hostile.prefixes(5)))
+    assert [len(mesh.faces) for mesh in scene.meshes.values()] == [1] * 5
+    monkeypatch.setattr(limits, "ELEMENTS", Limit("XML elements", 37, 0))
+    with pytest.raises(JaxmarkError, match="more than 37 XML elements"):
+        load_scene(tmp_path / "a.3mf")
+
+
+def test_corners_of_strips_and_fans_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ACCESSED", Limit("elements of accessors", 5000, 0))
+    for mode in (5, 6):
+        assert len(loaded(tmp_path, "a.glb", hostile.fans(1, 1000, mode)).faces) == 998
+        with pytest.raises(JaxmarkError, match="more than 5000 elements of accessors"):
+            loaded(tmp_path, "a.glb", hostile.fans(2, 1000, mode))
+    assert len(loaded(tmp_path, "a.glb", hostile.fans(4, 999, 4)).faces) == 4 * 333
+
+
+def test_a_file_that_is_many_buffers_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read, paths = atomic.read_file, list[str]()
+    monkeypatch.setattr(atomic, "read_file", lambda path: paths.append(str(path)) or read(path))
+    names = ["a.glb", "./a.glb", "b/../a.glb", "%61.glb"] * 250
+    data = hostile.itself(names, hostile.fans(1, 300, 4))
+    document = Document(data, atomic.read_beside(written(tmp_path, "a.glb", data).parent))
+    assert len(paths) == 1
+    assert len(document.data) == 348 + len(data)
+    assert {buffer.place for buffer in document.buffers if not isinstance(buffer, str)} == {
+        range(348),
+        range(348, 348 + len(data)),
+    }
+    assert len(load_mesh(tmp_path / "a.glb").faces) == 100
 
 
 def test_tags_of_any_length_below_the_limit_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,7 +188,7 @@ def _within_budget(worker: Worker, path: Path) -> str:
 def test_the_largest_files_that_are_unpacked(tmp_path: Path, worker: Worker, kind: str) -> None:
     data = hostile.threemf(kind, limits.UNPACKED.least)
     refusal = _within_budget(worker, written(tmp_path, "a.3mf", data))
-    assert bool(refusal) == (kind not in ("plain", "single", "triangles"))
+    assert bool(refusal) == (kind not in ("plain", "single", "triangles", "hidden"))
 
 
 @pytest.mark.long

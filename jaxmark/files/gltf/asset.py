@@ -14,6 +14,7 @@ from jaxmark.files import limits
 from jaxmark.files.binary import BinaryNumbers, encode, gather
 from jaxmark.files.gltf import draco
 from jaxmark.files.gltf.document import FLOAT, Document, Elements, Read, attribute, objects, uses, whole
+from jaxmark.files.limits import Count
 from jaxmark.files.source import (
     Faces,
     Indices,
@@ -124,7 +125,7 @@ def _primitive(document: Document, data: dict[str, Any], place: tuple[int, int],
     corners = _corners(document, data, count) if compressed is None else compressed.faces.ravel()
     if normal is not None and not (_is_plain(document, normal) and len(document.elements(normal).starts) == count):
         normal = None
-    faces = _triangles(corners, data.get("mode", 4) if compressed is None else 4, where)
+    faces = _triangles(corners, data.get("mode", 4) if compressed is None else 4, document.accessed, where)
     return _Primitive(data, place, position, normal, faces, compressed)
 
 
@@ -152,12 +153,13 @@ def _corners(document: Document, primitive: dict[str, Any], count: int) -> Indic
     return index
 
 
-def _triangles(corners: Indices, mode: int, where: str) -> Faces:
-    """Split a list (mode 4), a strip (5) or a fan (6) into triangles."""
+def _triangles(corners: Indices, mode: int, accessed: Count, where: str) -> Faces:
+    """Split a list (mode 4), a strip (5) or a fan (6) into triangles; count the corners that the last two add."""
     if mode == 4:
         if len(corners) % 3:
             raise JaxmarkError(f"{where} has {len(corners)} corners, which is no multiple of three.")
         return corners.reshape(-1, 3)
+    accessed.add(3 * max(len(corners) - 2, 0))
     first = np.arange(max(len(corners) - 2, 0))
     if mode == 6:
         return corners[np.stack([np.zeros_like(first), first + 1, first + 2], axis=1)]
@@ -217,7 +219,7 @@ def _shared_bytes(document: Document, found: dict[str, list[_Primitive]]) -> dic
 
 def _source(document: Document, found: dict[str, list[_Primitive]], left: dict[str, str]) -> Source:
     """Make the source of the meshes that were found."""
-    data = document.data
+    data = document.data = bytes(document.data)
     primitives = [one for group in found.values() for one in group]
     points = {one.position: document.located[one.position] for one in primitives}
     normals = {one.normal: document.located[one.normal] for one in primitives if one.normal is not None}

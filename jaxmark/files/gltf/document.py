@@ -19,7 +19,7 @@ from jaxmark.files.gltf.json_text import rewrite
 from jaxmark.files.limits import Count
 from jaxmark.files.source import Indices, Patched
 
-#: Reads a file by its path relative to the folder of the document.
+#: Reads a file by its path relative to the folder of the document; the same object for all paths of one file.
 Read = Callable[[str], bytes]
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
@@ -58,7 +58,7 @@ class Elements(NamedTuple):
 class Buffer(NamedTuple):
     """One buffer of a document."""
 
-    place: range  # of its bytes in `Document.data`
+    place: range  # of its bytes in `Document.data`, which other buffers of the same file share
     head: str  # the text before the data in the document, or another file's path; empty for the chunk of a GLB file
 
 
@@ -72,6 +72,7 @@ class Document:
         data: the bytes of the buffers, and whatever is added behind them.
         located: the elements of accessors that were read or decoded, by index.
         decoded: the indices of those that were compressed.
+        accessed: counts the elements of accessors that are read, and the corners of faces that are made of them.
         unpacked: counts the bytes of those that are decompressed.
     """
 
@@ -94,24 +95,28 @@ class Document:
         if file[:4] != _MAGIC and str(version).split(".")[0] != "2":
             raise JaxmarkError(f"Only version 2 of glTF is supported, not {ascii(version)[:40]}.")
         self.file, self.buffers = file, list[Buffer | str]()
-        pieces, size = list[bytes](), 0
+        pieces, places, size = list[bytes](), dict[int, range](), 0
         for index, entry in enumerate(_listed(self.content, "buffers")):
             try:
                 head, data = _content(entry, index, file[chunk.start : chunk.stop] if chunk else None, read)
             except JaxmarkError as error:
                 self.buffers.append(str(error).rstrip("."))
                 continue
-            self.buffers.append(Buffer(range(size, size + len(data)), head))
-            pieces.append(data)
-            size += len(data)
-        self.data = b"".join(pieces)
+            if id(data) not in places:
+                places[id(data)] = range(size, size + len(data))
+                pieces.append(data)
+                size += len(data)
+            self.buffers.append(Buffer(places[id(data)], head))
+        self.data: bytes | bytearray = b"".join(pieces)
         self.located: dict[int, Elements] = {}
         self.decoded: set[int] = set()
         self._lists: dict[str, list[dict[str, Any]]] = {}
-        self._accessed, self.unpacked = (Count(one, size) for one in (limits.ACCESSED, limits.UNPACKED))
+        self.accessed, self.unpacked = (Count(one, size) for one in (limits.ACCESSED, limits.UNPACKED))
 
     def add(self, data: bytes) -> int:
         """Append bytes to the data, and return where they begin."""
+        if isinstance(self.data, bytes):
+            self.data = bytearray(self.data)  # grows without being copied each time
         self.data += data
         return len(self.data) - len(data)
 
@@ -145,11 +150,12 @@ class Document:
     def elements(self, index: int) -> Elements:
         """Locate the elements of an accessor, which must lie inside its buffer."""
         if index in self.decoded:
+            self.accessed.add(len(self.located[index].starts))
             return self.located[index]
         where = f"accessors[{index}]"
         dtype, width, unit, count = self.form(index)
         size = dtype.itemsize * width
-        self._accessed.add(count)
+        self.accessed.add(count)
         accessor = self.item("accessors", index)
         if "sparse" in accessor:
             raise JaxmarkError(f"{where} is sparse, which is not supported.")

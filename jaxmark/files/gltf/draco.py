@@ -41,13 +41,15 @@ def decompress(document: Document, primitive: dict[str, Any], where: str) -> Com
     forms = {name: document.form(index) for name, index in indices.items()}
     # The announced size must be possible, before the decoder reserves memory for it.
     document.unpacked.add(sum(dtype.itemsize * width * count for dtype, width, _, count in forms.values()))
+    document.accessed.add(sum(count for _, _, _, count in forms.values()))
     decoder = require("DracoPy", "files")
     try:
-        found = decoder.decode(document.data[begin : begin + length])
+        found = decoder.decode(bytes(document.data[begin : begin + length]))
         by_id = {item["unique_id"]: np.asarray(item["data"]) for item in found.attributes}
         faces = np.asarray(found.faces, np.int64).reshape(-1, 3)
     except Exception as error:  # the decoder has several kinds of its own
         raise JaxmarkError(f"{where} cannot be decoded by Draco: {error}.") from None
+    document.accessed.add(len(faces))
     decoded = {}
     for name, (dtype, width, _, count) in forms.items():
         data = by_id.get(whole(named, name, where))
