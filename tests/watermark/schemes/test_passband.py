@@ -107,8 +107,8 @@ def test_faint_marks_are_read_with_their_record_and_without():
     with_record = jm.detect(marked, original=SHAPE, key=key, message=b"ab", record=info.record)
     without = jm.detect(marked, original=SHAPE, key=key, message=b"ab")
     assert with_record.message == without.message == b"ab"
-    # One of two bands that share a tenth. With the record, there are charges for what a record leaves open: the order of
-    # the original, blind marks beside, and the tag.
+    # One of two bands that share a tenth. With the record, there are charges for what a record leaves open: the order
+    # of the original, blind marks beside, and the tag.
     price = without.evidence.log10_p_unfloored - with_record.evidence.log10_p_unfloored
     assert price == pytest.approx(math.log10(2 / 0.1) + math.log10(0.97**2 * 2 / 3), abs=0.01)
     assert jm.detect(marked, original=SHAPE, key=jm.new_key(), bits=16).log10_p > -6
