@@ -26,7 +26,7 @@ class Limit(NamedTuple):
             )
 
 
-class Count:
+class RunningCount:
     """A running count of something in a file, which is refused when it exceeds its limit."""
 
     def __init__(self, limit: Limit, size: int) -> None:

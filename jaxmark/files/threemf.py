@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import limits
-from jaxmark.files.limits import Count
+from jaxmark.files.limits import RunningCount
 from jaxmark.files.source import Faces, JoinedNumbers, Part, Patched, Source, concerning, splice, unique_names, unusable
 from jaxmark.files.text import Spans, TextNumbers
 from jaxmark.files.threemf_xml import NO_TRIPLES, Model, RawMesh, read_relationships
@@ -50,7 +50,7 @@ def parse(data: bytes) -> Source:
     archive = Archive(data)
     signed = _is_signed(archive)
     found: list[tuple[Member, bytes, list[RawMesh]]] = []
-    elements, counted = (Count(limit, len(data)) for limit in (limits.ELEMENTS, limits.MESHES))
+    elements, counted = (RunningCount(limit, len(data)) for limit in (limits.ELEMENTS, limits.MESHES))
     for member in _model_members(archive, elements):
         content = archive.read(member)
         with concerning(member.shown):
@@ -96,7 +96,7 @@ def _is_signed(archive: Archive) -> bool:
     return signed
 
 
-def _model_members(archive: Archive, elements: Count) -> list[Member]:
+def _model_members(archive: Archive, elements: RunningCount) -> list[Member]:
     """Find the members that are models, in the order of the archive."""
     root = _DEFAULT
     relationships = archive.find("_rels/.rels")

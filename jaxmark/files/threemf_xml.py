@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.limits import Count
+from jaxmark.files.limits import RunningCount
 from jaxmark.files.text import line_error
 
 _ENCODINGS = ("utf-8", "utf8", "us-ascii", "ascii")
@@ -93,7 +93,7 @@ def _not_utf8(encoding: str) -> JaxmarkError:
     return JaxmarkError(f"The XML is encoded in {encoding!a}; only UTF-8 is supported, so save it as that.")
 
 
-def read_relationships(data: bytes, elements: Count) -> list[tuple[str, str]]:
+def read_relationships(data: bytes, elements: RunningCount) -> list[tuple[str, str]]:
     """Read the type and the target of each relationship that a `.rels` member states, and count its elements."""
     found: list[tuple[str, str]] = []
 
@@ -116,7 +116,7 @@ class Model(_Parser):
     of text (CDATA), processing instructions and meshes are counted.
     """
 
-    def __init__(self, data: bytes, elements: Count, meshes: Count) -> None:
+    def __init__(self, data: bytes, elements: RunningCount, meshes: RunningCount) -> None:
         super().__init__(data)
         self._count_element, self._count_mesh = elements.add, meshes.add
         self.meshes: list[RawMesh] = []

@@ -14,7 +14,7 @@ from jaxmark.files import limits
 from jaxmark.files.binary import BinaryNumbers, encode, gather
 from jaxmark.files.gltf import draco
 from jaxmark.files.gltf.document import FLOAT, Document, Elements, Read, attribute, objects, uses, whole
-from jaxmark.files.limits import Count
+from jaxmark.files.limits import RunningCount
 from jaxmark.files.source import (
     Faces,
     Indices,
@@ -153,7 +153,7 @@ def _corners(document: Document, primitive: dict[str, Any], count: int) -> Indic
     return index
 
 
-def _triangles(corners: Indices, mode: int, accessed: Count, where: str) -> Faces:
+def _triangles(corners: Indices, mode: int, accessed: RunningCount, where: str) -> Faces:
     """Split a list (mode 4), a strip (5) or a fan (6) into triangles; count the corners that the last two add."""
     if mode == 4:
         if len(corners) % 3:

@@ -16,7 +16,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import limits
 from jaxmark.files.binary import gather
 from jaxmark.files.gltf.json_text import rewrite
-from jaxmark.files.limits import Count
+from jaxmark.files.limits import RunningCount
 from jaxmark.files.source import Indices, Patched
 
 #: Reads a file by its path relative to the folder of the document; the same object for all paths of one file.
@@ -111,7 +111,7 @@ class Document:
         self.located: dict[int, Elements] = {}
         self.decoded: set[int] = set()
         self._lists: dict[str, list[dict[str, Any]]] = {}
-        self.accessed, self.unpacked = (Count(one, size) for one in (limits.ACCESSED, limits.UNPACKED))
+        self.accessed, self.unpacked = (RunningCount(one, size) for one in (limits.ACCESSED, limits.UNPACKED))
 
     def add(self, data: bytes) -> int:
         """Append bytes to the data, and return where they begin."""
