@@ -142,8 +142,8 @@ def test_capacity_is_what_embed_takes(workshop: Workshop):
     assert 64 <= bits < 1000
     for size, status in ((bits, 0), (bits + 8, 2)):
         code, _, err = workshop(
-            *("embed", "model.ply", "full.ply", "--key", "owner.key", "--message", "5a" * (size // 8), "--json"),
-            *(*budget, "--noise", "0.005"),
+            *("embed", "model.ply", f"full-{size}.ply", "--key", "owner.key", "--json"),
+            *("--message", "5a" * (size // 8), *budget, "--noise", "0.005"),
         )
         assert code == status, err
     assert f"at most {bits} bits" in err
