@@ -59,8 +59,10 @@ def make_suspect(original: Original, mesh: Mesh) -> PreparedSuspect:
         JaxmarkError: see `make_mesh`.
     """
     mesh = host_mesh(mesh)
-    vertices, faces, own = np.asarray(mesh.vertices), np.asarray(mesh.faces), np.asarray(original.marked_order.faces)
-    alike = len(vertices) == len(original.marked_order.vertices) and len(faces) == len(own)
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    marked = original.marked_order
+    own = np.asarray(marked.faces)
+    alike = len(vertices) == len(marked.vertices) and len(faces) == len(own)
     if alike and np.array_equal(np.sort(faces, axis=1), np.sort(own, axis=1)):
         mesh = mesh._replace(faces=own)
     size = float(np.quantile(np.abs(vertices - np.median(vertices, axis=0)).max(axis=1), 0.6))  # of most points

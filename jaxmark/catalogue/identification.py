@@ -470,7 +470,8 @@ class Finder(Generic[AnyOriginals]):
 def split(meshes: Mapping[str, Mesh]) -> list[Piece]:
     """Split a suspect into pieces: its distinct meshes, then the components of meshes with several large ones.
 
-    Of several meshes, those with few faces are left out: they carry no mark, and there may be thousands of them.
+    If there are several meshes, those with few faces are left out: they carry no mark, and there may be thousands of
+    them.
     """
     distinct: dict[bytes, Piece] = {}
     for name, mesh in meshes.items():

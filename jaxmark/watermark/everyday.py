@@ -386,7 +386,7 @@ def detect_scene(
             if record is None:
                 skipped[name] = str(error).rstrip(".")
                 continue
-            # If such meshes were skipped, who presents the original could choose the meshes that are read.
+            # If such meshes were skipped, damaging them would choose the meshes that are read.
             raise JaxmarkError(f"The mesh {name!r} of the original cannot be read: {error}") from None
         if message is not None:
             check_claim(marker, message)
@@ -412,8 +412,8 @@ def detect_scene(
         after()
     if not readings:
         raise JaxmarkError(f"None of the {len(chosen)} meshes could be compared: {_reasons(skipped)}.")
-    # Whoever presents the originals can make one unlike its counterpart, so that it is skipped. So the orders and the
-    # caveats of all originals count, and the number of meshes is that of all originals.
+    # An original can be presented so that it is unlike its counterpart, and is skipped. So the orders and the caveats
+    # of all originals count, and the number of meshes is that of all originals.
     orders = [charge for marker in markers.values() for charge in marker.order_charges]
     presented = *ledger.selection(len(chosen), len(marked)), *ledger.in_all(orders)
     caveats = tuple(dict.fromkeys(caveat for marker in markers.values() for caveat in marker.caveats))

@@ -61,7 +61,7 @@ _FIELDS = {  # the fields of a file, in which "told" is the commitment to the me
 
 
 _MAX_BITS = 2**23  # the largest payload, and the largest number of slots of a fingerprint
-_HASH, _HASH_BYTES = re.compile("[0-9a-f]{64}"), 32
+_HASH = re.compile("[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
@@ -88,12 +88,7 @@ class Record:
 
     def __post_init__(self) -> None:
         """Check the ranges of all fields."""
-        hashes = {
-            "original": self.original,
-            "key": self.key,
-            "message_commitment": self.message_commitment,
-            "code": self.code,
-        }
+        hashes = {name: getattr(self, name) for name in ("original", "key", "message_commitment", "code")}
         is_in_range = {
             **{name: _HASH.fullmatch(value) or (not value and name != "key") for name, value in hashes.items()},
             "bits": 0 <= self.bits <= _MAX_BITS
@@ -186,10 +181,9 @@ class Record:
                 bytes.fromhex(self.imprint["order"]),
             )
             numbers = [imprint.grid, *imprint.centre, *imprint.covariance.flat]
-            if not (
-                np.isfinite(numbers).all() and imprint.grid > 0 and len(tags) and len(imprint.order) == _HASH_BYTES
-            ):
-                raise ValueError("numbers out of range")
+            is_in_range = np.isfinite(numbers).all() and imprint.grid > 0 and len(tags) > 0
+            if not is_in_range or not _HASH.fullmatch(self.imprint["order"]):
+                raise ValueError("out of range")
             return imprint
         except (KeyError, ValueError, TypeError, OverflowError):
             raise JaxmarkError(
@@ -434,6 +428,6 @@ def make_commitment(digests: Iterable[str]) -> TimestampedCommitment:
         JaxmarkError: if no digest is given, or one is not 64 hexadecimal digits.
     """
     distinct = tuple(sorted(set(digests)))
-    if not distinct or not all(re.fullmatch("[0-9a-f]{64}", digest) for digest in distinct):
+    if not distinct or not all(map(_HASH.fullmatch, distinct)):
         raise JaxmarkError("A commitment needs at least one record digest, each of 64 hexadecimal digits.")
     return TimestampedCommitment(distinct)

@@ -263,7 +263,6 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
     if reading.view.mirrored[reading.turn]:
         notes.append("The suspect is the mirror image of the marked mesh.")
     agreement = float(score[chosen] / reading.anchors)
-    caveats = _caveats(scheme, record)
     return _nothing(scheme, reading.soft, reading.anchored._replace(agreement=agreement))._replace(
         message=None if decoded is None else decoded.message,
         premises=f"key, message and {'options' if record is None else 'record'}",
@@ -275,7 +274,7 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
             charges=charges,
             looks=looks,
             tag_was_open=bool(bits) and record is not None,
-            caveats=caveats,
+            caveats=_caveats(scheme, record),
         ),
         notes=tuple(notes),
     )

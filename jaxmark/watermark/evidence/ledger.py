@@ -195,10 +195,10 @@ BESIDE = Choice(
 )
 
 # Scenes: either the sum of scores over meshes, in the poses that the readings of single meshes chose, or one mesh.
-# Whoever presents the originals chooses their orders, also of those meshes that are not found in the suspect then.
 SUM_ALIGNMENT = _alignment(MESSAGE)
 MESHES = _each("mesh", "1/n for each of the n meshes of the original scene that are read", BESIDE)
 SCENE = Choice("scene", (Alternative("sum over meshes", 0.5, SUM_ALIGNMENT), Alternative("one mesh", 0.5, MESHES)))
+# The order of each original is a choice, also if its mesh is not found in the suspect because of it.
 SCENE_ORDER = _order(SCENE)
 PICKED = _each("meshes picked", "2^-k/m for each of the m sets of k meshes that could be picked", SCENE_ORDER)
 SELECTION = Choice("meshes read", (Alternative("all", 0.97, SCENE_ORDER), Alternative("picked", 0.03, PICKED)))
