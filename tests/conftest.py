@@ -1,6 +1,9 @@
 """Fixtures that many tests share; dtypes are never promoted silently."""
 
+import os
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import jax
 import jaxtyping
@@ -10,6 +13,14 @@ import pytest
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from tests.samples import bumpy_sphere
+
+# One cache of compiled programs for all workers, commands that tests start, and later runs in this environment.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(sys.prefix) / ".programs"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+jax.config.update(
+    "jax_persistent_cache_min_compile_time_secs", float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"])
+)
 
 
 @pytest.fixture(autouse=True)

@@ -233,7 +233,9 @@ def embed_command(
     "--dossier", type=FILE, help="Folder for a page that explains a detection to others (needs the extra `plot`)."
 )
 @click.option(
-    "--charges", is_flag=True, help="Print how much each choice of the reader costs of the significance budget."
+    "--charges",
+    is_flag=True,
+    help="Print how much each choice of the reader costs of the significance budget (see docs/proof.md).",
 )
 @ALPHA
 @WORKERS

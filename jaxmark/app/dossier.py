@@ -81,19 +81,24 @@ def save_report(folder: Path, original: Original, suspect: Mesh, alignment: Alig
     return path
 
 
+def missing_proof(detection: Detection) -> str:
+    """Return why a detection has no dossier, which is only about proofs; "" if it may have one."""
+    if detection.evidence.caveats:
+        return f"There is no dossier of an estimate: {'; '.join(detection.evidence.caveats)}."
+    if not detection.detected():
+        return "There is no dossier, because nothing was detected at a false-positive probability of 10^-6."
+    return ""
+
+
 def save_dossier(folder: Path, case: Case) -> None:
     """Write `dossier.html` and `dossier.json` to a folder, which is created if it does not exist.
 
     Raises:
-        JaxmarkError: if nothing was detected, if the detection is an estimate, if an extra is missing, or if a file
-            cannot be read or written.
+        JaxmarkError: if the detection proves nothing, see `missing_proof`, if an extra is missing, or if a file cannot
+            be read or written.
     """
-    if case.found.evidence.caveats:
-        raise JaxmarkError(f"There is no dossier of an estimate: {'; '.join(case.found.evidence.caveats)}.")
-    if not case.found.detected():
-        raise JaxmarkError(
-            "Nothing was detected at a false-positive probability of 10^-6, which a dossier needs; leave out --dossier."
-        )
+    if reason := missing_proof(case.found):
+        raise JaxmarkError(reason)
     require("jinja2", "plot")  # checked before the pictures are drawn, which takes longer
     facts = _facts(case)
     make_folder(folder)

@@ -9,7 +9,7 @@ from jaxmark.alignment.original import Original
 from jaxmark.alignment.pairing import pair
 from jaxmark.alignment.result import Align
 from jaxmark.app.diagnosis import diagnose, is_original
-from jaxmark.app.dossier import Case, save_dossier, save_report
+from jaxmark.app.dossier import Case, missing_proof, save_dossier, save_report
 from jaxmark.app.mark_files import pick
 from jaxmark.app.output import FileOutcome, Status, detection_lines, detection_status, detection_values
 from jaxmark.app.process import release_programs
@@ -64,9 +64,11 @@ class FileReader:
             report: folder for a picture of the alignment.
             dossier: folder for the dossier of a detection, see `jaxmark.app.dossier`.
 
+        Returns:
+            The outcome; if a dossier is requested and the detection proves nothing, it says so, and nothing is written.
+
         Raises:
-            JaxmarkError: see `detect`; also if the commitment does not contain the record, or a dossier is requested
-                for an estimate.
+            JaxmarkError: see `detect`; also if the commitment does not contain the record.
         """
         loaded = None if record is None else load_record(record)
         if original is None:
@@ -107,6 +109,9 @@ class FileReader:
         if nothing and detection.registration.deformed is not None and _has_skin(original):
             notes += ("If the suspect is in another pose of the original's skeleton, remove it by `jaxmark unpose`.",)
         outcome = self._outcome(detection._replace(notes=notes), suspect, loaded)
+        if dossier is not None and (reason := missing_proof(detection)):
+            outcome.values["dossier"] = None
+            return outcome._replace(lines=(*outcome.lines, reason))
         if dossier is not None:
             self.doing("making the dossier")
             timestamped = outcome.values.get("log10_p_timestamped")

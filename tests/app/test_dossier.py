@@ -123,15 +123,17 @@ def test_there_is_no_dossier_of_less_than_a_proof(workshop: Workshop):
     assert (told["detected"], told["estimate"]) == (False, True)
     assert told["log10_p"] < -6
     assert "the original was edited" in told["caveats"][0]
-    status, said, _ = workshop("detect", "marked.ply", *DETECT[2:], "--original", "dented.ply", *RECORD)
+    edited = ("detect", "marked.ply", *DETECT[2:], "--original", "dented.ply", *RECORD, "--dossier", "case")
+    status, said, _ = workshop(*edited)
     assert status == 3
     assert said.startswith("estimate, not a proof: message 6f6b")
     assert "an estimate: the original was edited" in said
-    assert "no dossier of an estimate" in workshop.refused(
-        "detect", "marked.ply", *DETECT[2:], "--original", "dented.ply", *RECORD, "--dossier", "case"
-    )
-    sentence = workshop.refused("detect", "model.ply", *DETECT, *RECORD, "--dossier", "case")
-    assert "Nothing was detected" in sentence
+    assert "There is no dossier of an estimate" in said.splitlines()[-1]
+    assert workshop.json(*edited, status=3)["dossier"] is None
+    status, said, _ = workshop("detect", "model.ply", *DETECT, *RECORD, "--dossier", "case")
+    assert status == 1
+    assert said.startswith("nothing detected")
+    assert "There is no dossier, because nothing was detected" in said
     workshop.json("commit", RECORD[1], "--output", "all.json")
     Path(RECORD[1]).write_text(json.dumps(json.loads(Path(RECORD[1]).read_text()) | {"beta": 1.0}))
     assert "was edited" in workshop.refused("detect", "marked.ply", *DETECT, *RECORD, "--commitment", "all.json")

@@ -4,6 +4,7 @@ import contextlib
 import doctest
 import inspect
 import io
+import itertools
 import os
 import pkgutil
 import re
@@ -13,6 +14,7 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -67,14 +69,15 @@ def blocks(page: str, language: str) -> list[str]:
 
 
 def run(page: str) -> dict:
-    """Run the Python blocks of a page in one namespace, in which a mesh and a key are there.
+    """Run the Python blocks of a page in one namespace, in which a mesh and a key are there; new keys are fixed ones.
 
     Text that follows a block at once is a sample of what it prints, with other numbers.
     """
     names: dict = {"mesh": bumpy_sphere(4), "key": jm.Key(bytes(32))}
+    keys = (jm.Key(bytes([number] * 32)) for number in itertools.count())
     for block, sample in SAMPLED.findall(PAGES[page]):
         printed = io.StringIO()
-        with contextlib.redirect_stdout(printed):
+        with contextlib.redirect_stdout(printed), mock.patch.object(jm, "new_key", side_effect=keys):
             exec(compile(textwrap.dedent(block), page, "exec"), names)
         print(printed.getvalue())
         if sample:

@@ -72,7 +72,7 @@ class FieldScheme(BlindScheme):
         if (-np.diff(variances) < _MIN_GAP * variances[0]).any():
             raise JaxmarkError(
                 "This shape is (nearly) equally wide in two directions, so that its pose cannot be found without the"
-                " original; use the scheme 'keyed'."
+                " original; use the scheme 'local', which is blind, too, or 'keyed'."
             )
         dtype, rows = original.signal.dtype, original.to_traced(original.positions)
         faces = turned(faces) if placement.inside_out else faces

@@ -69,7 +69,7 @@ def test_functions_and_record(key: jm.Key):
     assert info.record.content == "fingerprint"
     found = jm.identify(copy, ["bob", "alice"], original=mesh, key=key, record=info.record, top=1)
     assert found[0].recipient == "alice"
-    charge, _ = found[0].charges  # and the alignment
+    charge, *_ = found[0].charges  # and those of record and alignment
     assert (charge.choice, charge.log10) == ("recipient", pytest.approx(np.log10(2)))
     with pytest.raises(jm.JaxmarkError, match="identify reads it"):
         jm.detect(copy, original=mesh, key=key, record=info.record)
