@@ -17,6 +17,11 @@ SAY = "print(jax.config.jax_compilation_cache_dir)"
 CODE = f"import jax; from jaxmark.app.process import keep_programs; keep_programs(); {SAY}"
 
 
+@pytest.fixture(autouse=True)
+def _no_cache_of_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+
+
 def kept(home: Path, **more: str) -> str:
     """Where another process keeps programs."""
     environment = {**os.environ, "XDG_CACHE_HOME": str(home), **more}
