@@ -38,6 +38,7 @@ _PATH = click.Path(path_type=Path)
 _HOST = "127.0.0.1"
 _WORKERS = 2  # processes that read uploaded files
 _MOST_JOBS = 4  # most uploaded files that wait or are being read
+_MOST_UPLOADS = 16  # most files that are being uploaded; slow uploads alone cannot keep all others from being read
 _MOST_SECONDS, _MOST_MEGABYTES = 120.0, 4096  # for reading one file
 _UPLOAD_SECONDS = 120.0
 _MOST_DOSSIERS = 16  # most dossiers in memory
@@ -216,7 +217,7 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
     from starlette.responses import JSONResponse, Response
     from starlette.routing import Route
 
-    waiting = 0
+    uploading = waiting = 0
 
     def reply(content: bytes, kind: str, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
         return Response(content, status, {**_HEADERS, **(headers or {})}, kind)
@@ -246,10 +247,10 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
         return await run_in_threadpool(read, lambda catalogue: respond(_listed(catalogue, first)))
 
     async def thumbnail(request: Request) -> Response:
-        number = request.path_params["number"]
-        if number >= 2**63:
+        text = request.path_params["number"]
+        if not (text.isdecimal() and text.isascii() and len(text) < 19):  # a number of SQLite
             return refuse("The catalogue has no original with this number.", 404)
-        return await run_in_threadpool(read, lambda catalogue: reply(catalogue.thumbnail(number), "image/png"))
+        return await run_in_threadpool(read, lambda catalogue: reply(catalogue.thumbnail(int(text)), "image/png"))
 
     async def dossier(request: Request) -> Response:
         content = desk.dossiers.get(request.path_params["token"])
@@ -258,15 +259,15 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
         return reply(content, "text/html; charset=utf-8")
 
     async def find(request: Request) -> Response:
-        nonlocal waiting
+        nonlocal uploading, waiting
         if _OUR_HEADER not in request.headers or request.headers.get("sec-fetch-site", "same-origin") != "same-origin":
             return refuse("Files can only be uploaded from the catalogue's page.", 403)
         suffix = Path(request.query_params.get("name", "")).suffix.lower()
         if suffix not in _UPLOADED:
             return refuse(f"This is not a mesh file; drop one of {', '.join(_UPLOADED)}.", 415)
-        if waiting >= _MOST_JOBS:
-            return refuse(f"{_MOST_JOBS} files are being processed; try again when one is done.", 503)
-        waiting += 1
+        if uploading >= _MOST_UPLOADS:
+            return refuse(f"{_MOST_UPLOADS} files are being uploaded; try again when one is done.", 503)
+        uploading += 1
         try:
             async with asyncio.timeout(_UPLOAD_SECONDS):
                 data = bytearray()
@@ -275,11 +276,17 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
                     if len(data) > most_bytes:
                         sentence = f"The file is larger than {most_bytes // 2**20} megabytes, the limit of this server."
                         return refuse(sentence, 413)
-            return respond(await run_in_threadpool(desk.find, bytes(data), suffix))
         except TimeoutError:
             return refuse(f"The upload took longer than {_UPLOAD_SECONDS:g} seconds.", 408)
         except ClientDisconnect:
             return refuse("The browser has closed the connection.", 400)
+        finally:
+            uploading -= 1
+        if waiting >= _MOST_JOBS:
+            return refuse(f"{_MOST_JOBS} files are being processed; try again when one is done.", 503)
+        waiting += 1
+        try:
+            return respond(await run_in_threadpool(desk.find, bytes(data), suffix))
         except Exception as error:
             return refuse(error_text(error), 422 if isinstance(error, JaxmarkError) else 500)
         finally:
@@ -290,7 +297,7 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
             Route("/", page),
             Route("/catalogue.js", script),
             Route("/originals", originals),
-            Route("/thumbnails/{number:int}", thumbnail),
+            Route("/thumbnails/{number:str}", thumbnail),
             Route("/dossiers/{token:str}", dossier),
             Route("/find", find, methods=["POST"]),
         ],

@@ -126,3 +126,11 @@ def _check_counts(data: bytes) -> None:
         )
     if packed:
         limits.UNPACKED.check(count * size, len(data))
+        # The decoder reserves memory for the table of chunks, whose place stands before them, and its number in it. A
+        # place of -1 stands in the last eight bytes.
+        place = int.from_bytes(data[points : points + 8], "little", signed=True)
+        if place == -1:
+            place = int.from_bytes(data[-8:], "little", signed=True)
+        chunks = int.from_bytes(data[place + 4 : place + 8], "little") if 0 <= place <= len(data) - 8 else 0
+        if chunks > len(data):
+            raise JaxmarkError(f"This LAZ file is damaged: it counts {chunks} chunks in {len(data)} bytes.")

@@ -233,10 +233,13 @@ def linked(one: Indices, other: Indices, count: int) -> Indices:
 
 def unique_names(names: Iterable[str]) -> list[str]:
     """Append numbers to repeated names, so that no two are the same."""
-    count: dict[str, int] = {}
+    names = list(names)
+    given, count = set(names), dict[str, int]()
     unique: list[str] = []
     for name in names:
         count[name] = count.get(name, 0) + 1
+        while count[name] > 1 and f"{name} #{count[name]}" in given:
+            count[name] += 1
         unique.append(name if count[name] == 1 else f"{name} #{count[name]}")
     return unique
 

@@ -47,11 +47,20 @@ class RawMesh(NamedTuple):
 
 
 class _Parser:
-    """An XML parser of some data that knows its byte offsets, also if bytes are skipped."""
+    """An XML parser of some data that knows its byte offsets, also if bytes are skipped, and namespaces.
+
+    The parser of the library joins the whole address of a namespace to the name of each element and attribute in it,
+    which takes hours for a long address. So namespaces are numbered here instead: 0 is none.
+    """
 
     def __init__(self, data: bytes) -> None:
         self.data, self.skipped, self._fed = data, 0, 0
-        self.expat = expat.ParserCreate("utf-8", " ")
+        self._spaces = {"": 0}  # numbers of namespaces, by address
+        self._scopes = dict[
+            str, list[int]
+        ]()  # by prefix: the namespaces that open elements gave it, the last one counts
+        self._declared = list[list[str]]()  # the prefixes that each open element declares
+        self.expat = expat.ParserCreate("utf-8")
         self.expat.StartDoctypeDeclHandler = self._doctype
         self.expat.XmlDeclHandler = self._declaration
         if b"\0" in data[:4] or data[:2] in (b"\xff\xfe", b"\xfe\xff"):
@@ -77,6 +86,24 @@ class _Parser:
             at = max(0, self.expat.ErrorByteIndex + self.skipped)
             raise self.error(at, f"the XML is broken ({expat.ErrorString(error.code)})") from None
 
+    def enter(self, name: str, attributes: dict[str, str]) -> tuple[int, str]:
+        """Return the namespace of an element that begins, and its local name."""
+        prefixes = [one for one in attributes if one == "xmlns" or one.startswith("xmlns:")]
+        for one in prefixes:
+            number = self._spaces.setdefault(attributes[one], len(self._spaces))
+            self._scopes.setdefault(one[len("xmlns:") :], []).append(number)
+        self._declared.append(prefixes)
+        prefix, _, local = name.rpartition(":")
+        scope = self._scopes.get(prefix)
+        if prefix and not scope:
+            raise self.error(self.at, f"the namespace {prefix[:40]!a} is not declared")
+        return scope[-1] if scope else 0, local
+
+    def leave(self) -> None:
+        """End an element, and forget the namespaces that it declared."""
+        for one in self._declared.pop():
+            self._scopes[one[len("xmlns:") :]].pop()
+
     def error(self, at: int, what: str) -> JaxmarkError:
         """Make the exception for an error at a byte offset."""
         return line_error(self.data, at, what)
@@ -99,7 +126,7 @@ def read_relationships(data: bytes, elements: RunningCount) -> list[tuple[str, s
 
     def start(name: str, attributes: dict[str, str]) -> None:
         elements.add()
-        if name.rpartition(" ")[2] == "Relationship":
+        if name.rpartition(":")[2] == "Relationship":
             found.append((attributes.get("Type", ""), attributes.get("Target", "")))
 
     parser = _Parser(data)
@@ -121,7 +148,7 @@ class Model(_Parser):
         self._count_element, self._count_mesh = elements.add, meshes.add
         self.meshes: list[RawMesh] = []
         self._buffer = np.frombuffer(data, np.uint8)
-        self._space: str | None = None  # the namespace of the root with a space behind it
+        self._space: int | None = None  # the namespace of the root
         self._path: list[str] = []  # local names of the open elements, empty where they are of another namespace
         self._name = ""  # of the object that was opened last
         self._list: str | None = None  # which list is open
@@ -150,7 +177,7 @@ class Model(_Parser):
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         self._count_element()
-        space, _, local = name.rpartition(" ")
+        space, local = self.enter(name, attributes)
         if self._space is None:
             self._space = space
         self._path.append(local if space == self._space else "")
@@ -172,6 +199,7 @@ class Model(_Parser):
                 raise self.error(self._list_at, f"a mesh has its {self._list} twice")
 
     def _end(self, name: str) -> None:
+        self.leave()
         closed = self._path.pop()
         self._list_at = -1
         if self._list is not None and closed == self._list and self._path[-1:] == ["mesh"]:

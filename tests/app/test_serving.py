@@ -3,6 +3,7 @@
 import http.client
 import json
 import math
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -58,6 +59,12 @@ class Server:
         finally:
             connection.close()
 
+    def upload(self, head: bytes) -> socket.socket:
+        """Begin an upload of ten bytes, of which the first is sent."""
+        connection = socket.create_connection(self._socket.getsockname(), timeout=30)
+        connection.sendall(head + b"Content-Length: 10\r\n\r\nx")
+        return connection
+
     def end(self) -> None:
         self._server.should_exit = True
         self._thread.join(10)
@@ -98,6 +105,7 @@ def test_originals_are_shown_without_a_key_or_a_path(server: Server):
         "/thumbnails/..%2f..%2fetc%2fpasswd",
         "/thumbnails/2",
         "/thumbnails/99999999999999999999",
+        f"/thumbnails/{'9' * 5000}",
         "/dossiers/..%2f..%2fshop.db",
         "/shop.db",
     ],
@@ -145,6 +153,16 @@ def test_a_fifth_file_is_turned_away(server: Server):
         thread.join(20)
     assert found == [200] * 4
     assert len(server.desk.seen) == 4
+
+
+def test_slow_uploads_keep_no_others_waiting(server: Server):
+    server.desk.go.set()
+    slow = [
+        server.upload(b"POST /find?name=a.obj HTTP/1.1\r\nHost: 127.0.0.1\r\nx-jaxmark: find\r\n") for _ in range(8)
+    ]
+    assert server("POST", "/find?name=a.obj", b"x", **OURS)[0] == 200
+    for one in slow:
+        one.close()
 
 
 def test_a_killed_worker_leaves_no_file(tmp_path: Path):

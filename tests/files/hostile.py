@@ -118,6 +118,17 @@ def prefixes(count: int) -> bytes:
     return archive(1, _HEAD + b"".join(meshes) + _TAIL)
 
 
+def spaces(count: int, address: int) -> bytes:
+    """Elements in a namespace with a long address."""
+    return archive(1, b'<model xmlns="' + b"a" * address + b'">' + b"<a/>" * count + b"</model>")
+
+
+def prefixed(count: int, address: int) -> bytes:
+    """An element of many attributes in a namespace with a long address."""
+    named = b"".join(b' p:a%05x=""' % number for number in range(count))
+    return archive(1, b'<model xmlns:p="' + b"a" * address + b'"><a' + named + b"/></model>")
+
+
 def lists(count: int) -> bytes:
     """Lists outside of meshes."""
     return archive(1, _HEAD + _TRIANGLE + b"<vertices/>" * count + _TAIL)
@@ -234,6 +245,18 @@ def fans(count: int, corners: int, mode: int) -> bytes:
     }
     chunk = struct.pack("<12f", *(number for corner in _CORNERS for number in corner))
     return gltf(document, chunk + bytes(number % 4 for number in range(corners)) + bytes(-corners % 4))
+
+
+def compressed(views: int, blob: bytes, count: int) -> bytes:
+    """A GLB file with meshes that all name the same bytes, as compressed by Draco."""
+    extension = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}
+    document = {
+        "meshes": [{"primitives": [{"attributes": {"POSITION": n}, "extensions": extension}]} for n in range(views)],
+        "accessors": [{"componentType": 5126, "count": count, "type": "VEC3"}] * views,
+        "bufferViews": [{"buffer": 0, "byteLength": len(blob)}],
+        "buffers": [{"byteLength": len(blob)}],
+    }
+    return gltf(document, blob + bytes(-len(blob) % 4))
 
 
 def itself(names: list[str], data: bytes) -> bytes:

@@ -1,5 +1,8 @@
 """No small file costs minutes or gigabytes: it is read within its budget, or refused in one sentence."""
 
+import json
+import re
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -10,9 +13,10 @@ from hypothesis import HealthCheck, given, settings
 
 from jaxmark.app.limited import Worker
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import atomic, limits, load_mesh, load_scene, threemf_xml
+from jaxmark.files import atomic, limits, load_mesh, load_scene, save_mesh, threemf_xml
 from jaxmark.files.gltf.document import Document
 from jaxmark.files.limits import Limit
+from jaxmark.files.source import unique_names
 from tests.files import hostile
 from tests.files.helpers import loaded, written
 
@@ -99,6 +103,89 @@ def test_one_expression_is_made_for_all_lists(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(limits, "ELEMENTS", Limit("XML elements", 37, 0))
     with pytest.raises(JaxmarkError, match="more than 37 XML elements"):
         load_scene(tmp_path / "a.3mf")
+
+
+def test_namespaces_are_those_of_the_nearest_declaration(tmp_path: Path) -> None:
+    core = hostile._CORE
+    mesh = hostile._TRIANGLE
+    other = mesh.replace(b"<mesh>", b'<mesh xmlns="other">').replace(b'id="1"', b'id="2"')
+    back = b'<q:a xmlns:q="other" xmlns="other"/>' + mesh.replace(b'id="1"', b'id="3"')
+    declared = re.sub(rb"<(/?)", rb"<\1p:", mesh).replace(b' id="1"', b' xmlns:p="%s" id="4"' % core)
+    names = load_scene(
+        written(tmp_path, "a.3mf", hostile.archive(1, hostile._HEAD + mesh + other + back + declared + hostile._TAIL))
+    )
+    assert sorted(names.meshes) == ["object 1", "object 3", "object 4"]
+    loose = declared.replace(b"xmlns:p", b"xmlns:q")
+    with pytest.raises(JaxmarkError, match=r"the namespace 'p' is not declared"):
+        loaded(tmp_path, "b.3mf", hostile.archive(1, hostile._HEAD + loose + hostile._TAIL))
+
+
+def test_the_binary_chunk_of_a_glb_is_there_once(tmp_path: Path) -> None:
+    data = hostile.gltf({"buffers": [{"byteLength": 8}] * 5}, bytes(8))
+    assert len(Document(data, lambda path: b"").data) == 8
+
+
+def test_glb_files_that_are_nested_deeply_are_written(tmp_path: Path) -> None:
+    nest: object = 0
+    for _ in range(600):
+        nest = [nest]
+    data = hostile.fans(1, 300, 4)
+    size = struct.unpack_from("<I", data, 12)[0]
+    deep = hostile.gltf(json.loads(data[20 : 20 + size]) | {"extras": nest}, data[28 + size :])
+    mesh = load_mesh(written(tmp_path, "a.glb", deep))
+    save_mesh(mesh._replace(vertices=2 * mesh.vertices), tmp_path / "b.glb", like=tmp_path / "a.glb")
+    np.testing.assert_array_equal(load_mesh(tmp_path / "b.glb").vertices, 2 * mesh.vertices)
+
+
+def test_counts_in_draco_are_checked_before_it_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    draco = pytest.importorskip("DracoPy")
+    points = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
+    faces = np.arange(39).reshape(-1, 3).astype(np.uint32)
+    decoded = list[bytes]()
+    decode = draco.decode
+    monkeypatch.setattr(draco, "decode", lambda data: decoded.append(data) or decode(data))
+    for ordered in (True, False):
+        blob = bytes(draco.encode(points, faces, preserve_order=ordered))
+        assert blob[8] == (0 if ordered else 1)
+        count = len(decode(blob).points)
+        assert len(loaded(tmp_path, "a.glb", hostile.compressed(1, blob, count)).faces) == len(decode(blob).faces)
+        assert len(decoded) == 1
+        with pytest.raises(JaxmarkError, match="more points than the document says"):
+            loaded(tmp_path, "a.glb", hostile.compressed(1, blob, 1))
+        decoded.clear()
+    many = b"DRACO\2\2\1\0\0\0" + b"\0" + b"\x80\x80\x80\x80\1" + b"\1\1\1\0\x09\3\0\0\0"  # 2^28 points
+    cloud = bytes(draco.encode(points))
+    for bad in (many, many[:13], cloud, b"DRACO", many[:10] + b"\x80" + many[11:], many[:12] + b"\xff" * 20):
+        with pytest.raises(JaxmarkError, match=r"more points|cannot be decoded by Draco"):
+            loaded(tmp_path, "a.glb", hostile.compressed(1, bad, 40))
+    assert not decoded
+    monkeypatch.setattr(limits, "UNPACKED", Limit("bytes of unpacked content", 20_000, 0))
+    blob = bytes(draco.encode(points, faces, preserve_order=True))
+    load_scene(written(tmp_path, "a.glb", hostile.compressed(1, blob, 40)))
+    decoded.clear()
+    with pytest.raises(JaxmarkError, match="None of its 100 meshes can be marked"):
+        load_scene(written(tmp_path, "a.glb", hostile.compressed(100, blob, 41)))
+    assert 3 * len(blob) < len(decoded) * len(blob) <= 20_000
+
+
+def test_the_table_of_chunks_in_a_laz_file_is_checked(tmp_path: Path) -> None:
+    pytest.importorskip("lazrs")
+    data = hostile.laz(1000, 0)
+    begin = struct.unpack_from("<I", data, 96)[0]
+    place = struct.unpack_from("<q", data, begin)[0]
+    many = data[: place + 4] + b"\xff" * 4 + data[place + 8 :]
+    behind = many[:begin] + struct.pack("<q", -1) + many[begin + 8 :] + struct.pack("<q", place)
+    assert len(loaded(tmp_path, "a.laz", data).vertices) == 1000
+    for bad in (many, behind):
+        with pytest.raises(JaxmarkError, match="it counts 4294967295 chunks in"):
+            loaded(tmp_path, "a.laz", bad)
+
+
+@pytest.mark.parametrize("names", [["a #2", "a", "a"], ["a", "a", "a #2", "a"], ["a", "a #2", "a #2", "a"]])
+def test_meshes_have_names_of_their_own(names: list[str]) -> None:
+    unique = unique_names(names)
+    assert len({*unique}) == len(names)
+    assert all(one == name or one.startswith(f"{name} #") for one, name in zip(unique, names, strict=True))
 
 
 def test_corners_of_strips_and_fans_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,6 +286,8 @@ def test_the_largest_files_that_are_unpacked(tmp_path: Path, worker: Worker, kin
         ("three.3mf", lambda: hostile.threemf("three", 2**29), True),
         ("single.3mf", lambda: hostile.threemf("single", 2**28), True),
         ("plain.3mf", lambda: hostile.threemf("plain", 2**28), True),
+        ("spaces.3mf", lambda: hostile.spaces(500_000, 2**20), True),
+        ("prefixed.3mf", lambda: hostile.prefixed(30_000, 2**16), True),
         ("padded.laz", lambda: hostile.laz(36_000_000, 361_000), True),
         ("full.laz", lambda: hostile.laz(limits.UNPACKED.least // 20, 361_000), False),
         ("objects.obj", lambda: hostile.tetrahedra(7000), False),

@@ -1,6 +1,5 @@
 """Parse glTF 2.0 assets in both of their forms, GLB and JSON, with any number of meshes."""
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -331,7 +330,7 @@ class _GltfSource(Source):
             None if isinstance(buffer, str) else data[buffer.place.start : buffer.place.stop]
             for buffer in self.document.buffers
         ]
-        document = copy.deepcopy(self.document.content)
+        document = self.document.copy_content()
         for index, rows in _rows(self.points).items():
             _bound(document["accessors"][index], positions[rows.start : rows.stop], self.points[index])
         plain = []

@@ -96,9 +96,10 @@ class Document:
             raise JaxmarkError(f"Only version 2 of glTF is supported, not {ascii(version)[:40]}.")
         self.file, self.buffers = file, list[Buffer | str]()
         pieces, places, size = list[bytes](), dict[int, range](), 0
+        binary = file[chunk.start : chunk.stop] if chunk else None
         for index, entry in enumerate(_listed(self.content, "buffers")):
             try:
-                head, data = _content(entry, index, file[chunk.start : chunk.stop] if chunk else None, read)
+                head, data = _content(entry, index, binary, read)
             except JaxmarkError as error:
                 self.buffers.append(str(error).rstrip("."))
                 continue
@@ -112,6 +113,10 @@ class Document:
         self.decoded: set[int] = set()
         self._lists: dict[str, list[dict[str, Any]]] = {}
         self.accessed, self.unpacked = (RunningCount(one, size) for one in (limits.ACCESSED, limits.UNPACKED))
+
+    def copy_content(self) -> dict[str, Any]:
+        """Return a copy of the document's content, which may be nested more deeply than `copy.deepcopy` can copy."""
+        return json.loads(self._text)
 
     def add(self, data: bytes) -> int:
         """Append bytes to the data, and return where they begin."""

@@ -133,7 +133,7 @@ def identify(
 
     Args:
         suspect: any mesh.
-        recipients: the identifiers of all recipients of a copy.
+        recipients: the identifiers of all recipients of a copy, a list that was fixed before the suspect existed.
         original: the unmarked mesh.
         key: 32 bytes.
         record: the record of an earlier copy, see `make_tracer`.
