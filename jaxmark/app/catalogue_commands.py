@@ -299,14 +299,15 @@ def mark_copy(
         JaxmarkError: see `mark_file`.
     """
     record = copy.with_name(copy.name + RECORD_SUFFIX)
-    with writing_pair(copy, record, overwrite=overwrite) as (draft, record_draft):
+    with writing_pair(copy, record, overwrite=overwrite) as pair:
         catalogue.add(original)
-        outcome = mark_file(original, draft, record_draft, key=key, recipient=recipient, budget=budget)
+        outcome = mark_file(original, pair.file, pair.record, key=key, recipient=recipient, budget=budget)
         # The recipient is stored first: a recipient without a copy does no harm, but a copy without a recipient in the
         # catalogue could not be traced.
-        catalogue.add_copy(Record.load(record_draft), recipient, file_hash(draft))
-    places = {str(draft): str(copy), str(record_draft): str(record)}
-    lines = outcome.lines
+        catalogue.add_copy(Record.load(pair.record), recipient, file_hash(pair.file))
+    places = {str(pair.file): str(copy), str(pair.record): str(record)}
+    lines = (f"{outcome.lines[0]}{pair}", *outcome.lines[1:])
     for place, name in places.items():
         lines = tuple(line.replace(place, name) for line in lines)
-    return outcome._replace(values={**outcome.values, "record": str(record), "marked": str(copy)}, lines=lines)
+    named = {"record": str(record), "marked": str(copy), "old_record": None if pair.kept is None else str(pair.kept)}
+    return outcome._replace(values={**outcome.values, **named}, lines=lines)

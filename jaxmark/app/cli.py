@@ -417,12 +417,12 @@ def commit_command(records: tuple[Path, ...], output: Path, overwrite: bool, as_
     check_distinct(output=output, **{f"record {place}": path for place, path in enumerate(records)})
     made = make_commitment(load_record(path).digest() for path in records)
     request = output.with_name(output.name + ".tsq")
-    with writing_pair(request, output, overwrite=overwrite) as (request_draft, draft):
-        write_atomically(request_draft, made.timestamp_request())
-        write_atomically(draft, made.to_json().encode())
+    with writing_pair(request, output, overwrite=overwrite) as pair:
+        write_atomically(pair.file, made.timestamp_request())
+        write_atomically(pair.record, made.to_json().encode())
     values = {"root": made.root, "records": len(made.digests), "commitment": str(output), "request": str(request)}
     size = f"{len(made.digests)} record{'s' if len(made.digests) > 1 else ''}"
-    answer(as_json, values, f"{size} → {output}, root {made.root}, request → {request}")
+    answer(as_json, values, f"{size} → {output}, root {made.root}, request → {request}{pair}")
 
 
 # click keeps the lines of a paragraph that starts with \b.

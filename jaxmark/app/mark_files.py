@@ -118,11 +118,11 @@ def mark_file(
         result, info = tracer.fingerprint(name, budget)
         prepared, payload = tracer.mark.original, f"fingerprint of {recipient}"
         read_back, check = partial(tracer.finds, recipient=name), None
-    with writing_pair(marked, record, overwrite=overwrite) as (draft, record_draft):
+    with writing_pair(marked, record, overwrite=overwrite) as pair:
         doing(f"writing {marked}, and measuring the noise that the mark survives")
-        save_mesh(result, draft, like=original)
+        save_mesh(result, pair.file, like=original)
         # The mark must be readable from the written file, whose numbers are rounded.
-        written = load_mesh(draft)
+        written = load_mesh(pair.file)
         survives = read_back(written)
         if not survives:
             if check is not None:
@@ -131,7 +131,7 @@ def mark_file(
                 f"The mark cannot be read after rounding to the precision of {original}; use a larger budget, or a file"
                 " with more digits."
             )
-        write_atomically(record_draft, info.record.to_json().encode())
+        write_atomically(pair.record, info.record.to_json().encode())
     doing("measuring the displacement")
     texture = load_texture(original)
     drift = None if texture is None else distortion.texture_drift(mesh, written, texture)
@@ -146,8 +146,9 @@ def mark_file(
         "texture_drift": drift,
         "record": str(record),
         "marked": str(marked),
+        "old_record": None if pair.kept is None else str(pair.kept),
     }
-    text = f"{payload} → {marked}, {_moved_text(moved)} of the diagonal; record → {record}"
+    text = f"{payload} → {marked}, {_moved_text(moved)} of the diagonal; record → {record}{pair}"
     if isinstance(survives, Survival):
         text += f"; it survives {survival_text(survives)}"
     if (band := info.record.parameters.get("passband")) in ADAPTIVE[1:]:
@@ -189,11 +190,11 @@ def _mark_scene(
     doing(f"embedding {len(scene.meshes)} meshes of {original}")
     meshes, info = embed_scene(scene.meshes, message, key, budget=budget, scheme=scheme, after=check)
     survives: dict[str, Survival] = {}
-    with writing_pair(marked, record, overwrite=overwrite) as (draft, record_draft):
+    with writing_pair(marked, record, overwrite=overwrite) as pair:
         doing(f"writing {marked}, and reading it back")
-        notes = save_scene(meshes, draft, like=original)
+        notes = save_scene(meshes, pair.file, like=original)
         # The marks must be readable from the written file, whose numbers are rounded.
-        written = load_scene(draft).meshes
+        written = load_scene(pair.file).meshes
         for name, marker in markers.items():
             predicted = info.meshes[name].survives
             survival = _without_caches(marker).measure_survival(written[name], message, predicted)
@@ -203,7 +204,7 @@ def _mark_scene(
                     " select the other meshes by --mesh."
                 )
             survives[name] = survival
-        write_atomically(record_draft, info.record.to_json().encode())
+        write_atomically(pair.record, info.record.to_json().encode())
     each = {
         name: {**_moved(markers[name].original, written[name]), "survives": survives[name]._asdict()}
         for name in info.meshes
@@ -220,11 +221,13 @@ def _mark_scene(
         "notes": list(notes),
         "record": str(record),
         "marked": str(marked),
+        "old_record": None if pair.kept is None else str(pair.kept),
     }
     least = Survival(*(min(noises) for noises in zip(*survives.values(), strict=True)))
     text = (
         f"{payload_text(info.record.bits)} in {len(each)} of {len(each) + len(skipped)} meshes → {marked},"
-        f" {_moved_text(most)} of their diagonals; record → {record}; the weakest mark survives {survival_text(least)}"
+        f" {_moved_text(most)} of their diagonals; record → {record}{pair};"
+        f" the weakest mark survives {survival_text(least)}"
     )
     lines = [text, *(f"left unchanged: {name!r}: {reason}" for name, reason in list(skipped.items())[:_MOST_NAMED])]
     if len(skipped) > _MOST_NAMED:

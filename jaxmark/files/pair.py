@@ -2,13 +2,19 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import read_file, replacing, write_atomically
+
+try:
+    import fcntl
+except ModuleNotFoundError:  # not a POSIX system
+    fcntl = None  # type: ignore[assignment]
 
 
 def refuse_existing(*paths: Path, overwrite: bool) -> None:
@@ -22,8 +28,20 @@ def refuse_existing(*paths: Path, overwrite: bool) -> None:
             raise JaxmarkError(f"{path} exists; give another name, or replace it by --overwrite.")
 
 
+@dataclass
+class Pair:
+    """Drafts of a file and of its record, which `writing_pair` yields; `kept` is known when its block has ended."""
+
+    file: Path
+    record: Path
+    kept: Path | None = None  # the copy of a record that was replaced
+
+    def __str__(self) -> str:
+        return "" if self.kept is None else f"; the record that was there is kept as {self.kept}"
+
+
 @contextmanager
-def writing_pair(file: Path, record: Path, *, overwrite: bool = False) -> Iterator[tuple[Path, Path]]:
+def writing_pair(file: Path, record: Path, *, overwrite: bool = False) -> Iterator[Pair]:
     """Yield drafts of a file and of its record, which get their names if the block succeeds, and are deleted if not.
 
     No record is ever lost, and the record beside the file is always that of this file, even if the process is killed at
@@ -35,6 +53,8 @@ def writing_pair(file: Path, record: Path, *, overwrite: bool = False) -> Iterat
       new file then get their names. Until they have, the old pair is complete, under its own names or under those with
       `old-1-`, and there is no file of the given name. At the end, the old file is deleted. The old record stays, for
       copies that were handed out, unless it is equal to the new one.
+
+    Processes that write into the same folders give names one after another, where the system has locks of folders.
 
     Args:
         file: path of the file.
@@ -48,18 +68,36 @@ def writing_pair(file: Path, record: Path, *, overwrite: bool = False) -> Iterat
     if os.path.realpath(file) == os.path.realpath(record):
         raise JaxmarkError(f"{file} cannot be both the file and its record; give another name for one of them.")
     old = None
+    with ExitStack() as alone:
+        try:
+            with replacing(file) as draft, replacing(record) as record_draft:
+                pair = Pair(draft, record_draft)
+                yield pair
+                for folder in sorted({os.path.realpath(path.parent) for path in (file, record)}):
+                    alone.enter_context(_locked(folder))
+                refuse_existing(file, record, overwrite=overwrite)  # another process may have written them meanwhile
+                old = _Old.of(file, record)
+                old.set_aside()
+        except BaseException:
+            if old is not None:
+                old.restore()
+            raise
+        pair.kept = old.discard()
+
+
+@contextmanager
+def _locked(folder: str) -> Iterator[None]:
+    """Hold the lock of a folder, which the system releases if the process is killed."""
+    if fcntl is None:
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        with replacing(file) as draft, replacing(record) as record_draft:
-            yield draft, record_draft
-            refuse_existing(file, record, overwrite=overwrite)  # another process may have written them meanwhile
-            old = _Old.of(file, record)
-            old.set_aside()
-    except BaseException:
-        if old is not None:
-            old.restore()
-        raise
-    if old is not None:
-        old.discard()
+        with suppress(OSError):  # some file systems have no locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 class _Old(NamedTuple):
@@ -97,11 +135,12 @@ class _Old(NamedTuple):
                 self.aside.rename(self.file)
         self._drop_equal()
 
-    def discard(self) -> None:
-        """Delete the old file, and a copy of the old record that is equal to the new record."""
+    def discard(self) -> Path | None:
+        """Delete the old file, and a copy of the old record that is equal to the new one; return a copy that stays."""
         if self.aside is not None:
             self.aside.unlink()
         self._drop_equal()
+        return self.copy if self.copy is not None and self.copy.exists() else None
 
     def _drop_equal(self) -> None:
         if self.copy is not None and self.copy.exists() and read_file(self.copy) == read_file(self.record):

@@ -25,9 +25,9 @@ FILE, RECORD = Path("marked.ply"), Path("records", "marked.json")
 
 
 def write(overwrite: bool, record: bytes) -> None:
-    with writing_pair(FILE, RECORD, overwrite=overwrite) as (draft, record_draft):
-        draft.write_bytes(b"new")
-        record_draft.write_bytes(record)
+    with writing_pair(FILE, RECORD, overwrite=overwrite) as pair:
+        pair.file.write_bytes(b"new")
+        pair.record.write_bytes(record)
 
 
 def write_until(last: int, overwrite: bool, record: bytes) -> None:

@@ -4,12 +4,16 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files import pair as pairs
 from jaxmark.files.pair import writing_pair
 from jaxmark.watermark.record import Record
 
@@ -45,10 +49,11 @@ def complete(folder: Path, content: bytes, record: Record, prefix: str = "") -> 
     return file.is_file() and file.read_bytes() == content and told.is_file() and Record.load(told) == record
 
 
-def write(folder: Path, record: Record = NEW, content: bytes = b"new", overwrite: bool = False) -> None:
-    with writing_pair(folder / FILE, folder / RECORD, overwrite=overwrite) as (draft, record_draft):
-        draft.write_bytes(content)
-        record_draft.write_text(record.to_json())
+def write(folder: Path, record: Record = NEW, content: bytes = b"new", overwrite: bool = False) -> Path | None:
+    with writing_pair(folder / FILE, folder / RECORD, overwrite=overwrite) as pair:
+        pair.file.write_bytes(content)
+        pair.record.write_text(record.to_json())
+    return pair.kept
 
 
 @pytest.mark.skipif(os.name != "posix", reason="only there can a process be killed at a call")
@@ -92,9 +97,9 @@ def test_a_pair_that_another_process_wrote_meanwhile_is_refused(tmp_path: Path) 
     folder = lay(tmp_path / "place", False, False)
 
     def write_late() -> None:
-        with writing_pair(folder / FILE, folder / RECORD) as (draft, record_draft):
-            draft.write_bytes(b"late")
-            record_draft.write_text(NEW.to_json())
+        with writing_pair(folder / FILE, folder / RECORD) as pair:
+            pair.file.write_bytes(b"late")
+            pair.record.write_text(NEW.to_json())
             write(folder, OLD, b"first")
 
     with pytest.raises(JaxmarkError, match="exists"):
@@ -103,10 +108,33 @@ def test_a_pair_that_another_process_wrote_meanwhile_is_refused(tmp_path: Path) 
     assert sorted(path.name for path in folder.rglob("*") if path.is_file()) == ["marked.json", "marked.ply"]
 
 
+def test_pairs_are_replaced_one_after_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = lay(tmp_path / "place", True, True)
+    set_aside, inside = pairs._Old.set_aside, list[int]()
+
+    def slowly(old: pairs._Old) -> None:
+        inside.append(1)
+        assert len(inside) == 1
+        set_aside(old)
+        time.sleep(0.05)
+        inside.pop()
+
+    monkeypatch.setattr(pairs._Old, "set_aside", slowly)
+    with ThreadPoolExecutor(4) as pool:
+        others = [replace(NEW, bits=8 * count) for count in range(1, 5)]
+        kept = list(pool.map(lambda other: write(folder, other, b"%d" % other.bits, overwrite=True), others))
+    last = next(other for other in others if b"%d" % other.bits == (folder / FILE).read_bytes())
+    assert complete(folder, b"%d" % last.bits, last)
+    assert len(set(kept)) == 4
+    assert sorted(Record.load(path).bits for path in kept if path) == sorted(
+        record.bits for record in (OLD, *others) if record != last
+    )
+
+
 def test_replaced_records_are_kept_unless_they_are_equal(tmp_path: Path) -> None:
     folder = lay(tmp_path / "place", False, False)
-    for record in (OLD, OLD, NEW, OLD, OLD):
-        write(folder, record, overwrite=True)
+    told = [write(folder, record, overwrite=True) for record in (OLD, OLD, NEW, OLD, OLD)]
+    assert [path and path.name for path in told] == [None, None, "old-1-marked.json", "old-2-marked.json", None]
     assert complete(folder, b"new", OLD)
     assert [path.name for path in folder.iterdir() if path.is_file()] == [FILE]
     kept = {path.name: Record.load(path) for path in (folder / "records").iterdir()}
@@ -152,9 +180,9 @@ def test_a_device_is_not_replaced(tmp_path: Path) -> None:
 def test_names_that_collide_with_those_of_the_old_pair_lose_nothing(tmp_path: Path) -> None:
     file, record = tmp_path / "x.obj", tmp_path / "old-1-x.obj"
     file.write_bytes(b"old")
-    with writing_pair(file, record, overwrite=True) as (draft, record_draft):
-        draft.write_bytes(b"new")
-        record_draft.write_text(NEW.to_json())
+    with writing_pair(file, record, overwrite=True) as pair:
+        pair.file.write_bytes(b"new")
+        pair.record.write_text(NEW.to_json())
     assert file.read_bytes() == b"new"
     assert Record.load(record) == NEW
     with (
