@@ -2,21 +2,19 @@
 
 import multiprocessing
 import os
-import re
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from pathlib import Path
 from typing import Any
 
 import jax
 
 from jaxmark.app.folders import begin_worker
 from jaxmark.errors import JaxmarkError
+from jaxmark.files.unpacker import limit_memory
 
 _SPAWN = multiprocessing.get_context("spawn")  # forks of a running JAX would hang
-_STATUS, _DATA = Path("/proc/self/status"), re.compile(r"VmData:\s+(\d+) kB")
 
 
 class Worker:
@@ -84,7 +82,7 @@ def _work(connection: Connection, most_bytes: int) -> None:
     begin_worker()
     jax.config.update("jax_platforms", "cpu")  # the memory of an accelerator has no limit for each process
     jax.devices()
-    _limit_memory(most_bytes)
+    limit_memory(most_bytes)
     while True:
         try:
             function, args = connection.recv()
@@ -99,16 +97,3 @@ def _work(connection: Connection, most_bytes: int) -> None:
                 os._exit(1)  # what is left of the memory may not suffice for an answer
             answer = None, RuntimeError(f"{type(error).__name__}: {error}")
         connection.send(answer)
-
-
-def _limit_memory(most_bytes: int) -> None:
-    """Limit the memory that the process may take in addition to what it has now."""
-    try:
-        import resource
-
-        found = _DATA.search(_STATUS.read_text())
-    except (ImportError, OSError):  # not on Linux
-        return
-    if found is not None:
-        most = 1024 * int(found[1]) + most_bytes
-        resource.setrlimit(resource.RLIMIT_DATA, (most, most))

@@ -16,13 +16,17 @@ class Limit(NamedTuple):
     least: int  # largest amount in a small file
     each: float  # largest amount for each byte of a large file
 
+    def most(self, size: int) -> int:
+        """Return the largest amount in a file of a size in bytes."""
+        return max(self.least, int(self.each * size))
+
     def check(self, amount: int, size: int) -> None:
         """Refuse an amount that is too large for a file of a size in bytes."""
-        most = max(self.least, int(self.each * size))
+        most = self.most(size)
         if amount > most:
             raise JaxmarkError(
                 f"The file has more than {most} {self.what}, the most for a file of {size} bytes; save it in another"
-                " format, such as PLY, or split it."
+                " format, such as PLY with triangles only, or split it."
             )
 
 
@@ -41,10 +45,14 @@ class RunningCount:
 
 #: Bytes of a 3MF file's members, a LAZ file's points or Draco's numbers, after decompression.
 UNPACKED = Limit("bytes of unpacked content", 2**26, 50)
+#: Seconds of processor time that LAZ points or Draco meshes may take to be unpacked.
+UNPACKING_SECONDS = Limit("seconds of unpacking", 20, 2**-20)
 #: XML elements and comments of a 3MF file, without vertices and triangles that are written as nearly all programs do.
 ELEMENTS = Limit("XML elements that are read one by one", 2**19, 0.5)
 #: Elements of glTF accessors, which may share bytes, corners of strips and fans, and faces in Draco.
 ACCESSED = Limit("elements of accessors", 2**20, 16)
+#: Rows of a PLY element whose lists differ in length from row to row.
+ROWS = Limit("rows that are read one by one", 2**19, 0.2)
 #: Meshes, or objects, that are read one by one.
 MESHES = Limit("meshes", 2**14, 0)
 #: Points that a mesh needs to be read for a blind mark. Such marks have no anchors on coarser meshes.

@@ -7,7 +7,9 @@ import numpy as np
 from jaxtyping import Int64
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files import limits
 from jaxmark.files.binary import BinaryNumbers, gather
+from jaxmark.files.limits import RunningCount
 from jaxmark.files.source import Faces, Indices, Source, Transported, fan, ranges
 from jaxmark.files.text import Text, TextNumbers, unix
 
@@ -97,9 +99,9 @@ def parse(data: bytes) -> Source:
         if names.count(name) > 1:
             raise JaxmarkError(f"The header declares the element {name} more than once.")
     body: _Body = _Tokens(data, start) if order == "=" else _Bytes(data)
-    at = 0 if order == "=" else start
+    at, one_by_one = 0 if order == "=" else start, RunningCount(limits.ROWS, len(data))
     for element in elements:
-        at = _locate(body, element, at)
+        at = _locate(body, element, at, one_by_one)
 
     declared = {element.name: element for element in elements}
     vertex = declared.get("vertex", _Element("vertex", 0)).properties
@@ -156,7 +158,7 @@ def _type(name: str, order: str | None) -> np.dtype:
     return np.dtype(order + _TYPES[name])
 
 
-def _locate(body: _Body, element: _Element, at: int) -> int:
+def _locate(body: _Body, element: _Element, at: int, one_by_one: RunningCount) -> int:
     """Locate every property of an element; returns the place where the next element begins."""
     properties = element.properties.values()
     if element.rows == 0 or not properties:
@@ -177,6 +179,7 @@ def _locate(body: _Body, element: _Element, at: int) -> int:
             return at + element.rows * width
     elif not lists:
         raise _ended(element, max(0, body.end - at) // width)
+    one_by_one.add(element.rows)
     table = []
     for row in range(element.rows):
         *places, at = _row(body, element, row, at)

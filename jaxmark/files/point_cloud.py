@@ -11,8 +11,10 @@ from jaxmark.files import limits
 from jaxmark.files.binary import BinaryNumbers, overlay
 from jaxmark.files.source import Changes, Indices, Patched, Rows, Source, splice
 from jaxmark.files.text import Lines, Text, blank, is_numeral, unix, without_comments
+from jaxmark.files.unpacking import Unpacker
 from jaxmark.geometry.pose import Points
 
+_KIND, _PACKED = 104, 0x80  # byte offset of the kind of records, and the bit that is set where they are packed
 _BOX = 179  # byte offset of the header's bounding box: largest and smallest x, then y, then z, as doubles
 _INTEGER = np.dtype("<i4")
 _HEADER_BYTES, _HEADER_BYTES_1_4 = 227, 375
@@ -46,11 +48,16 @@ def parse_las(data: bytes) -> Source:
     Raises:
         JaxmarkError: if laspy is missing or cannot read the file, or it has no points.
     """
-    cloud = _read(data)
-    if not cloud.header.are_points_compressed:
-        return Source(data, ScaledNumbers(data, cloud.header), _NO_FACES)
-    data = _write(cloud, packed=False)
-    return _Compressed(data, ScaledNumbers(data, _read(data).header), _NO_FACES)
+    count = _check_counts(data)
+    if not data[_KIND] & _PACKED:
+        return Source(data, ScaledNumbers(data, _read(data).header), _NO_FACES)
+    try:
+        unpacked = Unpacker("laz", len(data))(data)["las"].tobytes()
+    except JaxmarkError as error:
+        raise JaxmarkError(f"This is no LAZ file that laspy reads: {error}.") from None
+    if _check_counts(unpacked) != count:
+        raise JaxmarkError(f"This LAZ file is damaged: it does not hold the {count} points of its header.")
+    return _Compressed(unpacked, ScaledNumbers(unpacked, _read(unpacked).header), _NO_FACES)
 
 
 class ScaledNumbers(BinaryNumbers):
@@ -97,7 +104,6 @@ def _write(cloud: Any, *, packed: bool) -> bytes:
 
 def _read(data: bytes) -> Any:
     laspy = require("laspy", "files")
-    _check_counts(data)
     try:
         return laspy.read(io.BytesIO(data))
     except Exception as error:  # laspy and its decoders raise various exceptions where bytes are wrong
@@ -105,8 +111,8 @@ def _read(data: bytes) -> Any:
         raise JaxmarkError(f"This is no LAS or LAZ file that laspy reads: {reason}.") from error
 
 
-def _check_counts(data: bytes) -> None:
-    """Refuse a header that counts more than the file can hold, which laspy does not check."""
+def _check_counts(data: bytes) -> int:
+    """Refuse a header that counts more than the file can hold, which laspy does not check; return its points."""
     if len(data) < _HEADER_BYTES:
         raise JaxmarkError(f"This is no LAS or LAZ file: it has {len(data)} bytes, and a header alone more.")
     begin, points, records, kind, size, count = struct.unpack_from("<H2IBHI", data, 94)
@@ -114,7 +120,7 @@ def _check_counts(data: bytes) -> None:
     if data[25] >= 4 and len(data) >= _HEADER_BYTES_1_4:  # version 1.4
         later, extended, wide_count = struct.unpack_from("<QIQ", data, 235)
         count = max(count, wide_count)
-    packed = bool(kind & 0x80)  # of compressed points, the highest bit is set
+    packed = bool(kind & _PACKED)
     if (
         begin + _RECORD_BYTES * records > min(points, len(data))
         or (extended and later + _EXTENDED_BYTES * extended > len(data))
@@ -126,11 +132,4 @@ def _check_counts(data: bytes) -> None:
         )
     if packed:
         limits.UNPACKED.check(count * size, len(data))
-        # The decoder reserves memory for the table of chunks, whose place stands before them, and its number in it. A
-        # place of -1 stands in the last eight bytes.
-        place = int.from_bytes(data[points : points + 8], "little", signed=True)
-        if place == -1:
-            place = int.from_bytes(data[-8:], "little", signed=True)
-        chunks = int.from_bytes(data[place + 4 : place + 8], "little") if 0 <= place <= len(data) - 8 else 0
-        if chunks > len(data):
-            raise JaxmarkError(f"This LAZ file is damaged: it counts {chunks} chunks in {len(data)} bytes.")
+    return count

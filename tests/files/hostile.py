@@ -150,6 +150,58 @@ def laz(count: int, size: int) -> bytes:
     return out.getvalue().ljust(size, b"\0")
 
 
+def _with_place(place: int) -> Callable[[bytes], bytes]:
+    """Let a LAZ file say another place of its table of chunks, which it also says at its end, and count 2³² chunks."""
+
+    def damage(data: bytes) -> bytes:
+        begin = struct.unpack_from("<I", data, 96)[0]
+        true = struct.unpack_from("<q", data, begin)[0]
+        many = data[: true + 4] + b"\xff" * 4 + data[true + 8 :]
+        return (
+            many[:begin]
+            + struct.pack("<q", true if place == 1 else place)
+            + many[begin + 8 :]
+            + struct.pack("<q", true)
+        )
+
+    return damage
+
+
+def _with_field(place: int, form: str, value: int) -> Callable[[bytes], bytes]:
+    """Change a field of a LAZ file's description of its packing."""
+
+    def damage(data: bytes) -> bytes:
+        at = data.index(b"laszip encoded") + 52 + place
+        return data[:at] + struct.pack(form, value) + data[at + struct.calcsize(form) :]
+
+    return damage
+
+
+#: Functions that damage a LAZ file so that its decoder panics, or reserves gigabytes.
+DAMAGED_LAZ: dict[str, Callable[[bytes], bytes]] = {
+    **{f"chunks {place}": _with_place(place) for place in (1, 0, -1, -2)},
+    "no items": _with_field(32, "<H", 0),
+    "empty items": _with_field(36, "<H", 0),
+    "wide items": _with_field(36, "<H", 65_535),
+    "small chunks": _with_field(12, "<I", 1),
+}
+
+
+def many_points() -> bytes:
+    """A mesh in Draco that says it has 2²⁸ points."""
+    return b"DRACO\2\2\1\0\0\0" + b"\0" + b"\x80\x80\x80\x80\1" + b"\1\1\1\0\x09\3\0\0\0"
+
+
+def rows(count: int, elements: int = 1) -> bytes:
+    """A PLY file with a triangle, and rows of lists, the first of which is longer than the others."""
+    number = "property float "
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex 3\n{number}x\n{number}y\n{number}z\n"
+    head += "element face 1\nproperty list uchar uchar vertex_index\n"
+    head += "".join(f"element x{n} {count}\nproperty list uchar uchar a\n" for n in range(elements)) + "end_header\n"
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
+    return head.encode() + corners + b"\3\0\1\2" + elements * (b"\1\0" + bytes(count - 1))
+
+
 def tetrahedra(count: int) -> bytes:
     """Objects of four vertices in OBJ."""
     lines = []

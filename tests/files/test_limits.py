@@ -17,6 +17,7 @@ from jaxmark.files import atomic, limits, load_mesh, load_scene, save_mesh, thre
 from jaxmark.files.gltf.document import Document
 from jaxmark.files.limits import Limit
 from jaxmark.files.source import unique_names
+from jaxmark.files.unpacking import Unpacker
 from tests.files import hostile
 from tests.files.helpers import loaded, written
 
@@ -137,48 +138,50 @@ def test_glb_files_that_are_nested_deeply_are_written(tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_mesh(tmp_path / "b.glb").vertices, 2 * mesh.vertices)
 
 
-def test_counts_in_draco_are_checked_before_it_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_draco_may_take_what_its_file_allows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     draco = pytest.importorskip("DracoPy")
     points = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
     faces = np.arange(39).reshape(-1, 3).astype(np.uint32)
-    decoded = list[bytes]()
-    decode = draco.decode
-    monkeypatch.setattr(draco, "decode", lambda data: decoded.append(data) or decode(data))
     for ordered in (True, False):
         blob = bytes(draco.encode(points, faces, preserve_order=ordered))
-        assert blob[8] == (0 if ordered else 1)
-        count = len(decode(blob).points)
-        assert len(loaded(tmp_path, "a.glb", hostile.compressed(1, blob, count)).faces) == len(decode(blob).faces)
-        assert len(decoded) == 1
-        with pytest.raises(JaxmarkError, match="more points than the document says"):
+        found = draco.decode(blob)
+        assert len(loaded(tmp_path, "a.glb", hostile.compressed(1, blob, len(found.points))).faces) == len(found.faces)
+        with pytest.raises(JaxmarkError, match="holds other numbers of POSITION than the document says"):
             loaded(tmp_path, "a.glb", hostile.compressed(1, blob, 1))
-        decoded.clear()
-    many = b"DRACO\2\2\1\0\0\0" + b"\0" + b"\x80\x80\x80\x80\1" + b"\1\1\1\0\x09\3\0\0\0"  # 2^28 points
     cloud = bytes(draco.encode(points))
-    for bad in (many, many[:13], cloud, b"DRACO", many[:10] + b"\x80" + many[11:], many[:12] + b"\xff" * 20):
-        with pytest.raises(JaxmarkError, match=r"more points|cannot be decoded by Draco"):
+    for bad in (hostile.many_points(), cloud, b"DRACO", blob[:40]):
+        with pytest.raises(JaxmarkError, match="cannot be decoded by Draco"):
             loaded(tmp_path, "a.glb", hostile.compressed(1, bad, 40))
-    assert not decoded
     monkeypatch.setattr(limits, "UNPACKED", Limit("bytes of unpacked content", 20_000, 0))
-    blob = bytes(draco.encode(points, faces, preserve_order=True))
-    load_scene(written(tmp_path, "a.glb", hostile.compressed(1, blob, 40)))
-    decoded.clear()
-    with pytest.raises(JaxmarkError, match="None of its 100 meshes can be marked"):
-        load_scene(written(tmp_path, "a.glb", hostile.compressed(100, blob, 41)))
-    assert 3 * len(blob) < len(decoded) * len(blob) <= 20_000
+    scene = load_scene(written(tmp_path, "a.glb", hostile.compressed(100, blob, len(found.points))))
+    assert 20_000 // 1000 < len(scene.meshes) < 20_000 // (12 * len(found.points))
+    assert all("more than 20000 bytes of unpacked content" in reason for reason in scene.skipped.values())
 
 
-def test_the_table_of_chunks_in_a_laz_file_is_checked(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", hostile.DAMAGED_LAZ)
+def test_laz_files_that_end_their_decoder_are_refused(tmp_path: Path, kind: str) -> None:
+    """A decoder that panics, or reserves more memory than there is, ends its own process only."""
     pytest.importorskip("lazrs")
-    data = hostile.laz(1000, 0)
-    begin = struct.unpack_from("<I", data, 96)[0]
-    place = struct.unpack_from("<q", data, begin)[0]
-    many = data[: place + 4] + b"\xff" * 4 + data[place + 8 :]
-    behind = many[:begin] + struct.pack("<q", -1) + many[begin + 8 :] + struct.pack("<q", place)
-    assert len(loaded(tmp_path, "a.laz", data).vertices) == 1000
-    for bad in (many, behind):
-        with pytest.raises(JaxmarkError, match="it counts 4294967295 chunks in"):
-            loaded(tmp_path, "a.laz", bad)
+    with pytest.raises(JaxmarkError, match=r"no LAZ file that laspy reads: [^.]*\.$|does not hold the 1000 points"):
+        loaded(tmp_path, "a.laz", hostile.DAMAGED_LAZ[kind](hostile.laz(1000, 0)))
+
+
+def test_unpacking_takes_limited_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("lazrs")
+    data = hostile.laz(1_000_000, 0)
+    monkeypatch.setattr(limits, "UNPACKING_SECONDS", Limit("seconds of unpacking", 1, 0))
+    unpack = Unpacker("laz", len(data))
+    with pytest.raises(JaxmarkError, match=r"its decoder ended; the data are damaged, or take more than 1 s"):
+        _ = [unpack(data) for _ in range(100)]
+
+
+def test_rows_of_ply_that_differ_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(limits, "ROWS", Limit("rows", 100, 0))
+    assert len(loaded(tmp_path, "a.ply", hostile.rows(100)).vertices) == 3
+    with pytest.raises(JaxmarkError, match="more than 100 rows"):
+        loaded(tmp_path, "a.ply", hostile.rows(101))
+    with pytest.raises(JaxmarkError, match="more than 100 rows"):
+        loaded(tmp_path, "a.ply", hostile.rows(60, 2))
 
 
 @pytest.mark.parametrize("names", [["a #2", "a", "a"], ["a", "a", "a #2", "a"], ["a", "a #2", "a #2", "a"]])

@@ -18,6 +18,7 @@ from jaxmark.files.binary import gather
 from jaxmark.files.gltf.json_text import rewrite
 from jaxmark.files.limits import RunningCount
 from jaxmark.files.source import Indices, Patched
+from jaxmark.files.unpacking import Unpacker
 
 #: Reads a file by its path relative to the folder of the document; the same object for all paths of one file.
 Read = Callable[[str], bytes]
@@ -74,6 +75,7 @@ class Document:
         decoded: the indices of those that were compressed.
         accessed: counts the elements of accessors that are read, and the corners of faces that are made of them.
         unpacked: counts the bytes of those that are decompressed.
+        draco: decodes primitives that are compressed with Draco.
     """
 
     def __init__(self, file: bytes, read: Read) -> None:
@@ -113,6 +115,7 @@ class Document:
         self.decoded: set[int] = set()
         self._lists: dict[str, list[dict[str, Any]]] = {}
         self.accessed, self.unpacked = (RunningCount(one, size) for one in (limits.ACCESSED, limits.UNPACKED))
+        self.draco = Unpacker("draco", size)
 
     def copy_content(self) -> dict[str, Any]:
         """Return a copy of the document's content, which may be nested more deeply than `copy.deepcopy` can copy."""
