@@ -49,8 +49,8 @@ function show(answer) {
   box.className = "key";
   if (named.length) {
     box.append(make("p", `The false-positive probability of this result is at most ${power(answer.log10_p)} if `
-      + "keys, originals and records were fixed before the file existed, and at most "
-      + `${power(answer.log10_p_uncommitted)} even if they were chosen afterwards. Both bounds count all ${answer.readings} readings that could have been made.`));
+      + "keys, originals, records and the list of recipients were fixed before the file existed, and at most "
+      + `${power(answer.log10_p_uncommitted)} even if keys, originals and records were chosen afterwards. Both bounds count all ${answer.readings} readings that could have been made.`));
   }
   if (answer.dossier) {
     const link = make("a", "Dossier");

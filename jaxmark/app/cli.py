@@ -388,8 +388,8 @@ def identify_command(
         f"{ESTIMATE}: {entry.recipient}: score {entry.score:.1f}, probability about {power(entry.log10_p)}:"
         f" {'; '.join(entry.caveats)}"
         if entry.caveats
-        else f"{entry.recipient}: score {entry.score:.1f}, probability at most {power(entry.log10_p)} if the list of"
-        " recipients was fixed before the suspect existed"
+        else f"{entry.recipient}: score {entry.score:.1f}, probability at most {power(entry.log10_p)} if key, original"
+        f"{'' if record is None else ', record'} and the list of recipients were fixed before the suspect existed"
         for entry in likely
     ]
     answer(as_json, values, *(lines or [f"none of {len(names)} recipients is accused (--alpha {alpha:g})"]))

@@ -28,7 +28,7 @@ from jaxmark.plot import View, draw, save_views
 from jaxmark.plot.figures import fill_template
 from jaxmark.watermark.coding.keys import commitment as commitment_to
 from jaxmark.watermark.evidence.detection import Detection
-from jaxmark.watermark.evidence.ledger import charges_as_json
+from jaxmark.watermark.evidence.ledger import charges_as_json, rounded_up
 from jaxmark.watermark.mark import Mark
 from jaxmark.watermark.record import TimestampedCommitment
 
@@ -102,7 +102,7 @@ def save_dossier(folder: Path, case: Case) -> None:
     require("jinja2", "plot")  # checked before the pictures are drawn, which takes longer
     facts = _facts(case)
     make_folder(folder)
-    text = fill_template("jaxmark.app", "dossier.html", **facts, pictures=_draw_sides(case))
+    text = fill_template("jaxmark.app", "dossier.html", **facts, rounded_up=rounded_up, pictures=_draw_sides(case))
     write_atomically(folder / "dossier.json", (json.dumps(facts, indent=2) + "\n").encode())
     write_atomically(folder / "dossier.html", text.encode())
 
@@ -128,7 +128,8 @@ def _facts(case: Case) -> dict[str, Any]:
         "log10_p": evidence.log10_p,
         "log10_p_uncommitted": evidence.log10_p_uncommitted,
         "charges": charges_as_json(evidence.charges),
-        "chance": _in_words(evidence.log10_p_uncommitted if timestamped is None else timestamped["log10_p"]),
+        "chance": _in_words(evidence.log10_p_uncommitted),
+        "premises": detection.premises,
         "commitment": timestamped,
         "obtained": case.obtained,
         "coverage": detection.coverage,

@@ -248,7 +248,7 @@ def _likely(match: Match) -> str:
     if match.estimate:
         return f"{ESTIMATE}: {result} about {power(match.log10_p)}: {'; '.join(match.caveats)}"
     return (
-        f"{result} at most {power(match.log10_p)} if keys, originals and"
-        f" records were fixed before the suspect existed, {power(match.log10_p_uncommitted)} even if they were chosen"
-        " afterwards"
+        f"{result} at most {power(match.log10_p)} if keys, originals, records and the list of recipients were fixed"
+        f" before the suspect existed, {power(match.log10_p_uncommitted)} even if keys, originals and records were"
+        " chosen afterwards"
     )

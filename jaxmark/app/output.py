@@ -16,7 +16,7 @@ from jaxmark.app.progress import current
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import file_hash
 from jaxmark.watermark.evidence.detection import Detection, Evidence
-from jaxmark.watermark.evidence.ledger import charges_as_json
+from jaxmark.watermark.evidence.ledger import charges_as_json, rounded_up
 from jaxmark.watermark.perception.capacity import Survival
 
 ESTIMATE = "estimate, not a proof"  # how the text of an estimate begins
@@ -96,7 +96,7 @@ def error_text(error: Exception) -> str:
 
 def power(log10_p: float) -> str:
     """Format a bound as a power of ten, rounded up."""
-    return f"10^{math.ceil(10 * log10_p - 1e-9) / 10 + 0.0:.1f}"
+    return f"10^{rounded_up(log10_p):.1f}"
 
 
 def payload_text(bits: int) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 from jaxmark.alignment.original import Original
@@ -162,16 +163,21 @@ class FileReader:
         blind_schemes = [BLIND_SCHEMES[name] for name in self.schemes if name in BLIND_SCHEMES]
         schemes = blind_schemes if len(blind_schemes) == 1 and record is None else []
 
-        def read(mesh: Mesh, record: Record | None) -> Detection:
-            release_programs()
-            return read_blind(mesh, self.key, bits=self.bits, message=self.message, record=record, schemes=schemes)
+        each: dict[str, list[Detection]] = {name: [] for name in names}
 
-        detections = list(try_each(partial(read, meshes[name], entry) for name in names for entry in records))
-        best = best_of(detections, ledger.PARTS, len(readable) * len(records))
+        def read(name: str, entry: Record | None) -> Detection:
+            release_programs()
+            options = {"bits": self.bits, "message": self.message, "record": entry, "schemes": schemes}
+            each[name].append(read_blind(meshes[name], self.key, **options))
+            return each[name][-1]
+
+        tries = len(readable) * len(records)
+        best = best_of(list(try_each(partial(read, *pair) for pair in product(names, records))), ledger.PARTS, tries)
         if not self.meshes and len(names) < len(readable):
             note = f"Only the {len(names)} largest of {len(readable)} meshes were read; select others by --mesh."
             best = best._replace(notes=(*best.notes, note))
-        return self._count_proving(best, detections, len(names)) if several else best
+        parts = [best_of(found, ledger.PARTS, tries) for found in each.values() if found]
+        return self._count_proving(best, parts, len(names)) if several else best
 
     def _names(self, scene: Scene, original: Path, record: SceneRecord | None) -> list[str]:
         """Return the names of the meshes to read; the record must have them, if there is one."""
@@ -198,13 +204,15 @@ class FileReader:
             align=self.align,
             after=release_programs,
         )
-        parts = detection.parts
-        return self._count_proving(detection, list(parts.values()), len(parts) + len(detection.skipped))
+        count = len(detection.parts) + len(detection.skipped)
+        charge = ledger.MESHES.charge("each", count)
+        parts = [part._replace(evidence=part.evidence.charged(charge)) for part in detection.parts.values()]
+        return self._count_proving(detection, parts, count)
 
     def _count_proving(self, detection: Detection, parts: Sequence[Detection], meshes: int) -> Detection:
-        """Add a note on how many of several meshes prove the mark without the others."""
+        """Add a note on how many of several meshes prove the mark without the others, after the charge for each."""
         proving = sum(part.detected(self.alpha) for part in parts)
-        note = f"{proving} of {meshes} meshes prove the mark without the others."
+        note = f"{proving} of {meshes} meshes {'proves' if proving == 1 else 'prove'} the mark without the others."
         return detection._replace(notes=(*detection.notes, note))
 
     def _alternatives(self, mesh: Mesh, original: Path, record: Record | None, suspect: Path) -> Alternatives:

@@ -1,7 +1,8 @@
 """Write a file and the record that belongs to it, so that a killed process leaves no file beside another's record."""
 
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
@@ -15,6 +16,8 @@ try:
     import fcntl
 except ModuleNotFoundError:  # not a POSIX system
     fcntl = None  # type: ignore[assignment]
+
+_LOCK_SECONDS, _LOCK_PAUSE = 60.0, 0.02  # how long the names of a pair are waited for, and how often they are tried
 
 
 def refuse_existing(*paths: Path, overwrite: bool) -> None:
@@ -73,8 +76,7 @@ def writing_pair(file: Path, record: Path, *, overwrite: bool = False) -> Iterat
             with replacing(file) as draft, replacing(record) as record_draft:
                 pair = Pair(draft, record_draft)
                 yield pair
-                for folder in sorted({os.path.realpath(path.parent) for path in (file, record)}):
-                    alone.enter_context(_locked(folder))
+                alone.enter_context(_locked({Path(os.path.realpath(path)).parent for path in (file, record)}))
                 refuse_existing(file, record, overwrite=overwrite)  # another process may have written them meanwhile
                 old = _Old.of(file, record)
                 old.set_aside()
@@ -82,22 +84,41 @@ def writing_pair(file: Path, record: Path, *, overwrite: bool = False) -> Iterat
             if old is not None:
                 old.restore()
             raise
-        pair.kept = old.discard()
+        kept = old.discard()
+        pair.kept = kept if kept is None or record.is_symlink() else record.with_name(kept.name)
 
 
 @contextmanager
-def _locked(folder: str) -> Iterator[None]:
-    """Hold the lock of a folder, which the system releases if the process is killed."""
+def _locked(folders: Collection[Path]) -> Iterator[None]:
+    """Hold the locks of folders, which the system releases if the process is killed; some folders have none.
+
+    Raises:
+        JaxmarkError: if another process holds one of them for a minute.
+    """
+    with ExitStack() as opened:
+        # A folder may have several names, and two processes must take its locks in the same order.
+        places = {(status.st_dev, status.st_ino): folder for folder in folders for status in [folder.stat()]}
+        for _, folder in sorted(places.items()):
+            with suppress(OSError):
+                descriptor = os.open(folder, os.O_RDONLY)
+                opened.callback(os.close, descriptor)
+                _lock(descriptor, folder)
+        yield
+
+
+def _lock(descriptor: int, folder: Path) -> None:
     if fcntl is None:
-        yield
         return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):  # some file systems have no locks
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
+    end = time.monotonic() + _LOCK_SECONDS
+    while True:
+        try:
+            return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() > end:
+                raise JaxmarkError(
+                    f"Another process has locked {folder} for {_LOCK_SECONDS:g} s; end it, or give another folder."
+                ) from None
+            time.sleep(_LOCK_PAUSE)
 
 
 class _Old(NamedTuple):
@@ -138,7 +159,8 @@ class _Old(NamedTuple):
     def discard(self) -> Path | None:
         """Delete the old file, and a copy of the old record that is equal to the new one; return a copy that stays."""
         if self.aside is not None:
-            self.aside.unlink()
+            with suppress(OSError):  # the new pair is complete
+                self.aside.unlink()
         self._drop_equal()
         return self.copy if self.copy is not None and self.copy.exists() else None
 

@@ -26,6 +26,7 @@ from jaxmark.watermark.coding import message as coding
 from jaxmark.watermark.coding.keys import Key, commitment
 from jaxmark.watermark.coding.message import DEFAULT_BITS, TAG_BITS, check_size
 from jaxmark.watermark.evidence.detection import Detection, Evidence
+from jaxmark.watermark.evidence.ledger import rounded_up
 from jaxmark.watermark.interfaces import Detector, Scheme
 from jaxmark.watermark.mark import EmbedInfo, Mark, recall
 from jaxmark.watermark.nonblind import Alternatives, read
@@ -522,7 +523,11 @@ def prepare(mesh: Mesh, key: bytes, bits: int, scheme: AnyScheme, *, adapt_to: B
 def unite(nonblind: Detection, blind: Sequence[Detection]) -> Detection:
     """Unite the detections of all marks of a mesh, whose signs are independent, into one non-blind detection."""
     detections = (nonblind, *blind)
-    notes = tuple(f"The mark of {detection.scheme!r} alone proves 10^{detection.log10_p:.1f}." for detection in blind)
+    notes = tuple(
+        f"The mark of {detection.scheme!r}, if it were the only one that was read, would have a probability of"
+        f" {'about' if detection.evidence.caveats else 'at most'} 10^{rounded_up(detection.log10_p):.1f}."
+        for detection in blind
+    )
     return nonblind._replace(
         message=next((detection.message for detection in detections if detection.message is not None), None),
         evidence=Evidence.product(*(detection.evidence for detection in detections)),

@@ -107,7 +107,7 @@ def test_a_dossier_shows_all_but_the_secret(workshop: Workshop):
     assert page.count("data:image/png;base64,") == 4
     for name in ("log10_p", "log10_p_uncommitted"):
         assert facts[name] == told[name]
-        assert f"{told[name]:.1f}" in page
+        assert power(told[name]).removeprefix("10^") in page
     assert facts["commitment"]["log10_p"] == told["log10_p_timestamped"]
     words = facts["command"].split()
     assert words == ["jaxmark", *(word.replace("secrets/mine.key", "KEYFILE") for word in detect)]

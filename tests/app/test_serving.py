@@ -14,6 +14,7 @@ import pytest
 
 import jaxmark as jm
 from jaxmark.app.serving import Desk, make_app
+from jaxmark.watermark.evidence.ledger import rounded_up
 from tests.samples import rough_sphere
 
 uvicorn = pytest.importorskip("uvicorn")
@@ -201,8 +202,10 @@ def test_a_file_that_is_dropped_is_named_with_its_dossier(tmp_path: Path):
     page = desk.dossiers[found["dossier"]].decode()
     assert b"8 bytes!".hex() in page
     assert found["readings"] == 2
-    assert f"<sup>{found['log10_p']:.1f}</sup>" in page, "the dossier is charged for the catalogue, as the verdict is"
-    assert f"<sup>{found['log10_p'] - math.log10(2):.1f}</sup>" not in page
+    assert f"<sup>{rounded_up(found['log10_p']):.1f}</sup>" in page, (
+        "the dossier is charged for the catalogue, as the verdict is"
+    )
+    assert f"<sup>{rounded_up(found['log10_p'] - math.log10(2)):.1f}</sup>" not in page
     assert KEY.hex() not in str(found)
     assert (tmp_path / "shop.db").read_bytes() == before
     for worker in (desk._workers.get(), desk._workers.get()):

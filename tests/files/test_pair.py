@@ -131,6 +131,19 @@ def test_pairs_are_replaced_one_after_another(tmp_path: Path, monkeypatch: pytes
     )
 
 
+@pytest.mark.skipif(os.name != "posix", reason="only there folders have locks")
+def test_a_folder_that_stays_locked_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pairs, "_LOCK_SECONDS", 0.05)
+    folder = lay(tmp_path / "place", True, True)
+    (tmp_path / "other").symlink_to(folder)
+    with pairs._locked({folder, tmp_path / "other"}):  # one folder with two names
+        with pytest.raises(JaxmarkError, match=r"Another process has locked .*place(/records)? for 0\.05 s; end it"):
+            write(folder, overwrite=True)
+        assert complete(folder, b"old", OLD)
+    write(folder, overwrite=True)
+    assert complete(folder, b"new", NEW)
+
+
 def test_replaced_records_are_kept_unless_they_are_equal(tmp_path: Path) -> None:
     folder = lay(tmp_path / "place", False, False)
     told = [write(folder, record, overwrite=True) for record in (OLD, OLD, NEW, OLD, OLD)]

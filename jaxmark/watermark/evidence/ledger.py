@@ -76,6 +76,11 @@ def figure(log10_p: float, charges: Sequence[Charge], floor: float = MIN_LOG10_P
     return min(0.0, max(floor, log10_p + inside) + outside)
 
 
+def rounded_up(log10_p: float) -> float:
+    """Round a bound up to one digit behind the point, so that what is shown is a bound as well."""
+    return math.ceil(10 * log10_p - 1e-9) / 10 + 0.0
+
+
 def uncommitted(log10_p: float) -> float:
     """Return log10 of the bound if nothing was fixed beforehand; `log10_p` must include all other charges."""
     return figure(log10_p, [forgeries()], UNFLOORED)
