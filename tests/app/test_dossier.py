@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -109,6 +110,8 @@ def test_a_dossier_shows_all_but_the_secret(workshop: Workshop):
         assert facts[name] == told[name]
         assert power(told[name]).removeprefix("10^") in page
     assert facts["commitment"]["log10_p"] == told["log10_p_timestamped"]
+    assert facts["chance"] == f"at most once in 10^{math.floor(-told['log10_p_uncommitted'])} cases"  # without a date
+    assert "Key, original, message and record were all fixed" in page
     words = facts["command"].split()
     assert words == ["jaxmark", *(word.replace("secrets/mine.key", "KEYFILE") for word in detect)]
 
