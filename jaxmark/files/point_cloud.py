@@ -48,6 +48,7 @@ def parse_las(data: bytes) -> Source:
     Raises:
         JaxmarkError: if laspy is missing or cannot read the file, or it has no points.
     """
+    require("laspy", "files")
     count = _check_counts(data)
     if not data[_KIND] & _PACKED:
         return Source(data, ScaledNumbers(data, _read(data).header), _NO_FACES)
