@@ -309,5 +309,5 @@ def mark_copy(
     lines = (f"{outcome.lines[0]}{pair}", *outcome.lines[1:])
     for place, name in places.items():
         lines = tuple(line.replace(place, name) for line in lines)
-    named = {"record": str(record), "marked": str(copy), "old_record": None if pair.kept is None else str(pair.kept)}
+    named = {"record": str(record), "marked": str(copy), "old_record": pair.kept}
     return outcome._replace(values={**outcome.values, **named}, lines=lines)

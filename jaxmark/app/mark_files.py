@@ -146,7 +146,7 @@ def mark_file(
         "texture_drift": drift,
         "record": str(record),
         "marked": str(marked),
-        "old_record": None if pair.kept is None else str(pair.kept),
+        "old_record": pair.kept,
     }
     text = f"{payload} → {marked}, {_moved_text(moved)} of the diagonal; record → {record}{pair}"
     if isinstance(survives, Survival):
@@ -221,7 +221,7 @@ def _mark_scene(
         "notes": list(notes),
         "record": str(record),
         "marked": str(marked),
-        "old_record": None if pair.kept is None else str(pair.kept),
+        "old_record": pair.kept,
     }
     least = Survival(*(min(noises) for noises in zip(*survives.values(), strict=True)))
     text = (

@@ -37,7 +37,7 @@ class Pair:
 
     file: Path
     record: Path
-    kept: Path | None = None  # the copy of a record that was replaced
+    kept: str | None = None  # path of the copy of a record that was replaced
 
     def __str__(self) -> str:
         return "" if self.kept is None else f"; the record that was there is kept as {self.kept}"
@@ -85,7 +85,8 @@ def writing_pair(file: Path, record: Path, *, overwrite: bool = False) -> Iterat
                 old.restore()
             raise
         kept = old.discard()
-        pair.kept = kept if kept is None or record.is_symlink() else record.with_name(kept.name)
+        if kept is not None:
+            pair.kept = str(kept if record.is_symlink() else record.with_name(kept.name))
 
 
 @contextmanager

@@ -56,9 +56,7 @@ class _Parser:
     def __init__(self, data: bytes) -> None:
         self.data, self.skipped, self._fed = data, 0, 0
         self._spaces = {"": 0}  # numbers of namespaces, by address
-        self._scopes = dict[
-            str, list[int]
-        ]()  # by prefix: the namespaces that open elements gave it, the last one counts
+        self._scopes: dict[str, list[int]] = {}  # by prefix, those that open elements gave it; the last one counts
         self._declared = list[list[str]]()  # the prefixes that each open element declares
         self.expat = expat.ParserCreate("utf-8")
         self.expat.StartDoctypeDeclHandler = self._doctype

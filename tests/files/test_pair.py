@@ -53,7 +53,7 @@ def write(folder: Path, record: Record = NEW, content: bytes = b"new", overwrite
     with writing_pair(folder / FILE, folder / RECORD, overwrite=overwrite) as pair:
         pair.file.write_bytes(content)
         pair.record.write_text(record.to_json())
-    return pair.kept
+    return None if pair.kept is None else Path(pair.kept)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="only there can a process be killed at a call")
