@@ -177,7 +177,8 @@ def test_products_of_preparing_embedding_and_reading(scheme, original, key: jm.K
         carrier, marked = written(x, bits, beta)
         seen, reader = observe(marked - x)._replace(nuisance=x), carrier.reader()
         received = reader.receive(seen)
-        probe = KeyedReader._probe(reader, jnp.ones_like(x[:, 0])) if scheme.name == "keyed" else None
+        signs = jnp.ones(carrier.chips.signs.shape, x.dtype) if scheme.name == "keyed" else None
+        probe = None if signs is None else KeyedReader._probe(reader, jnp.ones_like(x[:, 0]), signs)
         more = probe, reader.linear_score(received, x, bits), reader.read_quickly(seen)
         return (
             carrier.claim(seen, bits),

@@ -16,6 +16,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, PyTree
@@ -58,9 +59,11 @@ def _scan_terms(
     return carry, outputs
 
 
-def _factors(terms: int, x: Array) -> Array:
+def _factors(terms: int, x: Array) -> np.ndarray:
     """Return the factors of the recurrence from T_1 on; T_1 = Δ̃T_0 is a step with factor 1 and T_{-1} = 0."""
-    return jnp.full(terms - 1, 2, x.dtype).at[:1].set(1)
+    factors = np.full(terms - 1, 2, x.dtype)
+    factors[:1] = 1
+    return factors
 
 
 @dataclass(frozen=True)

@@ -245,7 +245,8 @@ class KeyedReader(NamedTuple):
 
     def free_dimensions(self, moving: Float[Array, " vertices"]) -> FreeDimensions:
         """See `Reader`; measured with one probe, which has random signs instead of the keyed ones."""
-        whole, remaining = np.asarray(self._probe(moving), np.float64).clip(0)
+        (signs,) = probe_signs("capacity", self.carrier.chips.signs.shape, dtype=moving.dtype)
+        whole, remaining = np.asarray(self._probe(moving, signs), np.float64).clip(0)
         profile = self.carrier.profile
         strength = np.ones(len(whole)) if profile is None else np.asarray(profile, np.float64)
         # The energy of a whole band is summed over the three coordinates of each vertex, or over one along its normal.
@@ -264,13 +265,17 @@ class KeyedReader(NamedTuple):
         return self.carrier.coefficients(1.0, received.gain / received.power)
 
     @jax.jit
-    def _probe(self, moving: Float[Array, " vertices"]) -> Float[Array, "2 bands"]:
+    def _probe(
+        self, moving: Float[Array, " vertices"], signs: Float[Array, "vertices channels"]
+    ) -> Float[Array, "2 bands"]:
         """Measure the energy of random signs in each band, before and after the nuisance is projected off."""
         receiver, normals = self.receiver, self.carrier.normals
-        (signs,) = probe_signs("capacity", self.carrier.chips.signs.shape, dtype=moving.dtype)
         signs = signs * moving[:, None]
         observation = observe(jnp.zeros_like(receiver.signal), moving)
         factor = normal_factor(receiver, observation)
         white = signs if normals is None else normals * signs
         remaining = clean(receiver, observation, factor, white)
-        return jnp.stack([band_energies(receiver.operator, receiver.coefficients, x, x) for x in (white, remaining)])
+        # The two are measured one after the other, so that there is less to compile.
+        return jax.lax.map(
+            lambda x: band_energies(receiver.operator, receiver.coefficients, x, x), jnp.stack([white, remaining])
+        )

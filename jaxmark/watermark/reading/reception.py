@@ -8,7 +8,7 @@ attack's effect on the host in that band.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -201,21 +201,21 @@ def receive(receiver: Receiver, observation: Observation) -> Reception:
     """
     check_precision("receive", observation.residual)
     extended = extend(receiver, observation)
+    # The probe comes from a program that all probes of this shape share.
+    (probe,) = probe_signs("reception", observation.residual.shape, dtype=observation.residual.dtype)
     # Only `_receive` is compiled, because a compiled function would return copies of its arguments.
-    return Reception(extended, observation, *_receive(extended, observation))
+    return Reception(extended, observation, *_receive(extended, observation, probe))
 
 
 @jax.jit
-def _receive(receiver: Receiver, observation: Observation) -> tuple[Array, Array, Array, Array, Observation, Array]:
-    # Points whose residual is still large without the nuisance were edited or lost; they get lower weights.
-    point_weights = _huber_weights if observation.normals is None else _precision
-    observation = observation._replace(weights=observation.weights * point_weights(receiver, observation))
-    factor = normal_factor(receiver, observation)
+def _receive(
+    receiver: Receiver, observation: Observation, probe: Float[Array, "vertices 3"]
+) -> tuple[Array, Array, Array, Array, Observation, Array]:
+    observation, factor = _weigh_points(receiver, observation)
     # The nuisance is projected off twice, because the ridge leaves a small part of a large nuisance.
     nuisance = _fit_nuisance(receiver, observation, factor, observation.residual)
     residual = clean(receiver, observation, factor, observation.residual - nuisance)
     # White noise is the reference for the power of each band.
-    (probe,) = probe_signs("reception", residual.shape, dtype=residual.dtype)
     pair = jnp.concatenate([residual, clean(receiver, observation, factor, probe)], axis=1)
     squares = gram(receiver.operator, receiver.coefficients, pair, method="moments")
     # Rounding may make the energy of a band negative.
@@ -282,33 +282,51 @@ def _inverse_root_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Ar
     return matmul(vectors / root, vectors.T), einsum("ik,kl,jl->ij", vectors, change, vectors)
 
 
-def _huber_weights(receiver: Receiver, observation: Observation) -> Float[Array, " vertices"]:
+def _weigh_points(receiver: Receiver, observation: Observation) -> tuple[Observation, Array]:
+    """Give lower weights to points that were edited or lost: whose residual is still large without the nuisance.
+
+    Returns the observation with these weights, and the factor of its normal equations, see `normal_factor`.
+    """
+    weigh, rounds = (_huber_weights, 1) if observation.normals is None else (_precision, _PRECISION_ROUNDS)
+
+    # One step computes weights from the residual, and first the residual by the weights of the step before. The last
+    # step's residual is not needed, but all steps are one program, so that there is less to compile.
+    def step(state: tuple[Array, Any, Any], _: None) -> tuple[tuple[Array, Array, Array], None]:
+        weights = observation.weights * state[0]
+        weighted = observation._replace(weights=weights)
+        factor = normal_factor(receiver, weighted)
+        rest = clean(receiver, weighted, factor, observation.residual)
+        return (weigh(receiver, weighted, rest), weights, factor), None
+
+    unknowns = receiver.nuisance.shape[1] * (1 if observation.normals is None else 3)
+    dtype = receiver.nuisance.dtype
+    start = jnp.ones_like(observation.weights), observation.weights, jnp.zeros((unknowns, unknowns), dtype)
+    (_, weights, factor), _ = jax.lax.scan(step, start, None, length=rounds + 1)
+    return observation._replace(weights=weights), factor
+
+
+def _huber_weights(receiver: Receiver, weighted: Observation, rest: Array) -> Float[Array, " vertices"]:
     """Compute Huber weights of squared lengths: 1 up to four times the median, which Gaussian noise rarely exceeds."""
-    residual = clean(receiver, observation, normal_factor(receiver, observation), observation.residual)
-    square = jnp.sum(residual**2, axis=1)
-    limit = 4 * _median_where(observation.weights > 0, square)
+    del receiver
+    square = jnp.sum(rest**2, axis=1)
+    limit = 4 * _median_where(weighted.weights > 0, square)
     return jnp.where(square > limit, limit / jnp.where(square > limit, square, 1), 1)
 
 
-def _precision(receiver: Receiver, observation: Observation) -> Float[Array, " vertices"]:
+def _precision(receiver: Receiver, weighted: Observation, rest: Array) -> Float[Array, " vertices"]:
     """Compute the inverse energy of the residual around each point, at most five times that at the median.
 
     The residuals of a remeshed surface are small on planar regions and large along edges, by orders of magnitude on
     machine parts, and S/‖b‖ is largest with these weights. Each projection with better weights leaves less of the
     nuisance of the bad regions in the good ones, so that energies are computed again.
     """
-    known = (observation.weights > 0).astype(observation.residual.dtype)
-
-    def refine(weights: Array, _: None) -> tuple[Array, None]:
-        weighted = observation._replace(weights=observation.weights * weights)
-        rest = clean(receiver, weighted, normal_factor(receiver, weighted), observation.residual)
-        square = jnp.sum(rest**2, axis=1) / jnp.where(weighted.weights > 0, weighted.weights, 1) ** 2
-        pair = filter(receiver.operator, jnp.asarray(_AROUND, rest.dtype), jnp.stack([known * square, known], axis=1))
-        energy = jnp.maximum(pair[:, 0], 0) / jnp.maximum(pair[:, 1], _LEAST_AROUND)
-        middle = _median_where(known > 0, energy)
-        return 1 / (energy / jnp.where(middle > 0, middle, 1) + _LEAST_ENERGY), None
-
-    return jax.lax.scan(refine, known, None, length=_PRECISION_ROUNDS)[0]
+    is_known = weighted.weights > 0
+    known = is_known.astype(rest.dtype)
+    square = jnp.sum(rest**2, axis=1) / jnp.where(is_known, weighted.weights, 1) ** 2
+    pair = filter(receiver.operator, jnp.asarray(_AROUND, rest.dtype), jnp.stack([known * square, known], axis=1))
+    energy = jnp.maximum(pair[:, 0], 0) / jnp.maximum(pair[:, 1], _LEAST_AROUND)
+    middle = _median_where(is_known, energy)
+    return 1 / (energy / jnp.where(middle > 0, middle, 1) + _LEAST_ENERGY)
 
 
 def _median_where(mask: Bool[Array, " vertices"], values: Float[Array, " vertices"]) -> Float[Array, ""]:
