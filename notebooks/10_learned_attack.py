@@ -37,7 +37,8 @@ from jaxmark.geometry import asteroid
 from jaxmark.plot.figures import BOUND, COLOURS, Picture, finish, panels
 
 mesh = asteroid(2800)  # small, so that this takes a minute
-marker = jm.make_marker(mesh, jm.new_key(), bits=16)
+owner = jm.Key(bytes(range(32)))  # the same in each run; make real keys by `jm.new_key()`
+marker = jm.make_marker(mesh, owner, bits=16)
 marked, _ = marker.embed(b"ok", 8e-4)
 surrogate, original = adversaries.make_surrogate(marked, "keyed", 16, 8e-4)
 sizes, draws = ((4, 8), (8, 3)), jax.random.split(jax.random.key(0), 3)
