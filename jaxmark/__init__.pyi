@@ -22,6 +22,7 @@ from .files import load_mesh as load_mesh
 from .files import save_mesh as save_mesh
 from .geometry import Mesh as Mesh
 from .geometry import make_mesh as make_mesh
+from .programs import keep_programs as keep_programs
 from .watermark import Budget as Budget
 from .watermark import Key as Key
 from .watermark import Record as Record

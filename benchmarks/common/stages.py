@@ -34,12 +34,11 @@ from common.filters import DEGREE, coefficients, graph, reordered, shifted
 from common.marks import BUDGET, KEY, MESSAGE, write
 from common.peers import PEERS
 from common.tables import Row
-from common.timing import Call, median_time, timed
+from common.timing import Call, Compilation, median_time, timed
 
 BLIND = ("field", "local")
 SHORT = b"m2"  # a message, shorter than MESSAGE, that blind marks carry on small meshes, too
 EIGENVECTORS = 64
-COMPILING = ("/jax/core/compile/jaxpr_to_mlir_module_duration", "/jax/core/compile/backend_compile_duration")
 
 
 def with_gradients(operator: Laplacian, c: Any, x: Any) -> Any:
@@ -132,23 +131,17 @@ FILTERS = ("filter", "gradients")  # of the stages, those that are one function 
 
 def work(stage: str, folder: Path, repeat: int) -> Row:
     """Measure a stage in this process, which is a fresh one."""
-    compiling: list[float] = []
-
-    def hear(event: str, duration_secs: float, **_: str | int) -> None:
-        if event in COMPILING:
-            compiling.append(duration_secs)
-
-    jax.monitoring.register_event_duration_secs_listener(hear)
     try:
         call = STAGES[stage](folder)
-        compiling.clear()
+        compilation = Compilation()
         with suppress(OSError):
             Path("/proc/self/clear_refs").write_text("5")  # on Linux: the peak counts from here
         held, start = resident("VmRSS"), time.perf_counter()
         result: Any = jax.block_until_ready(call())
     except jm.JaxmarkError as refusal:
         return {"note": str(refusal)}
-    row: Row = {"first call, s": time.perf_counter() - start, "compiling, s": sum(compiling)}
+    row: Row = {"first call, s": time.perf_counter() - start}
+    row |= {"compiling, s": compilation.seconds, "programs": compilation.programs}
     row |= {"held, GB": held / 1e9, "peak, GB": resident("VmHWM") / 1e9}
     if stats := jax.devices()[0].memory_stats():
         row["device peak, GB"] = stats["peak_bytes_in_use"] / 1e9

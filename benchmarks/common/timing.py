@@ -13,6 +13,21 @@ P = ParamSpec("P")
 Result = TypeVar("Result")
 Call = Callable[[], object]
 PATIENCE = 60.0  # seconds, after which a call is not repeated
+_COMPILED = "/jax/core/compile/backend_compile_duration"  # of one program
+_COMPILING = ("/jax/core/compile/jaxpr_to_mlir_module_duration", _COMPILED)
+
+
+class Compilation:
+    """Seconds that JAX takes to compile, without tracing, and the number of compiled programs, since it was made."""
+
+    def __init__(self) -> None:
+        self.seconds, self.programs = 0.0, 0
+        jax.monitoring.register_event_duration_secs_listener(self._hear)
+
+    def _hear(self, event: str, duration_secs: float, **_: str | int) -> None:
+        if event in _COMPILING:
+            self.seconds += duration_secs
+        self.programs += event == _COMPILED
 
 
 def timed(call: Callable[P, Result], *args: P.args, **kwargs: P.kwargs) -> tuple[Result, float]:

@@ -2,7 +2,8 @@
 
 `jaxmark embed` and `jaxmark detect` run as processes, twice each with the same cache of compiled programs, which is
 empty before the first run. The table has a line for each run: seconds of each stage without the stages inside it, of
-the whole process, and its peak memory.
+the whole process, and of compiling programs or loading them from the cache, the number of programs, and the peak
+memory.
 
 start    until the command line is parsed: interpreter and imports
 read     files, each time that one is read
@@ -33,7 +34,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.tables import say, table
-from common.timing import for_commands
+from common.timing import Compilation, for_commands
 
 BORN = time.time()
 # The functions of each stage: module, name, and stage.
@@ -96,7 +97,7 @@ class Watch:
 
 def run_inside(result: Path) -> None:
     """Run the command line with its functions watched, and leave what was seen in a file."""
-    watch = Watch()
+    watch, compilation = Watch(), Compilation()
     from jaxmark.app.start import main
 
     for module, names, stage in FUNCTIONS:
@@ -110,7 +111,8 @@ def run_inside(result: Path) -> None:
             main()
     finally:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-        result.write_text(json.dumps({"seconds": watch.seconds, "peak": peak}))
+        compiled = {"compiling, s": compilation.seconds, "programs": compilation.programs}
+        result.write_text(json.dumps({"seconds": watch.seconds, "compiled": compiled, "peak": peak}))
 
 
 def run(words: list[str], cache: Path) -> dict[str, Any]:
@@ -124,7 +126,7 @@ def run(words: list[str], cache: Path) -> dict[str, Any]:
         raise SystemExit(f"jaxmark {' '.join(words)} ended with {done.returncode}: {done.stderr[-500:]}")
     found = json.loads(result.read_text())
     shown = {stage: round(found["seconds"][stage], 2) for stage in STAGES}
-    return {**shown, "seconds": time.time() - start, "peak, GB": found["peak"] / 1e9}
+    return {**shown, "seconds": time.time() - start, **found["compiled"], "peak, GB": found["peak"] / 1e9}
 
 
 def measure(mesh: Path, options: list[str]) -> Iterator[dict[str, Any]]:

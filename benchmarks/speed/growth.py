@@ -6,7 +6,8 @@ PyGSP, and with both gradients; writing marks of 64 bits with default options, a
 blind; and the lowest 64 eigenvectors by SciPy's eigsh, on which the eigenvector schemes are based. A stage that took
 longer than --patience is left out at the larger sizes.
 
-Times are of the second call, without compiling. Memory is the maximum during the first call beyond the memory held
+Times are of the second call, without compiling; those of the first, its seconds of compiling and the number of programs
+that it compiles are noted beside them. Memory is the maximum during the first call beyond the memory held
 before; calls that reuse freed memory show less than they need. Exponents are slopes of logarithms, by least squares
 over all sizes of a stage and over its last three. With the extra `plot`, growth.png, in the same folder, shows time and
 memory over the number of vertices. An existing output file is extended: its stages are not measured again.
@@ -44,6 +45,7 @@ NAMES = {
     "read, local": "read, local",
 }
 MEASURES = {"s": "seconds", "GB": "GB"}
+FIRST = ("first call, s", "compiling, s", "programs")  # what is also noted of the first call
 LAST = 3  # sizes that the second exponent is of
 WIDTH = 1560  # pixels
 
@@ -69,7 +71,8 @@ def measure(meshes: Iterator[jm.Mesh], stages: list[str], patience: float) -> It
             if row["later calls, s"] > patience:
                 left.remove(row["stage"])
             memory = max(row["peak, GB"] - row["held, GB"], 1e-3)
-            yield {"vertices": row["vertices"], "stage": row["stage"], "s": row["later calls, s"], "GB": memory}
+            found = {"vertices": row["vertices"], "stage": row["stage"], "s": row["later calls, s"], "GB": memory}
+            yield found | {name: row[name] for name in FIRST}
 
 
 def exponents(rows: list[Row], stage: str, measure: str) -> tuple[float, float] | None:

@@ -17,7 +17,6 @@ import click
 
 from jaxmark.app.options import JSON, QUIET
 from jaxmark.app.output import answer, say
-from jaxmark.app.process import keep_programs, release_programs
 from jaxmark.app.progress import current
 from jaxmark.bench import page
 from jaxmark.bench._equal_visibility import SHARES, equal_visibility
@@ -32,6 +31,7 @@ from jaxmark.bench.tracks import TRACKS
 from jaxmark.errors import JaxmarkError, require
 from jaxmark.evaluation.cells import processes
 from jaxmark.files.atomic import write_atomically
+from jaxmark.programs import keep_programs, release_programs
 
 _PATH = click.Path(path_type=Path)
 

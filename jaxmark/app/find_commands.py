@@ -14,11 +14,11 @@ from jaxmark.app.catalogue_commands import CATALOGUE, catalogue_group
 from jaxmark.app.folders import begin_worker
 from jaxmark.app.options import ALIGN, FILE, JSON, KEYS, QUIET, read_key
 from jaxmark.app.output import ESTIMATE, Status, answer, message_text, power, say
-from jaxmark.app.process import release_programs
 from jaxmark.app.progress import current
 from jaxmark.catalogue import Catalogue, Finder, Match, Plan, Verdict, find_each, mesh_files_below
 from jaxmark.errors import JaxmarkError, require
 from jaxmark.evaluation.cells import Pool, processes
+from jaxmark.programs import release_programs
 
 _MOST_REFUSED = 5  # most refusals that a description lists
 _DIGITS = 16  # digits of a record's digest that are printed

@@ -13,11 +13,11 @@ from jaxmark.app.diagnosis import diagnose, is_original
 from jaxmark.app.dossier import Case, missing_proof, save_dossier, save_report
 from jaxmark.app.mark_files import pick
 from jaxmark.app.output import FileOutcome, Status, detection_lines, detection_status, detection_values
-from jaxmark.app.process import release_programs
 from jaxmark.app.progress import Doing, quietly
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import Scene, limits, load_mesh, load_scene, load_skin
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.programs import release_programs
 from jaxmark.watermark.blind.reading import best_of, try_each
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.everyday import alternatives, detect_scene, read_blind, with_blind

@@ -25,12 +25,12 @@ from jaxmark.app.find_commands import keep
 from jaxmark.app.limited import Worker
 from jaxmark.app.options import read_key
 from jaxmark.app.output import answer, error_text
-from jaxmark.app.process import release_programs
 from jaxmark.app.read_files import FileReader
 from jaxmark.catalogue import Catalogue, Finder, Match
 from jaxmark.errors import JaxmarkError, require
 from jaxmark.files import SUFFIXES
 from jaxmark.files.atomic import write_atomically
+from jaxmark.programs import release_programs
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.evidence import ledger
 

@@ -1,4 +1,4 @@
-"""Compiled programs between commands, and of many meshes in one."""
+"""Compiled programs between processes, and of many meshes in one."""
 
 import os
 import stat
@@ -9,12 +9,12 @@ from pathlib import Path
 import jax
 import pytest
 
-from jaxmark.app import process
+from jaxmark import programs
 
 pytestmark = pytest.mark.core
 
 SAY = "print(jax.config.jax_compilation_cache_dir)"
-CODE = f"import jax; from jaxmark.app.process import keep_programs; keep_programs(); {SAY}"
+CODE = f"import jax; from jaxmark.programs import keep_programs; keep_programs(); {SAY}"
 
 
 @pytest.fixture(autouse=True)
@@ -49,13 +49,13 @@ def test_a_folder_that_others_may_write_is_not_used(tmp_path: Path):
 
 def test_the_oldest_programs_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(process, "_MAX_BYTES", 250)
+    monkeypatch.setattr(programs, "_MAX_BYTES", 250)
     monkeypatch.setattr(jax.config, "update", lambda name, value: None)
     (tmp_path / "jaxmark").mkdir(mode=0o700)
     for age in range(4):
         (tmp_path / "jaxmark" / str(age)).write_bytes(bytes(100))
         os.utime(tmp_path / "jaxmark" / str(age), (1e9 - age, 1e9 - age))
-    process.keep_programs()
+    programs.keep_programs()
     assert sorted(file.name for file in (tmp_path / "jaxmark").iterdir()) == ["0", "1"]
 
 
@@ -63,12 +63,12 @@ def test_the_oldest_programs_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 def test_a_process_lets_go_before_it_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most, cleared):
     (tmp_path / "most").write_text(str(most))
     (tmp_path / "maps").write_text(20 * "a map\n")
-    monkeypatch.setattr(process, "_MOST", tmp_path / "most")
-    monkeypatch.setattr(process, "_MAPS", tmp_path / "maps")
+    monkeypatch.setattr(programs, "_MOST", tmp_path / "most")
+    monkeypatch.setattr(programs, "_MAPS", tmp_path / "maps")
     called = []
     monkeypatch.setattr(jax, "clear_caches", lambda: called.append(True))
-    process.release_programs()
+    programs.release_programs()
     assert bool(called) == cleared
-    monkeypatch.setattr(process, "_MOST", tmp_path / "absent")
-    process.release_programs()
+    monkeypatch.setattr(programs, "_MOST", tmp_path / "absent")
+    programs.release_programs()
     assert bool(called) == cleared
