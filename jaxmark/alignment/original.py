@@ -1,8 +1,10 @@
 """Prepare an original for embedding and detection, on the host: float64 in, the computing dtype out."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,8 @@ from jaxmark.geometry.canonical import grid_spacing, rounded
 from jaxmark.geometry.mesh import Mesh, Weld, diagonal, displacement, host_mesh, used_vertices
 from jaxmark.spectral.laplacian import Laplacian, centre
 from jaxmark.spectral.padding import common_laplacian, pad_rows
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +64,16 @@ class Original:
         points = np.array(self.points.vertices)
         points[~self.used] = points[self.used].mean(axis=0)
         return Mesh(points[self.weld.point], self.mesh.faces)
+
+    @cached_property
+    def _derived(self) -> dict[Callable[["Original"], Any], Any]:
+        return {}
+
+    def derived(self, compute: Callable[["Original"], Result]) -> Result:
+        """Return what a function computes from this original alone, on the host; it is called once."""
+        if compute not in self._derived:
+            self._derived[compute] = compute(self)
+        return self._derived[compute]
 
     @cached_property
     def radius(self) -> float:

@@ -8,7 +8,7 @@ claim.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from itertools import cycle
 from typing import NamedTuple
 
@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int8
 
-from jaxmark import distortion
 from jaxmark.alignment.attempts import align
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original, displace
@@ -27,7 +26,7 @@ from jaxmark.evaluation.channels import Margin, measure
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.carriers.chips import KeyedCarrier, KeyedReader
 from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key
-from jaxmark.watermark.perception.budget import Bounds, Written, displace_within
+from jaxmark.watermark.perception.budget import Bounds, Written, displace_within, reference_of
 from jaxmark.watermark.schemes.keyed import KeyedScheme
 
 Attack = Callable[[Mesh, int], Mesh]  # an attack of some strength on a mesh, with a seed
@@ -115,7 +114,7 @@ class Trials:
         word = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], code), original.signal.dtype)
         drawn = [carrier.redraw(number) for number in numbers]
         shifts = [original.to_host(one.displacement(word)) for one in drawn]
-        written = [displace_within(original, shift, self.bounds, self._reference) for shift in shifts]
+        written = [displace_within(original, shift, self.bounds) for shift in shifts]
         scaled = [one.scale * shift for one, shift in zip(written, shifts, strict=True)]
         marks = [displace(original, sign * shift) for shift in scaled for sign in (1, -1)]
         signs = tuple(sign * jnp.asarray(one.chips.signs) for one in drawn for sign in (1, -1))
@@ -192,13 +191,9 @@ class Trials:
 
     def _used(self, written: Written) -> Float64[np.ndarray, " limits"]:
         """Compute the fraction of each limit that a mark uses; the last is that of the RMS budget."""
-        found = self._reference.measure(written.mesh, self.bounds.limits.keys())
+        found = reference_of(self.original).measure(written.mesh, self.bounds.limits.keys())
         shares = [(found[metric] or 0.0) / limit for metric, limit in self.bounds.limits.items()]
         return np.array(shares + ([written.moved.rms / self.bounds.rms] if self.bounds.rms is not None else []))
-
-    @cached_property
-    def _reference(self) -> distortion.Reference:
-        return distortion.Reference(self.original.mesh)
 
 
 class _Copy(NamedTuple):

@@ -19,7 +19,7 @@ from jaxmark.adversaries.by_name import attack, get_attack
 from jaxmark.alignment.attempts import align
 from jaxmark.alignment.original import Original, make_original
 from jaxmark.attacks import Kind
-from jaxmark.distortion import Reference, name_of
+from jaxmark.distortion import name_of
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.allocation import balance, upper_bound
 from jaxmark.evaluation.channels import Channels, Margin, margins, measure
@@ -33,7 +33,7 @@ from jaxmark.watermark.blind.scheme import BlindScheme, Look
 from jaxmark.watermark.blind.writing import Plan, carried, sureness
 from jaxmark.watermark.interfaces import Displacement, Scheme
 from jaxmark.watermark.markers import make_blind_marker
-from jaxmark.watermark.perception.budget import Bounds, Budget, BudgetLike, displace_within
+from jaxmark.watermark.perception.budget import Bounds, Budget, BudgetLike, displace_within, reference_of
 from jaxmark.watermark.perception.capacity import Capacity
 from jaxmark.watermark.perception.masking import apply_mask
 from jaxmark.watermark.perception.visibility import band_visibility
@@ -240,7 +240,7 @@ def tune_blind(
         )
     writer = make_blind_marker(mesh, _PUBLIC_KEY, bits=bits, scheme=blind).writer
     word = codeword(bytes(bits // 8), writer.choices)
-    allowances = writer.allowances(word, Budget.of(budget).bounds(mesh), Reference(mesh))
+    allowances = writer.allowances(word, Budget.of(budget).bounds(mesh), reference_of(writer.original))
     plans = [one.plan(step) for one in allowances for step in writer.steps(one)]
     if not plans:
         raise JaxmarkError(f"This mesh, or the budget for it, leaves the scheme {blind.name!r} nothing to write in.")

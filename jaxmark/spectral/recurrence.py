@@ -59,11 +59,11 @@ def _scan_terms(
     return carry, outputs
 
 
-def _factors(terms: int, x: Array) -> np.ndarray:
+def _factors(terms: int, x: Array) -> Array:
     """Return the factors of the recurrence from T_1 on; T_1 = Δ̃T_0 is a step with factor 1 and T_{-1} = 0."""
     factors = np.full(terms - 1, 2, x.dtype)
     factors[:1] = 1
-    return factors
+    return jnp.asarray(factors)
 
 
 @dataclass(frozen=True)

@@ -148,7 +148,7 @@ class Mark:
             raise JaxmarkError(
                 f"This mesh ({len(unit)} points) cannot be marked with the scheme {self.scheme.name!r}: no point moves."
             )
-        written = displace_within(original, unit, bounds, self.capacity.reference if bounds.limits else None)
+        written = displace_within(original, unit, bounds)
         canonical = Canonical(original.points, original.weld, original.geometry, original.order)
         record = Record(
             scheme=self.scheme.name,

@@ -30,7 +30,7 @@ from jaxmark.watermark.evidence.ledger import rounded_up
 from jaxmark.watermark.interfaces import Detector, Scheme
 from jaxmark.watermark.mark import EmbedInfo, Mark, recall
 from jaxmark.watermark.nonblind import Alternatives, read
-from jaxmark.watermark.perception.budget import Bounds, Budget, BudgetLike
+from jaxmark.watermark.perception.budget import Bounds, Budget, BudgetLike, reference_of
 from jaxmark.watermark.perception.capacity import COVERAGE, NOISE, Conditions, Survival
 from jaxmark.watermark.record import Record, commit
 from jaxmark.watermark.schemes.passband import choose_pass_band
@@ -366,7 +366,7 @@ class CombinedMarker:
         budget = Budget.of(budget)
         mesh = self.original.mesh
         bounds = budget.bounds(mesh)
-        reference = distortion.Reference(mesh)
+        reference = reference_of(self.original)
         _, alone = self.nonblind.embed(message, Budget(rms=bounds.rms, limits=bounds.limits), read_back=False)
         sizes, survived = [alone.rms], [alone.survives.whole]
         for marker in self._blind:

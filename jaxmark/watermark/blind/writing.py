@@ -28,9 +28,9 @@ from jaxmark.watermark.blind.reading import TAG_BITS, codeword
 from jaxmark.watermark.blind.scheme import AnchoredHost, BlindScheme, Measured, measure
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import DEFAULT_BITS
-from jaxmark.watermark.perception.budget import Bounds, displace_within
+from jaxmark.watermark.perception.budget import Bounds, displace_within, reference_of
 from jaxmark.watermark.perception.capacity import NOISE, Survival
-from jaxmark.watermark.perception.masking import apply_mask, masking_directions
+from jaxmark.watermark.perception.masking import apply_mask, masking_tensors
 
 _RIDGE = 3e-3  # relative to the mean square of a row; values that contradict each other are met halfway
 _HELD_RIDGE = 1e-4  # the same for the held quantities, whose rows are scaled to the size of the others
@@ -156,7 +156,7 @@ class Writer:
     def _mask(self) -> Float[Array, "rows 3 3"]:
         original = self.original
         if self.scheme.hiding:
-            return original.to_traced(masking_directions(original))
+            return masking_tensors(original)
         return original.to_traced(np.tile(np.eye(3), (len(original.used), 1, 1)))
 
     def off(self, host: AnchoredHost, dither: Dither, word: Float64[np.ndarray, " code"], step: float) -> np.ndarray:
@@ -224,7 +224,7 @@ class Writer:
         Raises:
             JaxmarkError: see `plan`.
         """
-        reference = reference or distortion.Reference(self.original.mesh)
+        reference = reference or reference_of(self.original)
         plan = self.plan(word, bounds, reference, bits)
         targets = plan.host.values - plan.alpha * plan.step * self.off(plan.host, plan.dither, word, plan.step)
         shift = self.shift(plan.host, targets, _ROUNDS)
@@ -286,7 +286,7 @@ class Writer:
         """
         word = codeword(bytes(DEFAULT_BITS // 8), self.choices)
         try:
-            plan = self.plan(word, bounds, distortion.Reference(self.original.mesh), 0)
+            plan = self.plan(word, bounds, reference_of(self.original), 0)
         except JaxmarkError:
             return 0
         spread, bits = self._spread(plan.host) * noise / NOISE, 0

@@ -182,6 +182,15 @@ def _mean_edge(mesh: Mesh) -> float:
     return float(np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1).mean()) / diagonal(mesh)
 
 
+def reference_of(original: Original) -> distortion.Reference:
+    """Return the original's mesh, prepared for metrics; it is prepared once for each original."""
+    return original.derived(_reference)
+
+
+def _reference(original: Original) -> distortion.Reference:
+    return distortion.Reference(original.mesh)
+
+
 def displace_within(
     original: Original,
     shift: Float64[np.ndarray, "points 3"],
@@ -208,7 +217,7 @@ def displace_within(
     # Budgets are relative to the diagonal of the file's mesh; the original's points may be rounded.
     size = float(distortion.rms(shift[original.used])) * original.diagonal / diagonal(original.mesh)
 
-    compared = reference or distortion.Reference(original.mesh)
+    compared = reference or reference_of(original)
 
     def limit_ratio(metrics: Collection[Metric], rms: float) -> float:
         """Compute the largest ratio of a metric to its limit."""

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Hashable, Mapping
-from functools import cached_property
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -10,13 +9,12 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.special import log_ndtr, ndtri  # scipy.stats takes long to import
 
-from jaxmark import distortion
 from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.coding.keys import KEY_BYTES, Choices, Key
 from jaxmark.watermark.coding.message import TAG_BITS
 from jaxmark.watermark.interfaces import Carrier, FreeDimensions, Reader, Scheme
-from jaxmark.watermark.perception.budget import Bounds, displace_within
+from jaxmark.watermark.perception.budget import Bounds, displace_within, reference_of
 
 _MAX_PAYLOAD_BYTES = 2**20  # the limit if nothing else limits the payload
 
@@ -121,7 +119,6 @@ class Capacity:
         original: Original,
         scheme: Scheme,
         known: Mapping[int, Callable[[], Reader]] | None = None,
-        reference: distortion.Reference | None = None,
     ) -> None:
         """Prepare to measure the capacity of an original with a scheme.
 
@@ -129,11 +126,9 @@ class Capacity:
             original: the mesh to mark.
             scheme: the scheme to mark it with.
             known: functions that return available readers, by the size of their payload; other readers are made.
-            reference: the original's mesh, prepared for metrics, if it is available.
         """
         self.original, self.scheme = original, scheme
         self._known = {scheme.layout(original, bits): make for bits, make in (known or {}).items()}
-        self._reference = reference
         self._free: dict[Hashable, FreeDimensions | None] = {}
         self._reached: dict[Hashable, float] = {}
 
@@ -250,12 +245,7 @@ class Capacity:
         """Measure the RMS displacement of a mark with one of several codewords."""
         signs = np.random.default_rng(word).choice([-1.0, 1.0], carrier.code_bits)
         probe = self.original.to_host(carrier.displacement(jnp.asarray(signs, self.original.signal.dtype)))
-        return displace_within(self.original, probe, bounds, self.reference, **options).moved.rms
-
-    @cached_property
-    def reference(self) -> distortion.Reference:
-        """The original's mesh, prepared for measuring metrics."""
-        return self._reference or distortion.Reference(self.original.mesh)
+        return displace_within(self.original, probe, bounds, reference_of(self.original), **options).moved.rms
 
     def _carrier(self, bits: int) -> Carrier:
         code = self.scheme.code_length(self.original, bits)

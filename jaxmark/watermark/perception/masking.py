@@ -40,6 +40,11 @@ _PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # index of each entry of 
 _SPACING_SCALE = 5  # spacings are averaged over 2^5 steps of diffusion
 
 
+def masking_tensors(original: Original) -> Float[Array, "rows 3 3"]:
+    """Return the tensors of `masking_directions` for traced code; they are computed once for each original."""
+    return original.to_traced(original.derived(masking_directions))
+
+
 def masking_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     """Compute the masking tensor of each point, which rotates and scales displacements so that they are hardly visible.
 

@@ -10,6 +10,7 @@ from jaxmark.alignment.original import Original, displace
 from jaxmark.distortion import Metric
 from jaxmark.seeds import probe_signs
 from jaxmark.spectral.chebyshev import filter
+from jaxmark.watermark.perception.budget import reference_of
 from jaxmark.watermark.perception.masking import apply_mask
 
 _SAMPLED_BANDS = 16  # visibility varies smoothly from one band to the next
@@ -62,7 +63,7 @@ def band_visibility(
 
 def _per_rms(original: Original, shift: Float64[np.ndarray, "points 3"], metrics: Sequence[Metric]) -> list[float]:
     """Measure metrics per unit of RMS displacement, at so small a displacement that they are proportional to it."""
-    reference = distortion.Reference(original.mesh)
+    reference = reference_of(original)
 
     def measure_at(names: Sequence[Metric], size: float) -> dict[Metric, float]:
         measured = reference.measure(displace(original, size * shift), names)

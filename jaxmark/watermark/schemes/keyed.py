@@ -16,7 +16,7 @@ from jaxmark.watermark.carriers.chips import KeyedCarrier, make_chips
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import TAG_BITS, code_length
 from jaxmark.watermark.interfaces import Detector, Scheme
-from jaxmark.watermark.perception.masking import masking_directions
+from jaxmark.watermark.perception.masking import masking_tensors
 from jaxmark.watermark.reading.detectors import joint
 from jaxmark.watermark.reading.reception import Host, Receiver, make_host, make_receiver
 
@@ -163,7 +163,7 @@ class KeyedScheme(Scheme):
         """Compute a symmetric matrix `[3, 3]` on each vertex's displacement; None if it is 1 everywhere."""
         if not self.hiding or self.direction != "coordinates":
             return None
-        return original.to_traced(masking_directions(original))
+        return masking_tensors(original)
 
     def receiver(self, original: Original, bits: int) -> Receiver:
         """Make the receiver of marks with a payload size, with all bands of `family`."""

@@ -53,7 +53,7 @@ def choose_pass_band(usual: Capacity, bits: int, bounds: Bounds, noise: float = 
         # Even without noise, the evidence is at most half of the number of dimensions, in nats.
         if most >= min(_PLENTY, other.dimensions(original, bits) / 2):
             break
-        capacity = Capacity(original, other, reference=usual.reference)
+        capacity = Capacity(original, other)
         if not math.isfinite(capacity.least_budget(bits, Conditions(bounds, noise, COVERAGE))):
             break  # the payload does not fit
         evidence = capacity.evidence(bits, capacity.estimate_reach(bits, bounds), noise)
