@@ -86,3 +86,26 @@ def test_the_second_call_compiles_nothing(name: str, caplog: pytest.LogCaptureFi
     first, second = compiled
     assert first
     assert second == []
+
+
+def test_few_programs_are_compiled(key: jm.Key, caplog: pytest.LogCaptureFixture):
+    """The numbers of programs of first calls; unlike seconds, they are the same in each run."""
+    mesh = rough_sphere(500)
+
+    def compiled(call: Callable[[], Any]) -> tuple[Any, list[str]]:
+        caplog.clear()
+        with jax.log_compiles(True):
+            found = call()
+        messages = [record.message.split() for record in caplog.records]
+        return found, [words[4] for words in messages if words[:3] == ["Finished", "XLA", "compilation"]]
+
+    jax.clear_caches()
+    (marked, info), embedding = compiled(lambda: jm.embed(mesh, b"8 bytes!", key))
+    assert 0 < len(embedding) <= 56, embedding
+    found, detecting = compiled(lambda: jm.detect(marked, original=mesh, key=key, record=info.record))
+    assert found.detected()
+    assert 0 < len(detecting) <= 8, detecting
+    suspect = jm.attack(marked, "simplification", 0.3, seed=0)
+    found, remeshed = compiled(lambda: jm.detect(suspect, original=mesh, key=key, record=info.record))
+    assert found.detected()
+    assert 0 < len(remeshed) <= 6, remeshed

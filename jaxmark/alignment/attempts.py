@@ -22,7 +22,12 @@ from jaxmark.geometry.mesh import Mesh
 
 
 def align(
-    original: Original, suspect: Mesh, align: Align = "auto", *, reflections: Sequence[bool] = EITHER
+    original: Original,
+    suspect: Mesh,
+    align: Align = "auto",
+    *,
+    reflections: Sequence[bool] = EITHER,
+    in_parts: bool = True,
 ) -> Alignment:
     """Register a suspect to the original, and find the displacement of each point that remains.
 
@@ -36,6 +41,7 @@ def align(
             faces may be reversed.
         reflections: whether the pose of a surface may be a rotation (False), a reflection (True), or either. A shape
             that is nearly its own mirror image fits both.
+        in_parts: whether a surface may also be a part of the original, or several parts that were moved.
 
     Raises:
         JaxmarkError: if the suspect does not have the original's connectivity under `"same"`; if it cannot be aligned,
@@ -46,11 +52,13 @@ def align(
         raise JaxmarkError(f"A suspect is aligned by {', '.join(get_args(Align))}, not {align!r}.")
     start = time.perf_counter()
     ready = make_suspect(original, suspect)
-    result = _attempt(original, ready, align, reflections)
+    result = _attempt(original, ready, align, reflections, in_parts)
     return result._replace(pose=ready.pose.then(result.pose), seconds=time.perf_counter() - start, align=align)
 
 
-def _attempt(original: Original, suspect: PreparedSuspect, align: Align, reflections: Sequence[bool]) -> Alignment:
+def _attempt(
+    original: Original, suspect: PreparedSuspect, align: Align, reflections: Sequence[bool], in_parts: bool
+) -> Alignment:
     """Try the ways of registration one after another, until one works."""
     if align == "same":
         return align_in_order(original, suspect.mesh)
@@ -62,4 +70,4 @@ def _attempt(original: Original, suspect: PreparedSuspect, align: Align, reflect
             return align_in_order(original, suspect.mesh)
         if (by_connectivity := align_by_connectivity(original, suspect)) is not None:
             return by_connectivity
-    return align_surfaces(original, suspect, reflections, by_affine=align == "affine")
+    return align_surfaces(original, suspect, reflections, by_affine=align == "affine", in_parts=in_parts)

@@ -36,9 +36,9 @@ _FEW_VERTICES = 0.5
 
 
 def align_surfaces(
-    original: Original, suspect: PreparedSuspect, reflections: Sequence[bool], *, by_affine: bool
+    original: Original, suspect: PreparedSuspect, reflections: Sequence[bool], *, by_affine: bool, in_parts: bool
 ) -> Alignment:
-    """Align a suspect's surface: as the whole original, else as a part of it, else one component at a time.
+    """Align a suspect's surface: as the whole original; with `in_parts` else as a part, else one component at a time.
 
     Raises:
         JaxmarkError: if no pose brings the suspect's surface near the original's.
@@ -47,11 +47,13 @@ def align_surfaces(
     whole = Surface(suspect.welded)
     parts = [Surface(part) for part in components(suspect.welded)[:_MAX_COMPONENTS] if area(part) > 0]
     parts = parts if len(parts) > 1 else []
+    further = [(whole, register_part), *((part, register_whole) for part in parts)] if in_parts else []
     failed: list[Alignment] = []
-    for part, register in ((whole, register_whole), (whole, register_part), *((p, register_whole) for p in parts)):
+    for part, register in ((whole, register_whole), *further):
         if (pose := register(surface, part, reflections)) is None:
             continue
         result = _align_in_pose(original, surface, part, pose, by_affine=by_affine)
+        result = result._replace(as_whole=part is whole and register is register_whole)
         if (coverage := result.coverage(original)) >= MIN_COVERAGE and result.residual <= FAR_DISTANCE:
             return _with_pieces(original, surface, parts, result, pose) if coverage < _FULL_COVERAGE else result
         failed.append(result)

@@ -93,7 +93,8 @@ class Original:
 
     def to_traced(self, values: Shaped[np.ndarray, " points *columns"]) -> Float[Array, " rows *columns"]:
         """Convert values per point to a padded array in the dtype of traced code."""
-        return jnp.asarray(pad_rows(values, len(self.signal)), self.signal.dtype)
+        # `jnp.asarray` would compile a program for each shape.
+        return jax.device_put(pad_rows(values, len(self.signal)).astype(self.signal.dtype))
 
     def to_host(self, values: Float[Array, " rows *columns"]) -> Float64[np.ndarray, " points *columns"]:
         """Convert an array of traced code back to values per point."""
@@ -122,7 +123,7 @@ def make_original(mesh: Mesh, grid: float | None = None) -> Original:
     positions = np.asarray(points.vertices, np.float64)
     positions = (positions - positions[used].mean(axis=0)) / length
     positions[~used] = 0
-    signal = jnp.asarray(centre(operator, pad_rows(positions, len(operator.degree))), dtype)
+    signal = jax.device_put(centre(operator, pad_rows(positions, len(operator.degree))).astype(dtype))
     return Original(
         mesh=mesh,
         grid=spacing,
@@ -135,7 +136,9 @@ def make_original(mesh: Mesh, grid: float | None = None) -> Original:
         places=np.where(used, np.cumsum(used) - 1, -1),
         count=int(used.sum()),
         in_order=True,
-        operator=jax.tree.map(lambda x: jnp.asarray(x, dtype if x.dtype == np.float64 else None), operator),
+        operator=jax.tree.map(
+            lambda x: jax.device_put(x.astype(dtype if x.dtype == np.float64 else x.dtype)), operator
+        ),
         positions=positions,
         signal=signal,
     )

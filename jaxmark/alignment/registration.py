@@ -42,6 +42,7 @@ class RegistrationSettings:
     first_ratio: float = 12.0  # first poses are dropped if their distance exceeds this multiple of the least one
     likely_ratio: float = 2.0  # refined poses are dropped if their distance exceeds this multiple of the least one
     mirror_ratio: float = 1.05  # factor on the distance of a reflection when poses are compared
+    poor_share: float = 0.8  # a part's pose is poor if its distance exceeds this fraction of `outlier_distance`
     whole_distance: float = 0.01  # largest distance of a whole suspect's pose, several times that of two samplings
     # The following numbers apply to rotations and to reflections separately.
     distinct_poses: int = 32  # most candidate poses, which differ by more than `whole_distance`
@@ -139,9 +140,11 @@ def register_part(
         ends.append((_distance(original, posed[fine], back, settings), start, back))
     if not ends:
         return None
-    _, start, back = min(ends, key=lambda end: _unlikeliness(end[0], end[1], settings))
-    along = unit(normals @ start.matrix.T)
-    return start.then(refine(original, start(points), along, back, settings=settings).inverse())
+    distance, start, back = min(ends, key=lambda end: _unlikeliness(end[0], end[1], settings))
+    # A poor pose gets no better by more points, which take most of the time.
+    used = fine if distance > settings.poor_share * settings.outlier_distance else slice(None)
+    along = unit(normals[used] @ start.matrix.T)
+    return start.then(refine(original, start(points[used]), along, back, settings=settings).inverse())
 
 
 def _unlikeliness(distance: float, pose: Pose, settings: RegistrationSettings) -> float:

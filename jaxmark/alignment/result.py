@@ -29,6 +29,7 @@ class Alignment(NamedTuple):
     align: Align = "auto"  # the way of registration that was requested
     heights: VertexHeights | None = None  # heights of the suspect's vertices above the original, if there are few
     deformed: DeformedPoints | None = None  # recognised points, if no single affine map aligns them
+    as_whole: bool = False  # whether a surface was registered as the whole original
 
     def facts(self) -> dict[str, Any]:
         """Return the facts of the registration for reports, as values for JSON."""

@@ -86,9 +86,10 @@ def _registrations(original: Original, suspect: Mesh, align: Align) -> Iterator[
         yield (), aligned
         return
     yield (ledger.REFLECTION.charge("better fit"),), aligned
-    # A shape that is nearly its own mirror image fits nearly as well with the wrong reflection.
+    # A shape that is nearly its own mirror image fits nearly as well with the wrong reflection, as a whole or in parts.
+    reflections = (not aligned.pose.mirrors,)
     with suppress(JaxmarkError):
-        other = attempts.align(original, suspect, align, reflections=(not aligned.pose.mirrors,))
+        other = attempts.align(original, suspect, align, reflections=reflections, in_parts=not aligned.as_whole)
         yield (ledger.REFLECTION.charge("worse fit"),), other
 
 

@@ -245,8 +245,9 @@ def weigh_evenly(received: Reception) -> Reception:
     The usual weights grow as the power of a band falls. An attacker who has the key can therefore empty a band and
     reverse the mark in it, so that this band outweighs all others. Equal weights exclude this attack.
     """
-    flat = jnp.ones_like(received.power)
-    return received._replace(gain=flat, power=flat, axes=jnp.eye(3, dtype=received.axes.dtype))
+    # Made by NumPy, so that no programs are compiled for it.
+    flat = jnp.asarray(np.ones(received.power.shape, received.power.dtype))
+    return received._replace(gain=flat, power=flat, axes=jnp.asarray(np.eye(3, dtype=received.axes.dtype)))
 
 
 def whitening(receiver: Receiver, power: Float[Array, " bands"]) -> Float[Array, " terms"]:
