@@ -20,9 +20,9 @@ from .evaluation import robustness as robustness
 from .evaluation import tune as tune
 from .files import load_mesh as load_mesh
 from .files import save_mesh as save_mesh
+from .files.programs import keep_programs as keep_programs
 from .geometry import Mesh as Mesh
 from .geometry import make_mesh as make_mesh
-from .programs import keep_programs as keep_programs
 from .watermark import Budget as Budget
 from .watermark import Key as Key
 from .watermark import Record as Record

@@ -21,10 +21,10 @@ from scipy.spatial.transform import Rotation
 import jaxmark as jm
 from jaxmark.alignment.attempts import align
 from jaxmark.files import load_skin
+from jaxmark.files.programs import release_programs
 from jaxmark.geometry import Skinning, unpose
 from jaxmark.geometry.mesh import Mesh, diagonal
 from jaxmark.geometry.pose import Pose, similarity
-from jaxmark.programs import release_programs
 from jaxmark.watermark.schemes.keyed import KeyedScheme
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))

@@ -21,8 +21,8 @@ import numpy as np
 import jaxmark as jm
 from jaxmark.alignment.original import make_original
 from jaxmark.evaluation.tuning import Tuned, tune
+from jaxmark.files.programs import release_programs
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.programs import release_programs
 from jaxmark.watermark.interfaces import Scheme
 from jaxmark.watermark.schemes.keyed import KeyedScheme
 

@@ -31,7 +31,7 @@ from jaxmark.bench.tracks import TRACKS
 from jaxmark.errors import JaxmarkError, require
 from jaxmark.evaluation.cells import processes
 from jaxmark.files.atomic import write_atomically
-from jaxmark.programs import keep_programs, release_programs
+from jaxmark.files.programs import keep_programs, release_programs
 
 _PATH = click.Path(path_type=Path)
 

@@ -18,7 +18,7 @@ from jaxmark.app.progress import current
 from jaxmark.catalogue import Catalogue, Finder, Match, Plan, Verdict, find_each, mesh_files_below
 from jaxmark.errors import JaxmarkError, require
 from jaxmark.evaluation.cells import Pool, processes
-from jaxmark.programs import release_programs
+from jaxmark.files.programs import release_programs
 
 _MOST_REFUSED = 5  # most refusals that a description lists
 _DIGITS = 16  # digits of a record's digest that are printed

@@ -17,7 +17,7 @@ from jaxmark.app.process import end_by_exception
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation.cells import processes
 from jaxmark.files import SUFFIXES
-from jaxmark.programs import keep_programs, release_programs
+from jaxmark.files.programs import keep_programs, release_programs
 
 _MOST_TOGETHER = 16  # most files in a batch, which a worker takes at once
 _TURNS = 4  # least batches per worker, if there are enough files, so that all workers end at about the same time

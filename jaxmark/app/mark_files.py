@@ -14,8 +14,8 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import Scene, load_mesh, load_scene, load_texture, number_check, save_mesh, save_scene
 from jaxmark.files.atomic import write_atomically
 from jaxmark.files.pair import refuse_existing, writing_pair
+from jaxmark.files.programs import release_programs
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.programs import release_programs
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.everyday import embed_scene
 from jaxmark.watermark.mark import EmbedInfo

@@ -16,8 +16,8 @@ from jaxmark.app.output import FileOutcome, Status, detection_lines, detection_s
 from jaxmark.app.progress import Doing, quietly
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import Scene, limits, load_mesh, load_scene, load_skin
+from jaxmark.files.programs import release_programs
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.programs import release_programs
 from jaxmark.watermark.blind.reading import best_of, try_each
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.everyday import alternatives, detect_scene, read_blind, with_blind

@@ -30,7 +30,7 @@ from jaxmark.catalogue import Catalogue, Finder, Match
 from jaxmark.errors import JaxmarkError, require
 from jaxmark.files import SUFFIXES
 from jaxmark.files.atomic import write_atomically
-from jaxmark.programs import release_programs
+from jaxmark.files.programs import release_programs
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.evidence import ledger
 

@@ -10,7 +10,7 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         from jaxmark.app.cli import main as run
-        from jaxmark.programs import keep_programs
+        from jaxmark.files.programs import keep_programs
 
         keep_programs()
     except KeyboardInterrupt:

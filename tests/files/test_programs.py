@@ -9,12 +9,12 @@ from pathlib import Path
 import jax
 import pytest
 
-from jaxmark import programs
+from jaxmark.files import programs
 
 pytestmark = pytest.mark.core
 
 SAY = "print(jax.config.jax_compilation_cache_dir)"
-CODE = f"import jax; from jaxmark.programs import keep_programs; keep_programs(); {SAY}"
+CODE = f"import jax; from jaxmark.files.programs import keep_programs; keep_programs(); {SAY}"
 
 
 @pytest.fixture(autouse=True)
