@@ -27,6 +27,7 @@ from jaxmark.geometry.mesh import (
     diagonal,
     displacement,
     edges,
+    has_area,
     host_mesh,
     same_connectivity,
     used_vertices,
@@ -101,7 +102,7 @@ class Reference:
     def at_unit_size(self, mesh: Mesh, name: str) -> Mesh:
         """Move and scale a mesh as the original is moved and scaled to a diagonal of 1."""
         scaled = mesh._replace(vertices=(np.asarray(mesh.vertices) - self.centre) / self.length)
-        if len(scaled.faces) and not 0 < area(scaled) < np.inf:
+        if len(scaled.faces) and not has_area(scaled):
             raise JaxmarkError(f"The {name} has an area of {area(scaled):g}; its shape cannot be compared.")
         return scaled
 

@@ -105,7 +105,7 @@ def make_masking(
     # A closed surface of triangles has three edges for two faces.
     links = pad_edges(graph_laplacian(pairs, count, weights), 1.5)
 
-    used = vertices[np.isin(np.arange(len(vertices)), faces[area > 0])]
+    used = vertices[np.bincount(faces[area > 0].ravel(), minlength=len(vertices)) > 0]
     diagonal = float(np.linalg.norm(np.ptp(used, axis=0))) if len(used) else 1.0
     lengths = np.sqrt(4 / math.sqrt(3) * size * mean) / diagonal  # of equilateral triangles' sides
     padded = jnp.asarray(pad_rows(normals, count)), jnp.asarray(pad_rows(lengths, count))

@@ -126,7 +126,7 @@ def tune(
         raise JaxmarkError(f"The blind scheme {scheme!r} has no bands to tune; use tune_blind.")
     tunable = get_nonblind(scheme).tunable()
     original, family = make_original(mesh), tunable.family()
-    bounds = Budget.of(budget).bounds(original.mesh)
+    bounds = Budget.of(budget).bounds_of(original)
     signs = probe_signs("tuning", original.signal.shape, dtype=original.signal.dtype)[0]
     signs = signs * original.to_traced(original.used)[:, None]
     mask = tunable.mask(original)

@@ -19,6 +19,8 @@ from jaxmark.errors import JaxmarkError, require
 # Diagonal to which meshes are scaled for fast-simplification. Its thresholds are absolute: in smaller meshes it
 # collapses many edges in arbitrary order, in much larger ones too few.
 _INPUT_DIAGONAL = 100
+_ALWAYS_FINITE = 1e75  # coordinates up to this have finite areas
+_FACES_AT_ONCE = 2**14
 
 
 Faces = Int[Array | np.ndarray, "faces 3"]
@@ -221,6 +223,14 @@ def face_areas(mesh: Mesh) -> Float64[np.ndarray, " faces"]:
 def area(mesh: Mesh) -> float:
     """Compute the total surface area, in squared units of the mesh."""
     return float(face_areas(mesh).sum())
+
+
+def has_area(mesh: Mesh) -> bool:
+    """Whether the total area is positive and finite; faces are measured block by block until one has an area."""
+    if np.abs(np.asarray(mesh.vertices)).max(initial=0) > _ALWAYS_FINITE:
+        return 0 < area(mesh) < np.inf
+    starts = range(0, len(mesh.faces), _FACES_AT_ONCE)
+    return any(area(mesh._replace(faces=mesh.faces[start : start + _FACES_AT_ONCE])) > 0 for start in starts)
 
 
 def component_of(mesh: Mesh) -> Int64[np.ndarray, " vertices"]:

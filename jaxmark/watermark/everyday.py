@@ -119,7 +119,7 @@ def capacity(
         marker = make_blind_marker(mesh, bytes(KEY_BYTES), scheme=blind)
         return marker.writer.capacity(budget.bounds(mesh), noise)
     original = make_original(mesh)
-    return Capacity(original, get_nonblind(scheme)).bits(Conditions(budget.bounds(original.mesh), noise, coverage))
+    return Capacity(original, get_nonblind(scheme)).bits(Conditions(budget.bounds_of(original), noise, coverage))
 
 
 def detect(

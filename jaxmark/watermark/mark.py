@@ -136,7 +136,7 @@ class Mark:
         Raises:
             JaxmarkError: if the carrier does not displace this mesh at all; see also `displace_within`.
         """
-        original, bounds = self.original, Budget.of(budget).bounds(self.original.mesh)
+        original, bounds = self.original, Budget.of(budget).bounds_of(self.original)
         if original.weld.point.max() >= len(original.used):
             raise JaxmarkError(
                 "The original has vertices that no face uses, and another order than when it was marked with this"

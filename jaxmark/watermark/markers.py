@@ -117,7 +117,7 @@ class NonBlindMarker(Mark):
         """See `Marker`."""
         check_size(message, self.bits)
         budget = Budget.of(budget)
-        bounds = budget.bounds(self.original.mesh)
+        bounds = budget.bounds_of(self.original)
         marked, info = self.write(self.codeword(message), budget, content=message)
         # A budget without limits is reached up to rounding, so its own number is used.
         reached = info.rms if bounds.limits else bounds.rms or 0.0
@@ -136,7 +136,7 @@ class NonBlindMarker(Mark):
         `jaxmark.watermark.schemes.passband`.
         """
         budget = Budget.of(budget)
-        bounds = budget.bounds(self.original.mesh)
+        bounds = budget.bounds_of(self.original)
         return self.with_scheme(choose_pass_band(self.capacity, self.bits, bounds, budget.noise or NOISE))
 
     def with_record(self, record: Record) -> "NonBlindMarker":
@@ -281,7 +281,7 @@ class BlindMarker:
         self, message: bytes, budget: BudgetLike = None, reference: distortion.Reference | None = None
     ) -> tuple[Mesh, EmbedInfo]:
         """Write a message as far as a budget allows; limits are measured against `reference`, if given."""
-        choices, bounds = self.writer.choices, Budget.of(budget).bounds(self.original.mesh)
+        choices, bounds = self.writer.choices, Budget.of(budget).bounds_of(self.original)
         written = self.writer.write(blind_reading.codeword(message, choices), bounds, self.bits, reference)
         record = Record(
             scheme=self.scheme.name,
@@ -365,7 +365,7 @@ class CombinedMarker:
         """See `Marker`; the record is that of the non-blind mark."""
         budget = Budget.of(budget)
         mesh = self.original.mesh
-        bounds = budget.bounds(mesh)
+        bounds = budget.bounds_of(self.original)
         reference = reference_of(self.original)
         _, alone = self.nonblind.embed(message, Budget(rms=bounds.rms, limits=bounds.limits), read_back=False)
         sizes, survived = [alone.rms], [alone.survives.whole]

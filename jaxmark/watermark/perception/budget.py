@@ -129,9 +129,16 @@ class Budget:
 
     def bounds(self, mesh: Mesh) -> Bounds:
         """Return the bounds for a mesh; each limit is the smaller one of the given one and that of the visibility."""
+        return self._bounds(partial(visibility_of, mesh))
+
+    def bounds_of(self, original: Original) -> Bounds:
+        """Return the bounds for an original, whose limits by visibility are determined once."""
+        return self._bounds(lambda: original.derived(_visibility))
+
+    def _bounds(self, visibility: Callable[[], Mapping[Visibility, Mapping[str, float]]]) -> Bounds:
         is_hidden = self.rms is None and self.limits is None and self.visibility is None
         name = "hidden" if is_hidden else self.visibility
-        limits: dict[Metric, float] = {} if name is None else {**visibility_of(mesh)[name]}
+        limits: dict[Metric, float] = {} if name is None else {**visibility()[name]}
         for metric, limit in (self.limits or {}).items():
             limits[metric] = min(limit, limits.get(metric, math.inf))
         return Bounds(self.rms, limits)
@@ -171,9 +178,17 @@ def visibility_of(mesh: Mesh) -> Mapping[Visibility, Mapping[str, float]]:
     return {name: {**limits, "dame": round(factor * limits["dame"], 4)} for name, limits in VISIBILITY.items()}
 
 
+def _visibility(original: Original) -> Mapping[Visibility, Mapping[str, float]]:
+    return visibility_of(original.mesh)
+
+
 def first_rms(mesh: Mesh) -> float:
     """Return the RMS displacement, in diagonals, that is tried first if limits determine the displacement."""
     return _FIRST_OF_EDGES * _mean_edge(mesh) if len(mesh.faces) else _FIRST_OF_CLOUDS
+
+
+def _first_rms(original: Original) -> float:
+    return first_rms(original.mesh)
 
 
 def _mean_edge(mesh: Mesh) -> float:
@@ -218,15 +233,18 @@ def displace_within(
     size = float(distortion.rms(shift[original.used])) * original.diagonal / diagonal(original.mesh)
 
     compared = reference or reference_of(original)
+    measured: dict[float, dict[Metric, float | None]] = {}  # by RMS displacement
 
     def limit_ratio(metrics: Collection[Metric], rms: float) -> float:
         """Compute the largest ratio of a metric to its limit."""
-        values = compared.measure(displace(original, rms / size * shift), metrics)
+        values = measured.setdefault(rms, {})
+        if missing := [metric for metric in metrics if metric not in values]:
+            values.update(compared.measure(displace(original, rms / size * shift), missing))
         return max((values[metric] or 0.0) / bounds.limits[metric] for metric in metrics)
 
     rms = largest = bounds.rms or _MAX_RMS
     if bounds.limits:
-        first = first or first_rms(original.mesh)
+        first = first or original.derived(_first_rms)
         # Metrics of single edges are fast. Usually they determine the displacement, and the others are measured once.
         for metrics in dict.fromkeys(
             (tuple(metric for metric in bounds.limits if metric in LOCAL), tuple(bounds.limits))
