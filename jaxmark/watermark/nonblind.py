@@ -41,6 +41,8 @@ from jaxmark.watermark.record import is_recorded
 
 Charges = tuple[Charge, ...]
 
+_WORSE = 3.0  # ratio of residuals from which on the worse reflection is not read
+
 
 class Alternatives(NamedTuple):
     """The marks of one original, key and payload that a suspect may carry, the likeliest first.
@@ -90,6 +92,9 @@ def _registrations(original: Original, suspect: Mesh, align: Align) -> Iterator[
     reflections = (not aligned.pose.mirrors,)
     with suppress(JaxmarkError):
         other = attempts.align(original, suspect, align, reflections=reflections, in_parts=not aligned.as_whole)
+        # With a shape that is no mirror image of itself, the wrong reflection leaves a much larger residual.
+        if other.residual > _WORSE * aligned.residual and other.coverage(original) <= aligned.coverage(original):
+            return
         yield (ledger.REFLECTION.charge("worse fit"),), other
 
 
