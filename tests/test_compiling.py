@@ -94,17 +94,20 @@ def test_few_programs_are_compiled(key: jm.Key, caplog: pytest.LogCaptureFixture
 
     def compiled(call: Callable[[], Any]) -> tuple[Any, list[str]]:
         caplog.clear()
-        with jax.log_compiles(True):
+        jax.config.update("jax_log_compiles", True)  # of all threads
+        try:
             found = call()
+        finally:
+            jax.config.update("jax_log_compiles", False)
         messages = [record.message.split() for record in caplog.records]
         return found, [words[4] for words in messages if words[:3] == ["Finished", "XLA", "compilation"]]
 
     jax.clear_caches()
     (marked, info), embedding = compiled(lambda: jm.embed(mesh, b"8 bytes!", key))
-    assert 0 < len(embedding) <= 56, embedding
+    assert 0 < len(embedding) <= 20, embedding
     found, detecting = compiled(lambda: jm.detect(marked, original=mesh, key=key, record=info.record))
     assert found.detected()
-    assert 0 < len(detecting) <= 8, detecting
+    assert 0 < len(detecting) <= 7, detecting
     suspect = jm.attack(marked, "simplification", 0.3, seed=0)
     found, remeshed = compiled(lambda: jm.detect(suspect, original=mesh, key=key, record=info.record))
     assert found.detected()

@@ -5,7 +5,6 @@ original's cotangent Laplacian. Displacements that this smoothing explains are t
 the original's valence Laplacian explains are nuisance in any case.
 """
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 
@@ -89,7 +88,7 @@ def replay_smoothing_of_points(
     x = np.asarray(original.vertices)
     # Smoothing of any kind and amount is partly explained by Δx and Δ²x; marks and noise are not. This quick check
     # avoids the smoothing below for most suspects.
-    once = operator.apply(jnp.asarray(pad_rows(x, len(operator.degree)), jnp.float32))
+    once = operator.apply(pad_rows(x, len(operator.degree)).astype(np.float32))
     powers = np.concatenate([once, operator.apply(once)], axis=1)[: len(x)]
     if _likeliest([powers], x, displacement, None, weights, _MAX_UNEXPLAINED_AT_FIRST) is None or area(original) == 0:
         return None
@@ -101,7 +100,7 @@ def _smoothed(mesh: Mesh, weighting: Weighting, signal: Points) -> list[Float32[
     """Smooth a signal by a mesh's Laplacian, once for each number of steps."""
     family = diffusion(_SCALES, 4 * 2 ** (_SCALES // 2) + 1)
     operator = common_laplacian(mesh, weighting)
-    scales = band_components(operator, family, jnp.asarray(pad_rows(signal, len(operator.degree)), jnp.float32))
+    scales = band_components(operator, family, pad_rows(signal, len(operator.degree)).astype(np.float32))
     return list(np.asarray(scales)[:, : len(signal)])
 
 

@@ -145,7 +145,7 @@ class _Pair:
             points = _distinct(second, weld(second.vertices))
         self.meshes = reference.mesh, reference.at_unit_size(points, "distorted mesh")
         self.faces = [np.asarray(mesh.faces) for mesh in self.meshes]
-        self.x, self.y = (jnp.asarray(mesh.vertices, jnp.float32) for mesh in self.meshes)
+        self.x, self.y = (jax.device_put(np.asarray(mesh.vertices, np.float32)) for mesh in self.meshes)
 
     def measure(self, metric: Metric) -> float | None:
         if isinstance(metric, str):
@@ -159,7 +159,7 @@ class _Pair:
     def common(self) -> tuple[Array, Array]:
         """The positions, padded to a size that many meshes share."""
         count = common_size(len(self.x))
-        return jnp.asarray(pad_rows(np.asarray(self.x), count)), jnp.asarray(pad_rows(np.asarray(self.y), count))
+        return jax.device_put(pad_rows(np.asarray(self.x), count)), jax.device_put(pad_rows(np.asarray(self.y), count))
 
     @cached_property
     def moved(self) -> DisplacementSize:

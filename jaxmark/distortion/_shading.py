@@ -108,7 +108,7 @@ def make_masking(
     used = vertices[np.bincount(faces[area > 0].ravel(), minlength=len(vertices)) > 0]
     diagonal = float(np.linalg.norm(np.ptp(used, axis=0))) if len(used) else 1.0
     lengths = np.sqrt(4 / math.sqrt(3) * size * mean) / diagonal  # of equilateral triangles' sides
-    padded = jnp.asarray(pad_rows(normals, count)), jnp.asarray(pad_rows(lengths, count))
+    padded = jax.device_put(pad_rows(normals, count)), jax.device_put(pad_rows(lengths, count))
     threshold, bare = (np.asarray(values)[:, : len(faces)] for values in _hidden(links, *padded, bands))
     share, bend = area / (area.sum() or 1.0), _second_largest(pairs, angle, len(faces))
     return Masking(faces.astype(np.int32), share, turned, links, threshold, bare, bend)

@@ -44,7 +44,8 @@ def with_dtype(tree: Tree, dtype: DTypeLike) -> Tree:
     """Convert the arrays of a tree to JAX's, numbers with fractions to `dtype`."""
 
     def one(leaf: Any) -> Array:
-        return jnp.asarray(leaf, dtype if jnp.issubdtype(leaf.dtype, jnp.floating) else None)
+        # `jnp.asarray` would compile a program for each shape.
+        return jax.device_put(leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf)
 
     return jax.tree.map(one, tree)
 

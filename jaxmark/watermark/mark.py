@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, TypeVar
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float64
 from numpy.typing import ArrayLike
@@ -142,7 +142,7 @@ class Mark:
                 "The original has vertices that no face uses, and another order than when it was marked with this"
                 " record; mark it without the record."
             )
-        unit = original.to_host(self.carrier.displacement(jnp.asarray(amplitudes, original.signal.dtype)))
+        unit = original.to_host(self.carrier.displacement(jax.device_put(amplitudes.astype(original.signal.dtype))))
         size = float(distortion.rms(unit[original.used]))
         if not (math.isfinite(size) and size > 0):
             raise JaxmarkError(

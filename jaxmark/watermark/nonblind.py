@@ -16,7 +16,7 @@ from contextlib import suppress
 from functools import partial
 from typing import NamedTuple, cast
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Float64
 from numpy.typing import ArrayLike
@@ -158,7 +158,7 @@ def read(
 
 def claims_of(mark: Mark, received: Received, message: bytes) -> list[tuple[Array, Array]]:
     """Compute score and norm of a message's codeword for each way of weighting the suspect."""
-    codeword = jnp.asarray(mark.codeword(message), received.observed.residual.dtype)
+    codeword = jax.device_put(mark.codeword(message).astype(received.observed.residual.dtype))
     return list(zip(*claims(mark.reader, received, codeword), strict=True))
 
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Hashable, Mapping
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float64
 from scipy.special import log_ndtr, ndtri  # scipy.stats takes long to import
@@ -244,7 +244,7 @@ class Capacity:
     def _write(self, carrier: Carrier, word: int, bounds: Bounds, **options: float) -> float:
         """Measure the RMS displacement of a mark with one of several codewords."""
         signs = np.random.default_rng(word).choice([-1.0, 1.0], carrier.code_bits)
-        probe = self.original.to_host(carrier.displacement(jnp.asarray(signs, self.original.signal.dtype)))
+        probe = self.original.to_host(carrier.displacement(jax.device_put(signs.astype(self.original.signal.dtype))))
         return displace_within(self.original, probe, bounds, reference_of(self.original), **options).moved.rms
 
     def _carrier(self, bits: int) -> Carrier:

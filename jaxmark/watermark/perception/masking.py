@@ -70,12 +70,11 @@ def masking_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     if len(faces) == 0:
         return _by_spacing(original)
     mesh, size = Mesh(points, faces), len(points)
-    # `_heights` takes as long as all independent computations, which are in NumPy and run in another thread.
-    independent = _in_thread(
-        lambda: (face_normals(mesh), _corner_angles(points, faces), open_sides(faces), _along_edges(original))
-    )
-    shares, height, least = _heights(mesh)
-    normals, angles, opened, (along, free) = independent.result()
+    # Carriers may be made in traced code; in another thread, nothing is traced. The rest, in NumPy, takes as long.
+    heights = _in_thread(lambda: _heights(mesh))
+    normals, angles, opened = face_normals(mesh), _corner_angles(points, faces), open_sides(faces)
+    along, free = _along_edges(original)
+    shares, height, least = heights.result()
     proper = np.flatnonzero(shares)
     form, weight = _sums(faces[proper], angles[proper], _squares(normals[proper], height[proper]), size)
 
@@ -97,7 +96,7 @@ def masking_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
 
 
 def _in_thread(compute: Callable[[], Result]) -> "Future[Result]":
-    """Compute in another thread; or in this one, if the interpreter is shutting down and starts no more threads."""
+    """Compute in another thread, where nothing is traced; in this one, if the interpreter is shutting down."""
     future: Future[Result] = Future()
 
     def run() -> None:
@@ -109,7 +108,8 @@ def _in_thread(compute: Callable[[], Result]) -> "Future[Result]":
     try:
         Thread(target=run).start()
     except RuntimeError:
-        run()
+        with jax.ensure_compile_time_eval():
+            run()
     return future
 
 
@@ -137,9 +137,8 @@ def _heights(
     mesh: Mesh,
 ) -> tuple[Float64[np.ndarray, " faces"], Float64[np.ndarray, " faces"], Float64[np.ndarray, " faces"]]:
     """Compute each face's share of the area, the height of a wave that it masks, and the least such height."""
-    with jax.ensure_compile_time_eval():  # carriers may be made in traced code
-        masking = make_masking(mesh.vertices, mesh.faces, _BAND + 1)
-        bends = _bends(masking)
+    masking = make_masking(mesh.vertices, mesh.faces, _BAND + 1)
+    bends = _bends(masking)
     shares = np.asarray(masking.area)
     unmasked, threshold = masking.bare[_BAND], masking.threshold[_BAND]
     edge = np.sqrt(4 / np.sqrt(3) * shares * area(mesh))  # edge of an equilateral triangle of the same area
@@ -160,9 +159,9 @@ def _by_spacing(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     """Compute the relative spacing of a cloud's points, without variations that would mix low and high frequencies."""
     spacing = spacings(original.positions, _SPACING_POINTS)
     spacing = np.clip(spacing / (np.median(spacing) or 1.0), _LEAST_SPACING, _MOST_SPACING)
-    with jax.ensure_compile_time_eval():
-        average = diffusion(_SPACING_SCALE + 1, 2**_SPACING_SCALE + 1)[_SPACING_SCALE]
-        factor = original.to_host(filter(original.operator, average, original.to_traced(spacing)))
+    average = diffusion(_SPACING_SCALE + 1, 2**_SPACING_SCALE + 1)[_SPACING_SCALE]
+    smooth = _in_thread(lambda: original.to_host(filter(original.operator, average, original.to_traced(spacing))))
+    factor = smooth.result()
     return (factor / np.sqrt(np.mean(factor**2)))[:, None, None] * np.eye(3)
 
 
@@ -170,7 +169,7 @@ def _bends(masking: Masking) -> Float64[np.ndarray, " faces"]:
     """Compute the largest rotation that each face masks by its angle to neighbours, as a geometric mean around it."""
     logs = pad_rows(np.log(np.maximum(masking.bend**2 / _BENT, _LEAST_BEND)), len(masking.links.degree))
     average = diffusion(_AVERAGING_SCALE + 1, 2**_AVERAGING_SCALE + 1)[_AVERAGING_SCALE]
-    return np.exp(np.asarray(filter(masking.links, average, jnp.asarray(logs)), np.float64)[: len(masking.bend)])
+    return np.exp(np.asarray(filter(masking.links, average, logs), np.float64)[: len(masking.bend)])
 
 
 def _squares(x: Float64[np.ndarray, "rows 3"], size: Float64[np.ndarray, " rows"]) -> Float64[np.ndarray, "rows 6"]:

@@ -92,7 +92,7 @@ def make_host(
         scales: number of diffusion scales, see `Extent`.
         degree: total degree of the polynomials, see `Extent`.
     """
-    return Host(operator, signal, jnp.asarray(coefficients).astype(signal.dtype), positions, Extent(scales, degree))
+    return Host(operator, signal, jax.device_put(coefficients.astype(signal.dtype)), positions, Extent(scales, degree))
 
 
 def make_receiver(host: Host) -> Receiver:
@@ -246,8 +246,8 @@ def weigh_evenly(received: Reception) -> Reception:
     reverse the mark in it, so that this band outweighs all others. Equal weights exclude this attack.
     """
     # Made by NumPy, so that no programs are compiled for it.
-    flat = jnp.asarray(np.ones(received.power.shape, received.power.dtype))
-    return received._replace(gain=flat, power=flat, axes=jnp.asarray(np.eye(3, dtype=received.axes.dtype)))
+    flat = jax.device_put(np.ones(received.power.shape, received.power.dtype))
+    return received._replace(gain=flat, power=flat, axes=jax.device_put(np.eye(3, dtype=received.axes.dtype)))
 
 
 def whitening(receiver: Receiver, power: Float[Array, " bands"]) -> Float[Array, " terms"]:
