@@ -18,7 +18,7 @@ from scipy import sparse
 from jaxmark.alignment.original import Original
 from jaxmark.distortion import Masking, make_masking
 from jaxmark.geometry.clouds import spacings
-from jaxmark.geometry.mesh import Mesh, area, edges, face_normals, open_sides, unit
+from jaxmark.geometry.mesh import Mesh, area, face_normals, open_sides, unit
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.padding import pad_rows
@@ -123,7 +123,8 @@ def _along_edges(original: Original) -> tuple[Float64[np.ndarray, "free 3 3"], B
         The form of each point that has an edge, and a mask of these points.
     """
     points, size = original.positions, len(original.positions)
-    pairs = edges(np.asarray(original.points.faces))
+    pairs = np.asarray(original.operator.edges)
+    pairs = pairs[pairs[:, 0] < size]  # without padding
     ends = points[pairs[:, 1]] - points[pairs[:, 0]]
     lengths = np.linalg.norm(ends, axis=1)
     along, count = _sums(pairs, np.ones(pairs.shape), _squares(unit(ends), _ALONG * lengths), size)
