@@ -18,6 +18,8 @@ from jaxmark.spectral.laplacian import Laplacian, centre, symmetric_matrix
 
 # Up to this number of vertices, a dense decomposition is faster than an iterative one, and finds every eigenvalue.
 _DENSE_LIMIT = 2500
+_ROUNDING = 100 * np.finfo(np.float64).eps  # of eigenvalues, which are at most 2
+_SHIFT = 1e-6  # of iterated matrices, over the median of their diagonal, which keeps them definite
 
 
 class Eigenpairs(NamedTuple):
@@ -44,15 +46,16 @@ def eigenpairs(operator: Laplacian, count: int | None = None, *, tolerance: floa
     Args:
         operator: the Laplacian, of N vertices.
         count: largest number of pairs, from the lowest eigenvalue on. None for all.
-        tolerance: eigenvalues closer than this form one eigenspace. Its basis is arbitrary, so that only the projection
-            onto the whole eigenspace is meaningful; an eigenspace that `count` would cut is left out.
+        tolerance: eigenvalues that differ by less than this share of them form one eigenspace. Its basis is arbitrary,
+            so that only the projection onto the whole eigenspace is meaningful; an eigenspace that `count` would cut is
+            left out.
 
     Returns:
         The pairs, without the null vectors, of which there is one for each connected component.
 
     Raises:
-        JaxmarkError: if `count` is below 1, or more than a third of all pairs of a mesh of over 2,500 vertices are
-            asked for.
+        JaxmarkError: if `count` is below 1 or would cut the first eigenspace, or more than a third of all pairs of a
+            mesh of over 2,500 vertices are asked for.
     """
     if count is not None and count < 1:
         raise JaxmarkError(f"eigenpairs(count=...) must be at least 1, got {count}.")
@@ -72,9 +75,11 @@ def eigenpairs(operator: Laplacian, count: int | None = None, *, tolerance: floa
         )
     else:
         values, vectors = _lowest(scaled, root, component, wanted)
-    fresh = np.diff(values, prepend=-np.inf) > tolerance
+    fresh = np.diff(values, prepend=-np.inf) > tolerance * values + _ROUNDING
     space = np.maximum.accumulate(np.where(fresh, np.arange(len(values)), 0)).astype(np.int64)
     kept = len(values) if count is None or len(values) <= count else int(space[count])
+    if kept == 0 < len(values):
+        raise JaxmarkError(f"The lowest eigenspace has more pairs than count={count}; ask for more.")
     full = np.zeros((len(operator.degree), kept))
     full[linked] = vectors[:, :kept] / root[:, None]
     return Eigenpairs(values[:kept], full, space[:kept])
@@ -142,7 +147,7 @@ def _lowest(
     size = len(root)
     null = sparse.csr_array((root, (np.arange(size), component)))
     null = null @ sparse.diags_array(1 / np.sqrt(null.multiply(null).sum(axis=0)))
-    shift = 1e-6  # keeps the matrix definite
+    shift = _SHIFT * float(np.median(scaled.diagonal()))  # a few thin faces raise only their own elements
     factor = sparse_linalg.splu(
         scaled + shift * sparse.eye_array(size, format="csc"),
         permc_spec="MMD_AT_PLUS_A",

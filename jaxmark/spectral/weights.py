@@ -6,11 +6,12 @@ They take NumPy arrays, or JAX's, traced or not, and give the same: on the host 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Int64
+from jaxtyping import Array, Bool, Float, Int, Int64
 
 from jaxmark.geometry.mesh import Faces, edges, sides
 
-_MIN_COTANGENT = 1e-6  # over the largest weight
+_MIN_COTANGENT = 1e-6  # over the median size of the weights
+_MIN_HEIGHT = 64  # of a face that is not degenerate, over its longest side, in epsilons of the dtype
 
 Positions = Float[Array | np.ndarray, "points 3"]
 
@@ -26,10 +27,10 @@ def inverse_length_weights(
 
 
 def cotangent_weights(vertices: Positions, faces: Faces) -> Float[Array | np.ndarray, " edges"]:
-    """Compute half the sum of the cotangents of the angles opposite each edge, clipped below at 1e-6 of the largest.
+    """Compute half the sum of the cotangents of the angles opposite each edge, clipped below at 1e-6 of the median.
 
     Pinkall, Polthier, "Computing discrete minimal surfaces and their conjugates", 1993. Obtuse angles make weights
-    negative, whence the clipping. A degenerate face has no angles, and adds nothing.
+    negative, whence the clipping. A degenerate face, which is flat up to rounding, has no angles, and adds nothing.
 
     Args:
         vertices: `[V, 3]`.
@@ -42,27 +43,41 @@ def cotangent_weights(vertices: Positions, faces: Faces) -> Float[Array | np.nda
     pairs, (ends, apex), base = edges(faces), sides(faces), np.array([len(vertices), 1])
     first, second = vertices[ends[:, 0]] - vertices[apex], vertices[ends[:, 1]] - vertices[apex]
     square = xp.sum(xp.linalg.cross(first, second) ** 2, axis=1)
-    sound = square > 0
+    sound = xp.tile(_sound(vertices, faces), 3)
     # Select before dividing, so that degenerate faces keep finite gradients.
     cotangents = xp.where(sound, xp.sum(first * second, axis=1) / xp.sqrt(xp.where(sound, square, 1)), 0)
     # A side from a vertex to itself is no edge; it is counted past the last one.
     which = np.searchsorted(pairs @ base, np.sort(ends, axis=1) @ base)
     which[ends[:, 0] == ends[:, 1]] = len(pairs)
     weights = _sums(cotangents / 2, which, len(pairs))
-    return xp.maximum(weights, _MIN_COTANGENT * xp.max(xp.append(weights, 0)))
+    if not len(pairs):
+        return weights
+    # A thin face has weights of any size; the median is that of the others.
+    least = xp.where(xp.max(weights) > 0, _MIN_COTANGENT * xp.median(xp.abs(weights)), 0)
+    return xp.maximum(weights, least)
 
 
 def vertex_areas(vertices: Positions, faces: Faces) -> Float[Array | np.ndarray, " vertices"]:
     """Compute a third of the area of the faces around each vertex: the lumped mass `[V]` of linear finite elements.
 
-    Masses are in the square of the positions' unit, and sum to the area of the mesh. Faces are concrete.
+    Masses are in the square of the positions' unit, and sum to the area of the mesh. Faces are concrete; degenerate
+    ones, see `cotangent_weights`, have no area.
     """
     xp = vertices.__array_namespace__()
     faces = np.asarray(faces)
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    square = xp.sum(xp.linalg.cross(b - a, c - a) ** 2, axis=1)
-    areas = xp.where(square > 0, xp.sqrt(xp.where(square > 0, square, 1)) / 2, 0)
+    square, sound = xp.sum(xp.linalg.cross(b - a, c - a) ** 2, axis=1), _sound(vertices, faces)
+    areas = xp.where(sound, xp.sqrt(xp.where(sound, square, 1)) / 2, 0)
     return _sums(xp.concat([areas, areas, areas]) / 3, faces.T.ravel(), len(vertices))
+
+
+def _sound(vertices: Positions, faces: Faces) -> Bool[Array | np.ndarray, " faces"]:
+    """Find the faces that are not degenerate: not flat up to rounding."""
+    xp = vertices.__array_namespace__()
+    a, b, c = (vertices[np.asarray(faces)[:, corner]] for corner in range(3))
+    longest = xp.max(xp.stack([xp.sum(side**2, axis=1) for side in (b - a, c - b, a - c)]), axis=0)
+    height = xp.sum(xp.linalg.cross(b - a, c - a) ** 2, axis=1)
+    return height > (_MIN_HEIGHT * xp.finfo(vertices.dtype).eps * longest) ** 2
 
 
 def _sums(

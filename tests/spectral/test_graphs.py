@@ -166,7 +166,7 @@ def test_weights_and_areas_are_those_of_libigl(ball):
     pairs = jm.geometry.edges(faces)
     theirs = np.asarray(expected[pairs[:, 0], pairs[:, 1]]).ravel()
     ours = spectral.cotangent_weights(vertices, faces)
-    np.testing.assert_allclose(ours, np.maximum(theirs, 1e-6 * theirs.max()), atol=1e-12)
+    np.testing.assert_allclose(ours, np.maximum(theirs, 1e-6 * np.median(np.abs(theirs))), atol=1e-12)
     mass = igl.massmatrix(vertices, faces, igl.MASSMATRIX_TYPE_BARYCENTRIC).diagonal()
     np.testing.assert_allclose(spectral.vertex_areas(vertices, faces), mass, rtol=1e-12)
 

@@ -4,12 +4,15 @@ import pytest
 import trimesh
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, make_mesh
-from jaxmark.spectral import spectrum
+from jaxmark.geometry.mesh import Mesh, edges, make_mesh
+from jaxmark.spectral import bands, spectrum
+from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.laplacian import centre
 from jaxmark.spectral.spectrum import eigenpairs, quadrature, white_probes
+from jaxmark.spectral.subspaces import lowest_eigenpairs
 from tests.dense import laplacian_matrix
+from tests.samples import bumpy_sphere
 
 pytestmark = pytest.mark.core
 
@@ -53,9 +56,52 @@ def test_an_eigenspace_that_the_count_would_cut_is_left_out():
     """Part of an eigenspace would depend on the basis that a solver happened to pick."""
     ball = trimesh.creation.icosahedron()
     operator = from_mesh(make_mesh(ball.vertices, ball.faces))
-    assert [len(eigenpairs(operator, count).values) for count in (1, 2, 3, 4, 7, 8, 10, 11, 50)] == [
-        *(0, 0, 3, 3, 3, 8, 8, 11, 11)
-    ]
+    assert [len(eigenpairs(operator, count).values) for count in (3, 4, 7, 8, 10, 11, 50)] == [3, 3, 3, 8, 8, 11, 11]
+    with pytest.raises(JaxmarkError, match="more pairs than count=2"):
+        eigenpairs(operator, 2)
+
+
+def with_thin_face(mesh: Mesh, height: float) -> Mesh:
+    """With another face over an edge, of a third corner this high above the edge's middle."""
+    points, (a, b, _) = np.asarray(mesh.vertices), np.asarray(mesh.faces)[20]
+    top = (points[a] + points[b]) / 2 + height * np.array([1, 2, 3]) / 14**0.5
+    return make_mesh(np.vstack([points, top]), np.vstack([mesh.faces, [a, b, len(points)]]))
+
+
+@pytest.mark.parametrize("limit", [0, 2500], ids=["iterated", "dense"])
+@pytest.mark.parametrize("height", [1e-6, 1e-2])
+def test_a_thin_face_leaves_the_other_eigenvalues_as_they_are(height, limit, monkeypatch):
+    """It joins two vertices of the sphere more closely, which changes one of the eigenvalues by its share of all."""
+    sphere = bumpy_sphere(2)
+    monkeypatch.setattr(spectrum, "_DENSE_LIMIT", limit)
+    plain, thin = (from_mesh(mesh, "cotangent", mass="areas") for mesh in (sphere, with_thin_face(sphere, height)))
+    expected, found = (eigenpairs(operator, 20).values[:8] * operator.scale for operator in (plain, thin))
+    np.testing.assert_allclose(found, expected, rtol=0.03)
+
+
+def test_a_flat_face_is_named(sphere: Mesh):
+    """Up to rounding: its third corner has no mass."""
+    flat = with_thin_face(sphere, 0)
+    with pytest.raises(JaxmarkError, match=f"Vertex {len(sphere.vertices)} has edges, but no mass"):
+        from_mesh(flat, "cotangent", mass="areas")
+
+
+@pytest.mark.parametrize("factor", [1e-30, 1e30])
+def test_no_result_depends_on_the_unit_of_weights_and_masses(factor, x64):
+    sphere = bumpy_sphere(1)
+    pairs, size = edges(sphere.faces), len(sphere.vertices)
+    weights, mass = np.random.default_rng(0).uniform(0.1, 1, len(pairs)), np.random.default_rng(1).uniform(1, 2, size)
+    for masses in (None, mass):
+        one, other = (
+            from_mesh(sphere, unit * weights, mass=None if masses is None else unit * masses) for unit in (1, factor)
+        )
+        expected, found = (eigenpairs(operator, 9) for operator in (one, other))
+        np.testing.assert_allclose(found.values, expected.values, rtol=1e-9)
+        expected, found = (lowest_eigenpairs(operator, 9, 0, dtype=np.float64).values for operator in (one, other))
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+        coefficients = bands.scaling(8)[2]
+        expected, found = (filter(operator, coefficients, sphere.vertices) for operator in (one, other))
+        np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 def test_quadrature_is_exact_for_polynomials(hard_graph: Mesh):
