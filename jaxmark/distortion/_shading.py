@@ -38,6 +38,7 @@ from jaxtyping import Array, Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from jaxmark.distortion.dihedral import MIN_HEIGHT
 from jaxmark.distortion.norms import Positions, Scalar, percentile, ratio, root
 from jaxmark.geometry.mesh import cross_product, face_pairs
 from jaxmark.spectral.bands import diffusion
@@ -60,7 +61,6 @@ _MIN_SENSITIVITY = 1e-3  # sensitivity to the shortest waves, over the largest s
 _MASKING_SLOPE, _MASKING_BEND = 0.0078 * 88.29, 4.207
 _FEW_TERMS = 25  # number of terms of a series that the first four bands need
 _POOLING = 4  # exponent by which bands are summed
-_MIN_HEIGHT = 1e-5  # least height of a face over its longest side; the normals of flatter faces are ignored
 _MIN_AREA = 1e-3  # least area of a face in its links, over the mean area
 
 
@@ -156,7 +156,7 @@ def _areas_and_normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndar
     sides = [vertices[faces[:, k]] - vertices[faces[:, k - 1]] for k in range(3)]
     longest, normals = np.max([_squared(side) for side in sides], axis=0), cross_product(sides[1], sides[2])
     double = np.sqrt(_squared(normals))
-    area = np.where(double > _MIN_HEIGHT * longest, double / 2, 0)
+    area = np.where(double > MIN_HEIGHT * longest, double / 2, 0)
     return area, normals / np.where(area > 0, double, 1)[:, None]
 
 

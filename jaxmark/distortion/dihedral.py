@@ -10,11 +10,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxmark.distortion.norms import Positions, Scalar, lengths, ratio
 from jaxmark.geometry.mesh import edges
 
+MIN_HEIGHT = 1e-5  # least height of a face over its longest side; flatter faces have no angles that could be seen
 _FOLDED_WEIGHT = 0.01  # weight of an angle of π, where the surface is folded back onto itself; an angle of 0 has 1
 
 
@@ -71,8 +72,23 @@ def dame(original: Positions, distorted: Positions, hinges: Hinges) -> Scalar:
 
     The error is in radians, and independent of scale. It is the paper's sum with masking m = exp((kα)²), k² =
     ln(0.01)/π², by the original's angle α. The paper's visibility weights, which need rendered images, are 1 here.
+    Edges of faces that are flat in the original, which have no angle there, do not count.
     """
     before, after = dihedral_angles(original, hinges), dihedral_angles(distorted, hinges)
     masking = jnp.exp(math.log(_FOLDED_WEIGHT) * (before / np.pi) ** 2)
-    inner = jnp.asarray(hinges.inner).astype(before.dtype)
-    return jnp.sum(inner * masking * jnp.abs(after - before)) / jnp.maximum(inner.sum(), 1)
+    inner = jnp.where(_is_flat(original, hinges), 0, jnp.asarray(hinges.inner).astype(before.dtype))
+    change = jnp.abs(after - before)
+    change = jnp.minimum(change, 2 * np.pi - change)  # two sides of a sheet are folded by π and by -π alike
+    return jnp.sum(inner * masking * change) / jnp.maximum(inner.sum(), 1)
+
+
+def _is_flat(x: Positions, hinges: Hinges) -> Bool[Array, " edges"]:
+    """Find the edges that have a flat face on one of their sides."""
+    tail, head = x[hinges.edges[:, 0]], x[hinges.edges[:, 1]]
+
+    def flat(apex: Array) -> Array:
+        sides = head - tail, x[apex] - tail, x[apex] - head
+        longest = jnp.max(jnp.stack([jnp.sum(side**2, axis=1) for side in sides]), axis=0)
+        return jnp.sum(jnp.cross(sides[0], sides[1]) ** 2, axis=1) <= (MIN_HEIGHT * longest) ** 2
+
+    return flat(hinges.left) | flat(hinges.right)

@@ -96,6 +96,14 @@ def test_dame_of_one_hinge_in_closed_form(before, after, dtype):
     assert float(dame(folded(before), folded(after), hinges)) == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.parametrize(("apex", "moved"), [((0.5, 0, 0), (0.5, 0, 1e-6)), ((0.5, 1, 1e-6), (0.5, 1, -1e-6))])
+def test_faces_that_are_flat_or_folded_back_hardly_change_dame(apex, moved, dtype):
+    """A flat face may turn to anywhere, and the two sides of a sheet may fold the other way, if one point moves."""
+    hinges = make_hinges(np.array([[0, 1, 2], [1, 0, 3]]))
+    before, after = (jnp.array([[0, 0, 0], [1, 0, 0], [0.5, 1, 0], end], dtype) for end in (apex, moved))
+    assert float(dame(before, after, hinges)) < 1e-5
+
+
 def test_the_geometric_laplacian_by_hand(cap: Mesh, x64):
     v = np.vstack([cap.vertices, [[9.0, 9, 9]]])  # and one alone
     near: list[set[int]] = [set() for _ in v]
