@@ -60,8 +60,11 @@ def diagnose(suspect: Mesh, mark: Mark, align: Align) -> tuple[str, ...]:
                 f"A message of {bits} bits is readable with the scheme {scheme.name!r}: give both, or give the record."
                 f" {tried} readings led to this hint; if nothing else says so, add {math.log10(tried):.1f} to log10 p.",
             )
+    looked_for = f"a message of {mark.bits} bits" if mark.bits else "a presence mark"
     return (
-        "Without the record, the original must have exactly the coordinates, and the order, in which it was marked.",
+        f"Without the record, only {looked_for} was looked for: if the message has another size, give that by --bits (a"
+        " text has 8 bits for each byte). The original must have exactly the coordinates, and the order, in which it was"
+        " marked.",
     )
 
 

@@ -199,6 +199,7 @@ def test_nothing_found_is_status_1(workshop: Workshop):
     code, out, _ = workshop("detect", "model.ply", *DETECT)
     assert code == 1
     assert "nothing detected" in out
+    assert "give that by --bits" in out
 
 
 def test_refusals_are_one_sentence_and_leave_nothing(workshop: Workshop):
