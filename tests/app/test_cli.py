@@ -195,11 +195,11 @@ def test_nothing_found_is_status_1(workshop: Workshop):
         found = workshop.json("detect", suspect, "--original", "model.ply", "--key", key, *options, status=1)
         assert found["detected"] is False
         assert found["log10_p"] <= 0
+        assert ("give that by --bits" in str(found)) == (key == "other.key")
     assert workshop.json("detect", "model.ply", *DETECT, status=1)["log10_p"] == 0
     code, out, _ = workshop("detect", "model.ply", *DETECT)
     assert code == 1
     assert "nothing detected" in out
-    assert "give that by --bits" in out
 
 
 def test_refusals_are_one_sentence_and_leave_nothing(workshop: Workshop):
