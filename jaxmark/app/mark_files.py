@@ -15,6 +15,8 @@ from jaxmark.files import Scene, load_mesh, load_scene, load_texture, number_che
 from jaxmark.files.atomic import write_atomically
 from jaxmark.files.pair import refuse_existing, writing_pair
 from jaxmark.files.programs import release_programs
+from jaxmark.files.source import concerning
+from jaxmark.files.typed import find_name
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.everyday import embed_scene
@@ -35,16 +37,21 @@ def pick(scene: Scene, names: Sequence[str], path: Path) -> Scene:
     Raises:
         JaxmarkError: if the file has no mesh with one of the names, or this mesh cannot be used.
     """
+    chosen: list[str] = []
+    known_names = {**scene.meshes, **scene.skipped}
     for name in names:
-        if name in scene.skipped:
-            raise JaxmarkError(f"{path}: the mesh {name!r} cannot be used: {scene.skipped[name]}.")
-        if name not in scene.meshes:
+        with concerning(path):
+            known_name = find_name(name, known_names)
+        if known_name is None:
             known = ", ".join(map(repr, list(scene.meshes)[:_MOST_NAMED]))
             raise JaxmarkError(f"{path} has no mesh {name!r}; there are {len(scene.meshes)}, such as {known}.")
+        if known_name in scene.skipped:
+            raise JaxmarkError(f"{path}: the mesh {name!r} cannot be used: {scene.skipped[known_name]}.")
+        chosen.append(known_name)
     if not names:
         return scene
-    others = {name: "it was not selected" for name in scene.meshes if name not in names}
-    return Scene({name: scene.meshes[name] for name in names}, {**scene.skipped, **others})
+    others = {name: "it was not selected" for name in scene.meshes if name not in chosen}
+    return Scene({name: scene.meshes[name] for name in chosen}, {**scene.skipped, **others})
 
 
 def mark_file(
