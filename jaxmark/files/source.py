@@ -174,7 +174,7 @@ class Source:
         data: the file's bytes.
         coordinates: the positions in the file.
         faces: zero-based indices into the positions; polygons are split into triangles.
-        normals: the normals that follow the positions, if the file has any.
+        normals: the normals that follow the positions.
         texture: reads the texture coordinates of each face's corners, NaN where there are none; None without any.
         skin: reads which joints move each point; None without any.
         parts: the meshes in the file that can be marked; empty if there is just one in it.
@@ -184,7 +184,7 @@ class Source:
     data: bytes
     coordinates: Numbers
     faces: Faces
-    normals: Transported | PerFace | None = None
+    normals: Sequence[Transported | PerFace] = ()
     texture: Callable[[], Texture] = read_nothing
     skin: Callable[[], Skinning | None] = read_nothing
     parts: Sequence[Part] = ()
@@ -198,8 +198,8 @@ class Source:
     def spliced(self, positions: Points) -> bytes:
         """Write these positions, and the normals that follow them, into the data."""
         edits = self.coordinates.edits(positions)
-        if self.normals is not None:
-            edits += self.normals.numbers.edits(self.normals.moved(self.positions, positions, self.faces))
+        for normals in self.normals:
+            edits += normals.numbers.edits(normals.moved(self.positions, positions, self.faces))
         return splice(self.data, edits)
 
     def patch(self, positions: Points, name: str) -> Patched:

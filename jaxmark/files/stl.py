@@ -38,7 +38,7 @@ def _binary(data: bytes, facets: int) -> Source:
     start = 84 + 50 * np.arange(facets)[:, None]
     vertices = (start + np.arange(12, 48, 4)).reshape(-1, 3)
     normals = PerFace(BinaryNumbers(data, start + np.arange(0, 12, 4), _FLOAT))
-    return Source(data, BinaryNumbers(data, vertices, _FLOAT), np.arange(3 * facets).reshape(-1, 3), normals)
+    return Source(data, BinaryNumbers(data, vertices, _FLOAT), np.arange(3 * facets).reshape(-1, 3), [normals])
 
 
 def _text(data: bytes) -> Source:
@@ -55,4 +55,4 @@ def _text(data: bytes) -> Source:
         raise text.error(text.starts[-1], f"the file ends inside facet {facets} (zero-based)")
     vertices = tokens[:, [8, 9, 10, 12, 13, 14, 16, 17, 18]].reshape(-1, 3)
     normals = PerFace(TextNumbers(text, tokens[:, 2:5]))
-    return Source(data, TextNumbers(text, vertices), np.arange(3 * facets).reshape(-1, 3), normals)
+    return Source(data, TextNumbers(text, vertices), np.arange(3 * facets).reshape(-1, 3), [normals])

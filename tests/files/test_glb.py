@@ -114,6 +114,21 @@ def test_normals_turn(tmp_path: Path) -> None:
         np.testing.assert_allclose(struct.unpack_from("<3f", bin_, 28 * vertex + 16), [1, 0, 0], atol=1e-7)
 
 
+@pytest.mark.parametrize("normals", [[(0, -1, 0)] * 3, [(0, -1, 0), (0, -2, 0), (np.nan, 0, 0)]])
+def test_bounds_of_normals_follow(tmp_path: Path, normals: list[tuple[float, float, float]]) -> None:
+    content, bin_ = document(), bytearray(BIN)
+    for vertex, normal in enumerate(normals):
+        struct.pack_into("<3f", bin_, 28 * vertex + 16, *normal)
+    content["accessors"][2] |= {"min": [0, -1, 0], "max": [0, -1, 0]}
+    source = written(tmp_path, "a.glb", glb(json.dumps(content), bytes(bin_)))
+    assert patched(source, load_mesh(source)) == source.read_bytes()
+    text, bin_ = split(patched(source, turned(load_mesh(source))))
+    found = np.array([struct.unpack_from("<3f", bin_, 28 * vertex + 16) for vertex in range(3)])
+    accessor = json.loads(text)["accessors"][2]
+    assert accessor["min"] == np.nanmin(found, axis=0).tolist()
+    assert accessor["max"] == np.nanmax(found, axis=0).tolist()
+
+
 def test_a_mesh_that_no_node_uses(tmp_path: Path) -> None:
     plain = document()
     del plain["nodes"]
