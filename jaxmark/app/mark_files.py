@@ -1,6 +1,6 @@
 """Mark files of one mesh or of several meshes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -92,13 +92,16 @@ def mark_file(
     refuse_existing(marked, record, overwrite=overwrite)
     doing(f"reading {original}")
     scene = pick(load_scene(original), meshes, original)
+    check_numbers = number_check(original)
     if len(scene.meshes) + len(scene.skipped) > 1:
         if message is None:
             raise JaxmarkError(
                 f"A fingerprint needs a file of one mesh, and {original} has several; save each mesh in its own file."
             )
         try:
-            return _mark_scene(original, marked, record, scene, message, key, budget, scheme, overwrite, doing)
+            return _mark_scene(
+                original, marked, record, scene, message, key, budget, scheme, check_numbers, overwrite, doing
+            )
         except JaxmarkError:
             # All objects of an OBJ file share one coordinate system. Marked as one mesh, they may carry a message that
             # is too long for each of them.
@@ -127,7 +130,7 @@ def mark_file(
         read_back, check = partial(tracer.finds, recipient=name), None
     with writing_pair(marked, record, overwrite=overwrite) as pair:
         doing(f"writing {marked}, and measuring the noise that the mark survives")
-        save_mesh(result, pair.file, like=original)
+        notes = save_mesh(result, pair.file, like=original)
         # The mark must be readable from the written file, whose numbers are rounded.
         written = load_mesh(pair.file)
         survives = read_back(written)
@@ -151,6 +154,7 @@ def mark_file(
         "content": info.record.content,
         "survives": survives._asdict() if isinstance(survives, Survival) else None,
         "texture_drift": drift,
+        "notes": list(notes),
         "record": str(record),
         "marked": str(marked),
         "old_record": pair.kept,
@@ -162,7 +166,7 @@ def mark_file(
         text += f"; because the mark is weak, it is written in the pass band {band!r}, which is in the record"
     if drift is not None:
         text += f"; the texture drifts by {drift:.2g} texels, if it has 2,048 x 2,048"
-    return FileOutcome(values, (text,))
+    return FileOutcome(values, (text, *notes))
 
 
 def _mark_scene(
@@ -174,6 +178,7 @@ def _mark_scene(
     key: Key,
     budget: Budget,
     scheme: AnyScheme,
+    check_numbers: Callable[[str, Mesh], None],
     overwrite: bool,
     doing: Doing,
 ) -> FileOutcome:
@@ -183,19 +188,21 @@ def _mark_scene(
         JaxmarkError: if no mesh can carry the message; see `embed_scene`.
     """
     markers: dict[str, Any] = {}
-    fine_enough = number_check(original)
 
     def check(name: str, marker: Marker, result: Mesh, info: EmbedInfo) -> EmbedInfo:
         """Check that the numbers of the file are precise enough for a mark."""
         release_programs()
         doing(f"{len(markers) + 1} of {len(scene.meshes)} meshes: checking {name!r}")
-        fine_enough(name, result)
+        check_numbers(name, result)
         # The caches of the marker are dropped: the caches of all meshes together would not fit into memory.
         markers[name] = _without_caches(marker.with_record(info.record))
         return info
 
     doing(f"embedding {len(scene.meshes)} meshes of {original}")
-    meshes, info = embed_scene(scene.meshes, message, key, budget=budget, scheme=scheme, after=check)
+    try:
+        meshes, info = embed_scene(scene.meshes, message, key, budget=budget, scheme=scheme, after=check)
+    except JaxmarkError as error:
+        raise JaxmarkError("; ".join([str(error).rstrip("."), *_unchanged(scene.skipped)]) + ".") from error
     survives: dict[str, Survival] = {}
     with writing_pair(marked, record, overwrite=overwrite) as pair:
         doing(f"writing {marked}, and reading it back")
@@ -236,10 +243,15 @@ def _mark_scene(
         f" {_moved_text(most)} of their diagonals; record → {record}{pair};"
         f" the weakest mark survives {survival_text(least)}"
     )
-    lines = [text, *(f"left unchanged: {name!r}: {reason}" for name, reason in list(skipped.items())[:_MOST_NAMED])]
+    return FileOutcome(values, (text, *_unchanged(skipped), *notes))
+
+
+def _unchanged(skipped: Mapping[str, str]) -> list[str]:
+    """List the meshes that were left unchanged, with the reasons, at most five of them."""
+    lines = [f"left unchanged: {name!r}: {reason}" for name, reason in list(skipped.items())[:_MOST_NAMED]]
     if len(skipped) > _MOST_NAMED:
         lines.append(f"left unchanged: {len(skipped) - _MOST_NAMED} more, see --json")
-    return FileOutcome(values, (*lines, *notes))
+    return lines
 
 
 def _without_caches(marker: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Read and write mesh files (OBJ, PLY, OFF, STL, GLB, glTF, 3MF) and point clouds (also XYZ, LAS, LAZ).
+"""Read and write mesh files (OBJ, PLY, OFF, STL, GLB, VRM, glTF, 3MF) and point clouds (also XYZ, LAS, LAZ).
 
 A file is saved by patching the file that it was loaded from: all bytes except those of positions and normals stay.
 """
@@ -41,6 +41,7 @@ _FORMATS: dict[str, Callable[..., Source]] = {
     ".stl": stl.parse,
     ".glb": asset.parse,
     ".gltf": asset.parse,
+    ".vrm": asset.parse,
     ".3mf": threemf.parse,
     ".xyz": point_cloud.parse_xyz,
     ".las": point_cloud.parse_las,
@@ -69,8 +70,8 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
     triangles (v0, v1, v2), (v0, v2, v3), …, for computing only.
 
     Args:
-        path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary), GLB, glTF, 3MF, XYZ (text), LAS or LAZ
-            file.
+        path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary), GLB, VRM (a GLB), glTF, 3MF, XYZ (text),
+            LAS or LAZ file.
 
     Returns:
         NumPy arrays: float64 vertices in the file's units, int64 faces.
@@ -137,7 +138,7 @@ def load_skin(path: str | os.PathLike) -> Skinning:
     return skin
 
 
-def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | None = None) -> None:
+def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | None = None) -> tuple[str, ...]:
     """Write a mesh to a file, atomically.
 
     Args:
@@ -149,6 +150,9 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | 
             to come along: a buffer that changes is named after the new file, the others are copied where they are not
             there already.
 
+    Returns:
+        Sentences about content that could not stay as it was; usually none.
+
     Raises:
         JaxmarkError: if `path` has another suffix than `like`, the mesh has other faces or another number of
             vertices, the file cannot be read or written, or its numbers are too coarse for what changed: their
@@ -159,8 +163,8 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | 
         from jaxmark.files.export import encode_new
 
         write_atomically(path, encode_new(mesh, _suffix(path), partial(_parse, path)))
-    else:
-        _save_whole(mesh, _source_of(path, like), path, like)
+        return ()
+    return _save_whole(mesh, _source_of(path, like), path, like)
 
 
 def _save_whole(mesh: Mesh, source: Source, path: str | os.PathLike, like: str | os.PathLike) -> tuple[str, ...]:
@@ -207,8 +211,13 @@ def number_check(like: str | os.PathLike) -> Callable[[str, Mesh], None]:
     """Make a function (name, mesh) that checks whether a file's numbers are precise enough for changed vertices.
 
     The function raises a `JaxmarkError` if they are not, see `save_mesh`.
+
+    Raises:
+        JaxmarkError: if the file cannot be read, or cannot be written with other positions.
     """
     source = _read(like)
+    if source.fixed:
+        raise JaxmarkError(f"{os.fspath(like)}: {source.fixed}")
     places = _places(source)
 
     def check(name: str, mesh: Mesh) -> None:
@@ -236,7 +245,7 @@ def _suffix(path: str | os.PathLike) -> str:
 def _parse(path: str | os.PathLike, data: bytes) -> Source:
     """Parse the bytes of a file; files of some formats refer to other files in the same folder."""
     suffix = _suffix(path)
-    beside = (read_beside(Path(path).parent),) if suffix in (".glb", ".gltf") else ()
+    beside = (read_beside(Path(path).parent),) if _FORMATS[suffix] is asset.parse else ()
     return _FORMATS[suffix](data, *beside)
 
 
@@ -270,6 +279,8 @@ def _save(source: Source, positions: np.ndarray, path: str | os.PathLike, like: 
     """Write a source with other positions, and the files beside it; refused if its numbers are too coarse."""
     with concerning(os.fspath(like)):
         moved = [_check_spacing(source, positions, places) for places in _places(source).values()]
+        if any(moved) and source.fixed:
+            raise JaxmarkError(source.fixed)
         patched = source.patch(positions if any(moved) else source.positions, Path(path).stem)
     beside = dict(patched.beside)
     here, there = Path(like).parent, Path(path).parent

@@ -108,6 +108,8 @@ def parse(data: bytes) -> Source:
     declared = {element.name: element for element in elements}
     vertex = declared.get("vertex", _Element("vertex", 0)).properties
     coordinates = _triples(body, vertex, ("x", "y", "z"))
+    if coordinates is None and "packed_position" in vertex:
+        raise JaxmarkError("The file is a compressed splat; save it as uncompressed PLY, for example in SuperSplat.")
     if coordinates is None:
         raise JaxmarkError("The header declares no element vertex with the numbers x, y and z.")
     faces = np.concatenate([_surface(body, declared.get(name, _Element(name, 0))) for name in _SURFACES])

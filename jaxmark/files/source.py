@@ -179,6 +179,7 @@ class Source:
         skin: reads which joints move each point; None without any.
         parts: the meshes in the file that can be marked; empty if there is just one in it.
         skipped: the other meshes by name, and the reasons why they cannot be marked.
+        fixed: a sentence why the file cannot be written with other positions; empty if it can.
     """
 
     data: bytes
@@ -189,6 +190,7 @@ class Source:
     skin: Callable[[], Skinning | None] = read_nothing
     parts: Sequence[Part] = ()
     skipped: Mapping[str, str] = field(default_factory=dict)
+    fixed: str = ""
 
     @property
     def positions(self) -> Points:

@@ -10,7 +10,7 @@ import trimesh
 from trimesh.visual import TextureVisuals
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import load_mesh, load_texture
+from jaxmark.files import load_mesh, load_texture, save_mesh
 from tests.files.helpers import loaded, noisy, patched, shifted, turned, written
 
 pytestmark = pytest.mark.core
@@ -127,6 +127,21 @@ def test_bounds_of_normals_follow(tmp_path: Path, normals: list[tuple[float, flo
     accessor = json.loads(text)["accessors"][2]
     assert accessor["min"] == np.nanmin(found, axis=0).tolist()
     assert accessor["max"] == np.nanmax(found, axis=0).tolist()
+
+
+def test_an_avatar_is_a_glb_whose_extensions_stay(tmp_path: Path) -> None:
+    content = document() | {
+        "extensionsUsed": ["VRM", "VRMC_vrm"],
+        "extensions": {"VRM": {"meta": {"title": "\u00e9"}, "humanoid": {"humanBones": []}}, "VRMC_vrm": {"x": 1.50}},
+    }
+    source = written(tmp_path, "a.vrm", glb(json.dumps(content)))
+    mesh = load_mesh(source)
+    text, _ = split(patched(source, noisy(mesh, 0.1)))
+    found = json.loads(text)
+    assert found["extensions"] == content["extensions"]
+    assert found["extensionsUsed"] == content["extensionsUsed"]
+    save_mesh(mesh, tmp_path / "new.vrm")
+    np.testing.assert_array_equal(load_mesh(tmp_path / "new.vrm").vertices, mesh.vertices)
 
 
 def test_a_mesh_that_no_node_uses(tmp_path: Path) -> None:

@@ -325,6 +325,37 @@ def test_draco_is_decoded_and_encoded_again(tmp_path: Path, joints: type) -> Non
         np.testing.assert_array_equal(by_id[ids["JOINTS_0"]], np.arange(4 * len(BALLS[0].vertices)).reshape(-1, 4) % 7)
 
 
+@pytest.mark.parametrize("joints", [np.uint8, np.int16])
+@pytest.mark.parametrize("shared", [False, True])
+def test_nothing_is_left_of_draco_and_later_bytes_follow(tmp_path: Path, joints: type, shared: bool) -> None:
+    """An image behind the compressed view, which two primitives may share."""
+    document, data = compressed(joints)
+    image = b"a picture "
+    document["images"] = [{"bufferView": 1, "mimeType": "image/png"}]
+    document["bufferViews"].append({"buffer": 0, "byteOffset": len(data), "byteLength": len(image)})
+    document["buffers"] = [{"byteLength": len(data + image)}]
+    if shared:
+        document["meshes"].append(json.loads(json.dumps(document["meshes"][0])))
+        document["accessors"] += [dict(accessor) for accessor in document["accessors"]]
+        primitive = document["meshes"][1]["primitives"][0]
+        primitive |= {"attributes": {"POSITION": 4, "NORMAL": 5, "JOINTS_0": 6}, "indices": 7}
+    (tmp_path / "a.glb").write_bytes(glb(json.dumps(document), data + image + bytes(2)))
+    meshes = load_scene(tmp_path / "a.glb").meshes
+    factors = {name: 1.01 + 0.01 * number for number, name in enumerate(meshes)}
+    moved = {name: mesh._replace(vertices=factors[name] * mesh.vertices) for name, mesh in meshes.items()}
+    save_scene(moved, tmp_path / "b.glb", like=tmp_path / "a.glb")
+    for name, mesh in load_scene(tmp_path / "b.glb").meshes.items():
+        np.testing.assert_allclose(mesh.vertices, moved[name].vertices, atol=1e-6)
+    written = (tmp_path / "b.glb").read_bytes()
+    size = struct.unpack_from("<I", written, 12)[0]
+    text, chunk = json.loads(written[20 : 20 + size]), written[28 + size :]
+    places = [(view.get("byteOffset", 0), view["byteLength"]) for view in text["bufferViews"]]
+    assert chunk[places[1][0] :][: len(image)] == image
+    assert data.rstrip(b"\0") not in chunk
+    assert len(chunk) - sum(length for _, length in places) < 4 * len(places) + 4
+    assert all(begin % 4 == 0 for begin, _ in places)
+
+
 def test_numbers_decoded_by_draco_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     document, data = compressed(np.uint8)
     points, faces = len(BALLS[0].vertices), len(BALLS[0].faces)

@@ -345,7 +345,7 @@ class _GltfSource(Source):
                     plain.append(f"meshes[{mesh}].primitives[{number}]")
         if plain:
             draco.forget_unused(document)
-        why = "written without Draco, whose encoder does not know all types"
+        why = "written without Draco compression, because its encoder does not know all types of numbers in it"
         notes = (f"{', '.join(plain)}: {why}",) if plain else ()
         return self.document.encode(document, contents, name)._replace(notes=notes)
 
