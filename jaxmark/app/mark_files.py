@@ -1,6 +1,6 @@
 """Mark files of one mesh or of several meshes."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,11 +19,12 @@ from jaxmark.files.source import concerning
 from jaxmark.files.typed import find_name
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.coding.keys import Key
-from jaxmark.watermark.everyday import embed_scene
+from jaxmark.watermark.everyday import SceneInfo, embed_scene
 from jaxmark.watermark.mark import EmbedInfo
 from jaxmark.watermark.markers import Marker, prepare
 from jaxmark.watermark.perception.budget import Budget
 from jaxmark.watermark.perception.capacity import Survival
+from jaxmark.watermark.record import SceneRecord
 from jaxmark.watermark.schemes.passband import ADAPTIVE
 from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, AnyScheme, name_of
 from jaxmark.watermark.tracing.tracer import make_tracer
@@ -212,12 +213,16 @@ def _mark_scene(
         for name, marker in markers.items():
             predicted = info.meshes[name].survives
             survival = _without_caches(marker).measure_survival(written[name], message, predicted)
-            if survival is None:
-                raise JaxmarkError(
-                    f"The mark of the mesh {name!r} cannot be read after rounding to the precision of {original};"
-                    " select the other meshes by --mesh."
-                )
-            survives[name] = survival
+            if survival is not None:
+                survives[name] = survival
+        if not survives:
+            raise JaxmarkError(
+                f"No mark can be read after rounding to the precision of {original}; use a larger budget, or a file"
+                " with more digits."
+            )
+        if len(survives) < len(markers):
+            info = _restricted(info, survives)
+            notes = save_scene({name: meshes[name] for name in survives}, pair.file, like=original)
         write_atomically(pair.record, info.record.to_json().encode())
     each = {
         name: {**_moved(markers[name].original, written[name]), "survives": survives[name]._asdict()}
@@ -244,6 +249,14 @@ def _mark_scene(
         f" the weakest mark survives {survival_text(least)}"
     )
     return FileOutcome(values, (text, *_unchanged(skipped), *notes))
+
+
+def _restricted(info: SceneInfo, names: Collection[str]) -> SceneInfo:
+    """Leave out the marks of all other meshes, which cannot be read from the file."""
+    lost = dict.fromkeys(info.meshes.keys() - names, "its mark cannot be read after rounding to the file's precision")
+    records = {name: info.record.meshes[name] for name in names}
+    meshes = {name: info.meshes[name] for name in names}
+    return SceneInfo(meshes, {**info.skipped, **lost}, SceneRecord(records))
 
 
 def _unchanged(skipped: Mapping[str, str]) -> list[str]:

@@ -92,7 +92,7 @@ class ScaledNumbers(BinaryNumbers):
 
     def spacing(self, values: Rows, rows: Indices) -> float:
         """Return the largest scale, or the spacing of double precision if that is larger."""
-        return max(float(self._scales.max()), float(np.spacing(np.abs(values[rows]).max(initial=0.0))))
+        return max(super().spacing(values, rows), float(np.spacing(np.abs(values[rows]).max(initial=0.0))))
 
     def advice(self, step: float) -> str:
         """Advise a scale."""

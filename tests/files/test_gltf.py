@@ -251,8 +251,27 @@ def test_quantised_positions_move_by_their_own_step(tmp_path: Path, normalised: 
     np.testing.assert_allclose(again, np.minimum(moved, 32767 * step), atol=0.501 * step)
     text = json.loads((tmp_path / "b.glb").read_bytes()[20:].split(b"BIN\0")[0][:-4].decode())
     assert text["accessors"][0]["max"] == np.rint(again.max(0) / step).tolist()
-    with pytest.raises(JaxmarkError, match="apart"):
-        save_mesh(mesh._replace(vertices=mesh.vertices + 3 * step), tmp_path / "c.glb", like=tmp_path / "a.glb")
+    for share, loss in ((3, 0), (0.7, 43), (0.6, 67)):
+        moved = mesh._replace(vertices=np.asarray(mesh.vertices) - np.sign(mesh.vertices) * share * step)
+        notes = save_mesh(moved, tmp_path / "c.glb", like=tmp_path / "a.glb")
+        assert notes == ((f"rounding to the numbers of the file changes the displacement by {loss} %",) * (loss > 0))
+    with pytest.raises(JaxmarkError, match="rounding takes 100 %"):
+        save_mesh(mesh._replace(vertices=0.4 * step + mesh.vertices), tmp_path / "c.glb", like=tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+def test_quantised_positions_are_held_at_the_end_of_their_range(tmp_path: Path, normalised: bool) -> None:
+    document, data = quantised(normalised)
+    (tmp_path / "a.glb").write_bytes(glb(json.dumps(document), data))
+    mesh = load_mesh(tmp_path / "a.glb")
+    step = 1 / 32767 if normalised else 1
+    for factor in (1.005, 1.03):  # by up to 164 and 983 steps beyond the range of 65,536
+        moved = mesh._replace(vertices=factor * np.asarray(mesh.vertices))
+        save_mesh(moved, tmp_path / "b.glb", like=tmp_path / "a.glb")
+        again = np.asarray(load_mesh(tmp_path / "b.glb").vertices)
+        np.testing.assert_allclose(again, np.clip(moved.vertices, -32768 * step, 32767 * step), atol=0.501 * step)
+    with pytest.raises(JaxmarkError, match="beyond the range"):
+        save_mesh(mesh._replace(vertices=1.05 * mesh.vertices), tmp_path / "c.glb", like=tmp_path / "a.glb")
 
 
 def compressed(joints: type) -> tuple[dict[str, Any], bytes]:
