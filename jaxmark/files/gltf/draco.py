@@ -192,7 +192,7 @@ def _is_alone(document: dict[str, Any], view: int) -> bool:
 
 
 def _stored(views: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Yield all places in buffers: those of views, and those of views that are compressed as a whole."""
+    """Yield every place in a buffer: each view, and the source of each view that is compressed as a whole."""
     for view in views:
         yield from (one for one in (view, *view.get("extensions", {}).values()) if "buffer" in one)
 
