@@ -15,6 +15,7 @@ from jaxmark.alignment.attempts import align
 from jaxmark.alignment.nearest import find_heights, find_partners
 from jaxmark.alignment.original import make_original
 from jaxmark.app import cli
+from jaxmark.files import number_check
 from jaxmark.geometry.clouds import Cloud, planes, spacings
 from jaxmark.geometry.mesh import Mesh, diagonal, make_mesh, used_vertices
 from jaxmark.plot.meshes import roughness_masking
@@ -389,6 +390,42 @@ def test_laser_scans_keep_all_but_their_positions(suffix: str, tmp_path: Path):
     path.write_bytes(b"no scan")
     with pytest.raises(jm.JaxmarkError, match="no LAS or LAZ file"):
         jm.load_mesh(path)
+
+
+def test_cloud_optimised_scans_are_read_and_not_written(tmp_path: Path):
+    laspy = pytest.importorskip("laspy")
+    pytest.importorskip("lazrs")
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = [1e-4] * 3
+    header.vlrs.append(laspy.VLR(user_id="copc", record_id=1, record_data=bytes(160)))
+    scan = laspy.LasData(header)
+    scan.xyz = ball(500)
+    scan.write(tmp_path / "scan.laz")
+    mesh = jm.load_mesh(tmp_path / "scan.laz")
+    np.testing.assert_array_equal(mesh.vertices, np.asarray(scan.xyz))
+    moved = mesh._replace(vertices=1.01 * np.asarray(mesh.vertices))
+    for write in (
+        lambda: jm.save_mesh(moved, tmp_path / "moved.laz", like=tmp_path / "scan.laz"),
+        lambda: number_check(tmp_path / "scan.laz"),
+    ):
+        with pytest.raises(jm.JaxmarkError, match=r"scan\.laz: .*COPC.* save it as plain LAZ"):
+            write()
+
+
+def test_what_laspy_cannot_write_is_refused(tmp_path: Path, monkeypatch):
+    laspy = pytest.importorskip("laspy")
+    pytest.importorskip("lazrs")
+    scan = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+    scan.xyz = ball(500)
+    scan.write(tmp_path / "scan.laz")
+    mesh = jm.load_mesh(tmp_path / "scan.laz")
+
+    def fail(*_: object, **__: object) -> None:
+        raise NotImplementedError("no such records")
+
+    monkeypatch.setattr(laspy.LasData, "write", fail)
+    with pytest.raises(jm.JaxmarkError, match="laspy cannot write this LAZ file: no such records; save it as LAS"):
+        jm.save_mesh(mesh._replace(vertices=2 * mesh.vertices), tmp_path / "m.laz", like=tmp_path / "scan.laz")
 
 
 @pytest.mark.parametrize(("place", "size"), [(100, 4), (107, 4)], ids=["records", "points"])

@@ -17,6 +17,7 @@ from jaxmark.catalogue import Catalogue, export_catalogue, import_catalogue
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import file_hash
 from jaxmark.files.pair import refuse_existing, writing_pair
+from jaxmark.files.typed import normalise
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.perception.budget import Budget
 from jaxmark.watermark.record import RECORD_SUFFIX, Record, load_record
@@ -261,6 +262,7 @@ def mark_for_command(
     catalogue. The recipient is stored before the copy is written. The same recipient always gets the same copy.
     Files that exist are refused without --overwrite.
     """
+    recipient = normalise(recipient)
     if output is None:
         if not _PLAIN.fullmatch(recipient):
             raise JaxmarkError(f"{recipient!r} cannot be part of a file's name; name the copy by --output.")

@@ -40,6 +40,7 @@ from jaxmark.app.options import (
     budget_options,
     message_options,
     read_key,
+    read_recipients,
 )
 from jaxmark.app.output import (
     ESTIMATE,
@@ -364,12 +365,7 @@ def identify_command(
         identify_by_catalogue(suspect, catalogue_file, key_file, align, alpha, as_json)
     if original is None or recipients is None:
         raise JaxmarkError("Give --original and --recipients, or a --catalogue that holds them.")
-    try:
-        names = [line for line in recipients.read_text(encoding="utf-8").splitlines() if line]
-    except UnicodeDecodeError:
-        raise JaxmarkError(f"{recipients} is not text in UTF-8; write one identifier per line.") from None
-    if not names:
-        raise JaxmarkError(f"{recipients} contains no recipient; write one identifier per line.")
+    names = read_recipients(recipients)
     record = None if record_file is None else Record.load(record_file)
     key = read_key(key_file)
     current().doing(f"reading {suspect} and {original}")

@@ -148,7 +148,7 @@ def _line(row: Mapping[str, Any]) -> str:
 def _listed(file: Path) -> Iterator[Path]:
     """Read paths from a text file, one per line; relative paths start at the working directory."""
     try:
-        with click.open_file(str(file), encoding="utf-8") as lines:
+        with click.open_file(str(file), encoding="utf-8-sig") as lines:
             yield from (Path(line.rstrip("\n")) for line in lines if line.strip())
     except UnicodeDecodeError:
         raise JaxmarkError(f"{file} is not text in UTF-8; write one path per line.") from None

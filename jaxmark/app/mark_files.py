@@ -1,6 +1,6 @@
 """Mark files of one mesh or of several meshes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,13 +15,16 @@ from jaxmark.files import Scene, load_mesh, load_scene, load_texture, number_che
 from jaxmark.files.atomic import write_atomically
 from jaxmark.files.pair import refuse_existing, writing_pair
 from jaxmark.files.programs import release_programs
+from jaxmark.files.source import concerning
+from jaxmark.files.typed import find_name
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.coding.keys import Key
-from jaxmark.watermark.everyday import embed_scene
+from jaxmark.watermark.everyday import SceneInfo, embed_scene
 from jaxmark.watermark.mark import EmbedInfo
 from jaxmark.watermark.markers import Marker, prepare
 from jaxmark.watermark.perception.budget import Budget
 from jaxmark.watermark.perception.capacity import Survival
+from jaxmark.watermark.record import SceneRecord
 from jaxmark.watermark.schemes.passband import ADAPTIVE
 from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, AnyScheme, name_of
 from jaxmark.watermark.tracing.tracer import make_tracer
@@ -35,16 +38,21 @@ def pick(scene: Scene, names: Sequence[str], path: Path) -> Scene:
     Raises:
         JaxmarkError: if the file has no mesh with one of the names, or this mesh cannot be used.
     """
+    chosen: list[str] = []
+    known_names = {**scene.meshes, **scene.skipped}
     for name in names:
-        if name in scene.skipped:
-            raise JaxmarkError(f"{path}: the mesh {name!r} cannot be used: {scene.skipped[name]}.")
-        if name not in scene.meshes:
+        with concerning(path):
+            known_name = find_name(name, known_names)
+        if known_name is None:
             known = ", ".join(map(repr, list(scene.meshes)[:_MOST_NAMED]))
             raise JaxmarkError(f"{path} has no mesh {name!r}; there are {len(scene.meshes)}, such as {known}.")
+        if known_name in scene.skipped:
+            raise JaxmarkError(f"{path}: the mesh {name!r} cannot be used: {scene.skipped[known_name]}.")
+        chosen.append(known_name)
     if not names:
         return scene
-    others = {name: "it was not selected" for name in scene.meshes if name not in names}
-    return Scene({name: scene.meshes[name] for name in names}, {**scene.skipped, **others})
+    others = {name: "it was not selected" for name in scene.meshes if name not in chosen}
+    return Scene({name: scene.meshes[name] for name in chosen}, {**scene.skipped, **others})
 
 
 def mark_file(
@@ -85,13 +93,16 @@ def mark_file(
     refuse_existing(marked, record, overwrite=overwrite)
     doing(f"reading {original}")
     scene = pick(load_scene(original), meshes, original)
+    check_numbers = number_check(original)
     if len(scene.meshes) + len(scene.skipped) > 1:
         if message is None:
             raise JaxmarkError(
                 f"A fingerprint needs a file of one mesh, and {original} has several; save each mesh in its own file."
             )
         try:
-            return _mark_scene(original, marked, record, scene, message, key, budget, scheme, overwrite, doing)
+            return _mark_scene(
+                original, marked, record, scene, message, key, budget, scheme, check_numbers, overwrite, doing
+            )
         except JaxmarkError:
             # All objects of an OBJ file share one coordinate system. Marked as one mesh, they may carry a message that
             # is too long for each of them.
@@ -120,7 +131,7 @@ def mark_file(
         read_back, check = partial(tracer.finds, recipient=name), None
     with writing_pair(marked, record, overwrite=overwrite) as pair:
         doing(f"writing {marked}, and measuring the noise that the mark survives")
-        save_mesh(result, pair.file, like=original)
+        notes = save_mesh(result, pair.file, like=original)
         # The mark must be readable from the written file, whose numbers are rounded.
         written = load_mesh(pair.file)
         survives = read_back(written)
@@ -144,6 +155,7 @@ def mark_file(
         "content": info.record.content,
         "survives": survives._asdict() if isinstance(survives, Survival) else None,
         "texture_drift": drift,
+        "notes": list(notes),
         "record": str(record),
         "marked": str(marked),
         "old_record": pair.kept,
@@ -155,7 +167,7 @@ def mark_file(
         text += f"; because the mark is weak, it is written in the pass band {band!r}, which is in the record"
     if drift is not None:
         text += f"; the texture drifts by {drift:.2g} texels, if it has 2,048 x 2,048"
-    return FileOutcome(values, (text,))
+    return FileOutcome(values, (text, *notes))
 
 
 def _mark_scene(
@@ -167,6 +179,7 @@ def _mark_scene(
     key: Key,
     budget: Budget,
     scheme: AnyScheme,
+    check_numbers: Callable[[str, Mesh], None],
     overwrite: bool,
     doing: Doing,
 ) -> FileOutcome:
@@ -176,19 +189,21 @@ def _mark_scene(
         JaxmarkError: if no mesh can carry the message; see `embed_scene`.
     """
     markers: dict[str, Any] = {}
-    fine_enough = number_check(original)
 
     def check(name: str, marker: Marker, result: Mesh, info: EmbedInfo) -> EmbedInfo:
         """Check that the numbers of the file are precise enough for a mark."""
         release_programs()
         doing(f"{len(markers) + 1} of {len(scene.meshes)} meshes: checking {name!r}")
-        fine_enough(name, result)
+        check_numbers(name, result)
         # The caches of the marker are dropped: the caches of all meshes together would not fit into memory.
         markers[name] = _without_caches(marker.with_record(info.record))
         return info
 
     doing(f"embedding {len(scene.meshes)} meshes of {original}")
-    meshes, info = embed_scene(scene.meshes, message, key, budget=budget, scheme=scheme, after=check)
+    try:
+        meshes, info = embed_scene(scene.meshes, message, key, budget=budget, scheme=scheme, after=check)
+    except JaxmarkError as error:
+        raise JaxmarkError("; ".join([str(error).rstrip("."), *_unchanged(scene.skipped)]) + ".") from error
     survives: dict[str, Survival] = {}
     with writing_pair(marked, record, overwrite=overwrite) as pair:
         doing(f"writing {marked}, and reading it back")
@@ -198,12 +213,16 @@ def _mark_scene(
         for name, marker in markers.items():
             predicted = info.meshes[name].survives
             survival = _without_caches(marker).measure_survival(written[name], message, predicted)
-            if survival is None:
-                raise JaxmarkError(
-                    f"The mark of the mesh {name!r} cannot be read after rounding to the precision of {original};"
-                    " select the other meshes by --mesh."
-                )
-            survives[name] = survival
+            if survival is not None:
+                survives[name] = survival
+        if not survives:
+            raise JaxmarkError(
+                f"No mark can be read after rounding to the precision of {original}; use a larger budget, or a file"
+                " with more digits."
+            )
+        if len(survives) < len(markers):
+            info = _restricted(info, survives)
+            notes = save_scene({name: meshes[name] for name in survives}, pair.file, like=original)
         write_atomically(pair.record, info.record.to_json().encode())
     each = {
         name: {**_moved(markers[name].original, written[name]), "survives": survives[name]._asdict()}
@@ -229,10 +248,23 @@ def _mark_scene(
         f" {_moved_text(most)} of their diagonals; record → {record}{pair};"
         f" the weakest mark survives {survival_text(least)}"
     )
-    lines = [text, *(f"left unchanged: {name!r}: {reason}" for name, reason in list(skipped.items())[:_MOST_NAMED])]
+    return FileOutcome(values, (text, *_unchanged(skipped), *notes))
+
+
+def _restricted(info: SceneInfo, names: Collection[str]) -> SceneInfo:
+    """Leave out the marks of all other meshes, which cannot be read from the file."""
+    lost = dict.fromkeys(info.meshes.keys() - names, "its mark cannot be read after rounding to the file's precision")
+    records = {name: info.record.meshes[name] for name in names}
+    meshes = {name: info.meshes[name] for name in names}
+    return SceneInfo(meshes, {**info.skipped, **lost}, SceneRecord(records))
+
+
+def _unchanged(skipped: Mapping[str, str]) -> list[str]:
+    """List the meshes that were left unchanged, with the reasons, at most five of them."""
+    lines = [f"left unchanged: {name!r}: {reason}" for name, reason in list(skipped.items())[:_MOST_NAMED]]
     if len(skipped) > _MOST_NAMED:
         lines.append(f"left unchanged: {len(skipped) - _MOST_NAMED} more, see --json")
-    return FileOutcome(values, (*lines, *notes))
+    return lines
 
 
 def _without_caches(marker: Any) -> Any:

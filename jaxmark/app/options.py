@@ -13,6 +13,8 @@ from jaxmark.alignment.result import Align
 from jaxmark.app.output import say
 from jaxmark.app.progress import Progress
 from jaxmark.errors import JaxmarkError
+from jaxmark.files.source import concerning
+from jaxmark.files.typed import decode, normalise, normalise_names
 from jaxmark.watermark.coding.keys import Key, load_key
 from jaxmark.watermark.perception.budget import VISIBILITY, Budget
 from jaxmark.watermark.schemes.registry import NAMES, split
@@ -111,6 +113,7 @@ class _Text(click.ParamType):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> bytes:
         if isinstance(value, bytes):
             return value
+        value = normalise(value)
         if not value:
             self.fail("the message is empty; for a mark without a message use --presence.", param, ctx)
         return value.encode()
@@ -202,6 +205,19 @@ def budget_options(*, limits: bool = True, noise: float | None = None, noise_hel
         )(decorated)
 
     return decorate
+
+
+def read_recipients(path: Path) -> list[str]:
+    """Read identifiers of recipients, one per line; empty lines are skipped.
+
+    Raises:
+        JaxmarkError: if the file is not text in UTF-8 or contains no identifier; see also `normalise_names`.
+    """
+    with concerning(path):
+        lines = decode(path.read_bytes()).splitlines()
+        if names := normalise_names(line for line in lines if normalise(line)):
+            return names
+    raise JaxmarkError(f"{path} contains no recipient; write one identifier per line.")
 
 
 def read_key(path: Path) -> Key:

@@ -17,6 +17,7 @@ from jaxmark.app.progress import Doing, quietly
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import Scene, limits, load_mesh, load_scene, load_skin
 from jaxmark.files.programs import release_programs
+from jaxmark.files.typed import find_name
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.reading import best_of, try_each
 from jaxmark.watermark.coding.keys import Key
@@ -183,7 +184,7 @@ class FileReader:
         """Return the names of the meshes to read; the record must have them, if there is one."""
         marked = scene.meshes if record is None else record.meshes
         for name in self.meshes:
-            if name in scene.meshes and name not in marked:
+            if find_name(name, scene.meshes) and not find_name(name, marked):
                 names = ", ".join(map(repr, marked))
                 raise JaxmarkError(f"The record has no mesh {name!r}, which --mesh selects; it has {names}.")
         names = list(dict.fromkeys(self.meshes or marked))

@@ -15,6 +15,7 @@ from jaxmark.catalogue.identification import Finder, Verdict
 from jaxmark.catalogue.originals import meshes_of, prepare_file
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import file_hash
+from jaxmark.files.typed import normalise
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.record import Record, SceneRecord
 
@@ -157,6 +158,7 @@ class Catalogue:
         """
         if record.content != "fingerprint":
             raise JaxmarkError(f"The record is of a {record.content}, not of a recipient's copy; add it as a record.")
+        recipient = normalise(recipient)
         if not recipient:
             raise JaxmarkError("A recipient's identifier must not be empty.")
         with self.database.writing():

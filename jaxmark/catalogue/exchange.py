@@ -124,7 +124,7 @@ def _lines(path: str | os.PathLike[str]) -> Iterator[str]:
     try:
         if not Path(path).is_file():
             raise JaxmarkError(f"{path} is not a file; give one that `jaxmark catalogue export` wrote.")
-        with Path(path).open(encoding="utf-8") as file:
+        with Path(path).open(encoding="utf-8-sig") as file:
             if not (line := file.readline(_MAX_LINE_BYTES)):
                 raise JaxmarkError(f"{path} is empty; give a file that `jaxmark catalogue export` wrote.")
             while line:

@@ -443,7 +443,7 @@ class Finder(Generic[AnyOriginals]):
         tracer = make_tracer(pair.original, key, record=record)
         mark, aligned = tracer.mark, tracer.register(pair.suspect, self.align)
         charge = ledger.ORIGINALS.charge("copy", pair.readings)
-        tested = [entry.charged(charge) for entry in tracer.read(aligned, recipients)]
+        tested = [entry.charged(charge) for entry in tracer.rank(aligned, recipients)]
         likely = tuple(entry.recipient for entry in tested if entry.log10_p <= math.log10(self.alpha))
         accused, estimates = ((), likely) if mark.caveats else (likely, ())
         likeliest = min(tested, key=lambda entry: entry.log10_p, default=None)

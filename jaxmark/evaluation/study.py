@@ -26,6 +26,7 @@ from jaxmark.evaluation.cells import Cell, Pool, run
 from jaxmark.evaluation.study_results import Results
 from jaxmark.files import load_mesh
 from jaxmark.files.atomic import read_file
+from jaxmark.files.typed import decode
 from jaxmark.geometry.canonical import geometry_hash
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.scheme import BlindScheme
@@ -317,10 +318,10 @@ def load_study(path: str | os.PathLike[str]) -> Study:
     """
     name = os.fspath(path)
     try:
-        declared = tomllib.loads(read_file(path, _MAX_FILE_BYTES).decode("utf-8"))
+        declared = tomllib.loads(decode(read_file(path, _MAX_FILE_BYTES)))
     except OSError as error:
         raise JaxmarkError(f"Cannot read {name}: {error.strerror}.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, JaxmarkError) as error:
         raise JaxmarkError(f"{name} is no TOML: {error}.") from None
     for part in ("meshes", "attacks"):
         if part not in declared:

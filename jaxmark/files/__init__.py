@@ -1,4 +1,4 @@
-"""Read and write mesh files (OBJ, PLY, OFF, STL, GLB, glTF, 3MF) and point clouds (also XYZ, LAS, LAZ).
+"""Read and write mesh files (OBJ, PLY, OFF, STL, GLB, VRM, glTF, 3MF) and point clouds (also XYZ, LAS, LAZ).
 
 A file is saved by patching the file that it was loaded from: all bytes except those of positions and normals stay.
 """
@@ -41,14 +41,16 @@ _FORMATS: dict[str, Callable[..., Source]] = {
     ".stl": stl.parse,
     ".glb": asset.parse,
     ".gltf": asset.parse,
+    ".vrm": asset.parse,
     ".3mf": threemf.parse,
     ".xyz": point_cloud.parse_xyz,
     ".las": point_cloud.parse_las,
     ".laz": point_cloud.parse_las,
 }
 SUFFIXES = tuple(_FORMATS)
-# A file's numbers keep a displacement well enough if its RMS is at least this many times their spacing.
-_MIN_SPACINGS = 10
+_MOST_LOST = 0.9  # RMS of what rounding adds to a displacement, over the RMS of the displacement; readers decide below
+_NOTED_LOSS = 0.05  # of the same, from which rounding is reported
+_MIN_SPACINGS = 10  # numbers keep a displacement well if its RMS is this many times their spacing
 _ONLY = "mesh"  # name of the mesh in a file that has just one
 
 
@@ -69,8 +71,8 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
     triangles (v0, v1, v2), (v0, v2, v3), …, for computing only.
 
     Args:
-        path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary), GLB, glTF, 3MF, XYZ (text), LAS or LAZ
-            file.
+        path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary), GLB, VRM (a GLB), glTF, 3MF, XYZ (text),
+            LAS or LAZ file.
 
     Returns:
         NumPy arrays: float64 vertices in the file's units, int64 faces.
@@ -137,7 +139,7 @@ def load_skin(path: str | os.PathLike) -> Skinning:
     return skin
 
 
-def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | None = None) -> None:
+def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | None = None) -> tuple[str, ...]:
     """Write a mesh to a file, atomically.
 
     Args:
@@ -149,18 +151,21 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | 
             to come along: a buffer that changes is named after the new file, the others are copied where they are not
             there already.
 
+    Returns:
+        Sentences about content that could not stay as it was; usually none.
+
     Raises:
         JaxmarkError: if `path` has another suffix than `like`, the mesh has other faces or another number of
-            vertices, the file cannot be read or written, or its numbers are too coarse for what changed: their
-            spacing exceeds a tenth of the root mean square displacement of the vertices.
+            vertices, the file cannot be read or written, or its numbers are too coarse for what changed: rounding
+            takes more than 90 % of the root mean square displacement of the vertices.
     """
     mesh = host_mesh(mesh)
     if like is None:
         from jaxmark.files.export import encode_new
 
         write_atomically(path, encode_new(mesh, _suffix(path), partial(_parse, path)))
-    else:
-        _save_whole(mesh, _source_of(path, like), path, like)
+        return ()
+    return _save_whole(mesh, _source_of(path, like), path, like)
 
 
 def _save_whole(mesh: Mesh, source: Source, path: str | os.PathLike, like: str | os.PathLike) -> tuple[str, ...]:
@@ -207,14 +212,19 @@ def number_check(like: str | os.PathLike) -> Callable[[str, Mesh], None]:
     """Make a function (name, mesh) that checks whether a file's numbers are precise enough for changed vertices.
 
     The function raises a `JaxmarkError` if they are not, see `save_mesh`.
+
+    Raises:
+        JaxmarkError: if the file cannot be read, or cannot be written with other positions.
     """
     source = _read(like)
+    if source.fixed:
+        raise JaxmarkError(f"{os.fspath(like)}: {source.fixed}")
     places = _places(source)
 
     def check(name: str, mesh: Mesh) -> None:
         positions = source.positions.copy()
         positions[places[name]] = mesh.vertices
-        _check_spacing(source, positions, places[name])
+        _check_rounding(source, positions, places[name])
 
     return check
 
@@ -236,7 +246,7 @@ def _suffix(path: str | os.PathLike) -> str:
 def _parse(path: str | os.PathLike, data: bytes) -> Source:
     """Parse the bytes of a file; files of some formats refer to other files in the same folder."""
     suffix = _suffix(path)
-    beside = (read_beside(Path(path).parent),) if suffix in (".glb", ".gltf") else ()
+    beside = (read_beside(Path(path).parent),) if _FORMATS[suffix] is asset.parse else ()
     return _FORMATS[suffix](data, *beside)
 
 
@@ -269,8 +279,11 @@ def _source_of(path: str | os.PathLike, like: str | os.PathLike) -> Source:
 def _save(source: Source, positions: np.ndarray, path: str | os.PathLike, like: str | os.PathLike) -> tuple[str, ...]:
     """Write a source with other positions, and the files beside it; refused if its numbers are too coarse."""
     with concerning(os.fspath(like)):
-        moved = [_check_spacing(source, positions, places) for places in _places(source).values()]
-        patched = source.patch(positions if any(moved) else source.positions, Path(path).stem)
+        lost = [_check_rounding(source, positions, places) for places in _places(source).values()]
+        moved = any(loss is not None for loss in lost)
+        if moved and source.fixed:
+            raise JaxmarkError(source.fixed)
+        patched = source.patch(positions if moved else source.positions, Path(path).stem)
     beside = dict(patched.beside)
     here, there = Path(like).parent, Path(path).parent
     if os.path.realpath(here) != os.path.realpath(there):
@@ -278,22 +291,31 @@ def _save(source: Source, positions: np.ndarray, path: str | os.PathLike, like: 
             with suppress(JaxmarkError):  # a file that is missing already, or lies elsewhere, does not come along
                 beside[companion] = read_beside(here)(companion)
     write_together(path, patched.file, beside)
-    return patched.notes
+    most = max((loss or 0.0 for loss in lost), default=0.0)
+    noted = (f"rounding to the numbers of the file changes the displacement by {100 * most:.0f} %",)
+    return patched.notes + noted * (most > _NOTED_LOSS)
 
 
-def _check_spacing(source: Source, positions: Points, places: Indices) -> bool:
-    """Refuse numbers that are too coarse for the displacement of a mesh; returns whether anything moved."""
+def _check_rounding(source: Source, positions: Points, places: Indices) -> float | None:
+    """Refuse numbers that are too coarse for the displacement of a mesh.
+
+    Returns the RMS of what rounding adds to the displacement, over the RMS of the displacement; None if nothing moves.
+    """
+    wanted = positions[places]
     with np.errstate(all="ignore"):
-        moved = np.abs(positions[places] - source.positions[places])
-        largest = moved.max(initial=0.0)
+        moved = wanted - source.positions[places]
+        largest = np.abs(moved).max(initial=0.0)
         if largest == 0:
-            return False
-        rms = float(largest * np.sqrt(np.square(moved / largest).sum(axis=1).mean()))  # scaled: squares may overflow
-    spacing = source.coordinates.spacing(positions, places)
-    if not spacing <= rms / _MIN_SPACINGS:
+            return None
+        added = source.coordinates.rounded(positions, places) - wanted
+        # Scaled, because squares may overflow.
+        rms, lost = (float(np.sqrt(np.square(one / largest).sum(axis=1).mean())) for one in (moved, added))
+    if not lost <= _MOST_LOST * rms:
+        spacing = source.coordinates.spacing(positions, places)
+        step = largest * rms / _MIN_SPACINGS
         raise JaxmarkError(
-            f"The mesh differs from the file by {rms:.3g} (root mean square over the vertices, in file units),"
-            f" but the file's numbers are {spacing:.3g} apart, more than a tenth of that;"
-            f" {source.coordinates.advice(rms / _MIN_SPACINGS)}, or change it more."
+            f"The mesh differs from the file by {largest * rms:.3g} (root mean square over the vertices, in file"
+            f" units), but the file's numbers are {spacing:.3g} apart, so that rounding takes"
+            f" {100 * lost / rms:.0f} % of that; {source.coordinates.advice(step)}, or change it more."
         )
-    return True
+    return lost / rms

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.source import Changes, Indices, Overlay, Rows, changed
+from jaxmark.files.source import Changes, Indices, Overlay, Rows, SomeRows, changed
 
-_MAX_CLIPPED = 1e-3  # of the range of integers
+_HELD = 0.02  # how far beyond the range of integers a number may be, to be held at its end; see `BinaryNumbers`
 INTEGER_ADVICE = "declare its coordinates as float or double instead of integers"
 
 
@@ -21,10 +21,10 @@ def gather(data: bytes | bytearray, offsets: Int64[np.ndarray, "..."], dtype: np
     return rows.view(dtype)[..., 0]
 
 
-def encode(values: Float64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.ndarray, "..."]:
+def encode(values: Float64[np.ndarray, "..."], dtype: np.dtype, slack: float = 0.0) -> Shaped[np.ndarray, "..."]:
     """Convert finite numbers to a type, rounded to nearest; numbers beyond its range are refused.
 
-    Integers that are hardly out of range are clipped.
+    Integers that are out of range by at most `slack` are held at its end.
     """
     if dtype.kind == "f":
         with np.errstate(over="ignore", under="ignore"):
@@ -34,8 +34,7 @@ def encode(values: Float64[np.ndarray, "..."], dtype: np.dtype) -> Shaped[np.nda
         limits = np.iinfo(dtype)
         rounded = np.rint(values)
         clipped = np.clip(rounded, limits.min, limits.max)
-        # Positions at the end of the range may be moved beyond it, by next to nothing.
-        fits = np.abs(rounded - clipped) <= _MAX_CLIPPED * (float(limits.max) - float(limits.min))
+        fits = np.abs(rounded - clipped) <= slack
         coded = np.where(fits, clipped, 0).astype(dtype)
     if not fits.all():
         raise JaxmarkError(f"The number {values[~fits][0]:g} is beyond the range of the file's {dtype.name} numbers.")
@@ -48,7 +47,12 @@ def overlay(starts: Indices, coded: Shaped[np.ndarray, " numbers"]) -> Overlay:
 
 
 class BinaryNumbers:
-    """Triples of numbers in a binary file; see `Numbers`."""
+    """Triples of numbers in a binary file; see `Numbers`.
+
+    Quantised positions often fill the range of their integers, so that a mark moves some beyond it. These are held at
+    the end of the range if they are beyond it by at most 2 % of it, or, for integers of four bytes, whose range nothing
+    fills, by 2 % of the extent of the numbers.
+    """
 
     values: Rows
 
@@ -81,17 +85,42 @@ class BinaryNumbers:
     def edits(self, values: Rows) -> Changes:
         """Return the overlays, one a column, that write all numbers that changed."""
         moved, overlays = changed(self.values, values), Changes()
-        stored = (values if self._origin is None else values - self._origin) / self._unit
-        for axis, dtype in enumerate(self._types):
+        for axis in range(3):
             rows = np.flatnonzero(moved[:, axis])
-            overlays.append(overlay(self._offsets[rows, axis], encode(stored[rows, axis], dtype)))
+            overlays.append(overlay(self._offsets[rows, axis], self._encode(values[rows, axis], axis)))
         return overlays
+
+    def rounded(self, values: Rows, rows: Indices) -> SomeRows:
+        """Return the numbers of some rows as they are read back once they are written."""
+        unit, origin = self._scale
+        moved = changed(self.values[rows], values[rows])
+        result = self.values[rows]
+        for axis in range(3):
+            coded = self._encode(values[rows[moved[:, axis]], axis], axis)
+            result[moved[:, axis], axis] = coded.astype(np.float64) * unit[axis] + origin[axis]
+        return result
+
+    @property
+    def _scale(self) -> tuple[np.ndarray, np.ndarray]:
+        """The number that a stored 1 stands for in each column, and the one that a 0 stands for."""
+        return np.broadcast_to(self._unit, 3), np.zeros(3) if self._origin is None else self._origin
+
+    def _encode(self, values: Float64[np.ndarray, " rows"], axis: int) -> Shaped[np.ndarray, " rows"]:
+        (unit, origin), dtype = self._scale, self._types[axis]
+        reach = 0.0
+        if dtype.kind != "f":
+            limits, extent = np.iinfo(dtype), float(np.ptp(self.values[:, axis])) / unit[axis]
+            reach = extent if dtype.itemsize > 2 else float(limits.max) - float(limits.min)
+        return encode((values - origin[axis]) / unit[axis], dtype, _HELD * reach)
 
     def spacing(self, values: Rows, rows: Indices) -> float:
         """Return the largest distance from a column's largest number to the next one, a unit for integers."""
-        largest = np.abs(values[rows]).max(axis=0, initial=0.0) / self._unit
-        coded = [encode(largest[axis : axis + 1], dtype) for axis, dtype in enumerate(self._types)]
-        return float(self._unit) * max(float(np.spacing(top[0])) if top.dtype.kind == "f" else 1.0 for top in coded)
+        largest = np.abs(values[rows]).max(axis=0, initial=0.0)
+        steps = [
+            float(np.spacing(encode(largest[axis : axis + 1], dtype)[0])) if dtype.kind == "f" else self._scale[0][axis]
+            for axis, dtype in enumerate(self._types)
+        ]
+        return float(max(steps))
 
     def advice(self, step: float) -> str:
         """Advise a type that is fine enough."""

@@ -25,7 +25,7 @@ def encode_new(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> byt
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if suffix in _CLOUDS and len(faces):
         raise JaxmarkError(f"{suffix[1:].upper()} files hold points without faces; save the mesh as PLY or OBJ.")
-    if suffix in (".stl", ".glb", ".gltf", ".3mf") and not len(faces):
+    if suffix in (".stl", ".glb", ".vrm", ".gltf", ".3mf") and not len(faces):
         raise JaxmarkError(f"A new {suffix[1:].upper()} file holds faces; save the point cloud as PLY or XYZ.")
     if suffix in (".las", ".laz"):
         advice = "pass the one it came from as `like`, or use PLY or XYZ"
@@ -46,7 +46,8 @@ def encode_new(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> byt
             if suffix == ".gltf":
                 (data,) = export_gltf(trimesh.Scene(whole), embed_buffers=True).values()
             else:
-                data = bytes(whole.export(file_type=suffix[1:]))  # type: ignore[arg-type]
+                kind = "glb" if suffix == ".vrm" else suffix[1:]
+                data = bytes(whole.export(file_type=kind))  # type: ignore[arg-type]
             if suffix == ".stl":
                 vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
             vertices = _single(vertices, suffix)

@@ -79,7 +79,7 @@ def parse(data: bytes) -> Source:
         numbers = text.triples(normals, 1, "a normal needs three numbers")
         # A wrong index of a normal is no reason to refuse the file.
         used = referred(normals, second + 1, ends, np.flatnonzero(second + 1 < ends))
-        source.normals = Transported(numbers, used[triangles])
+        source.normals = [Transported(numbers, used[triangles])]
     return source
 
 

@@ -55,5 +55,5 @@ def parse(data: bytes) -> Source:
         lambda bad: f"the face refers to vertex {index[bad]}, but there are {points}, numbered from 0",
     )
     faces = index[fan(sizes)]
-    normals = Transported(TextNumbers(text, vertices[:, None] + np.arange(3, 6)), faces) if header[2] else None
+    normals = [Transported(TextNumbers(text, vertices[:, None] + np.arange(3, 6)), faces)] if header[2] else []
     return Source(data, coordinates, faces, normals)

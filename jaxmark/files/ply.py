@@ -20,6 +20,7 @@ _TYPES = {
 }
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _SURFACES = ("face", "tristrips")  # the elements that hold triangles
+_INDICES = ("vertex_indices", "vertex_index")  # names of the list of a face's corners
 _NONE = np.zeros(0, np.int64)
 
 
@@ -86,9 +87,10 @@ _Body = _Tokens | _Bytes
 
 
 def parse(data: bytes) -> Source:
-    """Read the positions, the faces and, if they are floats, the normals `nx ny nz`, in any order of the elements.
+    """Read positions, faces and normals, in any order of the elements.
 
-    Triangle strips are faces as well, and follow those of the element face.
+    Normals are `nx ny nz` of vertices and of faces, if they are floats. Triangle strips are faces as well, and follow
+    those of the element face.
 
     Raises:
         JaxmarkError: if the header or the body cannot be read, or the file ends too early.
@@ -106,14 +108,26 @@ def parse(data: bytes) -> Source:
     declared = {element.name: element for element in elements}
     vertex = declared.get("vertex", _Element("vertex", 0)).properties
     coordinates = _triples(body, vertex, ("x", "y", "z"))
+    if coordinates is None and "packed_position" in vertex:
+        raise JaxmarkError("The file is a compressed splat; save it as uncompressed PLY, for example in SuperSplat.")
     if coordinates is None:
         raise JaxmarkError("The header declares no element vertex with the numbers x, y and z.")
     faces = np.concatenate([_surface(body, declared.get(name, _Element(name, 0))) for name in _SURFACES])
-    normals = _triples(body, vertex, ("nx", "ny", "nz"))
-    if normals is None or any(vertex[name].type.kind != "f" for name in ("nx", "ny", "nz")):
-        return Source(data, coordinates, faces)
     outside = (faces < 0) | (faces >= len(coordinates.values))  # `make_mesh` refuses these with a better message
-    return Source(data, coordinates, faces, Transported(normals, np.where(outside, -1, faces)))
+    polygons = declared.get("face", _Element("face", 0)).properties
+    sizes = next((kind.sizes for name, kind in polygons.items() if name in _INDICES), _NONE)
+    polygon = np.full(len(faces), -1)  # of each triangle; strips have none
+    polygon[: (sizes - 2).sum()] = np.repeat(np.arange(len(sizes)), sizes - 2)
+    corners = (vertex, np.where(outside, -1, faces)), (polygons, np.stack([polygon] * 3, axis=1))
+    pairs = [(_normals(body, element), used) for element, used in corners]
+    return Source(data, coordinates, faces, [Transported(one, used) for one, used in pairs if one is not None])
+
+
+def _normals(body: _Body, properties: dict[str, _Property]) -> TextNumbers | BinaryNumbers | None:
+    """Read the normals of vertices or faces; None if there are none, or they are not floats."""
+    names = ("nx", "ny", "nz")
+    floats = all(name in properties and properties[name].type.kind == "f" for name in names)
+    return _triples(body, properties, names) if floats else None
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
@@ -225,10 +239,10 @@ def _ended(element: _Element, row: int) -> JaxmarkError:
 
 
 def _triples(
-    body: _Body, vertex: dict[str, _Property], names: tuple[str, str, str]
+    body: _Body, properties: dict[str, _Property], names: tuple[str, str, str]
 ) -> TextNumbers | BinaryNumbers | None:
-    """Read three scalar properties of the vertices; None if they are not declared."""
-    kinds = [vertex[name] for name in names if name in vertex and vertex[name].length is None]
+    """Read three scalar properties of an element; None if they are not declared."""
+    kinds = [properties[name] for name in names if name in properties and properties[name].length is None]
     if len(kinds) < 3:
         return None
     return body.numbers(np.stack([kind.starts for kind in kinds], axis=1), [kind.type for kind in kinds])
@@ -236,7 +250,7 @@ def _triples(
 
 def _surface(body: _Body, element: _Element) -> Faces:
     """Read the triangles of the element face or tristrips; none if it has no properties."""
-    name = next((name for name in ("vertex_indices", "vertex_index") if name in element.properties), None)
+    name = next((name for name in _INDICES if name in element.properties), None)
     if name is None:
         if element.properties:
             raise JaxmarkError(f"The element {element.name} has no list vertex_indices or vertex_index.")

@@ -19,6 +19,7 @@ _BOX = 179  # byte offset of the header's bounding box: largest and smallest x, 
 _INTEGER = np.dtype("<i4")
 _HEADER_BYTES, _HEADER_BYTES_1_4 = 227, 375
 _RECORD_BYTES, _EXTENDED_BYTES = 54, 60  # of a variable length record at least, and of one behind the points
+_OCTREE = range(377, 381)  # byte offsets of the word that begins the octree of cloud-optimised point clouds
 _NO_FACES = np.zeros((0, 3), np.int64)
 
 
@@ -58,7 +59,15 @@ def parse_las(data: bytes) -> Source:
         raise JaxmarkError(f"This is no LAZ file that laspy reads: {error}.") from None
     if _check_counts(unpacked) != count:
         raise JaxmarkError(f"This LAZ file is damaged: it does not hold the {count} points of its header.")
-    return _Compressed(unpacked, ScaledNumbers(unpacked, _read(unpacked).header), _NO_FACES)
+    octree = data[_OCTREE.start : _OCTREE.stop] == b"copc"
+    return _Compressed(
+        unpacked,
+        ScaledNumbers(unpacked, _read(unpacked).header),
+        _NO_FACES,
+        fixed="The file is a cloud-optimised point cloud (COPC), which is not written; save it as plain LAZ or LAS."
+        if octree
+        else "",
+    )
 
 
 class ScaledNumbers(BinaryNumbers):
@@ -83,7 +92,7 @@ class ScaledNumbers(BinaryNumbers):
 
     def spacing(self, values: Rows, rows: Indices) -> float:
         """Return the largest scale, or the spacing of double precision if that is larger."""
-        return max(float(self._scales.max()), float(np.spacing(np.abs(values[rows]).max(initial=0.0))))
+        return max(super().spacing(values, rows), float(np.spacing(np.abs(values[rows]).max(initial=0.0))))
 
     def advice(self, step: float) -> str:
         """Advise a scale."""
@@ -99,7 +108,10 @@ class _Compressed(Source):
 
 def _write(cloud: Any, *, packed: bool) -> bytes:
     out = io.BytesIO()
-    cloud.write(out, do_compress=packed)
+    try:
+        cloud.write(out, do_compress=packed)
+    except Exception as error:  # laspy and its encoders raise various exceptions for what they cannot write
+        raise JaxmarkError(f"laspy cannot write this LAZ file: {_reason(error)}; save it as LAS.") from error
     return out.getvalue()
 
 
@@ -108,8 +120,11 @@ def _read(data: bytes) -> Any:
     try:
         return laspy.read(io.BytesIO(data))
     except Exception as error:  # laspy and its decoders raise various exceptions where bytes are wrong
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise JaxmarkError(f"This is no LAS or LAZ file that laspy reads: {reason}.") from error
+        raise JaxmarkError(f"This is no LAS or LAZ file that laspy reads: {_reason(error)}.") from error
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split()).rstrip(".") or type(error).__name__
 
 
 def _check_counts(data: bytes) -> int:

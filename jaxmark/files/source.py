@@ -18,6 +18,7 @@ from jaxmark.geometry.skinning import Skinning
 _ANTIPARALLEL = 1e-6  # largest 1 + cos of a rotation's angle at which the minimal rotation is ill-defined
 
 Rows = Float64[np.ndarray, "rows 3"]
+SomeRows = Float64[np.ndarray, "some 3"]  # as many as are asked for
 Faces = Int64[np.ndarray, "faces 3"]
 Indices = Int64[np.ndarray, " _"]  # or byte offsets
 Texture = Float64[np.ndarray, "faces 3 2"] | None
@@ -45,13 +46,17 @@ Changes = list[Edits | Overlay]
 class Numbers(Protocol):
     """Triples of numbers in a file: its positions or normals.
 
-    Edits and spacing raise a `JaxmarkError` if a new value is beyond the range of the file's numbers.
+    Edits and rounding raise a `JaxmarkError` if a new value is beyond the range of the file's numbers.
     """
 
     values: Rows
 
     def edits(self, values: Rows) -> Changes:
         """Return the edits that write new values; numbers that did not change are not touched."""
+        ...
+
+    def rounded(self, values: Rows, rows: Indices) -> SomeRows:
+        """Return some rows of the new values as they are read back once they are written."""
         ...
 
     def spacing(self, values: Rows, rows: Indices) -> float:
@@ -75,11 +80,25 @@ class JoinedNumbers:
         pieces = zip(self._parts, np.split(values, self._ends[:-1]), strict=True)
         return [edit for part, piece in pieces for edit in part.edits(piece)]
 
+    def rounded(self, values: Rows, rows: Indices) -> SomeRows:
+        """Round each part on its own."""
+        result = np.empty((len(rows), 3))
+        for part, piece, mine, own in self._pieces(values, rows):
+            result[mine] = part.rounded(piece, own)
+        return result
+
     def spacing(self, values: Rows, rows: Indices) -> float:
         """Return the largest spacing of the parts that the rows are in."""
+        return max(part.spacing(piece, own) for part, piece, _, own in self._pieces(values, rows))
+
+    def _pieces(
+        self, values: Rows, rows: Indices
+    ) -> Iterator[tuple[Numbers, Rows, Bool[np.ndarray, " some"], Indices]]:
+        """Yield each part that some rows are in: it, its values, the mask of its rows, and these in its own count."""
         pieces, starts = np.split(values, self._ends[:-1]), [0, *self._ends]
         place = np.searchsorted(self._ends, rows, side="right")
-        return max(self._parts[k].spacing(pieces[k], rows[place == k] - starts[k]) for k in np.unique(place))
+        for k in np.unique(place):
+            yield self._parts[k], pieces[k], place == k, rows[place == k] - starts[k]
 
     def advice(self, step: float) -> str:
         """Advise what the first part advises."""
@@ -174,21 +193,23 @@ class Source:
         data: the file's bytes.
         coordinates: the positions in the file.
         faces: zero-based indices into the positions; polygons are split into triangles.
-        normals: the normals that follow the positions, if the file has any.
+        normals: the normals that follow the positions.
         texture: reads the texture coordinates of each face's corners, NaN where there are none; None without any.
         skin: reads which joints move each point; None without any.
         parts: the meshes in the file that can be marked; empty if there is just one in it.
         skipped: the other meshes by name, and the reasons why they cannot be marked.
+        fixed: a sentence why the file cannot be written with other positions; empty if it can.
     """
 
     data: bytes
     coordinates: Numbers
     faces: Faces
-    normals: Transported | PerFace | None = None
+    normals: Sequence[Transported | PerFace] = ()
     texture: Callable[[], Texture] = read_nothing
     skin: Callable[[], Skinning | None] = read_nothing
     parts: Sequence[Part] = ()
     skipped: Mapping[str, str] = field(default_factory=dict)
+    fixed: str = ""
 
     @property
     def positions(self) -> Points:
@@ -198,8 +219,8 @@ class Source:
     def spliced(self, positions: Points) -> bytes:
         """Write these positions, and the normals that follow them, into the data."""
         edits = self.coordinates.edits(positions)
-        if self.normals is not None:
-            edits += self.normals.numbers.edits(self.normals.moved(self.positions, positions, self.faces))
+        for normals in self.normals:
+            edits += normals.numbers.edits(normals.moved(self.positions, positions, self.faces))
         return splice(self.data, edits)
 
     def patch(self, positions: Points, name: str) -> Patched:

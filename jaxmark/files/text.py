@@ -10,7 +10,7 @@ from jaxtyping import Bool, Int64, Shaped
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.binary import INTEGER_ADVICE
-from jaxmark.files.source import Changes, Edits, Indices, Rows, changed
+from jaxmark.files.source import Changes, Edits, Indices, Rows, SomeRows, changed
 
 # The bytes that bytes.split() takes for white space.
 _SPACE = np.zeros(256, dtype=bool)
@@ -219,6 +219,18 @@ class TextNumbers:
             tokens[index] = tokens[index].lstrip(b"-")
         differs = read != self.values.reshape(-1)[moved]
         return [Edits(self._starts[moved[differs]], self._ends[moved[differs]], tokens[differs].tolist())]
+
+    def rounded(self, values: Rows, rows: Indices) -> SomeRows:
+        """Return the numbers of some rows as they are read back once they are written, up to the last bit."""
+        style, result = self._style, self.values[rows]
+        moved = changed(result, values[rows])
+        new, exponent = values[rows][moved], style.exponent.reshape(-1, 3)[rows][moved]
+        with np.errstate(divide="ignore"):
+            digits = np.where(exponent, style.mantissa - np.floor(np.log10(np.abs(new))), style.decimals)
+        unit = 10.0 ** -np.clip(digits, -300, 300)
+        # Larger numbers have no more digits than are written.
+        result[moved] = np.where(np.abs(new) < 2.0**53 * unit, np.rint(new / unit) * unit, new)
+        return result
 
     def spacing(self, values: Rows, rows: Indices) -> float:
         """Return the largest step of the last digit of numbers that change, or that of double precision if larger."""

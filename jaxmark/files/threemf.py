@@ -23,6 +23,7 @@ _DEFAULT = "3D/3dmodel.model"
 # Relationships of encrypted content; namespaces alone are declared by programs that encrypt nothing.
 _SECURED = (b"schemas.microsoft.com/3dmanufacturing/2019/04/keystore", b"package/2006/relationships/encryptedfile")
 _SIGNED = b"package/2006/relationships/digital-signature/"
+_SIGNED_FILE = "The file is signed, and a mark would break the signature; mark it before it is signed."
 _SIGNATURES = ("_xmlsignatures/", "package/services/digital-signature/")
 
 
@@ -80,7 +81,7 @@ def parse(data: bytes) -> Source:
         skipped=skipped,
         archive=archive,
         models=models,
-        signed=signed,
+        fixed=_SIGNED_FILE if signed else "",
     )
 
 
@@ -137,7 +138,7 @@ def _read_objects(
         name, numbers, faces = next(names), TextNumbers(text, next(pieces)), text.read(next(pieces), int)
         outside = ((faces < 0) | (faces >= len(numbers.values))).any(axis=1)
         if not len(faces):
-            skipped[name] = "it has no triangles"
+            skipped[name] = "it has no triangles, and beams and the like cannot be marked"
         elif outside.any():
             bad = int(np.argmax(outside))
             skipped[name] = (
@@ -155,7 +156,6 @@ class _ThreemfSource(Source):
 
     archive: Archive
     models: Sequence[_Model]
-    signed: bool
 
     def patch(self, positions: Points, name: str) -> Patched:
         """Write these positions into the file; members whose positions do not change stay as they are packed."""
@@ -167,6 +167,4 @@ class _ThreemfSource(Source):
                 contents[model.member.name] = content
         if not contents:
             return Patched(self.data)
-        if self.signed:
-            raise JaxmarkError("The file is signed, and a mark would break the signature; mark it before it is signed.")
         return Patched(self.archive.replaced(contents))

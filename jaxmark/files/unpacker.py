@@ -46,7 +46,11 @@ def _laz() -> Callable[[bytes], dict[str, np.ndarray]]:
 
     def unpack(data: bytes) -> dict[str, np.ndarray]:
         out = io.BytesIO()
-        laspy.read(io.BytesIO(data)).write(out, do_compress=False)
+        cloud = laspy.read(io.BytesIO(data))
+        for records in (cloud.header.vlrs, cloud.header.evlrs or []):
+            # The octree of a cloud-optimised point cloud says where packed points lie, and laspy does not write it.
+            records[:] = [record for record in records if record.user_id != "copc"]
+        cloud.write(out, do_compress=False)
         return {"las": np.frombuffer(out.getvalue(), np.uint8)}
 
     return unpack

@@ -19,6 +19,7 @@ from jaxmark.alignment.original import make_original
 from jaxmark.alignment.pairing import pair
 from jaxmark.alignment.result import Align, Alignment
 from jaxmark.errors import JaxmarkError
+from jaxmark.files.typed import find_name
 from jaxmark.geometry.mesh import Mesh, check_mesh
 from jaxmark.watermark.blind import reading as blind_reading
 from jaxmark.watermark.blind.scheme import BlindScheme
@@ -368,6 +369,7 @@ def detect_scene(
             `detect`.
     """
     marked = originals if record is None else record.meshes
+    names = [find_name(name, originals) or name for name in names]
     # The order of a file's meshes decides which of equal meshes counts; a record's digest does not cover it.
     chosen = sorted(name for name in marked if name in names or not names)
     for name in (*chosen, *names):

@@ -10,7 +10,7 @@ import trimesh
 from trimesh.visual import TextureVisuals
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import load_mesh, load_texture
+from jaxmark.files import load_mesh, load_texture, save_mesh
 from tests.files.helpers import loaded, noisy, patched, shifted, turned, written
 
 pytestmark = pytest.mark.core
@@ -112,6 +112,36 @@ def test_normals_turn(tmp_path: Path) -> None:
     _, bin_ = split(patched(source, turned(load_mesh(source))))
     for vertex in range(3):
         np.testing.assert_allclose(struct.unpack_from("<3f", bin_, 28 * vertex + 16), [1, 0, 0], atol=1e-7)
+
+
+@pytest.mark.parametrize("normals", [[(0, -1, 0)] * 3, [(0, -1, 0), (0, -2, 0), (np.nan, 0, 0)]])
+def test_bounds_of_normals_follow(tmp_path: Path, normals: list[tuple[float, float, float]]) -> None:
+    content, bin_ = document(), bytearray(BIN)
+    for vertex, normal in enumerate(normals):
+        struct.pack_into("<3f", bin_, 28 * vertex + 16, *normal)
+    content["accessors"][2] |= {"min": [0, -1, 0], "max": [0, -1, 0]}
+    source = written(tmp_path, "a.glb", glb(json.dumps(content), bytes(bin_)))
+    assert patched(source, load_mesh(source)) == source.read_bytes()
+    text, bin_ = split(patched(source, turned(load_mesh(source))))
+    found = np.array([struct.unpack_from("<3f", bin_, 28 * vertex + 16) for vertex in range(3)])
+    accessor = json.loads(text)["accessors"][2]
+    assert accessor["min"] == np.nanmin(found, axis=0).tolist()
+    assert accessor["max"] == np.nanmax(found, axis=0).tolist()
+
+
+def test_an_avatar_is_a_glb_whose_extensions_stay(tmp_path: Path) -> None:
+    content = document() | {
+        "extensionsUsed": ["VRM", "VRMC_vrm"],
+        "extensions": {"VRM": {"meta": {"title": "\u00e9"}, "humanoid": {"humanBones": []}}, "VRMC_vrm": {"x": 1.50}},
+    }
+    source = written(tmp_path, "a.vrm", glb(json.dumps(content)))
+    mesh = load_mesh(source)
+    text, _ = split(patched(source, noisy(mesh, 0.1)))
+    found = json.loads(text)
+    assert found["extensions"] == content["extensions"]
+    assert found["extensionsUsed"] == content["extensionsUsed"]
+    save_mesh(mesh, tmp_path / "new.vrm")
+    np.testing.assert_array_equal(load_mesh(tmp_path / "new.vrm").vertices, mesh.vertices)
 
 
 def test_a_mesh_that_no_node_uses(tmp_path: Path) -> None:

@@ -251,8 +251,27 @@ def test_quantised_positions_move_by_their_own_step(tmp_path: Path, normalised: 
     np.testing.assert_allclose(again, np.minimum(moved, 32767 * step), atol=0.501 * step)
     text = json.loads((tmp_path / "b.glb").read_bytes()[20:].split(b"BIN\0")[0][:-4].decode())
     assert text["accessors"][0]["max"] == np.rint(again.max(0) / step).tolist()
-    with pytest.raises(JaxmarkError, match="apart"):
-        save_mesh(mesh._replace(vertices=mesh.vertices + 3 * step), tmp_path / "c.glb", like=tmp_path / "a.glb")
+    for share, loss in ((3, 0), (0.7, 43), (0.6, 67)):
+        moved = mesh._replace(vertices=np.asarray(mesh.vertices) - np.sign(mesh.vertices) * share * step)
+        notes = save_mesh(moved, tmp_path / "c.glb", like=tmp_path / "a.glb")
+        assert notes == ((f"rounding to the numbers of the file changes the displacement by {loss} %",) * (loss > 0))
+    with pytest.raises(JaxmarkError, match="rounding takes 100 %"):
+        save_mesh(mesh._replace(vertices=0.4 * step + mesh.vertices), tmp_path / "c.glb", like=tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize("normalised", [False, True])
+def test_quantised_positions_are_held_at_the_end_of_their_range(tmp_path: Path, normalised: bool) -> None:
+    document, data = quantised(normalised)
+    (tmp_path / "a.glb").write_bytes(glb(json.dumps(document), data))
+    mesh = load_mesh(tmp_path / "a.glb")
+    step = 1 / 32767 if normalised else 1
+    for factor in (1.005, 1.03):  # by up to 164 and 983 steps beyond the range of 65,536
+        moved = mesh._replace(vertices=factor * np.asarray(mesh.vertices))
+        save_mesh(moved, tmp_path / "b.glb", like=tmp_path / "a.glb")
+        again = np.asarray(load_mesh(tmp_path / "b.glb").vertices)
+        np.testing.assert_allclose(again, np.clip(moved.vertices, -32768 * step, 32767 * step), atol=0.501 * step)
+    with pytest.raises(JaxmarkError, match="beyond the range"):
+        save_mesh(mesh._replace(vertices=1.05 * mesh.vertices), tmp_path / "c.glb", like=tmp_path / "a.glb")
 
 
 def compressed(joints: type) -> tuple[dict[str, Any], bytes]:
@@ -323,6 +342,37 @@ def test_draco_is_decoded_and_encoded_again(tmp_path: Path, joints: type) -> Non
         by_id = {item["unique_id"]: item["data"] for item in found.attributes}
         ids = text["meshes"][0]["primitives"][0]["extensions"]["KHR_draco_mesh_compression"]["attributes"]
         np.testing.assert_array_equal(by_id[ids["JOINTS_0"]], np.arange(4 * len(BALLS[0].vertices)).reshape(-1, 4) % 7)
+
+
+@pytest.mark.parametrize("joints", [np.uint8, np.int16])
+@pytest.mark.parametrize("shared", [False, True])
+def test_nothing_is_left_of_draco_and_later_bytes_follow(tmp_path: Path, joints: type, shared: bool) -> None:
+    """An image behind the compressed view, which two primitives may share."""
+    document, data = compressed(joints)
+    image = b"a picture "
+    document["images"] = [{"bufferView": 1, "mimeType": "image/png"}]
+    document["bufferViews"].append({"buffer": 0, "byteOffset": len(data), "byteLength": len(image)})
+    document["buffers"] = [{"byteLength": len(data + image)}]
+    if shared:
+        document["meshes"].append(json.loads(json.dumps(document["meshes"][0])))
+        document["accessors"] += [dict(accessor) for accessor in document["accessors"]]
+        primitive = document["meshes"][1]["primitives"][0]
+        primitive |= {"attributes": {"POSITION": 4, "NORMAL": 5, "JOINTS_0": 6}, "indices": 7}
+    (tmp_path / "a.glb").write_bytes(glb(json.dumps(document), data + image + bytes(2)))
+    meshes = load_scene(tmp_path / "a.glb").meshes
+    factors = {name: 1.01 + 0.01 * number for number, name in enumerate(meshes)}
+    moved = {name: mesh._replace(vertices=factors[name] * mesh.vertices) for name, mesh in meshes.items()}
+    save_scene(moved, tmp_path / "b.glb", like=tmp_path / "a.glb")
+    for name, mesh in load_scene(tmp_path / "b.glb").meshes.items():
+        np.testing.assert_allclose(mesh.vertices, moved[name].vertices, atol=1e-6)
+    written = (tmp_path / "b.glb").read_bytes()
+    size = struct.unpack_from("<I", written, 12)[0]
+    text, chunk = json.loads(written[20 : 20 + size]), written[28 + size :]
+    places = [(view.get("byteOffset", 0), view["byteLength"]) for view in text["bufferViews"]]
+    assert chunk[places[1][0] :][: len(image)] == image
+    assert data.rstrip(b"\0") not in chunk
+    assert len(chunk) - sum(length for _, length in places) < 4 * len(places) + 4
+    assert all(begin % 4 == 0 for begin, _ in places)
 
 
 def test_numbers_decoded_by_draco_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -163,7 +163,7 @@ def test_coarse_numbers_are_refused_with_advice(tmp_path: Path) -> None:
 def test_more_digits_are_not_advised_where_doubles_end(tmp_path: Path) -> None:
     source = written(tmp_path, "far.obj", b"v 1e6 0 0\nv 1000000.00000000001 0 0\nv 0 1 0\nf 1 2 3\n")
     with pytest.raises(JaxmarkError, match="double precision"):
-        save_mesh(shifted(load_mesh(source), 2, [1e-10, 0, 0]), source, like=source)
+        save_mesh(shifted(load_mesh(source), 2, [3e-11, 0, 0]), source, like=source)
 
 
 def test_digits_beyond_doubles_are_not_invented(tmp_path: Path) -> None:

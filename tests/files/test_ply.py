@@ -87,14 +87,33 @@ def test_normals_turn_and_custom_properties_stay(tmp_path: Path) -> None:
     np.testing.assert_allclose(got, expected, atol=1e-7)
 
 
+def test_normals_of_faces_turn(tmp_path: Path) -> None:
+    """A triangle and a quadrilateral, with normals; a face whose corners do not move keeps its own."""
+    points = ["0.00 0 0", "1 0 0", "0 0 1", "0 5 0", "1 5 0", "1 5 1", "0 5 1"]
+    faces = ["3 0 1 2 0.00000000 -1 0", "4 3 4 5 6 0 -2 0"]
+    header = ["ply", "format ascii 1.0", "element vertex 7", *(f"property float {name}" for name in "xyz")]
+    header += ["element face 2", "property list uchar int vertex_indices"]
+    header += [*(f"property float n{name}" for name in "xyz"), "end_header"]
+    source = written(tmp_path, "f.ply", "\n".join([*header, *points, *faces, ""]).encode())
+    mesh = load_mesh(source)
+    data = patched(source, turned(mesh))
+    for line, expected in zip(data.decode().split("\n")[-3:], ([1, 0, 0], [2, 0, 0]), strict=False):
+        np.testing.assert_allclose(np.array(line.split()[-3:], float), expected, atol=1e-6)
+    moved = patched(source, shifted(mesh, 0, [0, 0.5, 0])).decode().split("\n")
+    assert moved[-3] != faces[0]
+    assert moved[-2] == faces[1]
+
+
 def test_spacing_of_single_precision_far_from_the_origin(tmp_path: Path) -> None:
     data, offsets = binary("<", "f", False)
     far = bytearray(data)
     struct.pack_into("<f", far, offsets[0], 4096.0)  # there the next number is 2**-11 away
     source = written(tmp_path, "far.ply", bytes(far))
     save_mesh(noisy(load_mesh(source), 0.01), tmp_path / "out.ply", like=source)
-    with pytest.raises(JaxmarkError, match=r"0\.000488 apart.*centre the mesh"):
-        save_mesh(noisy(load_mesh(source), 0.001), tmp_path / "out.ply", like=source)
+    (note,) = save_mesh(shifted(load_mesh(source), 0, [0, 0, 0.0008]), tmp_path / "out.ply", like=source)
+    assert note == "rounding to the numbers of the file changes the displacement by 22 %"
+    with pytest.raises(JaxmarkError, match=r"0\.000488 apart.* takes 100 % .*centre the mesh"):
+        save_mesh(shifted(load_mesh(source), 0, [0, 0, 0.0001]), tmp_path / "out.ply", like=source)
 
 
 def test_integer_coordinates(tmp_path: Path) -> None:
@@ -141,6 +160,7 @@ BODY = b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
         (HEAD.replace(b"vertex 3", b"vertex -3") + FACE + BODY, "line 3"),
         (HEAD.replace(b"vertex 3", b"vertex 999999999999999") + FACE + BODY, "ends in row 4 .*vertex"),
         (HEAD.replace(b"float z", b"float w") + FACE + BODY, "x, y and z"),
+        (HEAD.replace(b"float x", b"uint packed_position") + FACE + BODY, "compressed splat"),
         (HEAD + FACE.replace(b"uchar int", b"uchar float") + BODY, "integers"),
         (HEAD + FACE.replace(b"uchar int", b"float int") + BODY, "line 8"),
         (HEAD + FACE.replace(b"_indices", b"s") + BODY, "vertex_indices"),

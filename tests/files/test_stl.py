@@ -68,6 +68,17 @@ def test_text(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.vertices, everything.vertices, rtol=0, atol=0.000501)
 
 
+@pytest.mark.parametrize("extra", [b"7", b"# colour 0.5 0.5 0.5", b"material steel\r\n  ; a comment"])
+@pytest.mark.parametrize("line", [b"outer loop", b"vertex 1.000 0.000 0.000", b"endloop", b"endfacet"])
+def test_extra_words_in_text_are_ignored_and_stay(tmp_path: Path, line: bytes, extra: bytes) -> None:
+    data = ASCII.replace(line + b"\r\n", line + b" " + extra + b"\r\n")
+    assert data != ASCII
+    source = written(tmp_path, "t.stl", data)
+    mesh = load_mesh(source)
+    np.testing.assert_array_equal(mesh.vertices, loaded(tmp_path, "plain.stl", ASCII).vertices)
+    assert extra in patched(source, turned(mesh))
+
+
 @pytest.mark.parametrize(
     ("data", "message"),
     [
@@ -81,6 +92,7 @@ def test_text(tmp_path: Path) -> None:
         (ASCII.replace(b"vertex 1.000", b"vertx 1.000"), "line 5: 'vertex'"),
         (ASCII.replace(b"vertex 1.000", b"vertex one"), "line 5: 'one'"),
         (ASCII.replace(b"vertex 1.000", b"vertex inf"), "finite"),
+        (ASCII.replace(b"vertex 1.000 0.000 0.000", b"vertex 1.000 0.000"), "'vertex'|'endloop'"),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path: Path, data: bytes, message: str) -> None:

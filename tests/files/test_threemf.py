@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
+import jaxmark as jm
+from jaxmark.app.mark_files import mark_file
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, load_scene, save_mesh, save_scene
 from jaxmark.geometry.mesh import make_mesh
@@ -101,7 +103,7 @@ def model_with(change: tuple[bytes, bytes]) -> bytes:
 def test_everything_that_xml_allows(tmp_path: Path) -> None:
     scene = load_scene(written(tmp_path, "a.3mf", RICH))
     assert [*scene.meshes] == ["object 7", "caf\xe9 & tea", "object 2"]
-    assert scene.skipped == {"flat": "it has no triangles"}
+    assert scene.skipped == {"flat": "it has no triangles, and beams and the like cannot be marked"}
     _, first, second = scene.meshes.values()
     np.testing.assert_array_equal(first.vertices, [[0.5, 0.25, 0.125], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     np.testing.assert_array_equal(first.faces, [[0, 1, 2], [0, 2, 3]])
@@ -137,6 +139,13 @@ def test_several_models_change(tmp_path: Path) -> None:
     error = np.abs(np.asarray(load_mesh(tmp_path / "out.3mf").vertices) - mesh.vertices)
     assert error[:3].max() <= 0.051  # each object is written with its own digits
     assert error[3:7].max() <= 0.000501
+
+
+def test_objects_without_triangles_are_named_where_nothing_can_be_marked(tmp_path: Path) -> None:
+    source = written(tmp_path, "a.3mf", RICH)
+    key, budget = jm.Key(bytes(32)), jm.Budget()
+    with pytest.raises(JaxmarkError, match="left unchanged: 'flat': it has no triangles, and beams"):
+        mark_file(source, tmp_path / "b.3mf", tmp_path / "b.json", key=key, message=b"message", budget=budget)
 
 
 def streamed(wide: bool, signature: bytes, stored: bool, model: bytes = PLAIN) -> bytes:

@@ -6,11 +6,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Shaped
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import limits
-from jaxmark.files.binary import BinaryNumbers, encode, gather
+from jaxmark.files.binary import BinaryNumbers, gather
 from jaxmark.files.gltf import draco
 from jaxmark.files.gltf.document import FLOAT, Document, Elements, Read, attribute, objects, uses, whole
 from jaxmark.files.limits import RunningCount
@@ -240,13 +240,13 @@ def _source(document: Document, found: dict[str, list[_Primitive]], left: dict[s
         data,
         JoinedNumbers([BinaryNumbers(data, one.offsets, (one.dtype,) * 3, one.unit) for one in points.values()]),
         np.concatenate([part.faces + part.places[0] for part in parts]),
-        turned,
+        [] if turned is None else [turned],
         lambda: np.concatenate([_texture(document, one) for one in primitives]),
         partial(_skin, document, list({one.position: one for one in primitives}.values())),
         parts if len(parts) + len(left) > 1 else (),
         left,
         document=document,
-        points=points,
+        patched={**points, **normals},
         compressed=[one for one in primitives if one.compressed is not None],
     )
 
@@ -317,10 +317,10 @@ def _part_of_skin(document: Document, primitive: _Primitive, skin: int | None) -
 
 @dataclass(kw_only=True)
 class _GltfSource(Source):
-    """A source that also updates the `min` and `max` of its position accessors, which glTF requires."""
+    """A source that also updates the `min` and `max` of the accessors that it changes."""
 
     document: Document
-    points: dict[int, Elements]  # the accessors of positions, in the order of the points
+    patched: dict[int, Elements]  # the accessors of positions and normals
     compressed: Sequence[_Primitive]
 
     def patch(self, positions: Points, name: str) -> Patched:
@@ -331,8 +331,10 @@ class _GltfSource(Source):
             for buffer in self.document.buffers
         ]
         document = self.document.copy_content()
-        for index, rows in _rows(self.points).items():
-            _bound(document["accessors"][index], positions[rows.start : rows.stop], self.points[index])
+        for index, rows in self.patched.items():
+            before, after = (gather(one, rows.offsets, rows.dtype) for one in (self.data, data))
+            if before.tobytes() != after.tobytes():
+                _bound(document["accessors"][index], after)
         plain = []
         for one in self.compressed:
             assert one.compressed is not None
@@ -343,16 +345,15 @@ class _GltfSource(Source):
                     plain.append(f"meshes[{mesh}].primitives[{number}]")
         if plain:
             draco.forget_unused(document)
-        why = "written without Draco, whose encoder does not know all types"
+        why = "written without Draco compression, because its encoder does not know all types of numbers in it"
         notes = (f"{', '.join(plain)}: {why}",) if plain else ()
         return self.document.encode(document, contents, name)._replace(notes=notes)
 
 
-def _bound(accessor: dict[str, Any], positions: Points, elements: Elements) -> None:
+def _bound(accessor: dict[str, Any], stored: Shaped[np.ndarray, "rows 3"]) -> None:
     """Bring the bounds of an accessor up to date; they are stored numbers, without their unit."""
-    rows = encode(positions / elements.unit, elements.dtype)
-    for key, bound in (("min", rows.min(axis=0)), ("max", rows.max(axis=0))):
-        if key in accessor and not _states(accessor[key], bound):
+    for key, bound in (("min", np.fmin.reduce(stored)), ("max", np.fmax.reduce(stored))):
+        if key in accessor and np.isfinite(bound).all() and not _states(accessor[key], bound):
             accessor[key] = bound.tolist()
 
 

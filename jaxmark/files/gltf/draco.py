@@ -1,5 +1,6 @@
 """Primitives that are compressed with Draco: decoded, and encoded again. Needs the extra `files`."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -109,7 +110,7 @@ def write(
 ) -> bool:
     """Write changed attributes of a compressed primitive into a document and its buffers.
 
-    The bytes that were there are overwritten, for they hold the primitive as it was. `contents` are the buffers, which
+    The bytes that were there are replaced, for they hold the primitive as it was. `contents` are the buffers, which
     change with the document, and `data` are those of the document with the new numbers. Returns whether the primitive
     is still compressed: the encoder does not know all types.
     """
@@ -117,44 +118,83 @@ def write(
         name: np.frombuffer(data[rows.span], rows.dtype).reshape(-1, rows.width)
         for name, rows in old.attributes.items()
     }
-    view = document["bufferViews"][old.view]
-    buffer = view["buffer"]
-    begin, length = view.get("byteOffset", 0), view["byteLength"]
-    content = bytearray(contents[buffer] or b"")
-    content[begin : begin + length] = bytes(length)
-
-    def append(added: bytes) -> dict[str, int]:
-        """Append bytes to the buffer at a multiple of four."""
-        content.extend(bytes(-len(content) % 4) + added)
-        return {"byteOffset": len(content) - len(added), "byteLength": len(added)}
-
     coded = _encode(attributes, old.faces)
     if coded is not None:
         blob, primitive["extensions"][EXTENSION]["attributes"] = coded
-        if len(blob) <= length:
-            content[begin : begin + len(blob)] = blob
-            view["byteLength"] = len(blob)
-        else:
-            view |= append(blob)
+        (primitive["extensions"][EXTENSION]["bufferView"],) = _place(document, contents, old.view, [(blob, {})])
+        return True
+    # Vertex attributes begin at multiples of four bytes.
+    arrays = [(primitive["attributes"][name], rows, 4) for name, rows in attributes.items()]
+    if "indices" in primitive:
+        component = document["accessors"][primitive["indices"]]["componentType"]
+        arrays.append((primitive["indices"], old.faces.reshape(-1, 1).astype(COMPONENTS[component]), 1))
+    blocks = []
+    for _, rows, step in arrays:
+        size = rows.shape[1] * rows.dtype.itemsize
+        padded = np.pad(rows.view(np.uint8), ((0, 0), (0, -size % step)))
+        blocks.append((padded.tobytes(), {} if padded.shape[1] == size else {"byteStride": padded.shape[1]}))
+    for (index, *_), view in zip(arrays, _place(document, contents, old.view, blocks), strict=True):
+        document["accessors"][index]["bufferView"] = view
+        document["accessors"][index].pop("byteOffset", None)
+    del primitive["extensions"][EXTENSION]
+    if not primitive["extensions"]:
+        del primitive["extensions"]
+    return False
+
+
+def _place(
+    document: dict[str, Any], contents: list[bytes | None], view: int, blocks: Sequence[tuple[bytes, dict[str, int]]]
+) -> list[int]:
+    """Replace a buffer view by views of blocks of bytes, each with further properties; returns their indices.
+
+    If something else needs the bytes of the view, the blocks follow at the end of the buffer.
+    """
+    views = document["bufferViews"]
+    buffer, alone = views[view]["buffer"], _is_alone(document, view)
+    content = contents[buffer] or b""
+    begin, length = (views[view].get("byteOffset", 0), views[view]["byteLength"]) if alone else (len(content), 0)
+    added, placed = b"", list[dict[str, int]]()
+    for block, properties in blocks:
+        added += bytes(-(begin + len(added)) % 4)
+        placed.append({"buffer": buffer, "byteOffset": begin + len(added), "byteLength": len(block)} | properties)
+        added += block
+    added += bytes((length - len(added)) % 4 if begin + length < len(content) else 0)  # later views stay aligned
+    contents[buffer] = content[:begin] + added + content[begin + length :]
+    for other in _stored(views):
+        if other["buffer"] == buffer and other.get("byteOffset", 0) >= begin + length and length:
+            other["byteOffset"] += len(added) - length
+    indices = [view, *range(len(views), len(views) + len(placed) - 1)]
+    if alone:
+        views[view] = placed.pop(0)
     else:
-        # Vertex attributes begin at multiples of four bytes.
-        arrays = [(primitive["attributes"][name], rows, 4) for name, rows in attributes.items()]
-        if "indices" in primitive:
-            component = document["accessors"][primitive["indices"]]["componentType"]
-            arrays.append((primitive["indices"], old.faces.reshape(-1, 1).astype(COMPONENTS[component]), 1))
-        for index, rows, step in arrays:
-            size = rows.shape[1] * rows.dtype.itemsize
-            padded = np.pad(rows.view(np.uint8), ((0, 0), (0, -size % step)))
-            stride = {} if padded.shape[1] == size else {"byteStride": padded.shape[1]}
-            document["bufferViews"].append({"buffer": buffer} | append(padded.tobytes()) | stride)
-            accessor = document["accessors"][index]
-            accessor["bufferView"] = len(document["bufferViews"]) - 1
-            accessor.pop("byteOffset", None)
-        del primitive["extensions"][EXTENSION]
-        if not primitive["extensions"]:
-            del primitive["extensions"]
-    contents[buffer] = bytes(content)
-    return coded is not None
+        indices = list(range(len(views), len(views) + len(placed)))
+    views += placed
+    return indices
+
+
+def _is_alone(document: dict[str, Any], view: int) -> bool:
+    """Whether just one compressed primitive uses a buffer view, and nothing else uses its bytes."""
+    primitives = [one for mesh in document["meshes"] for one in mesh["primitives"]]
+    owners = [one["extensions"][EXTENSION] for one in primitives if EXTENSION in one.get("extensions", {})]
+    owners += [*document.get("accessors", []), *document.get("images", [])]
+    owners = [one["extensions"][EXTENSION] for one in primitives if EXTENSION in one.get("extensions", {})]
+    owners += [*document.get("accessors", []), *document.get("images", [])]
+    users = [one["bufferView"] for one in owners if "bufferView" in one]
+    mine = document["bufferViews"][view]
+    begin = mine.get("byteOffset", 0)
+    return users.count(view) == 1 and not any(
+        other is not mine
+        and other["buffer"] == mine["buffer"]
+        and other.get("byteOffset", 0) < begin + mine["byteLength"]
+        and begin < other.get("byteOffset", 0) + other["byteLength"]
+        for other in _stored(document["bufferViews"])
+    )
+
+
+def _stored(views: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Yield every place in a buffer: each view, and the source of each view that is compressed as a whole."""
+    for view in views:
+        yield from (one for one in (view, *view.get("extensions", {}).values()) if "buffer" in one)
 
 
 def forget_unused(document: dict[str, Any]) -> None:

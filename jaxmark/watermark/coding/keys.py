@@ -18,6 +18,7 @@ from jaxtyping import Int8, Int64
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import read_file
+from jaxmark.files.typed import decode, normalise
 
 SCHEME_VERSION = 2  # version of the keyed choices and of records
 KEY_BYTES = 32
@@ -82,13 +83,13 @@ def load_key(path: str | os.PathLike[str]) -> Key:
         JaxmarkError: if the file cannot be read or does not contain 64 hexadecimal digits; the message hides them.
     """
     try:
-        text = read_file(path, _MAX_FILE_BYTES).decode("ascii")
+        text = normalise(decode(read_file(path, _MAX_FILE_BYTES)))
     except OSError as error:
         raise JaxmarkError(f"The key file {path} cannot be read: {error.strerror}.") from None
-    except UnicodeDecodeError:
+    except JaxmarkError:
         text = ""
     try:
-        return Key(bytes.fromhex(text.strip()))
+        return Key(bytes.fromhex(text))
     except ValueError:
         raise JaxmarkError(f"{path} is no key file: a key file contains {2 * KEY_BYTES} hexadecimal digits.") from None
 

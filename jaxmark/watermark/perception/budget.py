@@ -42,6 +42,7 @@ _FACET, _MOST_OF_FACETS = (
     2.5,
 )  # mean edge over the diagonal from which the limit of DAME grows; its largest factor
 _MAX_RMS = 0.01  # largest displacement in diagonals if only limits are given; a larger one is no watermark
+_USUAL_RMS = 0.003  # budget to advise for meshes whose metrics bound nothing
 _FIRST_OF_EDGES = 0.04  # displacement over the mean edge that is tried first: limits usually allow about as much
 _FIRST_OF_CLOUDS = 2e-4  # displacement of point clouds that is tried first, in diagonals
 _MIN_LIMIT_SHARE = 0.99  # share of a limit that must be reached
@@ -253,7 +254,8 @@ def displace_within(
                 rms = largest_within(partial(limit_ratio, metrics), rms, first if rms == largest else rms, share)
         if bounds.rms is None and rms == _MAX_RMS:
             raise JaxmarkError(
-                f"A displacement of {_MAX_RMS:g} of the diagonal still keeps {bounds}; give a budget, too."
+                f"A displacement of {_MAX_RMS:g} of the diagonal still keeps {bounds}; give a budget for the RMS"
+                f" displacement, too, such as --budget {_USUAL_RMS:g}, or Budget(rms={_USUAL_RMS:g}) in Python."
             )
     marked = displace(original, rms / size * shift)
     reached = distortion.DisplacementSize.of(shift_of(original, marked)[original.used])

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from jaxmark.alignment import attempts
 from jaxmark.alignment.result import Align, Alignment
 from jaxmark.errors import JaxmarkError
+from jaxmark.files.typed import normalise, normalise_names
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.evidence import ledger
@@ -39,7 +40,7 @@ class Tracer:
 
     def fingerprint(self, recipient: str, budget: BudgetLike = None) -> tuple[Mesh, EmbedInfo]:
         """Make the copy for one recipient; see `fingerprint`."""
-        choices, original = self.mark.choices, self.mark.original
+        choices, original, recipient = self.mark.choices, self.mark.original, normalise(recipient)
         if self.mark.code_bits >= _MIN_SLOTS:
             word = codewords([recipient], choices, biases(choices, self.mark.code_bits))[0]
             marked, info = self.mark.write(word.astype(float), budget, content=recipient.encode())
@@ -66,6 +67,10 @@ class Tracer:
 
     def read(self, aligned: Alignment, recipients: Iterable[str], top: int = 10) -> list[Accusation]:
         """Rank recipients by their scores in an aligned suspect; see `identify`."""
+        return self.rank(aligned, normalise_names(recipients), top)
+
+    def rank(self, aligned: Alignment, recipients: Iterable[str], top: int = 10) -> list[Accusation]:
+        """Rank recipients as `read` does, by identifiers that a catalogue holds and that are not normalised again."""
         soft = self.mark.soft_decisions(self.mark.receive(aligned))
         charges = *self.mark.order_charges, ledger.COPY_ALIGNMENT.charge(aligned.align)
         ranking = rank(soft, recipients, self.mark.choices, top=top)
@@ -106,7 +111,8 @@ def fingerprint(mesh: Mesh, recipient: str, key: bytes, *, budget: BudgetLike = 
 
     Args:
         mesh: the original.
-        recipient: any identifier that is not empty; the same identifier gives the same copy.
+        recipient: any identifier that is not empty; the same identifier gives the same copy. Accents are composed
+            (Unicode's form NFC), and white space at both ends and invisible characters are left out.
         key: 32 bytes, from `new_key`.
         budget: how strong the mark may be, see `embed`.
 
@@ -133,7 +139,8 @@ def identify(
 
     Args:
         suspect: any mesh.
-        recipients: the identifiers of all recipients of a copy, a list that was fixed before the suspect existed.
+        recipients: the identifiers of all recipients of a copy, a list that was fixed before the suspect existed;
+            normalised as by `fingerprint`.
         original: the unmarked mesh.
         key: 32 bytes.
         record: the record of an earlier copy, see `make_tracer`.
@@ -146,6 +153,7 @@ def identify(
         codewords alone (see `jaxmark.watermark.tracing.tardos`).
 
     Raises:
-        JaxmarkError: see `make_tracer`; also if the suspect cannot be aligned, or an identifier is empty.
+        JaxmarkError: see `make_tracer`; also if the suspect cannot be aligned, an identifier is empty, or two
+            identifiers differ only in what cannot be seen.
     """
     return make_tracer(original, key, record=record).identify(suspect, recipients, top, align)

@@ -86,3 +86,16 @@ def test_too_small_a_mesh_is_refused(key: jm.Key):
     tiny = Mesh(bumpy_sphere(1).vertices[:4], np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]]))
     with pytest.raises(jm.JaxmarkError, match="cannot carry a fingerprint"):
         jm.fingerprint(tiny, "alice", key)
+
+
+def test_a_copy_names_its_recipient_however_the_name_is_typed(tracer: jm.watermark.Tracer):
+    vertices = tracer.fingerprint("A\u030alice ", 8e-4)[0].vertices
+    suspect = tracer.mark.original.mesh._replace(vertices=vertices)
+    for name in ("Ålice", "\ufeffA\u030alice"):
+        first, _ = tracer.identify(suspect, ["bob", name])
+        assert (first.recipient, first.log10_p <= -6) == ("Ålice", True)
+    # Earlier versions wrote such names as they are.
+    aligned = tracer.register(suspect)
+    assert tracer.rank(aligned, ["Ålice"]) == tracer.read(aligned, ["Ålice"])
+    with pytest.raises(jm.JaxmarkError, match="cannot be seen"):
+        tracer.identify(suspect, ["Ålice", "Ålice "])
