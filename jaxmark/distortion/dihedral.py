@@ -86,7 +86,7 @@ def _is_flat(x: Positions, hinges: Hinges) -> Bool[Array, " edges"]:
     """Find the edges that have a flat face on one of their sides."""
     tail, head = x[hinges.edges[:, 0]], x[hinges.edges[:, 1]]
 
-    def flat(apex: Array) -> Array:
+    def flat(apex: Array | np.ndarray) -> Array:
         sides = head - tail, x[apex] - tail, x[apex] - head
         longest = jnp.max(jnp.stack([jnp.sum(side**2, axis=1) for side in sides]), axis=0)
         return jnp.sum(jnp.cross(sides[0], sides[1]) ** 2, axis=1) <= (MIN_HEIGHT * longest) ** 2

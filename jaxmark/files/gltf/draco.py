@@ -177,8 +177,6 @@ def _is_alone(document: dict[str, Any], view: int) -> bool:
     primitives = [one for mesh in document["meshes"] for one in mesh["primitives"]]
     owners = [one["extensions"][EXTENSION] for one in primitives if EXTENSION in one.get("extensions", {})]
     owners += [*document.get("accessors", []), *document.get("images", [])]
-    owners = [one["extensions"][EXTENSION] for one in primitives if EXTENSION in one.get("extensions", {})]
-    owners += [*document.get("accessors", []), *document.get("images", [])]
     users = [one["bufferView"] for one in owners if "bufferView" in one]
     mine = document["bufferViews"][view]
     begin = mine.get("byteOffset", 0)
