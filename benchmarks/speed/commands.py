@@ -46,6 +46,7 @@ FUNCTIONS = (
     ("jaxmark.app.read_files", "load_mesh", "read"),
     ("jaxmark.app.mark_files", "prepare", "prepare"),
     ("jaxmark.app.read_files", "alternatives", "prepare"),
+    ("jaxmark.app.read_files", "make_marker", "prepare"),
     ("jaxmark.distortion", "Reference.measure", "limits"),
     ("jaxmark.watermark.markers", "NonBlindMarker.adapted", "write"),
     ("jaxmark.watermark.markers", "NonBlindMarker.embed", "write"),
