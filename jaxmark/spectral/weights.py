@@ -6,7 +6,7 @@ They take NumPy arrays, or JAX's, traced or not, and give the same: on the host 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Int64
+from jaxtyping import Array, Float, Int, Int64
 
 from jaxmark.geometry.mesh import Faces, edges, sides
 
@@ -42,8 +42,8 @@ def cotangent_weights(vertices: Positions, faces: Faces) -> Float[Array | np.nda
     xp = vertices.__array_namespace__()
     pairs, (ends, apex), base = edges(faces), sides(faces), np.array([len(vertices), 1])
     first, second = vertices[ends[:, 0]] - vertices[apex], vertices[ends[:, 1]] - vertices[apex]
-    square = xp.sum(xp.linalg.cross(first, second) ** 2, axis=1)
-    sound = xp.tile(_sound(vertices, faces), 3)
+    square = xp.tile(_squares(vertices, faces), 3)
+    sound = square > 0
     # Select before dividing, so that degenerate faces keep finite gradients.
     cotangents = xp.where(sound, xp.sum(first * second, axis=1) / xp.sqrt(xp.where(sound, square, 1)), 0)
     # A side from a vertex to itself is no edge; it is counted past the last one.
@@ -64,20 +64,19 @@ def vertex_areas(vertices: Positions, faces: Faces) -> Float[Array | np.ndarray,
     ones, see `cotangent_weights`, have no area.
     """
     xp = vertices.__array_namespace__()
-    faces = np.asarray(faces)
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    square, sound = xp.sum(xp.linalg.cross(b - a, c - a) ** 2, axis=1), _sound(vertices, faces)
-    areas = xp.where(sound, xp.sqrt(xp.where(sound, square, 1)) / 2, 0)
-    return _sums(xp.concat([areas, areas, areas]) / 3, faces.T.ravel(), len(vertices))
+    square = _squares(vertices, faces)
+    areas = xp.where(square > 0, xp.sqrt(xp.where(square > 0, square, 1)) / 2, 0)
+    return _sums(xp.concat([areas, areas, areas]) / 3, np.asarray(faces).T.ravel(), len(vertices))
 
 
-def _sound(vertices: Positions, faces: Faces) -> Bool[Array | np.ndarray, " faces"]:
-    """Find the faces that are not degenerate: not flat up to rounding."""
+def _squares(vertices: Positions, faces: Faces) -> Float[Array | np.ndarray, " faces"]:
+    """Compute the square of twice each face's area; 0 for degenerate faces, which are flat up to rounding."""
     xp = vertices.__array_namespace__()
     a, b, c = (vertices[np.asarray(faces)[:, corner]] for corner in range(3))
     longest = xp.max(xp.stack([xp.sum(side**2, axis=1) for side in (b - a, c - b, a - c)]), axis=0)
-    height = xp.sum(xp.linalg.cross(b - a, c - a) ** 2, axis=1)
-    return height > (_MIN_HEIGHT * xp.finfo(vertices.dtype).eps * longest) ** 2
+    square = xp.sum(xp.linalg.cross(b - a, c - a) ** 2, axis=1)
+    eps = xp.finfo(xp.sqrt(square).dtype).eps  # positions may be whole numbers
+    return xp.where(square > (_MIN_HEIGHT * eps * longest) ** 2, square, 0)
 
 
 def _sums(
