@@ -113,14 +113,16 @@ def parse(data: bytes) -> Source:
     if coordinates is None:
         raise JaxmarkError("The header declares no element vertex with the numbers x, y and z.")
     faces = np.concatenate([_surface(body, declared.get(name, _Element(name, 0))) for name in _SURFACES])
-    outside = (faces < 0) | (faces >= len(coordinates.values))  # `make_mesh` refuses these with a better message
-    polygons = declared.get("face", _Element("face", 0)).properties
-    sizes = next((kind.sizes for name, kind in polygons.items() if name in _INDICES), _NONE)
-    polygon = np.full(len(faces), -1)  # of each triangle; strips have none
-    polygon[: (sizes - 2).sum()] = np.repeat(np.arange(len(sizes)), sizes - 2)
-    corners = (vertex, np.where(outside, -1, faces)), (polygons, np.stack([polygon] * 3, axis=1))
-    pairs = [(_normals(body, element), used) for element, used in corners]
-    return Source(data, coordinates, faces, [Transported(one, used) for one, used in pairs if one is not None])
+    polygons, normals = declared.get("face", _Element("face", 0)).properties, list[Transported]()
+    if (numbers := _normals(body, vertex)) is not None:
+        outside = (faces < 0) | (faces >= len(coordinates.values))  # `make_mesh` refuses these with a better message
+        normals.append(Transported(numbers, np.where(outside, -1, faces)))
+    if (numbers := _normals(body, polygons)) is not None:
+        sizes = next((kind.sizes for name, kind in polygons.items() if name in _INDICES), _NONE)
+        polygon = np.full(len(faces), -1)  # of each triangle; strips have none
+        polygon[: (sizes - 2).sum()] = np.repeat(np.arange(len(sizes)), sizes - 2)
+        normals.append(Transported(numbers, np.stack([polygon] * 3, axis=1)))
+    return Source(data, coordinates, faces, normals)
 
 
 def _normals(body: _Body, properties: dict[str, _Property]) -> TextNumbers | BinaryNumbers | None:
