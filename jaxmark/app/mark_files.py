@@ -93,21 +93,19 @@ def mark_file(
     refuse_existing(marked, record, overwrite=overwrite)
     doing(f"reading {original}")
     scene = pick(load_scene(original), meshes, original)
-    check_numbers = number_check(original)
     if len(scene.meshes) + len(scene.skipped) > 1:
         if message is None:
             raise JaxmarkError(
                 f"A fingerprint needs a file of one mesh, and {original} has several; save each mesh in its own file."
             )
         try:
-            return _mark_scene(
-                original, marked, record, scene, message, key, budget, scheme, check_numbers, overwrite, doing
-            )
+            return _mark_scene(original, marked, record, scene, message, key, budget, scheme, overwrite, doing)
         except JaxmarkError:
             # All objects of an OBJ file share one coordinate system. Marked as one mesh, they may carry a message that
             # is too long for each of them.
             if original.suffix.lower() != ".obj" or meshes:
                 raise
+    number_check(original)  # refuses a file that cannot be written before a mark is computed
     mesh = load_mesh(original)
     doing(f"preparing {original}")
     read_back: Callable[[Mesh], Survival | bool | None]
@@ -179,7 +177,6 @@ def _mark_scene(
     key: Key,
     budget: Budget,
     scheme: AnyScheme,
-    check_numbers: Callable[[str, Mesh], None],
     overwrite: bool,
     doing: Doing,
 ) -> FileOutcome:
@@ -189,6 +186,7 @@ def _mark_scene(
         JaxmarkError: if no mesh can carry the message; see `embed_scene`.
     """
     markers: dict[str, Any] = {}
+    check_numbers = number_check(original)
 
     def check(name: str, marker: Marker, result: Mesh, info: EmbedInfo) -> EmbedInfo:
         """Check that the numbers of the file are precise enough for a mark."""

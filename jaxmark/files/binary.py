@@ -108,9 +108,10 @@ class BinaryNumbers:
     def _encode(self, values: Float64[np.ndarray, " rows"], axis: int) -> Shaped[np.ndarray, " rows"]:
         (unit, origin), dtype = self._scale, self._types[axis]
         reach = 0.0
-        if dtype.kind != "f":
-            limits, extent = np.iinfo(dtype), float(np.ptp(self.values[:, axis])) / unit[axis]
-            reach = extent if dtype.itemsize > 2 else float(limits.max) - float(limits.min)
+        if dtype.kind != "f" and dtype.itemsize > 2:
+            reach = float(np.ptp(self.values[:, axis])) / unit[axis]
+        elif dtype.kind != "f":
+            reach = float(np.iinfo(dtype).max) - float(np.iinfo(dtype).min)
         return encode((values - origin[axis]) / unit[axis], dtype, _HELD * reach)
 
     def spacing(self, values: Rows, rows: Indices) -> float:
