@@ -17,6 +17,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import limits, load_mesh, load_scene, save_mesh, save_scene
 from jaxmark.files.gltf.document import Document
 from jaxmark.files.gltf.json_text import rewrite
+from jaxmark.geometry.mesh import Mesh
 from tests.files.test_glb import glb
 from tests.samples import bumpy_sphere
 
@@ -211,7 +212,8 @@ def test_strips_and_fans_are_those_of_another_program(tmp_path: Path, mode: int)
     np.testing.assert_array_equal(faces, expected)
 
 
-def quantised(normalised: bool) -> tuple[dict[str, Any], bytes]:
+def quantised(path: Path, normalised: bool) -> tuple[Mesh, float]:
+    """Write a mesh of integers that fill their range; returns it as it is read, and the step of its positions."""
     points = np.asarray(BALLS[0].vertices)
     stored = np.rint(32767 * points / np.abs(points).max()).astype("<i2")
     faces = np.asarray(BALLS[0].faces, "<u2").ravel()
@@ -234,15 +236,13 @@ def quantised(normalised: bool) -> tuple[dict[str, Any], bytes]:
         ],
         "buffers": [{"byteLength": padded.nbytes + faces.nbytes}],
     }
-    return document, padded.tobytes() + faces.tobytes()
+    path.write_bytes(glb(json.dumps(document), padded.tobytes() + faces.tobytes()))
+    return load_mesh(path), 1 / 32767 if normalised else 1
 
 
 @pytest.mark.parametrize("normalised", [False, True])
 def test_quantised_positions_move_by_their_own_step(tmp_path: Path, normalised: bool) -> None:
-    document, data = quantised(normalised)
-    (tmp_path / "a.glb").write_bytes(glb(json.dumps(document), data))
-    mesh = load_mesh(tmp_path / "a.glb")
-    step = 1 / 32767 if normalised else 1
+    mesh, step = quantised(tmp_path / "a.glb", normalised)
     assert np.abs(mesh.vertices).max() == pytest.approx(32767 * step)
     # What lies at the end of the range stays there.
     moved = np.asarray(mesh.vertices) + 12.3 * step
@@ -261,10 +261,7 @@ def test_quantised_positions_move_by_their_own_step(tmp_path: Path, normalised: 
 
 @pytest.mark.parametrize("normalised", [False, True])
 def test_quantised_positions_are_held_at_the_end_of_their_range(tmp_path: Path, normalised: bool) -> None:
-    document, data = quantised(normalised)
-    (tmp_path / "a.glb").write_bytes(glb(json.dumps(document), data))
-    mesh = load_mesh(tmp_path / "a.glb")
-    step = 1 / 32767 if normalised else 1
+    mesh, step = quantised(tmp_path / "a.glb", normalised)
     for factor in (1.005, 1.03):  # by up to 164 and 983 steps beyond the range of 65,536
         moved = mesh._replace(vertices=factor * np.asarray(mesh.vertices))
         save_mesh(moved, tmp_path / "b.glb", like=tmp_path / "a.glb")
