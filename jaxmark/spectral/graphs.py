@@ -15,12 +15,12 @@ from scipy import sparse
 from scipy.sparse import linalg
 from scipy.spatial import KDTree
 
-from jaxmark.errors import JaxmarkError
+from jaxmark.errors import JaxmarkError, require
 from jaxmark.geometry.mesh import Mesh, edges, face_pairs
 from jaxmark.spectral.laplacian import Laplacian, Lowering, graph_laplacian, symmetric_matrix
-from jaxmark.spectral.weights import cotangent_weights, inverse_length_weights, vertex_areas
+from jaxmark.spectral.weights import Negative, cotangent_weights, inverse_length_weights, vertex_areas
 
-Weighting = Literal["valence", "inverse-length", "cotangent"]
+Weighting = Literal["valence", "inverse-length", "cotangent", "robust"]
 PointWeighting = Literal["valence", "inverse-length", "gaussian"]
 Elements = Literal["vertices", "faces", "edges"]
 
@@ -33,6 +33,7 @@ def from_mesh(
     mesh: Mesh,
     weights: Weighting | ArrayLike = "valence",
     *,
+    negative: Negative = "clip",
     mass: Literal["areas"] | ArrayLike | None = None,
     bound: float | None = None,
     elements: Elements = "vertices",
@@ -47,8 +48,13 @@ def from_mesh(
         mesh: any mesh, its faces concrete; boundary edges, edges of three faces or more, and several components are
             well defined.
         weights: `"valence"`, each edge 1, so that w_ij = 1/d(v_i) as in the paper; `"inverse-length"`, 1 over the
-            edge's length; `"cotangent"`, see `jaxmark.spectral.weights.cotangent_weights`; or an array `[E]` of
-            non-negative weights, in the order of `jaxmark.geometry.mesh.edges`.
+            edge's length; `"cotangent"`, see `jaxmark.spectral.weights.cotangent_weights`; `"robust"`, cotangents of an
+            intrinsic Delaunay triangulation by `robust_laplacian` (Sharp, Crane, "A Laplacian for nonmanifold triangle
+            meshes", 2020; extra `robust`), which are not negative, also on thin triangles, and join other pairs of
+            vertices than the mesh does; or an array `[E]` of non-negative weights, in the order of
+            `jaxmark.geometry.mesh.edges`.
+        negative: what happens to negative cotangents, see `jaxmark.spectral.weights.cotangent_weights`. `"keep"` needs
+            a mass: then Δ stays positive semidefinite, but not its random walk.
         mass: the lumped mass M of the generalised problem (D - W)x = λMx: `"areas"`, see
             `jaxmark.spectral.weights.vertex_areas`, or `[N]`. By default M = D.
         bound: with a mass, a bound of λ; filters are functions of 2λ/bound. By default 1 % above the largest λ, which
@@ -70,13 +76,17 @@ def from_mesh(
     traced = isinstance(mesh.vertices, Tracer)
     vertices = mesh.vertices if traced else np.asarray(mesh.vertices, np.float64)
     faces = np.asarray(mesh.faces)
+    if negative == "keep" and mass is None:
+        raise JaxmarkError("negative='keep' needs a mass, such as 'areas'; without one the spectrum leaves [0, 2].")
+    if isinstance(weights, str) and weights == "robust":
+        return _robust(_of_vertices("robust weights", vertices, elements), faces, mass, bound, lowering)
     pairs, positions = _graph(vertices, faces, elements)
     if isinstance(weights, str):
         _check_name("weights are an array, or", weights, Weighting)
         by_name = {
             "valence": lambda: None,
             "inverse-length": lambda: inverse_length_weights(positions, pairs),
-            "cotangent": lambda: cotangent_weights(_of_vertices("cotangents", vertices, elements), faces),
+            "cotangent": lambda: cotangent_weights(_of_vertices("cotangents", vertices, elements), faces, negative),
         }
         values = by_name[weights]()
         if values is not None and not traced:
@@ -106,9 +116,6 @@ def from_matrices(
     stiffness: Any, mass: Any = None, *, bound: float | None = None, lowering: Lowering = "auto"
 ) -> Laplacian:
     """Build the operator of a stiffness matrix S = D - W, such as of `robust_laplacian` or `libigl`.
-
-    `from_matrices(*robust_laplacian.mesh_laplacian(vertices, faces))` has weights of an intrinsic Delaunay
-    triangulation, none of which is negative (Sharp, Crane, "A Laplacian for nonmanifold triangle meshes", 2020).
 
     Args:
         stiffness: `[N, N]`, any sparse matrix of SciPy's, or a dense one: symmetric, with rows that sum to zero, and
@@ -140,6 +147,22 @@ def from_matrices(
             raise JaxmarkError("A lumped mass is a diagonal matrix, or its diagonal.")
         mass = square.diagonal()
     return _with_mass(graph_laplacian(pairs, size, -upper.data[kept], lowering=lowering), mass, bound)
+
+
+def _robust(
+    vertices: Any, faces: Int64[np.ndarray, "faces 3"], mass: Any, bound: float | None, lowering: Lowering
+) -> Laplacian:
+    """Build the operator of an intrinsic Delaunay triangulation, see `from_mesh`."""
+    if isinstance(vertices, Tracer):
+        raise JaxmarkError("Robust weights need concrete vertices; use cotangent weights under jit, vmap or grad.")
+    stiffness, masses = require("robust_laplacian", "robust").mesh_laplacian(vertices, faces)
+    beside = sparse.triu(stiffness, 1)
+    joined = sparse.csr_array(beside + beside.T)
+    degree = -np.asarray(joined.sum(axis=1)).ravel()
+    if isinstance(mass, str):
+        _check_name("mass is an array, or", mass, Literal["areas"])
+        mass = np.where(degree > 0, masses.diagonal(), 0)  # the package gives lone vertices a little
+    return from_matrices(joined + sparse.diags_array(degree), mass, bound=bound, lowering=lowering)
 
 
 def checked_weights(weights: ArrayLike, count: int) -> Float64[np.ndarray, " edges"]:
@@ -304,7 +327,8 @@ def _with_mass(operator: Laplacian, mass: ArrayLike | None, bound: float | None)
     linked = np.asarray(operator.degree) > 0
     if (lacking := linked & (values == 0)).any():
         raise JaxmarkError(
-            f"Vertex {int(np.argmax(lacking))} has edges, but no mass; remove degenerate faces, or pass other masses."
+            f"Vertex {int(np.argmax(lacking))} has edges, but no mass; remove degenerate faces, use weights='robust',"
+            " or pass other masses."
         )
     # The largest λ is no smaller than any diagonal element of M⁻¹(D - W).
     least = float(np.max(np.asarray(operator.degree)[linked] / values[linked], initial=0))
@@ -319,7 +343,8 @@ def _bound(operator: Laplacian) -> float:
     linked, root, scaled = symmetric_matrix(operator)
     if len(linked) == 0:
         return 2.0
-    by_rows = 2 * float((np.asarray(operator.degree)[linked] * (1 / root) ** 2).max())
+    # Rows of M⁻¹(D - W) by size: twice the diagonal, or more with negative weights.
+    by_rows = float((abs(scaled) @ root / root).max())
     if len(linked) < 3:
         return by_rows
     start = np.cos(np.arange(len(linked), dtype=np.float64))  # a fixed start makes the result repeatable

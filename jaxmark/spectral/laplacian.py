@@ -94,11 +94,13 @@ class Neighbours(NamedTuple):
 class Laplacian(NamedTuple):
     """Δ = I - D⁻¹W of a graph with N vertices and E undirected edges, as a pytree of arrays.
 
-    A vertex without edges is an eigenvector of its own, with eigenvalue 0, and has no weight in the inner product.
+    An isolated vertex, one without edges, has a row of zeros: Δx is 0 there, and a filter multiplies its value by the
+    gain at 0. It has no mass, so no M-orthonormal eigenvector contains it: eigenpairs, traces and quadratic forms are
+    those of the vertices that have edges.
     """
 
     edges: Int[Array | np.ndarray, "edges 2"]  # each once, no vertex joined to itself; padding is past the last vertex
-    weights: Float[Array | np.ndarray, " edges"] | None  # W, symmetric by construction, non-negative; None if all are 1
+    weights: Float[Array | np.ndarray, " edges"] | None  # W, symmetric by construction; None if all are 1
     degree: Float[Array | np.ndarray, " vertices"]  # D: the row sums of W, 0 where a vertex is isolated
     neighbours: Neighbours | None = None  # the edges once more, as a table for products by gathering
     lumped_mass: Float[Array | np.ndarray, " vertices"] | None = None  # M, such as areas; None if it is D
@@ -344,7 +346,7 @@ def centre(
     size = len(mass)
     pairs, weights = host_edges(operator)
     # An edge of weight zero joins nothing.
-    tail, head = pairs[weights > 0].T
+    tail, head = pairs[weights != 0].T
     graph = sparse.coo_array((np.ones(len(tail)), (tail, head)), shape=(size, size))
     count, component = csgraph.connected_components(graph, directed=False)
     mass = np.where(mass > 0, mass, 1.0)

@@ -164,7 +164,7 @@ class LowestPairs(NamedTuple):
     """Eigenpairs of Δ from 0 on, ascending; a null vector for each component is among them."""
 
     values: Float[Array, " pairs"]  # in [0, 2]; times `Laplacian.scale`, those of (D - W)x = λMx
-    vectors: Float[Array, "vertices pairs"]  # M-orthonormal; isolated vertices come last, with the value 2
+    vectors: Float[Array, "vertices pairs"]  # M-orthonormal; for isolated vertices, see `lowest_eigenpairs`
     residual: Float[Array, ""]  # the largest ‖Δφ - λφ‖_M of a pair
 
 
@@ -177,9 +177,12 @@ def lowest_eigenpairs(operator: Operator, count: int, seed: Seed, *, dtype: Any 
     apart, also from the first that is left out; turns of vectors within an eigenspace are left out. Reference: Zhou,
     Saad, Tiago, Chelikowsky, "Self-consistent-field calculations using Chebyshev-filtered subspace iteration", 2006.
 
+    `eigenpairs` leaves isolated vertices out. Here shapes are static, so they are filled in after all other pairs, with
+    the value 2, the upper bound of the spectrum: only a `count` above the number of vertices with edges shows them.
+
     Args:
         operator: the Laplacian, of N vertices.
-        count: number of pairs, null vectors included, at most the number of vertices.
+        count: number of pairs, null vectors of components with edges included, at most the number of vertices.
         seed: a number or a JAX random key, of the start of the iteration; converged pairs depend on it by signs, and by
             the bases of eigenspaces.
         dtype: float32 or float64. Iteration ends at a residual of a hundred times its epsilon, or after 60 times.

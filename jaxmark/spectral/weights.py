@@ -3,16 +3,21 @@
 They take NumPy arrays, or JAX's, traced or not, and give the same: on the host in float64, or with derivatives.
 """
 
+from typing import Literal, get_args
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int, Int64
 
+from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Faces, edges, sides
 
 _MIN_COTANGENT = 1e-6  # over the median size of the weights
 _MIN_HEIGHT = 64  # of a face that is not degenerate, over its longest side, in epsilons of the dtype
 
+Negative = Literal["clip", "keep", "refuse"]
 Positions = Float[Array | np.ndarray, "points 3"]
 
 
@@ -26,19 +31,33 @@ def inverse_length_weights(
         return 1 / lengths
 
 
-def cotangent_weights(vertices: Positions, faces: Faces) -> Float[Array | np.ndarray, " edges"]:
-    """Compute half the sum of the cotangents of the angles opposite each edge, clipped below at 1e-6 of the median.
+def cotangent_weights(
+    vertices: Positions, faces: Faces, negative: Negative = "clip"
+) -> Float[Array | np.ndarray, " edges"]:
+    """Compute half the sum of the cotangents of the angles opposite each edge.
 
-    Pinkall, Polthier, "Computing discrete minimal surfaces and their conjugates", 1993. Obtuse angles make weights
-    negative, whence the clipping. A degenerate face, which is flat up to rounding, has no angles, and adds nothing.
+    Pinkall, Polthier, "Computing discrete minimal surfaces and their conjugates", 1993. A weight is negative where two
+    opposite angles sum to more than π, that is, where an edge is not Delaunay. A degenerate face, which is flat up to
+    rounding, has no angles, and adds nothing.
 
     Args:
         vertices: `[V, 3]`.
         faces: `[F, 3]`, concrete.
+        negative: what happens to negative weights: `"clip"`, all weights are raised to at least 1e-6 of the median
+            size, which changes the operator at these edges; `"keep"`, nothing; `"refuse"`, they are refused, which
+            needs concrete vertices.
 
     Returns:
-        `[E]`, in the order of `jaxmark.geometry.mesh.edges`; none is positive if no cotangent is.
+        `[E]`, in the order of `jaxmark.geometry.mesh.edges`; if no cotangent is positive, no weight is.
+
+    Raises:
+        JaxmarkError: if `negative` is something else, or is `"refuse"` and a weight is negative or the vertices are
+            traced.
     """
+    if negative not in get_args(Negative):
+        raise JaxmarkError(f"negative is {', '.join(map(repr, get_args(Negative)))}, not {negative!r}.")
+    if negative == "refuse" and isinstance(vertices, Tracer):
+        raise JaxmarkError("negative='refuse' needs concrete vertices; use 'clip' or 'keep' under jit, vmap or grad.")
     xp = vertices.__array_namespace__()
     pairs, (ends, apex), base = edges(faces), sides(faces), np.array([len(vertices), 1])
     first, second = vertices[ends[:, 0]] - vertices[apex], vertices[ends[:, 1]] - vertices[apex]
@@ -50,7 +69,12 @@ def cotangent_weights(vertices: Positions, faces: Faces) -> Float[Array | np.nda
     which = np.searchsorted(pairs @ base, np.sort(ends, axis=1) @ base)
     which[ends[:, 0] == ends[:, 1]] = len(pairs)
     weights = _sums(cotangents / 2, which, len(pairs))
-    if not len(pairs):
+    if negative == "refuse" and (bad := np.flatnonzero(np.asarray(weights) < 0)).size:
+        raise JaxmarkError(
+            f"{len(bad)} of {len(pairs)} edges have negative cotangent weights, the first is {pairs[bad[0]].tolist()};"
+            " remesh, or use weights='robust' (an intrinsic Delaunay triangulation) or negative='clip'."
+        )
+    if not len(pairs) or negative != "clip":
         return weights
     # A thin face has weights of any size; the median is that of the others.
     least = xp.where(xp.max(weights) > 0, _MIN_COTANGENT * xp.median(xp.abs(weights)), 0)

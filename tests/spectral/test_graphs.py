@@ -1,5 +1,7 @@
 """Laplacians of edges and of points, against dense matrices and trees that are searched by brute force."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -229,11 +231,51 @@ def test_matrices_of_other_libraries(ball, x64):
     x = jnp.asarray(ball.vertices)
     np.testing.assert_allclose(again.apply(x), operator.apply(x), atol=1e-10)
     np.testing.assert_allclose(spectral.from_matrices(stiffness).mass, stiffness.diagonal(), rtol=1e-12)
+
+
+def test_robust_weights_are_those_of_their_own_library(ball, x64):
+    """Of an intrinsic Delaunay triangulation, with a non-manifold edge; a lone vertex moves nothing."""
     robust = pytest.importorskip("robust_laplacian")
-    stiffness, mass = robust.mesh_laplacian(np.asarray(ball.vertices), np.asarray(ball.faces))
-    operator = spectral.from_matrices(stiffness, mass)
-    expected = (stiffness @ ball.vertices) / mass.diagonal()[:, None]
-    np.testing.assert_allclose(operator.apply(x) * operator.scale, expected, atol=1e-9)
+    vertices = np.vstack([ball.vertices, [[2, 2, 2], [9, 9, 9]]])
+    faces = np.vstack([ball.faces, [*np.asarray(ball.faces)[0, :2], len(ball.vertices)]])
+    mesh, x = jm.make_mesh(vertices, faces), jnp.asarray(vertices)
+    stiffness, mass = robust.mesh_laplacian(vertices, faces)
+    expected = (stiffness @ vertices)[:-1]
+    operator = spectral.from_mesh(mesh, "robust", mass="areas")
+    by_mass = expected / mass.diagonal()[:-1, None]
+    np.testing.assert_allclose((operator.apply(x) * operator.scale)[:-1], by_mass, atol=1e-9 * np.abs(by_mass).max())
+    plain = spectral.from_mesh(mesh, "robust")
+    np.testing.assert_allclose(plain.apply(x)[:-1], expected / stiffness.diagonal()[:-1, None], atol=1e-9)
+    for found in (operator, plain):
+        assert np.min(found.weights) > 0
+        np.testing.assert_array_equal(found.apply(x)[-1], 0)
+
+
+def test_negative_cotangents_are_clipped_kept_or_refused(ball, x64, unchecked):
+    """Kept, they are libigl's, and with a mass the spectrum is that of the dense pencil, in [0, 2]."""
+    igl = pytest.importorskip("igl")
+    vertices, faces = np.asarray(ball.vertices) * [1, 1, 0.2], np.asarray(ball.faces)
+    mesh = jm.make_mesh(vertices, faces)
+    stiffness = -igl.cotmatrix(vertices, faces).toarray()
+    pairs = jm.geometry.edges(faces)
+    weights = -stiffness[tuple(pairs.T)]
+    assert (weights < 0).any()
+    np.testing.assert_allclose(spectral.cotangent_weights(vertices, faces, "keep"), weights, atol=1e-12)
+    operator = spectral.from_mesh(mesh, "cotangent", negative="keep", mass="areas")
+    values = linalg.eigh(stiffness, np.diag(operator.mass), eigvals_only=True)
+    assert values[0] > -1e-9 * values[-1]
+    assert values[-1] <= 2 * operator.scale <= 1.02 * values[-1]
+    np.testing.assert_allclose(spectral.eigenpairs(operator).values * operator.scale, values[1:], rtol=1e-9)
+    traced = jax.jit(lambda v: spectral.cotangent_weights(v, faces, "keep"))(jnp.asarray(vertices))
+    np.testing.assert_allclose(traced, weights, atol=1e-12)
+    bad = pairs[np.flatnonzero(weights < 0)[0]].tolist()
+    for options, sentence in [
+        ({"negative": "refuse"}, f"negative cotangent weights, the first is {re.escape(str(bad))}"),
+        ({"negative": "keep"}, "needs a mass"),
+        ({"negative": "drop"}, "not 'drop'"),
+    ]:
+        with pytest.raises(jm.JaxmarkError, match=sentence):
+            spectral.from_mesh(mesh, "cotangent", **options)
 
 
 @pytest.mark.parametrize("options", [{}, {"weights": "cotangent", "mass": "areas"}])
@@ -286,6 +328,8 @@ def test_what_is_no_operator_is_refused(ball, unchecked):
         (lambda: spectral.from_mesh(ball, mass="volumes"), "mass is an array, or 'areas', not 'volumes'"),
         (lambda: spectral.from_mesh(ball, elements="corners"), "not 'corners'"),
         (lambda: spectral.from_mesh(ball, "cotangent", elements="faces"), "cotangents of a mesh belong to its vert"),
+        (lambda: spectral.from_mesh(ball, "robust", elements="edges"), "robust weights of a mesh belong to its vert"),
+        (lambda: jax.jit(lambda v: spectral.from_mesh(jm.Mesh(v, ball.faces), "robust"))(ball.vertices), "concrete"),
         (lambda: spectral.from_mesh(flat, "cotangent"), "No edge has a positive cotangent"),
         (lambda: spectral.from_matrices(stiffness[1:]), "square"),
         (lambda: spectral.from_matrices(stiffness + np.eye(size)), "rows sum to zero"),
