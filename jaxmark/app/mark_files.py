@@ -127,9 +127,9 @@ def mark_file(
         result, info = tracer.fingerprint(name, budget)
         prepared, payload = tracer.mark.original, f"fingerprint of {recipient}"
         read_back, check = partial(tracer.finds, recipient=name), None
-    with writing_pair(marked, record, overwrite=overwrite) as pair:
+    with info.explained(), writing_pair(marked, record, overwrite=overwrite) as pair:
         doing(f"writing {marked}, and measuring the noise that the mark survives")
-        notes = save_mesh(result, pair.file, like=original)
+        notes = (*info.notes, *save_mesh(result, pair.file, like=original))
         # The mark must be readable from the written file, whose numbers are rounded.
         written = load_mesh(pair.file)
         survives = read_back(written)
@@ -246,7 +246,8 @@ def _mark_scene(
         f" {_moved_text(most)} of their diagonals; record → {record}{pair};"
         f" the weakest mark survives {survival_text(least)}"
     )
-    return FileOutcome(values, (text, *_unchanged(skipped), *notes))
+    noted = [f"{name}: {note}" for name, info in info.meshes.items() for note in info.notes]
+    return FileOutcome(values, (text, *_unchanged(skipped), *noted, *notes))
 
 
 def _restricted(info: SceneInfo, names: Collection[str]) -> SceneInfo:

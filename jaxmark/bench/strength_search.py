@@ -51,7 +51,7 @@ def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[s
     def ratio(strength: float) -> float:
         nonlocal tries, refusal
         if strength < weakest:
-            raise JaxmarkError(refusal or f"Even the weakest mark, of strength {weakest:g}, exceeds the limits.")
+            return math.inf  # ends the search
         tries += 1
         try:
             marked = _in_pose_of(mesh, method.embed(mesh, message, key, strength), welded)
@@ -68,12 +68,10 @@ def fit(method: Method, mesh: Mesh, message: Bits, key: bytes, limits: Mapping[s
             fitted.append(Fitted(marked, strength, reached, tries))
         return worst
 
-    try:
-        largest_within(ratio, strongest, math.sqrt(weakest * strongest), SHARE)
-    except JaxmarkError:
-        # The search may end before the weakest mark is tested, which may be within the limits.
-        if not fitted and ratio(weakest) > 1:
-            raise
+    largest_within(ratio, strongest, math.sqrt(weakest * strongest), SHARE)
+    # The search may end before the weakest mark is tested, which may be within the limits.
+    if not fitted and ratio(weakest) > 1:
+        raise JaxmarkError(refusal or f"Even the weakest mark, of strength {weakest:g}, exceeds the limits.")
     return max(fitted, key=lambda mark: mark.strength)._replace(tries=tries)
 
 

@@ -82,13 +82,16 @@ def dame(original: Positions, distorted: Positions, hinges: Hinges) -> Scalar:
     return jnp.sum(inner * masking * change) / jnp.maximum(inner.sum(), 1)
 
 
+def flat_faces(
+    x: Float[Array | np.ndarray, "vertices 3"], faces: Int[Array | np.ndarray, "faces 3"]
+) -> Bool[Array, " faces"]:
+    """Find the faces that are flat, so that their angles mean nothing: lower than 1e-5 of their longest side."""
+    a, b, c = (x[jnp.asarray(faces)[:, corner]] for corner in range(3))
+    longest = jnp.max(jnp.stack([jnp.sum(side**2, axis=1) for side in (b - a, c - a, c - b)]), axis=0)
+    return jnp.sum(jnp.cross(b - a, c - a) ** 2, axis=1) <= (MIN_HEIGHT * longest) ** 2
+
+
 def _is_flat(x: Positions, hinges: Hinges) -> Bool[Array, " edges"]:
     """Find the edges that have a flat face on one of their sides."""
-    tail, head = x[hinges.edges[:, 0]], x[hinges.edges[:, 1]]
-
-    def flat(apex: Array | np.ndarray) -> Array:
-        sides = head - tail, x[apex] - tail, x[apex] - head
-        longest = jnp.max(jnp.stack([jnp.sum(side**2, axis=1) for side in sides]), axis=0)
-        return jnp.sum(jnp.cross(sides[0], sides[1]) ** 2, axis=1) <= (MIN_HEIGHT * longest) ** 2
-
-    return flat(hinges.left) | flat(hinges.right)
+    left, right = (flat_faces(x, jnp.column_stack([hinges.edges, apex])) for apex in (hinges.left, hinges.right))
+    return left | right

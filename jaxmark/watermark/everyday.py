@@ -315,7 +315,8 @@ def embed_scene(
         try:
             marker = prepare(mesh, key, 8 * len(message), scheme)
             result, info = marker.embed(message, budget)
-            info = after(name, marker, result, info)
+            with info.explained():
+                info = after(name, marker, result, info)
         except JaxmarkError as error:
             skipped[name] = str(error).rstrip(".")
         else:

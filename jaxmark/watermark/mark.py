@@ -1,6 +1,8 @@
 """A mark that is read with the original: its original, key, payload and scheme, and how it is written and read."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, TypeVar
@@ -43,6 +45,15 @@ class EmbedInfo(NamedTuple):
     beta: float  # strength: the factor on the carrier's unit displacement, in diagonals
     record: Record  # the record, which the owner needs to read the mark again
     survives: Survival = Survival(0.0, 0.0)  # as predicted; `Marker.measure_survival` measures it
+    notes: tuple[str, ...] = ()  # why limits allow far less than usual, if they do
+
+    @contextmanager
+    def explained(self) -> Iterator[None]:
+        """Return a context that adds the notes to the sentence of a `JaxmarkError`."""
+        try:
+            yield
+        except JaxmarkError as error:
+            raise JaxmarkError(" ".join((str(error), *self.notes))) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +172,9 @@ class Mark:
             message_commitment=commit(content, self.choices) if content else "",
             imprint=seal_imprint(make_imprint(canonical, original.grid), self.key),
         ).sealed(self.key)
-        return written.mesh, EmbedInfo(written.moved.rms, written.moved.max, written.scale, record)
+        return written.mesh, EmbedInfo(
+            written.moved.rms, written.moved.max, written.scale, record, notes=(written.note,) if written.note else ()
+        )
 
     def observe(self, aligned: Alignment, weights: ArrayLike | None = None) -> Observation:
         """Compute the observed displacement of each point of the original, in diagonals; independent of the key.

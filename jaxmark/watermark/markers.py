@@ -126,7 +126,8 @@ class NonBlindMarker(Mark):
         conditions = (Conditions(bounds, 1.0, share) for share in (1.0, COVERAGE))
         info = info._replace(survives=Survival(*(self.capacity.noise(self.bits, reached, case) for case in conditions)))
         if read_back:
-            self.check(marked, message)
+            with info.explained():
+                self.check(marked, message)
         return marked, info
 
     def adapted(self, budget: BudgetLike = None) -> "NonBlindMarker":

@@ -11,6 +11,7 @@ import jaxmark as jm
 from jaxmark.alignment.original import make_original
 from jaxmark.app import cli
 from jaxmark.geometry.mesh import Mesh, make_mesh
+from jaxmark.watermark.mark import EmbedInfo
 from jaxmark.watermark.perception.budget import VISIBILITY, displace_within, largest_within, visibility_of
 from tests.samples import rough_sphere
 
@@ -65,6 +66,31 @@ def test_a_metric_of_ones_own_can_be_limited(mesh: Mesh, noise: np.ndarray, key:
     assert 0.98 * 0.02 <= largest_stretch(mesh, marked) <= 0.02
     with pytest.raises(jm.JaxmarkError, match="The limit of largest_stretch must be a positive number"):
         jm.Budget(limits={largest_stretch: 0.0})
+
+
+def test_a_limit_that_a_few_faces_make_tight_is_named_with_them(mesh: Mesh, noise: np.ndarray, unchecked):
+    """A face is split at a point so near to a corner that the edge between them bounds the whole mark."""
+    bounds = jm.Budget(limits={largest_stretch: 0.02}).bounds(mesh)
+    assert displace_within(make_original(mesh), noise, bounds).note == ""
+    points, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    a, b, c = faces[0]
+    new, near = len(points), points[a] + 1e-3 * (points[b] + points[c] - 2 * points[a])
+    split = make_mesh(np.vstack([points, near]), np.vstack([[[a, b, new], [b, c, new], [c, a, new]], faces[1:]]))
+    written = displace_within(make_original(split), np.vstack([noise, -noise[a]]), bounds)
+    assert written.note.startswith("The limit of largest_stretch, 0.02, allows only ")
+    named = written.note.split("others: ")[1]
+    assert {int(part.split()[0]) for part in named.split(", ")} & {0, 2}
+    info = EmbedInfo(0, 0, 0, None, notes=(written.note,))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(jm.JaxmarkError, match=r"^First\. The limit of largest_stretch"), info.explained():
+        raise jm.JaxmarkError("First.")
+
+
+def test_a_limit_that_no_displacement_keeps_is_named(mesh: Mesh, noise: np.ndarray):
+    def counted(original: Mesh, distorted: Mesh) -> float:
+        return float((original.vertices != distorted.vertices).any(axis=1).sum())
+
+    with pytest.raises(jm.JaxmarkError, match=r"The limit of counted, 1, allows no displacement.* it is 2e\+03"):
+        displace_within(make_original(mesh), noise, jm.Budget(limits={counted: 1, "dame": 1}).bounds(mesh))
 
 
 @pytest.mark.slow
