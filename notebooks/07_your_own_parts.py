@@ -44,8 +44,7 @@ from jaxmark.watermark.carriers import ModulatedCarrier
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import code_length
 from jaxmark.watermark.coding.sequences import orthogonal_sequences
-from jaxmark.watermark.interfaces import Detector, Scheme
-from jaxmark.watermark.reading.detectors import decorrelate
+from jaxmark.watermark.interfaces import Scheme
 
 mesh = asteroid(2800)
 key = jm.Key(bytes(range(32)))  # the same in each run; make real keys by `jm.new_key()`
@@ -153,8 +152,7 @@ class Waves(NamedTuple):
 
 # %% [markdown]
 # A scheme is a frozen dataclass that makes the carrier for an original, a key and a payload, and inherits everything
-# else from `Scheme`. Its fields are stored in the record of a mark. It names its detector: `decorrelate` solves for all
-# bits at once, because the waves are not orthogonal on the surface.
+# else from `Scheme`. Its fields are stored in the record of a mark.
 #
 # `choices` provides everything that depends on the key: signs, permutations and bytes, for a label of your own. They
 # are bound to the scheme's name and fields, the payload and the original, so another wavelength gives other signs. Only
@@ -170,11 +168,6 @@ class WaveScheme(Scheme):
     name: ClassVar[str] = "waves"
     waves: int = 256
     wavelength: float = 0.1  # the shortest, in diagonals
-
-    @property
-    def detector(self) -> Detector:
-        """The detector of this scheme."""
-        return decorrelate
 
     def code_length(self, original, bits: int) -> int:
         """Return the number of code bits for a payload: at most one for every two waves."""

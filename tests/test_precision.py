@@ -170,7 +170,7 @@ def test_products_of_preparing_embedding_and_reading(scheme, original, key: jm.K
 
     def read(x, bits, beta, normals):
         carrier, marked = written(x, bits, beta)
-        soft = detect_bits(jax.lax.stop_gradient(marked), x, carrier, scheme.detector, beta, normals=normals)
+        soft = detect_bits(jax.lax.stop_gradient(marked), x, carrier, beta=beta, normals=normals)
         return jnp.sum(soft * bits)
 
     def others(x, bits, beta):

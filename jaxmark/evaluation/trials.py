@@ -176,7 +176,7 @@ class Trials:
         readers = cycle([reader.with_carrier(_with_signs(reader.carrier, one)) for one in signs])
         pairs = [(own, own.receive(one)) for one, own in zip(copies, readers, strict=False)]
         if self.margin == "rate":
-            values = [np.asarray(word * scheme.detector(*pair, 1.0), np.float64) for pair in pairs]
+            values = [np.asarray(word * reader.carrier.detector(*pair, 1.0), np.float64) for pair in pairs]
         else:
             claims = [own.claim(received, word) for own, received in pairs]
             values = [np.array([float(one.score) / (float(one.norm) or 1)]) for one in claims]

@@ -13,7 +13,7 @@ from jaxmark.alignment.observation import observe
 from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.carriers import Carrier
 from jaxmark.watermark.interfaces import Detector, Strength
-from jaxmark.watermark.reading.detectors import claims, decorrelate
+from jaxmark.watermark.reading.detectors import claims
 
 
 def embed_bits(
@@ -43,7 +43,7 @@ def detect_bits(
     suspect: Float[Array, "vertices 3"],
     x: Float[Array, "vertices 3"],
     carrier: Carrier,
-    detector: Detector = decorrelate,
+    detector: Detector | None = None,
     beta: Strength = 1.0,
     *,
     weights: Float[Array, " vertices"] | None = None,
@@ -55,9 +55,10 @@ def detect_bits(
         suspect: coordinates `[N, 3]` in the original's vertex order.
         x: the original's coordinates `[N, 3]`.
         carrier: the carrier that the bits were embedded with.
-        detector: see `jaxmark.watermark.reading.detectors`.
+        detector: see `jaxmark.watermark.reading.detectors`; by default, the carrier's own.
         beta: relative strengths of the bands, as embedded; a common factor only rescales the result.
         weights: relative inverse variance of each vertex `[N]`, 0 where nothing is known; by default, all are equal.
+            Isolated vertices, such as the rows that pad `Marker.original.signal`, carry nothing and never count.
         normals: unit vectors `[N, 3]`, if the displacement is known only along them; by default, all of it is known.
 
     Returns:
@@ -68,7 +69,7 @@ def detect_bits(
     """
     _check_suspect(suspect, x, weights, normals)
     reader = carrier.reader()
-    return detector(reader, reader.receive(observe(suspect - x, weights, normals)), beta)
+    return (detector or carrier.detector)(reader, reader.receive(observe(suspect - x, weights, normals)), beta)
 
 
 def log_evidence(

@@ -83,6 +83,11 @@ class Carrier(Protocol):
         """Number of code bits that the carrier carries, k."""
         ...
 
+    @property
+    def detector(self) -> Detector:
+        """The detector of the carrier's bits, unless the caller chooses another one."""
+        ...
+
     def displacement(self, bits: Float[Array, " bits"], beta: Strength = 1.0) -> Displacement:
         """Displace the vertices so that they carry the bits; linear in `bits` and in `beta`.
 
@@ -265,16 +270,11 @@ class Scheme(Protocol):
     """A scheme: a dataclass that makes a carrier for an original, a key and a payload size.
 
     The record of a mark stores the fields of its scheme. A scheme of your own inherits from this class and defines
-    `name`, `detector`, `code_length` and `carrier`; `layout`, `dimensions` and `tunable` have defaults.
+    `name`, `code_length` and `carrier`; `layout`, `dimensions` and `tunable` have defaults.
     """
 
     name: ClassVar[str]  # the scheme's name in records and on the command line
     __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    @property
-    def detector(self) -> Detector:
-        """The detector for marks of this scheme, unless the caller chooses another one."""
-        ...
 
     def code_length(self, original: Original, bits: int) -> int:
         """Choose the number of code bits that carry a payload; see `jaxmark.watermark.coding.message.code_length`.

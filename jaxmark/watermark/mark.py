@@ -94,9 +94,9 @@ class Mark:
         carrier = scheme.carrier(original, choices, bits, code_bits)
         if not is_builtin(scheme):
             caveats += (f"the scheme {scheme.name!r} is not one of this library",)
-        if detector not in (None, scheme.detector):
-            caveats += ("the detector is not the scheme's own",)
-        chosen = detector or scheme.detector
+        if detector not in (None, carrier.detector):
+            caveats += ("the detector is not the carrier's own",)
+        chosen = detector or carrier.detector
         return cls(original, choices, bits, scheme, carrier, code_bits, chosen, content, record, caveats)
 
     @property
@@ -123,8 +123,8 @@ class Mark:
 
     @property
     def uses_own_detector(self) -> bool:
-        """Whether the detector is the scheme's own; only then do the reader's shortcuts give equivalent results."""
-        return self.detector is self.scheme.detector
+        """Whether the detector is the carrier's own; only then do the reader's shortcuts give equivalent results."""
+        return self.detector is self.carrier.detector
 
     def choices_of(self, key: bytes) -> Choices:
         """Return the keyed choices of the same mark under another key."""

@@ -161,7 +161,7 @@ class NonBlindMarker(Mark):
         return self._reads_in_order(attempts.align(self.original, marked, "same"), message)
 
     def _reads_in_order(self, aligned: Alignment, message: bytes) -> bool:
-        # The reader's shortcut is equivalent only to the scheme's own detector.
+        # The reader's shortcut is equivalent only to the carrier's own detector.
         if message and self.uses_own_detector and self.read_quickly(self.observe(aligned)) == message:
             return True
         return self._reads(aligned, message)
@@ -463,7 +463,7 @@ def make_marker(
             that it was made with.
         scheme: a name (`"keyed"`, `"host"`, `"eigen"`), which a record overrides; or a scheme of
             `jaxmark.watermark.schemes`, or one of your own.
-        detector: a detector of `jaxmark.watermark.reading.detectors`; by default the scheme's own.
+        detector: a detector of `jaxmark.watermark.reading.detectors`; by default the carrier's own.
 
     Returns:
         The marker.

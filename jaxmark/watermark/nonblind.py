@@ -188,7 +188,7 @@ class _Reading(NamedTuple):
         If its tag does not match, the detector decodes all bits jointly, which is most of the work of reading.
         """
         mark = self.mark
-        # `Reader.correlate` replaces only the scheme's own detector.
+        # `Reader.correlate` replaces only the carrier's own detector.
         correlations = mark.reader.correlate(received) if mark.uses_own_detector else None
         if correlations is not None and ((first := mark.decode(correlations, 1)) is not None or not mark.bits):
             return self.weigh(received, np.asarray(correlations, np.float64), first, "correlations", charges)

@@ -41,7 +41,8 @@ def unbound(original: Mesh, other: Mesh, key: bytes) -> NonBlindMarker:
     ready = replace(make_original(original), geometry=bound.geometry, order=bound.order)
     code = scheme.code_length(ready, 16)
     choices = bind_mark(key, ready, scheme, 16, "message")
-    return NonBlindMarker(ready, choices, 16, scheme, scheme.carrier(ready, choices, 16, code), code, scheme.detector)
+    carrier = scheme.carrier(ready, choices, 16, code)
+    return NonBlindMarker(ready, choices, 16, scheme, carrier, code, carrier.detector)
 
 
 @pytest.mark.slow

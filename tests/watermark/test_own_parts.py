@@ -44,6 +44,10 @@ class Patches(NamedTuple):
     def code_bits(self) -> int:
         return self.patches.shape[1]
 
+    @property
+    def detector(self) -> Detector:
+        return correlate
+
     def displacement(self, bits, beta=1.0):
         heights = matmul(self.patches.reshape(len(self.degree), -1), (bits[:, None] * self.signs).ravel())
         return jnp.asarray(beta) * heights[:, None] * jnp.eye(3, dtype=heights.dtype)[:1]
@@ -73,10 +77,6 @@ class PatchScheme(Scheme):
 
     name: ClassVar[str] = "patches"
     size: int = 8  # patches of a bit
-
-    @property
-    def detector(self) -> Detector:
-        return correlate
 
     def code_length(self, original: Original, bits: int) -> int:
         return code_length(bits, len(original.used) // self.size, 2)

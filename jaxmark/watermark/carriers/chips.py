@@ -20,8 +20,9 @@ from jaxmark.spectral.chebyshev import band_energies, filter, transpose
 from jaxmark.spectral.laplacian import per_row
 from jaxmark.spectral.precision import matmul, sum_and_norm
 from jaxmark.watermark.coding.keys import Choices
-from jaxmark.watermark.interfaces import Claim, Displacement, FreeDimensions, Strength, check_strength
+from jaxmark.watermark.interfaces import Claim, Detector, Displacement, FreeDimensions, Strength, check_strength
 from jaxmark.watermark.perception.masking import apply_mask
+from jaxmark.watermark.reading.detectors import joint
 from jaxmark.watermark.reading.reception import (
     Host,
     Receiver,
@@ -85,6 +86,11 @@ class KeyedCarrier(NamedTuple):
     def code_bits(self) -> int:
         """See `Carrier`."""
         return len(self.chips.population)
+
+    @property
+    def detector(self) -> Detector:
+        """See `Carrier`."""
+        return joint
 
     @jax.jit
     def displacement(self, bits: Float[Array, " bits"], beta: Strength = 1.0) -> Displacement:

@@ -13,7 +13,8 @@ from jaxmark.alignment.observation import Observation
 from jaxmark.seeds import Seed, random_key
 from jaxmark.spectral.precision import einsum, sum_and_norm
 from jaxmark.watermark.carriers.components import Components
-from jaxmark.watermark.interfaces import Claim, Displacement, Strength, check_strength
+from jaxmark.watermark.interfaces import Claim, Detector, Displacement, Strength, check_strength
+from jaxmark.watermark.reading.detectors import decorrelate
 
 
 class PlainReader(NamedTuple):
@@ -71,6 +72,11 @@ class ModulatedCarrier(NamedTuple):
     def code_bits(self) -> int:
         """See `Carrier`."""
         return len(self.sequences)
+
+    @property
+    def detector(self) -> Detector:
+        """See `Carrier`; the components are not orthogonal, so all bits are solved for at once."""
+        return decorrelate
 
     def displacement(self, bits: Float[Array, " bits"], beta: Strength = 1.0) -> Displacement:
         """See `Carrier`."""

@@ -211,7 +211,9 @@ def receive(receiver: Receiver, observation: Observation) -> Reception:
 def _receive(
     receiver: Receiver, observation: Observation, probe: Float[Array, "vertices 3"]
 ) -> tuple[Array, Array, Array, Array, Observation, Array]:
-    observation, factor = _weigh_points(receiver, observation)
+    # An isolated vertex, such as a row that pads the mesh, carries nothing: it is unknown, whatever its weight.
+    weights = jnp.where(receiver.operator.linked(observation.weights), observation.weights, 0)
+    observation, factor = _weigh_points(receiver, observation._replace(weights=weights))
     # The nuisance is projected off twice, because the ridge leaves a small part of a large nuisance.
     nuisance = _fit_nuisance(receiver, observation, factor, observation.residual)
     residual = clean(receiver, observation, factor, observation.residual - nuisance)

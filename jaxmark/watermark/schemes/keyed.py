@@ -15,9 +15,8 @@ from jaxmark.spectral.bands import scaling
 from jaxmark.watermark.carriers.chips import KeyedCarrier, make_chips
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import TAG_BITS, code_length
-from jaxmark.watermark.interfaces import Detector, Scheme
+from jaxmark.watermark.interfaces import Scheme
 from jaxmark.watermark.perception.masking import masking_tensors
-from jaxmark.watermark.reading.detectors import joint
 from jaxmark.watermark.reading.reception import Host, Receiver, make_host, make_receiver
 
 # Relative strengths of the lowest 20 of 64 bands: the mean over meshes that were tuned to noise, smoothing and
@@ -101,11 +100,6 @@ class KeyedScheme(Scheme):
             if getattr(self, name) not in allowed:
                 *others, last = map(repr, allowed)
                 raise JaxmarkError(f"{name} must be {', '.join(others)} or {last}, got {getattr(self, name)!r}.")
-
-    @property
-    def detector(self) -> Detector:
-        """See `Scheme`."""
-        return joint
 
     def code_length(self, original: Original, bits: int) -> int:
         """See `Scheme`; beyond 12 code bits for each bit of message and tag, the code gains less than 0.1 dB."""

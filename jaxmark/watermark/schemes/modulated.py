@@ -13,8 +13,7 @@ from jaxmark.watermark.carriers.modulation import ModulatedCarrier
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import code_length
 from jaxmark.watermark.coding.sequences import orthogonal_sequences
-from jaxmark.watermark.interfaces import Carrier, Detector, Scheme
-from jaxmark.watermark.reading.detectors import decorrelate
+from jaxmark.watermark.interfaces import Carrier, Scheme
 
 
 class ModulatedScheme(Scheme):
@@ -28,11 +27,6 @@ class ModulatedScheme(Scheme):
     def components(self, original: Original) -> Components:
         """Split an original into its components."""
         raise NotImplementedError
-
-    @property
-    def detector(self) -> Detector:
-        """See `Scheme`."""
-        return decorrelate
 
     def code_length(self, original: Original, bits: int) -> int:
         """See `Scheme`; the more code bits share the components, the more they interfere with each other."""

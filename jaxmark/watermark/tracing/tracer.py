@@ -102,7 +102,7 @@ def make_tracer(original: Mesh, key: bytes, *, record: Record | None = None) -> 
     slots = min(_MAX_SLOTS, 1 << (max(2, dimensions) // 2).bit_length() - 1)
     choices = bind_mark(key, ready, scheme, slots, "fingerprint", record)
     carrier = scheme.carrier(ready, choices, _PASSBAND_MESSAGE_BITS, slots)
-    mark = Mark(ready, choices, slots, scheme, carrier, slots, scheme.detector, "fingerprint", record, caveats)
+    mark = Mark(ready, choices, slots, scheme, carrier, slots, carrier.detector, "fingerprint", record, caveats)
     return Tracer(mark)
 
 
