@@ -4,6 +4,9 @@ A `Mesh` is plain data: it goes through `jit`, `vmap` and `grad`. The functions 
 and refuse unusable input before anything is traced.
 """
 
+# `help` then shows the names of type aliases, such as ArrayLike, and not all that they stand for.
+from __future__ import annotations
+
 import math
 from typing import Any, NamedTuple
 

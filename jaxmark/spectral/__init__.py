@@ -7,6 +7,7 @@ reference.
 """
 
 from jaxmark.spectral import bands as bands
+from jaxmark.spectral.bands import fit as fit
 from jaxmark.spectral.chebyshev import band_components as band_components
 from jaxmark.spectral.chebyshev import cross_moments as cross_moments
 from jaxmark.spectral.chebyshev import filter as filter
@@ -18,6 +19,8 @@ from jaxmark.spectral.chebyshev import transpose as transpose
 from jaxmark.spectral.frames import frame_bounds as frame_bounds
 from jaxmark.spectral.frames import inverse as inverse
 from jaxmark.spectral.frames import tight as tight
+from jaxmark.spectral.frozen import FrozenLaplacian as FrozenLaplacian
+from jaxmark.spectral.frozen import freeze as freeze
 from jaxmark.spectral.graphs import from_edges as from_edges
 from jaxmark.spectral.graphs import from_matrices as from_matrices
 from jaxmark.spectral.graphs import from_mesh as from_mesh

@@ -9,6 +9,9 @@ the signal, and cost `degree` products with Δ. A bank of filters is `[bands, de
 `JaxmarkError` is raised if shapes or dtypes do not fit.
 """
 
+# `help` then shows the names of type aliases, such as ArrayLike, and not all that they stand for.
+from __future__ import annotations
+
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal
@@ -33,7 +36,6 @@ Bank = Float[Array | np.ndarray, "bands terms"]
 _BANDS_AT_ONCE = 5  # band components that are formed together where each is used only once
 
 
-@jax.jit
 def filter(operator: Operator, coefficients: Series, x: Signal) -> Float[Array, " vertices *columns"]:
     """Filter a signal: f(Δ)x for the Chebyshev series f(λ) = Σ_k c_k T_k(λ - 1), as one `lax.scan`.
 
@@ -44,12 +46,25 @@ def filter(operator: Operator, coefficients: Series, x: Signal) -> Float[Array, 
 
     Args:
         operator: the Laplacian, of N vertices.
-        coefficients: `[degree + 1]`, or `[C, degree + 1]` for one filter per column of `x`.
+        coefficients: `[degree + 1]`, or `[C, degree + 1]` for one filter per column of `x`; those of a function of λ
+            are given by `fit`.
         x: `[N]` or `[N, C]`.
 
     Returns:
         f(Δ)x, in the shape and dtype of `x`.
+
+    Raises:
+        JaxmarkError: if coefficients or signal have other shapes or types.
     """
+    if callable(coefficients):
+        raise JaxmarkError(
+            "filter takes Chebyshev coefficients; those of a function are spectral.fit(function, degree).coefficients."
+        )
+    return _filter(operator, coefficients, x)
+
+
+@jax.jit
+def _filter(operator: Operator, coefficients: Series, x: Signal) -> Float[Array, " vertices *columns"]:
     x = checked_signal("filter", operator, x)
     c = jnp.asarray(coefficients).astype(x.dtype)
     if c.ndim not in (1, 2) or c.shape[-1] == 0 or (c.ndim == 2 and c.shape[:1] != x.shape[1:]):
@@ -76,7 +91,7 @@ def band_components(operator: Laplacian, coefficients: Bank, x: Signal) -> Float
 
 @jax.jit
 def synthesise(
-    operator: Operator, coefficients: Bank, parts: Float[Array | np.ndarray, "..."]
+    operator: Operator, coefficients: Bank, parts: Float[Array | np.ndarray, ...]
 ) -> Float[Array, " vertices *columns"]:
     """Sum up filtered parts `[bands, N]` or `[bands, N, C]`: Σ_j g_j(Δ)y_j, in one pass; O(bands · N) memory.
 

@@ -4,6 +4,9 @@ They are built on the host, as a `Laplacian` of NumPy arrays in float64 that com
 applied to. Its `weights` are None if all are 1. `JaxmarkError` is raised for input that is not as described here.
 """
 
+# `help` then shows the names of type aliases, such as ArrayLike, and not all that they stand for.
+from __future__ import annotations
+
 from typing import Any, Literal, get_args
 
 import jax
@@ -26,6 +29,7 @@ Elements = Literal["vertices", "faces", "edges"]
 
 _BOUND_MARGIN = 1.01  # over an estimate of the largest eigenvalue that is good to a thousandth
 _MAX_MEETINGS = 100  # pairs of edges that meet, for each edge; in most meshes about five
+_TRACED_LATER = "weights and masses, unlike `with_weights` of the operator,"
 _ROUNDING = 1e-9  # of a matrix's rows that should sum to zero, relative to its diagonal
 
 
@@ -73,6 +77,8 @@ def from_mesh(
             `"cotangent"`, a vertex with edges has no mass, or the bound is below the spectrum.
     """
     _check_name("Products are lowered by", lowering, Lowering)
+    _check_concrete("from_mesh", "faces", mesh.faces)
+    _check_concrete("from_mesh", _TRACED_LATER, weights, mass)
     traced = isinstance(mesh.vertices, Tracer)
     vertices = mesh.vertices if traced else np.asarray(mesh.vertices, np.float64)
     faces = np.asarray(mesh.faces)
@@ -199,6 +205,8 @@ def from_edges(
             directions, which leaves Δ as it is.
         lowering: as in `from_mesh`.
     """
+    _check_concrete("from_edges", "edges", edges)
+    _check_concrete("from_edges", _TRACED_LATER, weights, mass)
     given = np.asarray(edges)
     if given.ndim != 2 or given.shape[1] != 2 or not (np.issubdtype(given.dtype, np.integer) or given.size == 0):
         raise JaxmarkError(f"Edges are whole numbers [E, 2], got {given.dtype} {given.shape}.")
@@ -241,6 +249,7 @@ def from_points(
             exp(-l²/2σ²) of its length l, with σ the mean distance to the farthest of the nearest points.
         lowering: as in `from_mesh`.
     """
+    _check_concrete("from_points", "points", points)
     positions = np.asarray(points, np.float64)
     if positions.ndim != 2 or not np.isfinite(positions).all():
         raise JaxmarkError(f"Points are finite numbers [N, dimensions], got {positions.shape}.")
@@ -350,6 +359,15 @@ def _bound(operator: Laplacian) -> float:
     start = np.cos(np.arange(len(linked), dtype=np.float64))  # a fixed start makes the result repeatable
     found: Any = linalg.eigsh(scaled, 1, which="LA", tol=1e-3, v0=start, return_eigenvectors=False)  # pyright: ignore[reportArgumentType]
     return min(by_rows, _BOUND_MARGIN * float(found[0]))
+
+
+def _check_concrete(function: str, name: str, *values: Any) -> None:
+    """Refuse traced values: the graph of an operator is built on the host."""
+    if any(isinstance(value, Tracer) for value in values):
+        raise JaxmarkError(
+            f"{function} needs concrete {name}, but is called under jit, vmap or grad; build the operator before, and"
+            " pass it as an argument."
+        )
 
 
 def _check_name(sentence: str, name: str, names: Any) -> None:

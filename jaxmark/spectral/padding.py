@@ -6,15 +6,17 @@ compile for, stay as they are.
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Array, Int, Shaped
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.graphs import Weighting, from_mesh, nearest_pairs
-from jaxmark.spectral.laplacian import Laplacian, Lowering, Neighbours, graph_laplacian, host_edges, make_neighbours
+from jaxmark.spectral.laplacian import Laplacian, Lowering, Neighbours, graph_laplacian, make_neighbours
 
 _MIN_SIZE = 256
 _MAX_DOUBLED_SIZE = 2**13  # up to this, sizes double: running takes next to no time
@@ -84,47 +86,88 @@ def pad_edges(operator: Laplacian, valence: float) -> Laplacian:
     return operator._replace(edges=pad_rows(edges, count, size), weights=values, neighbours=table)
 
 
-def stack(operators: Sequence[Laplacian]) -> Laplacian:
-    """Stack operators of any sizes into one whose arrays have a leading axis, on the host.
+def stack(operators: Sequence[Laplacian], *, size: int | None = None, edges: int | None = None) -> Laplacian:
+    """Stack operators of any sizes into one whose arrays have a leading axis.
 
     `jax.vmap(spectral.filter, (0, None, 0))(stack(operators), coefficients, signals)` filters all in one call that is
     compiled once, with signals `[batch, N]` or `[batch, N, C]` for the largest N. Smaller graphs are filled up by
-    isolated vertices, which move nothing: what a signal has there is of no consequence to the others.
+    isolated vertices, which move nothing: what a signal has there is of no consequence to the others. Every graph costs
+    as much as the largest, so sort graphs by size before batching, and loop over those that are far larger than others.
 
     Args:
-        operators: one or more. Products are by table where all have tables alike, with or without weights, and by
-            segment-sums otherwise.
+        operators: one or more; weights, degrees and masses may be traced, such as those of traced positions. Products
+            are by table where all have tables alike, with or without weights, and by segment-sums otherwise.
+        size: number of vertices to fill up to, by default that of the largest graph.
+        edges: number of edges to fill up to, by default that of the graph with the most. Batches of one size and number
+            of edges share compiled programs, unless one has so many vertices of high valence that tables differ.
 
     Returns:
         The batch, from which `jax.tree.map` takes operators out one by one, filled up as they are.
 
     Raises:
-        JaxmarkError: if there is no operator.
+        JaxmarkError: if there is no operator, or one is larger than `size` or `edges`.
     """
     if not operators:
         raise JaxmarkError("There is no operator to stack.")
-    size = max(len(one.degree) for one in operators)
-    found = [host_edges(one) for one in operators]
-    count = max(len(pairs) for pairs, _ in found)
+    real = [np.flatnonzero(np.asarray(one.edges)[:, 0] < len(one.degree)) for one in operators]
+    graphs = [np.asarray(one.edges)[found] for one, found in zip(operators, real, strict=True)]
+    largest, most = max(len(one.degree) for one in operators), max(map(len, graphs))
+    vertices, count = size or largest, edges or most
+    if vertices < largest or count < most:
+        raise JaxmarkError(
+            f"These graphs have up to {largest} vertices and {most} edges, so they do not fit into size={size} and"
+            f" edges={edges}."
+        )
     weighted = any(one.weights is not None for one in operators)
     massive = any(one.lumped_mass is not None for one in operators)
-    tables = [one.neighbours for one in operators if one.neighbours is not None]
-    alike = len(tables) == len(operators) and all((table.edges is not None) == weighted for table in tables)
-    slots = max((len(table.vertices) for table in tables), default=0)
-    rest = max((len(table.rest) for table in tables), default=0)
-    ordered = any(table.order is not None for table in tables)
-    own = np.arange(size, dtype=np.int32)
+    own = [one.neighbours for one in operators if one.neighbours is not None]
+    tables: Sequence[Neighbours | None] = [None] * len(operators)
+    if len(own) == len(operators) and all((table.edges is not None) == weighted for table in own):
+        if size is None and edges is None:
+            tables = _tables_alike(own, [len(pairs) for pairs in graphs], vertices, count)
+        else:
+            tables = _tables_of_shape(graphs, vertices, count, weighted=weighted)
 
-    def padded(table: Neighbours, edges: int) -> Neighbours:
-        """Return a table for a graph of more vertices, edges, slots and neighbours without a slot."""
+    def weights_of(one: Laplacian, found: np.ndarray) -> Any:
+        return np.ones(len(found)) if one.weights is None else one.weights[found]
+
+    batch = [
+        Laplacian(
+            pad_rows(pairs, count, vertices),
+            _filled(weights_of(one, found), count) if weighted else None,
+            _filled(one.degree, vertices),
+            table,
+            _filled(one.mass, vertices) if massive else None,
+            (np.asarray(1.0) if one.scale is None else one.scale) if massive else None,
+        )
+        for one, pairs, found, table in zip(operators, graphs, real, tables, strict=True)
+    ]
+    return jax.tree.map(_stacked, *batch)
+
+
+def _filled(values: Any, count: int) -> Any:
+    """Pad with zeros to a number of values, in NumPy or, such as traced values, in JAX."""
+    return jnp.pad(values, (0, count - len(values))) if isinstance(values, jax.Array) else pad_rows(values, count)
+
+
+def _stacked(*leaves: Any) -> Array | np.ndarray:
+    return (jnp if any(isinstance(leaf, jax.Array) for leaf in leaves) else np).stack(leaves)
+
+
+def _tables_alike(tables: Sequence[Neighbours], counts: Sequence[int], size: int, edges: int) -> list[Neighbours]:
+    """Fill tables up to as many vertices, edges, slots and neighbours without a slot as the largest one has."""
+    slots, rest = max(len(table.vertices) for table in tables), max(len(table.rest) for table in tables)
+    ordered, own = any(table.order is not None for table in tables), np.arange(size, dtype=np.int32)
+
+    def filled(table: Neighbours, count: int) -> Neighbours:
         old_slots, old_size = np.shape(table.vertices)
         vertices, empty = np.tile(own, (slots, 1)), np.full(size, slots, np.int32)
         vertices[:old_slots, :old_size] = table.vertices
         empty[:old_size] = np.asarray(table.empty) + slots - old_slots
         looked_up = None
         if table.edges is not None:
-            looked_up = np.full((slots, size), count, np.int32)
-            looked_up[:old_slots, :old_size] = np.where(np.asarray(table.edges) < edges, table.edges, count)
+            looked_up = np.full((slots, size), edges, np.int32)
+            looked_up[:old_slots, :old_size] = np.where(np.asarray(table.edges) < count, table.edges, edges)
         left = np.asarray(table.rest)
         orders = [
             np.concatenate([own[:old_size] if order is None else order, own[old_size:]]) if ordered else None
@@ -132,15 +175,16 @@ def stack(operators: Sequence[Laplacian]) -> Laplacian:
         ]
         return Neighbours(vertices, empty, pad_rows(left[left[:, 0] < old_size], rest, size), looked_up, *orders)
 
-    batch = [
-        Laplacian(
-            pad_rows(pairs, count, size),
-            pad_rows(weights, count) if weighted else None,
-            pad_rows(np.asarray(one.degree), size),
-            padded(one.neighbours, len(pairs)) if alike and one.neighbours is not None else None,
-            pad_rows(np.asarray(one.mass), size) if massive else None,
-            np.asarray(1.0 if one.scale is None else one.scale) if massive else None,
-        )
-        for one, (pairs, weights) in zip(operators, found, strict=True)
-    ]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *batch)
+    return [filled(table, count) for table, count in zip(tables, counts, strict=True)]
+
+
+def _tables_of_shape(
+    graphs: Sequence[Int[np.ndarray, "_edges 2"]], size: int, edges: int, *, weighted: bool
+) -> list[Neighbours | None]:
+    """Build tables in a shape that nearly all graphs with as many vertices and edges share."""
+    slots = 4 * math.ceil((2 * edges / size + 1) / 4)
+    tables = [make_neighbours(pairs, size, weighted=weighted, slots=slots) for pairs in graphs]
+    rest, most = max(size // 4, 1), max(0 if table is None else len(table.rest) for table in tables)
+    while rest < most:
+        rest *= 4
+    return [table and table._replace(rest=pad_rows(np.asarray(table.rest), rest, size)) for table in tables]

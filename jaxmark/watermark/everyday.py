@@ -5,7 +5,8 @@ bound to each mesh's geometry, so that the marks of different meshes of a scene 
 equal marks and count once.
 """
 
-from __future__ import annotations  # so that `help` shows the names of type aliases
+# `help` then shows the names of type aliases, such as ArrayLike, and not all that they stand for.
+from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.polynomial import chebyshev
 from scipy import integrate, optimize, special
 
+from jaxmark import spectral
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral.bands import bernstein, equal_edges, hat, intervals, lagrange, minimax, nodes, report, scaling
@@ -17,6 +18,7 @@ from jaxmark.spectral.graphs import from_mesh
 from jaxmark.spectral.laplacian import centre
 from jaxmark.spectral.spectrum import eigenpairs, quadrature, white_probes
 from tests.dense import laplacian_matrix
+from tests.samples import bumpy_sphere
 
 pytestmark = pytest.mark.core
 
@@ -293,4 +295,38 @@ def test_refusals(unchecked):
         lambda: hat(np.array([1.0, 0.5]), 4),
     ):
         with pytest.raises(JaxmarkError):
+            call()
+
+
+def test_a_fitted_function_is_interpolated_and_its_error_said():
+    """Against SciPy's interpolation at the same points, and the bound by the best polynomial, on a finer grid."""
+
+    def function(x):
+        return 1 / (1 + 10 * x)
+
+    fine = np.linspace(0, 2, 100_003)
+    for degree in (0, 5, 20, 60):
+        found = spectral.fit(function, degree)
+        expected = chebyshev.chebinterpolate(lambda y: function(y + 1), degree)
+        np.testing.assert_allclose(found.coefficients, expected, atol=1e-14)
+        errors = np.abs(chebyshev.chebval(fine - 1, found.coefficients) - function(fine))
+        assert errors.max() <= 1.001 * found.error + 1e-15
+        assert found.error <= (2 + 2 / np.pi * np.log(degree + 1)) * minimax(function, degree).deviation + 1e-15
+    operator = from_mesh(bumpy_sphere(1))
+    x = np.random.default_rng(0).normal(size=42)
+    values, vectors, _ = spectral.eigenpairs(operator)
+    exact = x + vectors @ ((function(values) - 1) * (vectors.T @ (np.asarray(operator.mass) * x)))
+    smooth = spectral.filter(operator, spectral.fit(function, 60).coefficients, jnp.asarray(x, jnp.float32))
+    np.testing.assert_allclose(smooth, exact, atol=1e-5)
+
+
+def test_functions_that_cannot_be_fitted_are_refused(unchecked):
+    operator = from_mesh(bumpy_sphere(1))
+    for call, sentence in [
+        (lambda: spectral.fit(np.exp, -1), "degree of at least 0, got -1"),
+        (lambda: spectral.fit(lambda x: np.where(x < 1, np.nan, x), 3), "one finite value for each"),
+        (lambda: spectral.fit(lambda x: np.float64(1), 3), "one finite value for each"),
+        (lambda: spectral.filter(operator, np.exp, jnp.ones(42)), r"spectral.fit\(function, degree\)"),  # pyright: ignore
+    ]:
+        with pytest.raises(JaxmarkError, match=sentence):
             call()

@@ -307,6 +307,52 @@ def check_batch(operators: list, dtype) -> None:
         np.testing.assert_allclose(found[k, :own], expected, atol=tolerance(dtype, 10))
 
 
+def test_batches_of_one_size_share_a_program(dtype):
+    """Other graphs in each batch, with and without weights; too small a size is refused."""
+    rng = np.random.default_rng(0)
+    batched = jax.jit(jax.vmap(spectral.filter, (0, None, 0)))
+    for weights, programs in (("valence", 1), ("gaussian", 2)):
+        for _ in range(3):
+            clouds = [rng.normal(size=(size, 3)) for size in rng.integers(40, 100, 3)]
+            operators = [spectral.from_points(cloud, 5, weights) for cloud in clouds]
+            x = rng.normal(size=(3, 128)).astype(dtype)
+            found = batched(spectral.stack(operators, size=128, edges=512), rng.normal(size=6).astype(dtype), x)
+            assert batched._cache_size() == programs  # pyright: ignore[reportAttributeAccessIssue]
+            c = rng.normal(size=6).astype(dtype)
+            found = batched(spectral.stack(operators, size=128, edges=512), c, x)
+            for k, one in enumerate(operators):
+                expected = spectral.filter(one, c, x[k, : len(one.degree)])
+                np.testing.assert_allclose(found[k, : len(expected)], expected, atol=tolerance(dtype, 10))
+    with pytest.raises(jm.JaxmarkError, match="do not fit into size=128 and edges=99"):
+        spectral.stack(operators, size=128, edges=99)
+
+
+def test_operators_of_traced_positions_stack(ball, x64):
+    """Gradients of meshes of unequal sizes in one batch are those of each alone."""
+    meshes, bound = [ball, bumpy_sphere(1)], 300.0
+    x = [jnp.asarray(mesh.vertices) for mesh in meshes]
+    c = np.random.default_rng(0).normal(size=5)
+
+    def operators(positions):
+        made = zip(positions, meshes, strict=True)
+        return [spectral.from_mesh(jm.Mesh(v, mesh.faces), "cotangent", mass="areas", bound=bound) for v, mesh in made]
+
+    def together(positions):
+        size = max(map(len, positions))
+        signals = jnp.stack([jnp.pad(v, ((0, size - len(v)), (0, 0))) for v in positions])
+        batch = spectral.stack(operators(positions))
+        found = jax.vmap(spectral.filter, (0, None, 0))(batch, c, signals)
+        return sum(jnp.sum(jnp.sin(one[: len(v)])) for one, v in zip(found, positions, strict=True))
+
+    def alone(positions):
+        return sum(
+            jnp.sum(jnp.sin(spectral.filter(one, c, v))) for one, v in zip(operators(positions), positions, strict=True)
+        )
+
+    for found, expected in zip(jax.jit(jax.grad(together))(x), jax.jit(jax.grad(alone))(x), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
 @pytest.mark.slow
 def test_a_batch_of_32_unlike_meshes(dtype):
     rng = np.random.default_rng(0)
@@ -328,6 +374,16 @@ def test_what_is_no_operator_is_refused(ball, unchecked):
         (lambda: spectral.from_mesh(ball, mass="volumes"), "mass is an array, or 'areas', not 'volumes'"),
         (lambda: spectral.from_mesh(ball, elements="corners"), "not 'corners'"),
         (lambda: spectral.from_mesh(ball, "cotangent", elements="faces"), "cotangents of a mesh belong to its vert"),
+        (
+            lambda: jax.jit(lambda m: spectral.from_mesh(m).degree)(ball),
+            "from_mesh needs concrete faces, but is called",
+        ),
+        (lambda: jax.jit(lambda w: spectral.from_mesh(ball, w).degree)(np.ones(480)), "unlike `with_weights`"),
+        (lambda: jax.jit(lambda p: spectral.from_points(p).degree)(ball.vertices), "from_points needs concrete points"),
+        (
+            lambda: jax.jit(lambda e: spectral.from_edges(e).degree)(np.array([[0, 1]])),
+            "from_edges needs concrete edges",
+        ),
         (lambda: spectral.from_mesh(ball, "robust", elements="edges"), "robust weights of a mesh belong to its vert"),
         (lambda: jax.jit(lambda v: spectral.from_mesh(jm.Mesh(v, ball.faces), "robust"))(ball.vertices), "concrete"),
         (lambda: spectral.from_mesh(flat, "cotangent"), "No edge has a positive cotangent"),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from jaxmark import spectral
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral import learned
@@ -205,3 +206,45 @@ def test_without_equinox_the_extra_is_named(monkeypatch):
         learned.ChebConv  # noqa: B018
     with pytest.raises(AttributeError, match="no attribute 'GraphConv'"):
         learned.GraphConv  # noqa: B018
+
+
+@pytest.mark.parametrize("options", [{}, {"weights": "cotangent", "mass": "areas"}], ids=["valence", "cotangent"])
+def test_optimisers_change_layers_and_weights_but_no_frozen_operator(options):
+    """Equinox and optax, with weight decay, which also changes what has no gradient."""
+    eqx, optax = pytest.importorskip("equinox"), pytest.importorskip("optax")
+    mesh = bumpy_sphere(1)
+    operator = spectral.from_mesh(mesh, **options)
+    x = jnp.asarray(mesh.vertices, jnp.float32)
+    ones = jnp.ones(len(operator.edges))
+
+    class Model(eqx.Module):
+        frozen: spectral.FrozenLaplacian
+        layer: learned.ChebConv
+        weights: jax.Array
+
+        def __call__(self, x):
+            smooth = spectral.filter(self.frozen.operator.with_weights(self.weights), jnp.array([1, 0.5]), x)
+            return smooth + self.layer(self.frozen.operator, x)
+
+    model = Model(spectral.freeze(operator), learned.ChebConv(3, 3, 2, key=jax.random.key(0)), ones)
+    optimiser = optax.adamw(1e-2, weight_decay=0.1)
+    state = optimiser.init(eqx.filter(model, eqx.is_inexact_array))
+
+    @eqx.filter_jit
+    def step(model, state):
+        loss, slopes = eqx.filter_value_and_grad(lambda model: jnp.mean((model(x) - x) ** 2))(model)
+        updates, state = optimiser.update(slopes, state, eqx.filter(model, eqx.is_inexact_array))
+        return eqx.apply_updates(model, updates), state, loss
+
+    losses = []
+    with jax.numpy_dtype_promotion("standard"):  # which optax needs
+        for _ in range(10):
+            model, state, loss = step(model, state)
+            losses.append(float(loss))
+    assert losses[-1] < 0.8 * losses[0]
+    assert not np.array_equal(model.weights, ones)
+    for before, after in zip(jax.tree.leaves(operator), jax.tree.leaves(model.frozen.operator), strict=True):
+        np.testing.assert_array_equal(after, jnp.asarray(before))
+    np.testing.assert_array_equal(
+        spectral.filter(model.frozen.operator, jnp.ones(3), x), spectral.filter(operator, jnp.ones(3), x)
+    )

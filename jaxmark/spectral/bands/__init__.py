@@ -7,7 +7,9 @@ arguments outside of the ranges that are given. `report` measures how cleanly a 
 
 from jaxmark.spectral.bands._lowpasses import diffusion as diffusion
 from jaxmark.spectral.bands._lowpasses import heat as heat
+from jaxmark.spectral.bands._minimax import Interpolation as Interpolation
 from jaxmark.spectral.bands._minimax import Minimax as Minimax
+from jaxmark.spectral.bands._minimax import fit as fit
 from jaxmark.spectral.bands._minimax import hat as hat
 from jaxmark.spectral.bands._minimax import minimax as minimax
 from jaxmark.spectral.bands._partitions import Damping as Damping

@@ -4,6 +4,9 @@ Any smoothing changes the host by a slowly varying function of λ. A few exponen
 such functions well, far better than as many polynomials do.
 """
 
+# `help` then shows the names of type aliases, such as ArrayLike, and not all that they stand for.
+from __future__ import annotations
+
 import math
 
 import numpy as np

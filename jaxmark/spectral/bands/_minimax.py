@@ -14,6 +14,39 @@ _POINTS_PER_RIPPLE = 32  # grid points, which miss at most 0.1 % of a ripple's h
 _MAX_EXCHANGES = 200
 
 
+class Interpolation(NamedTuple):
+    """A polynomial that interpolates a function on [0, 2]."""
+
+    coefficients: Float64[np.ndarray, " terms"]  # its Chebyshev series, for `jaxmark.spectral.filter`
+    error: float  # largest error on a grid that is 32 times as fine as the points of interpolation
+
+
+def fit(function: Callable[[np.ndarray], np.ndarray], degree: int) -> Interpolation:
+    """Interpolate a function g(λ) at the zeros of T_{degree + 1}(λ - 1), so that `filter` computes g(Δ)x.
+
+    The error is at most 2 + 2/π log(degree + 1) times that of the best polynomial, which `minimax` finds, and falls
+    geometrically with the degree if the function is analytic on [0, 2] (Trefethen, "Approximation Theory and
+    Approximation Practice", 2013, ch. 8 and 15).
+
+    Args:
+        function: maps λ `[points]` in [0, 2] to values `[points]`.
+        degree: degree of the polynomial, at least 0.
+
+    Raises:
+        JaxmarkError: if the degree is negative, or the function is not finite there, or returns another shape.
+    """
+    if degree < 0:
+        raise JaxmarkError(f"fit needs a degree of at least 0, got {degree}.")
+    points = 1 + np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
+    grid = 1 - np.cos(np.linspace(0, np.pi, _POINTS_PER_RIPPLE * (degree + 1) + 1))
+    values, fine = (np.asarray(function(where), np.float64) for where in (points, grid))
+    if values.shape != points.shape or not (np.isfinite(values).all() and np.isfinite(fine).all()):
+        raise JaxmarkError("fit needs a function with one finite value for each λ in [0, 2].")
+    coefficients = 2 / (degree + 1) * chebyshev.chebvander(points - 1, degree).T @ values
+    coefficients[0] /= 2
+    return Interpolation(coefficients, float(np.abs(chebyshev.chebval(grid - 1, coefficients) - fine).max()))
+
+
 class Minimax(NamedTuple):
     """A best approximation p of a function f on [0, 2]; by Chebyshev's theorem, the alternation of f - p proves it."""
 

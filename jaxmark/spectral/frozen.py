@@ -1,0 +1,58 @@
+"""Operators as parts of trained models that no optimiser changes.
+
+An optimiser changes all floating-point leaves of a model, so a Laplacian among its fields would drift away from its
+graph: its degrees would no longer be sums of its weights. Keep operators out of models and pass them as arguments, or
+freeze them.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxmark.spectral.laplacian import Laplacian
+
+_WHOLE = {2: jnp.int16, 4: jnp.int32, 8: jnp.int64}  # by the size of a number in bytes
+_FLOATING = ("weights", "degree", "lumped_mass", "scale")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class FrozenLaplacian:
+    """A Laplacian whose floating-point arrays are stored as whole numbers, which no optimiser takes for parameters.
+
+    It is a pytree. Gradients, weight decay and casts to other precisions leave it as it is.
+    """
+
+    bits: Laplacian  # the operator, with the bit patterns of its floating-point arrays
+
+    @property
+    def operator(self) -> Laplacian:
+        """The operator, for filters; derivatives with respect to it are zero."""
+        fields = {name: _as_float(getattr(self.bits, name)) for name in _FLOATING}
+        return self.bits._replace(**fields)
+
+
+def freeze(operator: Laplacian) -> FrozenLaplacian:
+    """Freeze an operator, so that it can be a field of a model that is trained.
+
+    The arrays take JAX's default precision: float32, unless `jax_enable_x64` is set. To train weights of edges, do not
+    freeze the operator, but make it in each step by `Laplacian.with_weights`.
+    """
+    return FrozenLaplacian(operator._replace(**{name: _as_bits(getattr(operator, name)) for name in _FLOATING}))
+
+
+def _as_bits(values: Any) -> Array | None:
+    if values is None:
+        return None
+    values = jnp.asarray(values)
+    return jax.lax.bitcast_convert_type(values, _WHOLE[values.dtype.itemsize])
+
+
+def _as_float(values: Any) -> Array | None:
+    if values is None:
+        return None
+    values = jnp.asarray(values)
+    return jax.lax.bitcast_convert_type(values, jnp.dtype(f"float{8 * values.dtype.itemsize}"))
