@@ -331,10 +331,12 @@ def embed_scene(
                 marked[name] = result
             except JaxmarkError as error:
                 skipped[name] = str(error).rstrip(".")
-    marked, infos, skipped = ({name: one[name] for name in meshes if name in one} for one in (marked, infos, skipped))
+    skipped = {name: skipped[name] for name in meshes if name in skipped}
     if not marked:
         raise JaxmarkError(f"None of the {len(meshes)} meshes can carry the mark: {_reasons(skipped)}.")
-    return marked, SceneInfo(infos, skipped, SceneRecord({name: info.record for name, info in infos.items()}))
+    infos = {name: infos[name] for name in meshes if name in infos}
+    record = SceneRecord({name: info.record for name, info in infos.items()})
+    return {name: marked[name] for name in infos}, SceneInfo(infos, skipped, record)
 
 
 def detect_scene(
