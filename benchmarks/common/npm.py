@@ -39,7 +39,7 @@ def install(package: str) -> Path:
     return folder
 
 
-def run(*words: object) -> str:
+def run_node(*words: object) -> str:
     """Run node on a script and its arguments; returns what it printed.
 
     Raises:

@@ -41,7 +41,7 @@ def validate() -> Callable[[Path], set[tuple[str, str]]]:
         folder = npm.install(PACKAGE)
     except npm.NpmError as error:
         pytest.skip(str(error))
-    return lambda path: {(code, pointer) for code, pointer in json.loads(npm.run("-e", SCRIPT, folder, path))}
+    return lambda path: {(code, pointer) for code, pointer in json.loads(npm.run_node("-e", SCRIPT, folder, path))}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
