@@ -14,6 +14,7 @@ it. The table has a row for each program, operation and pair of formats:
 Programs of npm are installed into the user's cache. Rows of programs that are not installed say so.
 """
 
+import locale
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import import_module
@@ -207,12 +208,15 @@ def read(case: Case, subject: Subject, folder: Path) -> Row:
     """
     row: Row = {"program": case.tool, "operation": case.operation, "from": case.source[1:], "to": case.result[1:]}
     out = folder / f"converted{case.result}"
+    words = locale.setlocale(locale.LC_ALL)
     try:
         case.convert(subject.files[case.source], out)
     except MissingError:
         raise
     except Exception as error:  # whatever another program raises
         return row | {"message": f"the program fails: {type(error).__name__}: {' '.join(str(error).split())}"}
+    finally:
+        locale.setlocale(locale.LC_ALL, words)  # lib3mf leaves another one, in which files are read as ASCII
     try:
         suspect = jm.load_mesh(out)
         found = subject.marker.detect(suspect)

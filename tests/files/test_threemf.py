@@ -1,7 +1,9 @@
 import io
+import locale
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -353,6 +355,15 @@ def test_lib3mf_sees_the_new_positions(tmp_path: Path, name: str) -> None:
         np.testing.assert_array_equal(faces, mesh.faces)
 
 
+@pytest.fixture
+def same_locale() -> Iterator[None]:
+    """Restore the locale, which lib3mf changes when it writes, so that files would be read as ASCII."""
+    before = locale.setlocale(locale.LC_ALL)
+    yield
+    locale.setlocale(locale.LC_ALL, before)
+
+
+@pytest.mark.usefixtures("same_locale")
 def test_models_of_the_production_extension_are_patched_in_place(tmp_path: Path) -> None:
     """Parts in model files of their own, which the root model names by paths."""
     library = pytest.importorskip("lib3mf")
