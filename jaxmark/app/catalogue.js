@@ -13,7 +13,7 @@ const picture = (id) => {
   image.alt = "";
   return image;
 };
-const power = (value) => `10^${(Math.ceil(value * 10 - 1e-9) / 10).toFixed(1)}`;
+const power = (value) => make("span", "10", make("sup", (Math.ceil(value * 10 - 1e-9) / 10).toFixed(1)));
 const text = (hexadecimal) => {
   try {
     const bytes = Uint8Array.from(hexadecimal.match(/../g), (pair) => parseInt(pair, 16));
@@ -31,7 +31,7 @@ async function list() {
   const answer = await (await fetch(`originals?start=${listed}`)).json();
   if (answer.refused) { place("count").textContent = answer.refused; return; }
   listed += answer.originals.length;
-  place("count").textContent = `${answer.count} originals`;
+  place("count").textContent = `${answer.count} ${answer.count === 1 ? "original" : "originals"}`;
   for (const entry of answer.originals) {
     const counts = `${entry.vertices} vertices, ${entry.records} records, ${entry.recipients} recipients`;
     place("originals").append(make("figure", null, picture(entry.id), make("figcaption", `${entry.id}  ${entry.name}: ${counts}`)));
@@ -39,18 +39,19 @@ async function list() {
   place("more").hidden = listed >= answer.count;
 }
 
-function show(answer) {
+function show(name, answer) {
   const verdict = place("verdict");
   verdict.replaceChildren();
   if (answer.refused) { verdict.append(make("p", answer.refused)); return; }
   const named = answer.matches.filter((match) => match.named);
-  const head = named.length ? named.map((match) => `${match.original}: ${content(match)}`).join("; ") : "No original is named";
-  const box = make("div", null, make("b", head));
+  const head = named.length ? named.map((match) => `made from ${match.original}, ${content(match)}`).join("; ") : "no original is named";
+  const box = make("div", null, make("b", `${name}: ${head}`));
   box.className = "key";
   if (named.length) {
-    box.append(make("p", `The false-positive probability of this result is at most ${power(answer.log10_p)} if `
-      + "keys, originals, records and the list of recipients were fixed before the file existed, and at most "
-      + `${power(answer.log10_p_uncommitted)} even if keys, originals and records were chosen afterwards. Both bounds count all ${answer.readings} readings that could have been made.`));
+    box.append(make("p", "The false-positive probability of this result is at most ", power(answer.log10_p),
+      " if keys, originals, records and the list of recipients were fixed before the file existed, and at most ",
+      power(answer.log10_p_uncommitted), " even if keys, originals and records were chosen afterwards. Both bounds "
+      + `count all ${answer.readings} readings that could have been made.`));
   }
   if (answer.dossier) {
     const link = make("a", "Dossier");
@@ -59,19 +60,23 @@ function show(answer) {
   }
   const rows = answer.matches.map((match) => make("tr", null,
     make("td", null, picture(match.id)), make("td", match.original), make("td", `${match.by}, rank ${match.rank}`),
-    make("td", content(match)), make("td", power(match.log10_p))));
+    make("td", content(match)), make("td", null, power(match.log10_p))));
   const titles = ["", "original", "similar by", "result", "false-positive probability"].map((title) => make("th", title));
   verdict.append(box, make("table", null, make("tr", null, ...titles), ...rows));
 }
 
+let latest = null;
 async function find(file) {
-  show({ refused: `Comparing ${file.name} with the originals …` });
+  latest = file;
+  show(file.name, { refused: `Comparing ${file.name} with the originals …` });
+  let answer;
   try {
     const request = { method: "POST", headers: { "x-jaxmark": "find" }, body: file };
-    show(await (await fetch(`find?name=${encodeURIComponent(file.name)}`, request)).json());
+    answer = await (await fetch(`find?name=${encodeURIComponent(file.name)}`, request)).json();
   } catch (error) {
-    show({ refused: `The server does not answer: ${error.message}` });
+    answer = { refused: `The server does not answer: ${error.message}` };
   }
+  if (file === latest) show(file.name, answer);  // a file that was chosen later has the place of its answer
 }
 
 const drop = place("drop");
@@ -82,6 +87,7 @@ for (const kind of ["dragover", "dragleave", "drop"]) {
     if (kind === "drop" && event.dataTransfer.files.length) find(event.dataTransfer.files[0]);
   });
 }
+place("file").addEventListener("click", (event) => { event.target.value = ""; });  // the same file can be chosen again
 place("file").addEventListener("change", (event) => event.target.files.length && find(event.target.files[0]));
 place("more").addEventListener("click", list);
 list();

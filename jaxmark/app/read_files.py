@@ -1,6 +1,6 @@
 """Read marks from mesh files, blind or non-blind."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
@@ -18,10 +18,10 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import Scene, limits, load_mesh, load_scene, load_skin
 from jaxmark.files.programs import release_programs
 from jaxmark.files.typed import find_name
-from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh, digest
 from jaxmark.watermark.blind.reading import best_of, try_each
 from jaxmark.watermark.coding.keys import Key
-from jaxmark.watermark.everyday import alternatives, detect_scene, read_blind, with_blind
+from jaxmark.watermark.everyday import EQUALS_ANOTHER, alternatives, detect_scene, read_blind, with_blind
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Detection
 from jaxmark.watermark.markers import make_marker
@@ -141,7 +141,8 @@ class FileReader:
 
         The charge is for all meshes that could have been selected, because a user may try one after another.
         """
-        records = [None] if record is None else list(record.meshes.values())
+        # Equal meshes and equal records give equal readings: they are read, and charged, once.
+        records = [None] if record is None else list({each.digest(): each for each in record.meshes.values()}.values())
         for entry in records:
             if entry is not None and entry.scheme not in BLIND_SCHEMES:
                 raise JaxmarkError(f"The scheme {entry.scheme!r} of the record is not blind; give --original.")
@@ -150,9 +151,12 @@ class FileReader:
         selected = pick(scene, self.meshes, suspect).meshes
         several = len(scene.meshes) > 1
         meshes = scene.meshes if several else {"": load_mesh(suspect)}
-        readable = [name for name, mesh in meshes.items() if len(mesh.vertices) >= limits.BLIND_POINTS]
-        largest = sorted(readable, key=lambda name: -len(meshes[name].vertices))
-        names = [name for name in largest if name in selected] if several and self.meshes else largest
+        largest = sorted(
+            (name for name, mesh in meshes.items() if len(mesh.vertices) >= limits.BLIND_POINTS),
+            key=lambda name: -len(meshes[name].vertices),
+        )
+        readable = _distinct(largest, meshes)
+        names = _distinct([name for name in largest if name in selected], meshes) if several else readable
         if not names:
             raise JaxmarkError(
                 f"{suspect}: a blind mark needs a mesh of {limits.BLIND_POINTS} points or more, and there is none"
@@ -208,7 +212,10 @@ class FileReader:
         count = len(detection.parts) + len(detection.skipped)
         charge = ledger.MESHES.charge("each", count)
         parts = [part._replace(evidence=part.evidence.charged(charge)) for part in detection.parts.values()]
-        return self._count_proving(detection, parts, count)
+        detection = self._count_proving(detection, parts, count)
+        equal = list(detection.skipped.values()).count(EQUALS_ANOTHER)
+        note = f"{equal} {'equals another' if equal == 1 else 'equal others'}, and count{'s' * (equal == 1)} once."
+        return detection._replace(notes=(*detection.notes, note)) if equal else detection
 
     def _count_proving(self, detection: Detection, parts: Sequence[Detection], meshes: int) -> Detection:
         """Add a note on how many of several meshes prove the mark without the others, after the charge for each."""
@@ -232,6 +239,14 @@ class FileReader:
                 raise
             self._last = place, marks
         return self._last[1]
+
+
+def _distinct(names: Sequence[str], meshes: Mapping[str, Mesh]) -> list[str]:
+    """Select the first of the named meshes that are equal."""
+    first: dict[bytes, str] = {}
+    for name in names:
+        first.setdefault(digest(meshes[name]), name)
+    return list(first.values())
 
 
 def _resembling(suspect: Path, name: str, original: Original) -> Mesh:

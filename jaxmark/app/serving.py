@@ -241,6 +241,9 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
     async def script(request: Request) -> Response:
         return reply(_asset("catalogue.js"), "text/javascript; charset=utf-8")
 
+    async def icon(request: Request) -> Response:
+        return reply(b"", "image/x-icon", 204)  # browsers ask for it, and report an error if there is no answer
+
     async def originals(request: Request) -> Response:
         start = request.query_params.get("start", "0")
         first = int(start) if start.isdecimal() and len(start) < 10 else 0
@@ -296,6 +299,7 @@ def make_app(desk: Desk, most_bytes: int) -> Any:
         routes=[
             Route("/", page),
             Route("/catalogue.js", script),
+            Route("/favicon.ico", icon),
             Route("/originals", originals),
             Route("/thumbnails/{number:str}", thumbnail),
             Route("/dossiers/{token:str}", dossier),

@@ -7,6 +7,7 @@ and refuse unusable input before anything is traced.
 # `help` then shows the names of type aliases, such as ArrayLike, and not all that they stand for.
 from __future__ import annotations
 
+import hashlib
 import math
 from typing import Any, NamedTuple
 
@@ -293,6 +294,17 @@ def simplify(mesh: Mesh, faces: int) -> Mesh:
 def same_connectivity(first: Mesh, second: Mesh) -> bool:
     """Whether two meshes have the same number of vertices and the same faces, index by index."""
     return len(first.vertices) == len(second.vertices) and np.array_equal(first.faces, second.faces)
+
+
+def digest(mesh: Mesh) -> bytes:
+    """Hash the arrays of a mesh, so that meshes of equal vertices and faces, in the same order, have equal hashes."""
+    check_mesh(mesh)
+    check_concrete("This", mesh.vertices, mesh.faces)
+    hashed = hashlib.sha256()
+    for array in map(np.asarray, mesh):
+        hashed.update(f"{array.dtype} {array.shape} ".encode())
+        hashed.update(array.tobytes())
+    return hashed.digest()
 
 
 def displacement(mesh: Mesh, suspect: Mesh, welded: Weld, length: float) -> Float64[np.ndarray, "points 3"]:

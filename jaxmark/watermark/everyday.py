@@ -21,7 +21,7 @@ from jaxmark.alignment.pairing import pair
 from jaxmark.alignment.result import Align, Alignment
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.typed import find_name
-from jaxmark.geometry.mesh import Mesh, check_mesh
+from jaxmark.geometry.mesh import Mesh, check_mesh, digest
 from jaxmark.watermark.blind import reading as blind_reading
 from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.coding.keys import KEY_BYTES, Key
@@ -46,6 +46,8 @@ from jaxmark.watermark.schemes.registry import (
     make_blind_scheme,
     split,
 )
+
+EQUALS_ANOTHER = "It equals another mesh, which counts once"  # reason why a mesh of a scene is not read
 
 
 def embed(
@@ -294,6 +296,8 @@ def embed_scene(
 ) -> tuple[dict[str, Mesh], SceneInfo]:
     """Embed one message in each mesh of a scene that can carry it.
 
+    Meshes with equal arrays would get equal marks, so the mark is computed once for all of them.
+
     Args:
         meshes: by name, from `jaxmark.files.load_scene`.
         message: see `embed`.
@@ -312,19 +316,29 @@ def embed_scene(
     marked: dict[str, Mesh] = {}
     infos: dict[str, EmbedInfo] = {}
     skipped: dict[str, str] = {}
+    equal: dict[bytes, list[str]] = {}
     for name, mesh in meshes.items():
+        equal.setdefault(digest(mesh), []).append(name)
+    for names in equal.values():
         try:
-            marker = prepare(mesh, key, 8 * len(message), scheme)
+            marker = prepare(meshes[names[0]], key, 8 * len(message), scheme)
             result, info = marker.embed(message, budget)
-            with info.explained():
-                info = after(name, marker, result, info)
         except JaxmarkError as error:
-            skipped[name] = str(error).rstrip(".")
-        else:
-            marked[name], infos[name] = result, info
+            skipped |= dict.fromkeys(names, str(error).rstrip("."))
+            continue
+        for name in names:
+            try:
+                with info.explained():
+                    infos[name] = after(name, marker, result, info)
+                marked[name] = result
+            except JaxmarkError as error:
+                skipped[name] = str(error).rstrip(".")
+    skipped = {name: skipped[name] for name in meshes if name in skipped}
     if not marked:
         raise JaxmarkError(f"None of the {len(meshes)} meshes can carry the mark: {_reasons(skipped)}.")
-    return marked, SceneInfo(infos, skipped, SceneRecord({name: info.record for name, info in infos.items()}))
+    infos = {name: infos[name] for name in meshes if name in infos}
+    record = SceneRecord({name: info.record for name, info in infos.items()})
+    return {name: marked[name] for name in infos}, SceneInfo(infos, skipped, record)
 
 
 def detect_scene(
@@ -382,10 +396,14 @@ def detect_scene(
         bits = 8 * len(message)
     markers: dict[str, NonBlindMarker] = {}
     skipped: dict[str, str] = {}
+    made: dict[tuple[bytes, str], NonBlindMarker] = {}  # equal meshes share a marker
     for name in chosen:
         mesh_record = None if record is None else record.meshes[name]
+        identity = digest(originals[name]), "" if mesh_record is None else mesh_record.digest()
         try:
-            marker = make_marker(originals[name], key, bits=bits, record=mesh_record, scheme=scheme)
+            marker = made.get(identity) or make_marker(
+                originals[name], key, bits=bits, record=mesh_record, scheme=scheme
+            )
         except JaxmarkError as error:
             if record is None:
                 skipped[name] = str(error).rstrip(".")
@@ -395,22 +413,22 @@ def detect_scene(
         if message is not None:
             check_claim(marker, message)
         # Cached results of markers are dropped here and below: those of all meshes would not fit into memory.
-        markers[name] = replace(marker)
+        markers[name] = made[identity] = replace(marker)
     suspect_names = pair({name: marker.original.marked_order for name, marker in markers.items()}, suspects)
     readings: dict[str, _MeshReading] = {}
-    identities: set[tuple[bytes, bytes]] = set()
+    counted: set[tuple[bytes, bytes]] = set()
     for name, marker in markers.items():
         try:
             if name not in suspect_names:
                 raise JaxmarkError("No mesh of the suspect resembles it.")
-            identity = marker.original.geometry, marker.original.order
-            if identity in identities:
-                raise JaxmarkError("It equals another mesh, which counts once.")
+            geometry = marker.original.geometry, marker.original.order
+            if geometry in counted:
+                raise JaxmarkError(f"{EQUALS_ANOTHER}.")
             aligned = marker.register(suspects[suspect_names[name]], align)
             # One mesh alone may be read in both reflections, by `detect`.
             charges = (ledger.REFLECTION.charge("better fit"),) if aligned.method == "surface" else ()
             readings[name] = _MeshReading(marker, aligned, read(replace(marker), aligned, message, charges=charges))
-            identities.add(identity)
+            counted.add(geometry)
         except JaxmarkError as error:
             skipped[name] = str(error).rstrip(".")
         after()

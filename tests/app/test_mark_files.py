@@ -63,3 +63,19 @@ def test_meshes_whose_marks_do_not_survive_rounding_are_left_unchanged(tmp_path:
     np.testing.assert_array_equal(before["a"].vertices, after["a"].vertices)
     assert not np.array_equal(before["b"].vertices, after["b"].vertices)
     assert list(load_record(tmp_path / "marked-two.json").meshes) == ["b"]
+
+
+def test_equal_meshes_get_equal_marks_that_are_measured_once(tmp_path: Path, key: Key, monkeypatch):
+    source = objects(tmp_path / "twins.obj", 6, *[bumpy_sphere(3)] * 3)
+    measured = []
+
+    def survival(marker: jm.watermark.NonBlindMarker, suspect: Mesh, *_: object) -> Survival:
+        measured.append(suspect)
+        return Survival(0.02, 0.01)
+
+    monkeypatch.setattr(jm.watermark.NonBlindMarker, "measure_survival", survival)
+    assert list(marked(source, key).values["meshes"]) == ["a", "b", "c"]
+    assert len(measured) == 1
+    first, *others = jm.files.load_scene(tmp_path / "marked-twins.obj").meshes.values()
+    for other in others:
+        np.testing.assert_array_equal(other.vertices, first.vertices)

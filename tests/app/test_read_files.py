@@ -66,6 +66,14 @@ def test_selected_meshes_are_charged_as_all_that_could_be_selected(tmp_path: Pat
     assert found.log10_p == pytest.approx(LOG10_P + math.log10(11))
 
 
+def test_equal_meshes_are_read_and_charged_once(tmp_path: Path, read: list[int]):
+    file = file_of(tmp_path, [100, 101, 100, 101, 100])
+    for meshes, expected in (((), [101, 100]), (("100 #2", "100"), [100])):
+        read.clear()
+        assert detection(file, *meshes).log10_p == pytest.approx(LOG10_P + math.log10(2))
+        assert read == expected
+
+
 def test_meshes_that_are_too_small_are_refused_unread(tmp_path: Path, read: list[int]):
     file = file_of(tmp_path, [40, 50, 100])
     assert detection(file).log10_p == LOG10_P

@@ -1,7 +1,9 @@
 import io
+import locale
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -351,6 +353,41 @@ def test_lib3mf_sees_the_new_positions(tmp_path: Path, name: str) -> None:
     for (_, points, faces), mesh in zip(got, moved.values(), strict=True):
         np.testing.assert_allclose(points, mesh.vertices, rtol=1e-6, atol=0.51)  # one file has whole numbers
         np.testing.assert_array_equal(faces, mesh.faces)
+
+
+@pytest.fixture
+def same_locale() -> Iterator[None]:
+    """Restore the locale, which lib3mf changes when it writes, so that files would be read as ASCII."""
+    before = locale.setlocale(locale.LC_ALL)
+    yield
+    locale.setlocale(locale.LC_ALL, before)
+
+
+@pytest.mark.usefixtures("same_locale")
+def test_models_of_the_production_extension_are_patched_in_place(tmp_path: Path) -> None:
+    """Parts in model files of their own, which the root model names by paths."""
+    library = pytest.importorskip("lib3mf")
+    wrapper = library.get_wrapper()
+    model, pose = wrapper.CreateModel(), wrapper.GetIdentityTransform()
+    shape = trimesh.creation.icosahedron()
+    for number in range(3):
+        part, assembly = model.AddMeshObject(), model.AddComponentsObject()
+        part.SetName(f"part {number}")
+        vertices = [library.Position(tuple(row)) for row in (shape.vertices + number).tolist()]
+        part.SetGeometry(vertices, [library.Triangle(tuple(row)) for row in shape.faces.tolist()])
+        part.SetPackagePart(model.FindOrCreatePackagePart(f"/3D/Objects/{number}.model"))
+        assembly.AddComponent(part, pose)
+        model.AddBuildItem(assembly, pose)
+    model.QueryWriter("3mf").WriteToFile(str(tmp_path / "a.3mf"))
+    meshes = load_scene(tmp_path / "a.3mf").meshes
+    assert sorted(meshes) == ["part 0", "part 1", "part 2"]
+    moved = {"part 0": noisy(meshes["part 0"], 0.1), "part 2": noisy(meshes["part 2"], 0.1)}
+    save_scene(moved, tmp_path / "b.3mf", like=tmp_path / "a.3mf")
+    before, after = (raw((tmp_path / name).read_bytes()) for name in ("a.3mf", "b.3mf"))
+    assert {name for name in before if before[name] != after[name]} == {"3D/Objects/0.model", "3D/Objects/2.model"}
+    for name, points, faces in read_by_lib3mf(tmp_path / "b.3mf", strict=True):
+        np.testing.assert_allclose(points, (meshes | moved)[name].vertices, atol=1e-5)
+        np.testing.assert_array_equal(faces, shape.faces)
 
 
 @pytest.mark.parametrize("name", NAMES)

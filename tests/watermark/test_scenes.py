@@ -12,10 +12,12 @@ import jaxmark as jm
 from jaxmark.alignment.pairing import pair
 from jaxmark.files import load_scene
 from jaxmark.geometry.mesh import Mesh
+from jaxmark.watermark import everyday
 from jaxmark.watermark.everyday import detect_scene, embed_scene
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Detection, united_score, weigh
 from jaxmark.watermark.evidence.ledger import is_charged_along_a_path
+from jaxmark.watermark.markers import make_marker
 from jaxmark.watermark.nonblind import claims_of
 from jaxmark.watermark.record import SceneRecord, load_record
 from tests.app.test_cli import Workshop
@@ -155,11 +157,18 @@ def test_each_reads_alone(marked, originals, key: jm.Key):
         assert found.detected()
 
 
-def test_equal_meshes_count_once(marked, originals, key: jm.Key):
+def test_equal_meshes_count_once(marked, originals, key: jm.Key, monkeypatch):
     meshes, info = marked
+    np.testing.assert_array_equal(meshes["again"].vertices, meshes["left"].vertices)
     twice = dict.fromkeys(("left", "again"), originals["left"])
     record = SceneRecord({name: info.record.meshes[name] for name in twice})
+    prepared = []
+    monkeypatch.setattr(
+        everyday, "make_marker", lambda mesh, *rest, **_: prepared.append(mesh) or make_marker(mesh, *rest, **_)
+    )
     found = detect_scene({name: meshes[name] for name in twice}, originals=twice, key=key, record=record)
+    assert len(prepared) == 1
+    assert found.skipped == {"left": everyday.EQUALS_ANOTHER}
     alone = jm.detect(meshes["left"], original=originals["left"], key=key, record=record.meshes["left"])
     assert list(found.parts) == ["again"], "the first by name"
     # All meshes were read, the evidence is that of one among two, and the order of each original is a choice. That of
@@ -170,6 +179,20 @@ def test_equal_meshes_count_once(marked, originals, key: jm.Key):
     again = detect_scene({name: meshes[name] for name in twice}, originals=twice, key=key, record=turned)
     assert turned.digest() == record.digest()
     assert again.log10_p == found.log10_p, "a digest does not cover the order of the meshes"
+
+
+def test_equal_meshes_are_marked_once(sphere: Mesh, key: jm.Key, monkeypatch):
+    prepared = []
+
+    def refuse(mesh: Mesh, *_: object, **__: object):
+        prepared.append(mesh)
+        raise jm.JaxmarkError("Not now.")
+
+    monkeypatch.setattr(everyday, "prepare", refuse)
+    scene = {"a": sphere, "b": sphere._replace(faces=sphere.faces[::-1]), "c": Mesh(*map(np.copy, sphere))}
+    with pytest.raises(jm.JaxmarkError, match="'a': Not now; 'b': Not now; 'c': Not now"):
+        embed_scene(scene, MESSAGE, key)
+    assert [id(mesh) for mesh in prepared] == [id(scene["a"]), id(scene["b"])]
 
 
 @pytest.mark.long

@@ -225,7 +225,7 @@ BLIND_MESSAGE = Choice(
     "message", (Alternative("claimed or recorded", 0.97, BLIND_PROOF), Alternative("another", 0.03, BLIND_PROOF))
 )
 BLIND_SCHEME = _each("scheme (no record)", "1/n for each of the n blind schemes that are tried", BLIND_MESSAGE)
-PARTS = _each("part of a file", "1/n for each of n pairs of a mesh of the suspect and a record", BLIND_SCHEME)
+PARTS = _each("part of a file", "1/n for each of n distinct pairs of a mesh of the suspect and a record", BLIND_SCHEME)
 
 # Copies for recipients.
 RECIPIENTS = _each("recipient", "1/n for each of the n recipients who were tested")
