@@ -402,6 +402,21 @@ def test_a_record_is_of_the_scheme_that_wrote_it(sphere: Mesh, key: jm.Key, tmp_
         make(record=old, scheme=scheme)
 
 
+def test_trained_strengths_make_a_scheme(sphere: Mesh, key: jm.Key):
+    """As many as the carrier has bands, from an array; the record has them, and reading needs nothing else."""
+    usual = NonBlindMarker.make(make_original(sphere), key, KeyedScheme(), 16)
+    bands = len(usual.carrier.host.coefficients)  # pyright: ignore[reportAttributeAccessIssue]
+    scheme = KeyedScheme().with_profile(jax.numpy.linspace(1, 0.1, bands))
+    marked, info = jm.embed(sphere, b"ok", key, budget=jm.Budget(rms=8e-4, noise=0), scheme=scheme)
+    carrier = jm.make_marker(sphere, key, record=info.record).carrier
+    np.testing.assert_allclose(carrier.profile, np.linspace(1, 0.1, bands), rtol=1e-6)  # pyright: ignore
+    assert len(carrier.host.coefficients) == bands  # pyright: ignore[reportAttributeAccessIssue]
+    assert jm.detect(marked, original=sphere, key=key, record=info.record).message == b"ok"
+    for wrong in (np.ones(65), np.ones((2, 3)), np.array([]), np.array([1, np.nan]), np.array([1, -1]), np.zeros(3)):
+        with pytest.raises(jm.JaxmarkError, match="A profile is"):
+            scheme.with_profile(wrong)
+
+
 @pytest.mark.slow
 def test_a_remeshed_suspect_of_a_shape_that_is_its_own_mirror_image(key: jm.Key):
     """Its surface does not tell whether it was mirrored: both ways are read, and paid for."""

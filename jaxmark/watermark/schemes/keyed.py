@@ -7,6 +7,7 @@ from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float, Float64
+from numpy.typing import ArrayLike
 
 from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
@@ -79,7 +80,7 @@ class KeyedScheme(Scheme):
     name: ClassVar[str] = "keyed"
     bands: int = 64  # number of Jackson-damped scaling functions over the whole spectrum; the lowest are used
     direction: Literal["coordinates", "normals"] = "coordinates"  # directions in which vertices are displaced
-    profile: tuple[float, ...] = ()  # relative strengths of the lowest bands, from `tune`; by default by `passband`
+    profile: tuple[float, ...] = ()  # relative strengths of the lowest bands; see `with_profile`; default by `passband`
     passband: Literal["tapered", "narrow", "low", "lowest"] = "tapered"  # the choice of bands and nuisance
     hiding: bool = True  # whether displacements are masked perceptually; see `jaxmark.watermark.perception.masking`
 
@@ -91,10 +92,10 @@ class KeyedScheme(Scheme):
                 the direction or the pass band is unknown.
         """
         if self.profile and not (
-            len(self.profile) <= self.bands and min(self.profile) >= 0 < max(self.profile) < math.inf
+            len(self.profile) <= self.bands and all(0 <= one < math.inf for one in self.profile) and any(self.profile)
         ):
             raise JaxmarkError(
-                f"A profile is up to {self.bands} numbers, none negative and not all 0; got {len(self.profile)}."
+                f"A profile is up to {self.bands} numbers, finite and not negative, and not all 0; got {len(self.profile)}."
             )
         for name, allowed in (("direction", ("coordinates", "normals")), ("passband", tuple(PASS_BANDS))):
             if getattr(self, name) not in allowed:
@@ -163,9 +164,22 @@ class KeyedScheme(Scheme):
         """Make the receiver of marks with a payload size, with all bands of `family`."""
         return make_receiver(self._host(original, self.layout(original, bits), self.family()))
 
-    def with_profile(self, profile: tuple[float, ...]) -> "KeyedScheme":
-        """Return the scheme with other relative strengths of the lowest bands."""
-        return replace(self, profile=profile)
+    def with_profile(self, profile: ArrayLike) -> "KeyedScheme":
+        """Return the scheme with other relative strengths of the lowest bands, such as trained ones; see `profile`.
+
+        The record of a mark stores them, and its keyed choices depend on them.
+
+        Args:
+            profile: one number for each of the lowest bands, `[bands]`, at most as many as the scheme has; of a trained
+                carrier, the argument of `KeyedCarrier.with_bands`.
+
+        Raises:
+            JaxmarkError: if it is no such list, or a number is negative or not finite, or all are 0.
+        """
+        values = np.asarray(profile, np.float64)
+        if values.ndim != 1 or not len(values):
+            raise JaxmarkError(f"A profile is one number for each of the lowest bands, not an array {values.shape}.")
+        return replace(self, profile=tuple(values.tolist()))
 
     def _host(self, original: Original, layout: Layout, coefficients: Float64[np.ndarray, "bands terms"]) -> Host:
         """Prepare the original with the bands to write or read in, and with the nuisance of a layout."""
