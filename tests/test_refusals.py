@@ -56,7 +56,7 @@ def mine(mesh: Mesh, strength: float, randomness: object) -> Mesh:
             lambda: jm.detect(MESH, original=MESH, key=KEY, message=b"abc", bits=64),
             "has 24 bits, but the payload is 64",
         ),
-        (lambda: KeyedScheme(profile=(1.0,) * 65), "A profile is up to 64 numbers, .* got 65"),
+        (lambda: KeyedScheme(profile=(1.0,) * 65), "A profile is up to 64 finite numbers, .* got 65"),
         (lambda: KeyedScheme(direction="up"), "direction must be 'coordinates' or 'normals', got 'up'"),
     ],
 )

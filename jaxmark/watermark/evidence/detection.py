@@ -6,6 +6,7 @@ charges of the ledger.
 
 import math
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -16,7 +17,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.pose import Pose
 from jaxmark.watermark.coding.keys import SCHEME_VERSION
 from jaxmark.watermark.evidence import bounds, ledger
-from jaxmark.watermark.evidence.ledger import MIN_LOG10_P, UNFLOORED, Charge, figure
+from jaxmark.watermark.evidence.ledger import MIN_LOG10_P, UNFLOORED, Charge, figure, rounded_up
 
 
 class Evidence(NamedTuple):
@@ -246,6 +247,27 @@ class Detection(NamedTuple):
     def rank(self) -> tuple[float, bool]:
         """A sort key of detections: smaller p-values first, and among equal ones those with a message first."""
         return self.log10_p, self.message is None
+
+    def statement(self) -> str:
+        """State the result for a publication: the message, both p-values, their conditions, and what they include."""
+        evidence = self.evidence
+        if self.message is None:
+            result = f"No message of the scheme {self.scheme!r} was decoded."
+        else:
+            result = f"The message {self.message.hex()} of the scheme {self.scheme!r} was decoded."
+        kind = "is estimated as" if evidence.caveats else "is at most"
+        charges = ", ".join(f"{charge.choice} ({charge.taken}) {charge.log10:.2f}" for charge in evidence.charges)
+        parts = [
+            result,
+            f"For a mesh that is independent of the key, the probability of evidence that is as strong {kind}"
+            f" 10^{rounded_up(evidence.log10_p):.1f} if {self.premises} were fixed before the mesh existed, and"
+            f" 10^{rounded_up(evidence.log10_p_uncommitted):.1f} if nothing shows that, which charges a choice among 2^64"
+            " keys, originals or records.",
+            f"These figures include the choices of the reader, as log10 of their number: {charges}." if charges else "",
+            f"They are estimates, because {'; '.join(evidence.caveats)}." if evidence.caveats else "",
+            f"(jaxmark {version('jaxmark')}, keyed choices of version {self.version})",
+        ]
+        return " ".join(filter(None, parts))
 
     def detected(self, alpha: float = 1e-6, *, allow_estimate: bool = False) -> bool:
         """Whether the false-positive probability is proven to be at most `alpha`, if all claims were fixed before.

@@ -95,7 +95,7 @@ class KeyedScheme(Scheme):
             len(self.profile) <= self.bands and all(0 <= one < math.inf for one in self.profile) and any(self.profile)
         ):
             raise JaxmarkError(
-                f"A profile is up to {self.bands} numbers, finite and not negative, and not all 0; got {len(self.profile)}."
+                f"A profile is up to {self.bands} finite numbers, not negative, and not all 0; got {len(self.profile)}."
             )
         for name, allowed in (("direction", ("coordinates", "normals")), ("passband", tuple(PASS_BANDS))):
             if getattr(self, name) not in allowed:
