@@ -261,8 +261,8 @@ class Detection(NamedTuple):
             result,
             f"For a mesh that is independent of the key, the probability of evidence that is as strong {kind}"
             f" 10^{rounded_up(evidence.log10_p):.1f} if {self.premises} were fixed before the mesh existed, and"
-            f" 10^{rounded_up(evidence.log10_p_uncommitted):.1f} if nothing shows that, which charges a choice among 2^64"
-            " keys, originals or records.",
+            f" 10^{rounded_up(evidence.log10_p_uncommitted):.1f} if nothing shows that, which charges a choice among"
+            " 2^64 keys, originals or records.",
             f"These figures include the choices of the reader, as log10 of their number: {charges}." if charges else "",
             f"They are estimates, because {'; '.join(evidence.caveats)}." if evidence.caveats else "",
             f"(jaxmark {version('jaxmark')}, keyed choices of version {self.version})",
