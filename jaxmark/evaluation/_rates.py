@@ -19,7 +19,7 @@ class Row(NamedTuple):
     mesh: str
     scheme: str
     bits: int  # size of the payload
-    budget: str
+    budget: float | str  # a number if it is an RMS displacement over the diagonal alone, else its name
     attack: str
     strength: float
     unit: str  # unit of the strength
@@ -41,19 +41,22 @@ def rates(rows: Iterable[Row], by: Sequence[str] = (*POINT, "control"), level: f
 
     Args:
         rows: the rows of a study.
-        by: fields of `Row` by which rows are grouped; the others are pooled.
+        by: fields of `Row` by which rows are grouped; the others are pooled, except for `control`: marked meshes and
+            controls are always apart.
         level: confidence level of the intervals, in (0, 1); see `clopper_pearson`.
 
     Returns:
-        For each group its fields of `by`; the number of `trials`; the counts `read` and `detected`, with the bounds
-        `read_low`, `read_high`, `detected_low` and `detected_high` on their rates; the mean of `bit_errors`; the median
-        `log10_p`, with `log10_p_least` and `log10_p_largest`; and the same of `log10_p_unfloored`.
+        For each group its fields of `by`, and its `control`; the number of `trials`; the counts `read` and `detected`,
+        with the bounds `read_low`, `read_high`, `detected_low` and `detected_high` on their rates; the mean of
+        `bit_errors`; the median `log10_p`, with `log10_p_least` and `log10_p_largest`; and the same of
+        `log10_p_unfloored`.
 
     Raises:
         JaxmarkError: if there is no such field, or the level is out of range.
     """
     if unknown := [name for name in by if name not in Row._fields]:
         raise JaxmarkError(f"A row has no field {unknown[0]!r}; there are {', '.join(Row._fields)}.")
+    by = (*by, *(() if "control" in by else ("control",)))
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault(tuple(getattr(row, name) for name in by), []).append(row)

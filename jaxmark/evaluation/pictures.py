@@ -1,5 +1,6 @@
 """Pictures by matplotlib: ROC curves, p-values, success, curves of studies, visibility of bands. Extra `plot`."""
 
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import cycle
@@ -33,6 +34,8 @@ _CONTROLS: dict[Control, tuple[str, dict[str, Any]]] = {
 }
 _ENDS = {"read": ("_low", "_high"), **dict.fromkeys(("log10_p", "log10_p_unfloored"), ("_least", "_largest"))}
 _MAX_COLUMNS = 3
+_PANEL_WIDTH = 4.2  # in inches, as the next three: of a letter and a line with its space in a legend of 8 points
+_LETTER_WIDTH, _LINE_WIDTH, _LEGEND_LINE = 0.065, 0.5, 0.18
 
 
 def roc(log10_p: Mapping[str, Suspects], *, lowest: float = -20.0, confidence: float = 0.95) -> Picture:
@@ -136,8 +139,8 @@ def band_visibility(original: Original, metrics: Sequence[Metric], bands: int = 
 def curves(rows: Sequence[Row], of: Measure = "read") -> Picture:
     """Plot one panel for each attack of a study, with weak strengths on the left.
 
-    Each scheme has a line, or each scheme with a payload and a budget where these vary; meshes and seeds are pooled.
-    Controls are grey, and pooled over all schemes. Lines stand beside each other, so that those that agree are visible.
+    Each scheme has a line, or each scheme with a mesh, a payload and a budget where these vary; seeds are pooled.
+    Controls are grey, and pooled over all of these. Lines stand beside each other, so that equal ones are visible.
 
     Args:
         rows: the rows of a study.
@@ -150,15 +153,20 @@ def curves(rows: Sequence[Row], of: Measure = "read") -> Picture:
         JaxmarkError: if matplotlib is missing.
     """
     attacks = list(dict.fromkeys(row.attack for row in rows))
-    figure, axes = panels(len(attacks), 4.2, 3.2, columns=_MAX_COLUMNS, legend=0.6)
-    # Lines differ by the scheme, and by payload or budget if these vary.
-    names = ("scheme", *(one for one in ("bits", "budget") if len({getattr(row, one) for row in rows}) > 1))
+    varied = (one for one in ("mesh", "bits", "budget") if len({getattr(row, one) for row in rows}) > 1)
+    names = ("scheme", *varied)
+    labels = [label for label, _, _ in _series(rows, names)]
+    width = _PANEL_WIDTH * min(len(attacks), _MAX_COLUMNS)
+    entry = _LINE_WIDTH + _LETTER_WIDTH * (len(", detected") + max(map(len, labels)))
+    columns = max(1, min(len(labels), int(width / entry)))
+    height = _LEGEND_LINE * (1 + math.ceil(len(labels) / columns))
+    figure, axes = panels(len(attacks), _PANEL_WIDTH, 3.2, columns=_MAX_COLUMNS, legend=height)
     for panel, attack in zip(axes, attacks, strict=False):
         _draw(panel, [row for row in rows if row.attack == attack], names, of)
     for panel in axes[len(attacks) :]:
         panel.set_axis_off()
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), _MAX_COLUMNS), fontsize=8)
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=8)
     return Picture(figure)
 
 
@@ -211,11 +219,11 @@ def _draw_level(panel: Any, log10_p: float, label: str) -> None:
 def _series(rows: Sequence[Row], names: Sequence[str]) -> list[Series]:
     """Return the lines of a panel; the last lines are the controls, pooled over all schemes."""
     marked: dict[str, list[dict[str, Any]]] = {}
-    for rate in rates(rows, [*names, "control", "strength"]):
+    for rate in rates(rows, [*names, "strength"]):
         if rate["control"] == "marked":
-            label = ", ".join(f"{rate[name]} bits" if name == "bits" else rate[name] for name in names)
+            label = ", ".join(f"{rate[name]} bits" if name == "bits" else str(rate[name]) for name in names)
             marked.setdefault(label, []).append(rate)
-    pooled = rates(rows, ["control", "strength"])
+    pooled = rates(rows, ["strength"])
     found: list[Series] = [(label, None, line) for label, line in marked.items()]
     for control, (label, _) in _CONTROLS.items():
         found.append((label, control, [rate for rate in pooled if rate["control"] == control]))

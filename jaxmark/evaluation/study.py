@@ -30,7 +30,7 @@ from jaxmark.files.typed import decode
 from jaxmark.geometry.canonical import geometry_hash
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.scheme import BlindScheme
-from jaxmark.watermark.coding.keys import Key
+from jaxmark.watermark.coding.keys import Key, commitment
 from jaxmark.watermark.coding.message import DEFAULT_BITS
 from jaxmark.watermark.interfaces import Scheme
 from jaxmark.watermark.markers import Marker, prepare
@@ -56,6 +56,7 @@ class Study:
         payloads: sizes of the message, in bits.
         budgets: see `embed`: RMS displacements over the diagonal, names of visibilities, limits by metric, or budgets.
         samples: number of samples of each cell, with the seeds 0, 1, …
+        keys: keys of your own, which samples take in turn; by default, each seed gives a key.
     """
 
     meshes: Mapping[str, str | os.PathLike[str] | Mesh]
@@ -64,6 +65,7 @@ class Study:
     payloads: Sequence[int] = (DEFAULT_BITS,)
     budgets: Sequence[BudgetLike] = ("hidden",)
     samples: int = 5
+    keys: Sequence[bytes] = ()
 
     def __post_init__(self) -> None:
         """Check the fields.
@@ -107,6 +109,8 @@ class Study:
             given = getattr(self, name)
             if isinstance(given, str) or not isinstance(given, Sequence | Mapping):
                 raise JaxmarkError(f"The {name} of a study are a list, such as {example}, got {given!r}.")
+        for key in self.keys:
+            Key(key)
         if not isinstance(self.samples, Integral):
             raise JaxmarkError(f"samples is a whole number, such as 5, got {self.samples!r}.")
 
@@ -177,8 +181,9 @@ class Study:
         blocks = [(first, min(_SEEDS_PER_CELL, count - first)) for first in range(0, count, _SEEDS_PER_CELL)]
         for mesh, scheme, bits, budget, block in product(self.meshes, schemes, self.payloads, budgets, blocks):
             # Cells of older files whose readings lack a field are read again.
-            fields = json.dumps([digests[mesh], schemes[scheme].name, parameters_of(schemes[scheme]), Outcome._fields])
-            digest = hashlib.sha256(fields.encode()).hexdigest()[:16]
+            fields = [digests[mesh], schemes[scheme].name, parameters_of(schemes[scheme]), Outcome._fields]
+            fields += [commitment(key) for key in self.keys]
+            digest = hashlib.sha256(json.dumps(fields).encode()).hexdigest()[:16]
             for name, (_, strengths) in self._attacks.items():
                 for strength in strengths:
                     yield mesh, scheme, bits, budget, name, float(strength), *block, digest
@@ -193,7 +198,8 @@ class Study:
 
     def _rows(self, cell: Mapping[str, Any]) -> Iterator[Row]:
         mesh, scheme, bits, budget, attack, strength, *_ = cell["cell"]
-        unit = self._attacks[attack][0].unit
+        unit, given = self._attacks[attack][0].unit, self._budgets[budget]
+        budget = given.rms if given == Budget(given.rms) and given.rms is not None else budget
         for one in cell["readings"]:
             detected = one["log10_p"] <= LOG10_LEVEL
             yield Row(mesh, scheme, bits, budget, attack, strength, unit, detected=detected, **one)
@@ -208,6 +214,13 @@ class _Point:
     scheme: str | Scheme | BlindScheme = field(compare=False)
     bits: int = field(compare=False)
     budget: Budget = field(compare=False)
+    keys: Sequence[bytes] = field(compare=False, repr=False)
+
+    def key(self, seed: int, control: Control = "marked") -> Key:
+        """Return the key of a seed, or another one for the control that reads with a wrong key."""
+        if control == "wrong-key" or not self.keys:
+            return Key(_derive(seed + (control == "wrong-key"), "key", 32))
+        return Key(self.keys[seed % len(self.keys)])
 
 
 def work(study: Study, cell: Cell) -> dict[str, Any]:
@@ -222,6 +235,7 @@ def work(study: Study, cell: Cell) -> dict[str, Any]:
         study._given_schemes[str(scheme)],  # a name stands for any pass band
         int(bits),
         study._budgets[str(budget)],
+        study.keys,
     )
     seeds = list(range(int(first), int(first) + int(count)))
     marked = [_mark(point, seed) for seed in seeds]
@@ -229,8 +243,8 @@ def work(study: Study, cell: Cell) -> dict[str, Any]:
     suspects = _attack_meshes(meshes, study._attacks[str(name)][0], float(strength), seeds + seeds)
     readings: list[dict[str, Any]] = []
     for seed, (_, rms), suspect, control in zip(seeds, marked, suspects, suspects[len(seeds) :], strict=False):
-        readings += _read(point, suspect, seed, {"marked": seed, "wrong-key": seed + 1}, rms)
-        readings += _read(point, control, seed, {"unmarked": seed}, 0.0)
+        readings += _read(point, suspect, seed, ("marked", "wrong-key"), rms)
+        readings += _read(point, control, seed, ("unmarked",), 0.0)
     return {"readings": readings}
 
 
@@ -250,15 +264,15 @@ def _attack_meshes(meshes: list[Mesh | str], attack: Attack, strength: float, se
 
 
 def _read(
-    point: _Point, suspect: Mesh | str, seed: int, keys: Mapping[Control, int], rms: float
+    point: _Point, suspect: Mesh | str, seed: int, controls: Sequence[Control], rms: float
 ) -> Iterator[dict[str, Any]]:
     """Read a suspect with several keys, aligned once."""
     refusal, registered = suspect if isinstance(suspect, str) else "", None
-    for control, key in keys.items():
+    for control in controls:
         start, outcome = time.perf_counter(), NOTHING
         if not refusal and not isinstance(suspect, str):
             try:
-                marker = _marker(point, key)
+                marker = _marker(point, point.key(seed, control))
                 registered = marker.register(suspect) if registered is None else registered
                 outcome = compare_with(_derive(seed, "message", point.bits // 8), marker, marker.read(registered))
             except JaxmarkError as error:
@@ -268,9 +282,9 @@ def _read(
 
 
 @lru_cache(maxsize=_SEEDS_PER_CELL + 1)  # the keys that a cell reads with
-def _marker(point: _Point, seed: int) -> Marker:
+def _marker(point: _Point, key: Key) -> Marker:
     mesh = point.mesh if isinstance(point.mesh, Mesh) else load_mesh(point.mesh)
-    return prepare(mesh, Key(_derive(seed, "key", 32)), point.bits, point.scheme, adapt_to=point.budget)
+    return prepare(mesh, key, point.bits, point.scheme, adapt_to=point.budget)
 
 
 @lru_cache(maxsize=_SEEDS_PER_CELL)
@@ -279,7 +293,7 @@ def _mark(point: _Point, seed: int) -> tuple[Mesh | str, float]:
     budget = replace(point.budget, noise=0.0 if point.budget.noise is None else point.budget.noise)
     message = _derive(seed, "message", point.bits // 8)
     try:
-        mesh, info = _marker(point, seed).embed(message, budget, read_back=False)
+        mesh, info = _marker(point, point.key(seed)).embed(message, budget, read_back=False)
     except JaxmarkError as error:
         return f"Not marked: {error}", 0.0
     return mesh, info.rms
@@ -287,7 +301,7 @@ def _mark(point: _Point, seed: int) -> tuple[Mesh | str, float]:
 
 def _original_mesh(point: _Point, seed: int) -> Mesh | str:
     try:
-        return _marker(point, seed).original.mesh
+        return _marker(point, point.key(seed)).original.mesh
     except JaxmarkError as error:
         return f"Not marked: {error}"
 

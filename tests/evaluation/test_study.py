@@ -218,6 +218,43 @@ def test_rates_pool_what_is_not_named():
         table.rates(["colour"])
 
 
+def test_controls_and_marks_are_never_pooled():
+    controls = [row for name in ("unmarked", "wrong-key") for row in made_up(3, control=name, read=False)]
+    found = Results((*made_up(3), *controls)).rates(["attack"])
+    assert {rate["control"]: (rate["read"], rate["trials"]) for rate in found} == {
+        "marked": (3, 3),
+        "unmarked": (0, 3),
+        "wrong-key": (0, 3),
+    }
+
+
+def test_keys_of_ones_own_are_taken_in_turn(key: jm.Key, tmp_path):
+    other = jm.Key(bytes(range(1, 33)))
+    own = study(attacks={"noise": [0.002]}, samples=3, keys=[key, other])
+    rows = own.run(tmp_path / "results.jsonl").rows
+    assert [row.read for row in rows if row.control == "marked"] == [True] * 3
+    assert not any(row.read for row in rows if row.control != "marked")
+    assert not {cell[-1] for cell in own._cells()} & {cell[-1] for cell in study(keys=[key])._cells()}
+    assert key.hex() not in (tmp_path / "results.jsonl").read_text()
+    with pytest.raises(jm.JaxmarkError, match="32 bytes"):
+        study(keys=[b"short"])
+
+
+def test_lines_of_meshes_are_apart_and_the_legend_fits():
+    pytest.importorskip("matplotlib")
+    rows = [row for name in ("a mesh with a long name", "b", "c") for row in made_up(2, mesh=name, budget=8e-4)]
+    rows += made_up(2, mesh="b", budget="dame=0.008, careful look") + made_up(2, control="unmarked", read=False)
+    figure = Results(tuple(rows)).plot().figure
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    labels = {container.get_label() for container in axes.containers}
+    assert {"keyed, a mesh with a long name, 0.0008", "keyed, b, 0.0008", "keyed, c, 0.0008"} < labels
+    (legend,) = figure.legends
+    box, page = legend.get_window_extent(), figure.bbox
+    assert page.x0 <= box.x0 < box.x1 <= page.x1
+    assert page.y0 <= box.y0 < box.y1 <= axes.get_tightbbox().y0
+
+
 def test_tables(results, tmp_path):
     results.save_csv(tmp_path / "results.csv")
     with (tmp_path / "results.csv").open() as file:
@@ -234,6 +271,7 @@ def test_frame(results):
     pytest.importorskip("pandas")
     frame = results.frame()
     assert tuple(frame.columns) == Row._fields
+    assert set(frame.budget) == {BUDGET}
     assert frame.groupby("control").read.sum().to_dict() == {"marked": 4, "unmarked": 0, "wrong-key": 0}
 
 
