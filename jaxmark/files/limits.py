@@ -43,9 +43,9 @@ class RunningCount:
         self._limit.check(self._amount, self._size)
 
 
-#: Bytes of a 3MF file's members, a LAZ file's points or Draco's numbers, after decompression.
+#: Bytes of a 3MF file's members, a LAZ file's points, or compressed numbers of glTF, after decompression.
 UNPACKED = Limit("bytes of unpacked content", 2**26, 50)
-#: Seconds of processor time that LAZ points or Draco meshes may take to be unpacked.
+#: Seconds of processor time that LAZ points or glTF meshes may take to be unpacked.
 UNPACKING_SECONDS = Limit("seconds of unpacking", 20, 2**-20)
 #: XML elements and comments of a 3MF file, without vertices and triangles that are written as nearly all programs do.
 ELEMENTS = Limit("XML elements that are read one by one", 2**19, 0.5)

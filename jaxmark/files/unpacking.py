@@ -1,4 +1,4 @@
-"""Unpack LAZ points and Draco meshes in another process, whose memory and processor time are limited.
+"""Unpack LAZ points and compressed glTF meshes in another process, whose memory and processor time are limited.
 
 The decoders are native code that trusts counts in the data: they reserve gigabytes, or end their process.
 """
@@ -14,14 +14,14 @@ import numpy as np
 from jaxmark.errors import JaxmarkError, require
 from jaxmark.files import limits, unpacker
 
-_MODULES = {"laz": "laspy", "draco": "DracoPy"}
+_MODULES = {"laz": "laspy", "draco": "DracoPy", "meshopt": "meshopt"}
 _COPIES, _LEAST_BYTES = 4, 2**28  # of the unpacked content that decoders hold, and memory that they take beside it
 
 
 class Unpacker:
     """A process that unpacks the packed parts of one file; it starts at the first call, and ends with this object."""
 
-    def __init__(self, kind: Literal["laz", "draco"], size: int) -> None:
+    def __init__(self, kind: Literal["laz", "draco", "meshopt"], size: int) -> None:
         """Prepare to unpack parts of a file of a size in bytes, from which its limits follow."""
         self._kind, self._size = kind, size
         self._process: subprocess.Popen[bytes] | None = None
@@ -31,6 +31,7 @@ class Unpacker:
 
         Returns:
             For LAZ, "las": the bytes of the LAS file. For Draco, "faces", and each attribute by its identifier.
+            For meshopt, "bytes" of the buffer view, whose form precedes the data, see `gltf.meshopt.Packing`.
 
         Raises:
             JaxmarkError: half a sentence, if the decoder is missing, fails, or takes more than the file's limits.
