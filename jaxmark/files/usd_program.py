@@ -17,6 +17,7 @@ import numpy as np
 os.environ.setdefault("PXR_WORK_THREAD_LIMIT", "1")  # the stacks of threads would count as memory
 
 Sdf: Any = importlib.import_module("pxr.Sdf")
+importlib.import_module("pxr.Usd")  # has the file formats, before version 25.8
 
 BINARY = b"PXR-USDC"
 _ARRAYS = ("points", "faceVertexCounts", "faceVertexIndices", "normals", "extent")

@@ -66,7 +66,7 @@ def test_points_and_normals_change_and_nothing_else(tmp_path: Path, form: str) -
     if form == "usdc":
         data = binary(data, tmp_path)
     if form == "usdz":
-        data = usd.pack(None, {"a.usdc": binary(data, tmp_path), "0/picture.png": b"picture"})
+        data = usd.pack(None, {"a.usdc": binary(data, tmp_path), "0/picture.png": b"an image"})
     source, out = written(tmp_path, f"a.{form}", data), tmp_path / f"b.{form}"
     scene = load_scene(source)
     assert list(scene.meshes) == ["/A/Ball", "/A/Square"]
@@ -81,10 +81,10 @@ def test_points_and_normals_change_and_nothing_else(tmp_path: Path, form: str) -
     np.testing.assert_allclose(np.linalg.norm(after["/A/Ball.normals"], axis=1), 1, atol=1e-6)
     assert len(notes) == (form in ("usda", "usd"))  # this text is not as USD would write it
     if form == "usdz":
-        archive = Sdf.ZipFile.Open(str(out))
-        assert archive.GetFileNames() == ["a.usdc", "0/picture.png"]
-        assert all(archive.GetFileInfo(name).dataOffset % 64 == 0 for name in archive.GetFileNames())
-        assert archive.GetFile("0/picture.png") == b"picture"
+        assert out.read_bytes().index(b"an image") % 64 == 0
+        assert out.read_bytes().index(b"PXR-USDC") % 64 == 0
+        with zipfile.ZipFile(out) as archive:
+            assert archive.namelist() == ["a.usdc", "0/picture.png"]
 
 
 def test_an_extent_follows_the_points(tmp_path: Path) -> None:
