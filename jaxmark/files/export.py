@@ -13,7 +13,7 @@ from jaxmark.files import usd
 from jaxmark.files.source import Source
 from jaxmark.geometry.mesh import Mesh
 
-_CLOUDS = (".xyz", ".las", ".laz")  # formats without faces
+_CLOUDS = (".xyz", ".las", ".laz", ".spz")  # formats without faces
 _USD = (".usd", ".usda", ".usdc", ".usdz")
 _MAX_ROUNDING = 1e-5  # of the bounding-box diagonal; marks move vertices by about ten times that or more
 
@@ -32,6 +32,8 @@ def encode_new(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> byt
     if suffix in (".las", ".laz"):
         advice = "pass the one it came from as `like`, or use PLY or XYZ"
         raise JaxmarkError(f"A new LAS or LAZ file is not written; {advice}.")
+    if suffix == ".spz":
+        raise JaxmarkError("A new SPZ file is not written; use PLY or XYZ.")
     if suffix in (".obj", ".off", ".xyz"):
         data = _text(vertices, faces, suffix)
     elif suffix == ".3mf":
