@@ -76,8 +76,8 @@ class _Mesh(NamedTuple):
             return f"one of its faces has {sizes.min()} corners; it needs at least three"
         if (corners := int(sizes.sum(dtype=np.int64))) != len(indices):
             return f"its faces have {corners} corners, but there are {len(indices)} indices"
-        if indices.min() < 0 or indices.max() >= len(points):
-            return f"a face refers to point {indices.max()}, but there are {len(points)}, numbered from 0"
+        if (outside := indices[(indices < 0) | (indices >= len(points))]).size:
+            return f"a face refers to point {outside[0]}, but there are {len(points)}, numbered from 0"
         return ""
 
     def elements(self, name: str) -> Faces | None:

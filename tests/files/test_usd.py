@@ -224,7 +224,7 @@ def _square(old: str, new: str) -> Callable[[], bytes]:
         (_square("[4]", "[2, 2]"), "one of its faces has 2 corners"),
         (_square("[4]", "[3]"), "have 3 corners, but there are 4 indices"),
         (_square("[0, 1, 2, 3]", "[0, 1, 2, 4]"), "refers to point 4, but there are 4"),
-        (_square("[0, 1, 2, 3]", "[0, 1, 2, -1]"), "a face refers to point"),
+        (_square("[0, 1, 2, 3]", "[0, 1, 2, -1]"), "refers to point -1, but there are 4"),
         (_square("int[] faceVertexCounts", "float[] faceVertexCounts"), "no integers"),
         (_square(f"point3f[] points = {CORNERS}", "int[] points = [1]"), "no triples"),
         (_square(f"point3f[] points = {CORNERS}", "point3f[] points = []"), "in another layer"),
