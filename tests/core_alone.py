@@ -18,28 +18,23 @@ LATE = {"trimesh", "jaxopt", "click", "scipy.optimize", "scipy.stats", "scipy.nd
 REMESHING = {"simplification": 0.5, "isotropic": 1, "iso-surface": 20, "poisson": 5, "arap": 0.05}
 
 
-def _draco() -> bytes:
-    """A file that says that it is compressed with Draco."""
+def _compressed(primitive: dict[str, object], view: dict[str, object]) -> bytes:
+    """A glTF file with extensions of its primitive and its buffer view."""
     document = {
         "asset": {"version": "2.0"},
-        "meshes": [
-            {
-                "primitives": [
-                    {
-                        "attributes": {"POSITION": 0},
-                        "extensions": {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}},
-                    }
-                ]
-            }
-        ],
-        "accessors": [{"componentType": 5126, "count": 3, "type": "VEC3"}],
-        "bufferViews": [{"buffer": 0, "byteLength": 5}],
-        "buffers": [{"byteLength": 5, "uri": "data:;base64,RFJBQ08="}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "extensions": primitive}]}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36, "extensions": view}],
+        "buffers": [{"byteLength": 36, "uri": f"data:;base64,{48 * 'A'}"}],
     }
     return json.dumps(document).encode()
 
 
-DRACO = _draco()
+_STORED = {"buffer": 0, "byteLength": 36, "byteStride": 12, "count": 3, "mode": "ATTRIBUTES"}
+COMPRESSED = {
+    "Draco": _compressed({"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}, {}),
+    "meshopt": _compressed({}, {"EXT_meshopt_compression": _STORED}),
+}
 
 
 def run(folder: str, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -106,9 +101,16 @@ def needing(folder: str) -> Iterator[tuple[str, str, Callable[[], object]]]:
     yield "pictures of studies", "plot", lambda: Results(()).plot()
     yield "tables of studies", "study", lambda: Results(()).frame()
     yield "closest points", "align", lambda: Surface(mesh).closest(mesh.vertices)
-    draco = Path(folder, "draco.gltf")
-    draco.write_bytes(DRACO)
-    yield "Draco", "files", lambda: jm.load_mesh(draco)
+    for name, data in COMPRESSED.items():
+        packed = Path(folder, f"{name}.gltf")
+        packed.write_bytes(data)
+        yield name, "files", lambda packed=packed: jm.load_mesh(packed)
+    layer = Path(folder, "layer.usda")
+    layer.write_bytes(b"#usda 1.0")
+    yield "USD", "usd", lambda: jm.load_mesh(layer)
+    splat = Path(folder, "splat.spz")
+    splat.write_bytes(b"NGSP" + bytes([4, 0, 0, 0, 1] + 11 * [0]))
+    yield "SPZ", "files", lambda: jm.load_mesh(splat)
     laser = Path(folder, "scan.las")
     laser.write_bytes(b"LASF")
     yield "laser scans", "files", lambda: jm.load_mesh(laser)

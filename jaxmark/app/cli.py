@@ -94,8 +94,8 @@ def cli() -> None:
       jaxmark attack marked.ply suspect.ply noise 0.001
       jaxmark detect suspect.ply --original model.ply --key owner.key
 
-    Mesh files are OBJ, PLY, OFF, STL, GLB, glTF or 3MF. Point clouds are PLY, XYZ, LAS or LAZ. Keep the key secret.
-    Keep the original, too: only marks of the blind schemes `field` and `local` are detected without it.
+    Mesh files are OBJ, PLY, OFF, STL, GLB, glTF, 3MF or USD. Point clouds are PLY, XYZ, LAS or LAZ. Keep the key
+    secret. Keep the original, too: only marks of the blind schemes `field` and `local` are detected without it.
     """  # noqa: D301
 
 

@@ -1,4 +1,4 @@
-"""Read and write mesh files (OBJ, PLY, OFF, STL, GLB, VRM, glTF, 3MF) and point clouds (also XYZ, LAS, LAZ).
+"""Read and write mesh files (OBJ, PLY, OFF, STL, GLB, VRM, glTF, 3MF, USD) and point clouds (also XYZ, LAS, LAZ, SPZ).
 
 A file is saved by patching the file that it was loaded from: all bytes except those of positions and normals stay.
 """
@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import obj, off, ply, point_cloud, stl, threemf
+from jaxmark.files import obj, off, ply, point_cloud, splats, stl, threemf, usd
 from jaxmark.files.atomic import read_beside, read_file, write_atomically, write_together
 from jaxmark.files.gltf import asset
 from jaxmark.files.source import Indices, Source, Texture, concerning
@@ -43,9 +43,11 @@ _FORMATS: dict[str, Callable[..., Source]] = {
     ".gltf": asset.parse,
     ".vrm": asset.parse,
     ".3mf": threemf.parse,
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), usd.parse),
     ".xyz": point_cloud.parse_xyz,
     ".las": point_cloud.parse_las,
     ".laz": point_cloud.parse_las,
+    ".spz": splats.parse_spz,
 }
 SUFFIXES = tuple(_FORMATS)
 _MOST_LOST = 0.9  # RMS of what rounding adds to a displacement, over the RMS of the displacement; readers decide below
@@ -65,14 +67,14 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
     """Read a mesh from a file, in the format that its suffix names.
 
     Vertices are the file's own, in its order: none are merged or dropped, and isolated ones are kept. An STL file has
-    three vertices of its own for each facet. A GLB, glTF or 3MF file gives local coordinates; transformations of nodes,
-    components and built items are not applied. Several meshes in a file follow each other as one; `load_scene`
-    separates them. A file without faces is a point cloud, as XYZ, LAS and LAZ files are. Polygons are split into
+    three vertices of its own for each facet. A GLB, glTF, USD or 3MF file gives local coordinates; transformations of
+    nodes, components and built items are not applied. Several meshes in a file follow each other as one; `load_scene`
+    separates them. A file without faces is a point cloud, as XYZ, LAS, LAZ and SPZ files are. Polygons are split into
     triangles (v0, v1, v2), (v0, v2, v3), …, for computing only.
 
     Args:
-        path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary), GLB, VRM (a GLB), glTF, 3MF, XYZ (text),
-            LAS or LAZ file.
+        path: an OBJ, PLY (text or binary), OFF (text), STL (text or binary), GLB, VRM (a GLB), glTF, 3MF, USD (also
+            USDA, USDC and USDZ), XYZ (text), LAS, LAZ or SPZ file.
 
     Returns:
         NumPy arrays: float64 vertices in the file's units, int64 faces.
@@ -84,7 +86,7 @@ def load_mesh(path: str | os.PathLike) -> Mesh:
 
 
 def load_scene(path: str | os.PathLike) -> Scene:
-    """Read the meshes of a file: those of a GLB or glTF file, or the objects of an OBJ or 3MF file.
+    """Read the meshes of a file: those of a GLB, glTF or USD file, or the objects of an OBJ or 3MF file.
 
     Objects of OBJ that share vertices are one mesh, and so are meshes that share positions. Instances and other nodes
     that show the same mesh are not distinguished. Files of other formats have one mesh.
@@ -108,7 +110,7 @@ def load_scene(path: str | os.PathLike) -> Scene:
 
 
 def load_texture(path: str | os.PathLike) -> Texture:
-    """Read the texture coordinates of an OBJ, GLB or glTF file.
+    """Read the texture coordinates of an OBJ, GLB, glTF or USD file.
 
     Returns:
         One pair for each corner of the faces that `load_mesh` returns, NaN for those that have none; None if the file
@@ -146,10 +148,10 @@ def save_mesh(mesh: Mesh, path: str | os.PathLike, *, like: str | os.PathLike | 
         mesh: the mesh to write.
         path: the file to write, in the format that its suffix names. It may be the same file as `like`.
         like: the file that the mesh was loaded from. Only the numbers of vertices that moved change, their normals
-            follow, and everything else stays byte for byte. Without it a new file is written: exact in OBJ, OFF, XYZ
-            and 3MF, in single precision in PLY, STL, GLB and glTF; none in LAS and LAZ. Files that a glTF file refers
-            to come along: a buffer that changes is named after the new file, the others are copied where they are not
-            there already.
+            follow, and everything else stays byte for byte; in USD, all other opinions stay. Without it a new file is
+            written: exact in OBJ, OFF, XYZ and 3MF, in single precision in PLY, STL, GLB, glTF and USD; none in LAS,
+            LAZ and SPZ. Files that a glTF or USD file refers to come along: a buffer that changes is named after the
+            new file, the others are copied where they are not there already.
 
     Returns:
         Sentences about content that could not stay as it was; usually none.

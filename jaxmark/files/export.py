@@ -9,10 +9,12 @@ import trimesh
 from trimesh.exchange.gltf import export_gltf
 
 from jaxmark.errors import JaxmarkError
+from jaxmark.files import usd
 from jaxmark.files.source import Source
 from jaxmark.geometry.mesh import Mesh
 
-_CLOUDS = (".xyz", ".las", ".laz")  # formats without faces
+_CLOUDS = (".xyz", ".las", ".laz", ".spz")  # formats without faces
+_USD = (".usd", ".usda", ".usdc", ".usdz")
 _MAX_ROUNDING = 1e-5  # of the bounding-box diagonal; marks move vertices by about ten times that or more
 
 
@@ -25,15 +27,24 @@ def encode_new(mesh: Mesh, suffix: str, parse: Callable[[bytes], Source]) -> byt
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if suffix in _CLOUDS and len(faces):
         raise JaxmarkError(f"{suffix[1:].upper()} files hold points without faces; save the mesh as PLY or OBJ.")
-    if suffix in (".stl", ".glb", ".vrm", ".gltf", ".3mf") and not len(faces):
+    if suffix in (".stl", ".glb", ".vrm", ".gltf", ".3mf", *_USD) and not len(faces):
         raise JaxmarkError(f"A new {suffix[1:].upper()} file holds faces; save the point cloud as PLY or XYZ.")
     if suffix in (".las", ".laz"):
         advice = "pass the one it came from as `like`, or use PLY or XYZ"
         raise JaxmarkError(f"A new LAS or LAZ file is not written; {advice}.")
+    if suffix == ".spz":
+        raise JaxmarkError("A new SPZ file is not written; use PLY or XYZ.")
     if suffix in (".obj", ".off", ".xyz"):
         data = _text(vertices, faces, suffix)
     elif suffix == ".3mf":
         data = _threemf(vertices, faces)
+    elif suffix in _USD:
+        vertices = _single(vertices, suffix)
+        data = _usda(vertices, faces)
+        if suffix == ".usdc":
+            data = usd.to_binary(data)
+        if suffix == ".usdz":
+            data = usd.pack(None, {"mesh.usda": data})
     elif not len(faces):
         vertices = _single(vertices, suffix)
         # trimesh would write a face element, which viewers take for a mesh.
@@ -78,6 +89,24 @@ def _text(vertices: np.ndarray, faces: np.ndarray, suffix: str) -> bytes:
     points = [point.format(*row) for row in vertices.tolist()]
     triangles = [face.format(*row) for row in (faces + obj).tolist()]
     return "\n".join([*head, *points, *triangles, ""]).encode()
+
+
+def _usda(vertices: np.ndarray, faces: np.ndarray) -> bytes:
+    """Encode a layer of USD with one mesh, in text."""
+    points = ", ".join("({!r}, {!r}, {!r})".format(*row) for row in vertices.tolist())
+    low, high = ("({!r}, {!r}, {!r})".format(*row.tolist()) for row in (vertices.min(axis=0), vertices.max(axis=0)))
+    lines = [
+        "#usda 1.0",
+        '(\n    defaultPrim = "mesh"\n)\n',
+        'def Mesh "mesh"\n{',
+        f"    float3[] extent = [{low}, {high}]",
+        f"    int[] faceVertexCounts = [{', '.join(len(faces) * ['3'])}]",
+        f"    int[] faceVertexIndices = [{', '.join(map(str, faces.ravel().tolist()))}]",
+        f"    point3f[] points = [{points}]",
+        '    uniform token subdivisionScheme = "none"',
+        "}",
+    ]
+    return "\n".join([*lines, ""]).encode()
 
 
 def _threemf(vertices: np.ndarray, faces: np.ndarray) -> bytes:

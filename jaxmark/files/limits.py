@@ -43,9 +43,9 @@ class RunningCount:
         self._limit.check(self._amount, self._size)
 
 
-#: Bytes of a 3MF file's members, a LAZ file's points or Draco's numbers, after decompression.
+#: Bytes of a 3MF file's members, a LAZ file's points, compressed numbers of glTF or arrays of USD, after decompression.
 UNPACKED = Limit("bytes of unpacked content", 2**26, 50)
-#: Seconds of processor time that LAZ points or Draco meshes may take to be unpacked.
+#: Seconds of processor time that LAZ points, glTF meshes or USD layers may take to be unpacked.
 UNPACKING_SECONDS = Limit("seconds of unpacking", 20, 2**-20)
 #: XML elements and comments of a 3MF file, without vertices and triangles that are written as nearly all programs do.
 ELEMENTS = Limit("XML elements that are read one by one", 2**19, 0.5)
@@ -55,6 +55,8 @@ ACCESSED = Limit("elements of accessors", 2**20, 16)
 ROWS = Limit("rows that are read one by one", 2**19, 0.2)
 #: Meshes, or objects, that are read one by one.
 MESHES = Limit("meshes", 2**14, 0)
+#: Layers of a USDZ file.
+LAYERS = Limit("layers", 2**10, 0)
 #: Points that a mesh needs to be read for a blind mark. Such marks have no anchors on coarser meshes.
 BLIND_POINTS = 100
 #: Meshes of a file that are read for a blind mark unless they are named, the largest ones. Each may take half a minute.

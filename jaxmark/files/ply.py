@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import limits
+from jaxmark.files import limits, splats
 from jaxmark.files.binary import BinaryNumbers, gather
 from jaxmark.files.limits import RunningCount
 from jaxmark.files.source import Faces, Indices, Source, Transported, fan, ranges
@@ -109,7 +109,7 @@ def parse(data: bytes) -> Source:
     vertex = declared.get("vertex", _Element("vertex", 0)).properties
     coordinates = _triples(body, vertex, ("x", "y", "z"))
     if coordinates is None and "packed_position" in vertex:
-        raise JaxmarkError("The file is a compressed splat; save it as uncompressed PLY, for example in SuperSplat.")
+        return _packed_splat(data, body, vertex["packed_position"], declared.get("chunk", _Element("chunk", 0)))
     if coordinates is None:
         raise JaxmarkError("The header declares no element vertex with the numbers x, y and z.")
     faces = np.concatenate([_surface(body, declared.get(name, _Element(name, 0))) for name in _SURFACES])
@@ -123,6 +123,14 @@ def parse(data: bytes) -> Source:
         polygon[: (sizes - 2).sum()] = np.repeat(np.arange(len(sizes)), sizes - 2)
         normals.append(Transported(numbers, np.stack([polygon] * 3, axis=1)))
     return Source(data, coordinates, faces, normals)
+
+
+def _packed_splat(data: bytes, body: _Body, packed: _Property, chunk: _Element) -> Source:
+    """Read a compressed splat, in which every position is a number of 32 bits, and every chunk has a box."""
+    low, high = (_triples(body, chunk.properties, (f"{end}_x", f"{end}_y", f"{end}_z")) for end in ("min", "max"))
+    if low is None or high is None or packed.type.itemsize != 4:
+        raise JaxmarkError("The file is a compressed splat without the boxes of its chunks; save it as plain PLY.")
+    return splats.cloud(data, splats.unpack(body.integers(packed.starts, packed.type), low.values, high.values))
 
 
 def _normals(body: _Body, properties: dict[str, _Property]) -> TextNumbers | BinaryNumbers | None:

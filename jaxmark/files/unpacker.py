@@ -1,12 +1,14 @@
-"""A program that unpacks LAZ points and Draco meshes for `jaxmark.files.unpacking`; it imports nothing of jaxmark.
+"""A program that unpacks LAZ, glTF and USD for `jaxmark.files.unpacking`; it imports nothing of jaxmark.
 
 It reads blocks from its standard input, and answers each by a block on its standard output. A block is its length in
 eight bytes, and the bytes. An answer begins with a byte: 1, then arrays in NumPy's format npz; or 0, then an error.
 """
 
 import io
+import json
 import os
 import re
+import runpy
 import struct
 import sys
 from collections.abc import Callable
@@ -67,6 +69,21 @@ def _draco() -> Callable[[bytes], dict[str, np.ndarray]]:
     return unpack
 
 
+def _meshopt() -> Callable[[bytes], dict[str, np.ndarray]]:
+    import meshopt
+
+    def unpack(data: bytes) -> dict[str, np.ndarray]:
+        form, _, packed = data.partition(b"\n")
+        rows = meshopt.decode_gltf_buffer(packed, *json.loads(form))
+        return {"bytes": np.ascontiguousarray(rows).reshape(-1).view(np.uint8)}
+
+    return unpack
+
+
+def _usd() -> Callable[[bytes], dict[str, np.ndarray]]:
+    return runpy.run_path(str(Path(__file__).with_name("usd_program.py")))["unpack"]
+
+
 def _answer(unpack: Callable[[bytes], dict[str, np.ndarray]], data: bytes) -> bytes:
     try:
         out = io.BytesIO()
@@ -82,7 +99,7 @@ def _main(kind: str, most_bytes: str, most_seconds: str) -> None:
     # Whatever decoders print goes elsewhere.
     out = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    unpack = {"laz": _laz, "draco": _draco}[kind]()
+    unpack = {"laz": _laz, "draco": _draco, "meshopt": _meshopt, "usd": _usd}[kind]()
     limit_memory(int(most_bytes))
     _limit("RLIMIT_CPU", int(most_seconds))
     while head := sys.stdin.buffer.read(LENGTH.size):

@@ -167,7 +167,7 @@ def _set(*path: str | int, value: Any) -> Callable[[dict[str, Any]], None]:
         (_set("accessors", 0, "sparse", value={}), "sparse"),
         (_set("accessors", 0, "componentType", value=5125), "three numbers"),
         (_set("meshes", 0, "primitives", 1, "extensions", value={"KHR_draco_mesh_compression": {}}), "KHR_draco"),
-        (_set("bufferViews", 2, "extensions", value={"EXT_meshopt_compression": {}}), "EXT_meshopt"),
+        (_set("bufferViews", 2, "extensions", value={"EXT_meshopt_compression": {}}), "buffer of bufferViews"),
         (_set("buffers", 0, "uri", value="data.bin"), "data.bin"),
         (_set("accessors", 1, "byteOffset", value=8), "shares bytes"),
         (_set("accessors", 2, "bufferView", value=2), "does not lie|shares bytes"),

@@ -160,7 +160,7 @@ BODY = b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
         (HEAD.replace(b"vertex 3", b"vertex -3") + FACE + BODY, "line 3"),
         (HEAD.replace(b"vertex 3", b"vertex 999999999999999") + FACE + BODY, "ends in row 4 .*vertex"),
         (HEAD.replace(b"float z", b"float w") + FACE + BODY, "x, y and z"),
-        (HEAD.replace(b"float x", b"uint packed_position") + FACE + BODY, "compressed splat"),
+        (HEAD.replace(b"float x", b"uint packed_position") + FACE + BODY, "compressed splat without the boxes"),
         (HEAD + FACE.replace(b"uchar int", b"uchar float") + BODY, "integers"),
         (HEAD + FACE.replace(b"uchar int", b"float int") + BODY, "line 8"),
         (HEAD + FACE.replace(b"_indices", b"s") + BODY, "vertex_indices"),

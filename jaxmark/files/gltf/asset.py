@@ -11,7 +11,7 @@ from jaxtyping import Float64, Shaped
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import limits
 from jaxmark.files.binary import BinaryNumbers, gather
-from jaxmark.files.gltf import draco
+from jaxmark.files.gltf import draco, meshopt
 from jaxmark.files.gltf.document import FLOAT, Document, Elements, Read, attribute, objects, uses, whole
 from jaxmark.files.limits import RunningCount
 from jaxmark.files.source import (
@@ -204,6 +204,8 @@ def _shared_bytes(document: Document, found: dict[str, list[_Primitive]]) -> dic
             continue
         seen.add(form)
         try:
+            if document.is_unread(whole(accessor, "bufferView", f"accessors[{index}]")):  # it shares nothing
+                continue
             rows = document.elements(index)
         except JaxmarkError:  # an accessor that cannot be read shares nothing
             continue
@@ -335,6 +337,10 @@ class _GltfSource(Source):
             before, after = (gather(one, rows.offsets, rows.dtype) for one in (self.data, data))
             if before.tobytes() != after.tobytes():
                 _bound(document["accessors"][index], after)
+        for view, place in self.document.packed.items():
+            part = data[place.start : place.stop]
+            if part != self.data[place.start : place.stop]:
+                meshopt.write(document, contents, view, part)
         plain = []
         for one in self.compressed:
             assert one.compressed is not None

@@ -16,6 +16,8 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files import limits
 from jaxmark.files.binary import gather
 from jaxmark.files.gltf.json_text import rewrite
+from jaxmark.files.gltf.meshopt import Packing
+from jaxmark.files.gltf.views import compression
 from jaxmark.files.limits import RunningCount
 from jaxmark.files.source import Indices, Patched
 from jaxmark.files.unpacking import Unpacker
@@ -28,7 +30,6 @@ _MAGIC = b"glTF"
 FLOAT = np.dtype("<f4")
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_COMPRESSED = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 _MAX_COUNT = 2**31
 
 
@@ -76,6 +77,7 @@ class Document:
         accessed: counts the elements of accessors that are read, and the corners of faces that are made of them.
         unpacked: counts the bytes of those that are decompressed.
         draco: decodes primitives that are compressed with Draco.
+        packed: the decoded bytes in `data` of buffer views that are compressed with meshoptimizer and were read.
     """
 
     def __init__(self, file: bytes, read: Read) -> None:
@@ -115,7 +117,8 @@ class Document:
         self.decoded: set[int] = set()
         self._lists: dict[str, list[dict[str, Any]]] = {}
         self.accessed, self.unpacked = (RunningCount(one, size) for one in (limits.ACCESSED, limits.UNPACKED))
-        self.draco = Unpacker("draco", size)
+        self.draco, self._meshopt = Unpacker("draco", size), Unpacker("meshopt", size)
+        self.packed: dict[int, range] = {}
 
     def copy_content(self) -> dict[str, Any]:
         """Return a copy of the document's content, which may be nested more deeply than `copy.deepcopy` can copy."""
@@ -180,17 +183,43 @@ class Document:
         """Locate a buffer view: where it begins in `Document.data`, and its length."""
         where = f"bufferViews[{number}]"
         view = self.item("bufferViews", number)
-        extensions = view.get("extensions")
-        for name in _COMPRESSED:
-            if isinstance(extensions, dict) and name in extensions:
-                raise JaxmarkError(f"{where} is compressed with {name}, which is not supported; save it without.")
-        index = whole(view, "buffer", where)
+        extension = compression(view)
+        if extension is None:
+            return self._stretch(view, where)
+        if number not in self.packed:
+            self.packed[number] = self._unpack(view, extension, where)
+        return self.packed[number].start, len(self.packed[number])
+
+    def is_unread(self, number: int) -> bool:
+        """Whether a buffer view is compressed, and was not read."""
+        views = self.items("bufferViews")
+        return number not in self.packed and number < len(views) and compression(views[number]) is not None
+
+    def _unpack(self, view: dict[str, Any], extension: dict[str, Any], where: str) -> range:
+        """Decode a buffer view, and return the place of its bytes in `Document.data`."""
+        begin, length = self._stretch(extension, where)
+        count, stride = (whole(extension, key, where) for key in ("count", "byteStride"))
+        stated = Packing.of(extension, count, stride, where)
+        if stated.size != whole(view, "byteLength", where):
+            raise JaxmarkError(f"{where} has another length than its compressed elements.")
+        # The announced size must be possible, before the decoder reserves memory for it; views may share their source.
+        self.unpacked.add(stated.size + length)
+        try:
+            found = self._meshopt(stated.framed(bytes(self.data[begin : begin + length])))
+        except JaxmarkError as error:
+            raise JaxmarkError(f"{where} cannot be decoded by meshopt: {error}.") from None
+        place = self.add(found["bytes"].tobytes())
+        return range(place, place + stated.size)
+
+    def _stretch(self, place: dict[str, Any], where: str) -> tuple[int, int]:
+        """Locate the bytes of a buffer view, or of its compressed form."""
+        index = whole(place, "buffer", where)
         if index >= len(self.buffers):
             raise JaxmarkError(f"buffers[{index}] is referred to, but there are {len(self.buffers)}.")
         buffer = self.buffers[index]
         if isinstance(buffer, str):
             raise JaxmarkError(f"{buffer}.")
-        offset, length = whole(view, "byteOffset", where, 0), whole(view, "byteLength", where)
+        offset, length = whole(place, "byteOffset", where, 0), whole(place, "byteLength", where)
         if offset + length > len(buffer.place):
             raise JaxmarkError(f"{where} does not lie inside its buffer, so that the accessors in it do not either.")
         return buffer.place.start + offset, length

@@ -1,6 +1,6 @@
 """Primitives that are compressed with Draco: decoded, and encoded again. Needs the extra `files`."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +9,7 @@ from jaxtyping import Shaped
 
 from jaxmark.errors import JaxmarkError, require
 from jaxmark.files.gltf.document import COMPONENTS, Document, Elements, whole
+from jaxmark.files.gltf.views import is_alone, replace
 from jaxmark.files.source import Faces
 
 EXTENSION = "KHR_draco_mesh_compression"
@@ -150,19 +151,15 @@ def _place(
     If something else needs the bytes of the view, the blocks follow at the end of the buffer.
     """
     views = document["bufferViews"]
-    buffer, alone = views[view]["buffer"], _is_alone(document, view)
-    content = contents[buffer] or b""
-    begin, length = (views[view].get("byteOffset", 0), views[view]["byteLength"]) if alone else (len(content), 0)
+    mine, alone = views[view], _users(document, view) == 1 and is_alone(document, views[view])
     added, placed = b"", list[dict[str, int]]()
     for block, properties in blocks:
-        added += bytes(-(begin + len(added)) % 4)
-        placed.append({"buffer": buffer, "byteOffset": begin + len(added), "byteLength": len(block)} | properties)
+        added += bytes(-len(added) % 4)
+        placed.append({"buffer": mine["buffer"], "byteOffset": len(added), "byteLength": len(block)} | properties)
         added += block
-    added += bytes((length - len(added)) % 4 if begin + length < len(content) else 0)  # later views stay aligned
-    contents[buffer] = content[:begin] + added + content[begin + length :]
-    for other in _stored(views):
-        if other["buffer"] == buffer and other.get("byteOffset", 0) >= begin + length and length:
-            other["byteOffset"] += len(added) - length
+    begin = replace(document, contents, mine, added, alone=alone)
+    for place in placed:
+        place["byteOffset"] += begin
     indices = [view, *range(len(views), len(views) + len(placed) - 1)]
     if alone:
         views[view] = placed.pop(0)
@@ -172,27 +169,12 @@ def _place(
     return indices
 
 
-def _is_alone(document: dict[str, Any], view: int) -> bool:
-    """Whether just one compressed primitive uses a buffer view, and nothing else uses its bytes."""
+def _users(document: dict[str, Any], view: int) -> int:
+    """Count the compressed primitives, accessors and images that use a buffer view."""
     primitives = [one for mesh in document["meshes"] for one in mesh["primitives"]]
     owners = [one["extensions"][EXTENSION] for one in primitives if EXTENSION in one.get("extensions", {})]
     owners += [*document.get("accessors", []), *document.get("images", [])]
-    users = [one["bufferView"] for one in owners if "bufferView" in one]
-    mine = document["bufferViews"][view]
-    begin = mine.get("byteOffset", 0)
-    return users.count(view) == 1 and not any(
-        other is not mine
-        and other["buffer"] == mine["buffer"]
-        and other.get("byteOffset", 0) < begin + mine["byteLength"]
-        and begin < other.get("byteOffset", 0) + other["byteLength"]
-        for other in _stored(document["bufferViews"])
-    )
-
-
-def _stored(views: Sequence[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """Yield every place in a buffer: each view, and the source of each view that is compressed as a whole."""
-    for view in views:
-        yield from (one for one in (view, *view.get("extensions", {}).values()) if "buffer" in one)
+    return [one["bufferView"] for one in owners if "bufferView" in one].count(view)
 
 
 def forget_unused(document: dict[str, Any]) -> None:
