@@ -105,7 +105,11 @@ def log_evidence(
     _check_suspect(suspect, x, weights, normals)
     _check_bits(codeword, carrier)
     reader = carrier.reader()
-    scores, norms = claims(reader, reader.receive(observe(suspect - x, weights, normals)), codeword)
+    return best_evidence(*claims(reader, reader.receive(observe(suspect - x, weights, normals)), codeword))
+
+
+def best_evidence(scores: Float[Array, " ways"], norms: Float[Array, " ways"]) -> Float[Array, ""]:
+    """Compute -ln p of the best of several ways of weighting; see `log_evidence`."""
     ratios = jnp.maximum(scores / norms, 0)
     return jnp.max(ratios) ** 2 / 2 - math.log(len(ratios))
 

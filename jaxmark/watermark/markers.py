@@ -11,14 +11,16 @@ from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxmark import distortion
 from jaxmark.alignment import attempts
-from jaxmark.alignment.original import Original, make_original
+from jaxmark.alignment.original import Original, displace, make_original
 from jaxmark.alignment.result import Align, Alignment
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces
+from jaxmark.watermark.arrays import MarkArrays, MarkBatch, make_arrays, make_batch
 from jaxmark.watermark.blind import reading as blind_reading
 from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.blind.writing import Writer
@@ -216,6 +218,28 @@ class NonBlindMarker(Mark):
     def guess(self, found: Detection) -> bytes | None:
         """See `Marker`."""
         return found.message or coding.guess(found.scores, self.bits, TAG_BITS)
+
+    def arrays(self, message: bytes) -> MarkArrays:
+        """Return the arrays of the mark for a message, for pure functions of them; see `jaxmark.watermark.arrays`.
+
+        Raises:
+            JaxmarkError: if the message has another size than the payload.
+        """
+        check_size(message, self.bits)
+        return make_arrays(self, message)
+
+    def arrays_of_keys(self, message: bytes, keys: Sequence[bytes]) -> MarkBatch:
+        """Return the arrays of the mark under other keys, for all of them at once; see `jaxmark.watermark.arrays`.
+
+        Raises:
+            JaxmarkError: if there is no key, one is no key, or the message has another size than the payload.
+        """
+        check_size(message, self.bits)
+        return make_batch(self, message, keys)
+
+    def to_mesh(self, coordinates: Float[Array, "rows 3"]) -> Mesh:
+        """Convert coordinates in the order and pose of `MarkArrays.x` to a mesh like the original, on the host."""
+        return displace(self.original, self.original.to_host(coordinates - self.original.signal))
 
     def _check_capacity(self, reached: float, conditions: Conditions) -> None:
         """Check that the payload is readable under these conditions at an RMS displacement of `reached` diagonals."""
