@@ -12,14 +12,15 @@ import pytest
 import jaxmark as jm
 from jaxmark.adversaries import erasure, erasure_by_descent
 from jaxmark.adversaries.expected import evidence, make_surrogate
-from jaxmark.alignment.observation import Observation
+from jaxmark.alignment.observation import Observation, observe
 from jaxmark.alignment.original import Original
-from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh, vertex_normals
 from jaxmark.spectral.laplacian import per_row
 from jaxmark.spectral.precision import matmul, sum_and_norm
+from jaxmark.watermark.bits import detect_bits, log_evidence
 from jaxmark.watermark.blind.local import LocalScheme
 from jaxmark.watermark.blind.reading import _caveats
-from jaxmark.watermark.carriers import Carrier, Claim, PlainReader, Reader
+from jaxmark.watermark.carriers import Carrier, Claim, PlainReader, Reader, make_spread_carrier
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import code_length
 from jaxmark.watermark.interfaces import Detector, Scheme
@@ -99,6 +100,35 @@ class PatchScheme(Scheme):
 def marked(key: jm.Key) -> tuple[jm.watermark.NonBlindMarker, Mesh]:
     marker = jm.make_marker(bumpy_sphere(3), key, bits=BITS, scheme=PatchScheme())
     return marker, marker.embed(MESSAGE, 2e-3)[0]
+
+
+def lifted(operator, normals, chips):
+    return normals * (chips - 0.5 * operator.apply(chips))
+
+
+def test_a_linear_map_makes_a_carrier(key: jm.Key, x64):
+    """Its adjoint and its claim against dense matrices; its mark is read, and redrawn signs have no evidence."""
+    original = jm.alignment.make_original(bumpy_sphere(2))
+    normals = original.to_traced(vertex_normals(bumpy_sphere(2)))
+    shape = jax.tree_util.Partial(lifted, original.operator, normals)
+    carrier = make_spread_carrier(original, Choices(key, b""), 40, shape, channels=1)
+    assert isinstance(carrier, Carrier)
+    columns = jax.vmap(carrier.displacement, out_axes=-1)(jnp.eye(40))
+    random = np.random.default_rng(0)
+    residual, bits = jnp.asarray(random.normal(size=columns.shape[:2])), jnp.asarray(random.choice([-1.0, 1], 40))
+    products = jnp.einsum("vck,vc->k", columns, residual)
+    np.testing.assert_allclose(carrier.adjoint(residual, 2.0), 2 * products, atol=1e-12)
+    np.testing.assert_allclose(carrier.gram(), jnp.einsum("vci,vcj->ij", columns, columns), atol=1e-12)
+    found = carrier.claim(observe(residual), bits)
+    assert float(found.score) == pytest.approx(float(bits @ products), rel=1e-6)
+    chips = jax.vmap(shape, out_axes=-1)(jnp.eye(len(original.signal))[:, :, None])
+    a = jnp.where(original.moving, jnp.einsum("vcj,vc->j", chips, residual), 0)
+    assert float(found.norm) == pytest.approx(float(jnp.linalg.norm(a)), rel=1e-6)
+    soft = detect_bits(carrier.displacement(bits, 1e-3), 0 * residual, carrier)
+    np.testing.assert_array_equal(jnp.sign(soft), bits)
+    other = carrier.redraw(0)
+    assert float(log_evidence(carrier.displacement(bits), 0 * residual, carrier, bits)) > 10
+    assert float(log_evidence(carrier.displacement(bits), 0 * residual, other, bits)) < 5
 
 
 def owner_sees(marker: jm.watermark.NonBlindMarker, suspect: Mesh) -> float:
