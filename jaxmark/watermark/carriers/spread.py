@@ -20,9 +20,9 @@ from jaxmark.watermark.reading.detectors import correlate
 class SpreadCarrier(NamedTuple):
     """A carrier w = β · shape(r) of keyed chips r[v, c] = s[v, c] · bit[slot(v, c)]; see `Carrier`.
 
-    The map `shape` is all that you write; JAX transposes it for reading. Make the carrier by `make_spread_carrier`. Memory
-    and time do not grow with the number of bits. With several chips for each bit, other bits act as noise, so bits are
-    read by correlation.
+    The map `shape` is all that you write; JAX transposes it for reading. Make the carrier by `make_spread_carrier`.
+    Memory and time do not grow with the number of bits. With several chips for each bit, other bits act as noise, so
+    bits are read by correlation.
     """
 
     shape: Any  # a linear map of chips `[N, channels]` to displacements `[N, 3]`; see `make_spread_carrier`
