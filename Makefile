@@ -13,9 +13,13 @@ OTHERS = box cylinder asteroid-1k creature-1 superquadric-1.5 gem
 QUICK = asteroid-3k
 QUICK_ATTACKS = 'noise 0.001' 'smoothing 10' 'quantisation 9' 'simplification 0.5' 'isotropic 1' 'bending 10' mirror 'Draco 11'
 
+# Numerical tests, which must hold on any device.
+ON_DEVICES = tests/spectral tests/distortion tests/watermark/carriers tests/watermark/reading tests/watermark/test_arrays.py \
+	tests/watermark/test_bits.py tests/test_compiling.py tests/test_contract.py tests/test_precision.py tests/test_transformations.py
+
 NOTEBOOKS = $(patsubst notebooks/%.py,docs/notebooks/%.ipynb,$(wildcard notebooks/*.py))
 
-.PHONY: help demo test lint types tests slow-tests long-tests coverage kernels notebooks pictures looks benchmark benchmark-quick docs clean
+.PHONY: help demo test lint types tests slow-tests long-tests test-device coverage kernels notebooks pictures looks benchmark benchmark-quick docs clean
 .DELETE_ON_ERROR:
 
 help:  ## list these commands
@@ -42,6 +46,9 @@ slow-tests: $(VENV)/.dev  ## pytest: the slow ones
 
 long-tests: $(VENV)/.dev  ## pytest: those of long runs, before a release
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m long
+
+test-device: $(VENV)/.dev  ## pytest: what computes, on whatever device JAX finds
+	$(BIN)/python -m pytest -q -n 0 -r fEs --tb line $(ON_DEVICES)
 
 coverage: $(VENV)/.dev  ## which lines the tests run; all of it in build/coverage
 	$(BIN)/python -m pytest -q -n auto --cov --cov-report=term:skip-covered --cov-report=html

@@ -29,6 +29,12 @@ def _strict_promotion() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(autouse=True)
+def _processors_only(request: pytest.FixtureRequest) -> None:
+    if request.node.get_closest_marker("processor") and jax.default_backend() != "cpu":
+        pytest.skip("for processors only")
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _forget_programs() -> Iterator[None]:
     """Let compiled programs go with the file of tests that needed them: all of them are gigabytes."""

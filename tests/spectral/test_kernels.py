@@ -15,7 +15,7 @@ from jaxmark.spectral.padding import common_laplacian, pad_edges
 from tests.dense import tolerance
 from tests.samples import bumpy_sphere
 
-pytestmark = pytest.mark.core
+pytestmark = [pytest.mark.core, pytest.mark.processor]
 
 needed = pytest.mark.skipif(not kernels.installed(), reason="jaxmark-kernels is not installed")
 TERMS = 24

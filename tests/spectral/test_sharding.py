@@ -17,7 +17,7 @@ from jaxmark.spectral.graphs import from_mesh
 from tests import ROOT
 from tests.samples import bumpy_sphere
 
-pytestmark = pytest.mark.core
+pytestmark = [pytest.mark.core, pytest.mark.processor]
 
 
 def start(*arguments: str, devices: int | None = None) -> subprocess.Popen[str]:
