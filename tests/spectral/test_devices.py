@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxmark import spectral
+from jaxmark.spectral import chebyshev
 from tests.samples import bumpy_sphere
 
 pytestmark = pytest.mark.core
@@ -45,3 +46,20 @@ def test_an_operator_on_a_device_stays_there(operator: spectral.Laplacian):
     on_host = jax.tree.map(np.asarray, operator)
     with jax.transfer_guard("disallow"), pytest.raises(Exception, match="Disallowed host-to-device transfer"):
         spectral.filter(on_host, first, x)
+
+
+def test_a_fourth_column_changes_nothing(operator: spectral.Laplacian, monkeypatch):
+    """It is added on GPUs for the alignment of rows; here it is said to be one."""
+    x, c = jnp.asarray(bumpy_sphere(2).vertices, jnp.float32), jnp.asarray(np.random.default_rng(0).normal(size=(3, 9)))
+
+    def value_and_slopes(c, x):
+        return jax.value_and_grad(lambda c, x: jnp.sum(jnp.sin(spectral.filter(operator, c, x))), (0, 1))(c, x)
+
+    expected = value_and_slopes(c, x)
+    jax.clear_caches()
+    monkeypatch.setattr(chebyshev, "_MIN_ALIGNED", 1)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert "f32[162,4]" in str(jax.make_jaxpr(spectral.filter)(operator, c, x))
+    for found, one in zip(jax.tree.leaves(value_and_slopes(c, x)), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(found, one, rtol=1e-5, atol=1e-5)
+    jax.clear_caches()
