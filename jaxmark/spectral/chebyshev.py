@@ -34,8 +34,6 @@ Series = Float[Array | np.ndarray, "*filters terms"]
 Bank = Float[Array | np.ndarray, "bands terms"]
 
 _MIN_ALIGNED = 2**18  # vertices from which a fourth column pays on a GPU
-    2**18
-)  # vertices from which a fourth column pays on a GPU: a quarter of the time of a million, on an H200
 _BANDS_AT_ONCE = 5  # band components that are formed together where each is used only once
 
 
