@@ -42,6 +42,19 @@ def test_peers_agree():
     assert all(row[2] == "not installed" or float(row[2]) > 0 for row in rows if row[0].startswith("1,0"))
 
 
+@pytest.mark.long
+def test_the_suite_for_devices_runs_on_processors(tmp_path: Path):
+    """In small; many keys at once are as one by one, and PyTorch agrees where it is installed."""
+    sizes = ("--sizes", "1000", "--mark", "1000", "--command", "1000", "--keys", "12", "--repeat", "1")
+    command = [sys.executable, str(SPEED.with_name("device_suite.py")), *sizes, "--output", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "device_suite.json").read_text())
+    assert found["readings"][0]["difference"] < 1e-3
+    assert found["filters"][0].get("difference", 0) < 1e-4
+    assert [row["command"] for row in found["commands"]] == ["embed", "detect"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [["no such mesh.ply"], ["--sizes", "10"], ["--repeat", "0"], ["--parts", "all"], ["--output", "x.txt"]]
