@@ -23,13 +23,14 @@ import subprocess
 import sys
 
 if importlib.util.find_spec("jaxmark") is None:  # in the folder of notebooks of a clone
-    subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", "..[plot]"], check=True)
+    subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", "..[plot]", "optax"], check=True)
 
 # %%
 import math
 
 import jax
 import jax.numpy as jnp
+import optax
 
 import jaxmark as jm
 from jaxmark import adversaries, plot, spectral
@@ -51,18 +52,22 @@ def displaced(layers, noise):
     return adversaries.rescale(surrogate, spectral.cheb_conv(surrogate.operator, layers[1], hidden), 4 * 8e-4)
 
 
+optimiser = optax.adam(0.02)
+
+
 @jax.jit
-def step(layers, key):
+def step(layers, state, key):
     noise, mark = jax.random.normal(key, surrogate.signal[:, :1].shape), jax.random.fold_in(key, 1)
     left, slope = jax.value_and_grad(lambda layers: adversaries.evidence(surrogate, displaced(layers, noise), mark))(
         layers
     )
-    return jax.tree.map(lambda value, change: value - 0.02 * jnp.sign(change), layers, slope), left
+    change, state = optimiser.update(slope, state)
+    return optax.apply_updates(layers, change), state, left
 
 
-history = []
+history, state = [], optimiser.init(layers)
 for key in jax.random.split(draws[2], 40):
-    layers, left = step(layers, key)
+    layers, state, left = step(layers, state, key)
     history.append(float(left))
 print("expected evidence S/‖a‖, step by step:", *(f"{left:.1f}" for left in history[::8]), f"{history[-1]:.1f}")
 assert sum(history[-5:]) < sum(history[:5])

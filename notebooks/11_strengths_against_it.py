@@ -24,11 +24,12 @@ import subprocess
 import sys
 
 if importlib.util.find_spec("jaxmark") is None:  # in the folder of notebooks of a clone
-    subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", "..[plot]"], check=True)
+    subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", "..[plot]", "optax"], check=True)
 
 # %%
 import jax
 import jax.numpy as jnp
+import optax
 
 import jaxmark as jm
 from jaxmark import spectral
@@ -65,22 +66,38 @@ draws = jax.random.split(jax.random.key(0), 3)
 start = [spectral.init_cheb_conv(key, *shape, degree=8) for key, shape in zip(draws, ((4, 8), (8, 3)), strict=False)]
 
 
-def play(strengths, layers, answer):
-    """Train the network, and the strengths at the rate `answer`; return the evidence of each step, and strengths."""
-    history = []
+def play(strengths, layers, rate):
+    """Train the network, and the strengths at a learning rate; return the evidence of each step, and the strengths."""
+    attack, defence = optax.adam(0.01), optax.chain(optax.scale(-1), optax.adam(rate))  # which descend, and ascend
+    states, history = (attack.init(layers), defence.init(strengths)), []
     for key in jax.random.split(draws[2], 40):
         nats, (up, down) = both(strengths, layers, key)
-        layers = jax.tree.map(lambda value, change: value - 0.01 * jnp.sign(change), layers, down)
-        strengths = strengths + answer * jnp.sign(up)
+        (down, attacking), (up, defending) = attack.update(down, states[0]), defence.update(up, states[1])
+        layers, strengths = optax.apply_updates(layers, down), optax.apply_updates(strengths, up)
+        states = attacking, defending
         history.append(float(nats))
     return history, strengths
 
 
 fixed = jnp.log(jnp.ones(bands) if carrier.profile is None else jnp.asarray(carrier.profile))
 figure, (axes,) = panels(1, 6.5, 3.6)
-for name, answer in {"fixed": 0.0, "trained": 0.05}.items():
-    history, strengths = play(fixed, start, answer)
+for name, rate in {"fixed": 0.0, "trained": 0.05}.items():
+    history, strengths = play(fixed, start, rate)
     print(f"strengths {name:<8} evidence in nats:", *(f"{nats:.0f}" for nats in history[::8]), f"{history[-1]:.0f}")
     axes.plot(history, label=f"strengths {name}")
 finish(axes, xlabel="step of network and strengths", ylabel="evidence after the attack, in nats")
 Picture(figure).save("11_1.png")
+
+# %% [markdown]
+# The strengths of the last play are the profile of a scheme, which embeds and detects like any other. At equal RMS
+# displacement, both schemes are attacked by jamming, random noise in the bands of the default strengths. So this
+# attacker does not know the trained ones.
+
+# %%
+profile = jnp.exp(strengths - strengths.max())
+schemes = {"default": marker.scheme, "trained": marker.scheme.with_profile(tuple(map(float, profile)))}
+for name, scheme in schemes.items():
+    marked, info = jm.embed(mesh, b"ok", owner, budget=jm.Budget(rms=size, noise=0), scheme=scheme)
+    jammed = jm.attack(marked, "jamming", 4 * size, seed=1)
+    found = jm.detect(jammed, original=mesh, key=owner, record=info.record)
+    print(f"strengths {name}: message {found.message}, log10 p {found.log10_p:.1f}")

@@ -43,6 +43,7 @@ APART = (
     "README.md",
     "docs/robustness.md",
     "docs/how-to/arrays.md",
+    "docs/how-to/features.md",
     "docs/how-to/recipients.md",
     "docs/how-to/study.md",
 )
