@@ -35,6 +35,7 @@ from jaxmark.watermark.record import load_record as load_record
 from jaxmark.watermark.schemes.keyed import KeyedScheme as KeyedScheme
 from jaxmark.watermark.schemes.modulated import EigenScheme as EigenScheme
 from jaxmark.watermark.schemes.modulated import HostScheme as HostScheme
+from jaxmark.watermark.schemes.own_bands import OwnBandsScheme as OwnBandsScheme
 from jaxmark.watermark.schemes.registry import SCHEMES as SCHEMES
 from jaxmark.watermark.tracing.tardos import Accusation as Accusation
 from jaxmark.watermark.tracing.tracer import Tracer as Tracer

@@ -55,6 +55,15 @@ class Layout(NamedTuple):
     degree: int  # total degree of the polynomials of the position
 
 
+def nuisance_size(columns: float, passband: PassBand) -> tuple[int, int]:
+    """Choose the diffusion scales and the degree of polynomials of the nuisance for a mark of so many dimensions."""
+    # Affine maps have 4 columns; each diffusion scale has one column for each coordinate.
+    scales, degree = min(9, max(0, int(columns / 3 - 4) // 3)), 1
+    while degree < passband.degree and math.comb(degree + 4, 3) + 3 * scales <= columns / passband.per_nuisance:
+        degree += 1
+    return scales, degree
+
+
 @dataclass(frozen=True)
 class KeyedScheme(Scheme):
     """A scheme that writes keyed chips in a pass band of low frequencies; its reader projects off the nuisance.
@@ -114,12 +123,7 @@ class KeyedScheme(Scheme):
         """Choose the pass band and the nuisance for a payload, independently of the key."""
         strengths = self._strengths(original, bits)
         columns = self._written_dimensions(original, strengths) / self._channels
-        # Affine maps have 4 columns; each diffusion scale has one column for each coordinate.
-        scales = min(9, max(0, int(columns / 3 - 4) // 3))
-        degree, passband = 1, PASS_BANDS[self.passband]
-        while degree < passband.degree and math.comb(degree + 4, 3) + 3 * scales <= columns / passband.per_nuisance:
-            degree += 1
-        return Layout(len(strengths), scales, degree)
+        return Layout(len(strengths), *nuisance_size(columns, PASS_BANDS[self.passband]))
 
     def strengths(self, original: Original, bits: int) -> Float64[np.ndarray, " passing"]:
         """Compute the relative strengths of the bands of the pass band for a payload."""

@@ -15,6 +15,7 @@ from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.interfaces import Scheme
 from jaxmark.watermark.schemes.keyed import KeyedScheme
 from jaxmark.watermark.schemes.modulated import EigenScheme, HostScheme
+from jaxmark.watermark.schemes.own_bands import OwnBandsScheme
 
 #: The schemes that are read with the original.
 SCHEMES: Mapping[str, type[KeyedScheme] | type[HostScheme] | type[EigenScheme]] = {
@@ -22,6 +23,8 @@ SCHEMES: Mapping[str, type[KeyedScheme] | type[HostScheme] | type[EigenScheme]] 
 }
 #: The blind schemes, the fastest first.
 BLIND_SCHEMES: Mapping[str, BlindScheme] = {LocalScheme.name: LocalScheme(), FieldScheme.name: FieldScheme()}
+# Schemes that only records name, because they have no usual fields.
+_BY_RECORD: Mapping[str, type[Scheme]] = {**SCHEMES, OwnBandsScheme.name: OwnBandsScheme}
 NAMES = (*SCHEMES, *BLIND_SCHEMES)  # the names of all schemes
 DEFAULT_SCHEME = KeyedScheme.name
 
@@ -46,7 +49,7 @@ class Named(Protocol):
 
 def is_builtin(scheme: Scheme | BlindScheme) -> bool:
     """Whether a scheme is one of this library; a subclass may do anything, and is not."""
-    return type(scheme) in (*SCHEMES.values(), *map(type, BLIND_SCHEMES.values()))
+    return type(scheme) in (*_BY_RECORD.values(), *map(type, BLIND_SCHEMES.values()))
 
 
 def find_blind(scheme: str | Scheme | BlindScheme) -> BlindScheme | None:
@@ -75,31 +78,40 @@ def make_scheme(name: str, parameters: Mapping[str, Any]) -> Scheme:
     """Make a scheme that is read with the original from its fields in a record.
 
     Args:
-        name: one of `SCHEMES`.
+        name: one of `SCHEMES`, or that of `OwnBandsScheme`.
         parameters: the fields, as `parameters_of` returns them.
 
     Raises:
         JaxmarkError: if there is no such scheme, or it does not have these fields.
     """
-    get_nonblind(name)  # raises an error for other names
-    types = {field.name: type(field.default) for field in fields(SCHEMES[name])}
-    # JSON stores tuples as lists.
-    values: dict[str, Any] = {
-        field: tuple(value) if isinstance(value, list) else value for field, value in parameters.items()
-    }
+    if name not in _BY_RECORD:
+        get_nonblind(name)  # raises an error
+    types = {field.name: type(field.default) for field in fields(_BY_RECORD[name])}
+    values: dict[str, Any] = {field: _as_tuples(value) for field, value in parameters.items()}
     for field, value in _RETIRED_FIELDS.get(name, {}).items():
         if values.pop(field, value) != value:
             raise JaxmarkError(f"Marks of the scheme {name!r} with {field} other than {value} are no longer read.")
     if any(
-        field not in types
-        or type(value) is not types[field]
-        or (isinstance(value, tuple) and not all(isinstance(item, float) for item in value))
+        field not in types or type(value) is not types[field] or not _fits(field, value)
         for field, value in values.items()
     ):
         raise JaxmarkError(f"The scheme {name!r} takes the parameters {', '.join(types)}, not {values}.")
     if any(not 0 < values.get(field, 1) <= _MAX_COMPONENTS for field in ("bands", "pairs")):
         raise JaxmarkError(f"The scheme in a record has 1 to {_MAX_COMPONENTS} bands or pairs, not {values}.")
-    return SCHEMES[name](**{**_FIELDS_OF_OLD_RECORDS.get(name, {}), **values})
+    return _BY_RECORD[name](**{**_FIELDS_OF_OLD_RECORDS.get(name, {}), **values})
+
+
+def _as_tuples(value: Any) -> Any:
+    """Convert lists, as which JSON stores tuples."""
+    return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple) else value
+
+
+def _fits(field: str, value: Any) -> bool:
+    """Whether a value, if it is a tuple, has only floats; `filters` are tuples of floats."""
+    if not isinstance(value, tuple):
+        return True
+    lists = value if field == "filters" else (value,)
+    return all(isinstance(one, tuple) and all(isinstance(item, float) for item in one) for one in lists)
 
 
 def make_blind_scheme(name: str, parameters: Mapping[str, Any]) -> BlindScheme:

@@ -1,0 +1,100 @@
+"""A scheme for band filters of your own, such as trained ones, which are bound to the mark like all its parameters."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import ArrayLike
+
+from jaxmark.alignment.original import Original
+from jaxmark.errors import JaxmarkError
+from jaxmark.watermark.carriers.chips import KeyedCarrier, make_chips
+from jaxmark.watermark.coding.keys import Choices
+from jaxmark.watermark.coding.message import code_length
+from jaxmark.watermark.interfaces import Scheme
+from jaxmark.watermark.perception.masking import masking_tensors
+from jaxmark.watermark.reading.reception import make_host
+from jaxmark.watermark.schemes.keyed import PASS_BANDS, nuisance_size
+
+_MOST = 512  # filters, and terms of each, which limits the time of reading a mark with its record
+_GRID = 2048  # values of λ at which responses are integrated
+
+
+@dataclass(frozen=True)
+class OwnBandsScheme(Scheme):
+    """A scheme that writes keyed chips in bands of your own, as `KeyedScheme` does in its bands.
+
+    The filters are in the record, and keyed choices depend on them, so a detection is a proof, as with the schemes that
+    have names. Make it by `from_arrays`.
+    """
+
+    name: ClassVar[str] = "own-bands"
+    filters: tuple[tuple[float, ...], ...] = ()  # Chebyshev coefficients of each band, times its strength
+    hiding: bool = True  # whether displacements are masked perceptually; see `jaxmark.watermark.perception.masking`
+
+    def __post_init__(self) -> None:
+        """Check the fields.
+
+        Raises:
+            JaxmarkError: if there is no filter or more than 512, or one has no or more than 512 terms, or other numbers
+                of terms than the others; if a number is not finite, or all are 0.
+        """
+        sizes = {len(one) for one in self.filters}
+        if not 1 <= len(self.filters) <= _MOST or len(sizes) != 1 or not 1 <= max(sizes) <= _MOST:
+            raise JaxmarkError(f"Own bands are 1 to {_MOST} filters of equally many terms, 1 to {_MOST}.")
+        if not (np.isfinite(self.filters).all() and np.any(self.filters)):
+            raise JaxmarkError("Own bands have finite coefficients, not all of them 0.")
+
+    @classmethod
+    def from_arrays(
+        cls, bands: ArrayLike, strengths: ArrayLike | None = None, *, hiding: bool = True
+    ) -> "OwnBandsScheme":
+        """Make the scheme from arrays, such as those that `KeyedCarrier.with_bands` was trained with.
+
+        Args:
+            bands: Chebyshev coefficients `[bands, degree + 1]`, as in `jaxmark.spectral.bands`.
+            strengths: factor on each band, `[bands]`; by default all are 1.
+            hiding: see the field.
+
+        Raises:
+            JaxmarkError: if they have other shapes, or are not as described in `__post_init__`.
+        """
+        filters = np.asarray(bands, np.float64)
+        factors = (
+            np.ones(len(filters) if filters.ndim else 0) if strengths is None else np.asarray(strengths, np.float64)
+        )
+        if filters.ndim != 2 or factors.shape != filters.shape[:1]:
+            raise JaxmarkError(
+                f"Own bands are an array [bands, degree + 1] and a strength for each, not {filters.shape} and"
+                f" {factors.shape}."
+            )
+        return cls(tuple(map(tuple, (factors[:, None] * filters).tolist())), hiding)
+
+    def code_length(self, original: Original, bits: int) -> int:
+        """See `Scheme`; 12 code bits for each bit of message and tag, if there are dimensions for them."""
+        return code_length(bits, self.dimensions(original, bits), 12)
+
+    def dimensions(self, original: Original, bits: int) -> int:
+        """Count the dimensions that the filters pass, as many as of an ideal pass band with equally peaked energy.
+
+        That is (∫r²)²/∫r⁴ of their response r, times the density of eigenvalues.
+        """
+        frequencies = np.linspace(0, 2, _GRID)
+        energy = np.sum(chebyshev.chebval(frequencies - 1, np.transpose(self.filters)) ** 2, axis=0)
+        width = 2 * np.mean(energy) ** 2 / np.mean(energy**2)
+        return int(3 * min(1.0, original.density * width) * int(original.used.sum()))
+
+    def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> KeyedCarrier:
+        """See `Scheme`."""
+        scales, degree = nuisance_size(self.dimensions(original, bits) / 3, PASS_BANDS["tapered"])
+        host = make_host(
+            original.operator,
+            original.signal,
+            original.to_traced(original.positions),
+            np.array(self.filters),
+            scales=scales,
+            degree=degree,
+        )
+        chips = make_chips(choices, original.chip_places, code_bits, count=original.count)
+        return KeyedCarrier(host, chips, masking=masking_tensors(original) if self.hiding else None)
