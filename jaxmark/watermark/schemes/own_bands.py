@@ -18,6 +18,7 @@ from jaxmark.watermark.reading.reception import make_host
 from jaxmark.watermark.schemes.keyed import PASS_BANDS, nuisance_size
 
 _MOST = 512  # filters, and terms of each, which limits the time of reading a mark with its record
+_LARGEST = 1e6  # coefficient, beyond which float32 would overflow; the budget sets the size of a mark anyway
 _GRID = 2048  # values of λ at which responses are integrated
 
 
@@ -38,13 +39,13 @@ class OwnBandsScheme(Scheme):
 
         Raises:
             JaxmarkError: if there is no filter or more than 512, or one has no or more than 512 terms, or other numbers
-                of terms than the others; if a number is not finite, or all are 0.
+                of terms than the others; or if the largest coefficient is not from 1e-6 to 1e6 in size.
         """
         sizes = {len(one) for one in self.filters}
         if not 1 <= len(self.filters) <= _MOST or len(sizes) != 1 or not 1 <= max(sizes) <= _MOST:
             raise JaxmarkError(f"Own bands are 1 to {_MOST} filters of equally many terms, 1 to {_MOST}.")
-        if not (np.isfinite(self.filters).all() and np.any(self.filters)):
-            raise JaxmarkError("Own bands have finite coefficients, not all of them 0.")
+        if not 1 / _LARGEST <= np.abs(self.filters).max() <= _LARGEST:  # not with NaN either
+            raise JaxmarkError(f"Own bands have a largest coefficient of {1 / _LARGEST:g} to {_LARGEST:g} in size.")
 
     @classmethod
     def from_arrays(

@@ -67,7 +67,19 @@ def test_dimensions_are_those_of_the_library_s_bands(mesh: Mesh):
 
 
 @pytest.mark.parametrize(
-    "filters", [(), ((),), ((1.0,), (1.0, 2.0)), ((0.0, 0.0),), ((np.inf,),), ((1.0,),) * 513, ((1.0,) * 513,)]
+    "filters",
+    [
+        (),
+        ((),),
+        ((1.0,), (1.0, 2.0)),
+        ((0.0, 0.0),),
+        ((np.inf,),),
+        ((1e9,),),
+        ((1e-9,),),
+        ((np.nan, 1.0),),
+        ((1.0,),) * 513,
+        ((1.0,) * 513,),
+    ],
 )
 def test_bands_that_are_none_are_refused(filters):
     with pytest.raises(jm.JaxmarkError, match="Own bands"):
