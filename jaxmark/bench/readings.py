@@ -19,7 +19,7 @@ from jaxmark.bench.method import Method
 from jaxmark.bench.paired import Paired, compare_paired
 from jaxmark.bench.tasks import MARK, UNMARKED, Task
 from jaxmark.bench.tracks import get_track
-from jaxmark.errors import JaxmarkError
+from jaxmark.errors import JaxmarkError, require
 from jaxmark.files.atomic import read_file, write_atomically
 
 _MAX_BIT_ERROR_DIFFERENCE = 0.1  # largest difference of the fractions of wrong bits of two readings that agree
@@ -161,6 +161,17 @@ class BenchResults:
             count = "more than one" if labels else "no"
             raise JaxmarkError(f"There is {count} method {name!r} in {', '.join(self.methods)}.")
         return labels[0]
+
+    def frame(self) -> Any:
+        """Return the readings of marked suspects with their own key as a `pandas.DataFrame`. Needs the extra `study`.
+
+        Columns are the fields of `Task`, those of the reading, and `detected` at the calibrated threshold.
+
+        Raises:
+            JaxmarkError: if pandas is missing.
+        """
+        rows = [{**one.task._asdict(), **one.reading, "detected": self.succeeds(one)} for one in self.suspects]
+        return require("pandas", "study").DataFrame(rows)
 
     def save_csv(self, path: str | os.PathLike[str]) -> None:
         """Write all readings as comma-separated values.

@@ -430,6 +430,10 @@ def test_a_mark_is_written_over_by_a_second_one_of_the_same_method(small: dict):
 
     method = replace(SIGNS, read=read)
     found = jm.bench.run(**{**small, "attacks": ["none", "overwritten"]}, tracks=["2026"], methods=[method])
+    frame = found.frame()
+    assert len(frame) == len(found.suspects)
+    assert frame.detected.tolist() == [found.succeeds(one) for one in found.suspects]
+    assert set(frame.attack) == {one.task.attack for one in found.suspects}
     scores = {one.task.attack: one.score / math.sqrt(len(small["meshes"]["ball"].vertices)) for one in found.suspects}
     assert scores["none"] == pytest.approx(1, abs=0.01), "the pose that the mark changed a little was undone"
     assert scores["overwritten"] == pytest.approx(math.sqrt(0.5), abs=0.12)
