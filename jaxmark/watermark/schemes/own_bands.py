@@ -79,7 +79,7 @@ class OwnBandsScheme(Scheme):
     def dimensions(self, original: Original, bits: int) -> int:
         """Count the dimensions that the filters pass, as many as of an ideal pass band with equally peaked energy.
 
-        That is (∫r²)²/∫r⁴ of their response r, times the density of eigenvalues.
+        Their number is (∫r²)²/∫r⁴ of the response r, times the density of eigenvalues.
         """
         frequencies = np.linspace(0, 2, _GRID)
         energy = np.sum(chebyshev.chebval(frequencies - 1, np.transpose(self.filters)) ** 2, axis=0)
