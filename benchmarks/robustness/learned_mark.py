@@ -44,7 +44,7 @@ BANDS, TERMS, HIDDEN, WAVES = 8, 25, 32, 16  # of the networks
 SMOOTH = 20.0  # time of heat flow that makes the smooth distance
 SHARP = 50.0  # of what the encoder writes into bits that the unmarked mesh shows already
 MESSAGES = 6  # random messages in each step of training
-STRENGTHS = (1e-3, 5e-3)  # in training: RMS displacement over the mean distance
+STRENGTHS = (5e-4, 3e-3)  # in training
 RATES = {"fast": 3e-3, "slow": 2e-4}  # of learning: of the decoder's functions, and of all else
 
 Signal = Float[Array, " vertices"]
@@ -119,7 +119,10 @@ class Networks(eqx.Module):
         return self._decisions(shape, self._details(shape).values, self._functions(places(shape)))
 
     def encode(self, shape: Rays, signs: Decisions, strength: Float[Array, ""] | float) -> Signal:
-        """Compute shifts along rays for bits of -1 or 1, with an RMS of `strength` times the mean distance."""
+        """Compute shifts along rays for bits of -1 or 1, in units of the mean distance.
+
+        The strength is the RMS of Δ times the shifts, because perceptual metrics compare curvature.
+        """
         where, details = places(shape), self._details(shape)
         functions = self._functions(where)
         patterns = spectral.synthesise(shape.operator, self.filters, jnp.moveaxis(functions, 1, 0))
@@ -128,7 +131,9 @@ class Networks(eqx.Module):
         patterns += self.second(shape.operator, jnp.tanh(self.first(shape.operator, inputs)))
         margin = jnp.exp(self.logs[1]) * strength
         needed = signs * jax.nn.softplus(SHARP * (margin - signs * self._decisions(shape, details.values, functions)))
-        return strength * shape.normalised(patterns @ self._amplitudes(shape, details, functions, patterns, needed))
+        shift = patterns @ self._amplitudes(shape, details, functions, patterns, needed)
+        bent = shape.operator.apply(shift)
+        return strength * shift / jnp.sqrt(shape.mean(bent**2) + 1e-12)
 
     def _amplitudes(
         self, shape: Rays, details: Details, functions: Array, patterns: Array, needed: Decisions
@@ -239,7 +244,7 @@ def centred(surface: Mesh) -> tuple[Rays, Mesh, float]:
 
 
 def embed(mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
-    """Embed a message; the strength is the RMS displacement over the mean distance to the centre."""
+    """Embed a message; for the strength, see `Networks.encode`."""
     surface = make_surface(mesh)
     shape, small, size = centred(surface.mesh)
     signs = jnp.asarray(2.0 * scatter(message, key, NAME) - 1, jnp.float32)

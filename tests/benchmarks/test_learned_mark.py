@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 import jaxmark as jm
+from jaxmark import spectral
 from jaxmark.bench.method import Method, load_method
 from jaxmark.errors import JaxmarkError
 from tests import ROOT
+from tests.dense import laplacian_matrix
 from tests.samples import rough_sphere
 
 PROGRAM = ROOT / "benchmarks" / "robustness" / "learned_mark.py"
@@ -44,10 +46,14 @@ def test_a_strong_mark_is_read_with_its_key_alone(method, mesh, message, marked)
     assert 3 <= np.sum(other != message) <= 13
 
 
-def test_the_strength_is_the_rms_displacement_over_the_mean_distance(mesh, marked):
+def test_the_strength_is_the_rms_of_delta_of_the_shifts(mesh, marked):
     x, y = np.asarray(mesh.vertices), np.asarray(marked.vertices)
-    distance = np.linalg.norm(x - x.mean(axis=0), axis=1).mean()
-    assert np.sqrt(np.mean(np.sum((y - x) ** 2, axis=1))) == pytest.approx(STRENGTH * distance, rel=0.05)
+    weights = spectral.vertex_areas(x, mesh.faces) / np.sum(spectral.vertex_areas(x, mesh.faces))
+    x, y = x - weights @ x, y - weights @ x
+    before, after = np.linalg.norm(x, axis=1), np.linalg.norm(y, axis=1)
+    np.testing.assert_allclose(np.sum(x * y, axis=1), before * after, rtol=1e-6)  # along rays
+    bent = laplacian_matrix(spectral.from_mesh(mesh)) @ (after - before)
+    assert np.sqrt(weights @ bent**2) == pytest.approx(STRENGTH * (weights @ before), rel=1e-2)
 
 
 def test_pose_scale_and_order_do_not_matter(method, marked):
