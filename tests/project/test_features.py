@@ -79,7 +79,7 @@ def test_graphwave_is_that_of_the_heat_kernels_of_pygsp(page, x64):
 
 
 def test_scattering_is_that_of_dense_powers(page, x64):
-    """Ψ_j = P^{2^(j-1)} - P^{2^j} with P = (I + WD⁻¹)/2, and Σ_v |…|^q (Gao, Wolf, Hirn 2019, section 3)."""
+    """Ψ_j = P^{2^(j-1)} - P^{2^j} with P = (I + WD⁻¹)/2, and Σ_v |…|^q (Gao, Wolf, Hirn 2019)."""
     operator, x = page["graph"], signal(page)
     walk = np.eye(len(x)) - laplacian_matrix(operator).T / 2
     wavelets = [np.linalg.matrix_power(walk, 2 ** (j - 1)) - np.linalg.matrix_power(walk, 2**j) for j in range(1, 4)]
