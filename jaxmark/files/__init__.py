@@ -4,6 +4,7 @@ A file is saved by patching the file that it was loaded from: all bytes except t
 """
 
 import os
+import posixpath
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
@@ -278,6 +279,14 @@ def _source_of(path: str | os.PathLike, like: str | os.PathLike) -> Source:
     return _read(like)
 
 
+# Of files that come along with one that refers to them.
+_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".bmp", ".gif", ".svg", ".tga", ".tif", ".tiff", ".exr", ".hdr")
+_TEXTURES, _LAYERS = (".ktx", ".ktx2", ".basis", ".dds", ".tx"), (".usd", ".usda", ".usdc", ".usdz")
+_COMPANIONS = frozenset((*_IMAGES, *_TEXTURES, *_LAYERS, ".bin", ".mtl", ".mtlx"))
+_MOST_COMPANION = 2**28  # bytes of one of them
+_MOST_NOTED = 5
+
+
 def _save(source: Source, positions: np.ndarray, path: str | os.PathLike, like: str | os.PathLike) -> tuple[str, ...]:
     """Write a source with other positions, and the files beside it; refused if its numbers are too coarse."""
     with concerning(os.fspath(like)):
@@ -288,14 +297,30 @@ def _save(source: Source, positions: np.ndarray, path: str | os.PathLike, like: 
         patched = source.patch(positions if moved else source.positions, Path(path).stem)
     beside = dict(patched.beside)
     here, there = Path(like).parent, Path(path).parent
+    left: tuple[str, ...] = ()
     if os.path.realpath(here) != os.path.realpath(there):
-        for companion in patched.companions:
+        read = read_beside(here, _MOST_COMPANION)
+        names = {posixpath.normpath(companion) for companion in patched.companions}
+        for name in sorted(names):
+            if not _may_come_along(name, Path(like)):
+                left += (f"the file {ascii(name)[:80]} that it refers to is not copied",)
+                continue
             with suppress(JaxmarkError):  # a file that is missing already, or lies elsewhere, does not come along
-                beside[companion] = read_beside(here)(companion)
+                beside[name] = read(name)
     write_together(path, patched.file, beside)
     most = max((loss or 0.0 for loss in lost), default=0.0)
     noted = (f"rounding to the numbers of the file changes the displacement by {100 * most:.0f} %",)
-    return patched.notes + noted * (most > _NOTED_LOSS)
+    return patched.notes + left[:_MOST_NOTED] + noted * (most > _NOTED_LOSS)
+
+
+def _may_come_along(name: str, like: Path) -> bool:
+    """Whether a file that another one refers to may be copied: an image, a buffer or a layer in or below its folder.
+
+    The name comes from the file, which could name a key or the original.
+    """
+    suffix, target = Path(name).suffix.lower(), like.parent / name
+    inside = not posixpath.isabs(name) and "\\" not in name and not name.startswith("..")
+    return inside and suffix in _COMPANIONS and os.path.realpath(target) != os.path.realpath(like)
 
 
 def _check_rounding(source: Source, positions: Points, places: Indices) -> float | None:

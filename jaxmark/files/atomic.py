@@ -54,8 +54,8 @@ def file_hash(path: str | os.PathLike[str]) -> str:
         raise JaxmarkError(f"Cannot read {path}: {error.strerror or error}.") from None
 
 
-def read_beside(folder: Path) -> Callable[[str], bytes]:
-    """Make a function that reads files by their paths relative to a folder, and none outside of it.
+def read_beside(folder: Path, most: int | None = None) -> Callable[[str], bytes]:
+    """Make a function that reads files by their paths relative to a folder, and none outside of it or beyond a size.
 
     A file is read once: the function returns the same object for all paths of it.
     The function raises a `JaxmarkError`, half a sentence, for a file that cannot be read.
@@ -71,7 +71,7 @@ def read_beside(folder: Path) -> Callable[[str], bytes]:
             status = Path(target).stat()
             file = status.st_dev, status.st_ino
             if file not in contents:
-                contents[file] = read_file(target)
+                contents[file] = read_file(target, most)
             return contents[file]
         except (OSError, ValueError) as error:
             said = getattr(error, "strerror", None) or str(error)
@@ -168,13 +168,17 @@ def write_together(path: str | os.PathLike, data: bytes, beside: Mapping[str, by
         beside: the other files' bytes, by path relative to the folder of the first. None of them replaces a file.
 
     Raises:
-        JaxmarkError: if one of the others is there already, with other bytes; see `write_atomically`.
+        JaxmarkError: if one of the others is there already, with other bytes, or would lie outside of the folder, such
+            as beyond a symbolic link; see `write_atomically`.
     """
     written: list[Path] = []
     with _writing(path):
         try:
             for name, content in beside.items():
-                target = Path(os.path.realpath(path)).parent / name
+                folder = Path(os.path.realpath(path)).parent
+                target = Path(os.path.realpath(folder / name))
+                if not target.is_relative_to(folder):
+                    raise JaxmarkError(f"{ascii(name)[:80]}, which it refers to, would lie outside of {folder}.")
                 if not target.exists():
                     target.parent.mkdir(parents=True, exist_ok=True)
                     written.append(target)

@@ -11,6 +11,7 @@ _INVISIBLE = re.compile(
     "[\u00ad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180b-\u180f\u200b\u200e\u200f\u202a-\u202e\u2060-\u206f\u3164"
     "\ufe00-\ufe0f\ufeff\uffa0\ufff0-\ufff8\U0001bca0-\U0001bca3\U0001d173-\U0001d17a\U000e0000-\U000e0fff]"
 )
+_SPACE = re.compile("[\u00a0\u1680\u2000-\u200a\u202f\u205f\u3000]")  # Unicode's spaces, which look like one
 # Joiners change the letters beside them in Persian, Indic scripts and emoji, but not in Latin script or at an end.
 _USELESS_JOINER = re.compile("(?<![\u0300-\U0010ffff])[\u200c\u200d]+|[\u200c\u200d]+(?![\u0300-\U0010ffff])")
 
@@ -28,7 +29,7 @@ def decode(data: bytes) -> str:
 
 
 def normalise(text: str) -> str:
-    """Compose accents (Unicode's form NFC), and remove invisible characters and white space at both ends.
+    """Compose accents (Unicode's form NFC), take all spaces for one kind, and remove what is invisible or at the ends.
 
     Raises:
         JaxmarkError: if the text has half of a surrogate pair, as from bytes that are not UTF-8.
@@ -72,4 +73,5 @@ def find_name(name: str, names: Collection[str]) -> str | None:
 def _normalised(text: str) -> str:
     if text.isascii():
         return text.strip()
-    return unicodedata.normalize("NFC", _USELESS_JOINER.sub("", _INVISIBLE.sub("", text))).strip()
+    plain = _SPACE.sub(" ", _USELESS_JOINER.sub("", _INVISIBLE.sub("", text)))
+    return unicodedata.normalize("NFC", plain).strip()

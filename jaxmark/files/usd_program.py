@@ -95,7 +95,7 @@ def _read(layer: Any, most: int) -> dict[str, np.ndarray]:
         meshes.append(mesh)
     report = {
         "meshes": meshes,
-        "layers": sorted(layer.GetCompositionAssetDependencies()),
+        "layers": sorted({*layer.GetCompositionAssetDependencies()} - {""}),  # "" is the layer itself
         "assets": sorted(assets - {""}),
     }
     return arrays | {"report": np.frombuffer(json.dumps(report).encode(), np.uint8)}

@@ -34,6 +34,12 @@ def test_visible_text_stays(text: str):
     assert normalise(text) == text
 
 
+def test_all_spaces_are_one_kind():
+    assert normalise("Åsa\u00a0Müller") == normalise("Åsa\u202fMüller") == "Åsa Müller"
+    with pytest.raises(JaxmarkError, match="differ only in what cannot be seen"):
+        normalise_names(["Åsa\u00a0Müller", "Åsa Müller"])
+
+
 def test_a_useless_joiner_is_dropped():
     assert normalise(BESIDE) == "xy"
 

@@ -252,7 +252,10 @@ class Detection(NamedTuple):
         """State the result for a publication: the message, both p-values, their conditions, and what they include."""
         evidence = self.evidence
         if self.message is None:
-            result = f"No message of the scheme {self.scheme!r} was decoded."
+            result = (
+                f"No message of the scheme {self.scheme!r} was decoded; if one was claimed, or the mark carries none,"
+                " the figures are those of the claim, or of the presence of the mark."
+            )
         else:
             result = f"The message {self.message.hex()} of the scheme {self.scheme!r} was decoded."
         kind = "is estimated as" if evidence.caveats else "is at most"
@@ -262,8 +265,10 @@ class Detection(NamedTuple):
             f"For a mesh that is independent of the key, the probability of evidence that is as strong {kind}"
             f" 10^{rounded_up(evidence.log10_p):.1f} if {self.premises} were fixed before the mesh existed, and"
             f" 10^{rounded_up(evidence.log10_p_uncommitted):.1f} if nothing shows that, which charges a choice among"
-            " 2^64 keys, originals or records.",
-            f"These figures include the choices of the reader, as log10 of their number: {charges}." if charges else "",
+            " 2^64 keys, originals or records for each mesh.",
+            f"The first figure includes the choices of the reader, as log10 of their number: {charges}."
+            if charges
+            else "",
             f"They are estimates, because {'; '.join(evidence.caveats)}." if evidence.caveats else "",
             f"(jaxmark {version('jaxmark')}, keyed choices of version {self.version})",
         ]

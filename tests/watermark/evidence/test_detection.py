@@ -21,6 +21,6 @@ def test_the_statement_of_a_detection_has_its_figures_conditions_and_choices():
     assert "estimate" not in said
     estimate = proof._replace(message=None, evidence=evidence._replace(caveats=("it is a test", "of mine")))
     said = estimate.statement()
-    assert "No message of the scheme 'keyed' was decoded." in said
+    assert "No message of the scheme 'keyed' was decoded; if one was claimed, " in said
     assert "is estimated as 10^-20.3" in said
     assert "They are estimates, because it is a test; of mine." in said
