@@ -17,7 +17,7 @@ _MAX_EXCHANGES = 200
 class Interpolation(NamedTuple):
     """A polynomial that interpolates a function on [0, 2]."""
 
-    coefficients: Float64[np.ndarray, " terms"]  # its Chebyshev series, for `jaxmark.spectral.filter`
+    coefficients: Float64[np.ndarray, " terms"]  # its Chebyshev series, for `jaxmark.spectral.chebyshev.filter`
     error: float  # largest error on a grid that is 32 times as fine as the points of interpolation
 
 
