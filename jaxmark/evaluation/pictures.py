@@ -34,8 +34,7 @@ _CONTROLS: dict[Control, tuple[str, dict[str, Any]]] = {
 }
 _ENDS = {"read": ("_low", "_high"), **dict.fromkeys(("log10_p", "log10_p_unfloored"), ("_least", "_largest"))}
 _MAX_COLUMNS = 3
-_PANEL_WIDTH = 4.2  # in inches, as the next three: of a letter and a line with its space in a legend of 8 points
-_LETTER_WIDTH, _LINE_WIDTH, _LEGEND_LINE = 0.065, 0.5, 0.18
+_LETTER_WIDTH, _LINE_WIDTH, _LEGEND_LINE = 0.065, 0.5, 0.18  # inches in a legend of 8 points
 
 
 def roc(log10_p: Mapping[str, Suspects], *, lowest: float = -20.0, confidence: float = 0.95) -> Picture:
@@ -155,17 +154,15 @@ def curves(rows: Sequence[Row], of: Measure = "read") -> Picture:
     attacks = list(dict.fromkeys(row.attack for row in rows))
     varied = (one for one in ("mesh", "bits", "budget") if len({getattr(row, one) for row in rows}) > 1)
     names = ("scheme", *varied)
-    labels = [label for label, _, _ in _series(rows, names)]
-    width = _PANEL_WIDTH * min(len(attacks), _MAX_COLUMNS)
-    entry = _LINE_WIDTH + _LETTER_WIDTH * (len(", detected") + max(map(len, labels)))
-    columns = max(1, min(len(labels), int(width / entry)))
-    height = _LEGEND_LINE * (1 + math.ceil(len(labels) / columns))
-    figure, axes = panels(len(attacks), _PANEL_WIDTH, 3.2, columns=_MAX_COLUMNS, legend=height)
+    figure, axes = panels(len(attacks), 4.2, 3.2, columns=_MAX_COLUMNS)
     for panel, attack in zip(axes, attacks, strict=False):
         _draw(panel, [row for row in rows if row.attack == attack], names, of)
     for panel in axes[len(attacks) :]:
         panel.set_axis_off()
     handles, labels = axes[0].get_legend_handles_labels()
+    width, height = figure.get_size_inches()
+    columns = max(1, min(len(labels), int(width / (_LINE_WIDTH + _LETTER_WIDTH * max(map(len, labels))))))
+    figure.set_figheight(height + _LEGEND_LINE * (1 + math.ceil(len(labels) / columns)))
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=8)
     return Picture(figure)
 

@@ -35,6 +35,7 @@ __all__ = [
     "write_atomically",
 ]
 
+_USD = (".usd", ".usda", ".usdc", ".usdz")
 _FORMATS: dict[str, Callable[..., Source]] = {
     ".obj": obj.parse,
     ".ply": ply.parse,
@@ -44,7 +45,7 @@ _FORMATS: dict[str, Callable[..., Source]] = {
     ".gltf": asset.parse,
     ".vrm": asset.parse,
     ".3mf": threemf.parse,
-    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), usd.parse),
+    **dict.fromkeys(_USD, usd.parse),
     ".xyz": point_cloud.parse_xyz,
     ".las": point_cloud.parse_las,
     ".laz": point_cloud.parse_las,
@@ -55,6 +56,12 @@ _MOST_LOST = 0.9  # RMS of what rounding adds to a displacement, over the RMS of
 _NOTED_LOSS = 0.05  # of the same, from which rounding is reported
 _MIN_SPACINGS = 10  # numbers keep a displacement well if its RMS is this many times their spacing
 _ONLY = "mesh"  # name of the mesh in a file that has just one
+# Suffixes of the files that are copied along with a file that refers to them.
+_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".bmp", ".gif", ".svg", ".tga", ".tif", ".tiff", ".exr", ".hdr")
+_TEXTURES = (".ktx", ".ktx2", ".basis", ".dds", ".tx")
+_COMPANIONS = frozenset((*_IMAGES, *_TEXTURES, *_USD, ".bin", ".mtl", ".mtlx"))
+_MOST_COMPANION = 2**28  # bytes of one of them
+_MOST_NOTED = 5
 
 
 class Scene(NamedTuple):
@@ -277,14 +284,6 @@ def _source_of(path: str | os.PathLike, like: str | os.PathLike) -> Source:
             f"{os.fspath(path)} must have the same suffix as {os.fspath(like)}, whose bytes it takes over."
         )
     return _read(like)
-
-
-# Of files that come along with one that refers to them.
-_IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".bmp", ".gif", ".svg", ".tga", ".tif", ".tiff", ".exr", ".hdr")
-_TEXTURES, _LAYERS = (".ktx", ".ktx2", ".basis", ".dds", ".tx"), (".usd", ".usda", ".usdc", ".usdz")
-_COMPANIONS = frozenset((*_IMAGES, *_TEXTURES, *_LAYERS, ".bin", ".mtl", ".mtlx"))
-_MOST_COMPANION = 2**28  # bytes of one of them
-_MOST_NOTED = 5
 
 
 def _save(source: Source, positions: np.ndarray, path: str | os.PathLike, like: str | os.PathLike) -> tuple[str, ...]:

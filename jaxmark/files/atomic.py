@@ -64,11 +64,10 @@ def read_beside(folder: Path, most: int | None = None) -> Callable[[str], bytes]
 
     def read(path: str) -> bytes:
         try:
-            inside = os.path.realpath(folder)
-            target = os.path.realpath(Path(inside) / path)
-            if os.path.commonpath([inside, target]) != inside:
+            target = _inside(folder, path)
+            if target is None:
                 raise JaxmarkError(f"the file {ascii(path)[:80]} that it refers to is outside of its folder")
-            status = Path(target).stat()
+            status = target.stat()
             file = status.st_dev, status.st_ino
             if file not in contents:
                 contents[file] = read_file(target, most)
@@ -78,6 +77,13 @@ def read_beside(folder: Path, most: int | None = None) -> Callable[[str], bytes]
             raise JaxmarkError(f"the file {ascii(path)[:80]} that it refers to cannot be read: {said}") from None
 
     return read
+
+
+def _inside(folder: Path, name: str) -> Path | None:
+    """Resolve a path relative to a folder, through symbolic links; None if it leads out of the folder."""
+    inside = os.path.realpath(folder)
+    target = os.path.realpath(Path(inside) / name)
+    return Path(target) if os.path.commonpath([inside, target]) == inside else None
 
 
 def _own_prefix() -> str:
@@ -176,8 +182,8 @@ def write_together(path: str | os.PathLike, data: bytes, beside: Mapping[str, by
         try:
             for name, content in beside.items():
                 folder = Path(os.path.realpath(path)).parent
-                target = Path(os.path.realpath(folder / name))
-                if not target.is_relative_to(folder):
+                target = _inside(folder, name)
+                if target is None:
                     raise JaxmarkError(f"{ascii(name)[:80]}, which it refers to, would lie outside of {folder}.")
                 if not target.exists():
                     target.parent.mkdir(parents=True, exist_ok=True)

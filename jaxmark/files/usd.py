@@ -156,6 +156,7 @@ def parse(data: bytes) -> Source:
     layers = [_Layer("", data)]
     if archive is not None:
         members = [member for member in archive.members if member.name.casefold().endswith(_LAYERS)]
+        limits.LAYERS.check(len(members), len(data))
         layers = [_Layer(member.name, archive.read(member)) for member in members]
         if not layers:
             raise JaxmarkError("The archive has no layer (USD, USDA or USDC), so it is no whole USDZ file.")
@@ -164,7 +165,6 @@ def parse(data: bytes) -> Source:
     outside: dict[str, None] = {}
     assets: list[str] = []
     counted, unpacked = (RunningCount(limit, len(data)) for limit in (limits.MESHES, limits.UNPACKED))
-    limits.LAYERS.check(len(layers), len(data))
     for number, layer in enumerate(layers):
         try:
             answer = unpacker(_request(layer.content, most=np.array(limits.UNPACKED.most(len(data)))))

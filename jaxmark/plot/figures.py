@@ -55,7 +55,6 @@ def panels(
     height: float = 4.2,
     *,
     columns: int | None = None,
-    legend: float = 0.0,
     **options: Any,
 ) -> tuple[Any, Any]:
     """Make a figure of panels side by side; sizes are in inches.
@@ -65,7 +64,6 @@ def panels(
         width: of each panel.
         height: of each panel.
         columns: the largest number of panels in a row; all of them unless given.
-        legend: height below the panels.
         options: options of matplotlib's `Figure.subplots`.
 
     Returns:
@@ -79,7 +77,7 @@ def panels(
 
     columns = min(count, columns or count)
     rows = -(-count // columns)
-    figure = Figure(figsize=(width * columns, height * rows + legend), layout="constrained")
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **options).ravel()
 
 

@@ -5,11 +5,12 @@ graph: its degrees would no longer be sums of its weights. Keep operators out of
 freeze them.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.lax import bitcast_convert_type as bitcast
 from jaxtyping import Array
 
 from jaxmark.spectral.laplacian import Laplacian
@@ -31,8 +32,7 @@ class FrozenLaplacian:
     @property
     def operator(self) -> Laplacian:
         """The operator, for filters; derivatives with respect to it are zero."""
-        fields = {name: _as_float(getattr(self.bits, name)) for name in _FLOATING}
-        return self.bits._replace(**fields)
+        return _converted(self.bits, lambda bits: bitcast(bits, jnp.dtype(f"float{8 * bits.dtype.itemsize}")))
 
 
 def freeze(operator: Laplacian) -> FrozenLaplacian:
@@ -41,18 +41,10 @@ def freeze(operator: Laplacian) -> FrozenLaplacian:
     The arrays take JAX's default precision: float32, unless `jax_enable_x64` is set. To train weights of edges, do not
     freeze the operator, but make it in each step by `Laplacian.with_weights`.
     """
-    return FrozenLaplacian(operator._replace(**{name: _as_bits(getattr(operator, name)) for name in _FLOATING}))
+    return FrozenLaplacian(_converted(operator, lambda values: bitcast(values, _WHOLE[values.dtype.itemsize])))
 
 
-def _as_bits(values: Any) -> Array | None:
-    if values is None:
-        return None
-    values = jnp.asarray(values)
-    return jax.lax.bitcast_convert_type(values, _WHOLE[values.dtype.itemsize])
-
-
-def _as_float(values: Any) -> Array | None:
-    if values is None:
-        return None
-    values = jnp.asarray(values)
-    return jax.lax.bitcast_convert_type(values, jnp.dtype(f"float{8 * values.dtype.itemsize}"))
+def _converted(operator: Laplacian, convert: Callable[[Array], Array]) -> Laplacian:
+    """Convert the fields that have, or stand for, floating-point numbers; those that are None stay None."""
+    fields = {name: getattr(operator, name) for name in _FLOATING}
+    return operator._replace(**jax.tree.map(lambda values: convert(jnp.asarray(values)), fields))

@@ -77,13 +77,23 @@ def pad_edges(operator: Laplacian, valence: float) -> Laplacian:
     # In most meshes, fewer neighbours than a sixteenth of the vertices have no slot, if slots are chosen by their cost.
     table, rest, step = operator.neighbours, max(size // 16, 1), 2
     if table is not None and size < _MAX_COMMON_TABLE:
-        slots, rest, step = 4 * math.ceil((2 * valence + 1) / 4), max(size // 4, 1), 4
-        table = make_neighbours(edges, size, weighted=values is not None, slots=slots)
+        rest, step = max(size // 4, 1), 4
+        table = make_neighbours(edges, size, weighted=values is not None, slots=_common_slots(valence))
     if table is not None and len(table.rest):
-        while rest < len(table.rest):
-            rest *= step
-        table = table._replace(rest=pad_rows(np.asarray(table.rest), rest, size))
+        table = table._replace(rest=pad_rows(np.asarray(table.rest), _raised(rest, step, len(table.rest)), size))
     return operator._replace(edges=pad_rows(edges, count, size), weights=values, neighbours=table)
+
+
+def _common_slots(valence: float) -> int:
+    """Return a number of slots that suffices for most vertices of graphs with so many edges per vertex."""
+    return 4 * math.ceil((2 * valence + 1) / 4)
+
+
+def _raised(count: int, step: int, least: int) -> int:
+    """Multiply a count until it is large enough, so that few different counts occur."""
+    while count < least:
+        count *= step
+    return count
 
 
 def stack(operators: Sequence[Laplacian], *, size: int | None = None, edges: int | None = None) -> Laplacian:
@@ -182,9 +192,7 @@ def _tables_of_shape(
     graphs: Sequence[Int[np.ndarray, "_edges 2"]], size: int, edges: int, *, weighted: bool
 ) -> list[Neighbours | None]:
     """Build tables in a shape that nearly all graphs with as many vertices and edges share."""
-    slots = 4 * math.ceil((2 * edges / size + 1) / 4)
+    slots = _common_slots(edges / size)
     tables = [make_neighbours(pairs, size, weighted=weighted, slots=slots) for pairs in graphs]
-    rest, most = max(size // 4, 1), max(0 if table is None else len(table.rest) for table in tables)
-    while rest < most:
-        rest *= 4
+    rest = _raised(max(size // 4, 1), 4, max(0 if table is None else len(table.rest) for table in tables))
     return [table and table._replace(rest=pad_rows(np.asarray(table.rest), rest, size)) for table in tables]

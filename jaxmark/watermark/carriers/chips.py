@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, Int64
 
 from jaxmark.alignment.observation import Observation, observe
@@ -41,6 +42,20 @@ class Chips(NamedTuple):
     signs: Int[Array | np.ndarray, "vertices channels"]  # ±1; 0 on a vertex that does not move
     slots: Int[Array | np.ndarray, "vertices channels"]  # index of the bit that each chip belongs to
     population: Int[Array | np.ndarray, " bits"]  # number of chips of each bit
+
+    def spread(self, bits: Float[Array, " bits"], dtype: DTypeLike) -> Float[Array, "vertices channels"]:
+        """Compute the value of each chip: its sign times the bit of its slot."""
+        return jnp.asarray(self.signs).astype(dtype) * jnp.asarray(bits).astype(dtype)[self.slots]
+
+    def collect(self, matched: Float[Array, "vertices channels"]) -> Float[Array, " bits"]:
+        """Apply the transpose of `spread`: add up what matches each bit's chips, times their signs."""
+        products = jnp.asarray(self.signs).astype(matched.dtype) * matched
+        return jax.ops.segment_sum(products.ravel(), jnp.asarray(self.slots).ravel(), len(self.population))
+
+    def redraw(self, seed: Seed) -> "Chips":
+        """Replace the signs by random ones; the slots are unchanged, and signs of 0, on vertices that stay, stay 0."""
+        moving = jnp.abs(jnp.asarray(self.signs)).astype(jnp.int8)
+        return self._replace(signs=moving * jax.random.rademacher(random_key(seed), moving.shape, jnp.int8))
 
 
 def make_chips(
@@ -104,7 +119,7 @@ class KeyedCarrier(NamedTuple):
     @jax.jit
     def gram(self, beta: Strength = 1.0) -> Float[Array, "bits bits"]:
         """See `Carrier`; needs one filter per bit, hence is meant for tests and small codes."""
-        unit = jnp.eye(self.code_bits, dtype=self._signs.dtype)
+        unit = jnp.eye(self.code_bits, dtype=self.host.signal.dtype)
         return jax.lax.map(lambda bits: self.adjoint(self.displacement(bits, beta), beta), unit)
 
     def claim(self, observation: Observation, bits: Float[Array, " bits"]) -> Claim:
@@ -113,10 +128,8 @@ class KeyedCarrier(NamedTuple):
         return reader.claim(reader.receive(observation), bits)
 
     def redraw(self, seed: Seed) -> "KeyedCarrier":
-        """See `Carrier`; the slots are unchanged, and signs of 0, on vertices that do not move, stay 0."""
-        moving = jnp.abs(jnp.asarray(self.chips.signs)).astype(jnp.int8)
-        signs = moving * jax.random.rademacher(random_key(seed), moving.shape, jnp.int8)
-        return self._replace(chips=self.chips._replace(signs=signs))
+        """See `Carrier`, and `Chips.redraw`."""
+        return self._replace(chips=self.chips.redraw(seed))
 
     def with_bands(
         self, strengths: Float[Array, " bands"], bands: Float[Array, "bands terms"] | None = None
@@ -142,7 +155,7 @@ class KeyedCarrier(NamedTuple):
         self, beta: Strength, weight: Float[Array, " bands"] | None = None
     ) -> Float[Array, "*channels terms"]:
         """Compute the Chebyshev coefficients of Σ_j weight_j β_j f_j, including the profile."""
-        strength = check_strength(jnp.asarray(beta), len(self.host.coefficients)).astype(self._signs.dtype)
+        strength = check_strength(jnp.asarray(beta), len(self.host.coefficients)).astype(self.host.signal.dtype)
         if strength.ndim == 0:
             strength = jnp.broadcast_to(strength, len(self.host.coefficients))
         for factor in (weight, self.profile):
@@ -156,8 +169,7 @@ class KeyedCarrier(NamedTuple):
 
     def correlate(self, residual: Displacement, coefficients: Float[Array, "*channels terms"]) -> Float[Array, " bits"]:
         """Apply the adjoint of `modulate` for inner products without D, Σ_v ⟨modulate(a)_v, r_v⟩."""
-        products = self._signs * self.match_chips(residual, coefficients)
-        return jax.ops.segment_sum(products.ravel(), self.chips.slots.ravel(), self.code_bits)
+        return self.chips.collect(self.match_chips(residual, coefficients))
 
     def filter_chips(
         self, chips: Float[Array, "vertices channels"], coefficients: Float[Array, "*channels terms"]
@@ -175,8 +187,8 @@ class KeyedCarrier(NamedTuple):
         return transpose(self.host.operator, coefficients, along)
 
     def spread(self, bits: Float[Array, " bits"]) -> Float[Array, "vertices channels"]:
-        """Compute the value of each chip: its sign times the bit of its slot."""
-        return self._signs * jnp.asarray(bits).astype(self._signs.dtype)[self.chips.slots]
+        """See `Chips.spread`."""
+        return self.chips.spread(bits, self.host.signal.dtype)
 
     def masked_share(self) -> float:
         """Compute the effective share of dimensions under masking: (Σ λ)² / (n Σ λ²) for energies λ of n dimensions."""
@@ -187,10 +199,6 @@ class KeyedCarrier(NamedTuple):
         total = square.sum() if root.ndim == 1 else np.trace(square, axis1=1, axis2=2).sum()
         moving = np.count_nonzero(np.asarray(self.chips.signs).any(axis=1))
         return float(total**2 / (3 * moving * np.sum(square**2)))
-
-    @property
-    def _signs(self) -> Float[Array, "vertices channels"]:
-        return jnp.asarray(self.chips.signs).astype(self.host.signal.dtype)
 
 
 class KeyedReader(NamedTuple):

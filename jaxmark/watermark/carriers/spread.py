@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original
-from jaxmark.seeds import Seed, random_key
+from jaxmark.seeds import Seed
 from jaxmark.spectral.precision import sum_and_norm
 from jaxmark.watermark.carriers.chips import Chips, make_chips
 from jaxmark.watermark.carriers.modulation import PlainReader
@@ -45,8 +45,7 @@ class SpreadCarrier(NamedTuple):
 
     def adjoint(self, residual: Displacement, beta: Strength = 1.0) -> Float[Array, " bits"]:
         """See `Carrier`; for the plain inner product, in which all vertices weigh the same."""
-        products = self._signs * self._match(self._scaled(residual, beta))
-        return jax.ops.segment_sum(products.ravel(), jnp.asarray(self.chips.slots).ravel(), self.code_bits)
+        return self.chips.collect(self._match(self._scaled(residual, beta)))
 
     def gram(self, beta: Strength = 1.0) -> Float[Array, "bits bits"]:
         """See `Carrier`; needs two maps per bit, hence is meant for tests and small codes."""
@@ -58,25 +57,20 @@ class SpreadCarrier(NamedTuple):
         return Claim(*sum_and_norm(self._spread(bits) * self._match(observation.weigh(observation.residual))))
 
     def redraw(self, seed: Seed) -> "SpreadCarrier":
-        """See `Carrier`; signs of 0, on vertices that do not move, stay 0."""
-        moving = jnp.abs(jnp.asarray(self.chips.signs)).astype(jnp.int8)
-        signs = moving * jax.random.rademacher(random_key(seed), moving.shape, jnp.int8)
-        return self._replace(chips=self.chips._replace(signs=signs))
+        """See `Carrier`, and `Chips.redraw`."""
+        return self._replace(chips=self.chips.redraw(seed))
 
     def reader(self) -> PlainReader:
         """See `Carrier`."""
         return PlainReader(self)
 
-    @property
-    def _signs(self) -> Float[Array, "vertices channels"]:
-        return jnp.asarray(self.chips.signs).astype(self.signal.dtype)
-
     def _spread(self, bits: Float[Array, " bits"]) -> Float[Array, "vertices channels"]:
-        return self._signs * jnp.asarray(bits).astype(self.signal.dtype)[self.chips.slots]
+        return self.chips.spread(bits, self.signal.dtype)
 
     def _match(self, residual: Displacement) -> Float[Array, "vertices channels"]:
         """Apply the transpose of the map."""
-        (matched,) = jax.linear_transpose(self.shape, self._signs)(residual)
+        chips = jax.ShapeDtypeStruct(self.chips.signs.shape, self.signal.dtype)
+        (matched,) = jax.linear_transpose(self.shape, chips)(residual)
         return matched
 
     def _scaled(self, displacement: Displacement, beta: Strength) -> Displacement:

@@ -64,6 +64,12 @@ def nuisance_size(columns: float, passband: PassBand) -> tuple[int, int]:
     return scales, degree
 
 
+def host_of(original: Original, coefficients: Float64[np.ndarray, "bands terms"], scales: int, degree: int) -> Host:
+    """Prepare an original with the bands to write or read in, and with a size of the nuisance."""
+    positions = original.to_traced(original.positions)
+    return make_host(original.operator, original.signal, positions, coefficients, scales=scales, degree=degree)
+
+
 @dataclass(frozen=True)
 class KeyedScheme(Scheme):
     """A scheme that writes keyed chips in a pass band of low frequencies; its reader projects off the nuisance.
@@ -139,7 +145,7 @@ class KeyedScheme(Scheme):
     def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> KeyedCarrier:
         """See `Scheme`."""
         layout, dtype = self.layout(original, bits), original.signal.dtype
-        host = self._host(original, layout, self.family()[: layout.passing])
+        host = host_of(original, self.family()[: layout.passing], layout.scales, layout.degree)
         chips = make_chips(choices, original.chip_places, code_bits, channels=self._channels, count=original.count)
         carrier = KeyedCarrier(host, chips, profile=self.strengths(original, bits).astype(dtype))
         if self.direction == "normals":
@@ -166,7 +172,8 @@ class KeyedScheme(Scheme):
 
     def receiver(self, original: Original, bits: int) -> Receiver:
         """Make the receiver of marks with a payload size, with all bands of `family`."""
-        return make_receiver(self._host(original, self.layout(original, bits), self.family()))
+        layout = self.layout(original, bits)
+        return make_receiver(host_of(original, self.family(), layout.scales, layout.degree))
 
     def with_profile(self, profile: ArrayLike) -> "KeyedScheme":
         """Return the scheme with other relative strengths of the lowest bands, such as trained ones; see `profile`.
@@ -184,17 +191,6 @@ class KeyedScheme(Scheme):
         if values.ndim != 1 or not len(values):
             raise JaxmarkError(f"A profile is one number for each of the lowest bands, not an array {values.shape}.")
         return replace(self, profile=tuple(values.tolist()))
-
-    def _host(self, original: Original, layout: Layout, coefficients: Float64[np.ndarray, "bands terms"]) -> Host:
-        """Prepare the original with the bands to write or read in, and with the nuisance of a layout."""
-        return make_host(
-            original.operator,
-            original.signal,
-            original.to_traced(original.positions),
-            coefficients,
-            scales=layout.scales,
-            degree=layout.degree,
-        )
 
     @property
     def _channels(self) -> int:

@@ -14,8 +14,7 @@ from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import code_length
 from jaxmark.watermark.interfaces import Scheme
 from jaxmark.watermark.perception.masking import masking_tensors
-from jaxmark.watermark.reading.reception import make_host
-from jaxmark.watermark.schemes.keyed import PASS_BANDS, nuisance_size
+from jaxmark.watermark.schemes.keyed import PASS_BANDS, host_of, nuisance_size
 
 _MOST = 512  # filters, and terms of each, which limits the time of reading a mark with its record
 _LARGEST = 1e6  # coefficient, beyond which float32 would overflow; the budget sets the size of a mark anyway
@@ -62,9 +61,7 @@ class OwnBandsScheme(Scheme):
             JaxmarkError: if they have other shapes, or are not as described in `__post_init__`.
         """
         filters = np.asarray(bands, np.float64)
-        factors = (
-            np.ones(len(filters) if filters.ndim else 0) if strengths is None else np.asarray(strengths, np.float64)
-        )
+        factors = np.asarray(np.ones(filters.shape[:1]) if strengths is None else strengths, np.float64)
         if filters.ndim != 2 or factors.shape != filters.shape[:1]:
             raise JaxmarkError(
                 f"Own bands are an array [bands, degree + 1] and a strength for each, not {filters.shape} and"
@@ -88,14 +85,7 @@ class OwnBandsScheme(Scheme):
 
     def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> KeyedCarrier:
         """See `Scheme`."""
-        scales, degree = nuisance_size(self.dimensions(original, bits) / 3, PASS_BANDS["tapered"])
-        host = make_host(
-            original.operator,
-            original.signal,
-            original.to_traced(original.positions),
-            np.array(self.filters),
-            scales=scales,
-            degree=degree,
-        )
+        size = nuisance_size(self.dimensions(original, bits) / 3, PASS_BANDS["tapered"])
+        host = host_of(original, np.array(self.filters), *size)
         chips = make_chips(choices, original.chip_places, code_bits, count=original.count)
         return KeyedCarrier(host, chips, masking=masking_tensors(original) if self.hiding else None)
