@@ -23,6 +23,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -92,8 +93,8 @@ def predict(mesh: Mesh, steps: str, one: Copy) -> float:
     """Predicted nρ² of a mark after an attack, by what the attack does to the unmarked mesh."""
     step, choices = one.info.record.parameters["step"], context(one.key, 8 * len(MESSAGE), one.scheme.name)
     scheme = one.scheme.fixed(one.info.record.parameters["width"], step)
-    before = next(scheme.views(mesh, choices))
-    looks = scheme.views(attacked(mesh, steps, 0), choices)
+    before = next(scheme.views(mesh, choices))[0]
+    looks = chain.from_iterable(scheme.views(attacked(mesh, steps, 0), choices))
     ways = [way for after in looks for way in compare(before, after)]
     return max((way.shown * way.cosine(step, one.info.record.beta) ** 2 for way in ways), default=0.0)
 

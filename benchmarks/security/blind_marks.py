@@ -462,7 +462,7 @@ def salts(name: str, mesh: Mesh) -> Iterator[Row]:
         break
     reading.read(reading.register(mesh), KEY, 8 * len(MESSAGE), SCHEME)
     start = time.perf_counter()
-    looks = list(SCHEME.views(mesh, choices))
+    looks = [look for group in SCHEME.views(mesh, choices) for look in group]
     looked = time.perf_counter() - start
     start = time.perf_counter()
     reading.read(reading.register(mesh), KEY, 8 * len(MESSAGE), SCHEME)

@@ -311,7 +311,7 @@ def _closest_pairs(
         The source points, the target points, and the root mean square distance of the selected pairs in the pose.
     """
     to_target, to_source = forward.query(pose(source)), backward.query(pose.inverse()(target))
-    scale = np.cbrt(abs(np.linalg.det(pose.matrix)))
+    scale = pose.scale
     pairs = [
         (source, forward.data[to_target[1]], to_target[0]),
         (backward.data[to_source[1]], target, to_source[0] * scale),

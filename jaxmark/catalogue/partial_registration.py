@@ -50,7 +50,7 @@ class Target:
     def fit(self, part: Points, pose: Pose, rounds: int = _ROUNDS) -> tuple[float, Pose]:
         """Refine a part's pose; returns its distance and the pose, which is never worse than the initial one."""
         first = self.off(part, pose), pose
-        scale = start = float(np.cbrt(abs(np.linalg.det(pose.matrix))))
+        scale = start = pose.scale
         for _ in range(rounds):
             posed = pose(part)
             distance, near = map(np.asarray, self.tree.query(posed))

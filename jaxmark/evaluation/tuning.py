@@ -7,7 +7,7 @@ continues by trials with the detector. `tune_blind` compares all widths and step
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from itertools import groupby
+from itertools import chain, groupby
 from typing import NamedTuple, get_args
 
 import jax
@@ -246,7 +246,8 @@ def tune_blind(
         raise JaxmarkError(f"This mesh, or the budget for it, leaves the scheme {blind.name!r} nothing to write in.")
 
     def looks(suspect: Mesh) -> dict[float, list[Look]]:
-        found = sorted(blind.views(register(suspect), writer.choices), key=lambda look: look.width)
+        views = chain.from_iterable(blind.views(register(suspect), writer.choices))
+        found = sorted(views, key=lambda look: look.width)
         return {width: list(some) for width, some in groupby(found, key=lambda look: look.width)}
 
     before = {width: some[0] for width, some in looks(mesh).items()}

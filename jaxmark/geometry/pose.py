@@ -35,6 +35,11 @@ class Pose(NamedTuple):
         return {"matrix": self.matrix.tolist(), "shift": self.shift.tolist()}
 
     @property
+    def scale(self) -> float:
+        """The factor on lengths; for a single similarity."""
+        return float(np.cbrt(abs(np.linalg.det(self.matrix))))
+
+    @property
     def mirrors(self) -> bool:
         """Whether the map is a reflection; for a single map."""
         return bool(np.linalg.det(self.matrix) < 0)

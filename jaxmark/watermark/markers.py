@@ -314,7 +314,11 @@ class BlindMarker:
             beta=float(written.plan.alpha),
             original="",
             key=commitment(self.key),
-            parameters={"width": written.plan.width, "step": written.plan.step},
+            parameters={
+                "width": written.plan.width,
+                "step": written.plan.step,
+                **self.scheme.recorded(self.original),
+            },
             content="message" if self.bits else "presence",
             message_commitment=commit(message, choices) if message else "",
         ).sealed(self.key)

@@ -66,12 +66,12 @@ def _cached(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
 class SharedField(FieldScheme):
     """The scheme `field` with views of a suspect that are computed once for all keys, because they depend on no key."""
 
-    def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:
+    def views(self, suspect: Mesh, choices: Choices) -> Iterator[list[Look]]:
         """Return the views of a suspect, see `BlindScheme`."""
         return copy(_once(_views, self, suspect))
 
 
-def _views(scheme: FieldScheme, suspect: Mesh) -> Iterator[Look]:
+def _views(scheme: FieldScheme, suspect: Mesh) -> Iterator[list[Look]]:
     """Compute the views of a suspect lazily; copies start from the beginning. Errors are raised at once, uncached."""
     looks = FieldScheme.views(scheme, suspect, Choices(Key(bytes(32)), b""))
     return tee(chain([next(looks)], looks), 1)[0]

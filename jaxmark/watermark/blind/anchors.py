@@ -6,7 +6,7 @@ the other. Their difference along the averaged normal is the anchor's value. Rem
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from jaxmark.spectral.padding import common_size
 SPACING = 3.4  # spacing of the lattice, in widths of the narrow Gaussian
 _WIDER = 2.0  # width of the wide Gaussian over the narrow one
 _CUT = 3.2  # widths of the wide Gaussian at which it is cut off
+REACH = _CUT * _WIDER  # distance, in widths of the narrow Gaussian, beyond which nothing changes a value
 _PIECE_AREA, _PIECE_SIDE = 0.2, 0.35  # largest size of pieces: in squared widths, and widths, of the narrow Gaussian
 _GROUP = 256  # pieces in a group
 _NO_PIECE = _NO_ANCHOR = 2**31 - 1  # the index that padding belongs to
@@ -110,6 +111,8 @@ class Pieces(NamedTuple):
     piece: Int[np.ndarray, " samples"]  # index of the sample's piece, ascending
     padding: Bool[np.ndarray, " pieces"]  # used only for its length, the number of pieces
 
+    PADDING = (0, 0, 0, _NO_PIECE, False)  # the value of each array in rows of padding
+
     def of(self, vertices: Float[Array, "vertices 3"]) -> Patches:
         """Compute the pieces for given vertices."""
         a, b, c = (vertices[self.corners[:, corner]] for corner in range(3))
@@ -171,6 +174,8 @@ class Anchors(NamedTuple):
     around: Int[np.ndarray, "groups group"]  # indices of pieces around an anchor; -1 for none
     anchor: Int[np.ndarray, " groups"]  # index of this anchor, ascending; for padding, beyond the last
 
+    PADDING = (0, 0, -1, _NO_ANCHOR)  # the value of each array in rows of padding
+
 
 def make_anchors(surface: Patches, width: float) -> Anchors:
     """Find the lattice points near a surface, and the pieces around each.
@@ -190,15 +195,40 @@ def make_anchors(surface: Patches, width: float) -> Anchors:
     tree = KDTree(points[nonempty])
     distance, _ = tree.query(cells * spacing, distance_upper_bound=0.75 * spacing)
     cells = cells[np.isfinite(np.asarray(distance))]
-    counts = np.asarray(tree.query_ball_point(cells * spacing, _CUT * _WIDER * width, workers=-1, return_length=True))
+    return Anchors(cells, cells * spacing, *_around(tree, nonempty, cells * spacing, REACH * width))
+
+
+def anchors_at(surface: Patches, places: Float64[np.ndarray, "anchors 3"], width: float, room: float = 0.0) -> Anchors:
+    """Make anchors at any places, which have no cells.
+
+    Args:
+        surface: the pieces of the surface.
+        places: where the anchors are.
+        width: width of the narrow Gaussian.
+        room: length by which the anchors may be moved afterwards.
+
+    Raises:
+        JaxmarkError: if there are too many pieces around the anchors.
+    """
+    nonempty = np.flatnonzero(np.asarray(surface.area) > _TINY)
+    tree = KDTree(np.asarray(surface.points, np.float64)[nonempty])
+    cells = np.zeros(places.shape, np.int64)
+    return Anchors(cells, places, *_around(tree, nonempty, places, REACH * width + room))
+
+
+def _around(
+    tree: KDTree, pieces: Int64[np.ndarray, " pieces"], places: Float64[np.ndarray, "anchors 3"], reach: float
+) -> tuple[Int[np.ndarray, "groups group"], Int[np.ndarray, " groups"]]:
+    """Find the pieces around places, in groups of equal size, and the place that each group belongs to."""
+    counts = np.asarray(tree.query_ball_point(places, reach, workers=-1, return_length=True))
     _check(int(counts.sum()), _MAX_AROUND)
-    lists = tree.query_ball_point(cells * spacing, _CUT * _WIDER * width, workers=-1)
+    lists = tree.query_ball_point(places, reach, workers=-1)
     groups = -(-counts // _GROUP)
-    anchor = np.repeat(np.arange(len(cells)), groups)
+    anchor = np.repeat(np.arange(len(places)), groups)
     first = _GROUP * (np.cumsum(groups) - groups) - (np.cumsum(counts) - counts)
     around = np.full(_GROUP * len(anchor), -1, np.int32)
-    around[np.arange(counts.sum()) + np.repeat(first, counts)] = nonempty[np.concatenate([*lists, []]).astype(np.int64)]
-    return Anchors(cells, cells * spacing, around.reshape(-1, _GROUP), anchor)
+    around[np.arange(counts.sum()) + np.repeat(first, counts)] = pieces[np.concatenate([*lists, []]).astype(np.int64)]
+    return around.reshape(-1, _GROUP), anchor
 
 
 def _check(size: float, largest: int) -> None:
@@ -227,21 +257,24 @@ def see(mesh: Mesh, widths: Sequence[float], dtype: np.dtype) -> dict[float, See
         JaxmarkError: if the surface is too large.
     """
     vertices = jnp.asarray(mesh.vertices, dtype)
-    pieces = [Pieces(*arrays) for arrays in _alike([cut(mesh, width) for width in widths], (0, 0, 0, _NO_PIECE, False))]
+    pieces = alike([cut(mesh, width) for width in widths])
     surfaces = [patches(part, vertices) for part in pieces]
-    anchors = [Anchors(*arrays) for arrays in _alike(list(map(make_anchors, surfaces, widths)), (0, 0, -1, _NO_ANCHOR))]
+    anchors = alike(list(map(make_anchors, surfaces, widths)))
     return dict(zip(widths, map(Seen, pieces, surfaces, anchors), strict=True))
 
 
-def _alike(partitions: Sequence[Pieces | Anchors], padding: tuple[float, ...]) -> list[tuple[np.ndarray, ...]]:
+_Partition = TypeVar("_Partition", Pieces, Anchors)
+
+
+def alike(partitions: Sequence[_Partition]) -> list[_Partition]:
     """Pad the arrays of the same field to the size of the largest, and then to a common size."""
     fields = []
-    for arrays, value in zip(zip(*partitions, strict=True), padding, strict=True):
+    for arrays, value in zip(zip(*partitions, strict=True), partitions[0].PADDING, strict=True):
         rows, *columns = np.max([array.shape for array in arrays], axis=0)
         shape = (common_size(int(rows)), *columns)
         widths = [[(0, largest - size) for largest, size in zip(shape, array.shape, strict=True)] for array in arrays]
         fields.append([np.pad(array, pad, constant_values=value) for array, pad in zip(arrays, widths, strict=True)])
-    return list(zip(*fields, strict=True))
+    return [type(partitions[0])(*arrays) for arrays in zip(*fields, strict=True)]
 
 
 class Shown(NamedTuple):
@@ -249,6 +282,8 @@ class Shown(NamedTuple):
 
     values: Float[Array, " anchors"]  # difference of the averages along the normal
     good: Bool[Array, " anchors"]  # whether the lattice point is near a single sheet of the surface
+    normals: Float[Array, "anchors 3"]  # averaged normals of the surface
+    away: Float[Array, " anchors"]  # how far the surface lies away along the normal
 
 
 @jax.jit
@@ -274,7 +309,7 @@ def look(
     positions = jnp.asarray(anchors.places, dtype) + shift
     offset = surface.points[anchors.around] - positions[jnp.minimum(anchors.anchor, len(positions) - 1)][:, None]
     square = jnp.sum(offset**2, axis=-1)
-    cut_off = jnp.exp(-((_CUT * _WIDER * width) ** 2) / 2 / wide)
+    cut_off = jnp.exp(-((REACH * width) ** 2) / 2 / wide)
     share = jnp.where(is_piece, jnp.maximum(jnp.exp(-square / 2 / wide) - cut_off, 0), 0)
     area = surface.area[anchors.around]
     inner, outer = jnp.where(is_piece, area * jnp.exp(-square / 2 / narrow), 0), area * share
@@ -290,10 +325,10 @@ def look(
     normal, narrow_mean, wide_mean, inside, outside = jnp.split(sums_per_anchor, (3, 6, 9, 10), axis=1)
     length = jnp.sqrt(jnp.sum(normal**2, axis=1, keepdims=True) + _TINY**2)
     normal, narrow_mean, wide_mean = normal / length, narrow_mean / (inside + _TINY), wide_mean / (outside + _TINY)
-    distance = jnp.abs(jnp.sum(narrow_mean * normal, axis=1))
+    away = jnp.sum(narrow_mean * normal, axis=1)
     is_coherent, is_covered = length > _MIN_COHERENCE * outside, inside > _MIN_MASS * 2 * jnp.pi * narrow
-    good = (distance < _NEAREST * SPACING * width) & is_coherent[:, 0] & is_covered[:, 0]
-    return Shown(jnp.sum((narrow_mean - wide_mean) * normal, axis=1), good)
+    good = (jnp.abs(away) < _NEAREST * SPACING * width) & is_coherent[:, 0] & is_covered[:, 0]
+    return Shown(jnp.sum((narrow_mean - wide_mean) * normal, axis=1), good, normal, away)
 
 
 class Changes(NamedTuple):

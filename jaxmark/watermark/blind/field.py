@@ -5,7 +5,8 @@ of smoothing steps undone. Its pose is nearly that of the marked mesh, up to hal
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -22,7 +23,9 @@ from jaxmark.spectral.bands import heat
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.padding import common_laplacian, pad_rows
 from jaxmark.spectral.precision import matmul
-from jaxmark.watermark.blind.anchors import Anchors, Pieces, changes, encloses, look, place, see, turned
+from jaxmark.watermark.blind.anchors import Anchors, Changes, Pieces, changes, encloses, look, place, see, turned
+from jaxmark.watermark.blind.hint import MOST_POSES, Hint, Posed
+from jaxmark.watermark.blind.landmarks import Border
 from jaxmark.watermark.blind.scheme import AnchoredHost, BlindScheme, Look, measure
 from jaxmark.watermark.coding.keys import Choices
 
@@ -39,6 +42,9 @@ _REFINEMENTS = 8  # iterations of the fixed-point iteration that undoes smoothin
 _STEP_SIZE = 0.1
 #: Standard deviations of the small changes of pose that are tried: turns in radians, shifts and growth in sizes.
 _SPREAD = (*(3.5e-3,) * 3, *(4e-4,) * 3, 2.5e-3)
+#: The same for a pose that a hint gave, with shifts in widths.
+_TURN, _SHIFT, _GROWTH = 6e-3, 0.12, 2.5e-3
+_RIM = 2.2  # least distance of the anchors of a part from its border, in widths
 #: The half turns of a shape about its axes; the last four are of its mirror image.
 TURNS = np.array(
     [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1], [-1, -1, -1]], np.int64
@@ -55,10 +61,18 @@ class FieldScheme(BlindScheme):
 
     name: ClassVar[str] = "field"
     in_parts: ClassVar[bool] = False
-    looks: ClassVar[int] = (len(_UNDONE_STEPS) - 1 + len(_BLURS)) * len(TURNS)
+    remembered: ClassVar[tuple[str, ...]] = ("hint",)
     widths: tuple[float, ...] = (0.018, 0.0125, 0.025)  # widths of the narrow Gaussian, approximately in diagonals
     steps: tuple[float, ...] = tuple(1e-4 * 2 ** (rung / 2) for rung in range(11))  # quantisation steps, in this unit
     hiding: bool = False  # whether displacements are masked perceptually; see `jaxmark.watermark.perception.masking`
+    with_hint: bool = True  # whether records get a hint, with which parts are read; see `jaxmark.watermark.blind.hint`
+    hint: str = ""  # the hint of a record, for reading
+
+    @property
+    def looks(self) -> int:
+        """See `BlindScheme`."""
+        in_own_pose = (len(_UNDONE_STEPS) - 1 + len(_BLURS)) * len(TURNS)
+        return in_own_pose + (MOST_POSES * len(_BLURS) if self.hint else 0)
 
     def hosts(self, original: Original, choices: Choices) -> dict[float, AnchoredHost]:
         """See `BlindScheme`.
@@ -90,40 +104,97 @@ class FieldScheme(BlindScheme):
             hosts[width] = AnchoredHost(shape, anchors.cells, values, pose, good, free, smoothing, _FIRST_STEP * width)
         return hosts
 
-    def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:
+    def recorded(self, original: Original) -> dict[str, str]:
+        """See `BlindScheme`: a hint, unless the scheme leaves it out."""
+        if not self.with_hint:
+            return {}
+        placement = place(Mesh(original.positions, np.asarray(original.points.faces)))
+        return {"hint": Hint.of(placement.mesh, placement.pose.scale / original.diagonal).to_text()}
+
+    def views(self, suspect: Mesh, choices: Choices) -> Iterator[list[Look]]:
         """See `BlindScheme`.
 
         Raises:
             JaxmarkError: see `place` and `see`, for the suspect as it is.
         """
-        dtype = jnp.result_type(float)
-        for steps in _UNDONE_STEPS:
-            try:
-                placement = place(unsmoothed(suspect, steps))
-                views = see(placement.mesh, self.widths, dtype)
-            except JaxmarkError:
-                if steps == 0:
-                    raise
-                continue  # the suspect has noise and was not smoothed, and is too rough now for this view
-            for width, (_, surface, anchors) in views.items():
-                for blur in _BLURS if steps == 0 else _BLURS[:1]:
-                    view = changes(surface, anchors, jnp.asarray(width, dtype), jnp.asarray(blur, dtype))
-                    positions = jnp.asarray(anchors.places, dtype)
-                    by_pose = jnp.concatenate(
-                        [jnp.cross(positions, view.slope), view.slope, view.growth[:, None]],
-                        axis=1,
-                    )
-                    yield Look(
-                        anchors.cells * TURNS[:, None],
+        smooth, *rough = _UNDONE_STEPS
+        try:
+            yield self._in_own_pose(suspect, smooth)
+        except JaxmarkError:
+            if not self.hint:
+                raise
+        if self.hint:
+            for poses in Hint.from_text(self.hint).poses(suspect):
+                yield [look for posed in poses for look in self._in_pose(suspect, posed)]
+        for steps in rough:
+            # A suspect that has noise and was not smoothed is too rough for some views.
+            with suppress(JaxmarkError):
+                yield self._in_own_pose(suspect, steps)
+
+    def _in_own_pose(self, suspect: Mesh, undone: int) -> list[Look]:
+        """See a suspect in its own pose, after undoing smoothing steps.
+
+        Raises:
+            JaxmarkError: see `place` and `see`.
+        """
+        placement = place(unsmoothed(suspect, undone))
+        return [
+            Look(
+                anchors.cells * TURNS[:, None],
+                view.shown.values,
+                np.asarray(view.shown.good),
+                _by_pose(view, np.asarray(anchors.places)),
+                _SPREAD,
+                width,
+                placement.pose,
+                undone,
+                TURNS.prod(axis=1) < 0,
+            )
+            for width, anchors, view in self._seen(placement.mesh, _BLURS if undone == 0 else _BLURS[:1])
+        ]
+
+    def _in_pose(self, suspect: Mesh, posed: Posed) -> list[Look]:
+        """See a suspect, which may be a part, in a pose that a hint gave; none if its surface is too large for it."""
+        mesh = posed.apply(suspect)
+        border, looks = Border(mesh), []
+        with suppress(JaxmarkError):
+            for width, anchors, view in self._seen(mesh, _BLURS):
+                places = np.asarray(anchors.places)
+                good = np.asarray(view.shown.good) & border.spares(places, _RIM * width)
+                # A turn about the centre of the part moves it less than a turn about the origin.
+                centre = places[good].mean(axis=0) if good.any() else np.zeros(3)
+                spread = (*(_TURN,) * 3, *(_SHIFT * width,) * 3, _GROWTH)
+                looks.append(
+                    Look(
+                        anchors.cells[None],
                         view.shown.values,
-                        np.asarray(view.shown.good),
-                        by_pose,
-                        _SPREAD,
+                        good,
+                        _by_pose(view, places - centre),
+                        spread,
                         width,
-                        placement.pose,
-                        steps,
-                        TURNS.prod(axis=1) < 0,
+                        posed.pose,
+                        0,
+                        np.array([posed.pose.mirrors]),
                     )
+                )
+        return looks
+
+    def _seen(self, mesh: Mesh, blurs: Sequence[float]) -> Iterator[tuple[float, Anchors, Changes]]:
+        """Measure the values of a surface for each width and blur.
+
+        Raises:
+            JaxmarkError: see `see`.
+        """
+        dtype = jnp.result_type(float)
+        for width, (_, surface, anchors) in see(mesh, self.widths, dtype).items():
+            for blur in blurs:
+                yield width, anchors, changes(surface, anchors, jnp.asarray(width, dtype), jnp.asarray(blur, dtype))
+
+
+def _by_pose(view: Changes, places: Float64[np.ndarray, "anchors 3"]) -> Float[Array, "anchors 7"]:
+    """Compute the derivatives of values with respect to turns, shifts and growth, as `_SPREAD` lists them."""
+    positions = jnp.asarray(places, view.slope.dtype)
+    return jnp.concatenate([jnp.cross(positions, view.slope), view.slope, view.growth[:, None]], axis=1)
 
 
 @jax.tree_util.register_dataclass

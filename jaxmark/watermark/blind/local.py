@@ -50,10 +50,14 @@ class LocalScheme(BlindScheme):
 
     name: ClassVar[str] = "local"
     in_parts: ClassVar[bool] = True
-    looks: ClassVar[int] = len(_SHORTER)
     widths: tuple[float, ...] = (32.0,)  # power k of the narrow average (I - Δ/2)^k
     steps: tuple[float, ...] = tuple(0.0625 * 2 ** (rung / 2) for rung in range(11))  # quantisation steps
     hiding: bool = False  # whether displacements are masked perceptually; see `jaxmark.watermark.perception.masking`
+
+    @property
+    def looks(self) -> int:
+        """See `BlindScheme`."""
+        return len(_SHORTER)
 
     def hosts(self, original: Original, choices: Choices) -> dict[float, AnchoredHost]:
         """See `BlindScheme`."""
@@ -69,7 +73,7 @@ class LocalScheme(BlindScheme):
             )
         return hosts
 
-    def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:
+    def views(self, suspect: Mesh, choices: Choices) -> Iterator[list[Look]]:
         """See `BlindScheme`.
 
         Raises:
@@ -80,19 +84,23 @@ class LocalScheme(BlindScheme):
         operator, anchors = common_laplacian(suspect), _anchors(suspect, choices)
         positions = jnp.asarray(pad_rows((points - points.mean(axis=0)) / size, len(operator.degree)), dtype)
         for shorter in _SHORTER:
+            looks = []
             for width in self.widths:
                 values, _ = measure(_shape(suspect, operator, anchors, int(width), shorter), positions)
-                yield Look(
-                    anchors.names[None],
-                    values,
-                    anchors.vertices >= 0,
-                    -values[:, None],
-                    _SPREAD,
-                    width,
-                    Pose(np.eye(3), np.zeros(3)),
-                    _STEPS_EACH * shorter,
-                    np.zeros(1, bool),
+                looks.append(
+                    Look(
+                        anchors.names[None],
+                        values,
+                        anchors.vertices >= 0,
+                        -values[:, None],
+                        _SPREAD,
+                        width,
+                        Pose(np.eye(3), np.zeros(3)),
+                        _STEPS_EACH * shorter,
+                        np.zeros(1, bool),
+                    )
                 )
+            yield looks
 
 
 class _Anchors(NamedTuple):

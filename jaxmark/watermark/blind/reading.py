@@ -13,7 +13,6 @@ independent of it, because the keyed choices do not depend on the geometry: thei
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import groupby
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -134,7 +133,7 @@ def read(
     looks = kinds * scheme.looks * _CHANGES
     best = _nothing(scheme, np.zeros(length), Anchored(Pose(np.eye(3), np.zeros(3))))
     tags_compared = 0  # number of messages whose tags were already compared
-    for _, group in groupby(scheme.views(suspect, choices), key=lambda view: view.undone):
+    for group in scheme.views(suspect, choices):
         readings = [reading for view in group for reading in _readings(view, scheme, choices, length)]
         if not readings:
             continue

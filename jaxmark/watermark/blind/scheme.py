@@ -79,22 +79,35 @@ class BlindScheme(Protocol):
 
     name: ClassVar[str]  # the scheme's name in records and on the command line
     in_parts: ClassVar[bool]  # whether a part of the shape can be read alone
-    looks: ClassVar[int]  # number of views of a suspect with one width, times the number of turns
+    remembered: ClassVar[tuple[str, ...]] = ()  # names of the texts that `recorded` may return
     __dataclass_fields__: ClassVar[dict[str, Any]]
     widths: tuple[float, ...]  # widths of the averages whose differences are the values
     steps: tuple[float, ...]  # quantisation steps of the values
     hiding: bool  # whether displacements are masked perceptually; see `jaxmark.watermark.perception.masking`
 
-    def fixed(self, width: float, step: float) -> "BlindScheme":
-        """Return the scheme with one width and step."""
-        return replace(self, widths=(width,), steps=(step,))
+    @property
+    def looks(self) -> int:
+        """The largest number of views of a suspect with one width, times the number of turns."""
+        ...
+
+    def fixed(self, width: float, step: float, **recorded: str) -> "BlindScheme":
+        """Return the scheme with one width and step, and with the parameters that `recorded` returned, if any."""
+        return replace(self, widths=(width,), steps=(step,), **recorded)
+
+    def recorded(self, original: Original) -> dict[str, str]:
+        """Return further parameters that a record stores and `fixed` takes; they depend on the original only.
+
+        Raises:
+            JaxmarkError: see `hosts`.
+        """
+        return {}
 
     def hosts(self, original: Original, choices: Choices) -> dict[float, AnchoredHost]:
         """Find the anchors of an original for each width; their arrays have the same shapes for all widths."""
         ...
 
-    def views(self, suspect: Mesh, choices: Choices) -> Iterator[Look]:
-        """Iterate over all views of a suspect, the likeliest first.
+    def views(self, suspect: Mesh, choices: Choices) -> Iterator[list[Look]]:
+        """Iterate over all views of a suspect, in groups that are read together, the likeliest first.
 
         Args:
             suspect: from `jaxmark.watermark.blind.reading.register`.

@@ -123,7 +123,10 @@ def make_blind_scheme(name: str, parameters: Mapping[str, Any]) -> BlindScheme:
     scheme, width, step = BLIND_SCHEMES.get(name), parameters.get("width"), parameters.get("step")
     if scheme is None or width not in scheme.widths or step not in scheme.steps:
         raise JaxmarkError(f"This jaxmark cannot read the record: no scheme {name!r} has its width and step.")
-    return scheme.fixed(width, step)
+    further = {name: value for name, value in parameters.items() if name not in ("width", "step")}
+    if not further.keys() <= set(scheme.remembered) or not all(isinstance(text, str) for text in further.values()):
+        raise JaxmarkError(f"This jaxmark cannot read the record: the scheme {name!r} has other parameters.")
+    return scheme.fixed(width, step, **further)
 
 
 def parameters_of(scheme: Named) -> dict[str, Any]:

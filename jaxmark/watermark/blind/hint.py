@@ -1,0 +1,223 @@
+"""Hints: landmarks of an original, from which a reader finds the pose of a part of it.
+
+A hint lies in the record of a mark. It is derived from the original alone, before the mark is made, and depends on no
+key: the poses that a reader finds with it are independent of the mark's signs (`jaxmark.watermark.blind.reading`). It
+reveals the places, normals and tangents of up to 100 points of the original, and nothing between them.
+"""
+
+import base64
+import binascii
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from scipy.spatial import KDTree
+
+from jaxmark.errors import JaxmarkError
+from jaxmark.geometry.mesh import Mesh, diagonal, unit
+from jaxmark.geometry.pose import Points, Pose, similarity
+from jaxmark.watermark.blind.landmarks import Landmarks, find_landmarks
+
+_VERSION = 1
+_MOST = 100  # landmarks in a hint
+_RATIO = 2 ** (1 / 3)  # ratio of neighbouring widths, and of the scales that are tried
+_WIDTHS = tuple(0.0125 * _RATIO**index for index in range(3))  # widths of the Gaussians, in units of the pose
+_UNIT = 2.0**-11  # unit of stored places, in units of the pose
+_FARTHEST = 1.5  # largest coordinate of a landmark in the pose, in which a shape is about 1 wide
+_HEAD = np.dtype([("version", "u1"), ("scale", "<f8")])
+_POINT = np.dtype([("place", "<i2", 3), ("normal", "i1", 3), ("tangent", "i1", 3), ("kind", "u1")])
+_LARGEST, _SMALLEST = 1.15, 0.28  # diagonals of parts of unknown scale, in units of the pose
+_POSES = 8  # poses of a suspect that are read, in the unit of the original and in any unit
+MOST_POSES = 2 * _POSES  # the largest number of poses of `Hint.poses`
+_NEAR = 0.035  # distance of landmarks, in units of the pose, up to which a rough pose fits them
+_CLOSER = (0.035, 0.02, 0.01, 0.006, 0.006)  # the same while the pose is refined
+_REFINED = 48  # number of rough poses that are refined
+_GRID = 0.0175  # side of the cubes in which rough poses are compared
+_CHUNK = 2**19  # number of landmarks that are compared at once
+_SAME = 0.005  # change of places, in units of the pose, up to which poses are the same
+_FEWEST = 4  # least number of landmarks that fit a pose
+
+
+class Posed(NamedTuple):
+    """A pose of a suspect that a hint gives."""
+
+    pose: Pose  # the map from the coordinates of the suspect's file to the pose of the original
+    inside_out: bool  # whether the suspect's faces are inward
+    fitting: int  # number of landmarks that fit
+
+    def apply(self, suspect: Mesh) -> Mesh:
+        """Return the suspect in this pose, with outward faces."""
+        faces = np.asarray(suspect.faces)
+        is_reversed = self.inside_out != self.pose.mirrors
+        return Mesh(self.pose(np.asarray(suspect.vertices, np.float64)), faces[:, ::-1] if is_reversed else faces)
+
+
+@dataclass(frozen=True, eq=False)
+class Hint:
+    """The landmarks of an original in its own pose."""
+
+    landmarks: Landmarks
+    scale: float  # units of the pose per unit of the original's file
+
+    @classmethod
+    def of(cls, mesh: Mesh, scale: float) -> "Hint":
+        """Find the clearest landmarks of an original, which is in its own pose, with outward faces.
+
+        Raises:
+            JaxmarkError: if its surface is too large.
+        """
+        found = find_landmarks(mesh, _WIDTHS)
+        found = found.pick(np.abs(found.places).max(axis=1, initial=0) < _FARTHEST)
+        clearest = np.argsort(-found.clarity, kind="stable")[:_MOST]
+        return cls(found.pick(clearest), scale)
+
+    def to_text(self) -> str:
+        """Return the hint as it is stored in a record: at most 1,800 characters."""
+        landmarks = self.landmarks
+        points = np.zeros(len(landmarks.places), _POINT)
+        points["place"] = np.round(landmarks.places / _UNIT)
+        points["normal"], points["tangent"] = np.round(127 * landmarks.normals), np.round(127 * landmarks.tangents)
+        points["kind"] = landmarks.kinds
+        head = np.array([(_VERSION, self.scale)], _HEAD)
+        return base64.b64encode(head.tobytes() + points.tobytes()).decode()
+
+    @classmethod
+    def from_text(cls, text: str) -> "Hint":
+        """Read a hint of a record.
+
+        Raises:
+            JaxmarkError: if it is damaged, or of a version that this jaxmark does not know.
+        """
+        try:
+            data = base64.b64decode(text, validate=True)
+            head = np.frombuffer(data[: _HEAD.itemsize], _HEAD)[0]
+            points = np.frombuffer(data[_HEAD.itemsize :], _POINT)
+        except (ValueError, binascii.Error, IndexError):
+            raise JaxmarkError("The record is damaged: its hint is incomplete. Use an unedited copy.") from None
+        if head["version"] != _VERSION:
+            raise JaxmarkError(f"The record's hint is of version {head['version']}; this jaxmark reads {_VERSION}.")
+        normals, tangents = (unit(points[name].astype(np.float64)) for name in ("normal", "tangent"))
+        places = _UNIT * points["place"]
+        is_in_range = normals.any(axis=1) & tangents.any(axis=1) & (points["kind"] < 2 * len(_WIDTHS))
+        is_in_range &= np.abs(places).max(axis=1, initial=0) <= _FARTHEST
+        if not (0 < head["scale"] < np.inf and len(points) <= _MOST and is_in_range.all()):
+            raise JaxmarkError("The record is damaged: its hint is out of range. Use an unedited copy.")
+        kinds = points["kind"].astype(np.int64)
+        return cls(Landmarks(places, normals, tangents, kinds, np.ones(len(points))), float(head["scale"]))
+
+    def poses(self, suspect: Mesh) -> Iterator[list["Posed"]]:
+        """Iterate over the likeliest poses of a suspect, the likeliest first: in the original's unit, then in any unit.
+
+        Raises:
+            JaxmarkError: if the suspect has no extent.
+        """
+        size = diagonal(suspect)
+        if not len(self.landmarks.places):
+            return
+        yield self._in_scales(suspect, [self.scale])
+        count = int(np.floor(np.log(_LARGEST / _SMALLEST) / np.log(_RATIO))) + 1
+        yield self._in_scales(suspect, [_LARGEST / size / _RATIO**index for index in range(count)])
+
+    def _in_scales(self, suspect: Mesh, scales: list[float]) -> list["Posed"]:
+        """Find the likeliest poses of a suspect with about the given scales, each smaller than the one before."""
+        # The landmarks of a scale have the widths of another scale, so that each width is needed once.
+        count = len(_WIDTHS) + len(scales) - 1
+        try:
+            found = find_landmarks(suspect, [_WIDTHS[0] / scales[0] * _RATIO**index for index in range(count)])
+        except JaxmarkError:
+            return []  # a surface with more folds than any shape in its own pose
+        candidates: list[Posed] = []
+        for index, scale in enumerate(scales):
+            chosen = found.pick((found.kinds >= 2 * index) & (found.kinds < 2 * (index + len(_WIDTHS))))
+            chosen = chosen._replace(kinds=chosen.kinds - 2 * index)
+            for mirrored, inside_out in product((False, True), repeat=2):
+                flip = Pose(scale * np.diag([-1.0 if mirrored else 1.0, 1, 1]), np.zeros(3))
+                seen = chosen.seen(flip, inside_out=inside_out)
+                candidates += [Posed(flip.then(one.pose), inside_out, one.fitting) for one in self._match(seen)]
+        return _distinct(sorted(candidates, key=lambda one: -one.fitting), suspect)[:_POSES]
+
+    def _match(self, suspect: Landmarks) -> list["Posed"]:
+        """Find poses that map many landmarks of a suspect to those of the hint; the suspect has about their scale."""
+        ours, poses = self.landmarks, []
+        # A half turn about the normal makes up for the arbitrary sign of the tangents.
+        half_turn = np.diag([-1.0, -1, 1])
+        for kind in np.unique(suspect.kinds):
+            first, second = np.flatnonzero(suspect.kinds == kind), np.flatnonzero(ours.kinds == kind)
+            first, second = (index.ravel() for index in np.meshgrid(first, second))
+            for turn in (np.eye(3), half_turn):
+                matrix = ours.frames[second] @ turn @ np.swapaxes(suspect.frames[first], 1, 2)
+                shift = ours.places[second] - np.einsum("nab,nb->na", matrix, suspect.places[first])
+                poses.append((matrix, shift))
+        if not poses:
+            return []
+        matrix, shift = map(np.concatenate, zip(*poses, strict=True))
+        rough = self._fitting(suspect, matrix, shift)
+        best = np.argsort(-rough, kind="stable")[:_REFINED]
+        return [one for index in best if (one := self._refine(suspect, Pose(matrix[index], shift[index]))) is not None]
+
+    def _fitting(
+        self,
+        suspect: Landmarks,
+        matrix: Float64[np.ndarray, "poses 3 3"],
+        shift: Float64[np.ndarray, "poses 3"],
+    ) -> Int64[np.ndarray, " poses"]:
+        """Count the landmarks of a suspect that each pose maps near a landmark of their kind."""
+        near, corner = self._near
+        side = near.shape[1]
+        counts = []
+        chunk = max(_CHUNK // max(len(suspect.places), 1), 1)
+        for start in range(0, len(matrix), chunk):
+            placed = Pose(matrix[start : start + chunk], shift[start : start + chunk])(suspect.places)
+            cube = np.floor((placed - corner) / _GRID).astype(np.int64)
+            inside = ((cube >= 0) & (cube < side)).all(axis=-1)
+            cube = np.where(inside[..., None], cube, 0)
+            counts.append((near[suspect.kinds, cube[..., 0], cube[..., 1], cube[..., 2]] & inside).sum(axis=1))
+        return np.concatenate(counts)
+
+    @cached_property
+    def _near(self) -> tuple[Bool[np.ndarray, "kinds side side side"], Float64[np.ndarray, " 3"]]:
+        """A mask of cubes near the landmarks of each kind, and the corner at which the cubes begin."""
+        places = self.landmarks.places
+        corner = places.min(axis=0, initial=np.inf) - _NEAR
+        side = int(np.ceil((places.max(initial=-np.inf, axis=0) + _NEAR - corner).max() / _GRID))
+        centres = corner + _GRID * (np.indices((side, side, side)).reshape(3, -1).T + 0.5)
+        near = [np.isfinite(tree.query(centres, distance_upper_bound=_NEAR)[0]) for tree, _ in self._trees.values()]
+        return np.reshape(near, (len(near), side, side, side)), corner
+
+    @cached_property
+    def _trees(self) -> dict[int, tuple[KDTree, Points]]:
+        """The landmarks of each kind."""
+        ours, kinds = self.landmarks, range(2 * len(_WIDTHS))
+        return {kind: (KDTree(places), places) for kind in kinds for places in [ours.places[ours.kinds == kind]]}
+
+    def _refine(self, suspect: Landmarks, pose: Pose) -> "Posed | None":
+        """Fit a pose to the landmarks that it maps near those of the hint, nearer from step to step."""
+        source = target = np.zeros((0, 3))
+        for reach in _CLOSER:
+            pairs = []
+            for kind, (tree, places) in self._trees.items():
+                own = suspect.places[suspect.kinds == kind]
+                distance, nearest = tree.query(pose(own), distance_upper_bound=reach)
+                near = np.isfinite(distance)
+                pairs.append((own[near], places[np.asarray(nearest)[near]]))
+            source, target = map(np.concatenate, zip(*pairs, strict=True))
+            if len(source) < _FEWEST:
+                return None
+            pose = similarity(source, target)
+        return Posed(pose, False, len(source))
+
+
+def _distinct(candidates: list[Posed], suspect: Mesh) -> list[Posed]:
+    """Drop poses that put the suspect where an earlier one puts it."""
+    vertices = np.asarray(suspect.vertices, np.float64)
+    ends = np.stack([vertices.min(axis=0), vertices.max(axis=0)])
+    corners = np.stack([ends[list(corner), range(3)] for corner in product((0, 1), repeat=3)])
+    kept: list[Posed] = []
+    for one in candidates:
+        if all(np.abs(one.pose(corners) - other.pose(corners)).max() > _SAME for other in kept):
+            kept.append(one)
+    return kept

@@ -1,0 +1,197 @@
+"""Landmarks of a surface: points that are found again in its parts, after remeshing and in any pose.
+
+A landmark is a point where the value of an anchor (`jaxmark.watermark.blind.anchors`) is larger, or smaller, than
+everywhere around it on the surface. It has a frame: the averaged normal, and the direction along the surface in which
+the value changes most. Landmarks depend on the surface only, not on a key. All computations run on the host.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from scipy.spatial import KDTree
+
+from jaxmark.geometry.mesh import Mesh, cross_product, open_sides, unit
+from jaxmark.geometry.pose import Pose
+from jaxmark.watermark.blind.anchors import Anchors, Patches, alike, anchors_at, changes, cut, patches
+
+# The surface is cut into pieces for a Gaussian so much wider, for finding extremes and for refining them.
+_COARSE, _FINE = 3.0, 2.0
+_AROUND = 1.6  # distance, in widths, within which a value is the largest
+_RIM = 1.0  # least distance from a border, in widths
+_RIM_POINTS = 5  # points on each edge of the border
+_STEPS, _LONGEST_STEP, _LONGEST_WAY = 5, 0.5, 1.5  # Newton steps; the longest step, and the longest way, in widths
+_ASIDE = 0.4  # distance, in widths, over which curvatures are measured
+_ARRIVED = 0.15  # length of the last step, in widths, up to which a landmark counts as found
+_LEAST_CURVATURE = 0.15  # curvatures are taken as at least this share of the largest
+_APART = 0.3  # least distance of landmarks of one kind, in widths
+_TINY = 1e-9
+
+_Vectors = Float64[np.ndarray, "points 3"]
+
+
+class Landmarks(NamedTuple):
+    """The landmarks of a surface."""
+
+    places: _Vectors
+    normals: _Vectors
+    tangents: _Vectors  # unit vectors along the surface, of arbitrary sign
+    kinds: Int64[np.ndarray, " points"]  # twice the index of the width, plus 1 for maxima
+    clarity: Float64[np.ndarray, " points"]  # curvature of the value in the direction in which it changes least
+
+    def pick(self, chosen: Int64[np.ndarray, " chosen"] | Bool[np.ndarray, " points"]) -> "Landmarks":
+        """Return some of the landmarks."""
+        return Landmarks(*(column[chosen] for column in self))
+
+    def seen(self, pose: Pose, *, inside_out: bool = False) -> "Landmarks":
+        """Return the landmarks of the surface in another pose, and with its faces reversed if it was inside out."""
+        return self._replace(
+            places=pose(self.places),
+            normals=(-1 if inside_out else 1) * unit(self.normals @ pose.matrix.T),
+            tangents=unit(self.tangents @ pose.matrix.T),
+            kinds=self.kinds ^ 1 if inside_out else self.kinds,
+        )
+
+    @property
+    def frames(self) -> Float64[np.ndarray, "points 3 3"]:
+        """The axes of each landmark as columns: tangent, the cross product of normal and tangent, and normal."""
+        return np.stack([self.tangents, cross_product(self.normals, self.tangents), self.normals], axis=-1)
+
+
+class Border:
+    """The border of a surface, beside which averages miss a part of it."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        faces, vertices = np.asarray(mesh.faces), np.asarray(mesh.vertices, np.float64)
+        is_open = open_sides(faces)
+        start, end = vertices[faces[is_open]], vertices[np.roll(faces, -1, axis=1)[is_open]]
+        share = np.linspace(0, 1, _RIM_POINTS)[:, None, None]
+        self._points = ((1 - share) * start + share * end).reshape(-1, 3)
+
+    def spares(self, places: _Vectors, distance: float) -> Bool[np.ndarray, " points"]:
+        """Return a mask of the places that are at least so far away from the border."""
+        if not len(self._points):
+            return np.ones(len(places), bool)
+        nearest, _ = KDTree(self._points).query(places, distance_upper_bound=distance)
+        return ~np.isfinite(np.asarray(nearest))
+
+
+def find_landmarks(mesh: Mesh, widths: Sequence[float]) -> Landmarks:
+    """Find the landmarks of a surface, for narrow Gaussians of some widths.
+
+    Args:
+        mesh: the surface, in any unit.
+        widths: in units of the mesh.
+
+    Raises:
+        JaxmarkError: if the surface is too large for these widths.
+    """
+    border, vertices = Border(mesh), np.asarray(mesh.vertices, np.float64)
+    # In units of the width, so that neither numbers nor compiled programs depend on the unit.
+    scaled = [Mesh(vertices / width, mesh.faces) for width in widths]
+    coarse, fine = _surfaces(scaled, _COARSE), _surfaces(scaled, _FINE)
+    points = [np.asarray(surface.points, np.float64)[np.asarray(surface.area) > _TINY] for surface in coarse]
+    inside = [border.spares(width * point, _RIM * width) for width, point in zip(widths, points, strict=True)]
+    extremes = list(map(_extremes, coarse, alike(list(map(_anchors, coarse, points))), inside))
+    starts = alike([_anchors(surface, one.places, _LONGEST_WAY) for surface, one in zip(fine, extremes, strict=True)])
+    columns = []
+    for index, (width, found) in enumerate(zip(widths, map(_climb, fine, starts, extremes), strict=True)):
+        found = found._replace(places=width * found.places, kinds=found.kinds + 2 * index)
+        found = found.pick(border.spares(found.places, _RIM * width))
+        columns.append(_distinct(found, _APART * width))
+    return Landmarks(*map(np.concatenate, zip(*columns, strict=True)))
+
+
+def _surfaces(scaled: Sequence[Mesh], wider: float) -> list[Patches]:
+    """Cut surfaces into pieces, of a common shape so that programs are compiled once."""
+    pieces, dtype = alike([cut(mesh, wider) for mesh in scaled]), jnp.result_type(float)
+    return [patches(one, jnp.asarray(mesh.vertices, dtype)) for one, mesh in zip(pieces, scaled, strict=True)]
+
+
+def _anchors(surface: Patches, places: _Vectors, room: float = 0.0) -> Anchors:
+    return anchors_at(surface, places, 1.0, room)
+
+
+class _Seen(NamedTuple):
+    """What is measured at places beside a surface, in units of the width."""
+
+    values: Float64[np.ndarray, " points"]
+    slopes: _Vectors
+    normals: _Vectors
+    away: Float64[np.ndarray, " points"]
+    good: Bool[np.ndarray, " points"]
+
+
+def _measure(surface: Patches, anchors: Anchors, places: _Vectors) -> _Seen:
+    """Measure values and their derivatives at places near some anchors."""
+    moved = anchors.places.copy()
+    moved[: len(places)] = places
+    dtype = surface.points.dtype
+    seen = changes(surface, anchors._replace(places=moved), jnp.ones((), dtype), jnp.zeros((), dtype))
+    values, good, normals, away = (np.asarray(column)[: len(places)] for column in seen.shown)
+    slopes = np.asarray(seen.slope, np.float64)[: len(places)]
+    return _Seen(values.astype(np.float64), slopes, normals.astype(np.float64), away.astype(np.float64), good)
+
+
+class _Extremes(NamedTuple):
+    """Points whose values are the largest or the smallest around."""
+
+    places: _Vectors
+    signs: Float64[np.ndarray, " points"]  # 1 for the largest, -1 for the smallest
+
+
+def _extremes(surface: Patches, anchors: Anchors, inside: Bool[np.ndarray, " points"]) -> _Extremes:
+    """Find the points whose values are the largest or the smallest around; `inside` are those that count."""
+    places = anchors.places[: len(inside)]
+    seen = _measure(surface, anchors, places)
+    first, second = KDTree(places).query_pairs(_AROUND, output_type="ndarray").T
+    on_one_sheet = (seen.normals[first] * seen.normals[second]).sum(axis=1) > 0
+    first, second, inside = first[on_one_sheet], second[on_one_sheet], inside & seen.good
+    found = []
+    for sign in (-1.0, 1.0):
+        height = np.where(inside, sign * seen.values, -np.inf)
+        highest = height.copy()
+        np.maximum.at(highest, first, height[second])
+        np.maximum.at(highest, second, height[first])
+        top = np.flatnonzero((height >= highest) & inside)
+        found.append(_Extremes(places[top], np.full(len(top), sign)))
+    return _Extremes(*map(np.concatenate, zip(*found, strict=True)))
+
+
+def _climb(surface: Patches, anchors: Anchors, extremes: _Extremes) -> Landmarks:
+    """Move extremes along the surface to where the value is extreme, by Newton steps; in units of the width."""
+    start, signs = extremes
+    places, curvature, length = start, np.zeros((len(start), 2)), np.full(len(start), np.inf)
+    axes, seen = np.zeros((len(start), 2, 3)), _measure(surface, anchors, start)
+    for _ in range(_STEPS):
+        axis = np.where(np.abs(seen.normals[:, :1]) < 0.6, [[1.0, 0, 0]], [[0, 1.0, 0]])
+        across = unit(cross_product(axis, seen.normals))
+        basis = np.stack([across, cross_product(seen.normals, across)], axis=1)
+        bends = []
+        for direction in np.swapaxes(basis, 0, 1):
+            ahead, behind = (_measure(surface, anchors, places + way * direction) for way in (_ASIDE, -_ASIDE))
+            bends.append(signs[:, None] * (behind.slopes - ahead.slopes) / (2 * _ASIDE))
+        hessian = np.einsum("kax,alx->akl", np.stack(bends), basis)
+        curvature, turn = np.linalg.eigh((hessian + np.swapaxes(hessian, 1, 2)) / 2)
+        axes = np.einsum("alk,alx->akx", turn, basis)
+        slope = signs[:, None] * np.einsum("akx,ax->ak", axes, seen.slopes)
+        step = slope / np.maximum(curvature, np.maximum(_LEAST_CURVATURE * curvature[:, 1:], _TINY))
+        length = np.linalg.norm(step, axis=1)
+        step *= np.minimum(1, _LONGEST_STEP / np.maximum(length, _TINY))[:, None]
+        places = places + np.einsum("ak,akx->ax", step, axes) + seen.away[:, None] * seen.normals
+        seen = _measure(surface, anchors, places)
+    is_found = (length < _ARRIVED) & (curvature[:, 0] > 0) & seen.good
+    is_found &= np.linalg.norm(places - start, axis=1) < _LONGEST_WAY
+    kinds = (signs > 0).astype(np.int64)
+    return Landmarks(places, seen.normals, axes[:, 1], kinds, curvature[:, 0]).pick(is_found)
+
+
+def _distinct(landmarks: Landmarks, apart: float) -> Landmarks:
+    """Drop landmarks that lie beside another one of their kind."""
+    keep = np.ones(len(landmarks.places), bool)
+    for one, other in sorted(KDTree(landmarks.places).query_pairs(apart)):
+        if keep[one] and landmarks.kinds[one] == landmarks.kinds[other]:
+            keep[other] = False
+    return landmarks.pick(keep)
