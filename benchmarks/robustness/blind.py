@@ -1,8 +1,9 @@
 """Read blind marks after attacks: python benchmarks/robustness/blind.py MESH...
 
 With each of --keys keys, 64 bits are written by --scheme within --limits: either set of the protocol of SMI 2010 (a
-track of `jaxmark bench`), or hidden, as by default. Each suspect is read with the key alone. The table of a mesh has a
-line for each attack, written as soon as it is known:
+track of `jaxmark bench`), or hidden, as by default. Each suspect is read with the key alone; with --record, also with
+the record, whose hint finds the pose of parts (scheme `field`). The table of a mesh has a line for each attack, written
+as soon as it is known:
 
 read        number of copies from which the exact message was read
 log10 p     of the false-positive probability, the worst and the best of the copies; [...] without its floor at -77
@@ -23,6 +24,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -34,6 +36,7 @@ from jaxmark.geometry.mesh import Mesh, weld
 from jaxmark.watermark.blind.prediction import compare
 from jaxmark.watermark.blind.reading import TAG_BITS, context
 from jaxmark.watermark.blind.scheme import BlindScheme
+from jaxmark.watermark.coding.keys import commitment
 from jaxmark.watermark.mark import EmbedInfo
 from jaxmark.watermark.schemes.registry import BLIND_SCHEMES
 
@@ -76,11 +79,14 @@ class Cell(NamedTuple):
     seconds: float
 
 
-def read(suspect: Mesh, key: bytes, scheme: BlindScheme) -> Cell:
-    """Read by the key and the suspect alone."""
+def read(suspect: Mesh, key: bytes, one: Copy, by_record: bool) -> Cell:
+    """Read by a key and the suspect, and by the record if so asked."""
     start = time.perf_counter()
     try:
-        found = jm.detect(suspect, key=key, scheme=scheme)
+        if by_record:
+            found = jm.detect(suspect, key=key, record=one.info.record)
+        else:
+            found = jm.detect(suspect, key=key, scheme=one.scheme)
     except jm.JaxmarkError:
         return Cell(False, 0.0, 0.0, 0.0, time.perf_counter() - start)
     seconds = time.perf_counter() - start
@@ -132,12 +138,13 @@ def copies(
         yield Copy(key, marked, info, scheme)
 
 
-def measure(mesh: Mesh, marked: list[Copy], attacks: list[str]) -> None:
+def measure(mesh: Mesh, marked: list[Copy], attacks: list[str], by_record: bool) -> None:
     """Attack what was marked, read it, and print a table."""
     print(f"\n{head('attack', *NAMES, 'predicted')}", flush=True)
     for steps in attacks:
         try:
-            cells = [read(attacked(one.marked, steps, seed), one.key, one.scheme) for seed, one in enumerate(marked)]
+            suspects = [attacked(one.marked, steps, seed) for seed, one in enumerate(marked)]
+            cells = [read(suspect, one.key, one, by_record) for suspect, one in zip(suspects, marked, strict=True)]
             predicted = f"{predict(mesh, steps, marked[0]):.0f}" if "width" in marked[0].info.record.parameters else ""
         except jm.JaxmarkError as refusal:
             print(line(steps, f"failed: {refusal}"), flush=True)
@@ -145,13 +152,21 @@ def measure(mesh: Mesh, marked: list[Copy], attacks: list[str]) -> None:
         print(row(steps, cells, predicted), flush=True)
 
 
-def control(mesh: Mesh, marked: list[Copy]) -> None:
+def replace_key(one: Copy, key: bytes) -> Copy:
+    """Return a copy whose record is of another key; without that, it would be refused."""
+    record = replace(one.info.record, key=commitment(key), message_commitment="", code="").sealed(key)
+    return one._replace(info=one.info._replace(record=record))
+
+
+def control(mesh: Mesh, marked: list[Copy], by_record: bool) -> None:
     """Read what nobody should find a mark in, and print a table."""
     print(f"\n{head('control', *NAMES)}")
     for steps in CONTROLS:
-        cells = [read(attacked(mesh, steps, seed), one.key, one.scheme) for seed, one in enumerate(marked)]
+        cells = [read(attacked(mesh, steps, seed), one.key, one, by_record) for seed, one in enumerate(marked)]
         print(row(f"unmarked, {steps}", cells), flush=True)
-    cells = [read(one.marked, bytes(reversed(one.key)), one.scheme) for one in marked]
+    others = [(one, bytes(reversed(one.key))) for one in marked]
+    resealed = [(replace_key(one, key), key) for one, key in others]
+    cells = [read(one.marked, key, one, by_record) for one, key in resealed]
     print(row("another key", cells), flush=True)
 
 
@@ -164,6 +179,7 @@ def main() -> None:
     parser.add_argument("--scheme", choices=BLIND_SCHEMES, default="field", help="%(default)s")
     parser.add_argument("--together", nargs="+", default=[], help="mark with these schemes, and read the blind ones")
     parser.add_argument("--attacks", default=ATTACKS, help="kinds and strengths; %(default)s")
+    parser.add_argument("--record", action="store_true", help="read with the record, too")
     parser.add_argument("--controls", action=argparse.BooleanOptionalAction, default=True)
     options = parser.parse_args()
     scheme, steps = BLIND_SCHEMES[options.scheme], " ".join(options.attacks.split()).split("; ")
@@ -179,9 +195,9 @@ def main() -> None:
             continue
         for name in options.together[1:] or [options.scheme]:
             print(f"\nRead by `{name}`:")
-            measure(mesh, [one._replace(scheme=BLIND_SCHEMES[name]) for one in marked], steps)
+            measure(mesh, [one._replace(scheme=BLIND_SCHEMES[name]) for one in marked], steps, options.record)
             if options.controls:
-                control(mesh, marked)
+                control(mesh, marked, options.record)
 
 
 if __name__ == "__main__":

@@ -66,6 +66,7 @@ from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.files.pair import writing_pair
 from jaxmark.geometry import unpose
 from jaxmark.geometry.mesh import same_connectivity
+from jaxmark.watermark.blind.field import FieldScheme
 from jaxmark.watermark.coding.keys import commitment, new_key, save_key
 from jaxmark.watermark.coding.message import DEFAULT_BITS
 from jaxmark.watermark.everyday import capacity
@@ -73,7 +74,7 @@ from jaxmark.watermark.evidence.ledger import charges_as_json
 from jaxmark.watermark.perception.budget import Budget
 from jaxmark.watermark.perception.capacity import COVERAGE, NOISE
 from jaxmark.watermark.record import RECORD_SUFFIX, Record, TimestampedCommitment, load_record, make_commitment
-from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, DEFAULT_SCHEME, NAMES
+from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, DEFAULT_SCHEME, NAMES, AnyScheme
 from jaxmark.watermark.tracing.tracer import identify
 
 
@@ -137,6 +138,11 @@ def keygen(keyfile: Path, as_json: bool) -> None:
     help=f"Scheme that carries the bits: {', '.join(NAMES)}. Marks of `field` and `local` are read without the"
     " original. Several schemes, separated by commas (keyed,field), mark the mesh with each of them.",
 )
+@click.option(
+    "--no-hint",
+    is_flag=True,
+    help="Leave out of the record of `field` the hint with which parts are read: 100 points of the original.",
+)
 @click.option("--record", "record_file", type=FILE, help=f"File for the record.  [default: MARKED{RECORD_SUFFIX}]")
 @OVERWRITE
 @WORKERS
@@ -152,6 +158,7 @@ def embed_command(
     budget: Budget,
     meshes: tuple[str, ...],
     schemes: tuple[str, ...],
+    no_hint: bool,
     record_file: Path | None,
     overwrite: bool,
     workers: int,
@@ -162,8 +169,9 @@ def embed_command(
     Needs the key and a message, --presence or --recipient.
 
     Writes MARKED, in the same format, and its record. Only positions change, and normals where the file has them;
-    materials, colours, groups and comments stay the same, byte by byte. The record holds no secret. `jaxmark detect`
-    takes scheme and payload from it. Files that exist are refused without --overwrite.
+    materials, colours, groups and comments stay the same, byte by byte. The record holds no secret, but that of `field`
+    holds up to 100 points of the original (--no-hint). `jaxmark detect` takes scheme and payload from it. Files that
+    exist are refused without --overwrite.
 
     In a file of several meshes, all that can carry the message are marked; the output names those left unchanged.
 
@@ -174,12 +182,17 @@ def embed_command(
     """
     if presence and message is not None:
         raise JaxmarkError("Give either --message or --presence.")
+    scheme: AnyScheme = schemes[0] if len(schemes) == 1 else schemes
+    if no_hint:
+        if scheme != FieldScheme.name:
+            raise JaxmarkError(f"Only records of --scheme {FieldScheme.name} have a hint; leave out --no-hint.")
+        scheme = FieldScheme(with_hint=False)
     mark = partial(
         mark_file,
         message=b"" if presence else message,
         recipient=recipient,
         budget=budget,
-        scheme=schemes[0] if len(schemes) == 1 else schemes,
+        scheme=scheme,
         meshes=meshes,
         overwrite=overwrite,
     )

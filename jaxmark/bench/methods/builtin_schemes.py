@@ -66,6 +66,8 @@ def _cached(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
 class SharedField(FieldScheme):
     """The scheme `field` with views of a suspect that are computed once for all keys, because they depend on no key."""
 
+    with_hint: bool = False  # methods read without a record
+
     def views(self, suspect: Mesh, choices: Choices) -> Iterator[list[Look]]:
         """Return the views of a suspect, see `BlindScheme`."""
         return copy(_once(_views, self, suspect))

@@ -175,6 +175,7 @@ class FieldScheme(BlindScheme):
                         posed.pose,
                         0,
                         np.array([posed.pose.mirrors]),
+                        by_hint=True,
                     )
                 )
         return looks

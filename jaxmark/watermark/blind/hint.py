@@ -30,8 +30,9 @@ _UNIT = 2.0**-11  # unit of stored places, in units of the pose
 _FARTHEST = 1.5  # largest coordinate of a landmark in the pose, in which a shape is about 1 wide
 _HEAD = np.dtype([("version", "u1"), ("scale", "<f8")])
 _POINT = np.dtype([("place", "<i2", 3), ("normal", "i1", 3), ("tangent", "i1", 3), ("kind", "u1")])
-_LARGEST, _SMALLEST = 1.15, 0.28  # diagonals of parts of unknown scale, in units of the pose
-_POSES = 8  # poses of a suspect that are read, in the unit of the original and in any unit
+_LARGEST, _SMALLEST = 1.15, 0.28  # diagonals of parts, in units of the pose
+_LARGEST_SCENE = 2.0  # the same for a part in the unit of the original, with other things beside it
+_POSES = 4  # poses of a suspect that are read, in the unit of the original and in any unit
 MOST_POSES = 2 * _POSES  # the largest number of poses of `Hint.poses`
 _NEAR = 0.035  # distance of landmarks, in units of the pose, up to which a rough pose fits them
 _CLOSER = (0.035, 0.02, 0.01, 0.006, 0.006)  # the same while the pose is refined
@@ -118,7 +119,8 @@ class Hint:
         size = diagonal(suspect)
         if not len(self.landmarks.places):
             return
-        yield self._in_scales(suspect, [self.scale])
+        if _SMALLEST <= size * self.scale <= _LARGEST_SCENE:
+            yield self._in_scales(suspect, [self.scale])
         count = int(np.floor(np.log(_LARGEST / _SMALLEST) / np.log(_RATIO))) + 1
         yield self._in_scales(suspect, [_LARGEST / size / _RATIO**index for index in range(count)])
 
@@ -138,7 +140,8 @@ class Hint:
                 flip = Pose(scale * np.diag([-1.0 if mirrored else 1.0, 1, 1]), np.zeros(3))
                 seen = chosen.seen(flip, inside_out=inside_out)
                 candidates += [Posed(flip.then(one.pose), inside_out, one.fitting) for one in self._match(seen)]
-        return _distinct(sorted(candidates, key=lambda one: -one.fitting), suspect)[:_POSES]
+        likely = [one for one in candidates if one.fitting >= max(other.fitting for other in candidates) / 2]
+        return _distinct(sorted(likely, key=lambda one: -one.fitting), suspect)[:_POSES]
 
     def _match(self, suspect: Landmarks) -> list["Posed"]:
         """Find poses that map many landmarks of a suspect to those of the hint; the suspect has about their scale."""

@@ -13,19 +13,21 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import KDTree
 
+from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, cross_product, open_sides, unit
 from jaxmark.geometry.pose import Pose
 from jaxmark.watermark.blind.anchors import Anchors, Patches, alike, anchors_at, changes, cut, patches
 
-# The surface is cut into pieces for a Gaussian so much wider, for finding extremes and for refining them.
-_COARSE, _FINE = 3.0, 2.0
+_COARSER = 2.5  # the surface is cut into pieces for a Gaussian so much wider; more pieces would change little
 _AROUND = 1.6  # distance, in widths, within which a value is the largest
 _RIM = 1.0  # least distance from a border, in widths
 _RIM_POINTS = 5  # points on each edge of the border
-_STEPS, _LONGEST_STEP, _LONGEST_WAY = 5, 0.5, 1.5  # Newton steps; the longest step, and the longest way, in widths
+_TURNS, _STEPS = 2, 2  # curvatures are measured so many times, and Newton steps taken with each
+_LONGEST_STEP, _LONGEST_WAY = 0.5, 1.0  # the longest step, and the longest way of all steps, in widths
 _ASIDE = 0.4  # distance, in widths, over which curvatures are measured
 _ARRIVED = 0.15  # length of the last step, in widths, up to which a landmark counts as found
 _LEAST_CURVATURE = 0.15  # curvatures are taken as at least this share of the largest
+_MOST_POINTS, _MOST_EXTREMES = 2**16, 400  # points of a surface that are compared, and extremes that are refined
 _APART = 0.3  # least distance of landmarks of one kind, in widths
 _TINY = 1e-9
 
@@ -91,23 +93,20 @@ def find_landmarks(mesh: Mesh, widths: Sequence[float]) -> Landmarks:
     border, vertices = Border(mesh), np.asarray(mesh.vertices, np.float64)
     # In units of the width, so that neither numbers nor compiled programs depend on the unit.
     scaled = [Mesh(vertices / width, mesh.faces) for width in widths]
-    coarse, fine = _surfaces(scaled, _COARSE), _surfaces(scaled, _FINE)
-    points = [np.asarray(surface.points, np.float64)[np.asarray(surface.area) > _TINY] for surface in coarse]
+    pieces, dtype = alike([cut(one, _COARSER) for one in scaled]), jnp.result_type(float)
+    surfaces = [patches(*one) for one in zip(pieces, [jnp.asarray(one.vertices, dtype) for one in scaled], strict=True)]
+    points = [np.asarray(surface.points, np.float64)[np.asarray(surface.area) > _TINY] for surface in surfaces]
+    if max(map(len, points)) > _MOST_POINTS:
+        raise JaxmarkError("This surface is too large in comparison with its extent to find landmarks on it.")
     inside = [border.spares(width * point, _RIM * width) for width, point in zip(widths, points, strict=True)]
-    extremes = list(map(_extremes, coarse, alike(list(map(_anchors, coarse, points))), inside))
-    starts = alike([_anchors(surface, one.places, _LONGEST_WAY) for surface, one in zip(fine, extremes, strict=True)])
+    extremes = list(map(_extremes, surfaces, alike(list(map(_anchors, surfaces, points))), inside))
+    starts = alike([_anchors(*one, _LONGEST_WAY) for one in zip(surfaces, [e.places for e in extremes], strict=True)])
     columns = []
-    for index, (width, found) in enumerate(zip(widths, map(_climb, fine, starts, extremes), strict=True)):
+    for index, (width, found) in enumerate(zip(widths, map(_climb, surfaces, starts, extremes), strict=True)):
         found = found._replace(places=width * found.places, kinds=found.kinds + 2 * index)
         found = found.pick(border.spares(found.places, _RIM * width))
         columns.append(_distinct(found, _APART * width))
     return Landmarks(*map(np.concatenate, zip(*columns, strict=True)))
-
-
-def _surfaces(scaled: Sequence[Mesh], wider: float) -> list[Patches]:
-    """Cut surfaces into pieces, of a common shape so that programs are compiled once."""
-    pieces, dtype = alike([cut(mesh, wider) for mesh in scaled]), jnp.result_type(float)
-    return [patches(one, jnp.asarray(mesh.vertices, dtype)) for one, mesh in zip(pieces, scaled, strict=True)]
 
 
 def _anchors(surface: Patches, places: _Vectors, room: float = 0.0) -> Anchors:
@@ -156,6 +155,7 @@ def _extremes(surface: Patches, anchors: Anchors, inside: Bool[np.ndarray, " poi
         np.maximum.at(highest, first, height[second])
         np.maximum.at(highest, second, height[first])
         top = np.flatnonzero((height >= highest) & inside)
+        top = top[np.argsort(-height[top], kind="stable")[:_MOST_EXTREMES]]
         found.append(_Extremes(places[top], np.full(len(top), sign)))
     return _Extremes(*map(np.concatenate, zip(*found, strict=True)))
 
@@ -163,29 +163,38 @@ def _extremes(surface: Patches, anchors: Anchors, inside: Bool[np.ndarray, " poi
 def _climb(surface: Patches, anchors: Anchors, extremes: _Extremes) -> Landmarks:
     """Move extremes along the surface to where the value is extreme, by Newton steps; in units of the width."""
     start, signs = extremes
-    places, curvature, length = start, np.zeros((len(start), 2)), np.full(len(start), np.inf)
-    axes, seen = np.zeros((len(start), 2, 3)), _measure(surface, anchors, start)
-    for _ in range(_STEPS):
-        axis = np.where(np.abs(seen.normals[:, :1]) < 0.6, [[1.0, 0, 0]], [[0, 1.0, 0]])
-        across = unit(cross_product(axis, seen.normals))
-        basis = np.stack([across, cross_product(seen.normals, across)], axis=1)
-        bends = []
-        for direction in np.swapaxes(basis, 0, 1):
-            ahead, behind = (_measure(surface, anchors, places + way * direction) for way in (_ASIDE, -_ASIDE))
-            bends.append(signs[:, None] * (behind.slopes - ahead.slopes) / (2 * _ASIDE))
-        hessian = np.einsum("kax,alx->akl", np.stack(bends), basis)
-        curvature, turn = np.linalg.eigh((hessian + np.swapaxes(hessian, 1, 2)) / 2)
-        axes = np.einsum("alk,alx->akx", turn, basis)
-        slope = signs[:, None] * np.einsum("akx,ax->ak", axes, seen.slopes)
-        step = slope / np.maximum(curvature, np.maximum(_LEAST_CURVATURE * curvature[:, 1:], _TINY))
-        length = np.linalg.norm(step, axis=1)
-        step *= np.minimum(1, _LONGEST_STEP / np.maximum(length, _TINY))[:, None]
-        places = places + np.einsum("ak,akx->ax", step, axes) + seen.away[:, None] * seen.normals
-        seen = _measure(surface, anchors, places)
+    places, seen = start, _measure(surface, anchors, start)
+    axes, curvature, length = np.zeros((len(start), 2, 3)), np.zeros((len(start), 2)), np.full(len(start), np.inf)
+    for _ in range(_TURNS):
+        axes, curvature = _curvatures(surface, anchors, places, seen.normals, signs)
+        least = np.maximum(_LEAST_CURVATURE * curvature[:, 1:], _TINY)
+        for _ in range(_STEPS):
+            slope = signs[:, None] * np.einsum("akx,ax->ak", axes, seen.slopes)
+            step = slope / np.maximum(curvature, least)
+            length = np.linalg.norm(step, axis=1)
+            step *= np.minimum(1, _LONGEST_STEP / np.maximum(length, _TINY))[:, None]
+            places = places + np.einsum("ak,akx->ax", step, axes) + seen.away[:, None] * seen.normals
+            seen = _measure(surface, anchors, places)
     is_found = (length < _ARRIVED) & (curvature[:, 0] > 0) & seen.good
     is_found &= np.linalg.norm(places - start, axis=1) < _LONGEST_WAY
-    kinds = (signs > 0).astype(np.int64)
-    return Landmarks(places, seen.normals, axes[:, 1], kinds, curvature[:, 0]).pick(is_found)
+    tangents = unit(axes[:, 1] - (axes[:, 1] * seen.normals).sum(axis=1, keepdims=True) * seen.normals)
+    return Landmarks(places, seen.normals, tangents, (signs > 0).astype(np.int64), curvature[:, 0]).pick(is_found)
+
+
+def _curvatures(
+    surface: Patches, anchors: Anchors, places: _Vectors, normals: _Vectors, signs: Float64[np.ndarray, " points"]
+) -> tuple[Float64[np.ndarray, "points 2 3"], Float64[np.ndarray, "points 2"]]:
+    """Compute the main axes and curvatures, ascending, of values times -1 for maxima, along the surface."""
+    axis = np.where(np.abs(normals[:, :1]) < 0.6, [[1.0, 0, 0]], [[0, 1.0, 0]])
+    across = unit(cross_product(axis, normals))
+    basis = np.stack([across, cross_product(normals, across)], axis=1)
+    bends = []
+    for direction in np.swapaxes(basis, 0, 1):
+        ahead, behind = (_measure(surface, anchors, places + way * direction) for way in (_ASIDE, -_ASIDE))
+        bends.append(signs[:, None] * (behind.slopes - ahead.slopes) / (2 * _ASIDE))
+    hessian = np.einsum("kax,alx->akl", np.stack(bends), basis)
+    curvature, turn = np.linalg.eigh((hessian + np.swapaxes(hessian, 1, 2)) / 2)
+    return np.einsum("alk,alx->akx", turn, basis), curvature
 
 
 def _distinct(landmarks: Landmarks, apart: float) -> Landmarks:

@@ -259,6 +259,8 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
         )
     if reading.view.undone:
         notes.append(f"The suspect was read after undoing {reading.view.undone} steps of smoothing.")
+    if reading.view.by_hint:
+        notes.append("The suspect was read in a pose that was found by the record's hint, as parts are.")
     if reading.view.mirrored[reading.turn]:
         notes.append("The suspect is the mirror image of the marked mesh.")
     agreement = float(score[chosen] / reading.anchors)
@@ -286,6 +288,8 @@ def _caveats(scheme: BlindScheme, record: Record | None) -> tuple[str, ...]:
     usual = BLIND_SCHEMES[scheme.name]
     if record is None and not (set(scheme.widths) <= set(usual.widths) and set(scheme.steps) <= set(usual.steps)):
         return (f"the widths or steps of the scheme {scheme.name!r} were chosen by the reader",)
+    if record is None and scheme.looks > usual.looks:
+        return ("the hint was chosen by the reader; give the record",)
     return ()
 
 

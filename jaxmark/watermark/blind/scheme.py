@@ -68,6 +68,7 @@ class Look(NamedTuple):
     pose: Pose  # the map from the coordinates of the suspect's file to those of the view
     undone: int  # number of smoothing steps that were undone
     mirrored: Bool[np.ndarray, " turns"]  # whether the suspect is a mirror image in this turn
+    by_hint: bool = False  # whether the pose was found by the hint of a record
 
 
 @runtime_checkable
