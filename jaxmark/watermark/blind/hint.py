@@ -23,7 +23,7 @@ from jaxmark.geometry.pose import Points, Pose, similarity
 from jaxmark.watermark.blind.landmarks import Landmarks, find_landmarks
 
 _VERSION = 1
-_MOST = 100  # landmarks in a hint
+_MOST, _COMPARED = 100, 300  # landmarks in a hint, and of a suspect
 _RATIO = 2 ** (1 / 3)  # ratio of neighbouring widths, and of the scales that are tried
 _WIDTHS = tuple(0.0125 * _RATIO**index for index in range(3))  # widths of the Gaussians, in units of the pose
 _UNIT = 2.0**-11  # unit of stored places, in units of the pose
@@ -36,11 +36,11 @@ _POSES = 4  # poses of a suspect that are read, in the unit of the original and 
 MOST_POSES = 2 * _POSES  # the largest number of poses of `Hint.poses`
 _NEAR = 0.035  # distance of landmarks, in units of the pose, up to which a rough pose fits them
 _CLOSER = (0.035, 0.02, 0.01, 0.006, 0.006)  # the same while the pose is refined
-_REFINED = 48  # number of rough poses that are refined
+_REFINED = 16  # number of rough poses that are refined
 _GRID = 0.0175  # side of the cubes in which rough poses are compared
 _CHUNK = 2**19  # number of landmarks that are compared at once
 _SAME = 0.005  # change of places, in units of the pose, up to which poses are the same
-_FEWEST = 4  # least number of landmarks that fit a pose
+_FEWEST, _ENOUGH = 4, 20  # numbers of landmarks that must fit a pose, and with which other units are not tried
 
 
 class Posed(NamedTuple):
@@ -73,8 +73,7 @@ class Hint:
         """
         found = find_landmarks(mesh, _WIDTHS)
         found = found.pick(np.abs(found.places).max(axis=1, initial=0) < _FARTHEST)
-        clearest = np.argsort(-found.clarity, kind="stable")[:_MOST]
-        return cls(found.pick(clearest), scale)
+        return cls(found.clearest(_MOST), scale)
 
     def to_text(self) -> str:
         """Return the hint as it is stored in a record: at most 1,800 characters."""
@@ -111,7 +110,9 @@ class Hint:
         return cls(Landmarks(places, normals, tangents, kinds, np.ones(len(points))), float(head["scale"]))
 
     def poses(self, suspect: Mesh) -> Iterator[list["Posed"]]:
-        """Iterate over the likeliest poses of a suspect, the likeliest first: in the original's unit, then in any unit.
+        """Iterate over the likeliest poses of a suspect, the likeliest first.
+
+        Poses in the unit of the original come first, and then, unless many landmarks fit one of them, in any unit.
 
         Raises:
             JaxmarkError: if the suspect has no extent.
@@ -120,7 +121,10 @@ class Hint:
         if not len(self.landmarks.places):
             return
         if _SMALLEST <= size * self.scale <= _LARGEST_SCENE:
-            yield self._in_scales(suspect, [self.scale])
+            found = self._in_scales(suspect, [self.scale])
+            yield found
+            if found and found[0].fitting >= _ENOUGH:
+                return
         count = int(np.floor(np.log(_LARGEST / _SMALLEST) / np.log(_RATIO))) + 1
         yield self._in_scales(suspect, [_LARGEST / size / _RATIO**index for index in range(count)])
 
@@ -135,7 +139,7 @@ class Hint:
         candidates: list[Posed] = []
         for index, scale in enumerate(scales):
             chosen = found.pick((found.kinds >= 2 * index) & (found.kinds < 2 * (index + len(_WIDTHS))))
-            chosen = chosen._replace(kinds=chosen.kinds - 2 * index)
+            chosen = chosen._replace(kinds=chosen.kinds - 2 * index).clearest(_COMPARED)
             for mirrored, inside_out in product((False, True), repeat=2):
                 flip = Pose(scale * np.diag([-1.0 if mirrored else 1.0, 1, 1]), np.zeros(3))
                 seen = chosen.seen(flip, inside_out=inside_out)

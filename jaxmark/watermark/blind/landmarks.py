@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, cross_product, open_sides, unit
 from jaxmark.geometry.pose import Pose
-from jaxmark.watermark.blind.anchors import Anchors, Patches, alike, anchors_at, changes, cut, patches
+from jaxmark.watermark.blind.anchors import Anchors, Patches, alike, anchors_at, changes, cut, look, patches
 
 _COARSER = 2.5  # the surface is cut into pieces for a Gaussian so much wider; more pieces would change little
 _AROUND = 1.6  # distance, in widths, within which a value is the largest
@@ -27,7 +27,7 @@ _LONGEST_STEP, _LONGEST_WAY = 0.5, 1.0  # the longest step, and the longest way 
 _ASIDE = 0.4  # distance, in widths, over which curvatures are measured
 _ARRIVED = 0.15  # length of the last step, in widths, up to which a landmark counts as found
 _LEAST_CURVATURE = 0.15  # curvatures are taken as at least this share of the largest
-_MOST_POINTS, _MOST_EXTREMES = 2**16, 400  # points of a surface that are compared, and extremes that are refined
+_MOST_POINTS, _MOST_EXTREMES = 2**16, 256  # points of a surface that are compared, and extremes that are refined
 _APART = 0.3  # least distance of landmarks of one kind, in widths
 _TINY = 1e-9
 
@@ -55,6 +55,10 @@ class Landmarks(NamedTuple):
             tangents=unit(self.tangents @ pose.matrix.T),
             kinds=self.kinds ^ 1 if inside_out else self.kinds,
         )
+
+    def clearest(self, count: int) -> "Landmarks":
+        """Return so many of the landmarks, or all if there are fewer, the clearest first."""
+        return self.pick(np.argsort(-self.clarity, kind="stable")[:count])
 
     @property
     def frames(self) -> Float64[np.ndarray, "points 3 3"]:
@@ -116,7 +120,6 @@ def _anchors(surface: Patches, places: _Vectors, room: float = 0.0) -> Anchors:
 class _Seen(NamedTuple):
     """What is measured at places beside a surface, in units of the width."""
 
-    values: Float64[np.ndarray, " points"]
     slopes: _Vectors
     normals: _Vectors
     away: Float64[np.ndarray, " points"]
@@ -129,9 +132,9 @@ def _measure(surface: Patches, anchors: Anchors, places: _Vectors) -> _Seen:
     moved[: len(places)] = places
     dtype = surface.points.dtype
     seen = changes(surface, anchors._replace(places=moved), jnp.ones((), dtype), jnp.zeros((), dtype))
-    values, good, normals, away = (np.asarray(column)[: len(places)] for column in seen.shown)
-    slopes = np.asarray(seen.slope, np.float64)[: len(places)]
-    return _Seen(values.astype(np.float64), slopes, normals.astype(np.float64), away.astype(np.float64), good)
+    columns = (seen.slope, seen.shown.normals, seen.shown.away)
+    slopes, normals, away = (np.asarray(column, np.float64)[: len(places)] for column in columns)
+    return _Seen(slopes, normals, away, np.asarray(seen.shown.good)[: len(places)])
 
 
 class _Extremes(NamedTuple):
@@ -144,13 +147,15 @@ class _Extremes(NamedTuple):
 def _extremes(surface: Patches, anchors: Anchors, inside: Bool[np.ndarray, " points"]) -> _Extremes:
     """Find the points whose values are the largest or the smallest around; `inside` are those that count."""
     places = anchors.places[: len(inside)]
-    seen = _measure(surface, anchors, places)
+    dtype = surface.points.dtype
+    shown = look(surface, anchors, jnp.zeros(anchors.places.shape, dtype), jnp.ones((), dtype), jnp.zeros((), dtype))
+    values, good, normals = (np.asarray(column)[: len(inside)] for column in shown[:3])
     first, second = KDTree(places).query_pairs(_AROUND, output_type="ndarray").T
-    on_one_sheet = (seen.normals[first] * seen.normals[second]).sum(axis=1) > 0
-    first, second, inside = first[on_one_sheet], second[on_one_sheet], inside & seen.good
+    on_one_sheet = (normals[first] * normals[second]).sum(axis=1) > 0
+    first, second, inside = first[on_one_sheet], second[on_one_sheet], inside & good
     found = []
     for sign in (-1.0, 1.0):
-        height = np.where(inside, sign * seen.values, -np.inf)
+        height = np.where(inside, sign * values, -np.inf)
         highest = height.copy()
         np.maximum.at(highest, first, height[second])
         np.maximum.at(highest, second, height[first])

@@ -107,7 +107,7 @@ def test_values_do_not_depend_on_the_meshing_nor_on_the_pose(shape: Mesh, other:
 
 @pytest.mark.parametrize("axis", range(7))
 def test_changes_of_pose_are_derivatives(shape: Mesh, axis: int):
-    view = next(SCHEME.views(shape, CHOICES))
+    view = next(SCHEME.views(shape, CHOICES))[0]
     change = 1e-3 * np.eye(7)[axis]
     points = np.asarray(place(shape).mesh.vertices)
     # The suspect lies off by the inverse of the change, so that anchors see what they would after it.
@@ -181,6 +181,33 @@ def test_a_record_reads_what_was_attacked(marked, key: jm.Key, attack):
     found = jm.detect(jm.attack(mesh, *attack, seed=1), key=key, record=info.record)
     assert found.message == MESSAGE
     assert found.log10_p < -10
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_record_reads_a_part_in_any_pose(marked, key: jm.Key, mirrored: bool):
+    """Turned, scaled and mirrored; the hint gives the pose, which is charged whether it was needed or not."""
+    mesh, info = marked
+    part = turned(jm.attack(mesh, "cropping", 0.3, seed=0), mirrored)
+    found = jm.detect(part, key=key, record=info.record, message=MESSAGE)
+    assert found.log10_p < -10
+    assert any("hint" in note for note in found.notes)
+    assert any("mirror image" in note for note in found.notes) == mirrored
+    views = {charge.choice: charge.log10 for charge in found.evidence.charges}["view"]
+    assert views == pytest.approx(np.log10(2 * (5 * 8 + 2 * 4 * 2)))
+
+
+@pytest.mark.slow
+def test_a_part_has_no_mark_that_was_not_made(shape: Mesh, marked, key: jm.Key):
+    mesh, info = marked
+    part = jm.attack(shape, "cropping", 0.3, seed=0)
+    assert jm.detect(part, key=key, record=info.record, message=MESSAGE).log10_p > -2
+    without = dataclasses.replace(SCHEME.fixed(WIDTH, info.record.parameters["step"]), hint="")
+    part = jm.attack(mesh, "cropping", 0.3, seed=0)
+    assert reading.read(reading.register(part), key, 32, without, MESSAGE).log10_p > -2
+    chosen = dataclasses.replace(without, hint=info.record.parameters["hint"])
+    found = jm.detect(part, key=key, scheme=chosen, message=MESSAGE)
+    assert found.evidence.caveats == ("the hint was chosen by the reader; give the record",)
+    assert not found.detected()
 
 
 def test_smoothing_is_undone_as_by_rounds(shape: Mesh):
@@ -288,6 +315,12 @@ def test_commands_without_the_original(shape: Mesh, tmp_path: Path, monkeypatch,
     assert found["message"] == CLI_MESSAGE
     assert found["scheme"] == "field"
     assert workshop("detect", "model.ply", *key, *record)[0] == 1
+    assert "hint" in jm.Record.load(tmp_path / "marked.ply.jaxmark.json").parameters
+    workshop.embed("--scheme", "field", "--no-hint", "--overwrite")
+    assert jm.Record.load(tmp_path / "marked.ply.jaxmark.json").parameters.keys() == {"width", "step"}
+    assert "leave out --no-hint" in workshop.refused(
+        "embed", "model.ply", "other.ply", *key, "--message", CLI_MESSAGE.hex(), "--no-hint"
+    )
     assert "give --original" in workshop.refused("detect", "marked.ply", *key, "--align", "same")
     assert "give --original" in workshop.refused("detect", "marked.ply", *key, "--scheme", "keyed")
 
@@ -329,7 +362,7 @@ def test_a_part_that_one_scheme_refuses_does_not_hide_what_another_proves(shape:
 @pytest.mark.slow
 def test_what_is_too_rough_when_smoothing_is_undone_is_left_out(shape: Mesh):
     rough = jm.attack(shape, "noise", 0.2, seed=0)
-    undone = {view.undone for view in SCHEME.views(rough, CHOICES)}
+    undone = {view.undone for group in SCHEME.views(rough, CHOICES) for view in group}
     assert 0 in undone
     assert not undone >= {0, 10, 30, 50}
 

@@ -79,7 +79,7 @@ def test_values_are_differences_of_averages_over_sizes(x64):
     good = host.good > 0
     anchors = local._anchors(original.points, CHOICES).vertices
     np.testing.assert_allclose(host.values[good], values[anchors[good]], rtol=1e-3)
-    view = next(LocalScheme(widths=(8,)).views(turned(mesh), CHOICES))
+    view = next(LocalScheme(widths=(8,)).views(turned(mesh), CHOICES))[0]
     assert sorted(view.names[0, view.good, 0].tolist()) == sorted(host.names[good, 0].tolist())
     np.testing.assert_allclose(np.sort(np.asarray(view.values)[view.good]), np.sort(host.values[good]), atol=1e-3)
 
@@ -140,7 +140,7 @@ def test_equal_surroundings_count_once(key: jm.Key):
     )
     readings = []
     for one in (mesh, two):
-        view = next(LocalScheme().views(one, CHOICES))
+        view = next(LocalScheme().views(one, CHOICES))[0]
         readings.append(reading._readings(view, LocalScheme(), CHOICES, 128)[0])
     # Far from the origin, coordinates have fewer digits, and the median is another one.
     assert readings[1].anchors == readings[0].anchors

@@ -1,0 +1,184 @@
+"""Landmarks, and the hints of records that are made of them."""
+
+import base64
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+import jaxmark as jm
+from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.pose import Pose
+from jaxmark.watermark.blind.anchors import place
+from jaxmark.watermark.blind.hint import Hint
+from jaxmark.watermark.blind.landmarks import Border, Landmarks, find_landmarks
+from jaxmark.watermark.schemes.registry import make_blind_scheme
+from tests.samples import bumpy_sphere
+
+WIDTHS = (0.05, 0.063)
+
+
+@pytest.fixture(scope="module")
+def bumpy() -> Mesh:
+    """A smooth closed surface of 2,562 points, with bumps, in its own pose."""
+    ball, random = trimesh.creation.icosphere(4), np.random.default_rng(0)
+    waves = random.normal(size=(3, 8))
+    waves *= 6 / np.linalg.norm(waves, axis=0)
+    height = np.sin(ball.vertices @ waves + random.uniform(0, 6, 8)).sum(axis=1)
+    points = ball.vertices * (1 + 0.04 * height)[:, None] * [1, 0.75, 0.55]
+    return place(Mesh(points, np.asarray(ball.faces, np.int64))).mesh
+
+
+@pytest.fixture(scope="module")
+def landmarks(bumpy: Mesh) -> Landmarks:
+    return find_landmarks(bumpy, WIDTHS).clearest(15)
+
+
+@pytest.fixture(scope="module")
+def rough() -> Mesh:
+    """A closed surface of 2,562 points, rough enough for the narrow widths of hints, in its own pose."""
+    mesh = bumpy_sphere(4)
+    return place(mesh._replace(vertices=np.asarray(mesh.vertices) * [1, 0.75, 0.55])).mesh
+
+
+@pytest.fixture(scope="module")
+def hint(rough: Mesh) -> Hint:
+    return Hint.of(rough, 1.0)
+
+
+def share_found(landmarks: Landmarks, others: Landmarks, reach: float) -> float:
+    """The share of landmarks beside which another of their kind lies."""
+    kinds = np.unique(landmarks.kinds)
+    trees = {kind: KDTree(others.places[others.kinds == kind]) for kind in kinds}
+    near = [trees[kind].query(spot)[0] < reach for kind, spot in zip(landmarks.kinds, landmarks.places, strict=True)]
+    return float(np.mean(near))
+
+
+def test_landmarks_move_with_the_surface(bumpy: Mesh, landmarks: Landmarks):
+    pose = Pose(3.7 * Rotation.random(random_state=3).as_matrix(), np.array([9.0, -5, 2]))
+    moved = bumpy._replace(vertices=pose(np.asarray(bumpy.vertices)))
+    there = find_landmarks(moved, [pose.scale * width for width in WIDTHS])
+    assert share_found(landmarks.seen(pose), there, 0.3 * pose.scale * WIDTHS[0]) > 0.9
+
+
+def test_landmarks_are_found_again_after_remeshing(bumpy: Mesh, landmarks: Landmarks):
+    coarser = jm.attack(bumpy, "simplification", 0.5, seed=0)
+    assert share_found(landmarks, find_landmarks(coarser, WIDTHS), 0.3 * WIDTHS[0]) > 0.8
+
+
+def test_reversed_faces_exchange_minima_and_maxima(bumpy: Mesh, landmarks: Landmarks):
+    inside_out = find_landmarks(bumpy._replace(faces=np.asarray(bumpy.faces)[:, ::-1]), WIDTHS).clearest(15)
+    same = inside_out.seen(Pose(np.eye(3), np.zeros(3)), inside_out=True)
+    assert share_found(landmarks, same, 1e-3) == 1
+    np.testing.assert_allclose(np.sort(same.normals, axis=0), np.sort(landmarks.normals, axis=0), atol=1e-3)
+
+
+def test_values_at_landmarks_are_extreme(bumpy: Mesh, landmarks: Landmarks):
+    """By two Gaussian averages of many samples of the surface, computed here from their definition."""
+    a, b, c = (np.asarray(bumpy.vertices)[np.asarray(bumpy.faces)[:, corner]] for corner in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    places, width = (a + b + c) / 3, WIDTHS[0]
+
+    def value(spot: np.ndarray, normal: np.ndarray) -> float:
+        offset = places - spot
+        averages = []
+        for size in (width, 2 * width):
+            weight = area * np.exp(-np.sum(offset**2, axis=1) / 2 / size**2)
+            averages.append(weight @ offset / weight.sum())
+        return float((averages[0] - averages[1]) @ normal)
+
+    clear = np.flatnonzero(landmarks.kinds < 2)
+    clear = clear[np.argsort(-landmarks.clarity[clear])[:8]]
+    for index in clear:
+        spot, normal, tangent = (column[index] for column in landmarks[:3])
+        sign = 1 if landmarks.kinds[index] & 1 else -1
+        aside = [spot + way * width * tangent for way in (-0.8, 0.8)]
+        assert sign * value(spot, normal) > max(sign * value(other, normal) for other in aside)
+
+
+def test_borders_are_spared(bumpy: Mesh):
+    part = jm.attack(bumpy, "cropping", 0.5, seed=0)
+    found = find_landmarks(part, WIDTHS)
+    assert Border(part).spares(found.places, 0.99 * WIDTHS[0]).all()
+    assert not Border(part).spares(found.places, 1.0).any()
+    assert Border(bumpy).spares(np.asarray(bumpy.vertices), 1.0).all()
+
+
+def test_hints_are_stored(hint: Hint):
+    text = hint.to_text()
+    again = Hint.from_text(text)
+    assert len(text) < 1800
+    assert 10 < len(again.landmarks.places) <= 100
+    np.testing.assert_allclose(again.landmarks.places, hint.landmarks.places, atol=2**-12)
+    np.testing.assert_allclose(again.landmarks.frames, hint.landmarks.frames, atol=0.03)
+    np.testing.assert_array_equal(again.landmarks.kinds, hint.landmarks.kinds)
+    assert again.scale == 1
+    assert again.to_text()[:12] == text[:12]
+
+
+def edited(text: str, place: int, byte: int) -> str:
+    """A hint with another byte in one place."""
+    data = bytearray(base64.b64decode(text))
+    data[place] = byte
+    return base64.b64encode(data).decode()
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda text: text[:-4], "incomplete"),
+        (lambda text: "", "incomplete"),
+        (lambda text: text[:20], "incomplete"),
+        (lambda text: "é" + text[1:], "incomplete"),
+        (lambda text: edited(text, 0, 9), "version 9"),
+        (lambda text: edited(text, 8, 255), "out of range"),  # a scale that is negative
+        (lambda text: edited(text, 21, 6), "out of range"),  # an unknown kind
+        (lambda text: edited(text, 10, 127), "out of range"),  # far away
+        (lambda text: text + text[12:] * 100, "incomplete|out of range"),
+    ],
+)
+def test_damaged_hints_are_refused(hint: Hint, change, reason: str):
+    with pytest.raises(jm.JaxmarkError, match=reason):
+        Hint.from_text(change(hint.to_text()))
+
+
+@pytest.mark.parametrize(
+    ("scale", "mirrored", "inside_out"), [(1.0, False, True), pytest.param(2.9, True, False, marks=pytest.mark.slow)]
+)
+def test_the_pose_of_a_part_is_found(rough: Mesh, hint: Hint, scale: float, mirrored: bool, inside_out: bool):
+    part = jm.attack(rough, "cropping", 0.3, seed=0)
+    matrix = scale * Rotation.random(random_state=4).as_matrix() @ np.diag([-1.0 if mirrored else 1.0, 1, 1])
+    moved = Pose(matrix, np.array([1.0, 2, 3]))
+    faces = np.asarray(part.faces)
+    suspect = Mesh(moved(np.asarray(part.vertices)), faces[:, ::-1] if inside_out else faces)
+    *_, group = islice(Hint.from_text(hint.to_text()).poses(suspect), 1 if scale == 1 else 2)
+    best = group[0]
+    np.testing.assert_allclose(best.apply(suspect).vertices, np.asarray(part.vertices), atol=0.004)
+    np.testing.assert_array_equal(best.apply(suspect).faces, part.faces)
+    assert best.pose.mirrors == mirrored
+
+
+@pytest.mark.slow
+def test_a_suspect_of_any_size_costs_as_much(bumpy: Mesh, hint: Hint):
+    """A suspect that is no part in the unit of the original is looked at in its own unit alone."""
+    for factor in (1e-6, 1e6):
+        other = bumpy._replace(vertices=factor * np.asarray(bumpy.vertices))
+        assert len(list(hint.poses(other))) == 1
+
+
+def test_an_empty_hint_has_no_poses(bumpy: Mesh, hint: Hint):
+    empty = replace(hint, landmarks=hint.landmarks.pick(np.zeros(0, int)))
+    assert list(Hint.from_text(empty.to_text()).poses(bumpy)) == []
+
+
+def test_records_with_other_parameters_are_refused():
+    known = {"width": 0.018, "step": 4e-4}
+    assert make_blind_scheme("field", known | {"hint": "text"}).hint == "text"
+    for name, parameters in (("field", {"hint": 3}), ("field", {"tip": "text"}), ("local", {"hint": "text"})):
+        usual = known if name == "field" else {"width": 32.0, "step": 0.5}
+        with pytest.raises(jm.JaxmarkError, match="other parameters"):
+            make_blind_scheme(name, usual | parameters)
