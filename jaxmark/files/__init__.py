@@ -6,7 +6,6 @@ A file is saved by patching the file that it was loaded from: all bytes except t
 import os
 import posixpath
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import obj, off, ply, point_cloud, splats, stl, threemf, usd
+from jaxmark.files import limits, obj, off, ply, point_cloud, splats, stl, threemf, usd
 from jaxmark.files.atomic import read_beside, read_file, write_atomically, write_together
 from jaxmark.files.gltf import asset
 from jaxmark.files.source import Indices, Source, Texture, concerning
@@ -60,7 +59,7 @@ _ONLY = "mesh"  # name of the mesh in a file that has just one
 _IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".bmp", ".gif", ".svg", ".tga", ".tif", ".tiff", ".exr", ".hdr")
 _TEXTURES = (".ktx", ".ktx2", ".basis", ".dds", ".tx")
 _COMPANIONS = frozenset((*_IMAGES, *_TEXTURES, *_USD, ".bin", ".mtl", ".mtlx"))
-_MOST_COMPANION = 2**28  # bytes of one of them
+_MOST_COMPANION, _MOST_COMPANIONS = 2**28, 2**30  # bytes of one of them, and of all together
 _MOST_NOTED = 5
 
 
@@ -256,8 +255,9 @@ def _suffix(path: str | os.PathLike) -> str:
 def _parse(path: str | os.PathLike, data: bytes) -> Source:
     """Parse the bytes of a file; files of some formats refer to other files in the same folder."""
     suffix = _suffix(path)
-    beside = (read_beside(Path(path).parent),) if _FORMATS[suffix] is asset.parse else ()
-    return _FORMATS[suffix](data, *beside)
+    if _FORMATS[suffix] is not asset.parse:
+        return _FORMATS[suffix](data)
+    return asset.parse(data, read_beside(Path(path).parent, limits.BUFFERS.least, limits.BUFFERS.least))
 
 
 def _read(path: str | os.PathLike) -> Source:
@@ -298,14 +298,16 @@ def _save(source: Source, positions: np.ndarray, path: str | os.PathLike, like: 
     here, there = Path(like).parent, Path(path).parent
     left: tuple[str, ...] = ()
     if os.path.realpath(here) != os.path.realpath(there):
-        read = read_beside(here, _MOST_COMPANION)
+        read = read_beside(here, _MOST_COMPANION, _MOST_COMPANIONS)
         names = {posixpath.normpath(companion) for companion in patched.companions}
         for name in sorted(names):
             if not _may_come_along(name, Path(like)):
                 left += (f"the file {ascii(name)[:80]} that it refers to is not copied",)
                 continue
-            with suppress(JaxmarkError):  # a file that is missing already, or lies elsewhere, does not come along
-                beside[name] = read(name)
+            try:
+                beside[name] = read(name, None)
+            except JaxmarkError as error:  # a file that is missing already does not come along
+                left += (f"{error}, and is not copied",) if (here / name).exists() else ()
     write_together(path, patched.file, beside)
     most = max((loss or 0.0 for loss in lost), default=0.0)
     noted = (f"rounding to the numbers of the file changes the displacement by {100 * most:.0f} %",)

@@ -22,8 +22,9 @@ from jaxmark.files.limits import RunningCount
 from jaxmark.files.source import Indices, Patched
 from jaxmark.files.unpacking import Unpacker
 
-#: Reads a file by its path relative to the folder of the document; the same object for all paths of one file.
-Read = Callable[[str], bytes]
+#: Reads so many bytes, or all, of a file by its path relative to the folder of the document; the same object for all
+#: paths of one file.
+Read = Callable[[str, int | None], bytes]
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _MAGIC = b"glTF"
@@ -366,4 +367,4 @@ def _content(entry: Any, index: int, chunk: bytes | None, read: Read) -> tuple[s
         except (ValueError, binascii.Error):
             raise JaxmarkError(f"buffers[{index}] is no data in base64") from None
     path = unquote(uri)
-    return path, read(path)
+    return path, read(path, whole(entry, "byteLength", f"buffers[{index}]") if "byteLength" in entry else None)
