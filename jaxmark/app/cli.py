@@ -61,7 +61,7 @@ from jaxmark.errors import JaxmarkError, require
 from jaxmark.evaluation.cells import left_over
 from jaxmark.evaluation.pictures import Measure
 from jaxmark.evaluation.study import load_study
-from jaxmark.files import load_mesh, load_scene, load_skin, save_mesh, save_scene
+from jaxmark.files import load_mesh, load_scene, load_skin, may_stay, save_mesh, save_scene
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.files.pair import writing_pair
 from jaxmark.geometry import unpose
@@ -456,7 +456,7 @@ def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int
     ):  # the objects of an OBJ file share one coordinate system, and are attacked as one mesh
         return _attack_scene(source, target, steps, seed, as_json)
     mesh = load_mesh(source)
-    with replacing(target) as draft:
+    with replacing(target, may_stay) as draft:
         attacked = chain(mesh, steps, seed=seed)
         same = same_connectivity(mesh, attacked)
         save_mesh(attacked, draft, like=source if same else None)
@@ -482,7 +482,7 @@ def _attack_scene(source: Path, target: Path, steps: list[tuple[str, float]], se
                 f"{_steps_text(steps)} changes faces, which is not possible in a file of several meshes; save each"
                 " mesh in a file of its own."
             )
-    with replacing(target) as draft:
+    with replacing(target, may_stay) as draft:
         save_scene(attacked, draft, like=source)
         after = load_scene(draft).meshes
     sizes = {name: distortion.displacement_size(mesh, after[name])._asdict() for name, mesh in meshes.items()}

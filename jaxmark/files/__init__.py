@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import limits, obj, off, ply, point_cloud, splats, stl, threemf, usd
-from jaxmark.files.atomic import read_beside, read_file, write_atomically, write_together
+from jaxmark.files.atomic import holds, read_beside, read_file, write_atomically, write_together
 from jaxmark.files.gltf import asset
 from jaxmark.files.source import Indices, Source, Texture, concerning
 from jaxmark.geometry.mesh import Mesh, host_mesh, make_mesh
@@ -61,6 +61,7 @@ _TEXTURES = (".ktx", ".ktx2", ".basis", ".dds", ".tx")
 _COMPANIONS = frozenset((*_IMAGES, *_TEXTURES, *_USD, ".bin", ".mtl", ".mtlx"))
 _MOST_COMPANION, _MOST_COMPANIONS = 2**28, 2**30  # bytes of one of them, and of all together
 _MOST_NOTED = 5
+_MOST_MOVED = 0.05  # largest displacement, over the extent of a mesh, of a layer that was marked
 
 
 class Scene(NamedTuple):
@@ -308,7 +309,7 @@ def _save(source: Source, positions: np.ndarray, path: str | os.PathLike, like: 
                 beside[name] = read(name, None)
             except JaxmarkError as error:  # a file that is missing already does not come along
                 left += (f"{error}, and is not copied",) if (here / name).exists() else ()
-    write_together(path, patched.file, beside)
+    write_together(path, patched.file, beside, may_stay)
     most = max((loss or 0.0 for loss in lost), default=0.0)
     noted = (f"rounding to the numbers of the file changes the displacement by {100 * most:.0f} %",)
     return patched.notes + left[:_MOST_NOTED] + noted * (most > _NOTED_LOSS)
@@ -322,6 +323,29 @@ def _may_come_along(name: str, like: Path) -> bool:
     suffix, target = Path(name).suffix.lower(), like.parent / name
     inside = not posixpath.isabs(name) and "\\" not in name and not name.startswith("..")
     return inside and suffix in _COMPANIONS and os.path.realpath(target) != os.path.realpath(like)
+
+
+def may_stay(target: Path, content: bytes) -> bool:
+    """Whether an existing file may stay where a companion with the given bytes would come.
+
+    It may if it has these bytes, or if it is the same USD layer with points that moved a little: most likely this layer
+    was marked before the file that refers to it.
+    """
+    if holds(target, content):
+        return True
+    if not target.is_file() or target.suffix.lower() not in _USD:
+        return False
+    try:
+        there, new = usd.parse(read_file(target, _MOST_COMPANION)), usd.parse(content)
+    except (OSError, JaxmarkError):
+        return False
+    if [mesh.name for mesh in there.meshes] != [mesh.name for mesh in new.meshes]:
+        return False
+    if len(there.positions) != len(new.positions) or not np.array_equal(there.faces, new.faces):
+        return False
+    sizes = [np.ptp(new.positions[places], axis=0).max() for places in _places(new).values()]
+    moved = [np.abs(there.positions[places] - new.positions[places]).max() for places in _places(new).values()]
+    return all(shift <= _MOST_MOVED * size for shift, size in zip(moved, sizes, strict=True))
 
 
 def _check_rounding(source: Source, positions: Points, places: Indices) -> float | None:

@@ -14,6 +14,9 @@ from pathlib import Path
 
 from jaxmark.errors import JaxmarkError
 
+#: Tells whether an existing file may stay, instead of a file with the given bytes.
+MayStay = Callable[[Path, bytes], bool]
+
 _PREFIX = ".jaxmark-"  # prefix of drafts, which are renamed to the file's name when they are complete
 
 
@@ -177,16 +180,25 @@ def write_atomically(path: str | os.PathLike, data: bytes, *, mode: int | None =
             raise
 
 
-def write_together(path: str | os.PathLike, data: bytes, beside: Mapping[str, bytes]) -> None:
+def holds(target: Path, content: bytes) -> bool:
+    """Whether a path is an ordinary file with the given bytes; files of another size are not read."""
+    return target.is_file() and target.stat().st_size == len(content) and target.read_bytes() == content
+
+
+def write_together(
+    path: str | os.PathLike, data: bytes, beside: Mapping[str, bytes], may_stay: MayStay = holds
+) -> None:
     """Write a file and other files that belong to it, all or none; the other files are written first.
 
     Args:
         path: the file to write.
         data: all of its bytes.
         beside: the other files' bytes, by path relative to the folder of the first. None of them replaces a file.
+        may_stay: tells whether a file that is there already may stay, instead of one with the given bytes; by default,
+            if it has these bytes.
 
     Raises:
-        JaxmarkError: if one of the others is there already, with other bytes, or would lie outside of the folder, such
+        JaxmarkError: if one of the others is there already, and may not stay, or would lie outside of the folder, such
             as beyond a symbolic link; see `write_atomically`.
     """
     written: list[Path] = []
@@ -201,7 +213,7 @@ def write_together(path: str | os.PathLike, data: bytes, beside: Mapping[str, by
                     target.parent.mkdir(parents=True, exist_ok=True)
                     written.append(target)
                     write_atomically(target, content)
-                elif not _holds(target, content):
+                elif not may_stay(target, content):
                     raise JaxmarkError(f"{target} is there already, and is another file; write into another folder.")
             write_atomically(path, data)
         except BaseException:
@@ -210,17 +222,16 @@ def write_together(path: str | os.PathLike, data: bytes, beside: Mapping[str, by
             raise
 
 
-def _holds(target: Path, content: bytes) -> bool:
-    """Whether a path is an ordinary file with the given bytes; files of another size are not read."""
-    return target.is_file() and target.stat().st_size == len(content) and target.read_bytes() == content
-
-
 @contextmanager
-def replacing(target: Path) -> Iterator[Path]:
+def replacing(target: Path, may_stay: MayStay = holds) -> Iterator[Path]:
     """Yield the path of a draft that replaces a file if the block succeeds, and is deleted if it fails.
 
     The draft has the file's name, in a temporary folder beside it; files that are written beside it there come along. A
     symbolic link is followed. Refusals of the draft name the file.
+
+    Args:
+        target: the file.
+        may_stay: see `write_together`.
 
     Raises:
         JaxmarkError: if the file's folder does not exist, or the target exists and is no ordinary file.
@@ -245,6 +256,6 @@ def replacing(target: Path) -> Iterator[Path]:
             if file.is_file() and file != draft
         }
         if others:
-            write_together(real, draft.read_bytes(), others)
+            write_together(real, draft.read_bytes(), others, may_stay)
         else:
             draft.replace(real)

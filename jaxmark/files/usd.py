@@ -142,7 +142,7 @@ class _Stretch(NamedTuple):
         return np.frombuffer(data, self.array.dtype, self.array.size, self.begin).reshape(-1, 3)
 
 
-def parse(data: bytes) -> Source:
+def parse(data: bytes) -> "_UsdSource":
     """Read the meshes of a layer, in text or binary, or of all layers of a USDZ archive.
 
     Points are those that the layer itself states, local to the mesh: transformations are not applied, and instances
@@ -227,7 +227,7 @@ def _source(
     outside: Sequence[str],
     assets: Sequence[str],
     unpacker: Unpacker,
-) -> Source:
+) -> "_UsdSource":
     """Make the source of the meshes that can be marked; refused if there are none."""
     skipped = {mesh.name: reason for mesh in found if (reason := mesh.defect())}
     meshes = [mesh for mesh in found if mesh.name not in skipped]
