@@ -58,7 +58,7 @@ ROWS = Limit("rows that are read one by one", 2**19, 0.2)
 #: Meshes, or objects, that are read one by one.
 MESHES = Limit("meshes", 2**14, 0)
 #: Layers of a USDZ file.
-LAYERS = Limit("layers", 2**10, 0)
+LAYERS = Limit("layers", 2**8, 0)
 #: Points that a mesh needs to be read for a blind mark. Such marks have no anchors on coarser meshes.
 BLIND_POINTS = 100
 #: Meshes of a file that are read for a blind mark unless they are named, the largest ones. Each may take half a minute.

@@ -64,12 +64,15 @@ class _Mesh(NamedTuple):
     def defect(self) -> str:
         """Return the reason why the mesh cannot be marked; empty if it can."""
         points, sizes, indices = (self.arrays.get(name) for name in ("points", "faceVertexCounts", "faceVertexIndices"))
-        if points is None or not points.size:
-            return "its points are in another layer, which is left alone"
-        if not _has_rows(points, 3):
+        elsewhere = not self.stated["alone"]
+        if "points" in self.stated["unread"] or (points is not None and points.size and not _has_rows(points, 3)):
             return "its points are no triples of floating-point numbers"
+        if points is None or not points.size:
+            return "its points are in another layer, which is left alone" if elsewhere else "it has no points"
+        if {"faceVertexCounts", "faceVertexIndices"} & {*self.stated["unread"]}:
+            return "its faces are no integers"
         if sizes is None or indices is None or not len(sizes):
-            return "it has no faces, or they are in another layer"
+            return "it has no faces" + ", or they are in another layer" * elsewhere
         if sizes.ndim != 1 or indices.ndim != 1 or sizes.dtype.kind == "f" or indices.dtype.kind == "f":
             return "its faces are no integers"
         if sizes.min() < 3:
@@ -180,7 +183,7 @@ def parse(data: bytes) -> "_UsdSource":
             arrays[int(index)][kind] = array
         prefix = layer.member if number else ""
         found += [
-            _Mesh(prefix + stated["path"], number, stated, mine)
+            _Mesh(prefix + stated["path"], number, stated | {"alone": report["alone"]}, mine)
             for stated, mine in zip(report["meshes"], arrays, strict=True)
         ]
         outside |= dict.fromkeys(path for path in report["layers"] if not _is_member(archive, layer.member, path))
