@@ -57,7 +57,7 @@ from jaxmark.app.process import end_by_exception
 from jaxmark.app.progress import current
 from jaxmark.app.read_files import FileReader
 from jaxmark.app.serving import serve_command
-from jaxmark.errors import JaxmarkError, require
+from jaxmark.errors import AlignmentError, JaxmarkError, require
 from jaxmark.evaluation.cells import left_over
 from jaxmark.evaluation.pictures import Measure
 from jaxmark.evaluation.study import load_study
@@ -278,7 +278,8 @@ def detect_command(
     If SUSPECT is a folder, one line is printed per file. --original and --record may then be folders, with files of
     the same names.
 
-    Exit status 0 if the false-positive probability is at most --alpha, 1 if it is larger, 2 if SUSPECT is refused, 3 if
+    Exit status 0 if the false-positive probability is at most --alpha, 1 if it is larger or SUSPECT cannot be aligned
+    with the original, 2 if SUSPECT is refused, 3 if
     it is at most --alpha but only an estimate, which proves nothing, for example because the original was edited. For a
     folder, 0 if it is 0 for all files; otherwise 2, 1 or 3, the first of these that any file has.
     """
@@ -371,7 +372,13 @@ def identify_command(
     current().doing(f"reading {suspect} and {original}")
     meshes = load_mesh(suspect), load_mesh(original)
     current().doing(f"testing the copies of {len(names)} recipients in {suspect}")
-    ranking = identify(meshes[0], names, original=meshes[1], key=key, record=record, top=top, align=align)
+    nobody = f"none of {len(names)} recipients is accused"
+    try:
+        ranking = identify(meshes[0], names, original=meshes[1], key=key, record=record, top=top, align=align)
+    except AlignmentError as error:
+        values = {"accused": [], "estimates": [], "ranking": [], "recipients": len(names), "notes": [str(error)]}
+        answer(as_json, values, f"{nobody}: {error}")
+        sys.exit(Status.NOTHING)
     likely = [entry for entry in ranking if entry.log10_p <= math.log10(alpha)]
     accused = [entry.recipient for entry in likely if not entry.caveats]
     values = {
@@ -388,7 +395,7 @@ def identify_command(
         f"{'' if record is None else ', record'} and the list of recipients were fixed before the suspect existed"
         for entry in likely
     ]
-    answer(as_json, values, *(lines or [f"none of {len(names)} recipients is accused (--alpha {alpha:g})"]))
+    answer(as_json, values, *(lines or [f"{nobody} (--alpha {alpha:g})"]))
     sys.exit(Status.of(bool(accused), bool(likely)))
 
 
