@@ -76,7 +76,8 @@ class FileReader:
         try:
             return self._read(suspect, original, record, report, dossier)
         except AlignmentError as error:
-            values = {"detected": False, "estimate": False, "message": None, "notes": [str(error)]}
+            values = {"detected": False, "estimate": False, "message": None, "log10_p": 0.0, "log10_p_uncommitted": 0.0}
+            values["notes"] = [str(error)]
             return FileOutcome(values, (f"{VERDICTS[Status.NOTHING]}: {error}",), Status.NOTHING)
 
     def _read(
