@@ -13,6 +13,14 @@ class JaxmarkError(ValueError):
     """
 
 
+class AlignmentError(JaxmarkError):
+    """The error for a suspect that cannot be aligned with the original, such as any mesh of another shape.
+
+    The suspect can be read, but nothing is detected in it. On the command line, `detect` and `identify` end with exit
+    status 1.
+    """
+
+
 def require(module: str, extra: str) -> ModuleType:
     """Import an optional dependency.
 

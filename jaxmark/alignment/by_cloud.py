@@ -12,7 +12,7 @@ from jaxmark.alignment.original import Original
 from jaxmark.alignment.registration import SETTINGS, refine, register_part, register_whole
 from jaxmark.alignment.result import Align, Alignment, file_pose, rms
 from jaxmark.alignment.suspect import PreparedSuspect
-from jaxmark.errors import JaxmarkError
+from jaxmark.errors import AlignmentError
 from jaxmark.geometry.clouds import Cloud
 from jaxmark.geometry.mesh import used_vertices
 from jaxmark.geometry.pose import Pose
@@ -57,7 +57,7 @@ def align_cloud(original: Original, suspect: PreparedSuspect, align: Align, refl
     if fitting:
         return min(fitting, key=lambda result: result.residual)
     distance = f" (at best at a distance of {100 * least:.2g} % of the diagonal)" if least < np.inf else ""
-    raise JaxmarkError(
+    raise AlignmentError(
         f"The suspect could not be aligned: in no pose are its points near the original's{distance}. Move it into the"
         " original's pose and cut off the parts that do not belong to it."
     )

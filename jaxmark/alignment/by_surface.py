@@ -13,7 +13,7 @@ from jaxmark.alignment.registration import refine, register_part, register_whole
 from jaxmark.alignment.replay import replay_smoothing
 from jaxmark.alignment.result import Alignment, file_pose, rms
 from jaxmark.alignment.suspect import PreparedSuspect
-from jaxmark.errors import JaxmarkError, available
+from jaxmark.errors import AlignmentError, available
 from jaxmark.geometry.mesh import (
     Mesh,
     area,
@@ -41,7 +41,7 @@ def align_surfaces(
     """Align a suspect's surface: as the whole original; with `in_parts` else as a part, else one component at a time.
 
     Raises:
-        JaxmarkError: if no pose brings the suspect's surface near the original's.
+        AlignmentError: if no pose brings the suspect's surface near the original's.
     """
     surface = Surface(Mesh(original.positions, original.points.faces))
     whole = Surface(suspect.welded)
@@ -63,7 +63,7 @@ def align_surfaces(
         size, coverage = result.residual, result.coverage(original)
         if coverage >= _ROUGH_COVERAGE and size <= _ROUGH_DISTANCE:
             return result
-    raise JaxmarkError(
+    raise AlignmentError(
         "The suspect could not be aligned: "
         + (
             f"the distance of its surface from the original's is {100 * size:.2g} % of the diagonal, with a coverage of"

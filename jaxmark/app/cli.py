@@ -57,11 +57,11 @@ from jaxmark.app.process import end_by_exception
 from jaxmark.app.progress import current
 from jaxmark.app.read_files import FileReader
 from jaxmark.app.serving import serve_command
-from jaxmark.errors import JaxmarkError, require
+from jaxmark.errors import AlignmentError, JaxmarkError, require
 from jaxmark.evaluation.cells import left_over
 from jaxmark.evaluation.pictures import Measure
 from jaxmark.evaluation.study import load_study
-from jaxmark.files import load_mesh, load_scene, load_skin, save_mesh, save_scene
+from jaxmark.files import load_mesh, load_scene, load_skin, may_stay, save_mesh, save_scene
 from jaxmark.files.atomic import replacing, write_atomically
 from jaxmark.files.pair import writing_pair
 from jaxmark.geometry import unpose
@@ -291,7 +291,8 @@ def detect_command(
     If SUSPECT is a folder, one line is printed per file. --original and --record may then be folders, with files of
     the same names.
 
-    Exit status 0 if the false-positive probability is at most --alpha, 1 if it is larger, 2 if SUSPECT is refused, 3 if
+    Exit status 0 if the false-positive probability is at most --alpha, 1 if it is larger or SUSPECT cannot be aligned
+    with the original, 2 if SUSPECT is refused, 3 if
     it is at most --alpha but only an estimate, which proves nothing, for example because the original was edited. For a
     folder, 0 if it is 0 for all files; otherwise 2, 1 or 3, the first of these that any file has.
     """
@@ -384,7 +385,13 @@ def identify_command(
     current().doing(f"reading {suspect} and {original}")
     meshes = load_mesh(suspect), load_mesh(original)
     current().doing(f"testing the copies of {len(names)} recipients in {suspect}")
-    ranking = identify(meshes[0], names, original=meshes[1], key=key, record=record, top=top, align=align)
+    nobody = f"none of {len(names)} recipients is accused"
+    try:
+        ranking = identify(meshes[0], names, original=meshes[1], key=key, record=record, top=top, align=align)
+    except AlignmentError as error:
+        values = {"accused": [], "estimates": [], "ranking": [], "recipients": len(names), "notes": [str(error)]}
+        answer(as_json, values, f"{nobody}: {error}")
+        sys.exit(Status.NOTHING)
     likely = [entry for entry in ranking if entry.log10_p <= math.log10(alpha)]
     accused = [entry.recipient for entry in likely if not entry.caveats]
     values = {
@@ -401,7 +408,7 @@ def identify_command(
         f"{'' if record is None else ', record'} and the list of recipients were fixed before the suspect existed"
         for entry in likely
     ]
-    answer(as_json, values, *(lines or [f"none of {len(names)} recipients is accused (--alpha {alpha:g})"]))
+    answer(as_json, values, *(lines or [f"{nobody} (--alpha {alpha:g})"]))
     sys.exit(Status.of(bool(accused), bool(likely)))
 
 
@@ -469,7 +476,7 @@ def attack_command(source: Path, target: Path, words: tuple[str, ...], seed: int
     ):  # the objects of an OBJ file share one coordinate system, and are attacked as one mesh
         return _attack_scene(source, target, steps, seed, as_json)
     mesh = load_mesh(source)
-    with replacing(target) as draft:
+    with replacing(target, may_stay) as draft:
         attacked = chain(mesh, steps, seed=seed)
         same = same_connectivity(mesh, attacked)
         save_mesh(attacked, draft, like=source if same else None)
@@ -495,7 +502,7 @@ def _attack_scene(source: Path, target: Path, steps: list[tuple[str, float]], se
                 f"{_steps_text(steps)} changes faces, which is not possible in a file of several meshes; save each"
                 " mesh in a file of its own."
             )
-    with replacing(target) as draft:
+    with replacing(target, may_stay) as draft:
         save_scene(attacked, draft, like=source)
         after = load_scene(draft).meshes
     sizes = {name: distortion.displacement_size(mesh, after[name])._asdict() for name, mesh in meshes.items()}

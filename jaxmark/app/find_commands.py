@@ -15,7 +15,7 @@ from jaxmark.app.folders import begin_worker
 from jaxmark.app.options import ALIGN, FILE, JSON, KEYS, QUIET, read_key
 from jaxmark.app.output import ESTIMATE, Status, answer, message_text, power, say
 from jaxmark.app.progress import current
-from jaxmark.catalogue import Catalogue, Finder, Match, Plan, Verdict, find_each, mesh_files_below
+from jaxmark.catalogue import Catalogue, Finder, LeftOut, Match, Plan, Verdict, find_each, mesh_files_below
 from jaxmark.errors import JaxmarkError, require
 from jaxmark.evaluation.cells import Pool, processes
 from jaxmark.files.programs import release_programs
@@ -139,6 +139,8 @@ def _line(row: Mapping[str, Any]) -> str:
         return f"{ESTIMATE}: no original is named: {'; '.join(row['caveats'])}"
     refused = sum(match["refused"] is not None for match in row["matches"])
     refusals = f"; {refused} readings refused" if refused else ""
+    unsearched = sum(pieces["number"] for pieces in row.get("left_out", ()))
+    refusals += f"; {unsearched} pieces not searched" if unsearched else ""
     if not row["named"]:
         return f"no original is named{refusals}"
     content = row["recipient"] or row["message"] or "a mark"
@@ -209,15 +211,24 @@ def describe(verdict: Verdict, alpha: float) -> tuple[str, ...]:
     refusals = list(refused)[:_MOST_REFUSED]
     if len(refused) > _MOST_REFUSED:
         refusals.append(f"{len(refused) - _MOST_REFUSED} more could not be read, see --json")
+    refusals += map(_left_out, verdict.left_out)
     if verdict.named or verdict.estimates:
         return (*map(_likely, verdict.named + verdict.estimates), *refusals)
     read = [match for match in verdict.matches if match.refused is None]
+    if not verdict.readings:
+        return ("no original is named: no mesh of the suspect is large enough to be searched", *refusals)
     text = f"no original is named: none of {verdict.readings} readings detects a mark (--alpha {alpha:g})"
     if read:
         bound = "about" if read[0].caveats else "at most"
         text += f"; most similar to {_place(read[0])}, probability {bound} {power(read[0].log10_p)}"
         text += "".join(f". {note}" for note in read[0].notes)
     return text + _caveats(read), *refusals
+
+
+def _left_out(pieces: LeftOut) -> str:
+    """Describe pieces of a suspect that were not searched."""
+    more = ", …" if pieces.number > len(pieces.names) else ""
+    return f"not searched: {pieces.number} pieces ({', '.join(map(repr, pieces.names))}{more}): {pieces.reason}"
 
 
 def _refused(match: Match) -> str:

@@ -11,9 +11,9 @@ from jaxmark.alignment.original import Original, shift_of
 from jaxmark.app.output import FileOutcome, payload_text, survival_text
 from jaxmark.app.progress import Doing, quietly
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import Scene, load_mesh, load_scene, load_texture, number_check, save_mesh, save_scene
+from jaxmark.files import Scene, load_mesh, load_scene, load_texture, may_stay, number_check, save_mesh, save_scene
 from jaxmark.files.atomic import write_atomically
-from jaxmark.files.pair import refuse_existing, writing_pair
+from jaxmark.files.pair import refuse_existing_pair, writing_pair
 from jaxmark.files.programs import release_programs
 from jaxmark.files.source import concerning
 from jaxmark.files.typed import find_name
@@ -90,7 +90,7 @@ def mark_file(
     """
     if (message is None) == (recipient is None):
         raise JaxmarkError("Give --message, --presence or --recipient, one of them.")
-    refuse_existing(marked, record, overwrite=overwrite)
+    refuse_existing_pair(marked, record, overwrite=overwrite, original=original)
     doing(f"reading {original}")
     scene = pick(load_scene(original), meshes, original)
     if len(scene.meshes) + len(scene.skipped) > 1:
@@ -127,7 +127,8 @@ def mark_file(
         result, info = tracer.fingerprint(name, budget)
         prepared, payload = tracer.mark.original, f"fingerprint of {recipient}"
         read_back, check = partial(tracer.finds, recipient=name), None
-    with info.explained(), writing_pair(marked, record, overwrite=overwrite) as pair:
+    writing = writing_pair(marked, record, overwrite=overwrite, original=original, may_stay=may_stay)
+    with info.explained(), writing as pair:
         doing(f"writing {marked}, and measuring the noise that the mark survives")
         notes = (*info.notes, *save_mesh(result, pair.file, like=original))
         # The mark must be readable from the written file, whose numbers are rounded.
@@ -203,7 +204,7 @@ def _mark_scene(
     except JaxmarkError as error:
         raise JaxmarkError("; ".join([str(error).rstrip("."), *_unchanged(scene.skipped)]) + ".") from error
     survives: dict[str, Survival] = {}
-    with writing_pair(marked, record, overwrite=overwrite) as pair:
+    with writing_pair(marked, record, overwrite=overwrite, original=original, may_stay=may_stay) as pair:
         doing(f"writing {marked}, and reading it back")
         notes = save_scene(meshes, pair.file, like=original)
         # The marks must be readable from the written file, whose numbers are rounded.

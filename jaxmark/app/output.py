@@ -128,7 +128,8 @@ def detection_status(detection: Detection, alpha: float) -> Status:
     return Status.of(detection.detected(alpha), detection.detected(alpha, allow_estimate=True))
 
 
-_VERDICTS = {Status.DONE: "detected", Status.ESTIMATE: ESTIMATE, Status.NOTHING: "nothing detected"}
+#: The first words of the text of a detection.
+VERDICTS = {Status.DONE: "detected", Status.ESTIMATE: ESTIMATE, Status.NOTHING: "nothing detected"}
 
 
 def detection_lines(
@@ -144,7 +145,7 @@ def detection_lines(
     """
     evidence = detection.evidence
     read = f"message {message_text(detection.message)}" if detection.message is not None else "no message could be read"
-    text = f"{_VERDICTS[detection_status(detection, alpha)]}: {read}; "
+    text = f"{VERDICTS[detection_status(detection, alpha)]}: {read}; "
     if evidence.caveats:
         text += (
             f"false-positive probability about {power(detection.log10_p)}, an estimate: {'; '.join(evidence.caveats)}"

@@ -12,9 +12,9 @@ from jaxmark.alignment.result import Align
 from jaxmark.app.diagnosis import diagnose, is_original
 from jaxmark.app.dossier import Case, missing_proof, save_dossier, save_report
 from jaxmark.app.mark_files import pick
-from jaxmark.app.output import FileOutcome, Status, detection_lines, detection_status, detection_values
+from jaxmark.app.output import VERDICTS, FileOutcome, Status, detection_lines, detection_status, detection_values
 from jaxmark.app.progress import Doing, quietly
-from jaxmark.errors import JaxmarkError
+from jaxmark.errors import AlignmentError, JaxmarkError
 from jaxmark.files import Scene, limits, load_mesh, load_scene, load_skin
 from jaxmark.files.programs import release_programs
 from jaxmark.files.typed import find_name
@@ -68,9 +68,25 @@ class FileReader:
 
         Returns:
             The outcome; if a dossier is requested and the detection proves nothing, it says so, and nothing is written.
+            If the suspect cannot be aligned with the original, nothing is detected.
 
         Raises:
             JaxmarkError: see `detect`; also if the commitment does not contain the record.
+        """
+        try:
+            return self._read(suspect, original, record, report, dossier)
+        except AlignmentError as error:
+            values = {"detected": False, "estimate": False, "message": None, "log10_p": 0.0, "log10_p_uncommitted": 0.0}
+            values["notes"] = [str(error)]
+            return FileOutcome(values, (f"{VERDICTS[Status.NOTHING]}: {error}",), Status.NOTHING)
+
+    def _read(
+        self, suspect: Path, original: Path | None, record: Path | None, report: Path | None, dossier: Path | None
+    ) -> FileOutcome:
+        """Read one file, see `read`.
+
+        Raises:
+            AlignmentError: if the suspect cannot be aligned with the original.
         """
         loaded = None if record is None else load_record(record)
         if original is None:

@@ -14,6 +14,7 @@ from jaxmark.catalogue.exchange import import_catalogue as import_catalogue
 from jaxmark.catalogue.identification import Finder as Finder
 from jaxmark.catalogue.identification import Match as Match
 from jaxmark.catalogue.identification import Verdict as Verdict
+from jaxmark.catalogue.pieces import LeftOut as LeftOut
 from jaxmark.catalogue.stream import Done as Done
 from jaxmark.catalogue.stream import Plan as Plan
 from jaxmark.catalogue.stream import count as count

@@ -7,8 +7,9 @@ significance budget nevertheless covers every original of the catalogue, with ev
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar, get_args, runtime_checkable
 
@@ -21,11 +22,11 @@ from jaxmark.catalogue.database import Database
 from jaxmark.catalogue.landmarks import landmarks
 from jaxmark.catalogue.originals import meshes_of
 from jaxmark.catalogue.partial_registration import Part, fit_whole
+from jaxmark.catalogue.pieces import LeftOut, Piece, split
 from jaxmark.catalogue.retrieval import Index, Near, state_of
 from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import file_hash
-from jaxmark.geometry.canonical import geometry_hash
-from jaxmark.geometry.mesh import Mesh, area, compact, components, weld, weld_mesh
+from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.pose import Points, Pose
 from jaxmark.watermark.coding.keys import Key, commitment
 from jaxmark.watermark.everyday import alternatives
@@ -40,12 +41,15 @@ _ALIKE = 100  # originals to which a whole shape is fitted
 _LIKELY = 2000  # originals that are retrieved as candidates for a part
 _REFERENCES = 6  # candidates of different shapes by which the poses of a part are found
 _KIN = 200  # originals similar to a reference to which a part is fitted
-_DEEP_PIECES = 3  # pieces of a suspect that are compared with DEPTH originals; other pieces are compared with one
+_DEEP_PIECES = 1  # pieces of a suspect that are compared with DEPTH originals; other pieces are compared with one
+_WAYS = 3  # ways of retrieval
+# Comparisons in vain after which a search ends, in addition to those of one piece by all ways. Each takes seconds.
+_FURTHER_COMPARISONS = 4
+_ENDED = (
+    "the search by shape ended after {} comparisons that show no mark, with the pieces that are most similar to an"
+    " original; to search one of them, save it as a file of its own"
+)
 _WHOLE = 0.95  # coverage from which on a piece counts as a whole original
-_MOST_PIECES = 32  # most pieces of a suspect, the largest ones
-_MOST_COMPONENTS = 8  # most components of a mesh
-_LEAST_SHARE = 0.02  # least area of a component, as a fraction of the mesh's area
-_LEAST_FACES = 50  # least number of faces of a component, or of one of several meshes
 _NEAR = 0.01  # largest distance of a piece from an original, over its size, if the original explains the piece
 
 
@@ -87,6 +91,7 @@ class Verdict(NamedTuple):
     suspect: str  # SHA-256 of its file, hexadecimal; empty for a mesh without a file
     matches: tuple[Match, ...]  # all comparisons and all refusals, the likeliest first
     readings: int  # number of readings that could have been made, by which all probabilities are corrected
+    left_out: tuple[LeftOut, ...] = ()  # pieces that were not searched
 
     @property
     def named(self) -> tuple[Match, ...]:
@@ -122,17 +127,10 @@ class Verdict(NamedTuple):
             "log10_p_uncommitted": likeliest.log10_p_uncommitted if likeliest else 0.0,
             "caveats": likeliest.caveats if likeliest else (),
             "readings": self.readings,
+            "left_out": [pieces._asdict() for pieces in self.left_out],
             "suspect_sha256": self.suspect or None,
             "matches": [match._asdict() | {"charges": ledger.charges_as_json(match.charges)} for match in self.matches],
         }
-
-
-class Piece(NamedTuple):
-    """A mesh that may be a copy of an original, or of a part of one."""
-
-    name: str  # name of the mesh in the suspect's file, and number of its component
-    mesh: Mesh
-    within: str  # name of the piece that it is a component of; empty if it is a whole mesh
 
 
 class _Comparison(NamedTuple):
@@ -156,6 +154,27 @@ class _Comparison(NamedTuple):
     def refused(self, reason: JaxmarkError | str, **fields: Any) -> "_Comparison":
         """Return the comparison without a result, for a reason."""
         return self._replace(match=self.match._replace(refused=str(reason), **fields))
+
+
+@dataclass
+class _Search:
+    """The search for the originals of one piece."""
+
+    piece: Piece
+    compared: set[int] = field(default_factory=set)  # numbers of originals
+    is_over: bool = False  # whether an original is named, or the pose of another piece explains this one
+    is_whole: bool = False  # whether the piece covers a whole original, so that it is not compared as a part
+    is_cut: bool = False  # whether comparisons were left out
+
+
+@dataclass
+class _Progress:
+    """The state of the search for the originals of all pieces of a suspect."""
+
+    searches: list[_Search]
+    readings: int
+    comparisons: int  # number of comparisons in vain after which the search ends
+    matches: list[Match] = field(default_factory=list)
 
 
 class _Stored(NamedTuple):
@@ -248,20 +267,16 @@ class Finder(Generic[AnyOriginals]):
         """
         meshes = {"": suspect} if isinstance(suspect, Mesh) else meshes_of(suspect).meshes
         digest = "" if isinstance(suspect, Mesh) else file_hash(suspect)
-        pieces = split(meshes)
-        readings = len(pieces) * self._readings()
-        matches: list[Match] = []
-        explained: set[str] = set()
-        for number, piece in enumerate(pieces):
-            if piece.name in explained:
-                continue
-            for pair in self._compare(piece, self.depth if number < _DEEP_PIECES else 1, readings):
-                matches.append(pair.match)
-                if pair.match.named and pair.pose is not None:
-                    inside = [part for part in pieces if part.within == piece.name]
-                    explained |= {part.name for part in inside if _is_explained(part.mesh, pair.pose, pair.original)}
-                    break
-        return Verdict(digest, tuple(sorted(matches, key=lambda match: match.order)), readings)
+        pieces, left_out = split(meshes)
+        # A file of many pieces that resemble no original must not cost much more than a file of one such piece.
+        most_in_vain = _WAYS * self.depth + _FURTHER_COMPARISONS
+        progress = _Progress([_Search(piece) for piece in pieces], len(pieces) * self._readings(), most_in_vain)
+        self._search_by_connectivity(progress)
+        self._search_by_shape(progress)
+        cut = [search.piece for search in progress.searches if search.is_cut and not search.is_over]
+        left_out += LeftOut.of(cut, _ENDED.format(most_in_vain))
+        matches = sorted(progress.matches, key=lambda match: match.order)
+        return Verdict(digest, tuple(matches), progress.readings, left_out)
 
     def _readings(self) -> int:
         """Count all possible readings of a piece, each of which could have named an original."""
@@ -331,22 +346,62 @@ class Finder(Generic[AnyOriginals]):
             )
         return np.frombuffer(row["points"], "<f2").astype(np.float64).reshape(-1, 3)
 
-    def _compare(self, piece: Piece, depth: int, readings: int) -> Iterator[_Comparison]:
-        """Compare a piece with similar originals; once it covers a whole original, it is not compared as a part."""
-        compared: set[int] = set()
-        is_whole = False
-        for by, look in (("landmarks", self.meshed_alike), ("whole", self.wholes), ("part", self.parts)):
-            for number, near in enumerate([] if is_whole else look(piece.mesh, depth), 1):
-                query = "SELECT o.path, s.name FROM shapes s JOIN originals o ON o.id = s.original WHERE s.id = ?"
-                rows = self.catalogue.database.rows(query, near.shape)
-                if near.shape in compared or not rows:  # the original may have been removed meanwhile
-                    continue
-                compared.add(near.shape)
-                match = Match(rows[0]["path"], rows[0]["name"], piece.name, by, number, near.distance)
-                comparison = _Comparison(match, piece.mesh, piece.mesh, readings)
-                for reading in self._best(comparison, near.shape):
-                    is_whole |= reading.match.coverage >= _WHOLE
-                    yield reading
+    def _search_by_connectivity(self, progress: _Progress) -> None:
+        """Compare pieces with originals of the same connectivity, meshes first, and among these the best fits first."""
+        alike = [(search, self.meshed_alike(search.piece.mesh, self.depth)) for search in progress.searches]
+        alike = [(search, nearest) for search, nearest in alike if nearest]
+        alike.sort(key=lambda pair: (bool(pair[0].piece.within), pair[1][0].distance))
+        for number, (search, nearest) in enumerate(alike):
+            self._compare(progress, search, "landmarks", nearest[: self._depth(number)])
+
+    def _search_by_shape(self, progress: _Progress) -> None:
+        """Compare pieces with similar originals, and with those that they may be parts of, the likeliest pieces first.
+
+        This finds remeshed copies, but takes much longer than by connectivity.
+        """
+        searches = [search for search in progress.searches if not search.is_over and not search.is_whole]
+        searches.sort(key=lambda search: self._unlikeness(search.piece.mesh))
+        for number, search in enumerate(searches):
+            for by, look in (("whole", self.wholes), ("part", self.parts)):
+                search.is_cut |= progress.comparisons <= 0
+                if not (search.is_over or search.is_whole or search.is_cut):
+                    progress.comparisons -= by == "part"  # to find the poses of a part takes as long as a comparison
+                    self._compare(progress, search, by, look(search.piece.mesh, self._depth(number)))
+
+    def _depth(self, number: int) -> int:
+        """Return the number of originals that a piece is compared with, by its place among the likeliest pieces."""
+        return self.depth if number < _DEEP_PIECES else 1
+
+    def _unlikeness(self, piece: Mesh) -> float:
+        """Return the distance of a piece from the most similar original, by descriptors of whole shapes."""
+        points = descriptors.spread(piece)
+        return math.inf if points is None else self.index.by_whole(descriptors.whole(points), 1)[0].distance
+
+    def _compare(self, progress: _Progress, search: _Search, by: str, nearest: Sequence[Near]) -> None:
+        """Compare a piece with some originals, until one is named."""
+        piece = search.piece
+        for number, near in enumerate(nearest, 1):
+            query = "SELECT o.path, s.name FROM shapes s JOIN originals o ON o.id = s.original WHERE s.id = ?"
+            rows = self.catalogue.database.rows(query, near.shape)
+            if near.shape in search.compared or not rows:  # the original may have been removed meanwhile
+                continue
+            search.is_cut |= progress.comparisons <= 0
+            if search.is_over or search.is_cut:
+                return
+            search.compared.add(near.shape)
+            match = Match(rows[0]["path"], rows[0]["name"], piece.name, by, number, near.distance)
+            compared = self._best(_Comparison(match, piece.mesh, piece.mesh, progress.readings), near.shape)
+            progress.matches += [pair.match for pair in compared]
+            progress.comparisons -= _is_in_vain(compared)
+            search.is_whole |= any(pair.match.coverage >= _WHOLE for pair in compared)
+            for pair in compared:
+                if pair.match.named and pair.pose is not None:
+                    search.is_over = True
+                    for inside in progress.searches:
+                        if inside.piece.within == piece.name and _is_explained(
+                            inside.piece.mesh, pair.pose, pair.original
+                        ):
+                            inside.is_over = True
 
     def _best(self, pair: _Comparison, shape: int) -> list[_Comparison]:
         """Read a piece with an original in all ways; returns all refusals, and then the most significant reading.
@@ -467,39 +522,12 @@ class Finder(Generic[AnyOriginals]):
         return pair._replace(match=match, pose=aligned.pose)
 
 
-def split(meshes: Mapping[str, Mesh]) -> list[Piece]:
-    """Split a suspect into pieces: its distinct meshes, then the components of meshes with several large ones.
-
-    If there are several meshes, those with few faces are left out: they carry no mark, and there may be thousands of
-    them.
-    """
-    distinct: dict[bytes, Piece] = {}
-    for name, mesh in meshes.items():
-        distinct.setdefault(geometry_hash(mesh), Piece(name, mesh, ""))
-    readable = [piece for piece in distinct.values() if len(distinct) == 1 or _is_readable(piece.mesh)]
-    wholes = sorted(readable, key=lambda piece: -len(piece.mesh.faces))[:_MOST_PIECES]
-    pieces = [*wholes]
-    for piece in wholes:
-        parts = _components(piece.mesh)
-        if len(parts) > 1:
-            names = (f"{piece.name}#{number}".lstrip() for number in range(1, len(parts) + 1))
-            pieces += [Piece(name, part, piece.name) for name, part in zip(names, parts, strict=True)]
-    return pieces[:_MOST_PIECES]
-
-
-def _is_readable(mesh: Mesh) -> bool:
-    """Whether a mesh has enough faces, or is a point cloud."""
-    return not len(mesh.faces) or len(mesh.faces) >= _LEAST_FACES
-
-
-def _components(mesh: Mesh) -> list[Mesh]:
-    """Return the largest components of a surface; small components are left out."""
-    if not len(mesh.faces):
-        return []
-    welded = weld_mesh(mesh, weld(mesh.vertices))
-    least = _LEAST_SHARE * area(welded)
-    parts = components(welded)[:_MOST_COMPONENTS]
-    return [compact(part) for part in parts if len(part.faces) >= _LEAST_FACES and area(part) >= least]
+def _is_in_vain(compared: Sequence[_Comparison]) -> bool:
+    """Whether a comparison shows no mark, although it took long: the piece was not aligned by its connectivity."""
+    matches = [pair.match for pair in compared]
+    if any(match.named or match.estimate for match in matches):
+        return False
+    return any(match.by != "landmarks" for match in matches) or all(match.refused is not None for match in matches)
 
 
 def _is_explained(piece: Mesh, pose: Pose, original: Mesh) -> bool:

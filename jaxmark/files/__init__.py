@@ -6,7 +6,6 @@ A file is saved by patching the file that it was loaded from: all bytes except t
 import os
 import posixpath
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -14,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import obj, off, ply, point_cloud, splats, stl, threemf, usd
-from jaxmark.files.atomic import read_beside, read_file, write_atomically, write_together
+from jaxmark.files import limits, obj, off, ply, point_cloud, splats, stl, threemf, usd
+from jaxmark.files.atomic import holds, read_beside, read_file, write_atomically, write_together
 from jaxmark.files.gltf import asset
 from jaxmark.files.source import Indices, Source, Texture, concerning
 from jaxmark.geometry.mesh import Mesh, host_mesh, make_mesh
@@ -60,8 +59,9 @@ _ONLY = "mesh"  # name of the mesh in a file that has just one
 _IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".bmp", ".gif", ".svg", ".tga", ".tif", ".tiff", ".exr", ".hdr")
 _TEXTURES = (".ktx", ".ktx2", ".basis", ".dds", ".tx")
 _COMPANIONS = frozenset((*_IMAGES, *_TEXTURES, *_USD, ".bin", ".mtl", ".mtlx"))
-_MOST_COMPANION = 2**28  # bytes of one of them
+_MOST_COMPANION, _MOST_COMPANIONS = 2**28, 2**30  # bytes of one of them, and of all together
 _MOST_NOTED = 5
+_MOST_MOVED = 0.05  # largest displacement, over the extent of a mesh, of a layer that was marked
 
 
 class Scene(NamedTuple):
@@ -256,8 +256,9 @@ def _suffix(path: str | os.PathLike) -> str:
 def _parse(path: str | os.PathLike, data: bytes) -> Source:
     """Parse the bytes of a file; files of some formats refer to other files in the same folder."""
     suffix = _suffix(path)
-    beside = (read_beside(Path(path).parent),) if _FORMATS[suffix] is asset.parse else ()
-    return _FORMATS[suffix](data, *beside)
+    if _FORMATS[suffix] is not asset.parse:
+        return _FORMATS[suffix](data)
+    return asset.parse(data, read_beside(Path(path).parent, limits.BUFFERS.least, limits.BUFFERS.least))
 
 
 def _read(path: str | os.PathLike) -> Source:
@@ -298,15 +299,17 @@ def _save(source: Source, positions: np.ndarray, path: str | os.PathLike, like: 
     here, there = Path(like).parent, Path(path).parent
     left: tuple[str, ...] = ()
     if os.path.realpath(here) != os.path.realpath(there):
-        read = read_beside(here, _MOST_COMPANION)
+        read = read_beside(here, _MOST_COMPANION, _MOST_COMPANIONS)
         names = {posixpath.normpath(companion) for companion in patched.companions}
         for name in sorted(names):
             if not _may_come_along(name, Path(like)):
                 left += (f"the file {ascii(name)[:80]} that it refers to is not copied",)
                 continue
-            with suppress(JaxmarkError):  # a file that is missing already, or lies elsewhere, does not come along
-                beside[name] = read(name)
-    write_together(path, patched.file, beside)
+            try:
+                beside[name] = read(name, None)
+            except JaxmarkError as error:  # a file that is missing already does not come along
+                left += (f"{error}, and is not copied",) if (here / name).exists() else ()
+    write_together(path, patched.file, beside, may_stay)
     most = max((loss or 0.0 for loss in lost), default=0.0)
     noted = (f"rounding to the numbers of the file changes the displacement by {100 * most:.0f} %",)
     return patched.notes + left[:_MOST_NOTED] + noted * (most > _NOTED_LOSS)
@@ -320,6 +323,29 @@ def _may_come_along(name: str, like: Path) -> bool:
     suffix, target = Path(name).suffix.lower(), like.parent / name
     inside = not posixpath.isabs(name) and "\\" not in name and not name.startswith("..")
     return inside and suffix in _COMPANIONS and os.path.realpath(target) != os.path.realpath(like)
+
+
+def may_stay(target: Path, content: bytes) -> bool:
+    """Whether an existing file may stay where a companion with the given bytes would come.
+
+    It may if it has these bytes, or if it is the same USD layer with points that moved a little: most likely this layer
+    was marked before the file that refers to it.
+    """
+    if holds(target, content):
+        return True
+    if not target.is_file() or target.suffix.lower() not in _USD:
+        return False
+    try:
+        there, new = usd.parse(read_file(target, _MOST_COMPANION)), usd.parse(content)
+    except (OSError, JaxmarkError):
+        return False
+    if [mesh.name for mesh in there.meshes] != [mesh.name for mesh in new.meshes]:
+        return False
+    if len(there.positions) != len(new.positions) or not np.array_equal(there.faces, new.faces):
+        return False
+    sizes = [np.ptp(new.positions[places], axis=0).max() for places in _places(new).values()]
+    moved = [np.abs(there.positions[places] - new.positions[places]).max() for places in _places(new).values()]
+    return all(shift <= _MOST_MOVED * size for shift, size in zip(moved, sizes, strict=True))
 
 
 def _check_rounding(source: Source, positions: Points, places: Indices) -> float | None:

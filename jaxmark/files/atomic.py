@@ -14,15 +14,19 @@ from pathlib import Path
 
 from jaxmark.errors import JaxmarkError
 
+#: Tells whether an existing file may stay, instead of a file with the given bytes.
+MayStay = Callable[[Path, bytes], bool]
+
 _PREFIX = ".jaxmark-"  # prefix of drafts, which are renamed to the file's name when they are complete
 
 
-def read_file(path: str | os.PathLike, most: int | None = None) -> bytes:
-    """Read all bytes of an ordinary file; a device or a pipe, which may never end, is refused.
+def read_file(path: str | os.PathLike, most: int | None = None, count: int | None = None) -> bytes:
+    """Read the bytes of an ordinary file; a device or a pipe, which may never end, is refused.
 
     Args:
         path: the file; symbolic links are followed.
         most: the largest number of bytes that make sense.
+        count: number of bytes to read, from the first one; by default all.
 
     Raises:
         OSError: if it cannot be read, is no ordinary file, or is larger than that.
@@ -34,9 +38,10 @@ def read_file(path: str | os.PathLike, most: int | None = None) -> bytes:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
     if not target.is_file():
         raise OSError(errno.EINVAL, "it is no ordinary file; write its content to one", os.fspath(path))
-    if most is not None and size > most:
+    if most is not None and (size if count is None else min(size, count)) > most:
         raise OSError(errno.EFBIG, f"it has {size} bytes, more than {most}", os.fspath(path))
-    return target.read_bytes()
+    with target.open("rb") as file:
+        return file.read(-1 if count is None else count)
 
 
 def file_hash(path: str | os.PathLike[str]) -> str:
@@ -54,23 +59,33 @@ def file_hash(path: str | os.PathLike[str]) -> str:
         raise JaxmarkError(f"Cannot read {path}: {error.strerror or error}.") from None
 
 
-def read_beside(folder: Path, most: int | None = None) -> Callable[[str], bytes]:
+def read_beside(folder: Path, most: int, most_together: int) -> Callable[[str, int | None], bytes]:
     """Make a function that reads files by their paths relative to a folder, and none outside of it or beyond a size.
 
-    A file is read once: the function returns the same object for all paths of it.
-    The function raises a `JaxmarkError`, half a sentence, for a file that cannot be read.
+    The function takes a path, and the number of bytes that are needed, or None for all. It returns no more than these,
+    unless it has read more of the file before: it returns the same object for all paths of a file.
+    It raises a `JaxmarkError`, half a sentence, for a file that cannot be read.
+
+    Args:
+        folder: the folder.
+        most: largest number of bytes that are read of a file.
+        most_together: largest number of bytes that are read of all files.
     """
     contents: dict[tuple[int, int], bytes] = {}
+    left = most_together
 
-    def read(path: str) -> bytes:
+    def read(path: str, count: int | None) -> bytes:
+        nonlocal left
         try:
             target = _inside(folder, path)
             if target is None:
                 raise JaxmarkError(f"the file {ascii(path)[:80]} that it refers to is outside of its folder")
             status = target.stat()
             file = status.st_dev, status.st_ino
-            if file not in contents:
-                contents[file] = read_file(target, most)
+            needed = status.st_size if count is None else min(count, status.st_size)
+            if file not in contents or len(contents[file]) < needed:
+                contents[file] = read_file(target, min(most, left), count)
+                left -= len(contents[file])
             return contents[file]
         except (OSError, ValueError) as error:
             said = getattr(error, "strerror", None) or str(error)
@@ -165,16 +180,25 @@ def write_atomically(path: str | os.PathLike, data: bytes, *, mode: int | None =
             raise
 
 
-def write_together(path: str | os.PathLike, data: bytes, beside: Mapping[str, bytes]) -> None:
+def holds(target: Path, content: bytes) -> bool:
+    """Whether a path is an ordinary file with the given bytes; files of another size are not read."""
+    return target.is_file() and target.stat().st_size == len(content) and target.read_bytes() == content
+
+
+def write_together(
+    path: str | os.PathLike, data: bytes, beside: Mapping[str, bytes], may_stay: MayStay = holds
+) -> None:
     """Write a file and other files that belong to it, all or none; the other files are written first.
 
     Args:
         path: the file to write.
         data: all of its bytes.
         beside: the other files' bytes, by path relative to the folder of the first. None of them replaces a file.
+        may_stay: tells whether a file that is there already may stay, instead of one with the given bytes; by default,
+            if it has these bytes.
 
     Raises:
-        JaxmarkError: if one of the others is there already, with other bytes, or would lie outside of the folder, such
+        JaxmarkError: if one of the others is there already, and may not stay, or would lie outside of the folder, such
             as beyond a symbolic link; see `write_atomically`.
     """
     written: list[Path] = []
@@ -189,7 +213,7 @@ def write_together(path: str | os.PathLike, data: bytes, beside: Mapping[str, by
                     target.parent.mkdir(parents=True, exist_ok=True)
                     written.append(target)
                     write_atomically(target, content)
-                elif not target.is_file() or target.read_bytes() != content:
+                elif not may_stay(target, content):
                     raise JaxmarkError(f"{target} is there already, and is another file; write into another folder.")
             write_atomically(path, data)
         except BaseException:
@@ -199,11 +223,15 @@ def write_together(path: str | os.PathLike, data: bytes, beside: Mapping[str, by
 
 
 @contextmanager
-def replacing(target: Path) -> Iterator[Path]:
+def replacing(target: Path, may_stay: MayStay = holds) -> Iterator[Path]:
     """Yield the path of a draft that replaces a file if the block succeeds, and is deleted if it fails.
 
     The draft has the file's name, in a temporary folder beside it; files that are written beside it there come along. A
     symbolic link is followed. Refusals of the draft name the file.
+
+    Args:
+        target: the file.
+        may_stay: see `write_together`.
 
     Raises:
         JaxmarkError: if the file's folder does not exist, or the target exists and is no ordinary file.
@@ -228,6 +256,6 @@ def replacing(target: Path) -> Iterator[Path]:
             if file.is_file() and file != draft
         }
         if others:
-            write_together(real, draft.read_bytes(), others)
+            write_together(real, draft.read_bytes(), others, may_stay)
         else:
             draft.replace(real)

@@ -51,12 +51,14 @@ UNPACKING_SECONDS = Limit("seconds of unpacking", 20, 2**-20)
 ELEMENTS = Limit("XML elements that are read one by one", 2**19, 0.5)
 #: Elements of glTF accessors, which may share bytes, corners of strips and fans, and faces in Draco.
 ACCESSED = Limit("elements of accessors", 2**20, 16)
+#: Bytes that are read of all files that hold the buffers of a glTF file.
+BUFFERS = Limit("bytes of buffers in other files", 2**30, 0)
 #: Rows of a PLY element whose lists differ in length from row to row.
 ROWS = Limit("rows that are read one by one", 2**19, 0.2)
 #: Meshes, or objects, that are read one by one.
 MESHES = Limit("meshes", 2**14, 0)
 #: Layers of a USDZ file.
-LAYERS = Limit("layers", 2**10, 0)
+LAYERS = Limit("layers", 2**8, 0)
 #: Points that a mesh needs to be read for a blind mark. Such marks have no anchors on coarser meshes.
 BLIND_POINTS = 100
 #: Meshes of a file that are read for a blind mark unless they are named, the largest ones. Each may take half a minute.

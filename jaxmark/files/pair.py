@@ -1,5 +1,6 @@
 """Write a file and the record that belongs to it, so that a killed process leaves no file beside another's record."""
 
+import filecmp
 import os
 import time
 from collections.abc import Collection, Iterator
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.atomic import read_file, replacing, write_atomically
+from jaxmark.files.atomic import MayStay, holds, read_file, replacing, write_atomically
 
 try:
     import fcntl
@@ -31,6 +32,27 @@ def refuse_existing(*paths: Path, overwrite: bool) -> None:
             raise JaxmarkError(f"{path} exists; give another name, or replace it by --overwrite.")
 
 
+def refuse_existing_pair(file: Path, record: Path, *, overwrite: bool, original: Path | None) -> None:
+    """Refuse a file and its record that exist already, unless they may be overwritten.
+
+    A file without a record may also be replaced if it is an exact copy of the original: such a copy comes along with
+    a file that refers to the original.
+
+    Raises:
+        JaxmarkError: if one of them exists, and may not be replaced.
+    """
+    came_along = not record.exists() and original is not None and _is_copy(file, original)
+    refuse_existing(*([record] if came_along else [file, record]), overwrite=overwrite)
+
+
+def _is_copy(file: Path, original: Path) -> bool:
+    """Whether a file has the bytes of another one."""
+    try:
+        return not file.samefile(original) and filecmp.cmp(file, original, shallow=False)
+    except OSError:
+        return False
+
+
 @dataclass
 class Pair:
     """Drafts of a file and of its record, which `writing_pair` yields; `kept` is known when its block has ended."""
@@ -44,7 +66,14 @@ class Pair:
 
 
 @contextmanager
-def writing_pair(file: Path, record: Path, *, overwrite: bool = False) -> Iterator[Pair]:
+def writing_pair(
+    file: Path,
+    record: Path,
+    *,
+    overwrite: bool = False,
+    original: Path | None = None,
+    may_stay: MayStay = holds,
+) -> Iterator[Pair]:
     """Yield drafts of a file and of its record, which get their names if the block succeeds, and are deleted if not.
 
     No record is ever lost, and the record beside the file is always that of this file, even if the process is killed at
@@ -63,21 +92,24 @@ def writing_pair(file: Path, record: Path, *, overwrite: bool = False) -> Iterat
         file: path of the file.
         record: path of its record.
         overwrite: whether existing files may be replaced.
+        original: the file that is marked, if there is one, see `refuse_existing_pair`.
+        may_stay: see `write_together`.
 
     Raises:
         JaxmarkError: if one of them exists and may not be replaced; see `replacing`. The files are then as before.
     """
-    refuse_existing(file, record, overwrite=overwrite)
+    refuse_existing_pair(file, record, overwrite=overwrite, original=original)
     if os.path.realpath(file) == os.path.realpath(record):
         raise JaxmarkError(f"{file} cannot be both the file and its record; give another name for one of them.")
     old = None
     with ExitStack() as alone:
         try:
-            with replacing(file) as draft, replacing(record) as record_draft:
+            with replacing(file, may_stay) as draft, replacing(record) as record_draft:
                 pair = Pair(draft, record_draft)
                 yield pair
                 alone.enter_context(_locked({Path(os.path.realpath(path)).parent for path in (file, record)}))
-                refuse_existing(file, record, overwrite=overwrite)  # another process may have written them meanwhile
+                # Another process may have written them meanwhile.
+                refuse_existing_pair(file, record, overwrite=overwrite, original=original)
                 old = _Old.of(file, record)
                 old.set_aside()
         except BaseException:

@@ -64,12 +64,15 @@ class _Mesh(NamedTuple):
     def defect(self) -> str:
         """Return the reason why the mesh cannot be marked; empty if it can."""
         points, sizes, indices = (self.arrays.get(name) for name in ("points", "faceVertexCounts", "faceVertexIndices"))
-        if points is None or not points.size:
-            return "its points are in another layer, which is left alone"
-        if not _has_rows(points, 3):
+        elsewhere = not self.stated["alone"]
+        if "points" in self.stated["unread"] or (points is not None and points.size and not _has_rows(points, 3)):
             return "its points are no triples of floating-point numbers"
+        if points is None or not points.size:
+            return "its points are in another layer, which is left alone" if elsewhere else "it has no points"
+        if {"faceVertexCounts", "faceVertexIndices"} & {*self.stated["unread"]}:
+            return "its faces are no integers"
         if sizes is None or indices is None or not len(sizes):
-            return "it has no faces, or they are in another layer"
+            return "it has no faces" + ", or they are in another layer" * elsewhere
         if sizes.ndim != 1 or indices.ndim != 1 or sizes.dtype.kind == "f" or indices.dtype.kind == "f":
             return "its faces are no integers"
         if sizes.min() < 3:
@@ -142,7 +145,7 @@ class _Stretch(NamedTuple):
         return np.frombuffer(data, self.array.dtype, self.array.size, self.begin).reshape(-1, 3)
 
 
-def parse(data: bytes) -> Source:
+def parse(data: bytes) -> "_UsdSource":
     """Read the meshes of a layer, in text or binary, or of all layers of a USDZ archive.
 
     Points are those that the layer itself states, local to the mesh: transformations are not applied, and instances
@@ -180,7 +183,7 @@ def parse(data: bytes) -> Source:
             arrays[int(index)][kind] = array
         prefix = layer.member if number else ""
         found += [
-            _Mesh(prefix + stated["path"], number, stated, mine)
+            _Mesh(prefix + stated["path"], number, stated | {"alone": report["alone"]}, mine)
             for stated, mine in zip(report["meshes"], arrays, strict=True)
         ]
         outside |= dict.fromkeys(path for path in report["layers"] if not _is_member(archive, layer.member, path))
@@ -227,7 +230,7 @@ def _source(
     outside: Sequence[str],
     assets: Sequence[str],
     unpacker: Unpacker,
-) -> Source:
+) -> "_UsdSource":
     """Make the source of the meshes that can be marked; refused if there are none."""
     skipped = {mesh.name: reason for mesh in found if (reason := mesh.defect())}
     meshes = [mesh for mesh in found if mesh.name not in skipped]

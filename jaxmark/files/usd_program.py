@@ -21,6 +21,7 @@ importlib.import_module("pxr.Usd")  # has the file formats, before version 25.8
 
 BINARY = b"PXR-USDC"
 _ARRAYS = ("points", "faceVertexCounts", "faceVertexIndices", "normals", "extent")
+_ARCS = ("references", "payload", "inheritPaths", "specializes", "variantSetNames")
 _PRIMVARS = {"normals": "primvars:normals", "texture": "primvars:st"}
 
 
@@ -35,10 +36,12 @@ def unpack(data: bytes) -> dict[str, np.ndarray]:
     Raises:
         ValueError: half a sentence, if USD cannot read the layer, or its meshes have too many bytes.
     """
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays, tempfile.TemporaryDirectory() as folder:
+    folder = tempfile.gettempdir()  # that of this process alone; one for each of many layers would take longer
+    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
         content = arrays["layer"].tobytes()
         # The kind of the content decides, because the suffix usd may name either.
         path = Path(folder, f"layer.{_suffix(content.startswith(BINARY))}")
+        path.unlink(missing_ok=True)  # a layer that was read before may still map the bytes
         path.write_bytes(content)
         layer = _native("this is no layer that USD reads", lambda: Sdf.Layer.OpenAsAnonymous(str(path)))
         if "paths" not in arrays:
@@ -93,9 +96,11 @@ def _read(layer: Any, most: int) -> dict[str, np.ndarray]:
             raise ValueError(f"its meshes have more than {most} bytes; save it as several files, or as PLY")
         arrays |= {f"{len(meshes)}.{name}": array for name, array in found.items()}
         meshes.append(mesh)
+    layers = {*layer.GetCompositionAssetDependencies()}
     report = {
         "meshes": meshes,
-        "layers": sorted({*layer.GetCompositionAssetDependencies()} - {""}),  # "" is the layer itself
+        "alone": not layers and not any(map(_is_composed, prims)),
+        "layers": sorted(layers - {""}),  # "" is the layer itself
         "assets": sorted(assets - {""}),
     }
     return arrays | {"report": np.frombuffer(json.dumps(report).encode(), np.uint8)}
@@ -117,7 +122,18 @@ def _mesh(prim: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     points = prim.attributes.get("points")
     if points is not None and arrays["points"] is not None:
         mesh["samples"] = sum(not _equal(value, arrays["points"]) for _, value in _slots(points))
+    stated = {name: prim.attributes.get(name) for name in _ARRAYS if arrays[name] is None}
+    mesh["unread"] = [name for name, spec in stated.items() if spec is not None and any(True for _ in _slots(spec))]
     return mesh, {name: array for name, array in arrays.items() if array is not None}
+
+
+def _is_composed(prim: Any) -> bool:
+    """Whether a prim, or one that it is in, may have values from elsewhere in the layer."""
+    while prim is not None and not prim.path.isEmpty:
+        if any(prim.HasInfo(name) for name in _ARCS):
+            return True
+        prim = prim.nameParent
+    return False
 
 
 def _slots(spec: Any) -> Iterator[tuple[float | None, Any]]:

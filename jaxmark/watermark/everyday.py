@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from jaxmark.alignment.original import make_original
 from jaxmark.alignment.pairing import pair
 from jaxmark.alignment.result import Align, Alignment
-from jaxmark.errors import JaxmarkError
+from jaxmark.errors import AlignmentError, JaxmarkError
 from jaxmark.files.typed import find_name
 from jaxmark.geometry.mesh import Mesh, check_mesh, digest
 from jaxmark.watermark.blind import reading as blind_reading
@@ -381,6 +381,7 @@ def detect_scene(
         be compared, with reasons. Fields that belong to one mesh are those of the mesh with most evidence.
 
     Raises:
+        AlignmentError: if no mesh can be aligned with that of the original.
         JaxmarkError: if no mesh can be compared, or an original mesh is missing or is not the recorded one; see also
             `detect`.
     """
@@ -417,10 +418,11 @@ def detect_scene(
     suspect_names = pair({name: marker.original.marked_order for name, marker in markers.items()}, suspects)
     readings: dict[str, _MeshReading] = {}
     counted: set[tuple[bytes, bytes]] = set()
+    unlike = False  # whether a mesh of the suspect is unlike that of the original
     for name, marker in markers.items():
         try:
             if name not in suspect_names:
-                raise JaxmarkError("No mesh of the suspect resembles it.")
+                raise AlignmentError("No mesh of the suspect resembles it.")
             geometry = marker.original.geometry, marker.original.order
             if geometry in counted:
                 raise JaxmarkError(f"{EQUALS_ANOTHER}.")
@@ -430,10 +432,11 @@ def detect_scene(
             readings[name] = _MeshReading(marker, aligned, read(replace(marker), aligned, message, charges=charges))
             counted.add(geometry)
         except JaxmarkError as error:
-            skipped[name] = str(error).rstrip(".")
+            skipped[name], unlike = str(error).rstrip("."), unlike or isinstance(error, AlignmentError)
         after()
     if not readings:
-        raise JaxmarkError(f"None of the {len(chosen)} meshes could be compared: {_reasons(skipped)}.")
+        kind = AlignmentError if unlike else JaxmarkError
+        raise kind(f"None of the {len(chosen)} meshes could be compared: {_reasons(skipped)}.")
     # An original can be presented so that it is unlike its counterpart, and is skipped. So the orders and the caveats
     # of all originals count, and the number of meshes is that of all originals.
     orders = [charge for marker in markers.values() for charge in marker.order_charges]

@@ -279,9 +279,14 @@ def test_other_connectivity_is_read_where_it_can_be(workshop: Workshop):
 
 
 @pytest.mark.slow
-def test_what_cannot_be_aligned_is_refused_by_name(workshop: Workshop):
+def test_nothing_is_detected_in_a_mesh_of_another_shape(workshop: Workshop):
     trimesh.Trimesh(*bumpy_sphere(2), process=False).export("small.ply")
-    assert "could not be aligned" in workshop.refused("detect", "small.ply", *DETECT)
+    assert workshop.json("detect", "small.ply", *DETECT, status=1)["detected"] is False
+    status, said, _ = workshop("detect", "small.ply", *DETECT)
+    assert (status, said[:50]) == (1, "nothing detected: The suspect could not be aligned")
+    Path("names.txt").write_text("alice\n")
+    identify = ("identify", "small.ply", "--original", "model.ply", "--key", "owner.key", "--recipients", "names.txt")
+    assert "could not be aligned" in workshop.json(*identify, status=1)["notes"][0]
 
 
 def test_key_files_are_private_and_keys_never_shown(workshop: Workshop):

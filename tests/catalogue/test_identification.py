@@ -10,11 +10,13 @@ import pytest
 
 import jaxmark as jm
 from jaxmark.app.find_commands import describe
-from jaxmark.catalogue import Finder, Match, Verdict
+from jaxmark.catalogue import Finder, Match, Verdict, identification
 from jaxmark.catalogue.descriptors import centred
-from jaxmark.catalogue.identification import _Comparison, split
+from jaxmark.catalogue.identification import _Comparison
 from jaxmark.catalogue.landmarks import KEPT, MOST, LandmarkIndex, landmarks
 from jaxmark.catalogue.partial_registration import Part, fit_whole
+from jaxmark.catalogue.pieces import split
+from jaxmark.files import Scene
 from jaxmark.geometry.mesh import compact
 from jaxmark.watermark.coding.keys import commitment
 from jaxmark.watermark.record import Record
@@ -158,15 +160,57 @@ def test_nobody_is_named_without_the_key_or_the_mark(shop: Shop):
 def test_small_meshes_of_a_file_are_left_out():
     small, large = rough_sphere(12), rough_sphere(60)
     many = {str(number): small._replace(vertices=(1 + number) * np.asarray(small.vertices)) for number in range(40)}
-    assert [piece.name for piece in split({**many, "large": large})] == ["large"]
-    assert split(many) == []
-    assert [piece.name for piece in split({"only": small})] == ["only"]
+    pieces, (left_out,) = split({**many, "large": large})
+    assert [piece.name for piece in pieces] == ["large"]
+    assert (left_out.number, left_out.names) == (40, ("0", "1", "2", "3", "4"))
+    pieces, left = split(many)
+    assert pieces == []
+    first, second = describe(Verdict("", (), 0, left), 1e-6)
+    assert first.endswith("no mesh of the suspect is large enough to be searched")
+    assert second.startswith("not searched: 40 pieces ('0', '1', '2', '3', '4', …): in a file of several meshes")
+    assert "50 faces or more; to search one of them, save it as a file of its own" in second
+    pieces, left = split({"only": small})
+    assert ([piece.name for piece in pieces], left) == (["only"], ())
+
+
+def test_no_more_than_32_pieces_are_searched():
+    mesh = rough_sphere(60)
+    pieces, (left_out,) = split(
+        {str(n): mesh._replace(vertices=(1 + n) * np.asarray(mesh.vertices)) for n in range(40)}
+    )
+    assert (len(pieces), left_out.number) == (32, 8)
+
+
+def test_many_pieces_that_resemble_nothing_cost_little_more_than_one(shop: Shop, monkeypatch):
+    """Readings, and searches for the poses of parts, are counted; the piece that resembles an original comes first."""
+    calls: list[str] = []
+
+    def read(finder: Finder, pair: _Comparison, *rest: object) -> _Comparison:
+        calls.append(pair.match.piece)
+        return pair.refused("it cannot be aligned")
+
+    monkeypatch.setattr(Finder, "_detect", read)
+    monkeypatch.setattr(Finder, "fitting", lambda finder, piece, likely: calls.append("part") or likely)
+    boxes = [jm.Mesh(rough_sphere(60).vertices * [1, 1, 2 + n], rough_sphere(60).faces) for n in range(10)]
+    strange = {f"strange{number}": mesh for number, mesh in enumerate(boxes)}
+    monkeypatch.setattr(identification, "meshes_of", lambda path: Scene({**strange, "alike": alike}, {}))
+    monkeypatch.setattr(identification, "file_hash", lambda path: "00")
+    alike = jm.attack(shop.originals[2], "simplification", 0.5, seed=0)
+    with jm.Catalogue(shop.file, read_only=True) as catalogue:
+        verdict = Finder(catalogue, [shop.key], depth=2).find("scene.glb")
+    assert calls[0] == "alike"
+    assert len(calls) == 3 * 2 + 4
+    assert verdict.readings == 11 * COUNT  # all pieces are charged, also those that were left out
+    (left_out,) = verdict.left_out
+    assert left_out.number >= 8
+    assert "to search one of them" in describe(verdict, 1e-6)[-1]
+    assert verdict.as_json()["left_out"][0]["number"] == left_out.number
 
 
 @pytest.mark.long
 def test_both_models_of_a_merged_file_are_named(shop: Shop):
     merged = joined(shop.marked[3], shop.originals[0], shop.marked[1])
-    pieces = split({"": merged})
+    pieces, _ = split({"": merged})
     assert [piece.name for piece in pieces] == ["", "#1", "#2", "#3"]
     found, verdict = named(shop, merged, depth=1)
     assert sorted(found) == ["1", "3"]

@@ -280,6 +280,18 @@ def gltf(document: dict[str, object], chunk: bytes) -> bytes:
     return head + text + struct.pack("<II", len(chunk), 0x004E4942) + chunk
 
 
+def triangle_beside(name: str, length: int) -> bytes:
+    """A glTF file of a triangle, whose numbers are in another file of a stated length."""
+    document = {
+        "asset": {"version": "2.0"},
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "buffers": [{"uri": name, "byteLength": length}],
+    }
+    return json.dumps(document).encode()
+
+
 def fans(count: int, corners: int, mode: int) -> bytes:
     """Primitives that share a list of corners."""
     primitive = {"attributes": {"POSITION": 0}, "indices": 1, "mode": mode}

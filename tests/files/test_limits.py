@@ -1,6 +1,7 @@
 """No small file costs minutes or gigabytes: it is read within its budget, or refused in one sentence."""
 
 import json
+import os
 import re
 import struct
 from collections.abc import Callable, Iterator
@@ -202,17 +203,42 @@ def test_corners_of_strips_and_fans_are_counted(tmp_path: Path, monkeypatch: pyt
 
 def test_a_file_that_is_many_buffers_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read, paths = atomic.read_file, list[str]()
-    monkeypatch.setattr(atomic, "read_file", lambda path, most=None: paths.append(str(path)) or read(path, most))
+    monkeypatch.setattr(atomic, "read_file", lambda path, *rest: paths.append(str(path)) or read(path, *rest))
     names = ["a.glb", "./a.glb", "b/../a.glb", "%61.glb"] * 250
     data = hostile.itself(names, hostile.fans(1, 300, 4))
-    document = Document(data, atomic.read_beside(written(tmp_path, "a.glb", data).parent))
+    document = Document(data, atomic.read_beside(written(tmp_path, "a.glb", data).parent, 2**20, 2**20))
     assert len(paths) == 1
-    assert len(document.data) == 348 + len(data)
+    assert len(document.data) == 348 + 4  # each buffer states 4 bytes
     assert {buffer.place for buffer in document.buffers if not isinstance(buffer, str)} == {
         range(348),
-        range(348, 348 + len(data)),
+        range(348, 348 + 4),
     }
     assert len(load_mesh(tmp_path / "a.glb").faces) == 100
+
+
+def test_a_buffer_is_read_as_far_as_the_document_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sparse file may have any size."""
+    content = b"0123456789"
+    written(tmp_path, "big.bin", content)
+    os.truncate(tmp_path / "big.bin", 2**40)
+    written(tmp_path, "small.bin", content)
+    read = atomic.read_beside(tmp_path, 2**20, 2**20)
+    assert read("big.bin", 4) == content[:4]
+    assert read("./big.bin", 10) == content
+    assert read("big.bin", 3) is read("big.bin", 10)
+    for path, count in (("big.bin", 2**30), ("big.bin", None)):
+        with pytest.raises(JaxmarkError, match=f"'big.bin' .* has {2**40} bytes, more than"):
+            read(path, count)
+    read = atomic.read_beside(tmp_path, 100, 11)
+    assert (read("small.bin", None), read("small.bin", 2**53)) == (content, content)
+    with pytest.raises(JaxmarkError, match=r"more than 1$"):  # all files together
+        read("big.bin", 2)
+    monkeypatch.setattr(limits, "BUFFERS", Limit("bytes of buffers in other files", 1000, 0))
+    with pytest.raises(JaxmarkError, match="has 1099511627776 bytes, more than 1000"):
+        loaded(tmp_path, "a.gltf", hostile.triangle_beside("big.bin", 2**40))
+    written(tmp_path, "big.bin", np.eye(3, dtype="<f4").tobytes())
+    os.truncate(tmp_path / "big.bin", 2**40)
+    assert len(loaded(tmp_path, "a.gltf", hostile.triangle_beside("big.bin", 36)).faces) == 1
 
 
 def test_tags_of_any_length_below_the_limit_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

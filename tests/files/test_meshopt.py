@@ -136,13 +136,25 @@ def test_damaged_views_are_refused(tmp_path: Path, change: dict[str, Any], messa
         load_mesh(written(tmp_path, "a.glb", glb(json.dumps(document), data)))
 
 
+@pytest.mark.parametrize("change", [{"byteOffset": 10**9}, {"buffer": 0}])
+def test_views_beyond_the_end_of_their_own_buffer_are_refused(tmp_path: Path, change: dict[str, int]) -> None:
+    """The decoded form must lie inside the buffer for programs that cannot decode, whether it is there or not."""
+    document, data = packed("floats")
+    document["buffers"][0]["byteLength"] = POINTS.nbytes - 1
+    document["bufferViews"][1] |= change
+    with pytest.raises(JaxmarkError, match=r"bufferViews\[1\] does not lie inside"):
+        load_mesh(written(tmp_path, "a.glb", glb(json.dumps(document), data)))
+
+
 def test_views_that_announce_too_much_are_refused(tmp_path: Path) -> None:
     document, data = packed("floats")
     view = document["bufferViews"][1]
     view["extensions"]["EXT_meshopt_compression"]["count"] = 2**40
     view["byteLength"] = 12 * 2**40
-    with pytest.raises(JaxmarkError, match="bytes of unpacked content"):
-        load_mesh(written(tmp_path, "a.glb", glb(json.dumps(document), data)))
+    document["buffers"][1]["byteLength"] = 2**50
+    file = glb(json.dumps(document), data)
+    with pytest.raises(JaxmarkError, match=f"bytes of unpacked content, the most for a file of {len(file)} bytes"):
+        load_mesh(written(tmp_path, "a.glb", file))
 
 
 def test_views_of_the_same_bytes_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

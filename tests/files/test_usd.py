@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.files import limits, load_mesh, load_scene, load_texture, save_mesh, save_scene, usd
+from jaxmark.files import limits, load_mesh, load_scene, load_texture, may_stay, save_mesh, save_scene, usd
+from jaxmark.files.atomic import replacing
+from jaxmark.files.pair import writing_pair
 from tests.files.helpers import noisy, shifted, turned, written
 from tests.samples import bumpy_sphere
 
@@ -176,6 +178,71 @@ def test_content_of_other_layers_is_named_and_left_alone(tmp_path: Path) -> None
     assert found == {"b.usda", "other.usda", "pictures/a.png"}
 
 
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """A layer with a mesh that refers to another layer with a mesh."""
+    written(tmp_path, "ball.usda", layer({"Ball": ball()}))
+    return written(
+        tmp_path, "scene.usda", layer({"Square": SQUARE}, more='    def "B" ( references = @ball.usda@ ) {}')
+    )
+
+
+def test_a_layer_that_was_marked_first_stays(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    square = load_scene(scene).meshes["/A/Square"]
+    original = tmp_path / "ball.usda"
+    save_mesh(noisy(load_mesh(original), 0.001), out / "ball.usda", like=original)
+    marked = (out / "ball.usda").read_bytes()
+    with replacing(out / "scene.usda", may_stay) as draft:
+        save_scene({"/A/Square": square}, draft, like=scene)
+    save_scene({"/A/Square": square}, out / "again.usda", like=scene)
+    assert (out / "ball.usda").read_bytes() == marked != original.read_bytes()
+    mesh = load_mesh(original)
+    first, back = (", ".join(map(str, corners)) for corners in (BALL.faces[0], BALL.faces[0, ::-1]))
+    for other in (
+        layer({"Ball": ball().replace(first, back)}),
+        layer({"Other": ball()}),
+        layer({"Ball": SQUARE}),
+        b"#usda 1.0\n",
+        b"",
+    ):
+        (out / "ball.usda").write_bytes(other)
+        with pytest.raises(JaxmarkError, match=r"ball\.usda is there already, and is another file"):
+            save_scene({"/A/Square": square}, out / "third.usda", like=scene)
+        assert (out / "ball.usda").read_bytes() == other
+    save_mesh(mesh._replace(vertices=1.2 * np.asarray(mesh.vertices)), out / "ball.usda", like=original)
+    with pytest.raises(JaxmarkError, match="is another file"):
+        save_scene({"/A/Square": square}, out / "third.usda", like=scene)
+
+
+def test_a_layer_that_came_along_can_be_marked(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    original, target, record = tmp_path / "ball.usda", out / "ball.usda", out / "ball.usda.json"
+    save_scene({"/A/Square": load_scene(scene).meshes["/A/Square"]}, out / "scene.usda", like=scene)
+
+    def mark(content: bytes, like: Path | None = original) -> None:
+        with writing_pair(target, record, original=like) as pair:
+            pair.file.write_bytes(content)
+            pair.record.write_bytes(b"{}")
+
+    with pytest.raises(JaxmarkError, match=r"exists; give another name"):
+        mark(b"marked", None)
+    mark(b"marked")
+    assert target.read_bytes() == b"marked"
+    with pytest.raises(JaxmarkError, match=r"exists; give another name"):  # it is no copy any more
+        mark(b"twice")
+    target.write_bytes(original.read_bytes())
+    with pytest.raises(JaxmarkError, match=r"exists; give another name"):  # it has a record
+        mark(b"twice")
+    record.unlink()
+    target.unlink()
+    target.hardlink_to(original)
+    with pytest.raises(JaxmarkError, match=r"exists; give another name"):  # it is the original itself
+        mark(b"twice")
+
+
 def test_all_layers_of_an_archive_are_read(tmp_path: Path) -> None:
     root = layer({"Square": SQUARE}, more='    def "B" ( prepend references = @geometry/b.usda@ )\n    {\n    }')
     inner = layer({"Square": SQUARE}).replace(b"(\n\n)", b'(\n    defaultPrim = "A"\n)')
@@ -218,7 +285,7 @@ def _square(old: str, new: str) -> Callable[[], bytes]:
         (lambda: b"", "USD cannot read the file"),
         (lambda: usd.pack(None, {"a.png": b""}), "no layer"),
         (lambda: usd.pack(None, {"a.usda": b"x"}), "USD cannot read 'a.usda'"),
-        (lambda: usd.pack(None, {f"{number}.usda": b"" for number in range(1025)}), "more than 1024 layers"),
+        (lambda: usd.pack(None, {f"{number}.usda": b"" for number in range(257)}), "more than 256 layers"),
         (lambda: layer({}), "has no mesh"),
         (lambda: layer({}, "    subLayers = [@b.usda@]"), "mark the files it refers to: 'b.usda'"),
         (_square("[4]", "[2, 2]"), "one of its faces has 2 corners"),
@@ -227,7 +294,14 @@ def _square(old: str, new: str) -> Callable[[], bytes]:
         (_square("[0, 1, 2, 3]", "[0, 1, 2, -1]"), "refers to point -1, but there are 4"),
         (_square("int[] faceVertexCounts", "float[] faceVertexCounts"), "no integers"),
         (_square(f"point3f[] points = {CORNERS}", "int[] points = [1]"), "no triples"),
-        (_square(f"point3f[] points = {CORNERS}", "point3f[] points = []"), "in another layer"),
+        (_square(f"point3f[] points = {CORNERS}", "int points = 1"), "no triples"),
+        (_square(f"point3f[] points = {CORNERS}", 'string points = "(0, 0, 0)"'), "no triples"),
+        (_square(f"point3f[] points = {CORNERS}", "point3f[] points = []"), "it has no points"),
+        (_square(f"point3f[] points = {CORNERS}", ""), "it has no points"),
+        (lambda: layer({"Empty": ""}, more='    def "B" ( references = </A/Empty> ) {}'), "in another layer"),
+        (lambda: layer({"Empty": ""}, more='    def Mesh "B" ( inherits = </A/Empty> ) {}'), "in another layer"),
+        (_square("int[] faceVertexIndices = [0, 1, 2, 3]", "int faceVertexIndices = 3"), "no integers"),
+        (_square("int[] faceVertexIndices = [0, 1, 2, 3]", ""), "it has no faces$|it has no faces[^,]"),
     ],
 )
 def test_files_without_a_usable_mesh_are_refused(tmp_path: Path, make: Callable[[], bytes], message: str) -> None:

@@ -10,6 +10,8 @@ import trimesh
 
 import jaxmark as jm
 from jaxmark.alignment.pairing import pair
+from jaxmark.app.read_files import FileReader
+from jaxmark.errors import AlignmentError
 from jaxmark.files import load_scene
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark import everyday
@@ -53,6 +55,25 @@ def test_what_cannot_carry_is_named(marked):
     assert list(info.skipped) == ["small"]
     for one in info.meshes.values():
         assert one.rms == pytest.approx(BUDGET, rel=1e-3)
+
+
+def test_a_scene_of_other_shapes_is_no_refusal_of_its_file(key: jm.Key, tmp_path: Path):
+    """Nothing is detected in a scene that can be read, but of which no mesh resembles one of the original."""
+    originals = {name: bumpy_sphere(2, seed) for seed, name in enumerate(NAMES)}
+    flat = {
+        name: Mesh(mesh.vertices * [1, 1, 0.01 * (1 + n)], mesh.faces[:-1])
+        for n, (name, mesh) in enumerate((f"flat {name}", mesh) for name, mesh in originals.items())
+    }
+    with pytest.raises(AlignmentError, match="None of the 3 meshes could be compared: 'left': No mesh of the suspect"):
+        detect_scene(flat, originals=originals, key=key, bits=0)
+    for name, meshes in (("original.glb", originals), ("suspect.glb", flat)):
+        scene = trimesh.Scene({name: trimesh.Trimesh(*mesh, process=False) for name, mesh in meshes.items()})
+        scene.export(tmp_path / name)
+    outcome = FileReader(key, 0, None).read(tmp_path / "suspect.glb", tmp_path / "original.glb")
+    assert (outcome.status, outcome.values["detected"]) == (1, False)
+    assert outcome.lines[0].startswith("nothing detected: None of the 3 meshes could be compared")
+    with pytest.raises(jm.JaxmarkError, match="Cannot read"):
+        FileReader(key, 0, None).read(tmp_path / "missing.glb", tmp_path / "original.glb")
 
 
 def read(marked, originals, key: jm.Key, noise: float, **options) -> Detection:

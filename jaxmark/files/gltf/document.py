@@ -22,8 +22,9 @@ from jaxmark.files.limits import RunningCount
 from jaxmark.files.source import Indices, Patched
 from jaxmark.files.unpacking import Unpacker
 
-#: Reads a file by its path relative to the folder of the document; the same object for all paths of one file.
-Read = Callable[[str], bytes]
+#: Reads so many bytes, or all, of a file by its path relative to the folder of the document; the same object for all
+#: paths of one file.
+Read = Callable[[str, int | None], bytes]
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _MAGIC = b"glTF"
@@ -99,7 +100,7 @@ class Document:
         if file[:4] != _MAGIC and str(version).split(".")[0] != "2":
             raise JaxmarkError(f"Only version 2 of glTF is supported, not {ascii(version)[:40]}.")
         self.file, self.buffers = file, list[Buffer | str]()
-        pieces, places, size = list[bytes](), dict[int, range](), 0
+        pieces, places, size, whole_size = list[bytes](), dict[int, range](), 0, len(file)
         binary = file[chunk.start : chunk.stop] if chunk else None
         for index, entry in enumerate(_listed(self.content, "buffers")):
             try:
@@ -111,13 +112,14 @@ class Document:
                 places[id(data)] = range(size, size + len(data))
                 pieces.append(data)
                 size += len(data)
+                whole_size += len(data) if _is_path(head) else 0
             self.buffers.append(Buffer(places[id(data)], head))
         self.data: bytes | bytearray = b"".join(pieces)
         self.located: dict[int, Elements] = {}
         self.decoded: set[int] = set()
         self._lists: dict[str, list[dict[str, Any]]] = {}
-        self.accessed, self.unpacked = (RunningCount(one, size) for one in (limits.ACCESSED, limits.UNPACKED))
-        self.draco, self._meshopt = Unpacker("draco", size), Unpacker("meshopt", size)
+        self.accessed, self.unpacked = (RunningCount(one, whole_size) for one in (limits.ACCESSED, limits.UNPACKED))
+        self.draco, self._meshopt = Unpacker("draco", whole_size), Unpacker("meshopt", whole_size)
         self.packed: dict[int, range] = {}
 
     def copy_content(self) -> dict[str, Any]:
@@ -202,6 +204,10 @@ class Document:
         stated = Packing.of(extension, count, stride, where)
         if stated.size != whole(view, "byteLength", where):
             raise JaxmarkError(f"{where} has another length than its compressed elements.")
+        index = whole(view, "buffer", where)
+        length_of_buffer = whole(self.item("buffers", index), "byteLength", f"buffers[{index}]")
+        if whole(view, "byteOffset", where, 0) + stated.size > length_of_buffer:
+            raise _outside(where)
         # The announced size must be possible, before the decoder reserves memory for it; views may share their source.
         self.unpacked.add(stated.size + length)
         try:
@@ -221,7 +227,7 @@ class Document:
             raise JaxmarkError(f"{buffer}.")
         offset, length = whole(place, "byteOffset", where, 0), whole(place, "byteLength", where)
         if offset + length > len(buffer.place):
-            raise JaxmarkError(f"{where} does not lie inside its buffer, so that the accessors in it do not either.")
+            raise _outside(where)
         return buffer.place.start + offset, length
 
     def numbers(self, index: int) -> Float64[np.ndarray, "count width"]:
@@ -244,7 +250,7 @@ class Document:
             if isinstance(buffer, str) or content is None:
                 continue
             if content == self.data[buffer.place.start : buffer.place.stop]:
-                companions += [buffer.head] if buffer.head and not buffer.head.startswith("data:") else []
+                companions += [buffer.head] if _is_path(buffer.head) else []
                 continue
             entry = document["buffers"][index]
             if len(content) != len(buffer.place):
@@ -279,6 +285,15 @@ class Document:
         version, total = struct.unpack_from("<II", before, 4)
         total += len(before) + len(coded) + len(after) - len(self.file)
         return struct.pack("<4sIIII", _MAGIC, version, total, len(coded), _JSON) + coded + after
+
+
+def _outside(where: str) -> JaxmarkError:
+    return JaxmarkError(f"{where} does not lie inside its buffer, so that the accessors in it do not either.")
+
+
+def _is_path(head: str) -> bool:
+    """Whether the head of a buffer is the path of another file, see `Buffer`."""
+    return bool(head) and not head.startswith("data:")
 
 
 def uses(mesh: dict[str, Any]) -> Iterator[tuple[str, int]]:
@@ -366,4 +381,4 @@ def _content(entry: Any, index: int, chunk: bytes | None, read: Read) -> tuple[s
         except (ValueError, binascii.Error):
             raise JaxmarkError(f"buffers[{index}] is no data in base64") from None
     path = unquote(uri)
-    return path, read(path)
+    return path, read(path, whole(entry, "byteLength", f"buffers[{index}]") if "byteLength" in entry else None)
