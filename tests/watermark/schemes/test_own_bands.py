@@ -36,7 +36,10 @@ def test_a_mark_in_trained_bands_is_a_proof_with_its_record(mesh: Mesh, key: jm.
     assert not found.evidence.caveats
     carrier = jm.make_marker(mesh, key, record=record).carrier
     expected = np.asarray(BANDS, np.float32) * np.asarray(strengths)[:, None]
-    np.testing.assert_allclose(carrier.host.coefficients, expected, rtol=1e-6)  # pyright: ignore
+    coefficients = np.asarray(carrier.host.coefficients)  # pyright: ignore
+    factor = np.abs(coefficients).max() / np.abs(expected).max()
+    np.testing.assert_allclose(coefficients, factor * expected, rtol=1e-6)
+    assert np.log2(factor) == pytest.approx(round(np.log2(factor)))  # exact in floating point
     assert jm.detect(mesh, original=mesh, key=key, record=record).log10_p == 0
     other = dataclasses.replace(record, key=jm.make_marker(mesh, jm.Key(bytes(32)), bits=16).choices.key.hex())
     with pytest.raises(jm.JaxmarkError, match="key"):
@@ -140,11 +143,11 @@ def test_a_common_factor_of_the_bands_changes_nothing(mesh: Mesh, key: jm.Key, s
 
 
 @pytest.mark.parametrize(
-    "scheme", [OwnBandsScheme(((0, 1, 0), (1, 0, -1))), KeyedScheme(bands=32, profile=(0, 1, 1))], ids=["own", "keyed"]
+    "scheme", [OwnBandsScheme(((0, 1, 0), (1, 0, -1))), KeyedScheme(profile=(0, *(1,) * 20))], ids=["own", "keyed"]
 )
 def test_whole_numbers_in_a_scheme_are_read_back_from_its_record(mesh: Mesh, key: jm.Key, scheme, tmp_path):
     marker = jm.make_marker(mesh, key, bits=0, scheme=scheme)
-    marked, info = marker.embed(b"", jm.Budget(rms=2e-3, noise=0), read_back=False)
+    marked, info = marker.embed(b"", 2e-3, read_back=False)
     (tmp_path / "record.json").write_text(info.record.to_json())
     record = jm.Record.load(tmp_path / "record.json")
     assert jm.detect(marked, original=mesh, key=key, record=record).detected()
