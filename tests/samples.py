@@ -62,3 +62,11 @@ def ordered_laplacian(mesh: Mesh, weights: Weighting = "valence", **options) -> 
     assert made.neighbours is not None
     assert not np.array_equal(made.neighbours.order, np.arange(len(made.degree)))
     return made
+
+
+def with_thin_faces(mesh: Mesh) -> Mesh:
+    """Split the first face at a point so near to its first corner that two faces are thin."""
+    points, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    a, b, c = faces[0]
+    new, near = len(points), points[a] + 1e-3 * (points[b] + points[c] - 2 * points[a])
+    return make_mesh(np.vstack([points, near]), np.vstack([[[a, b, new], [b, c, new], [c, a, new]], faces[1:]]))

@@ -1,9 +1,9 @@
-"""Measure the cost of removal by learned attacks: python benchmarks/security/learned.py MESH... --output FOLDER.
+"""Measure the cost of removal by learned attacks: python benchmarks/security/learned.py [MESH...] --output FOLDER.
 
 Attacks are trained on meshes by formula: 20 that this library marks with random keys, and 4 for validation. They attack
-marks of 64 bits on the given meshes, at 0.08 % RMS and hidden. The table is that of `adversarial.py`: the least
-distortion that brings a mark below detection at 1e-6, with its message claimed, relative to the mark's own, in each
-metric.
+marks of 64 bits, at 0.08 % RMS and hidden, on the given meshes. By default, these are ten of the benchmark's corpus,
+of which those that are not installed are skipped. As in `adversarial.py`, the table has the least distortion that
+brings a mark below detection at 1e-6, with its message claimed, relative to the mark's own, in each metric.
 
   estimate: a network that estimates the mark, and subtracts it
   removal:  a network that lowers the expected evidence
@@ -19,6 +19,7 @@ import sys
 import zlib
 from collections.abc import Callable
 from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 
 import jax
@@ -29,6 +30,7 @@ import jaxmark as jm
 from jaxmark import adversaries as enemies
 from jaxmark.adversaries.chains import decode
 from jaxmark.adversaries.networks import init_network
+from jaxmark.bench.corpus import corpus, make_member
 from jaxmark.bench.parametric import creature
 from jaxmark.evaluation import cells
 from jaxmark.geometry import asteroid
@@ -42,6 +44,10 @@ from common.tables import head, line, say
 
 SIZE, LEARNED_FROM, HELD_OUT = 3000, 20, 4  # vertices, and meshes
 LIMITS = {"0.08 % RMS": BUDGET, "hidden": None}
+SUBJECTS = (
+    *("asteroid-3k", "creature-1", "box", "cylinder", "superquadric-1.5", "gem"),  # by formula
+    *("cow", "bone", "airplane", "bunny-10k"),  # from the package pymeshlab
+)
 GOALS: tuple[enemies.Goal, ...] = ("estimate", "removal")
 
 
@@ -80,8 +86,9 @@ def search(folder: Path, generations: int, size: int) -> list[enemies.Gene]:
 
 
 @lru_cache(maxsize=1)
-def target_of(path: str, limits: str) -> Target:
-    return make_target(jm.load_mesh(path), "keyed", LIMITS[limits])
+def target_of(folder: Path | None, name: str, limits: str) -> Target:
+    mesh = make_member(corpus()[name]) if folder is None else jm.load_mesh(folder / name)
+    return make_target(mesh, "keyed", LIMITS[limits])
 
 
 def network(goal: enemies.Goal, folder: Path, target: Target) -> jm.attacks.Attack:
@@ -103,10 +110,10 @@ ATTACKERS: dict[str, Callable[[Path, Target], jm.attacks.Attack]] = {
 }
 
 
-def work(folder: Path, output: Path, one: cells.Cell) -> cells.Row:
+def work(folder: Path | None, output: Path, one: cells.Cell) -> cells.Row:
     mesh, limits, name = map(str, one)
     try:
-        target = target_of(str(folder / mesh), limits)
+        target = target_of(folder, mesh, limits)
         return paid(target, ATTACKERS[name](output, target), zlib.crc32(repr(one).encode()) % 2**31)
     except jm.JaxmarkError as error:
         return {"refused": str(error)}
@@ -121,9 +128,21 @@ def keep_settings(parser: argparse.ArgumentParser, output: Path, settings: dict[
         parser.error(f"{output} has results with {before}; choose another folder, or the same settings")
 
 
+def subjects_of(parser: argparse.ArgumentParser, files: list[Path]) -> tuple[Path | None, list[str]]:
+    """The folder of the given files and their names; without files, no folder and the names of corpus meshes."""
+    if not files:
+        known = corpus()
+        for name in [name for name in SUBJECTS if name not in known]:
+            say(f"{name}: skipped, because the package pymeshlab is not installed")
+        return None, [name for name in SUBJECTS if name in known]
+    for file in files:
+        load(parser, file)
+    return folder_of(parser, files), [file.name for file in files]
+
+
 def main() -> None:
     parser = make_parser(__doc__)
-    add_meshes(parser, help="files of one folder")
+    add_meshes(parser, nargs="*", help="files of one folder; by default ten meshes of the corpus")
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--steps", type=positive, default=400, help="of learning (%(default)s)")
     parser.add_argument("--generations", type=positive, default=8, help="of the search for chains (%(default)s)")
@@ -131,12 +150,10 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=list(ATTACKERS), default=list(ATTACKERS), help="attackers")
     parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()
-    folder = folder_of(parser, arguments.meshes)
+    folder, meshes = subjects_of(parser, arguments.meshes)
     output = arguments.output.resolve()
     output.mkdir(parents=True, exist_ok=True)
     keep_settings(parser, output, {name: getattr(arguments, name) for name in ("steps", "generations", "size")})
-    for mesh in arguments.meshes:
-        load(parser, mesh)
     for goal in GOALS:
         if goal in arguments.only:
             learn(output, goal, arguments.steps, arguments.size)
@@ -149,7 +166,6 @@ def main() -> None:
                 f"{kind} {size:g}" for kind, size in decode(search(output, arguments.generations, arguments.size))
             ),
         )
-    meshes = [mesh.name for mesh in arguments.meshes]
     wanted = [(mesh, limits, name) for mesh in meshes for limits in LIMITS for name in arguments.only]
     rows = cells.run(
         wanted,
@@ -159,11 +175,10 @@ def main() -> None:
         say,
     )
     found = {tuple(row["cell"]): row for row in rows}
-    for limits in LIMITS:
-        print(f"\nmarks at {limits}: distortion over the mark's, {' / '.join(METRICS)}\n")
-        print(head("mesh", *arguments.only))
-        for mesh in meshes:
-            print(line(mesh, *(cell(found[mesh, limits, name]) for name in arguments.only)))
+    print(f"\ndistortion over the mark's, {' / '.join(METRICS)}\n")
+    print(head("mesh", "mark", *arguments.only))
+    for mesh, limits in product(meshes, LIMITS):
+        print(line(mesh, limits, *(cell(found[mesh, limits, name]) for name in arguments.only)))
 
 
 if __name__ == "__main__":

@@ -124,6 +124,7 @@ def _facts(case: Case) -> dict[str, Any]:
         "original": files[1],
         "files": files,
         "message": None if detection.message is None else detection.message.hex(),
+        "claimed": None if detection.claimed is None else detection.claimed.hex(),
         "notes": list(detection.notes),
         "log10_p": evidence.log10_p,
         "log10_p_uncommitted": evidence.log10_p_uncommitted,

@@ -38,6 +38,10 @@ from jaxmark.geometry.mesh import (
 )
 from jaxmark.seeds import Seed, generator, random_key
 
+# The ends of the units of strengths that are lengths, relative to the vertices' mean distance to their centre or to the
+# diagonal.
+_OVER_RADIUS, _OVER_DIAGONAL = "over the mean distance to the centre", "over the diagonal"
+
 
 class Attack(NamedTuple):
     """An attack: one of the library's, or your own.
@@ -45,7 +49,8 @@ class Attack(NamedTuple):
     Attributes:
         apply: function (mesh, strength, seed) → mesh. On the host, the seed is a `numpy.random.Generator`, and the mesh
             is as it is; else a JAX random key, and the mesh is centred and at unit diagonal.
-        unit: description of the strength and its unit.
+        unit: description of the strength and its unit; "over the diagonal" or "over the mean distance to the centre" in
+            it say that the strength is a length.
         strengths: usual strengths, weak ones first.
         host: whether the attack runs on the host, in NumPy or another program; otherwise, it is traced.
         faces: whether the attack needs faces, so that point clouds are refused.
@@ -57,6 +62,28 @@ class Attack(NamedTuple):
     host: bool = False
     faces: bool = False
 
+    def length(self, strength: float, radius: float) -> float | None:
+        """Convert a strength to a fraction of the mesh's diagonal; None if its unit says that it is no length.
+
+        Args:
+            strength: a strength in the attack's unit.
+            radius: the mean distance of the mesh's vertices to their centre, over its diagonal, see `mean_distance`.
+        """
+        if _OVER_RADIUS in self.unit:
+            return strength * radius
+        return strength if _OVER_DIAGONAL in self.unit else None
+
+
+def unit_of_length(unit: str) -> str:
+    """Return the unit of `Attack.length` for an attack with this unit."""
+    return unit.replace(_OVER_RADIUS, _OVER_DIAGONAL)
+
+
+def mean_distance(mesh: Mesh) -> float:
+    """Compute the mean distance of a mesh's welded vertices that faces use to their centre, over its diagonal."""
+    points = np.asarray(compact(weld_mesh(mesh, weld(mesh.vertices))).vertices, np.float64)
+    return float(np.linalg.norm(points - points.mean(axis=0), axis=1).mean()) / diagonal(mesh)
+
 
 # Attacks that need faces, that run on the host, and both.
 surface_attack, _host = partial(Attack, faces=True), partial(Attack, host=True)
@@ -64,13 +91,11 @@ _host_surface = partial(Attack, host=True, faces=True)
 
 #: Attacks by accident or by a tool; `jaxmark.adversaries.by_name.ATTACKS` has all attacks.
 ATTACKS: Mapping[str, Attack] = {
-    "noise": Attack(
-        uniform_noise, "half width over the mean distance to the centre", (0.0005, 0.001, 0.003, 0.005, 0.01)
-    ),
+    "noise": Attack(uniform_noise, f"half width {_OVER_RADIUS}", (0.0005, 0.001, 0.003, 0.005, 0.01)),
     "diagonal-noise": Attack(diagonal_noise, "half width over the diagonal", (0.0002, 0.0005, 0.001, 0.002, 0.005)),
     "gaussian-noise": Attack(
         gaussian_noise,
-        "standard deviation of a coordinate over the mean distance to the centre",
+        f"standard deviation of a coordinate {_OVER_RADIUS}",
         (0.0003, 0.0006, 0.002, 0.003, 0.006),
     ),
     "smoothing": surface_attack(laplacian_smoothing, "steps of 0.1", (5, 10, 30, 50, 100)),

@@ -34,6 +34,7 @@ class Row(NamedTuple):
     refusal: str  # a sentence that says why nothing could be read; empty otherwise
     seconds: float  # duration of the reading, with the alignment unless the row before includes it
     rms: float  # RMS displacement by the mark over the diagonal; 0 without a mark
+    length: float | None = None  # the strength as a fraction of the mesh's diagonal; None if it is no length
 
 
 def rates(rows: Iterable[Row], by: Sequence[str] = (*POINT, "control"), level: float = 0.95) -> list[dict[str, Any]]:
@@ -48,8 +49,8 @@ def rates(rows: Iterable[Row], by: Sequence[str] = (*POINT, "control"), level: f
     Returns:
         For each group its fields of `by`, and its `control`; the number of `trials`; the counts `read` and `detected`,
         with the bounds `read_low`, `read_high`, `detected_low` and `detected_high` on their rates; the mean of
-        `bit_errors`; the median `log10_p`, with `log10_p_least` and `log10_p_largest`; and the same of
-        `log10_p_unfloored`.
+        `bit_errors`, `rms` and `length` (None if a strength is no length); the median `log10_p`, with `log10_p_least`
+        and `log10_p_largest`; and the same of `log10_p_unfloored`.
 
     Raises:
         JaxmarkError: if there is no such field, or the level is out of range.
@@ -69,7 +70,9 @@ def _rate(rows: list[Row], level: float) -> dict[str, Any]:
         rate[name] = sum(getattr(row, name) for row in rows)
         interval = clopper_pearson(rate[name], len(rows), level)
         rate |= {f"{name}_low": float(interval.low), f"{name}_high": float(interval.high)}
-    rate["bit_errors"] = float(np.mean([row.bit_errors for row in rows]))
+    rate |= {name: float(np.mean([getattr(row, name) for row in rows])) for name in ("bit_errors", "rms")}
+    lengths = [row.length for row in rows if row.length is not None]
+    rate["length"] = float(np.mean(lengths)) if lengths else None
     for name in ("log10_p", "log10_p_unfloored"):
         p = [getattr(row, name) for row in rows]
         rate |= {name: float(np.median(p)), f"{name}_least": min(p), f"{name}_largest": max(p)}

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from jaxmark.alignment.original import Original
+from jaxmark.attacks.attack import unit_of_length
 from jaxmark.confidence import clopper_pearson
 from jaxmark.distortion import Metric, name_of
 from jaxmark.errors import JaxmarkError
@@ -139,7 +140,8 @@ def curves(rows: Sequence[Row], of: Measure = "read") -> Picture:
     """Plot one panel for each attack of a study, with weak strengths on the left.
 
     Each scheme has a line, or each scheme with a mesh, a payload and a budget where these vary; seeds are pooled.
-    Controls are grey, and pooled over all of these. Lines stand beside each other, so that equal ones are visible.
+    Strengths that are lengths, and budgets that are numbers, are fractions of the diagonal; the labels say so. Controls
+    are grey, and pooled over all of these. Lines stand beside each other, so that equal ones are visible.
 
     Args:
         rows: the rows of a study.
@@ -168,27 +170,29 @@ def curves(rows: Sequence[Row], of: Measure = "read") -> Picture:
 
 
 def _draw(panel: Any, rows: Sequence[Row], names: Sequence[str], of: Measure) -> None:
-    strengths = list(dict.fromkeys(row.strength for row in rows))
     series = _series(rows, names)
+    # A length depends on the mesh, so the ticks are at the means.
+    ticks = {rate["strength"]: _place(rate, rate["strength"]) for rate in rates(rows, ["strength"])}
+    strengths = list(ticks.values())
     looks = zip(series, cycle(COLOURS), cycle(MARKERS), cycle(_LINE_STYLES), strict=False)
     for place, ((label, control, found), colour, marker, dashes) in enumerate(looks):
         success = of if of != "read" else "detected" if control else "read"
         y, low, high = (_column(found, success + end) for end in ("", *_ENDS[of]))
         if of == "read":
             y, label = y / _column(found, "trials"), f"{label}, detected" if control else label
-        line = _column(found, "strength"), y, low, high
+        line = np.array([_place(rate, ticks[rate["strength"]]) for rate in found]), y, low, high
         style = _CONTROLS[control][1] if control else {"color": colour, "marker": marker, "linestyle": dashes}
         style = {**style, "label": label, "linewidth": 1.4, "elinewidth": 1, "markersize": 5}
         draw_aside(panel, line, place, len(series), len(strengths), **style)
     if len(strengths) > 1 and min(strengths) > 0:
         panel.set_xscale("log")
     panel.margins(x=0.12, y=0.08)  # space for the markers next to the outermost strengths
-    panel.set_xticks(strengths, [f"{strength:g}" for strength in strengths], fontsize=8)
+    panel.set_xticks(strengths, [f"{strength:.3g}" for strength in strengths], fontsize=8)
     panel.minorticks_off()
     if strengths[0] > strengths[-1]:
         panel.invert_xaxis()
     panel.set_title(rows[0].attack, fontsize=10)
-    panel.set_xlabel(textwrap.fill(rows[0].unit, 44), fontsize=8)
+    panel.set_xlabel(textwrap.fill(unit_of_length(rows[0].unit), 44), fontsize=8)
     counts = sorted({rate["trials"] for _, control, found in series if control is None for rate in found})
     trials = " to ".join(map(str, dict.fromkeys([*counts[:1], *counts[-1:]]))) or "none"
     if of == "read":
@@ -201,6 +205,11 @@ def _draw(panel: Any, rows: Sequence[Row], names: Sequence[str], of: Measure) ->
         panel.invert_yaxis()
         floor = ", without floor" if of == "log10_p_unfloored" else ""
         panel.set_ylabel(f"log10 p{floor}, median and range of {trials}", fontsize=8)
+
+
+def _place(rate: Mapping[str, Any], otherwise: float) -> float:
+    """Return the place of a rate on the axis of strengths: in diagonals if the strength is known to be a length."""
+    return otherwise if rate["length"] is None else rate["length"]
 
 
 def _column(rates: Sequence[dict[str, Any]], name: str) -> Float64[np.ndarray, " rates"]:
@@ -218,10 +227,17 @@ def _series(rows: Sequence[Row], names: Sequence[str]) -> list[Series]:
     marked: dict[str, list[dict[str, Any]]] = {}
     for rate in rates(rows, [*names, "strength"]):
         if rate["control"] == "marked":
-            label = ", ".join(f"{rate[name]} bits" if name == "bits" else str(rate[name]) for name in names)
+            label = ", ".join(_label(name, rate[name]) for name in names)
             marked.setdefault(label, []).append(rate)
     pooled = rates(rows, ["strength"])
     found: list[Series] = [(label, None, line) for label, line in marked.items()]
     for control, (label, _) in _CONTROLS.items():
         found.append((label, control, [rate for rate in pooled if rate["control"] == control]))
     return found
+
+
+def _label(name: str, value: Any) -> str:
+    """Return the value of a field as a part of a line's name, with its unit."""
+    if name == "bits":
+        return f"{value} bits"
+    return f"{value:g} of the diagonal" if isinstance(value, float) else str(value)

@@ -19,6 +19,7 @@ from typing import Any
 
 from jaxmark.adversaries.by_name import attack_each, get_attack
 from jaxmark.attacks import Attack
+from jaxmark.attacks.attack import mean_distance
 from jaxmark.errors import JaxmarkError
 from jaxmark.evaluation._rates import LOG10_LEVEL, Control, Row
 from jaxmark.evaluation._robustness import NOTHING, Outcome, compare_with
@@ -152,7 +153,8 @@ class Study:
         finally:
             _marker.cache_clear()
             _mark.cache_clear()
-        return Results(tuple(row for cell in done for row in self._rows(cell)))
+        distances = {name: _mean_distance(mesh) for name, mesh in self.meshes.items()}
+        return Results(tuple(row for cell in done for row in self._rows(cell, distances)))
 
     @property
     def _given_schemes(self) -> Mapping[str, str | Scheme | BlindScheme]:
@@ -196,13 +198,15 @@ class Study:
         varied = [name for name, part in zip(names, parts, strict=True) if len(part) > 1]
         return ", ".join([f"{attack} {strength:g}", *varied])
 
-    def _rows(self, cell: Mapping[str, Any]) -> Iterator[Row]:
+    def _rows(self, cell: Mapping[str, Any], distances: Mapping[str, float | None]) -> Iterator[Row]:
         mesh, scheme, bits, budget, attack, strength, *_ = cell["cell"]
-        unit, given = self._attacks[attack][0].unit, self._budgets[budget]
+        kind, given, distance = self._attacks[attack][0], self._budgets[budget], distances[mesh]
+        length = None if distance is None else kind.length(strength, distance)
         budget = given.rms if given == Budget(given.rms) and given.rms is not None else budget
         for one in cell["readings"]:
             detected = one["log10_p"] <= LOG10_LEVEL
-            yield Row(mesh, scheme, bits, budget, attack, strength, unit, detected=detected, **one)
+            point = mesh, scheme, bits, budget, attack, strength, kind.unit
+            yield Row(*point, length=length, detected=detected, **one)
 
 
 @dataclass(frozen=True)
@@ -304,6 +308,14 @@ def _original_mesh(point: _Point, seed: int) -> Mesh | str:
         return _marker(point, point.key(seed)).original.mesh
     except JaxmarkError as error:
         return f"Not marked: {error}"
+
+
+def _mean_distance(mesh: str | os.PathLike[str] | Mesh) -> float | None:
+    """Compute the mean distance of a mesh's vertices to their centre, over its diagonal; None for a refused mesh."""
+    try:
+        return mean_distance(mesh if isinstance(mesh, Mesh) else load_mesh(mesh))
+    except JaxmarkError:
+        return None
 
 
 def _derive(seed: int, label: str, size: int) -> bytes:

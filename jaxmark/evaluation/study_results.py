@@ -16,6 +16,9 @@ from jaxmark.files.atomic import write_atomically
 from jaxmark.plot.figures import Picture, write_page
 
 _LABELS: dict[Control, str] = {"unmarked": "unmarked, detected", "wrong-key": "another key, detected"}
+# Columns whose unit is not evident; the mark and the attack have lengths in one unit.
+_HEADS = {"budget": "budget, RMS over the diagonal or limits"}
+_LENGTHS = ("mark, RMS over the diagonal", "strength over the diagonal")
 _SHOWN: dict[Measure, str] = {"read": "What was read", "log10_p_unfloored": "Evidence"}
 
 
@@ -49,11 +52,13 @@ class Results:
         cells: dict[tuple[Any, ...], dict[Control, dict[str, Any]]] = {}
         for rate in self.rates():
             cells.setdefault(tuple(rate[name] for name in POINT), {})[rate["control"]] = rate
-        heads = [*POINT, "read", "95 %", "wrong bits", "log10 p, median", "without floor", *_LABELS.values()]
+        heads = [*(_HEADS.get(name, name) for name in POINT), *_LENGTHS]
+        heads += ["read", "95 %", "wrong bits", "log10 p, median", "without floor", *_LABELS.values()]
         lines = []
         for point, rate in cells.items():
             mark = rate["marked"]
             line = [f"{one:g}" if isinstance(one, float) else " ".join(str(one).split()) for one in point]
+            line += [f"{mark['rms']:.2g}", "-" if mark["length"] is None else f"{mark['length']:.2g}"]
             low, high = 100 * mark["read_low"], 100 * mark["read_high"]
             line += [f"{mark['read']}/{mark['trials']}", f"{low:.0f} - {high:.0f}"]
             line += [f"{100 * mark['bit_errors']:.1f} %", f"{mark['log10_p']:.1f}", f"{mark['log10_p_unfloored']:.1f}"]

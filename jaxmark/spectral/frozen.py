@@ -36,7 +36,7 @@ class FrozenLaplacian:
 
 
 def freeze(operator: Laplacian) -> FrozenLaplacian:
-    """Freeze an operator, so that it can be a field of a model that is trained.
+    """Freeze an operator, so that it can be a field of a model that is trained; use its `operator` for filters.
 
     The arrays take JAX's default precision: float32, unless `jax_enable_x64` is set. To train weights of edges, do not
     freeze the operator, but make it in each step by `Laplacian.with_weights`.

@@ -109,8 +109,13 @@ def log_evidence(
 
 
 def best_evidence(scores: Float[Array, " ways"], norms: Float[Array, " ways"]) -> Float[Array, ""]:
-    """Compute -ln p of the best of several ways of weighting; see `log_evidence`."""
-    ratios = jnp.maximum(scores / norms, 0)
+    """Compute -ln p of the best of several ways of weighting; see `log_evidence`.
+
+    As in `jaxmark.watermark.evidence.bounds.log10_p_score`, scores and norms that are not positive or not finite prove
+    nothing; those of a suspect that is the original itself are 0.
+    """
+    proves = (norms > 0) & jnp.isfinite(norms) & jnp.isfinite(scores)
+    ratios = jnp.where(proves, jnp.maximum(scores, 0) / jnp.where(proves, norms, 1), 0)
     return jnp.max(ratios) ** 2 / 2 - math.log(len(ratios))
 
 

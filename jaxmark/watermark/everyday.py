@@ -458,7 +458,8 @@ def detect_scene(
         if united.log10_p < evidence.log10_p:
             decoded = candidate if any(detection.message == candidate for detection in parts.values()) else None
         evidence = Evidence.least(evidence, united)
-    return best._replace(message=decoded, evidence=evidence, parts=parts, skipped=skipped)
+    recorded = None if decoded is None else next(part.recorded for part in parts.values() if part.message == decoded)
+    return best._replace(message=decoded, evidence=evidence, parts=parts, skipped=skipped, recorded=recorded)
 
 
 class _MeshReading(NamedTuple):

@@ -299,7 +299,8 @@ class BlindMarker:
                 " budget, a shorter message or another scheme."
             )
         if read_back:
-            self.with_record(info.record).check(marked, message)
+            with info.explained():
+                self.with_record(info.record).check(marked, message)
         return marked, info
 
     def write(
@@ -323,7 +324,8 @@ class BlindMarker:
             message_commitment=commit(message, choices) if message else "",
         ).sealed(self.key)
         survives = self.writer.survives(written.plan, self.bits)
-        return written.mesh, EmbedInfo(written.moved.rms, written.moved.max, record.beta, record, survives)
+        notes = (written.note,) if written.note else ()
+        return written.mesh, EmbedInfo(written.moved.rms, written.moved.max, record.beta, record, survives, notes)
 
     def with_record(self, record: Record) -> "BlindMarker":
         """See `Marker`; only the width and the quantisation step of the record are then read."""
@@ -407,18 +409,21 @@ class CombinedMarker:
         shares = _share(survived)
         first = Budget(rms=shares[0] * sizes[0], noise=budget.noise)
         marked, info = self.nonblind.embed(message, first, read_back=False)
-        survives = [info.survives]
+        survives, notes = [info.survives], [*alone.notes]
         limits = {**bounds.limits, **({} if bounds.rms is None else {"rms": bounds.rms})}
         for place, scheme in enumerate(self.schemes, 1):
             rms = None if place == len(self.schemes) else shares[place] * sizes[place]
             marker = self._make_blind(make_original(marked), scheme)
             marked, blind_info = marker.write(message, Budget(rms=rms, limits=limits), reference)
             survives.append(blind_info.survives)
-        if read_back:
-            self.check(marked, message)
+            notes += blind_info.notes
         change = distortion.displacement_size(mesh, marked)
         least = Survival(min(survival.whole for survival in survives), max(survival.half for survival in survives))
-        return marked, info._replace(rms=change.rms, max=change.max, survives=least)
+        info = info._replace(rms=change.rms, max=change.max, survives=least, notes=tuple(notes[:1]))
+        if read_back:
+            with info.explained():
+                self.check(marked, message)
+        return marked, info
 
     def with_record(self, record: Record) -> "CombinedMarker":
         """See `Marker`."""
@@ -552,13 +557,15 @@ def prepare(mesh: Mesh, key: bytes, bits: int, scheme: AnyScheme, *, adapt_to: B
 def unite(nonblind: Detection, blind: Sequence[Detection]) -> Detection:
     """Unite the detections of all marks of a mesh, whose signs are independent, into one non-blind detection."""
     detections = (nonblind, *blind)
+    decoded = next((detection for detection in detections if detection.message is not None), nonblind)
     notes = tuple(
         f"The mark of {detection.scheme!r}, if it were the only one that was read, would have a probability of"
         f" {'about' if detection.evidence.caveats else 'at most'} 10^{rounded_up(detection.log10_p):.1f}."
         for detection in blind
     )
     return nonblind._replace(
-        message=next((detection.message for detection in detections if detection.message is not None), None),
+        message=decoded.message,
+        recorded=decoded.recorded,
         evidence=Evidence.product(*(detection.evidence for detection in detections)),
         notes=(*nonblind.notes, *notes),
         parts={detection.scheme: detection for detection in detections},

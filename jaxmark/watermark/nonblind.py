@@ -137,6 +137,7 @@ def read(
         mark.coverage(received.observed),
         mark.scheme.name,
         premises=f"key, original, message and {'record' if mark.record else 'options'}",
+        claimed=claimed,
     )
     # Rounding moves no coordinate by more than half of the grid spacing, and the fit of the pose by little more. A mark
     # that can be read moves some coordinates by more.
@@ -248,6 +249,8 @@ class _Reading(NamedTuple):
         if message is None:
             return detection
         recorded = is_recorded(mark.record, message, mark.choices)
+        if message == detection.message:
+            detection = detection._replace(recorded=recorded)
         is_another = recorded is False if claimed is None else detection.message not in (None, claimed)
         fixed = not is_another and (claimed is not None or recorded is True)
         if is_another:

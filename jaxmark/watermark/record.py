@@ -16,6 +16,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -313,14 +314,26 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     """Read the JSON of a record file; None if it contains no JSON.
 
     Raises:
-        JaxmarkError: if the file cannot be read.
+        JaxmarkError: if the file cannot be read, or a name in it has two values.
     """
     try:
-        return json.loads(read_file(path, _MAX_FILE_BYTES))
+        return json.loads(read_file(path, _MAX_FILE_BYTES), object_pairs_hook=partial(_unique, path))
     except OSError as error:
         raise JaxmarkError(f"The record {path} cannot be read: {error.strerror}.") from None
+    except JaxmarkError:
+        raise
     except (ValueError, RecursionError):
         return None
+
+
+def _unique(path: str | os.PathLike[str], pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make a JSON object's mapping; a name with two values would be read differently by other programs."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise JaxmarkError(
+            f"The record {path} is damaged or forged: a name in it has two values. Use an unedited copy."
+        )
+    return found
 
 
 def is_recorded(record: Record | None, content: bytes, choices: Choices) -> bool | None:

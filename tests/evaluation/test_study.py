@@ -14,12 +14,13 @@ import pytest
 
 import jaxmark as jm
 from jaxmark.attacks import Attack
+from jaxmark.attacks.attack import mean_distance
 from jaxmark.confidence import clopper_pearson
 from jaxmark.evaluation._rates import Row
 from jaxmark.evaluation.cells import load_finished
 from jaxmark.evaluation.study import load_study
 from jaxmark.evaluation.study_results import Results
-from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh, diagonal
 from tests.app.test_cli import Workshop
 from tests.samples import bumpy_sphere
 
@@ -248,11 +249,58 @@ def test_lines_of_meshes_are_apart_and_the_legend_fits():
     figure.draw_without_rendering()
     (axes,) = figure.axes
     labels = {container.get_label() for container in axes.containers}
-    assert {"keyed, a mesh with a long name, 0.0008", "keyed, b, 0.0008", "keyed, c, 0.0008"} < labels
+    names = ("a mesh with a long name", "b", "c")
+    assert {f"keyed, {name}, 0.0008 of the diagonal" for name in names} | {
+        "keyed, b, dame=0.008, careful look"
+    } < labels
     (legend,) = figure.legends
     box, page = legend.get_window_extent(), figure.bbox
     assert page.x0 <= box.x0 < box.x1 <= page.x1
     assert page.y0 <= box.y0 < box.y1 <= axes.get_tightbbox().y0
+
+
+@pytest.mark.parametrize(
+    ("attack", "strength", "size"),
+    [
+        ("noise", 0.02, lambda moved: np.abs(moved).max()),
+        ("gaussian-noise", 0.02, lambda moved: np.sqrt(np.mean(moved**2))),
+        ("diagonal-noise", 0.02, lambda moved: np.abs(moved).max()),
+        ("warp", 0.02, lambda moved: np.sqrt(np.mean(np.sum(moved**2, axis=1)))),
+    ],
+)
+def test_strengths_that_are_lengths_are_fractions_of_the_diagonal(attack, strength, size):
+    """The length is that of the displacement that the attack makes, also where a mesh has seams."""
+    ball = bumpy_sphere(3)
+    apart = Mesh(
+        np.asarray(ball.vertices)[np.asarray(ball.faces).ravel()], np.arange(3 * len(ball.faces)).reshape(-1, 3)
+    )
+    for mesh in (ball, apart):
+        moved = np.asarray(jm.attack(mesh, attack, strength, seed=0).vertices) - np.asarray(mesh.vertices)
+        length = jm.adversaries.ATTACKS[attack].length(strength, mean_distance(mesh))
+        assert length == pytest.approx(size(moved) / diagonal(mesh), rel=0.03)
+
+
+def test_strengths_that_are_no_lengths_keep_their_unit():
+    assert jm.adversaries.ATTACKS["smoothing"].length(10, 0.3) is None
+
+
+def test_noise_and_budgets_have_one_unit_in_pictures():
+    pytest.importorskip("matplotlib")
+    unit = jm.adversaries.ATTACKS["noise"].unit
+    rows = [
+        row
+        for mesh, distance in (("a", 0.2), ("b", 0.3))
+        for strength in (0.001, 0.01)
+        for row in made_up(2, mesh=mesh, strength=strength, length=distance * strength, unit=unit)
+    ]
+    rows += made_up(1, mesh="refused", strength=0.001, unit=unit, refusal="It has no faces.")
+    (axes,) = Results(tuple(rows)).plot().figure.axes
+    assert axes.get_xlabel() == "half width over the diagonal"
+    lines = {container.get_label(): container.lines[0].get_xdata() for container in axes.containers}
+    np.testing.assert_allclose(lines["keyed, a"], [0.0002, 0.002])
+    np.testing.assert_allclose(lines["keyed, b"], [0.0003, 0.003])
+    np.testing.assert_allclose(lines["keyed, refused"], [0.00025])
+    np.testing.assert_allclose(axes.get_xticks(), [0.00025, 0.0025])
 
 
 def test_tables(results, tmp_path):
@@ -262,7 +310,11 @@ def test_tables(results, tmp_path):
     assert len(rows) == len(results.rows)
     assert [float(row["log10_p"]) for row in rows] == [row.log10_p for row in results.rows]
     lines = results.markdown().splitlines()
-    assert lines[2].startswith("| ball | keyed | 16 | 0.002 | noise | 0.002 | 2/2 | 16 - 100 | 0.0 % | -")
+    assert lines[0].startswith("| mesh | scheme | bits | budget, RMS over the diagonal or limits | attack | strength |")
+    length = f"{0.002 * mean_distance(bumpy_sphere(3)):.2g}"
+    start = f"| ball | keyed | 16 | 0.002 | noise | 0.002 | 0.002 | {length} | 2/2 | 16 - 100 | 0.0 % | -"
+    assert lines[2].startswith(start)
+    assert "| stretch | 0.1 | 0.002 | - |" in results.markdown()  # its unit is no length
     assert lines[2].endswith("| 0/2 | 0/2 |")
     assert any(line.startswith("unmarked, detected: 0/6, 95 % interval up to 46 %") for line in lines)
 
@@ -384,7 +436,7 @@ def test_a_study_from_a_file(tmp_path, monkeypatch, capfd):
     code, out, err = workshop("study", "declared/study.toml", "--output", "left")
     assert code == 0, err
     assert err == ""  # progress is for terminals
-    assert "| ball | keyed | 16 | 0.002 | noise | 0.002 | 1/1 |" in out
+    assert re.search(r"\| ball \| keyed \| 16 \| 0\.002 \| noise \| 0\.002 \| 0\.002 \| [\d.]+ \| 1/1 \|", out)
     assert Path("left/rates.md").read_text() == out
     assert "<td>ball</td><td>keyed</td>" in Path("left/study.html").read_text()
     told = workshop.json("study", "declared/study.toml", "--output", "left")

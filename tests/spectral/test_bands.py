@@ -323,7 +323,9 @@ def test_a_fitted_function_is_interpolated_and_its_error_said():
 def test_functions_that_cannot_be_fitted_are_refused(unchecked):
     operator = from_mesh(bumpy_sphere(1))
     for call, sentence in [
-        (lambda: spectral.fit(np.exp, -1), "degree of at least 0, got -1"),
+        (lambda: spectral.fit(np.exp, -1), "whole number of at least 0, got -1"),
+        (lambda: spectral.fit(np.exp, 2.5), "whole number of at least 0, got 2.5"),  # pyright: ignore
+        (lambda: spectral.fit(lambda x: 1j * x, 3), "real values"),
         (lambda: spectral.fit(lambda x: np.where(x < 1, np.nan, x), 3), "one finite value for each"),
         (lambda: spectral.fit(lambda x: np.float64(1), 3), "one finite value for each"),
         (lambda: spectral.filter(operator, np.exp, jnp.ones(42)), r"spectral.fit\(function, degree\)"),  # pyright: ignore

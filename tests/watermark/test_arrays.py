@@ -79,3 +79,10 @@ def test_meshes_of_arrays_are_in_the_units_of_the_file(marker: NonBlindMarker, k
     large = Mesh(1e3 * np.asarray(bumpy_sphere(2).vertices) + 5e3, bumpy_sphere(2).faces)
     other = NonBlindMarker.make(make_original(large), key, marker.scheme, 16)
     np.testing.assert_allclose(other.to_mesh(other.arrays(b"ok").x).vertices, large.vertices, rtol=1e-12)
+
+
+def test_an_original_and_broken_numbers_prove_nothing(sphere: Mesh, key: jm.Key):
+    arrays = jm.make_marker(sphere, key, bits=16).arrays(b"ok")
+    for suspect in (arrays.x, jnp.nan * arrays.x, arrays.x.at[0, 0].set(jnp.inf)):
+        assert arrays.evidence(suspect) <= 0
+    assert jnp.isfinite(jax.grad(arrays.evidence)(arrays.x)).all()

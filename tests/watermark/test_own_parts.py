@@ -216,3 +216,21 @@ def test_studies_and_curves_read_it(marked, tmp_path):
 def test_tuning_says_that_it_has_no_bands():
     with pytest.raises(jm.JaxmarkError, match="'patches' has no bands whose strengths could be tuned"):
         jm.tune(bumpy_sphere(2), [("noise", 1e-3)], 1e-3, seed=0, scheme=PatchScheme())
+
+
+@pytest.mark.parametrize(
+    ("function", "sentence"),
+    [
+        (lambda chips: chips + 1, "must be a linear function"),
+        (jnp.abs, "must be a linear function"),
+        (lambda chips: chips**2, "must be a linear function"),
+        (lambda chips: chips[:5], r"one for each row.* this one returns \(5, 3\)"),
+    ],
+)
+def test_maps_that_are_not_linear_make_no_carrier(sphere: Mesh, key: jm.Key, function, sentence: str):
+    original, choices = jm.alignment.make_original(sphere), Choices(key, b"")
+    with pytest.raises(jm.JaxmarkError, match=sentence):
+        make_spread_carrier(original, choices, 16, jax.tree_util.Partial(function))
+    for bits, channels in ((0, 3), (16, 0)):
+        with pytest.raises(jm.JaxmarkError, match=f"code bits and channels, got {bits} and {channels}"):
+            make_spread_carrier(original, choices, bits, jax.tree_util.Partial(lambda chips: chips), channels=channels)

@@ -288,6 +288,18 @@ def test_imprints_have_ranges(marked, original: Mesh, key: jm.Key, field: str, v
         jm.make_marker(original, key, record=forged)
 
 
+@pytest.mark.parametrize(
+    ("name", "second"), [("told", '"00"'), ("bits", "8"), ("format", '"x"'), ("grid", "1.0"), ("profile", "[]")]
+)
+def test_records_that_give_a_name_two_values_are_refused(marked, tmp_path: Path, name: str, second: str):
+    """Other programs may read the first of them."""
+    text = marked[1].to_json()
+    assert text.count(f'"{name}":') == 1
+    (tmp_path / "a.json").write_text(text.replace(f'"{name}":', f'"{name}": {second}, "{name}":'))
+    with pytest.raises(jm.JaxmarkError, match=r"a\.json is damaged or forged: a name in it has two values"):
+        load_record(tmp_path / "a.json")
+
+
 def test_records_nested_too_deeply_are_refused(marked, tmp_path: Path):
     data = json.loads(marked[1].to_json())
     for _ in range(900):

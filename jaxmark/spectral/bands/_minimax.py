@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
@@ -33,13 +34,17 @@ def fit(function: Callable[[np.ndarray], np.ndarray], degree: int) -> Interpolat
         degree: degree of the polynomial, at least 0.
 
     Raises:
-        JaxmarkError: if the degree is negative, or the function is not finite there, or returns another shape.
+        JaxmarkError: if the degree is no whole number of at least 0, or the function is not real and finite there, or
+            returns another shape.
     """
-    if degree < 0:
-        raise JaxmarkError(f"fit needs a degree of at least 0, got {degree}.")
+    if not isinstance(degree, Integral) or degree < 0:
+        raise JaxmarkError(f"fit needs a degree that is a whole number of at least 0, got {degree!r}.")
     points = 1 + np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
     grid = 1 - np.cos(np.linspace(0, np.pi, _POINTS_PER_RIPPLE * (degree + 1) + 1))
-    values, fine = (np.asarray(function(where), np.float64) for where in (points, grid))
+    found = [function(where) for where in (points, grid)]
+    if any(np.iscomplexobj(values) for values in found):
+        raise JaxmarkError("fit needs a function with real values; fit real and imaginary part one by one.")
+    values, fine = (np.asarray(values, np.float64) for values in found)
     if values.shape != points.shape or not (np.isfinite(values).all() and np.isfinite(fine).all()):
         raise JaxmarkError("fit needs a function with one finite value for each λ in [0, 2].")
     coefficients = 2 / (degree + 1) * chebyshev.chebvander(points - 1, degree).T @ values

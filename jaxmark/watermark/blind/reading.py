@@ -131,7 +131,7 @@ def read(
     usual = scheme if record is not None else BLIND_SCHEMES.get(scheme.name, scheme)
     kinds = max(len(one.widths) * len(one.steps) for one in (scheme, usual))
     looks = kinds * scheme.looks * _CHANGES
-    best = _nothing(scheme, np.zeros(length), Anchored(Pose(np.eye(3), np.zeros(3))))
+    best = _nothing(scheme, claim, np.zeros(length), Anchored(Pose(np.eye(3), np.zeros(3))))
     tags_compared = 0  # number of messages whose tags were already compared
     for group in scheme.views(suspect, choices):
         readings = [reading for view in group for reading in _readings(view, scheme, choices, length)]
@@ -237,7 +237,7 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
         message = decoded.message if is_recorded(record, decoded.message, choices) else None
     fixed = message is not None
     if decoded is None and not fixed:
-        return _nothing(scheme, readings[0].soft, readings[0].anchored)
+        return _nothing(scheme, claim, readings[0].soft, readings[0].anchored)
     if message is None:
         message = decoded.message if decoded is not None else b""
     word = codeword(message, choices)
@@ -264,9 +264,9 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
     if reading.view.mirrored[reading.turn]:
         notes.append("The suspect is the mirror image of the marked mesh.")
     agreement = float(score[chosen] / reading.anchors)
-    return _nothing(scheme, reading.soft, reading.anchored._replace(agreement=agreement))._replace(
+    return _nothing(scheme, claim, reading.soft, reading.anchored._replace(agreement=agreement))._replace(
         message=None if decoded is None else decoded.message,
-        premises=f"key, message and {'options' if record is None else 'record'}",
+        recorded=None if decoded is None else is_recorded(record, decoded.message, choices),
         evidence=weigh(
             ways,
             bits=bits,
@@ -293,7 +293,8 @@ def _caveats(scheme: BlindScheme, record: Record | None) -> tuple[str, ...]:
     return ()
 
 
-def _nothing(scheme: BlindScheme, soft: Float64[np.ndarray, " code"], anchored: Anchored) -> Detection:
+def _nothing(scheme: BlindScheme, claim: _Claim, soft: Float64[np.ndarray, " code"], anchored: Anchored) -> Detection:
     """Make a detection without evidence."""
     scores = soft / (np.sqrt(np.mean(soft**2)) or 1.0)
-    return Detection(None, Evidence(), anchored, scores, None, scheme.name, premises="key, message and record")
+    premises = f"key, message and {'options' if claim.record is None else 'record'}"
+    return Detection(None, Evidence(), anchored, scores, None, scheme.name, premises, claimed=claim.message)

@@ -116,6 +116,7 @@ class Allowance(NamedTuple):
     size: float  # RMS displacement with it, in diagonals
     host: AnchoredHost
     dither: Dither
+    note: str  # see `jaxmark.watermark.perception.budget.Written`
 
     def plan(self, step: float) -> Plan:
         """Plan a mark with a quantisation step, with the largest α that is allowed."""
@@ -129,6 +130,7 @@ class Written(NamedTuple):
     mesh: Mesh
     moved: distortion.DisplacementSize
     plan: Plan
+    note: str  # see `jaxmark.watermark.perception.budget.Written`
 
 
 def carried(bits: int) -> float:
@@ -195,15 +197,16 @@ class Writer:
         Raises:
             JaxmarkError: if the mesh has no anchors, or the budget does not allow the smallest step.
         """
-        fitting = []
-        for allowance in self.allowances(word, bounds, reference):
-            if steps := self.steps(allowance):
-                fitting.append(allowance.plan(max(steps)))
+        allowances = self.allowances(word, bounds, reference)
+        fitting = [allowance.plan(max(steps)) for allowance in allowances if (steps := self.steps(allowance))]
         if not fitting:
-            raise JaxmarkError(
+            refusal = (
                 f"This mesh, or the budget for it, leaves the scheme {self.scheme.name!r} nothing to write in; use a"
                 " larger budget or the scheme 'keyed'."
             )
+            # The anchors of different widths meet the same faces, so one note says it.
+            notes = [allowance.note for allowance in allowances if allowance.note]
+            raise JaxmarkError(" ".join((refusal, *notes[:1])))
         return max(fitting, key=lambda plan: (sureness(plan, bits), plan.margin(self._spread(plan.host), bits).surplus))
 
     def write(
@@ -233,7 +236,7 @@ class Writer:
         if alpha > 1:  # beyond the lattice, values would have errors again
             mesh, alpha = displace(self.original, shift / plan.alpha), 1.0
             moved = distortion.DisplacementSize.of(shift_of(self.original, mesh)[self.original.used])
-        return Written(mesh, moved, plan._replace(alpha=alpha))
+        return Written(mesh, moved, plan._replace(alpha=alpha), written.note)
 
     def allowances(
         self, word: Float64[np.ndarray, " code"], bounds: Bounds, reference: distortion.Reference
@@ -249,8 +252,9 @@ class Writer:
             size = float(distortion.rms(shift[self.original.used]))
             if math.isfinite(size) and size > 0:
                 first = allowances[-1].size if allowances else None
-                scale = displace_within(self.original, shift, bounds, reference, first=first, share=_ENOUGH).scale
-                allowances.append(Allowance(width, host.step * scale, size * scale, host, dither))
+                written = displace_within(self.original, shift, bounds, reference, first=first, share=_ENOUGH)
+                step, reached = host.step * written.scale, size * written.scale
+                allowances.append(Allowance(width, step, reached, host, dither, written.note))
         return allowances
 
     def steps(self, allowance: Allowance) -> list[float]:

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxmark.alignment.observation import Observation
 from jaxmark.alignment.original import Original
+from jaxmark.errors import JaxmarkError
 from jaxmark.seeds import Seed
 from jaxmark.spectral.precision import sum_and_norm
 from jaxmark.watermark.carriers.chips import Chips, make_chips
@@ -89,6 +90,36 @@ def make_spread_carrier(
         shape: a linear function of chips `[rows, channels]`, with a row for each of `original.signal`, to displacements
             `[rows, 3]`, **independent of the key**; as a pytree, such as `jax.tree_util.Partial(function, *arrays)`.
         channels: number of chips of each vertex.
+
+    Raises:
+        JaxmarkError: if there is no code bit or no channel, or the map is not linear or returns another shape.
     """
+    if code_bits < 1 or channels < 1:
+        raise JaxmarkError(f"A carrier needs code bits and channels, got {code_bits} and {channels}.")
+    _check_map(shape, original.signal, channels)
     chips = make_chips(choices, original.chip_places, code_bits, channels=channels, count=original.count)
     return SpreadCarrier(shape, chips, original.signal)
+
+
+def _check_map(shape: Any, signal: Float[Array, "rows 3"], channels: int) -> None:
+    """Check the map of `make_spread_carrier`: JAX can transpose it, and it maps zero to zero displacements.
+
+    Raises:
+        JaxmarkError: if the map is not linear or returns another shape.
+    """
+    chips = jnp.zeros((len(signal), channels), signal.dtype)
+    moved = shape(chips)
+    if jnp.shape(moved) != signal.shape:
+        raise JaxmarkError(
+            f"The map of a carrier returns displacements of the shape {signal.shape}, one for each row of"
+            f" `original.signal`; this one returns {jnp.shape(moved)}."
+        )
+    try:
+        jax.eval_shape(jax.linear_transpose(shape, chips), moved)
+    except NotImplementedError:
+        moved = None
+    if moved is None or (moved != 0).any():
+        raise JaxmarkError(
+            "The map of a carrier must be a linear function of the chips, such as a filter, a matrix or products with"
+            " constants; this one is not."
+        )

@@ -224,6 +224,9 @@ class Detection(NamedTuple):
         parts: the detections that are united here, by the names of meshes or schemes.
         skipped: original meshes that could not be compared, and the reasons.
         version: version of the keyed choices that the mark was read with.
+        claimed: the message that was claimed before the suspect was read, empty for the presence of a mark without a
+            message; None if the suspect was read without a claim.
+        recorded: whether the record commits to the decoded message; None without such a message or commitment.
     """
 
     message: bytes | None
@@ -237,6 +240,8 @@ class Detection(NamedTuple):
     parts: Mapping[str, "Detection"] = {}
     skipped: Mapping[str, str] = {}
     version: int = SCHEME_VERSION
+    claimed: bytes | None = None
+    recorded: bool | None = None
 
     @property
     def log10_p(self) -> float:
@@ -249,19 +254,15 @@ class Detection(NamedTuple):
         return self.log10_p, self.message is None
 
     def statement(self) -> str:
-        """State the result for a publication: the message, both p-values, their conditions, and what they include."""
+        """State the result for a publication: the claim or the message, both p-values, and their conditions.
+
+        A claim without a decoded message is called supported if its evidence is detected at 10^-6, as by `detected`.
+        """
         evidence = self.evidence
-        if self.message is None:
-            result = (
-                f"No message of the scheme {self.scheme!r} was decoded; if one was claimed, or the mark carries none,"
-                " the figures are those of the claim, or of the presence of the mark."
-            )
-        else:
-            result = f"The message {self.message.hex()} of the scheme {self.scheme!r} was decoded."
         kind = "is estimated as" if evidence.caveats else "is at most"
         charges = ", ".join(f"{charge.choice} ({charge.taken}) {charge.log10:.2f}" for charge in evidence.charges)
         parts = [
-            result,
+            self._result(),
             f"For a mesh that is independent of the key, the probability of evidence that is as strong {kind}"
             f" 10^{rounded_up(evidence.log10_p):.1f} if {self.premises} were fixed before the mesh existed, and"
             f" 10^{rounded_up(evidence.log10_p_uncommitted):.1f} if nothing shows that, which charges a choice among"
@@ -273,6 +274,37 @@ class Detection(NamedTuple):
             f"(jaxmark {version('jaxmark')}, keyed choices of version {self.version})",
         ]
         return " ".join(filter(None, parts))
+
+    def _result(self) -> str:
+        """State what was claimed, and what was found."""
+        scheme = f"of the scheme {self.scheme!r}"
+        if self.claimed is None:
+            return self._result_of_reading(scheme)
+        claim = f"the message {self.claimed.hex()} {scheme}" if self.claimed else f"the presence of a mark {scheme}"
+        start = f"Before the mesh was read, {claim} was claimed"
+        if self.message is None or not self.claimed:
+            missing = ", although it could not be decoded," if self.claimed else ""
+            if self.detected(allow_estimate=True):
+                return f"{start}. The mesh supports the claim{missing} at a level of 10^-6."
+            return f"{start}. The mesh does not support the claim at a level of 10^-6."
+        if self.message == self.claimed:
+            return f"{start}, and it was decoded."
+        figures = "unite the evidence of all marks" if self.parts else "are those of the decoded message"
+        return (
+            f"{start}. The mesh does not support the claim: the message {self.message.hex()} was decoded instead, and"
+            f" the figures {figures}."
+        )
+
+    def _result_of_reading(self, scheme: str) -> str:
+        """State what was found without a claim."""
+        if self.message is None:
+            return f"No message was claimed, and none {scheme} was decoded, so there is no evidence of a mark."
+        recorded = {
+            True: " It is the message that the record commits to.",
+            False: " It is another message than the one that the record commits to.",
+            None: "",
+        }
+        return f"The message {self.message.hex()} {scheme} was decoded without a claim.{recorded[self.recorded]}"
 
     def detected(self, alpha: float = 1e-6, *, allow_estimate: bool = False) -> bool:
         """Whether the false-positive probability is proven to be at most `alpha`, if all claims were fixed before.

@@ -200,7 +200,7 @@ class KeyedScheme(Scheme):
     def _strengths(self, original: Original, bits: int) -> Float64[np.ndarray, " passing"]:
         """Compute relative strengths as in `strengths`, but also in bands that are mostly nuisance."""
         if self.profile:
-            return np.array(self.profile)
+            return np.array(self.profile, np.float64)
         passband = PASS_BANDS[self.passband]
         default, needed = round(self.bands * passband.share), passband.spread * (bits + TAG_BITS)
         if self.passband == "narrow":

@@ -1,9 +1,10 @@
 """A scheme for band filters of your own, such as trained ones, which are bound to the mark like all its parameters."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from jaxtyping import Float64
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike
 
@@ -38,12 +39,13 @@ class OwnBandsScheme(Scheme):
 
         Raises:
             JaxmarkError: if there is no filter or more than 512, or one has no or more than 512 terms, or other numbers
-                of terms than the others; or if the largest coefficient is not from 1e-6 to 1e6 in size.
+                of terms than the others; if a term is no real number; or if the largest coefficient is not from 1e-6
+                to 1e6 in size.
         """
-        sizes = {len(one) for one in self.filters}
-        if not 1 <= len(self.filters) <= _MOST or len(sizes) != 1 or not 1 <= max(sizes) <= _MOST:
+        filters = _as_reals(self.filters)
+        if filters.ndim != 2 or not all(1 <= size <= _MOST for size in filters.shape):
             raise JaxmarkError(f"Own bands are 1 to {_MOST} filters of equally many terms, 1 to {_MOST}.")
-        if not 1 / _LARGEST <= np.abs(self.filters).max() <= _LARGEST:  # not with NaN either
+        if not 1 / _LARGEST <= np.abs(filters).max() <= _LARGEST:  # not with NaN either
             raise JaxmarkError(f"Own bands have a largest coefficient of {1 / _LARGEST:g} to {_LARGEST:g} in size.")
 
     @classmethod
@@ -58,10 +60,10 @@ class OwnBandsScheme(Scheme):
             hiding: see the field.
 
         Raises:
-            JaxmarkError: if they have other shapes, or are not as described in `__post_init__`.
+            JaxmarkError: if they have other shapes, or are not real numbers as described in `__post_init__`.
         """
-        filters = np.asarray(bands, np.float64)
-        factors = np.asarray(np.ones(filters.shape[:1]) if strengths is None else strengths, np.float64)
+        filters = _as_reals(bands)
+        factors = _as_reals(np.ones(filters.shape[:1]) if strengths is None else strengths)
         if filters.ndim != 2 or factors.shape != filters.shape[:1]:
             raise JaxmarkError(
                 f"Own bands are an array [bands, degree + 1] and a strength for each, not {filters.shape} and"
@@ -86,6 +88,23 @@ class OwnBandsScheme(Scheme):
     def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> KeyedCarrier:
         """See `Scheme`."""
         size = nuisance_size(self.dimensions(original, bits) / 3, PASS_BANDS["tapered"])
-        host = host_of(original, np.array(self.filters), *size)
+        # A common factor of the filters changes nothing, but very small ones would be lost in float32. Powers of two
+        # are exact.
+        scale = 2.0 ** -np.round(np.log2(np.abs(self.filters).max()))
+        host = host_of(original, scale * np.array(self.filters), *size)
         chips = make_chips(choices, original.chip_places, code_bits, count=original.count)
         return KeyedCarrier(host, chips, masking=masking_tensors(original) if self.hiding else None)
+
+
+def _as_reals(values: Any) -> Float64[np.ndarray, "..."]:
+    """Convert real numbers to an array.
+
+    Raises:
+        JaxmarkError: if they are no array of real numbers.
+    """
+    try:
+        if not np.iscomplexobj(values):
+            return np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        pass
+    raise JaxmarkError("Own bands and their strengths are arrays of real numbers, with rows of equally many terms.")

@@ -31,6 +31,7 @@ DEFAULT_SCHEME = KeyedScheme.name
 #: A scheme, its name, or names for several marks in one mesh: one that is read with the original, then blind ones.
 AnyScheme = str | Scheme | BlindScheme | tuple[str, ...]
 
+_MOST_EXACT = 2**53  # largest whole number up to which floats have all
 _MAX_COMPONENTS = 512  # the most bands or eigenpairs that a record may ask for, which limits the time of reading
 
 # The values, by scheme, of fields that are missing from records that were written before the fields existed.
@@ -91,11 +92,15 @@ def make_scheme(name: str, parameters: Mapping[str, Any]) -> Scheme:
     for field, value in _RETIRED_FIELDS.get(name, {}).items():
         if values.pop(field, value) != value:
             raise JaxmarkError(f"Marks of the scheme {name!r} with {field} other than {value} are no longer read.")
-    if any(
-        field not in types or type(value) is not types[field] or not _fits(field, value)
+    if wrong := [
+        field
         for field, value in values.items()
-    ):
-        raise JaxmarkError(f"The scheme {name!r} takes the parameters {', '.join(types)}, not {values}.")
+        if field not in types or type(value) is not types[field] or not _fits(field, value)
+    ]:
+        raise JaxmarkError(
+            f"The scheme {name!r} takes the parameters {', '.join(types)}; there is none of this form:"
+            f" {', '.join(map(repr, wrong))}."
+        )
     if any(not 0 < values.get(field, 1) <= _MAX_COMPONENTS for field in ("bands", "pairs")):
         raise JaxmarkError(f"The scheme in a record has 1 to {_MAX_COMPONENTS} bands or pairs, not {values}.")
     return _BY_RECORD[name](**{**_FIELDS_OF_OLD_RECORDS.get(name, {}), **values})
@@ -107,11 +112,16 @@ def _as_tuples(value: Any) -> Any:
 
 
 def _fits(field: str, value: Any) -> bool:
-    """Whether a value, if it is a tuple, has only floats; `filters` are tuples of floats."""
+    """Whether a value, if it is a tuple, has only numbers; `filters` are tuples of numbers."""
     if not isinstance(value, tuple):
         return True
     lists = value if field == "filters" else (value,)
-    return all(isinstance(one, tuple) and all(isinstance(item, float) for item in one) for one in lists)
+    return all(isinstance(one, tuple) and all(map(_is_number, one)) for one in lists)
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a float, or a whole number that a float holds exactly."""
+    return isinstance(value, float) or (type(value) is int and abs(value) <= _MOST_EXACT)
 
 
 def make_blind_scheme(name: str, parameters: Mapping[str, Any]) -> BlindScheme:

@@ -5,6 +5,7 @@ import math
 from contextlib import nullcontext
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxmark as jm
 from jaxmark.alignment.original import make_original
+from jaxmark.app import mark_files
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.surfaces import surface_moments, volume_moments
 from jaxmark.spectral.graphs import from_mesh
@@ -27,9 +29,12 @@ from jaxmark.watermark.blind.reading import context
 from jaxmark.watermark.blind.scheme import measure
 from jaxmark.watermark.blind.search import moved
 from jaxmark.watermark.blind.writing import Writer
+from jaxmark.watermark.markers import BlindMarker, CombinedMarker, make_blind_marker
+from jaxmark.watermark.perception.capacity import Survival
 from tests.app.test_cli import MESSAGE as CLI_MESSAGE
 from tests.app.test_cli import Workshop
-from tests.samples import bumpy_sphere
+from tests.samples import bumpy_sphere, with_thin_faces
+from tests.watermark.perception.test_budget import largest_stretch
 
 MESSAGE = bytes.fromhex("c0ffee42")
 WIDTH = 0.025
@@ -394,3 +399,74 @@ def test_information_of_few_good_and_of_many_weak_values():
 def test_tuning_refuses_informed_schemes(shape: Mesh):
     with pytest.raises(jm.JaxmarkError, match="there is tune"):
         jm.evaluation.tune_blind(shape, [("noise", 0.003)], seed=0, scheme="keyed")
+
+
+@pytest.fixture(scope="module")
+def thin() -> BlindMarker:
+    """Marks the presence in a mesh with thin faces, whose angles change far more than others."""
+    mesh = with_thin_faces(bumpy_sphere(3))
+    mesh = mesh._replace(vertices=np.asarray(mesh.vertices) * [1, 0.75, 0.55])
+    return make_blind_marker(mesh, bytes(range(32)), bits=0, scheme=FieldScheme(widths=(WIDTH,)))
+
+
+TIGHT = "The limit of dame, 0.006, allows only "
+
+
+def test_a_limit_that_a_few_faces_make_tight_is_named(thin):
+    assert not thin.write(b"", 1e-3)[1].notes
+    info = thin.write(b"", jm.Budget(limits={"dame": 0.006}))[1]
+    (note,) = info.notes
+    assert note.startswith(TIGHT)
+    faces = {int(part.split()[0]) for part in note.split("others: ")[1].split(", ")}
+    assert {0, 2} <= faces
+    # A limit that allows no mark at all is named in the refusal.
+    with pytest.raises(jm.JaxmarkError, match=r"nothing to write in.*The limit of dame, 0\.003, allows only .* \(by "):
+        thin.write(b"", jm.Budget(limits={"dame": 0.003}))
+
+
+def test_a_mark_that_does_not_read_back_is_refused_with_the_limit(thin, monkeypatch):
+    monkeypatch.setattr(BlindMarker, "reads", lambda *_: False)
+    with pytest.raises(jm.JaxmarkError, match=f"does not read back.*{TIGHT}"):
+        thin.embed(b"", jm.Budget(limits={"dame": 0.006}))
+
+
+def test_the_command_prints_the_limit(thin, tmp_path, monkeypatch):
+    monkeypatch.setattr(mark_files, "prepare", lambda *_, **__: thin)
+    monkeypatch.setattr(BlindMarker, "measure_survival", lambda *_, **__: Survival(0.02, 0.01))
+    source, out = tmp_path / "thin.obj", tmp_path / "out.obj"
+    jm.save_mesh(thin.original.mesh, source)
+    budget = jm.Budget(limits={"dame": 0.006})
+    options = {"key": thin.key, "message": b"", "budget": budget, "scheme": "field"}
+    outcome = mark_files.mark_file(source, out, tmp_path / "out.json", **options)
+    assert outcome.values["notes"][0].startswith(TIGHT)
+    assert any(line.startswith(TIGHT) for line in outcome.lines)
+
+
+@pytest.mark.slow
+def test_several_marks_name_the_limit_as_well(thin):
+    limits = {largest_stretch: 0.2}
+    marker = CombinedMarker(jm.make_marker(thin.original.mesh, thin.key, bits=0), (thin.scheme,))
+    (note,) = marker.embed(b"", jm.Budget(limits=limits), read_back=False)[1].notes
+    assert note.startswith("The limit of largest_stretch, 0.2, allows only ")
+
+
+@pytest.mark.parametrize(
+    ("claim", "sign", "fields"),
+    [
+        (MESSAGE, 1, (MESSAGE, MESSAGE, None)),
+        (bytes(4), 1, (MESSAGE, bytes(4), None)),
+        (None, 1, (MESSAGE, None, None)),
+        (MESSAGE, 0, (None, MESSAGE, None)),
+        (None, 0, (None, None, None)),
+    ],
+)
+def test_a_blind_detection_has_its_claim(monkeypatch, claim, sign, fields):
+    """A suspect whose values fit the message, or nothing."""
+    word = sign * reading.codeword(MESSAGE, CHOICES)
+    view = SimpleNamespace(pose=None, width=WIDTH, undone=0, mirrored=[False], values=np.zeros(1))
+    phases = reading.Phases(view, 0, 1e-3, 0.0, word, float(len(word)), len(word))  # pyright: ignore[reportArgumentType]
+    claimed = reading._Claim(CHOICES, 32, claim, None)
+    found = reading._weigh([phases], SCHEME, claimed, 1, 0)
+    assert (found.message, found.claimed, found.recorded) == fields
+    assert found.premises == "key, message and options"
+    assert (found.log10_p < -6) == (sign == 1)

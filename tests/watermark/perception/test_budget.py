@@ -13,7 +13,7 @@ from jaxmark.app import cli
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.watermark.mark import EmbedInfo
 from jaxmark.watermark.perception.budget import VISIBILITY, displace_within, largest_within, visibility_of
-from tests.samples import rough_sphere
+from tests.samples import rough_sphere, with_thin_faces
 
 MESSAGE = b"\xa5\x5a"
 SUBSET = ["gl", "dame", "fmpd", "msdm", "max", "mrms"]
@@ -72,11 +72,8 @@ def test_a_limit_that_a_few_faces_make_tight_is_named_with_them(mesh: Mesh, nois
     """A face is split at a point so near to a corner that the edge between them bounds the whole mark."""
     bounds = jm.Budget(limits={largest_stretch: 0.02}).bounds(mesh)
     assert displace_within(make_original(mesh), noise, bounds).note == ""
-    points, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    a, b, c = faces[0]
-    new, near = len(points), points[a] + 1e-3 * (points[b] + points[c] - 2 * points[a])
-    split = make_mesh(np.vstack([points, near]), np.vstack([[[a, b, new], [b, c, new], [c, a, new]], faces[1:]]))
-    written = displace_within(make_original(split), np.vstack([noise, -noise[a]]), bounds)
+    noise = np.vstack([noise, -noise[mesh.faces[0, 0]]])
+    written = displace_within(make_original(with_thin_faces(mesh)), noise, bounds)
     assert written.note.startswith("The limit of largest_stretch, 0.02, allows only ")
     named = written.note.split("others: ")[1]
     assert {int(part.split()[0]) for part in named.split(", ")} & {0, 2}
