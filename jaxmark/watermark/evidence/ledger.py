@@ -211,8 +211,8 @@ SELECTION = Choice("meshes read", (Alternative("all", 0.97, SCENE_ORDER), Altern
 # Blind reading. The rank of a tag counts the candidates of all readings, because tags are compared reading by reading.
 LOOKS = _each(
     "view",
-    "1/n for each of n combinations of width, quantisation step, undone smoothing or blur, half turn or reflection,"
-    " and change of pose",
+    "1/n for each of n combinations of width, quantisation step, undone smoothing or blur, half turn or reflection"
+    " or pose that a hint gives, and change of pose",
     PAYLOAD,
     in_bound=True,
 )

@@ -324,7 +324,7 @@ def test_commands_without_the_original(shape: Mesh, tmp_path: Path, monkeypatch,
     workshop.embed("--scheme", "field", "--no-hint", "--overwrite")
     assert jm.Record.load(tmp_path / "marked.ply.jaxmark.json").parameters.keys() == {"width", "step"}
     assert "leave out --no-hint" in workshop.refused(
-        "embed", "model.ply", "other.ply", *key, "--message", CLI_MESSAGE.hex(), "--no-hint"
+        "embed", "model.ply", "other.ply", *key, "--message", CLI_MESSAGE, "--no-hint"
     )
     assert "give --original" in workshop.refused("detect", "marked.ply", *key, "--align", "same")
     assert "give --original" in workshop.refused("detect", "marked.ply", *key, "--scheme", "keyed")

@@ -1,7 +1,7 @@
 """Landmarks, and the hints of records that are made of them."""
 
 import base64
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import islice
 
 import numpy as np
@@ -177,7 +177,7 @@ def test_an_empty_hint_has_no_poses(bumpy: Mesh, hint: Hint):
 
 def test_records_with_other_parameters_are_refused():
     known = {"width": 0.018, "step": 4e-4}
-    assert make_blind_scheme("field", known | {"hint": "text"}).hint == "text"
+    assert asdict(make_blind_scheme("field", known | {"hint": "text"}))["hint"] == "text"
     for name, parameters in (("field", {"hint": 3}), ("field", {"tip": "text"}), ("local", {"hint": "text"})):
         usual = known if name == "field" else {"width": 32.0, "step": 0.5}
         with pytest.raises(jm.JaxmarkError, match="other parameters"):
