@@ -118,7 +118,7 @@ def _anchors(surface: Patches, places: _Vectors, room: float = 0.0) -> Anchors:
 
 
 class _Seen(NamedTuple):
-    """What is measured at places beside a surface, in units of the width."""
+    """The measurements at places beside a surface, in units of the width."""
 
     slopes: _Vectors
     normals: _Vectors
