@@ -188,7 +188,7 @@ def test_a_record_reads_what_was_attacked(marked, key: jm.Key, attack):
     assert found.log10_p < -10
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("mirrored", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_record_reads_a_part_in_any_pose(marked, key: jm.Key, mirrored: bool):
     """Turned, scaled and mirrored; the hint gives the pose, which is charged whether it was needed or not."""
     mesh, info = marked
