@@ -6,7 +6,8 @@ the record, whose hint finds the pose of parts (scheme `field`). The table of a 
 as soon as it is known:
 
 read        number of copies from which the exact message was read
-log10 p     of the false-positive probability, the worst and the best of the copies; [...] without its floor at -77
+log10 p     of the false-positive probability, the worst and the best of the copies; [...] without its floor at -77;
+            with --record, of the claimed message where none was read
 agreement   mean cosine of the anchors' phases, the least of the copies
 seconds     of the slowest reading
 predicted   nρ² after the attack, from the unmarked mesh: n anchors are found, and ρ is the mean cosine that is left;
@@ -86,6 +87,9 @@ def read(suspect: Mesh, key: bytes, one: Copy, by_record: bool) -> Cell:
     try:
         if by_record:
             found = jm.detect(suspect, key=key, record=one.info.record)
+            if found.message != MESSAGE and one.info.record.message_commitment:
+                claimed = jm.detect(suspect, key=key, record=one.info.record, message=MESSAGE)
+                found = claimed._replace(message=found.message)
         else:
             found = jm.detect(suspect, key=key, scheme=one.scheme)
     except jm.JaxmarkError:

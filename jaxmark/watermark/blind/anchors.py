@@ -71,7 +71,8 @@ def place(mesh: Mesh) -> Placed:
     mesh = compact(weld_mesh(mesh, weld(mesh.vertices)))
     diagonal(mesh)  # raises an error if there is no extent
     moments = moments_of(mesh)
-    variances, axes = np.linalg.eigh(moments.covariance)
+    has_volume = bool(np.isfinite(moments.covariance).all())
+    variances, axes = np.linalg.eigh(moments.covariance if has_volume else np.zeros((3, 3)))
     size = _SIZE_BY_VOLUME if encloses(mesh) else _SIZE_BY_AREA
     if not variances[0] > 0:
         raise JaxmarkError("This shape encloses no volume, so that it has no pose of its own; mend its faces.")

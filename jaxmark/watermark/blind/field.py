@@ -44,7 +44,7 @@ _STEP_SIZE = 0.1
 _SPREAD = (*(3.5e-3,) * 3, *(4e-4,) * 3, 2.5e-3)
 #: The same for a pose that a hint gave, with shifts in widths.
 _TURN, _SHIFT, _GROWTH = 6e-3, 0.12, 2.5e-3
-_RIM = 2.2  # least distance of the anchors of a part from its border, in widths
+_RIM = 3.2  # least distance of the anchors of a part from its border, in widths
 #: The half turns of a shape about its axes; the last four are of its mirror image.
 TURNS = np.array(
     [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1], [-1, -1, -1]], np.int64
@@ -57,6 +57,9 @@ class FieldScheme(BlindScheme):
 
     Widths and steps are public lists. The largest step that keeps the limits is written, with the width that is
     predicted to survive noise best. Readers without a record try all of them.
+
+    Raises:
+        JaxmarkError: if the hint is damaged.
     """
 
     name: ClassVar[str] = "field"
@@ -67,6 +70,11 @@ class FieldScheme(BlindScheme):
     hiding: bool = False  # whether displacements are masked perceptually; see `jaxmark.watermark.perception.masking`
     with_hint: bool = True  # whether records get a hint, with which parts are read; see `jaxmark.watermark.blind.hint`
     hint: str = ""  # the hint of a record, for reading
+
+    def __post_init__(self) -> None:
+        """Check the hint."""
+        if self.hint:
+            Hint.from_text(self.hint)
 
     @property
     def looks(self) -> int:
@@ -118,14 +126,18 @@ class FieldScheme(BlindScheme):
             JaxmarkError: see `place` and `see`, for the suspect as it is.
         """
         smooth, *rough = _UNDONE_STEPS
+        refusal, is_seen = None, False
         try:
             yield self._in_own_pose(suspect, smooth)
-        except JaxmarkError:
-            if not self.hint:
-                raise
+        except JaxmarkError as error:
+            refusal = error
         if self.hint:
             for poses in Hint.from_text(self.hint).poses(suspect):
-                yield [look for posed in poses for look in self._in_pose(suspect, posed)]
+                looks = [look for posed in poses for look in self._in_pose(suspect, posed)]
+                is_seen |= bool(looks)
+                yield looks
+        if refusal is not None and not is_seen:
+            raise refusal
         for steps in rough:
             # A suspect that has noise and was not smoothed is too rough for some views.
             with suppress(JaxmarkError):

@@ -40,6 +40,7 @@ _REFINED = 16  # number of rough poses that are refined
 _GRID = 0.0175  # side of the cubes in which rough poses are compared
 _CHUNK = 2**19  # number of landmarks that are compared at once
 _SAME = 0.005  # change of places, in units of the pose, up to which poses are the same
+_MOST_SCALING = 1.25  # largest factor by which refining may change the size of a suspect
 _FEWEST, _ENOUGH = 4, 20  # numbers of landmarks that must fit a pose, and with which other units are not tried
 
 
@@ -152,7 +153,7 @@ class Hint:
         ours, poses = self.landmarks, []
         # A half turn about the normal makes up for the arbitrary sign of the tangents.
         half_turn = np.diag([-1.0, -1, 1])
-        for kind in np.unique(suspect.kinds):
+        for kind in np.intersect1d(suspect.kinds, ours.kinds):
             first, second = np.flatnonzero(suspect.kinds == kind), np.flatnonzero(ours.kinds == kind)
             first, second = (index.ravel() for index in np.meshgrid(first, second))
             for turn in (np.eye(3), half_turn):
@@ -203,19 +204,21 @@ class Hint:
 
     def _refine(self, suspect: Landmarks, pose: Pose) -> "Posed | None":
         """Fit a pose to the landmarks that it maps near those of the hint, nearer from step to step."""
-        source = target = np.zeros((0, 3))
+        fitting = 0
         for reach in _CLOSER:
-            pairs = []
+            pairs, fitting = [], 0
             for kind, (tree, places) in self._trees.items():
                 own = suspect.places[suspect.kinds == kind]
                 distance, nearest = tree.query(pose(own), distance_upper_bound=reach)
                 near = np.isfinite(distance)
                 pairs.append((own[near], places[np.asarray(nearest)[near]]))
-            source, target = map(np.concatenate, zip(*pairs, strict=True))
-            if len(source) < _FEWEST:
+                fitting += len(np.unique(np.asarray(nearest)[near]))
+            if fitting < _FEWEST:
                 return None
-            pose = similarity(source, target)
-        return Posed(pose, False, len(source))
+            pose = similarity(*map(np.concatenate, zip(*pairs, strict=True)))
+            if not 1 / _MOST_SCALING < pose.scale < _MOST_SCALING:
+                return None
+        return Posed(pose, False, fitting)
 
 
 def _distinct(candidates: list[Posed], suspect: Mesh) -> list[Posed]:

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, cross_product, open_sides, unit
 from jaxmark.geometry.pose import Pose
-from jaxmark.watermark.blind.anchors import Anchors, Patches, alike, anchors_at, changes, cut, look, patches
+from jaxmark.watermark.blind.anchors import REACH, Anchors, Patches, alike, anchors_at, changes, cut, look, patches
 
 _COARSER = 2.5  # the surface is cut into pieces for a Gaussian so much wider; more pieces would change little
 _AROUND = 1.6  # distance, in widths, within which a value is the largest
@@ -27,7 +27,8 @@ _LONGEST_STEP, _LONGEST_WAY = 0.5, 1.0  # the longest step, and the longest way 
 _ASIDE = 0.4  # distance, in widths, over which curvatures are measured
 _ARRIVED = 0.15  # length of the last step, in widths, up to which a landmark counts as found
 _LEAST_CURVATURE = 0.15  # curvatures are taken as at least this share of the largest
-_MOST_POINTS, _MOST_EXTREMES = 2**16, 256  # points of a surface that are compared, and extremes that are refined
+_CROWDED = 1000  # pieces around a point that are too many; a plane has about 170
+_MOST_POINTS, _MOST_EXTREMES = 2**15, 256  # points of a surface that are compared, and extremes that are refined
 _APART = 0.3  # least distance of landmarks of one kind, in widths
 _TINY = 1e-9
 
@@ -74,13 +75,14 @@ class Border:
         is_open = open_sides(faces)
         start, end = vertices[faces[is_open]], vertices[np.roll(faces, -1, axis=1)[is_open]]
         share = np.linspace(0, 1, _RIM_POINTS)[:, None, None]
-        self._points = ((1 - share) * start + share * end).reshape(-1, 3)
+        points = ((1 - share) * start + share * end).reshape(-1, 3)
+        self._tree = KDTree(points) if len(points) else None
 
     def spares(self, places: _Vectors, distance: float) -> Bool[np.ndarray, " points"]:
         """Return a mask of the places that are at least so far away from the border."""
-        if not len(self._points):
+        if self._tree is None:
             return np.ones(len(places), bool)
-        nearest, _ = KDTree(self._points).query(places, distance_upper_bound=distance)
+        nearest, _ = self._tree.query(places, distance_upper_bound=distance)
         return ~np.isfinite(np.asarray(nearest))
 
 
@@ -94,12 +96,16 @@ def find_landmarks(mesh: Mesh, widths: Sequence[float]) -> Landmarks:
     Raises:
         JaxmarkError: if the surface is too large for these widths.
     """
-    border, vertices = Border(mesh), np.asarray(mesh.vertices, np.float64)
+    vertices = np.asarray(mesh.vertices, np.float64)
+    # Around the centre, where coordinates have most digits.
+    centre = vertices.mean(axis=0)
+    mesh, vertices = mesh._replace(vertices=vertices - centre), vertices - centre
+    border = Border(mesh)
     # In units of the width, so that neither numbers nor compiled programs depend on the unit.
     scaled = [Mesh(vertices / width, mesh.faces) for width in widths]
     pieces, dtype = alike([cut(one, _COARSER) for one in scaled]), jnp.result_type(float)
     surfaces = [patches(*one) for one in zip(pieces, [jnp.asarray(one.vertices, dtype) for one in scaled], strict=True)]
-    points = [np.asarray(surface.points, np.float64)[np.asarray(surface.area) > _TINY] for surface in surfaces]
+    points = list(map(_uncrowded, surfaces))
     if max(map(len, points)) > _MOST_POINTS:
         raise JaxmarkError("This surface is too large in comparison with its extent to find landmarks on it.")
     inside = [border.spares(width * point, _RIM * width) for width, point in zip(widths, points, strict=True)]
@@ -108,9 +114,15 @@ def find_landmarks(mesh: Mesh, widths: Sequence[float]) -> Landmarks:
     columns = []
     for index, (width, found) in enumerate(zip(widths, map(_climb, surfaces, starts, extremes), strict=True)):
         found = found._replace(places=width * found.places, kinds=found.kinds + 2 * index)
-        found = found.pick(border.spares(found.places, _RIM * width))
-        columns.append(_distinct(found, _APART * width))
+        found = _distinct(found.pick(border.spares(found.places, _RIM * width)), _APART * width)
+        columns.append(found._replace(places=found.places + centre))
     return Landmarks(*map(np.concatenate, zip(*columns, strict=True)))
+
+
+def _uncrowded(surface: Patches) -> _Vectors:
+    """Return the pieces around which the surface is no thicker than some sheets; elsewhere, averages mean nothing."""
+    points = np.asarray(surface.points, np.float64)[np.asarray(surface.area) > _TINY]
+    return points[np.asarray(KDTree(points).query_ball_point(points, REACH, workers=-1, return_length=True)) < _CROWDED]
 
 
 def _anchors(surface: Patches, places: _Vectors, room: float = 0.0) -> Anchors:

@@ -170,14 +170,46 @@ def test_a_suspect_of_any_size_costs_as_much(bumpy: Mesh, hint: Hint):
         assert len(list(hint.poses(other))) == 1
 
 
+def test_hints_of_one_kind_or_place_do_no_harm(rough: Mesh, hint: Hint):
+    """Made by an owner who edits a record: a suspect shrinks to no point, and shares no kind with the hint."""
+    one = hint.landmarks.pick(np.zeros(50, int))
+    for kind, normal in ((5, one.normals), (0, np.roll(one.normals, 1, axis=1))):
+        forged = replace(hint, landmarks=one._replace(kinds=np.full(50, kind), normals=normal))
+        assert next(forged.poses(rough)) == []
+    alien = find_landmarks(rough, [0.1]).pick(np.zeros(0, int))
+    assert replace(hint, landmarks=one)._match(alien) == []
+
+
+def test_landmarks_are_found_far_away_and_beside_a_crowd(bumpy: Mesh, landmarks: Landmarks):
+    far = bumpy._replace(vertices=np.asarray(bumpy.vertices) + 1e6)
+    assert share_found(landmarks._replace(places=landmarks.places + 1e6), find_landmarks(far, WIDTHS), 1e-3) == 1
+    random = np.random.default_rng(0)
+    crowd = [3.0, 0, 0] + 0.3 * random.normal(size=(20_000, 1, 3)) + 0.02 * random.normal(size=(20_000, 3, 3))
+    count = len(bumpy.vertices)
+    both = Mesh(
+        np.concatenate([np.asarray(bumpy.vertices), crowd.reshape(-1, 3)]),
+        np.concatenate([np.asarray(bumpy.faces), count + np.arange(60_000).reshape(-1, 3)]),
+    )
+    assert share_found(landmarks, find_landmarks(both, WIDTHS), 0.3 * WIDTHS[0]) > 0.8
+
+
+def test_a_double_sided_surface_has_no_pose_of_its_own(bumpy: Mesh):
+    faces = np.asarray(bumpy.faces)
+    with pytest.raises(jm.JaxmarkError, match="encloses no volume"):
+        place(bumpy._replace(faces=np.concatenate([faces, faces[:, ::-1]])))
+
+
 def test_an_empty_hint_has_no_poses(bumpy: Mesh, hint: Hint):
     empty = replace(hint, landmarks=hint.landmarks.pick(np.zeros(0, int)))
     assert list(Hint.from_text(empty.to_text()).poses(bumpy)) == []
 
 
-def test_records_with_other_parameters_are_refused():
+def test_records_with_other_parameters_are_refused(hint: Hint):
     known = {"width": 0.018, "step": 4e-4}
-    assert asdict(make_blind_scheme("field", known | {"hint": "text"}))["hint"] == "text"
+    text = hint.to_text()
+    assert asdict(make_blind_scheme("field", known | {"hint": text}))["hint"] == text
+    with pytest.raises(jm.JaxmarkError, match="incomplete"):
+        make_blind_scheme("field", known | {"hint": text[:-4]})
     for name, parameters in (("field", {"hint": 3}), ("field", {"tip": "text"}), ("local", {"hint": "text"})):
         usual = known if name == "field" else {"width": 32.0, "step": 0.5}
         with pytest.raises(jm.JaxmarkError, match="other parameters"):
