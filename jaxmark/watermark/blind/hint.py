@@ -36,7 +36,7 @@ _POSES = 4  # poses of a suspect that are read, in the unit of the original and 
 MOST_POSES = 2 * _POSES  # the largest number of poses of `Hint.poses`
 _NEAR = 0.035  # distance of landmarks, in units of the pose, up to which a rough pose fits them
 _CLOSER = (0.035, 0.02, 0.01, 0.006, 0.006)  # the same while the pose is refined
-_REFINED = 16  # number of rough poses that are refined
+_REFINED = 100  # number of rough poses that are refined
 _GRID = 0.0175  # side of the cubes in which rough poses are compared
 _CHUNK = 2**19  # number of landmarks that are compared at once
 _SAME = 0.005  # change of places, in units of the pose, up to which poses are the same
@@ -56,6 +56,16 @@ class Posed(NamedTuple):
         faces = np.asarray(suspect.faces)
         is_reversed = self.inside_out != self.pose.mirrors
         return Mesh(self.pose(np.asarray(suspect.vertices, np.float64)), faces[:, ::-1] if is_reversed else faces)
+
+
+class _Rough(NamedTuple):
+    """A rough pose of a suspect."""
+
+    fitting: int  # number of landmarks that fit roughly
+    pose: Pose  # the map from the flipped suspect to the pose of the original
+    suspect: Landmarks  # the landmarks of the flipped suspect
+    flip: Pose  # the map from the coordinates of the suspect's file to those of the flipped suspect
+    inside_out: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +120,7 @@ class Hint:
         kinds = points["kind"].astype(np.int64)
         return cls(Landmarks(places, normals, tangents, kinds, np.ones(len(points))), float(head["scale"]))
 
-    def poses(self, suspect: Mesh) -> Iterator[list["Posed"]]:
+    def poses(self, suspect: Mesh) -> Iterator[list[Posed]]:
         """Iterate over the likeliest poses of a suspect, the likeliest first.
 
         Poses in the unit of the original come first, and then, unless many landmarks fit one of them, in any unit.
@@ -129,7 +139,7 @@ class Hint:
         count = int(np.floor(np.log(_LARGEST / _SMALLEST) / np.log(_RATIO))) + 1
         yield self._in_scales(suspect, [_LARGEST / size / _RATIO**index for index in range(count)])
 
-    def _in_scales(self, suspect: Mesh, scales: list[float]) -> list["Posed"]:
+    def _in_scales(self, suspect: Mesh, scales: list[float]) -> list[Posed]:
         """Find the likeliest poses of a suspect with about the given scales, each smaller than the one before."""
         # The landmarks of a scale have the widths of another scale, so that each width is needed once.
         count = len(_WIDTHS) + len(scales) - 1
@@ -137,19 +147,21 @@ class Hint:
             found = find_landmarks(suspect, [_WIDTHS[0] / scales[0] * _RATIO**index for index in range(count)])
         except JaxmarkError:
             return []  # a surface with more folds than any shape in its own pose
-        candidates: list[Posed] = []
+        rough: list[_Rough] = []
         for index, scale in enumerate(scales):
             chosen = found.pick((found.kinds >= 2 * index) & (found.kinds < 2 * (index + len(_WIDTHS))))
             chosen = chosen._replace(kinds=chosen.kinds - 2 * index).clearest(_COMPARED)
             for mirrored, inside_out in product((False, True), repeat=2):
                 flip = Pose(scale * np.diag([-1.0 if mirrored else 1.0, 1, 1]), np.zeros(3))
                 seen = chosen.seen(flip, inside_out=inside_out)
-                candidates += [Posed(flip.then(one.pose), inside_out, one.fitting) for one in self._match(seen)]
+                rough += [_Rough(*one, seen, flip, inside_out) for one in self._match(seen)]
+        rough.sort(key=lambda one: -one.fitting)
+        candidates = [posed for one in rough[:_REFINED] if (posed := self._refine(one)) is not None]
         likely = [one for one in candidates if one.fitting >= max(other.fitting for other in candidates) / 2]
         return _distinct(sorted(likely, key=lambda one: -one.fitting), suspect)[:_POSES]
 
-    def _match(self, suspect: Landmarks) -> list["Posed"]:
-        """Find poses that map many landmarks of a suspect to those of the hint; the suspect has about their scale."""
+    def _match(self, suspect: Landmarks) -> list[tuple[int, Pose]]:
+        """Find poses that map many landmarks of a suspect near those of the hint, which have about the same scale."""
         ours, poses = self.landmarks, []
         # A half turn about the normal makes up for the arbitrary sign of the tangents.
         half_turn = np.diag([-1.0, -1, 1])
@@ -165,7 +177,7 @@ class Hint:
         matrix, shift = map(np.concatenate, zip(*poses, strict=True))
         rough = self._fitting(suspect, matrix, shift)
         best = np.argsort(-rough, kind="stable")[:_REFINED]
-        return [one for index in best if (one := self._refine(suspect, Pose(matrix[index], shift[index]))) is not None]
+        return [(int(rough[index]), Pose(matrix[index], shift[index])) for index in best]
 
     def _fitting(
         self,
@@ -202,9 +214,9 @@ class Hint:
         ours, kinds = self.landmarks, range(2 * len(_WIDTHS))
         return {kind: (KDTree(places), places) for kind in kinds for places in [ours.places[ours.kinds == kind]]}
 
-    def _refine(self, suspect: Landmarks, pose: Pose) -> "Posed | None":
+    def _refine(self, rough: "_Rough") -> Posed | None:
         """Fit a pose to the landmarks that it maps near those of the hint, nearer from step to step."""
-        fitting = 0
+        pose, suspect, fitting = rough.pose, rough.suspect, 0
         for reach in _CLOSER:
             pairs, fitting = [], 0
             for kind, (tree, places) in self._trees.items():
@@ -218,7 +230,7 @@ class Hint:
             pose = similarity(*map(np.concatenate, zip(*pairs, strict=True)))
             if not 1 / _MOST_SCALING < pose.scale < _MOST_SCALING:
                 return None
-        return Posed(pose, False, fitting)
+        return Posed(rough.flip.then(pose), rough.inside_out, fitting)
 
 
 def _distinct(candidates: list[Posed], suspect: Mesh) -> list[Posed]:
