@@ -227,7 +227,8 @@ class Hint:
                 fitting += len(np.unique(np.asarray(nearest)[near]))
             if fitting < _FEWEST:
                 return None
-            pose = similarity(*map(np.concatenate, zip(*pairs, strict=True)))
+            source, target = map(np.concatenate, zip(*pairs, strict=True))
+            pose = similarity(source, target)
             if not 1 / _MOST_SCALING < pose.scale < _MOST_SCALING:
                 return None
         return Posed(rough.flip.then(pose), rough.inside_out, fitting)
