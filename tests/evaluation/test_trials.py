@@ -56,6 +56,7 @@ def test_what_is_tried_is_what_the_detector_has(mesh, trials, trial):
     assert trial.strengths == pytest.approx(np.mean(trial.scales) * np.ones(12))
 
 
+@pytest.mark.slow
 def test_strengths_are_fitted_chosen_and_checked_by_different_signs(trials, trial):
     fitted, checked = trials.run(trial.scheme, module.FITTED), trials.run(trial.scheme, module.CHECKED)
     signs = [np.asarray(one).tobytes() for tried in (trial, fitted, checked) for one in tried.signs]

@@ -187,6 +187,7 @@ def scene(tmp_path: Path) -> Path:
     )
 
 
+@pytest.mark.slow
 def test_a_layer_that_was_marked_first_stays(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()

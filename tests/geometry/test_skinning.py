@@ -87,6 +87,7 @@ def test_a_pose_is_undone_to_rounding(mesh: Mesh):
         np.testing.assert_allclose(back.vertices, mesh.vertices, atol=1e-7 * diagonal(mesh))
 
 
+@pytest.mark.slow
 def test_a_mark_is_read_in_another_pose_of_the_skeleton(mesh: Mesh, key: jm.Key, tmp_path: Path, monkeypatch, capsys):
     """By the command line, from a file with a skin; without the skeleton, the pose hides the message."""
     skin, model = skin_along(mesh, 5), tmp_path / "model.glb"

@@ -188,7 +188,8 @@ def test_a_record_reads_what_was_attacked(marked, key: jm.Key, attack):
     assert found.log10_p < -10
 
 
-@pytest.mark.parametrize("mirrored", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("mirrored", [False, True])
 def test_a_record_reads_a_part_in_any_pose(marked, key: jm.Key, mirrored: bool):
     """Turned, scaled and mirrored; the hint gives the pose, which is charged whether it was needed or not."""
     mesh, info = marked
@@ -412,6 +413,7 @@ def thin() -> BlindMarker:
 TIGHT = "The limit of dame, 0.006, allows only "
 
 
+@pytest.mark.slow
 def test_a_limit_that_a_few_faces_make_tight_is_named(thin):
     assert not thin.write(b"", 1e-3)[1].notes
     info = thin.write(b"", jm.Budget(limits={"dame": 0.006}))[1]
@@ -463,7 +465,7 @@ def test_several_marks_name_the_limit_as_well(thin):
 def test_a_blind_detection_has_its_claim(monkeypatch, claim, sign, fields):
     """A suspect whose values fit the message, or nothing."""
     word = sign * reading.codeword(MESSAGE, CHOICES)
-    view = SimpleNamespace(pose=None, width=WIDTH, undone=0, mirrored=[False], values=np.zeros(1))
+    view = SimpleNamespace(pose=None, width=WIDTH, undone=0, by_hint=False, mirrored=[False], values=np.zeros(1))
     phases = reading.Phases(view, 0, 1e-3, 0.0, word, float(len(word)), len(word))  # pyright: ignore[reportArgumentType]
     claimed = reading._Claim(CHOICES, 32, claim, None)
     found = reading._weigh([phases], SCHEME, claimed, 1, 0)

@@ -60,6 +60,7 @@ def ratio(marker: NonBlindMarker, received: Reception) -> float:
     return float(score) / float(norm)
 
 
+@pytest.mark.slow
 def test_vertices_tell_what_closest_points_do_not():
     marker = marker_of(3)
     usual = marker.receive(aligned())
