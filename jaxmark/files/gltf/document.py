@@ -118,7 +118,9 @@ class Document:
         self.located: dict[int, Elements] = {}
         self.decoded: set[int] = set()
         self._lists: dict[str, list[dict[str, Any]]] = {}
-        self.accessed, self.unpacked = (RunningCount(one, whole_size) for one in (limits.ACCESSED, limits.UNPACKED))
+        # Elements lie in buffers: a long list of primitives that read the same ones does not allow more of them.
+        self.accessed = RunningCount(limits.ACCESSED, size)
+        self.unpacked = RunningCount(limits.UNPACKED, whole_size)
         self.draco, self._meshopt = Unpacker("draco", whole_size), Unpacker("meshopt", whole_size)
         self.packed: dict[int, range] = {}
 
