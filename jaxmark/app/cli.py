@@ -292,9 +292,9 @@ def detect_command(
     the same names.
 
     Exit status 0 if the false-positive probability is at most --alpha, 1 if it is larger or SUSPECT cannot be aligned
-    with the original, 2 if SUSPECT is refused, 3 if
-    it is at most --alpha but only an estimate, which proves nothing, for example because the original was edited. For a
-    folder, 0 if it is 0 for all files; otherwise 2, 1 or 3, the first of these that any file has.
+    with the original, 2 if SUSPECT is refused, 3 if it is at most --alpha but only an estimate, which proves nothing,
+    for example because the original was edited. For a folder, 0 if it is 0 for all files; otherwise 2, 1 or 3, the
+    first of these that any file has.
     """
     if commitment_file is not None and record_file is None:
         raise JaxmarkError("--commitment is to a record; also give the --record that it contains.")

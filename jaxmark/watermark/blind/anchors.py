@@ -70,7 +70,8 @@ def place(mesh: Mesh) -> Placed:
     check_faces("A mark without an original", mesh)
     mesh = compact(weld_mesh(mesh, weld(mesh.vertices)))
     diagonal(mesh)  # raises an error if there is no extent
-    moments = moments_of(mesh)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a double-sided surface has a volume of 0
+        moments = moments_of(mesh)
     has_volume = bool(np.isfinite(moments.covariance).all())
     variances, axes = np.linalg.eigh(moments.covariance if has_volume else np.zeros((3, 3)))
     size = _SIZE_BY_VOLUME if encloses(mesh) else _SIZE_BY_AREA

@@ -104,13 +104,13 @@ def find_landmarks(mesh: Mesh, widths: Sequence[float]) -> Landmarks:
     # In units of the width, so that neither numbers nor compiled programs depend on the unit.
     scaled = [Mesh(vertices / width, mesh.faces) for width in widths]
     pieces, dtype = alike([cut(one, _COARSER) for one in scaled]), jnp.result_type(float)
-    surfaces = [patches(*one) for one in zip(pieces, [jnp.asarray(one.vertices, dtype) for one in scaled], strict=True)]
+    surfaces = list(map(patches, pieces, [jnp.asarray(one.vertices, dtype) for one in scaled]))
     points = list(map(_uncrowded, surfaces))
     if max(map(len, points)) > _MOST_POINTS:
         raise JaxmarkError("This surface is too large in comparison with its extent to find landmarks on it.")
     inside = [border.spares(width * point, _RIM * width) for width, point in zip(widths, points, strict=True)]
     extremes = list(map(_extremes, surfaces, alike(list(map(_anchors, surfaces, points))), inside))
-    starts = alike([_anchors(*one, _LONGEST_WAY) for one in zip(surfaces, [e.places for e in extremes], strict=True)])
+    starts = alike([_anchors(one, top.places, _LONGEST_WAY) for one, top in zip(surfaces, extremes, strict=True)])
     columns = []
     for index, (width, found) in enumerate(zip(widths, map(_climb, surfaces, starts, extremes), strict=True)):
         found = found._replace(places=width * found.places, kinds=found.kinds + 2 * index)
