@@ -48,7 +48,7 @@ long-tests: $(VENV)/.dev  ## pytest: those of long runs, before a release
 	$(BIN)/python -m pytest -q -n auto --dist worksteal -m long
 
 test-device: $(VENV)/.dev  ## pytest: what computes, on whatever device JAX finds
-	$(BIN)/python -m pytest -q -n 0 -r fEs --tb line $(ON_DEVICES)
+	XLA_PYTHON_CLIENT_PREALLOCATE=false $(BIN)/python -m pytest -q -n auto --dist worksteal -r fEs --tb line $(ON_DEVICES)
 
 coverage: $(VENV)/.dev  ## which lines the tests run; all of it in build/coverage
 	$(BIN)/python -m pytest -q -n auto --cov --cov-report=term:skip-covered --cov-report=html

@@ -1,4 +1,4 @@
-"""The filter f(Δ)x in other libraries, for `speed.py`: Chebyshev coefficients, evaluated by the recurrence.
+"""The filter f(Δ)x by other means, for `speed.py` and others: Chebyshev coefficients, evaluated by the recurrence.
 
 Each function takes Δ - I as a SciPy matrix, coefficients and a signal, and returns a function that filters once.
 """
@@ -6,6 +6,7 @@ Each function takes Δ - I as a SciPy matrix, coefficients and a signal, and ret
 import os
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 from scipy import sparse
 
 from jaxmark.errors import require
+from jaxmark.spectral import Laplacian
 
 Run = Callable[[], Any]
 
@@ -69,6 +71,80 @@ def by_torch(shifted: sparse.csr_array, c: np.ndarray, x: np.ndarray) -> Run:
         if device == "cuda":
             torch.cuda.synchronize()
         return total
+
+    return run
+
+
+@dataclass(frozen=True)
+class Launched:
+    """What a card computes, as JAX's own arrays: `jax.block_until_ready` waits for it, and NumPy reads it."""
+
+    block_until_ready: Callable[[], None]
+    read: Callable[[], np.ndarray]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        self.block_until_ready()
+        return np.asarray(self.read(), dtype)
+
+
+_STEP = r"""
+extern "C" __global__ void step(const float4* __restrict__ current, float4* before, float4* total,
+    const int* __restrict__ table, const float* __restrict__ own, const float* __restrict__ inverse,
+    int rows, int slots, float factor, float c) {
+  int i = blockIdx.x * blockDim.x + threadIdx.x;
+  if (i >= rows) return;
+  float4 s = make_float4(0, 0, 0, 0), x = current[i], b = before[i], t = total[i];
+  for (int k = 0; k < slots; ++k) {
+    float4 y = current[table[k * (long long)rows + i]];
+    s.x += y.x; s.y += y.y; s.z += y.z; s.w += y.w;
+  }
+  float p = factor * own[i], q = factor * inverse[i];
+  x = make_float4(p * x.x - q * s.x - b.x, p * x.y - q * s.y - b.y, p * x.z - q * s.z - b.z, p * x.w - q * s.w - b.w);
+  before[i] = x;
+  total[i] = make_float4(t.x + c * x.x, t.y + c * x.y, t.z + c * x.z, t.w + c * x.w);
+}
+"""
+
+
+def by_cuda(operator: Laplacian, c: np.ndarray, x: np.ndarray) -> Run:
+    """A kernel of one launch a degree on our table of neighbours, all launched as one graph; three float32 columns.
+
+    It is near the limit of what one pass over the mesh a degree can do on a GPU. Edges have weight 1, and all have a
+    slot in the table. CuPy has to be installed for the version of CUDA at hand; no extra does that.
+    """
+    cupy = require("cupy", "peers")
+    kernel, table = cupy.RawModule(code=_STEP).get_function("step"), operator.neighbours
+    if table is None or len(table.rest) or operator.weights is not None:
+        raise ValueError("the kernel takes meshes whose neighbours all have slots, with weights 1")
+    (slots, rows), same = np.shape(table.vertices), np.arange(len(x))
+    order, rank = (same if part is None else np.asarray(part) for part in (table.order, table.rank))
+    degree = np.asarray(operator.degree)[order]
+    inverse = np.where(degree > 0, 1 / np.maximum(degree, 1), 0)
+    own = (degree > 0) - 1 + inverse * np.asarray(table.empty)
+    arrays = [cupy.asarray(part, dtype) for part, dtype in ((table.vertices, "i4"), (own, "f4"), (inverse, "f4"))]
+    first = cupy.asarray(np.pad(x[order], ((0, 0), (0, 1))))
+    one, other, total = (cupy.zeros_like(first) for _ in range(3))
+    stream = cupy.cuda.Stream(non_blocking=True)
+
+    def launch() -> None:
+        one[...], other[...] = first, 0
+        cupy.multiply(first, np.float32(c[0]), out=total)
+        current, before = one, other
+        for k, c_k in enumerate(c[1:]):
+            numbers = (np.int32(rows), np.int32(slots), np.float32(2 if k else 1), np.float32(c_k))
+            kernel((-(-rows // 256),), (256,), (current, before, total, *arrays, *numbers))
+            current, before = before, current
+
+    with stream:
+        launch()  # what CuPy compiles for it cannot be compiled while a graph is recorded
+        stream.synchronize()
+        stream.begin_capture()
+        launch()
+        graph = stream.end_capture()
+
+    def run() -> Launched:
+        graph.launch(stream)
+        return Launched(stream.synchronize, lambda: cupy.asnumpy(total)[rank, :3])
 
     return run
 

@@ -44,6 +44,28 @@ def for_commands(cache: Path) -> dict[str, str]:
     return {**os.environ, "PYTHONDONTWRITEBYTECODE": "", "XDG_CACHE_HOME": str(cache)}
 
 
+def time_in_row(call: Call, repeat: int, *, calls: int = 20) -> float:
+    """Median seconds of a call among so many that follow each other, so that a device need not wait for the host.
+
+    Those that are not counted last a tenth of a second, because GPUs that had nothing to do are slow at first.
+    """
+    start = time.perf_counter()
+    while True:
+        jax.block_until_ready(call())
+        if time.perf_counter() - start > 0.1:
+            break
+    times: list[float] = []
+    for _ in range(repeat):
+        start = time.perf_counter()
+        for _ in range(calls - 1):
+            call()
+        jax.block_until_ready(call())
+        times.append((time.perf_counter() - start) / calls)
+        if sum(times) * calls > PATIENCE:
+            break
+    return statistics.median(times)
+
+
 def median_time(call: Call, repeat: int, *, counted: bool = False, patience: float = PATIENCE) -> float:
     """Median seconds of a call, after one that does not count unless that has been; at least one."""
     times: list[float] = []

@@ -3,22 +3,24 @@
 It runs on whatever device JAX finds, in about 8 minutes on a large GPU, and writes FOLDER/device_suite.md and .json.
 The meshes are bumpy tori. Times are medians of --repeat calls after a first one that is not counted. The parts:
 
-filters   f(Δ)x of degree 64, float32, operator and signal on the device, in milliseconds: of one, three and four
-          columns; by segment-sums; the value and both gradients of three columns; and PyTorch's sparse CSR products
-          (extra `peers`), with the largest difference from our result over the largest value.
+filters   f(Δ)x of degree 64, float32, operator and signal on the device, in milliseconds, 20 calls in a row: of one,
+          three and four columns; by segment-sums; the value and both gradients of three columns; PyTorch's sparse CSR
+          products (extra `peers`); and a CUDA kernel of one launch a degree, which CuPy compiles and launches as one
+          graph; with their largest difference from our result over the largest value.
 readings  claims of one mark: --keys keys and one suspect, then one key and as many suspects, each by one compiled call
           over chunks of 50, and by a loop over keys, of which ten are timed; with the largest difference of the
           evidence in nats, and the host's time to derive the keys' arrays.
 use       first and later calls of embedding at an RMS displacement of 0.08 %, detecting, 32 readings of bits, eight at
           a time, and 30 steps of descent on the evidence.
-commands  `jaxmark embed` and `jaxmark detect`, each in a process, first and second runs.
+commands  `jaxmark embed` and `jaxmark detect`, each in a process, first and second runs, on the device and on the
+          processors beside it.
 """
 
 import platform
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
@@ -36,9 +38,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common.arguments import make_parser, positive
 from common.filters import DEGREE, bumpy_torus, coefficients, shifted
 from common.marks import BUDGET, KEY, MESSAGE
-from common.peers import by_torch
+from common.peers import Run, by_cuda, by_torch
 from common.tables import Row, save, say, table
-from common.timing import for_commands, median_time, timed
+from common.timing import for_commands, median_time, time_in_row, timed
 
 SIZES = (35_000, 300_000, 1_000_000, 4_000_000, 16_000_000)
 LARGEST_FOR_TORCH = 4_000_000  # it takes longer than all others together
@@ -55,18 +57,25 @@ def filters(size: int, repeat: int) -> Row:
     both = jax.jit(jax.value_and_grad(lambda o, c, x: jnp.sum(jnp.sin(spectral.filter(o, c, x))), (1, 2)))
     x = signals[3]
     row: Row = {"vertices": len(mesh.vertices)}
-    row |= {f"{n} columns": 1e3 * median_time(lambda x=s: run(operator, c, x), repeat) for n, s in signals.items()}
-    row["segment-sums"] = 1e3 * median_time(lambda: run(operator.by_segments, c, x), repeat)
-    row["value, gradients"] = 1e3 * median_time(lambda: both(operator, c, x), repeat)
+    row |= {f"{n} columns": 1e3 * time_in_row(lambda x=s: run(operator, c, x), repeat) for n, s in signals.items()}
+    row["segment-sums"] = 1e3 * time_in_row(lambda: run(operator.by_segments, c, x), repeat)
+    row["value, gradients"] = 1e3 * time_in_row(lambda: both(operator, c, x), repeat)
+    ours, numbers, values = np.asarray(run(operator, c, x)), np.asarray(c), np.asarray(x)
+    others: dict[str, Callable[[], Run]] = {}
     if size <= LARGEST_FOR_TORCH:
+        others["torch"] = lambda: by_torch(shifted(on_host), numbers, values)
+    if jax.default_backend() == "gpu":
+        others["CUDA kernel"] = lambda: by_cuda(on_host, numbers, values)
+    for name, make in others.items():
         try:
-            torch_run = by_torch(shifted(on_host), np.asarray(c), np.asarray(x))
+            other = make()
         except JaxmarkError as missing:
-            row["torch"] = str(missing).split(" is needed")[0] + " is missing"
-        else:
-            expected, ours = np.asarray(torch_run()), np.asarray(run(operator, c, x))
-            row["torch"] = 1e3 * median_time(torch_run, repeat)
-            row["difference"] = float(np.abs(ours - expected).max() / np.abs(expected).max())
+            row[name] = str(missing).split(" is needed")[0] + " is missing"
+            continue
+        expected = np.asarray(other())
+        row[name] = 1e3 * time_in_row(other, repeat)
+        difference = float(np.abs(ours - expected).max() / np.abs(expected).max())
+        row["difference"] = max(difference, float(row.get("difference") or 0))
     return row
 
 
@@ -140,22 +149,28 @@ def use(mesh: jm.Mesh, repeat: int) -> Iterator[Row]:
 
 def commands(mesh: jm.Mesh) -> Iterator[Row]:
     """Seconds of whole commands, which keep their compiled programs in a folder of their own."""
+    beside = [] if jax.default_backend() == "cpu" else ["cpu"]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        environment = for_commands(folder / "cache")
         jm.save_mesh(mesh, folder / "mesh.ply")
         save_key(KEY, folder / "key")
 
-        def run(*words: str) -> None:
+        def run(platform: str, *words: str) -> None:
             command = [sys.executable, "-m", "jaxmark", *words, "--key", "key"]
+            environment = for_commands(folder / f"cache-{platform}") | {"JAX_PLATFORMS": platform}
             subprocess.run(command, cwd=folder, env=environment, check=True, capture_output=True)
 
-        for words in (
-            ("embed", "mesh.ply", "marked.ply", "--message", MESSAGE.hex(), "--overwrite"),
-            ("detect", "marked.ply", "--original", "mesh.ply"),
-        ):
-            first, later = (timed(run, *words)[1] for _ in range(2))
-            yield {"command": words[0], "vertices": len(mesh.vertices), "first": first, "second": later}
+        for platform in ["", *beside]:
+            for words in (
+                ("embed", "mesh.ply", "marked.ply", "--message", MESSAGE.hex(), "--overwrite"),
+                ("detect", "marked.ply", "--original", "mesh.ply"),
+            ):
+                first, later = (timed(run, platform, *words)[1] for _ in range(2))
+                where = platform or jax.default_backend()
+                yield {"command": words[0], "on": where, "vertices": len(mesh.vertices)} | {
+                    "first": first,
+                    "second": later,
+                }
 
 
 def main() -> None:

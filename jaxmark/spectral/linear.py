@@ -32,6 +32,9 @@ class Linear:
     # One for each of `fixed`, derivative(*fixed, x, tangent), for tangents in the structure of that argument with None
     # in place of leaves that are not floating. Without them, `apply` is differentiated by JAX, with its memory.
     derivatives: tuple[Rule, ...] | None = None
+    # The derivative in directions of the last of `fixed` and of x at once, jointly(*fixed, x, (tangent, tangent)), if
+    # its transpose takes less time than theirs.
+    jointly: Rule | None = None
     on_processors: Rule | None = None  # what computes `apply` where a program is compiled for processors
 
     def __call__(self, *arguments: PyTree) -> Array:
@@ -109,7 +112,7 @@ def _evaluate_abstractly(*avals: Any, rule: Linear, structure: Any) -> Any:
 def _differentiate(primals: Any, tangents: Any, *, rule: Linear, structure: Any) -> tuple[Array, Any]:
     arguments = jax.tree.unflatten(structure, primals)
     value = _primitive.bind(*primals, rule=rule, structure=structure)
-    terms = []  # one or more, for JAX asks only where something is differentiated
+    changes: dict[int, PyTree] = {}  # one or more, for JAX asks only where something is differentiated
     for index, (tree, part) in enumerate(_split(structure, tangents)):
         if all(isinstance(leaf, ad.Zero) for leaf in part):
             continue
@@ -117,7 +120,11 @@ def _differentiate(primals: Any, tangents: Any, *, rule: Linear, structure: Any)
             ad.instantiate_zeros(leaf) if jnp.issubdtype(jnp.result_type(old), jnp.inexact) else None
             for leaf, old in zip(part, jax.tree.leaves(arguments[index]), strict=True)
         ]
-        terms.append(rule.derivative(index, arguments, jax.tree.unflatten(tree, leaves)))
+        changes[index] = jax.tree.unflatten(tree, leaves)
+    last, terms = len(arguments) - 1, []
+    if rule.jointly is not None and {last - 1, last} <= changes.keys():
+        terms.append(rule.jointly(*arguments, (changes.pop(last - 1), changes.pop(last))))
+    terms += [rule.derivative(index, arguments, change) for index, change in changes.items()]
     return value, sum(terms[1:], terms[0])
 
 
@@ -139,10 +146,15 @@ def _map(operands: Any, axes: Any, *, rule: Linear, structure: Any) -> tuple[Arr
     derivatives = rule.derivatives and tuple(
         _Mapped(function, (*parts, part)) for function, part in zip(rule.derivatives, parts, strict=False)
     )
+    jointly = None
+    if rule.jointly is not None:
+        (before, before_axes), (last, last_axes) = parts[-2:]
+        jointly = _Mapped(rule.jointly, (*parts, (jax.tree.structure((before, last)), (*before_axes, *last_axes))))
     over = Linear(
         _Mapped(rule.apply, parts),
         _Mapped(rule.transposed, (*parts[:-1], one), parts[-1][1]),
         derivatives,
+        jointly,
         rule.on_processors and _Mapped(rule.on_processors, parts),
     )
     return _primitive.bind(*moved, rule=over, structure=structure), 0

@@ -21,13 +21,14 @@ from jax.custom_derivatives import SymbolicZero
 from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, PyTree
 
-from jaxmark.spectral.kernels import Computation, component_rows, filter_rows, project_rows, where_installed
+from jaxmark.spectral.kernels import Computation, component_rows, filter_rows, installed, project_rows, where_installed
 from jaxmark.spectral.laplacian import Operator, per_row
 from jaxmark.spectral.linear import Linear, along, combine, floats
 from jaxmark.spectral.precision import einsum, matmul
 
-_ROWS_AT_ONCE = 128  # rows that are summed as one wide row
+_ROWS_AT_ONCE = 512  # rows that are summed as one wide row
 _MAX_SUMMED_COLUMNS = 6  # up to which sums took less time than matrix products, by measurement
+_UNROLLED_ON_GPU = 5  # steps, by measurement
 _MIN_UNROLLED_VALUES = 2**16  # values of a signal from which on running the recurrence takes longer than compiling it
 
 
@@ -51,8 +52,9 @@ def _scan_terms(
         carry, output = step(carry, following, current, datum)
         return (current, following, carry), output
 
-    # Unrolling saves a copy of the carry in each step, but leaves more to compile.
-    unroll = 3 if x.size >= _MIN_UNROLLED_VALUES else 1
+    # Unrolling saves a copy of the carry in each step, but leaves more to compile. On GPUs, bodies of some more steps
+    # are launched as one.
+    unroll = _UNROLLED_ON_GPU if jax.default_backend() == "gpu" else 3 if x.size >= _MIN_UNROLLED_VALUES else 1
     (_, _, carry), outputs = jax.lax.scan(
         body, (jnp.zeros_like(x), x, start), (_factors(len(data), x), data[1:]), unroll=unroll
     )
@@ -137,8 +139,8 @@ def _pulled_back(family: Family, operator: Operator, w: Array, x: Array, y: Arra
     return total
 
 
-def changes_of(operator: Operator, tangents: Any) -> PyTree | None:
-    """Convert the tangents of an operator in a rule of `jax.custom_jvp` for `along`; None if it does not change."""
+def changes_of(primal: PyTree, tangents: Any) -> PyTree | None:
+    """Convert the tangents of an argument of a `jax.custom_jvp` rule for `along`; None if it does not change."""
     leaves: list[Any] = jax.tree.leaves(tangents, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
     if all(isinstance(leaf, SymbolicZero) for leaf in leaves):
         return None
@@ -148,7 +150,7 @@ def changes_of(operator: Operator, tangents: Any) -> PyTree | None:
         else None
         for leaf in leaves
     ]
-    return jax.tree.unflatten(jax.tree.structure(operator), part)
+    return jax.tree.unflatten(jax.tree.structure(primal), part)
 
 
 @cache
@@ -173,7 +175,57 @@ def _filtered(family: Family) -> Linear:
         scan,
         transposed,
         (_changed(family), lambda operator, w, x, change: _of_weights(family, len(w))(operator, x, change)),
+        _changed_jointly(family),
         where_installed(family.filter_kernel, scan),
+    )
+
+
+@cache
+def _changed_jointly(family: Family) -> Linear:
+    """Return the derivative of a filter in directions of weights and signal: `(operator, w, x, (change, change))`."""
+
+    def apply(operator: Operator, w: Array, x: Array, changes: tuple[Array, Array]) -> Array:
+        of_w, of_x = changes
+        return _filtered(family)(operator, w, of_x) + _of_weights(family, len(w))(operator, x, of_w)
+
+    def transposed(operator: Operator, w: Array, x: Array, y: Array) -> tuple[Array, Array]:
+        mass = inner_mass(operator, y)
+        of_x, of_w = _filter_and_projection(family, operator, family.turn(w), y / mass, mass * x)
+        return family.turn(of_w), mass * of_x
+
+    return Linear(apply, transposed)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _filter_and_projection(family: Family, operator: Operator, w: Array, x: Array, y: Array) -> tuple[Array, Array]:
+    """Filter a signal, and pair T_k(Δ̃)x with y for each k, by one recurrence."""
+    if installed() and jax.default_backend() == "cpu":
+        # Kernels have one recurrence each, and take less time for two than the scan for one.
+        return _filtered(family)(operator, w, x), projection(len(w), family)(operator, x, y)
+    x, y = operator.enter(x), operator.enter(y)
+
+    def add(total: Array, t: Array, _: Array, w_k: Array) -> tuple[Array, Array]:
+        return total + family.mix(t, w_k), family.pair(t, y)
+
+    total, rest = _scan_terms(operator, x, w, add, family.mix(x, w[0]))
+    return operator.leave(total), jnp.concatenate([family.pair(x, y)[None], rest])
+
+
+@partial(_filter_and_projection.defjvp, symbolic_zeros=True)
+def _change_of_both(family: Family, primals: Any, tangents: Any) -> tuple[Any, Any]:
+    """Differentiate the two one by one, by their own rules."""
+    operator, w, x, y = primals
+    of_operator, of_w, of_x, of_y = (changes_of(*pair) for pair in zip(primals, tangents, strict=True))
+
+    def change(rule: Linear, arguments: tuple[Any, ...], changes: tuple[Any, ...], like: Array) -> Array:
+        found = [rule.derivative(i, arguments, part) for i, part in enumerate(changes) if part is not None]
+        return sum(found, jnp.zeros_like(like))
+
+    values = _filter_and_projection(family, operator, w, x, y)
+    filtering, pairing = _filtered(family), projection(len(w), family)
+    return values, (
+        change(filtering, (operator, w, x), (of_operator, of_w, of_x), values[0]),
+        change(pairing, (operator, x, y), (of_operator, of_x, of_y), values[1]),
     )
 
 
@@ -189,7 +241,7 @@ def _of_weights(family: Family, terms: int) -> Linear:
             lambda operator, x, w, change: _changed(family)(operator, w, x, change),
             lambda operator, x, w, change: _filtered(family)(operator, w, change),
         ),
-        lambda operator, x, w: on_processors(operator, w, x),
+        on_processors=lambda operator, x, w: on_processors(operator, w, x),
     )
 
 
@@ -220,7 +272,7 @@ def projection(terms: int, family: Family = COLUMNS) -> Linear:
         scan,
         lambda operator, x, w: _of_weights(family, terms)(operator, x, w),
         (_changed_projection(family, terms), by_signal),
-        where_installed(family.project_kernel and partial(family.project_kernel, terms), scan),
+        on_processors=where_installed(family.project_kernel and partial(family.project_kernel, terms), scan),
     )
 
 
@@ -256,7 +308,7 @@ def inner_mass(operator: Operator, x: Array) -> Array:
 
 
 def _sums(x: Array) -> Array:
-    """Sum over vertices, column by column; many rows at a time, because processors sum few columns slowly."""
+    """Sum over vertices, column by column; many rows at a time, because few columns are summed slowly."""
     whole = len(x) // _ROWS_AT_ONCE * _ROWS_AT_ONCE
     wide = x[:whole].reshape(-1, _ROWS_AT_ONCE * (x.size // max(len(x), 1))).sum(axis=0)
     return wide.reshape(_ROWS_AT_ONCE, *x.shape[1:]).sum(axis=0) + x[whole:].sum(axis=0)
@@ -303,7 +355,7 @@ components = Linear(
             operator, x, _per_column(change, x)
         ),
     ),
-    where_installed(component_rows, _components_scan),
+    on_processors=where_installed(component_rows, _components_scan),
 )
 
 #: Σ_j g_j(Δ)y_j as a function of all y_j: `(operator, c, y)`.

@@ -148,6 +148,17 @@ def test_all_derivatives_are_those_of_dense_matrices(operator, lumped, order, x6
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
+def test_both_gradients_take_one_recurrence(operator):
+    """That of the value and one for the gradients by coefficients and signal, which read the same polynomials."""
+    c, x = (jnp.asarray(random_array(*shape), jnp.float32) for shape in ((DEGREE + 1,), (len(operator.degree), 3)))
+
+    def recurrences(of):
+        lowered = jax.jit(jax.grad(lambda c, x: jnp.sum(jnp.sin(chebyshev.filter(operator, c, x))), of)).lower(c, x)
+        return lowered.compile().as_text().count(" while(")
+
+    assert recurrences((0, 1)) == recurrences(0) == recurrences(1) == 2
+
+
 @pytest.mark.parametrize("axes", [(0, None), (None, 0), (0, 0)])
 def test_derivatives_of_mapped_filters(operator, axes, x64):
     """What all members share collects the derivatives of all; and derivatives are mapped as well."""

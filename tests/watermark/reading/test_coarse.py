@@ -18,7 +18,7 @@ from jaxmark.watermark.markers import NonBlindMarker
 from jaxmark.watermark.nonblind import read
 from jaxmark.watermark.reading.coarse import receive_coarse
 from jaxmark.watermark.reading.reception import Reception
-from tests.samples import bumpy_sphere
+from tests.samples import TWICE, bumpy_sphere
 
 pytest.importorskip("igl")
 pytest.importorskip("fast_simplification")
@@ -73,7 +73,8 @@ def test_vertices_tell_what_closest_points_do_not():
 
 
 def test_no_key_takes_part():
-    assert np.array_equal(coarse(3).residual, coarse(5).residual)
+    one, other = coarse(3).residual, coarse(5).residual
+    np.testing.assert_allclose(other, one, rtol=0, atol=TWICE * np.abs(one).max())
 
 
 @pytest.mark.long
@@ -98,7 +99,7 @@ def test_what_was_chosen_before_is_charged():
     marker, half = marker_of(3), ledger.SCENE.charge("sum over meshes")
     charged = read(marker, aligned(), MESSAGE, charges=(half,)).evidence
     alone = marker.read(aligned(), MESSAGE).evidence
-    assert charged.log10_p_unfloored == pytest.approx(alone.log10_p_unfloored + np.log10(2), abs=1e-6)
+    assert charged.log10_p_unfloored == pytest.approx(alone.log10_p_unfloored + np.log10(2), abs=max(1e-6, TWICE))
     assert charged.charges == (half, *alone.charges)
 
 

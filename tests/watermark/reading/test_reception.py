@@ -372,7 +372,8 @@ def test_differentiable_with_respect_to_suspect_and_original(normals: bool, case
     _, slopes = value_and_slopes(suspect, x)
     for which, slope in enumerate(slopes):
         for _ in range(3):
-            way = jnp.asarray(1e-7 * random.normal(size=x.shape))
+            # The fit of the nuisance magnifies rounding, which on GPUs differs from run to run, so steps are not small.
+            way = jnp.asarray(1e-5 * random.normal(size=x.shape))
             ends = [
                 value_and_slopes(*((suspect + s * way, x) if which == 0 else (suspect, x + s * way)))[0]
                 for s in (1, -1)
