@@ -22,13 +22,12 @@ from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, PyTree
 
 from jaxmark.spectral.kernels import Computation, component_rows, filter_rows, project_rows, where_installed
-from jaxmark.spectral.laplacian import Operator, per_row
+from jaxmark.spectral.laplacian import MIN_LARGE_VALUES, Operator, per_row
 from jaxmark.spectral.linear import Linear, along, combine, floats
 from jaxmark.spectral.precision import einsum, matmul
 
 _ROWS_AT_ONCE = 128  # rows that are summed as one wide row
 _MAX_SUMMED_COLUMNS = 6  # up to which sums took less time than matrix products, by measurement
-_MIN_UNROLLED_VALUES = 2**16  # values of a signal from which on running the recurrence takes longer than compiling it
 
 
 def _scan_terms(
@@ -52,7 +51,7 @@ def _scan_terms(
         return (current, following, carry), output
 
     # Unrolling saves a copy of the carry in each step, but leaves more to compile.
-    unroll = 3 if x.size >= _MIN_UNROLLED_VALUES else 1
+    unroll = 3 if x.size >= MIN_LARGE_VALUES else 1
     (_, _, carry), outputs = jax.lax.scan(
         body, (jnp.zeros_like(x), x, start), (_factors(len(data), x), data[1:]), unroll=unroll
     )
