@@ -43,7 +43,7 @@ from jaxmark.distortion.norms import Positions, Scalar, percentile, ratio, root
 from jaxmark.geometry.mesh import cross_product, face_pairs
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import band_components, filter
-from jaxmark.spectral.laplacian import MIN_LARGE_VALUES, Laplacian, graph_laplacian
+from jaxmark.spectral.laplacian import MIN_LARGE_VALUES, Laplacian, graph_laplacian, take_rows
 from jaxmark.spectral.padding import common_size, pad_edges, pad_rows
 
 SHARE = 0.99  # fraction of the area on which the turn is less visible than the value of the metric
@@ -197,7 +197,7 @@ def _orient(pairs: np.ndarray, against: np.ndarray, count: int) -> np.ndarray:
 
 def _normals(x: Array, masking: Masking) -> Array:
     """Compute the unit normals of the faces that have one."""
-    corners = x[masking.faces]
+    corners = take_rows(x, masking.faces)
     cross = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     square = jnp.sum(cross**2, axis=1, keepdims=True)
     sound = (square > 0) & (jnp.asarray(masking.area) > 0)[:, None]
