@@ -19,7 +19,7 @@ from jaxmark.spectral.chebyshev import band_energies, gram
 from jaxmark.spectral.laplacian import Laplacian
 from jaxmark.spectral.precision import compensated_sum, sum_and_norm
 from jaxmark.watermark.bits import detect_bits, embed_bits
-from jaxmark.watermark.carriers import Chips, KeyedCarrier, KeyedReader
+from jaxmark.watermark.carriers import Chips, KeyedCarrier, KeyedReader, chips
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.evidence import bounds
 from jaxmark.watermark.reading.detectors import decorrelate
@@ -178,7 +178,7 @@ def test_products_of_preparing_embedding_and_reading(scheme, original, key: jm.K
         seen, reader = observe(marked - x)._replace(nuisance=x), carrier.reader()
         received = reader.receive(seen)
         signs = jnp.ones(carrier.chips.signs.shape, x.dtype) if scheme.name == "keyed" else None
-        probe = None if signs is None else KeyedReader._probe(reader, jnp.ones_like(x[:, 0]), signs)
+        probe = None if signs is None else chips._probe(reader.receiver, carrier.normals, jnp.ones_like(x[:, 0]), signs)
         more = probe, reader.linear_score(received, x, bits), reader.read_quickly(seen)
         return (
             carrier.claim(seen, bits),

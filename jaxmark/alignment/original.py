@@ -97,7 +97,8 @@ class Original:
 
     def to_host(self, values: Float[Array, " rows *columns"]) -> Float64[np.ndarray, " points *columns"]:
         """Convert an array of traced code back to values per point."""
-        return np.asarray(values[: len(self.used)], np.float64)
+        # Slicing the array of JAX would compile a program.
+        return np.asarray(values)[: len(self.used)].astype(np.float64)
 
 
 def make_original(mesh: Mesh, grid: float | None = None) -> Original:

@@ -13,12 +13,10 @@ from jaxmark.geometry.pose import Points
 from jaxmark.geometry.surfaces import Surface, barycentric
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import band_components
-from jaxmark.spectral.graphs import Weighting
-from jaxmark.spectral.laplacian import Laplacian
+from jaxmark.spectral.laplacian import Laplacian, host_edges
 from jaxmark.spectral.padding import common_laplacian, pad_rows
 
 _SCALES = 9  # smoothing by 1, 2, 4 … 256 steps, each halfway to the neighbours' mean
-_WEIGHTINGS: tuple[Weighting, ...] = ("valence", "cotangent")
 # Smoothing is assumed if it leaves at most this fraction of the squared displacement unexplained. If displacements are
 # known along normals only, smoothing also explains a large part of the mark; at recognised points, hardly any of it.
 _MAX_UNEXPLAINED_ON_SURFACES, _MAX_UNEXPLAINED_AT_POINTS = 0.1, 0.5
@@ -58,11 +56,16 @@ def replay_smoothing(
     x = np.asarray(original.mesh.vertices)
     signal = original.closest(np.asarray(suspect.vertices))[0]
     share, corners = barycentric(suspect, face, closest), np.asarray(suspect.faces)[face]
+    cotangents = common_laplacian(suspect, "cotangent")
+    # The valence Laplacian gets weights of 1, so that one compiled program serves both.
+    pairs, _ = host_edges(cotangents)
+    valence = cotangents._replace(
+        weights=pad_rows(np.ones(len(pairs)), len(cotangents.edges)),
+        degree=np.bincount(pairs.ravel(), minlength=len(cotangents.degree)).astype(np.float64),
+    )
     smoothed = [
-        np.concatenate(
-            [np.einsum("pkc,pk->pc", scale[corners], share) for scale in _smoothed(suspect, weighting, signal)], 1
-        )
-        for weighting in _WEIGHTINGS
+        np.concatenate([np.einsum("pkc,pk->pc", scale[corners], share) for scale in _smoothed(operator, signal)], 1)
+        for operator in (valence, cotangents)
     ]
     displacement = np.where(weights[:, None], closest - x, 0)
     return _likeliest(smoothed, x, displacement, normals, weights, _MAX_UNEXPLAINED_ON_SURFACES)
@@ -92,14 +95,13 @@ def replay_smoothing_of_points(
     powers = np.concatenate([once, operator.apply(once)], axis=1)[: len(x)]
     if _likeliest([powers], x, displacement, None, weights, _MAX_UNEXPLAINED_AT_FIRST) is None or area(original) == 0:
         return None
-    columns = np.concatenate(_smoothed(original, "cotangent", x), axis=1)
+    columns = np.concatenate(_smoothed(common_laplacian(original, "cotangent"), x), axis=1)
     return _likeliest([columns], x, displacement, None, weights, _MAX_UNEXPLAINED_AT_POINTS)
 
 
-def _smoothed(mesh: Mesh, weighting: Weighting, signal: Points) -> list[Float32[np.ndarray, "points 3"]]:
-    """Smooth a signal by a mesh's Laplacian, once for each number of steps."""
+def _smoothed(operator: Laplacian, signal: Points) -> list[Float32[np.ndarray, "points 3"]]:
+    """Smooth a signal by a Laplacian, once for each number of steps."""
     family = diffusion(_SCALES, 4 * 2 ** (_SCALES // 2) + 1)
-    operator = common_laplacian(mesh, weighting)
     scales = band_components(operator, family, pad_rows(signal, len(operator.degree)).astype(np.float32))
     return list(np.asarray(scales)[:, : len(signal)])
 

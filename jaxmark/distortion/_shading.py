@@ -43,7 +43,7 @@ from jaxmark.distortion.norms import Positions, Scalar, percentile, ratio, root
 from jaxmark.geometry.mesh import cross_product, face_pairs
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import band_components, filter
-from jaxmark.spectral.laplacian import Laplacian, graph_laplacian
+from jaxmark.spectral.laplacian import MIN_LARGE_VALUES, Laplacian, graph_laplacian, take_rows
 from jaxmark.spectral.padding import common_size, pad_edges, pad_rows
 
 SHARE = 0.99  # fraction of the area on which the turn is less visible than the value of the metric
@@ -109,7 +109,9 @@ def make_masking(
     diagonal = float(np.linalg.norm(np.ptp(used, axis=0))) if len(used) else 1.0
     lengths = np.sqrt(4 / math.sqrt(3) * size * mean) / diagonal  # of equilateral triangles' sides
     padded = jax.device_put(pad_rows(normals, count)), jax.device_put(pad_rows(lengths, count))
-    threshold, bare = (np.asarray(values)[:, : len(faces)] for values in _hidden(links, *padded, bands))
+    # On small meshes, all bands take less time than compiling a program for fewer.
+    computed = BANDS if padded[0].size < MIN_LARGE_VALUES else bands
+    threshold, bare = (np.asarray(values)[:bands, : len(faces)] for values in _hidden(links, *padded, computed))
     share, bend = area / (area.sum() or 1.0), _second_largest(pairs, angle, len(faces))
     return Masking(faces.astype(np.int32), share, turned, links, threshold, bare, bend)
 
@@ -195,7 +197,7 @@ def _orient(pairs: np.ndarray, against: np.ndarray, count: int) -> np.ndarray:
 
 def _normals(x: Array, masking: Masking) -> Array:
     """Compute the unit normals of the faces that have one."""
-    corners = x[masking.faces]
+    corners = take_rows(x, masking.faces)
     cross = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     square = jnp.sum(cross**2, axis=1, keepdims=True)
     sound = (square > 0) & (jnp.asarray(masking.area) > 0)[:, None]
@@ -216,13 +218,17 @@ def _bands(links: Laplacian, x: Array, count: int) -> Array:
     """Split signals of faces into bands, starting with the shortest waves; the longest waves are in no band."""
     passed = _diffusions(count)
     bands = _GAINS[:count, None] * (np.vstack([np.eye(1, passed.shape[1]), passed[:-1]]) - passed)
-    # Most bands need only few of the terms.
-    parts = [band_components(links, jnp.asarray(some, x.dtype), x) for some in _by_length(bands)]
+    parts = [band_components(links, jnp.asarray(some, x.dtype), x) for some in _by_length(bands, x.size)]
     return jnp.concatenate(parts)
 
 
-def _by_length(series: Float[np.ndarray, "series terms"]) -> list[Float[np.ndarray, "some fewer"]]:
-    """Split series, sorted by length, into those of at most `_FEW_TERMS` terms, without the zeros, and the others."""
+def _by_length(series: Float[np.ndarray, "series terms"], values: int) -> list[Float[np.ndarray, "some fewer"]]:
+    """Split series, sorted by length, into those of at most `_FEW_TERMS` terms, without the zeros, and the others.
+
+    If a signal has few values, the series stay together: running them takes less time than compiling two programs.
+    """
+    if values < MIN_LARGE_VALUES:
+        return [series]
     short = int((~series[:, _FEW_TERMS:].any(axis=1)).sum())
     return [some for some in (series[:short, :_FEW_TERMS], series[short:]) if len(some)]
 
@@ -232,7 +238,7 @@ def _hidden(links: Laplacian, normals: Array, length: Array, count: int) -> tupl
     """Compute the just noticeable turns in each band, with and without masking, from the means around each face."""
     energy, dtype = jnp.sum(_bands(links, normals, count) ** 2, axis=2), normals.dtype
     means, start = [], 0
-    for some in _by_length(_diffusions(count)):
+    for some in _by_length(_diffusions(count), normals.size):
         # Each band's energy and the lengths are averaged by the same series: columns of one signal.
         columns = jnp.concatenate([energy[start : start + len(some)], jnp.tile(length, (len(some), 1))]).T
         means.append(filter(links, jnp.tile(jnp.asarray(some, dtype), (2, 1)), columns).T.reshape(2, len(some), -1))

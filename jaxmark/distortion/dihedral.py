@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxmark.distortion.norms import Positions, Scalar, lengths, ratio
 from jaxmark.geometry.mesh import edges
+from jaxmark.spectral.laplacian import take_rows
 
 MIN_HEIGHT = 1e-5  # least height of a face over its longest side; flatter faces have no angles that could be seen
 _FOLDED_WEIGHT = 0.01  # weight of an angle of π, where the surface is folded back onto itself; an angle of 0 has 1
@@ -50,10 +51,10 @@ def dihedral_sine_cosine(x: Positions, hinges: Hinges) -> tuple[Float[Array, " e
 
     The angle is positive where a surface whose faces run counterclockwise is convex, and 0 where it is not defined.
     """
-    tail, head = x[hinges.edges[:, 0]], x[hinges.edges[:, 1]]
+    tail, head, left, right = _corners(x, hinges)
     along = head - tail
     length = lengths(along)
-    first, second = jnp.cross(along, x[hinges.left] - tail), jnp.cross(x[hinges.right] - tail, along)
+    first, second = jnp.cross(along, left - tail), jnp.cross(right - tail, along)
     size = lengths(first) * lengths(second) * length
     sine = ratio(jnp.sum(jnp.cross(first, second) * along, axis=1), size)
     cosine = ratio(jnp.sum(first * second, axis=1) * length, size)
@@ -86,12 +87,23 @@ def flat_faces(
     x: Float[Array | np.ndarray, "vertices 3"], faces: Int[Array | np.ndarray, "faces 3"]
 ) -> Bool[Array, " faces"]:
     """Find the faces that are flat, so that their angles mean nothing: lower than 1e-5 of their longest side."""
-    a, b, c = (x[jnp.asarray(faces)[:, corner]] for corner in range(3))
+    return _are_flat(*(take_rows(x, jnp.asarray(faces)[:, corner]) for corner in range(3)))
+
+
+def _are_flat(
+    a: Float[Array, "faces 3"], b: Float[Array, "faces 3"], c: Float[Array, "faces 3"]
+) -> Bool[Array, " faces"]:
+    """Find the faces that are flat, as `flat_faces`, from the positions of their corners."""
     longest = jnp.max(jnp.stack([jnp.sum(side**2, axis=1) for side in (b - a, c - a, c - b)]), axis=0)
     return jnp.sum(jnp.cross(b - a, c - a) ** 2, axis=1) <= (MIN_HEIGHT * longest) ** 2
 
 
+def _corners(x: Positions, hinges: Hinges) -> list[Float[Array, "edges 3"]]:
+    """Return the positions of both ends of each edge, and of the third corners of the faces on its two sides."""
+    return [take_rows(x, places) for places in (hinges.edges[:, 0], hinges.edges[:, 1], hinges.left, hinges.right)]
+
+
 def _is_flat(x: Positions, hinges: Hinges) -> Bool[Array, " edges"]:
     """Find the edges that have a flat face on one of their sides."""
-    left, right = (flat_faces(x, jnp.column_stack([hinges.edges, apex])) for apex in (hinges.left, hinges.right))
-    return left | right
+    tail, head, left, right = _corners(x, hinges)
+    return _are_flat(tail, head, left) | _are_flat(tail, head, right)

@@ -12,6 +12,7 @@ from jaxmark.distortion.norms import Positions, Scalar, inverse_root, lengths, p
 from jaxmark.geometry.clouds import planes, spacings
 from jaxmark.geometry.mesh import Mesh, used_vertices
 from jaxmark.geometry.surfaces import Surface, sample
+from jaxmark.spectral.laplacian import take_rows
 
 Edges = Int[Array | np.ndarray, "edges 2"]  # as by `jaxmark.geometry.mesh.edges`
 
@@ -80,7 +81,7 @@ def stretch(original: Positions, distorted: Positions, edges: Edges, share: floa
     Displacements along the surface change lengths, and so textures, where shading hardly changes. Edges of length 0 do
     not count. The gradient is that of the edge at this percentile.
     """
-    before, after = (lengths(x[edges[:, 0]] - x[edges[:, 1]]) for x in (original, distorted))
+    before, after = (lengths(take_rows(x, edges[:, 0]) - take_rows(x, edges[:, 1])) for x in (original, distorted))
     return percentile(ratio(jnp.abs(after - before), before), (before > 0).astype(before.dtype), share)
 
 

@@ -151,9 +151,15 @@ def band_energies(
     v: Float[Array, "vertices columns"],
 ) -> Float[Array, " bands"]:
     """Compute ⟨u, f_j(Δ)v⟩ of each band, with mass over its mean as weights; of unit noise, the bands' dimensions."""
-    moments = cross_moments(operator, u, v, degree=coefficients.shape[1] - 1)
+    return matmul(coefficients, energy_moments(operator, u, v, degree=coefficients.shape[1] - 1))
+
+
+def energy_moments(
+    operator: Laplacian, u: Float[Array, "vertices columns"], v: Float[Array, "vertices columns"], *, degree: int
+) -> Float[Array, " terms"]:
+    """Compute ⟨u, T_k(Δ̃)v⟩ for k = 0 … degree, with mass over its mean as weights, over all columns."""
     mass = jnp.asarray(operator.mass).astype(u.dtype)
-    return matmul(coefficients, moments.sum(axis=1)) * (jnp.sum(jnp.sign(mass)) / mass.sum())
+    return cross_moments(operator, u, v, degree=degree).sum(axis=1) * (jnp.sum(jnp.sign(mass)) / mass.sum())
 
 
 @partial(jax.jit, static_argnames="degree")

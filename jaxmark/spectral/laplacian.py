@@ -9,7 +9,7 @@ half a bound of its spectrum: an eigenvalue λ of that is λ/s of Δ, in [0, 2] 
 ⟨x, y⟩_M = xᵀMy. Without one, M = D and s = 1.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -30,6 +30,7 @@ Values = Shaped[Array, " vertices *columns"]
 # The cost of adding to a row at any index, in units of reading a row, by measurement: 8 on processors, 5 to 7 on GPUs.
 _SCATTER_COST = 8
 _SCATTER_COST_PER_VERTEX = 4  # what a pass of such additions costs beside them, however few they are, in the same unit
+MIN_LARGE_VALUES = 2**16  # values of a signal from which on running the recurrence takes longer than compiling it
 _MIN_ORDERED_VERTICES = 2**14  # from here on a signal outgrows the fastest memory, and reordering vertices pays
 
 
@@ -206,11 +207,16 @@ class Laplacian(NamedTuple):
         """Return the map x → Wx, slot by slot; without weights, each empty slot adds the vertex's own row."""
         weights, rest_weights = self._table_weights(table, like)
         factors = [1.0] * len(table.vertices) if weights is None else [per_row(slot, like) for slot in weights]
-        slots, rest = list(zip(factors, table.vertices, strict=True)), jnp.asarray(table.rest)
-        factor = 1.0 if rest_weights is None else per_row(rest_weights, like)
+        rest, factor = jnp.asarray(table.rest), 1.0 if rest_weights is None else per_row(rest_weights, like)
+
+        def read(x: Array) -> Iterable[Array]:
+            # One gather for all slots leaves less to compile than one for each slot, but takes longer to run.
+            if x.size < MIN_LARGE_VALUES:
+                return take_rows(x, table.vertices)
+            return (take_rows(x, vertices) for vertices in table.vertices)
 
         def total(x: Array) -> Array:
-            found = sum((weight * x[vertex] for weight, vertex in slots), jnp.zeros_like(x))
+            found = sum((weight * rows for weight, rows in zip(factors, read(x), strict=True)), jnp.zeros_like(x))
             return found.at[rest[:, 0]].add(factor * x[rest[:, 1]]) if len(rest) else found
 
         return total
@@ -308,6 +314,11 @@ def adjacency(pairs: Int[np.ndarray, "edges 2"], size: int) -> sparse.csr_array:
     pairs = pairs.astype(np.int32, copy=False)
     (tail, head), edge = np.concatenate([pairs, pairs[:, ::-1]]).T, np.tile(np.arange(len(pairs), dtype=np.int32), 2)
     return sparse.csr_array(sparse.coo_array((edge, (tail, head)), shape=(size, size)))
+
+
+def take_rows(x: Array | np.ndarray, places: Int[Array | np.ndarray, " *places"]) -> Array:
+    """Read the rows at places that are certainly between 0 and the number of rows, which leaves less to compile."""
+    return jnp.asarray(x).at[places].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def per_row(values: Num[Array | np.ndarray, " rows"], x: Array | np.ndarray) -> Array:

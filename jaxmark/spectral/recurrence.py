@@ -22,14 +22,13 @@ from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, PyTree
 
 from jaxmark.spectral.kernels import Computation, component_rows, filter_rows, installed, project_rows, where_installed
-from jaxmark.spectral.laplacian import Operator, per_row
+from jaxmark.spectral.laplacian import MIN_LARGE_VALUES, Operator, per_row
 from jaxmark.spectral.linear import Linear, along, combine, floats
 from jaxmark.spectral.precision import einsum, matmul
 
 _ROWS_AT_ONCE = 512  # rows that are summed as one wide row
 _MAX_SUMMED_COLUMNS = 6  # up to which sums took less time than matrix products, by measurement
 _UNROLLED_ON_GPU = 5  # steps, by measurement
-_MIN_UNROLLED_VALUES = 2**16  # values of a signal from which on running the recurrence takes longer than compiling it
 
 
 def _scan_terms(
@@ -54,7 +53,7 @@ def _scan_terms(
 
     # Unrolling saves a copy of the carry in each step, but leaves more to compile. On GPUs, bodies of some more steps
     # are launched as one.
-    unroll = _UNROLLED_ON_GPU if jax.default_backend() == "gpu" else 3 if x.size >= _MIN_UNROLLED_VALUES else 1
+    unroll = _UNROLLED_ON_GPU if jax.default_backend() == "gpu" else 3 if x.size >= MIN_LARGE_VALUES else 1
     (_, _, carry), outputs = jax.lax.scan(
         body, (jnp.zeros_like(x), x, start), (_factors(len(data), x), data[1:]), unroll=unroll
     )

@@ -18,7 +18,7 @@ from typing import NamedTuple, cast
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float64
+from jaxtyping import Float64
 from numpy.typing import ArrayLike
 
 from jaxmark.alignment import attempts
@@ -32,10 +32,10 @@ from jaxmark.watermark.coding.message import TAG_BITS, Decoded, check_size
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Detection, Evidence, Tag, estimate_beside, weigh
 from jaxmark.watermark.evidence.ledger import Charge
-from jaxmark.watermark.interfaces import ChipCarrier, Received
+from jaxmark.watermark.interfaces import ChipCarrier, Claim, Received
 from jaxmark.watermark.mark import Mark
 from jaxmark.watermark.reading.coarse import receive_coarse
-from jaxmark.watermark.reading.detectors import claims
+from jaxmark.watermark.reading.detectors import claims_by_way
 from jaxmark.watermark.reading.reception import Reception
 from jaxmark.watermark.record import is_recorded
 
@@ -157,10 +157,10 @@ def read(
     return min(standard, second, key=lambda detection: detection.rank)
 
 
-def claims_of(mark: Mark, received: Received, message: bytes) -> list[tuple[Array, Array]]:
+def claims_of(mark: Mark, received: Received, message: bytes) -> list[Claim]:
     """Compute score and norm of a message's codeword for each way of weighting the suspect."""
     codeword = jax.device_put(mark.codeword(message).astype(received.observed.residual.dtype))
-    return list(zip(*claims(mark.reader, received, codeword), strict=True))
+    return claims_by_way(mark.reader, received, codeword)
 
 
 def check_claim(mark: Mark, message: bytes) -> None:

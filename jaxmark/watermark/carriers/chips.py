@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int, Int64
 from jaxmark.alignment.observation import Observation, observe
 from jaxmark.errors import JaxmarkError
 from jaxmark.seeds import Seed, probe_signs, random_key
-from jaxmark.spectral.chebyshev import band_energies, filter, transpose
+from jaxmark.spectral.chebyshev import energy_moments, filter, transpose
 from jaxmark.spectral.laplacian import per_row
 from jaxmark.spectral.precision import matmul, sum_and_norm
 from jaxmark.watermark.coding.keys import Choices
@@ -29,6 +29,7 @@ from jaxmark.watermark.reading.reception import (
     Receiver,
     Reception,
     clean,
+    no_filters,
     normal_factor,
     nuisance_basis,
     receive,
@@ -47,6 +48,7 @@ class Chips(NamedTuple):
         """Compute the value of each chip: its sign times the bit of its slot."""
         return jnp.asarray(self.signs).astype(dtype) * jnp.asarray(bits).astype(dtype)[self.slots]
 
+    @jax.jit
     def collect(self, matched: Float[Array, "vertices channels"]) -> Float[Array, " bits"]:
         """Apply the transpose of `spread`: add up what matches each bit's chips, times their signs."""
         products = jnp.asarray(self.signs).astype(matched.dtype) * matched
@@ -224,15 +226,15 @@ class KeyedReader(NamedTuple):
         """
         return received, weigh_evenly(received)
 
-    @jax.jit
     def claim(self, received: Reception, bits: Float[Array, " bits"]) -> Claim:
         """See `Reader`; up to the signs of the bits, the vector a is the result of `matched_residual`.
 
         The computed a, including rounding errors, does not depend on the keyed signs. Only the two sums have errors
         that do, see `jaxmark.spectral.precision.sum_and_norm`.
         """
-        return Claim(*sum_and_norm(self.carrier.spread(bits) * self.matched_residual(received)))
+        return _claim(self.carrier.chips, self.matched_residual(received), bits)
 
+    @jax.jit
     def matched_residual(self, received: Reception) -> Float[Array, "vertices channels"]:
         """Filter the residual with the filter matched to gain and power; the keyed signs multiply the result."""
         return self.carrier.match_chips(matmul(received.residual, received.axes), self._matched_coefficients(received))
@@ -251,16 +253,18 @@ class KeyedReader(NamedTuple):
         residual = clean(receiver, observation, normal_factor(receiver, observation), observation.residual)
         return self.carrier.correlate(residual, self.carrier.coefficients(beta))
 
-    @jax.jit
     def correlate(self, received: Reception) -> Float[Array, " bits"]:
         """See `Reader`; the score of a claim is the sum of these values times the signs of its codeword."""
-        residual = matmul(received.residual, received.axes)
-        return self.carrier.correlate(residual, self._matched_coefficients(received))
+        return self.carrier.chips.collect(self.matched_residual(received))
 
     def free_dimensions(self, moving: Float[Array, " vertices"]) -> FreeDimensions:
         """See `Reader`; measured with one probe, which has random signs instead of the keyed ones."""
         (signs,) = probe_signs("capacity", self.carrier.chips.signs.shape, dtype=moving.dtype)
-        whole, remaining = np.asarray(self._probe(moving, signs), np.float64).clip(0)
+        # Without bands and chips, pass bands and payloads of all sizes share a program.
+        bands = self.carrier.host.coefficients
+        receiver = self.receiver._replace(coefficients=no_filters(bands))
+        moments = np.asarray(_probe(receiver, self.carrier.normals, moving, signs), np.float64)
+        whole, remaining = (moments @ np.asarray(bands, np.float64).T).clip(0)
         profile = self.carrier.profile
         strength = np.ones(len(whole)) if profile is None else np.asarray(profile, np.float64)
         # The energy of a whole band is summed over the three coordinates of each vertex, or over one along its normal.
@@ -278,18 +282,25 @@ class KeyedReader(NamedTuple):
         """Compute the Chebyshev coefficients of the filter matched to gain and power."""
         return self.carrier.coefficients(1.0, received.gain / received.power)
 
-    @jax.jit
-    def _probe(
-        self, moving: Float[Array, " vertices"], signs: Float[Array, "vertices channels"]
-    ) -> Float[Array, "2 bands"]:
-        """Measure the energy of random signs in each band, before and after the nuisance is projected off."""
-        receiver, normals = self.receiver, self.carrier.normals
-        signs = signs * moving[:, None]
-        observation = observe(jnp.zeros_like(receiver.signal), moving)
-        factor = normal_factor(receiver, observation)
-        white = signs if normals is None else normals * signs
-        remaining = clean(receiver, observation, factor, white)
-        # The two are measured one after the other, so that there is less to compile.
-        return jax.lax.map(
-            lambda x: band_energies(receiver.operator, receiver.coefficients, x, x), jnp.stack([white, remaining])
-        )
+
+@jax.jit
+def _claim(chips: Chips, matched: Float[Array, "vertices channels"], bits: Float[Array, " bits"]) -> Claim:
+    return Claim(*sum_and_norm(chips.spread(bits, matched.dtype) * matched))
+
+
+@jax.jit
+def _probe(
+    receiver: Receiver,
+    normals: Float[Array, "vertices 3"] | None,
+    moving: Float[Array, " vertices"],
+    signs: Float[Array, "vertices channels"],
+) -> Float[Array, "2 terms"]:
+    """Measure the moments of the energy of random signs, before and after the nuisance is projected off."""
+    signs = signs * moving[:, None]
+    observation = observe(jnp.zeros_like(receiver.signal), moving)
+    factor = normal_factor(receiver, observation)
+    white = signs if normals is None else normals * signs
+    remaining = clean(receiver, observation, factor, white)
+    degree = receiver.coefficients.shape[1] - 1
+    # The two are measured one after the other, so that there is less to compile.
+    return jax.lax.map(lambda x: energy_moments(receiver.operator, x, x, degree=degree), jnp.stack([white, remaining]))

@@ -71,7 +71,8 @@ def receive_coarse(
         return None
     marks = [original.to_host(_any_mark(carrier, number)) for number in range(others)]
     unit = float(distortion.rms(marks[0][original.used]))
-    shifts = [first_rms(original.points) / unit * mark for mark in marks]
+    strength = first_rms(original.points) / unit
+    shifts = [strength * mark for mark in marks]
     faces = original.points.faces
     surface = Surface(Mesh(original.positions, faces))
     elsewhere = [
@@ -206,5 +207,7 @@ def expected_errors(
 
 def orthonormal(columns: Unknowns) -> Float64[np.ndarray, "vertices rank"]:
     """Compute an orthonormal basis of the columns' span."""
-    u, values, _ = np.linalg.svd(columns, full_matrices=False)
-    return u[:, values > 1e-9 * values.max()]
+    # Decomposing the triangle of a QR decomposition takes a fraction of the time of decomposing all rows.
+    tall, triangle = np.linalg.qr(columns)
+    u, values, _ = np.linalg.svd(triangle, full_matrices=False)
+    return tall @ u[:, values > 1e-9 * values.max()]

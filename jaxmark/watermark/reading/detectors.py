@@ -16,7 +16,7 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.seeds import probe_signs
 from jaxmark.spectral.chebyshev import filter, transpose
 from jaxmark.spectral.precision import matmul
-from jaxmark.watermark.interfaces import ChipCarrier, Reader, Received, Strength
+from jaxmark.watermark.interfaces import ChipCarrier, Claim, Reader, Received, Strength
 from jaxmark.watermark.reading.reception import Reception, clean, whitening
 
 # The conjugate gradients of joint decoding stop here: further gains are below the noise of the soft decisions.
@@ -55,8 +55,13 @@ def claims(
 
     Each way is a test of its own; taking the best one is charged (`jaxmark.watermark.evidence.ledger`).
     """
-    scores, norms = zip(*(reader.claim(way, codeword) for way in reader.ways(received)), strict=True)
+    scores, norms = zip(*claims_by_way(reader, received, codeword), strict=True)
     return jnp.stack(scores), jnp.stack(norms)
+
+
+def claims_by_way(reader: Reader, received: Received, codeword: Float[Array, " code"]) -> list[Claim]:
+    """Compute the same as `claims`, one claim for each way."""
+    return [reader.claim(way, codeword) for way in reader.ways(received)]
 
 
 def joint(reader: Reader, received: Any, beta: Strength = 1.0) -> Float[Array, " bits"]:

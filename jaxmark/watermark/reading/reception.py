@@ -101,9 +101,18 @@ def make_receiver(host: Host) -> Receiver:
     return Receiver(host.operator, host.signal, host.coefficients, nuisance_basis(host))
 
 
-@jax.jit
 def nuisance_basis(host: Host) -> Float[Array, "vertices columns"]:
     """Form a nearly orthonormal basis of the nuisance of each coordinate: polynomials and diffusion scales."""
+    return _nuisance_basis(host._replace(coefficients=no_filters(host.coefficients)))
+
+
+def no_filters(bank: Float[Array, "bands terms"]) -> Float[np.ndarray, "none terms"]:
+    """Return a bank of as many terms without filters, for programs that all banks of as many terms share."""
+    return np.empty((0, bank.shape[1]), bank.dtype)
+
+
+@jax.jit
+def _nuisance_basis(host: Host) -> Float[Array, "vertices columns"]:
     low, high = jax.lax.stop_gradient((host.positions.min(axis=0), host.positions.max(axis=0)))
     inside = (2 * host.positions - (high + low)) / jnp.where(high > low, high - low, 1)
     smooth = (
@@ -203,20 +212,41 @@ def receive(receiver: Receiver, observation: Observation) -> Reception:
     extended = extend(receiver, observation)
     # The probe comes from a program that all probes of this shape share.
     (probe,) = probe_signs("reception", observation.residual.shape, dtype=observation.residual.dtype)
-    # Only `_receive` is compiled, because a compiled function would return copies of its arguments.
-    return Reception(extended, observation, *_receive(extended, observation, probe))
+    # Only two steps are compiled, because a compiled function would return copies of its arguments. The first is the
+    # same for all pass bands.
+    weighed, factor, residual, nuisance = _project(
+        extended._replace(coefficients=no_filters(receiver.coefficients)), observation
+    )
+    residual, gain, power, axes = _measure(extended, weighed, factor, residual, nuisance, probe)
+    return Reception(extended, observation, residual, gain, power, axes, weighed, factor)
 
 
 @jax.jit
-def _receive(
-    receiver: Receiver, observation: Observation, probe: Float[Array, "vertices 3"]
-) -> tuple[Array, Array, Array, Array, Observation, Array]:
+def _project(receiver: Receiver, observation: Observation) -> tuple[Observation, Array, Array, Array]:
+    """Weigh the points, and project the nuisance off the residual.
+
+    Returns:
+        The observation with these weights, the factor of its normal equations, the residual without the nuisance, and
+        the nuisance.
+    """
     # An isolated vertex, such as a row that pads the mesh, carries nothing: it is unknown, whatever its weight.
     weights = jnp.where(receiver.operator.linked(observation.weights), observation.weights, 0)
     observation, factor = _weigh_points(receiver, observation._replace(weights=weights))
     # The nuisance is projected off twice, because the ridge leaves a small part of a large nuisance.
     nuisance = _fit_nuisance(receiver, observation, factor, observation.residual)
-    residual = clean(receiver, observation, factor, observation.residual - nuisance)
+    return observation, factor, clean(receiver, observation, factor, observation.residual - nuisance), nuisance
+
+
+@jax.jit
+def _measure(
+    receiver: Receiver,
+    observation: Observation,
+    factor: Array,
+    residual: Float[Array, "vertices 3"],
+    nuisance: Float[Array, "vertices 3"],
+    probe: Float[Array, "vertices 3"],
+) -> tuple[Array, Array, Array, Array]:
+    """Measure gain and power of each band, and the power along each direction; see `Reception` for the results."""
     # White noise is the reference for the power of each band.
     pair = jnp.concatenate([residual, clean(receiver, observation, factor, probe)], axis=1)
     squares = gram(receiver.operator, receiver.coefficients, pair, method="moments")
@@ -238,7 +268,7 @@ def _receive(
     change, whole = over_bands(products, receiver.operator, receiver.coefficients, pair)
     gain = 1 + jnp.where(whole > 0, change / jnp.where(whole > 0, whole, 1), 0)
     axes = _axes(filter(receiver.operator, whitening(receiver, power), residual), observation)
-    return (matmul(residual, axes), jnp.clip(gain, 0, 2), power, axes, observation, factor)
+    return matmul(residual, axes), jnp.clip(gain, 0, 2), power, axes
 
 
 def weigh_evenly(received: Reception) -> Reception:

@@ -16,7 +16,7 @@ from jaxmark.watermark.carriers.chips import KeyedCarrier
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.markers import NonBlindMarker
 from jaxmark.watermark.nonblind import read
-from jaxmark.watermark.reading.coarse import receive_coarse
+from jaxmark.watermark.reading.coarse import orthonormal, receive_coarse
 from jaxmark.watermark.reading.reception import Reception
 from tests.samples import TWICE, bumpy_sphere
 
@@ -143,3 +143,10 @@ def test_fine_suspects_have_no_heights():
 def test_without_the_simplifier_suspects_are_read_by_closest_points(monkeypatch):
     monkeypatch.setattr("jaxmark.alignment.by_surface.available", lambda module: False)
     assert align(marker_of(3).original, suspect()).heights is None
+
+
+def test_a_basis_of_dependent_columns():
+    columns = np.random.default_rng(0).normal(size=(40, 3)) @ np.random.default_rng(1).normal(size=(3, 5))
+    basis = orthonormal(columns)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(basis @ (basis.T @ columns), columns, atol=1e-12)
