@@ -3,6 +3,10 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
+# Python keeps byte code on disk even where the environment says otherwise: tests start many processes, and each of them
+# would compile the source of all packages again.
+unexport PYTHONDONTWRITEBYTECODE
+
 PICTURED = fandisk_6475.obj casting.off teapot_utah.obj blub_7106.obj hand_10345.obj bunny_oded_3301.obj
 
 # Of the benchmark of methods: what is published, and what `make benchmark-quick` repeats of it. `field`, of 13 s a reading,

@@ -2,6 +2,7 @@
 
 import ast
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 
 from tests import ROOT
@@ -19,6 +20,7 @@ def modules() -> set[str]:
     return {path.stem.lstrip("_") for path in PACKAGE.rglob("*.py")} | {path.name for path in PACKAGE.rglob("*/")}
 
 
+@cache
 def packages() -> dict[str, set[str]]:
     """For each module or folder at the top of the package, what it imports of the others."""
     found: dict[str, set[str]] = {}
@@ -78,6 +80,7 @@ def written(text: str, rows: str) -> str:
     return before + BEGIN + rows + END + rest.split(END)[1]
 
 
+@cache
 def _first_line(path: Path) -> str:
     """First line of a module's docstring, without the full stop; empty if it has none."""
     said = ast.get_docstring(ast.parse(path.read_text())) or ""
