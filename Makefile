@@ -42,6 +42,9 @@ lint: $(VENV)/.dev  ## ruff: style and formatting
 types: $(VENV)/.dev  ## pyright: types
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+# Each worker keeps to one thread of BLAS: on small matrices, more of them mostly wait for each other.
+tests slow-tests long-tests: export OPENBLAS_NUM_THREADS = 1
+
 tests: $(VENV)/.dev  ## pytest: all tests but the slow and the long ones
 	$(BIN)/python -m pytest -q -n auto --dist worksteal --durations=20
 
