@@ -13,6 +13,7 @@ from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.spectral import chebyshev, recurrence
 from jaxmark.spectral.bands import scaling
 from jaxmark.spectral.graphs import from_mesh
+from jaxmark.spectral.kernels import installed
 from jaxmark.spectral.laplacian import Laplacian
 from tests.dense import chebyshev_matrices, tolerance
 from tests.samples import bumpy_sphere, ordered_laplacian
@@ -148,6 +149,7 @@ def test_all_derivatives_are_those_of_dense_matrices(operator, lumped, order, x6
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
+@pytest.mark.skipif(installed(), reason="compiled kernels run the recurrences")
 def test_both_gradients_take_one_recurrence(operator):
     """That of the value and one for the gradients by coefficients and signal, which read the same polynomials."""
     c, x = (jnp.asarray(random_array(*shape), jnp.float32) for shape in ((DEGREE + 1,), (len(operator.degree), 3)))
