@@ -49,21 +49,16 @@ def time_in_row(call: Call, repeat: int, *, calls: int = 20) -> float:
 
     Those that are not counted last a tenth of a second, because GPUs that had nothing to do are slow at first.
     """
-    start = time.perf_counter()
-    while True:
-        jax.block_until_ready(call())
-        if time.perf_counter() - start > 0.1:
-            break
-    times: list[float] = []
-    for _ in range(repeat):
-        start = time.perf_counter()
+
+    def in_row() -> object:
         for _ in range(calls - 1):
             call()
+        return call()
+
+    start = time.perf_counter()
+    while time.perf_counter() - start < 0.1:
         jax.block_until_ready(call())
-        times.append((time.perf_counter() - start) / calls)
-        if sum(times) * calls > PATIENCE:
-            break
-    return statistics.median(times)
+    return median_time(in_row, repeat, counted=True) / calls
 
 
 def median_time(call: Call, repeat: int, *, counted: bool = False, patience: float = PATIENCE) -> float:

@@ -165,12 +165,9 @@ def commands(mesh: jm.Mesh) -> Iterator[Row]:
                 ("embed", "mesh.ply", "marked.ply", "--message", MESSAGE.hex(), "--overwrite"),
                 ("detect", "marked.ply", "--original", "mesh.ply"),
             ):
+                row: Row = {"command": words[0], "on": platform or jax.default_backend()}
                 first, later = (timed(run, platform, *words)[1] for _ in range(2))
-                where = platform or jax.default_backend()
-                yield {"command": words[0], "on": where, "vertices": len(mesh.vertices)} | {
-                    "first": first,
-                    "second": later,
-                }
+                yield row | {"vertices": len(mesh.vertices), "first": first, "second": later}
 
 
 def main() -> None:
