@@ -89,7 +89,7 @@ def descriptors(
         settings: the number of neighbours and of bins.
     """
     bins = settings.bins
-    nearest = KDTree(points).query(points, k=settings.neighbours + 1, distance_upper_bound=radius)
+    nearest = KDTree(points).query(points, k=settings.neighbours + 1, distance_upper_bound=radius, workers=-1)
     distance, other = (np.asarray(array)[:, 1:] for array in nearest)  # without the point itself
     near = np.isfinite(distance) & (distance > 0)
     other, distance = np.where(near, other, 0), np.where(near, distance, 1)
