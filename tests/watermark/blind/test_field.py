@@ -466,7 +466,7 @@ def test_a_blind_detection_has_its_claim(monkeypatch, claim, sign, fields):
     """A suspect whose values fit the message, or nothing."""
     word = sign * reading.codeword(MESSAGE, CHOICES)
     view = SimpleNamespace(pose=None, width=WIDTH, undone=0, by_hint=False, mirrored=[False], values=np.zeros(1))
-    phases = reading.Phases(view, 0, 1e-3, 0.0, word, float(len(word)), len(word))  # pyright: ignore[reportArgumentType]
+    phases = reading.Phases(view, 0, 1e-3, np.zeros(7), 0.0, word, *[len(word)] * 3)  # pyright: ignore[reportArgumentType]
     claimed = reading._Claim(CHOICES, 32, claim, None)
     found = reading._weigh([phases], SCHEME, claimed, 1, 0)
     assert (found.message, found.claimed, found.recorded) == fields
