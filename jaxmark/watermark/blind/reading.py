@@ -68,7 +68,7 @@ class Anchored(NamedTuple):
     width: float = 0.0  # width of the averages, in the scheme's unit
     step: float = 0.0  # quantisation step of the values, in the scheme's unit
     anchors: int = 0  # number of values that were read
-    agreement: float = 0.0  # mean cosine of their phases; 1 if all have exactly the values of the mark
+    agreement: float = 0.0  # mean cosine of their phases by reliability; 1 if all have exactly the values of the mark
 
     def facts(self) -> dict[str, Any]:
         """See `Registration`."""

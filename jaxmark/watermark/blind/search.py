@@ -16,6 +16,7 @@ from jaxmark.spectral.precision import matmul
 from jaxmark.watermark.blind.scheme import Look
 
 _STARTS_PER_CLIMB, _STEPS = 64, 6  # random changes for each that is refined, and the number of steps
+_BATCH = 256  # random changes that are tried at once, to limit the memory
 
 
 def random_changes(count: int, size: int) -> Float64[np.ndarray, "count size"]:
@@ -78,7 +79,8 @@ def search(
             gradient = jnp.einsum("ac,ta->tc", slope, pull * residual)
             return change - jnp.linalg.solve(gram, gradient[..., None])[..., 0], None
 
-        best = starts[jax.lax.top_k(pilot(starts), climbs)[1]]
+        batches = starts.reshape(-1, min(_BATCH, len(starts)), starts.shape[1])
+        best = starts[jax.lax.top_k(jax.lax.map(pilot, batches).ravel(), climbs)[1]]
         best = jnp.concatenate([starts[:1], best, jax.lax.scan(refine, best, None, length=_STEPS)[0]])
         # Large changes are unlikely, and some of many changes fit by chance.
         fit_score = pilot(best) / jnp.sqrt(jnp.maximum(jnp.sum(weight**2), 1) / 2)
