@@ -136,7 +136,9 @@ def read(
     looks = kinds * scheme.looks * _CHANGES
     best = _nothing(scheme, claim, np.zeros(length), Anchored(Pose(np.eye(3), np.zeros(3))))
     tags_compared = 0  # number of messages whose tags were already compared
+    poses: set[bytes] = set()  # poses that the hint gave
     for group in scheme.views(suspect, choices):
+        poses |= {view.pose.shift.tobytes() for view in group if view.by_hint}
         readings = [reading for view in group for reading in _readings(view, scheme, choices, length)]
         if not readings:
             continue
@@ -150,7 +152,17 @@ def read(
         )
         if is_sure(best):
             break
+    if record is not None and record.parameters.get("hint") and not best.detected(allow_estimate=True):
+        return best._replace(notes=(*best.notes, _note_on_poses(len(poses))))
     return best
+
+
+def _note_on_poses(count: int) -> str:
+    """Say whether the hint of a record gave poses of a suspect in which nothing was detected."""
+    if count == 0:
+        return "The record's hint gives no pose of this suspect: too few landmarks of the original are found on it."
+    tried = "one pose" if count == 1 else f"{count} poses"
+    return f"The record's hint gives {tried} of this suspect, but what is read there does not prove the mark."
 
 
 def try_each(reads: Iterable[Callable[[], Detection]]) -> Iterator[Detection]:
